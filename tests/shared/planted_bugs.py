@@ -125,7 +125,7 @@ def _motion_kept_quiet(patch: pytest.MonkeyPatch) -> None:
     is_news = DeviceRows._is_news
 
     def some(rows: DeviceRows, status: Any, now: float) -> bool:
-        return status.state is not State.MOVING and is_news(rows, status, now)
+        return status.state != State.MOVING.value and is_news(rows, status, now)
 
     patch.setattr(DeviceRows, "_is_news", some)
 

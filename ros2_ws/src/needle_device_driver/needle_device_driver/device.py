@@ -10,7 +10,6 @@ import operator
 from collections.abc import Callable, Sequence
 
 from needle_core import messages as m
-from needle_core import status_messages as m_status
 from needle_core.component import (
     LATCHED,
     Actions,
@@ -25,18 +24,16 @@ from needle_core.component import (
     Service,
 )
 from needle_core.component import Reply as ServiceReply
-from needle_core.diagnostics import Level
 from needle_core.process.claim import WAY_OUT
+from needle_core.status_messages import DeviceStatus
 from needle_device_driver.procedure import Procedure, Running
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.reports import (
-    DeviceStatus,
     Notice,
     NoticeLimit,
     Reply,
     StepResult,
 )
-from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
 COMMANDS, HOLD, EMERGENCY_STOP = "device/joint_trajectory", "device/hold", "device/estop"
@@ -51,9 +48,8 @@ _LONGEST = 4096
 _JOINT_STATES = Delivery(depth=200)
 # Positions, or messages that are ignored, alone change device/status so often at most [s].
 _STATUS_PERIOD = 0.5
-_OFTEN = {"insertion", "rotation", "holds_ignored"}
+_OFTEN = {"insertion_m", "rotation_rad", "holds_ignored"}
 _SELDOM = operator.attrgetter(*({row.name for row in dataclasses.fields(DeviceStatus)} - _OFTEN))
-_LEVELS = {State.FAULT: Level.ERROR, State.ESTOPPED: Level.ERROR, State.UNCONFIGURED: Level.WARN}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +116,7 @@ class DeviceRows:
         self.outputs: Sequence[Output] = (
             Output(JOINTS, m.JointState, _JOINT_STATES),
             Output(RESULT, m.CommandResult),
-            Output(STATUS, m_status.DeviceStatus, LATCHED, alone=True),
+            Output(STATUS, DeviceStatus, LATCHED, alone=True),
         )
         call = supervisor
         self.services: Sequence[Service] = (
@@ -153,7 +149,7 @@ class DeviceRows:
         if order is None:
             return
         if self._supervisor.stops > order.stops:
-            yield from self.call_off(self._supervisor.status(at.steady).fault, at)
+            yield from self.call_off(self._supervisor.fault, at)
             return
         try:
             has_ended = order.running.advance(at.steady)
@@ -193,12 +189,11 @@ class DeviceRows:
                     text = self._notices.admit(event, at.steady)
                     if text:
                         yield Log("error" if event.fault else "warning", text)
-        status = self._supervisor.status(at.steady, simulated=self.simulated)
+        status = self._supervisor.status(at.steady, self._name, simulated=self.simulated)
         if self._is_news(status, at.steady):
             self._told, self._told_at = status, at.steady
-            told = device_status(status, self._name)
-            yield Publish(STATUS, told)
-            yield Diagnose("device", told.diagnostic)
+            yield Publish(STATUS, status)
+            yield Diagnose("device", status.diagnostic)
 
     def joint_states(self, at: Moment) -> Actions:
         """Return the measured joints, unless they are stale."""
@@ -279,29 +274,3 @@ class DeviceRows:
     @property
     def _under_way(self) -> str:
         return "another order is under way" if self.is_busy else ""
-
-
-def device_status(status: DeviceStatus, source: str) -> m_status.DeviceStatus:
-    """Return the supervisor's status as the node `source` says it."""
-    return m_status.DeviceStatus(
-        source=source,
-        level=_LEVELS.get(status.state, Level.OK),
-        text=status.fault or status.reason or status.state.value,
-        state=status.state.value,
-        activity=status.activity.value,
-        homed=status.homed,
-        hold_owner=status.hold_owner,
-        press_again=status.press_again,
-        speed_scale=status.speed_scale,
-        insertion_m=status.insertion,
-        rotation_rad=status.rotation,
-        fault=status.fault,
-        reason=status.reason,
-        needle_out_confirmed=status.needle_out_confirmed,
-        watchdog_trips=status.watchdog_trips,
-        commands_refused=status.commands_refused,
-        holds_ignored=status.holds_ignored,
-        command_ns=status.command_ns,
-        rotation_owed_rad=status.rotation_owed,
-        simulated=status.simulated,
-    )

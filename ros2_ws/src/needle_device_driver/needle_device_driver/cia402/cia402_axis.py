@@ -37,8 +37,6 @@ from needle_device_driver.rules import Rule
 
 # In cycles without an answer: a drive that is switched off at the end is given up.
 _SILENT = 15
-# Of no opening of the link.
-_TO_BE_SET_UP = -1
 
 
 class Cia402Axis(Axis):
@@ -78,9 +76,7 @@ class Cia402Axis(Axis):
         # As given, and with the units that the drive tells.
         self._given = self._settings = settings
         self.actuated = settings.actuated
-        self._link = link
-        self._period = period
-        self._watchdog = watchdog
+        self._link, self._period, self._watchdog = link, period, watchdog
         self.monitor = DriveMonitor(link, settings.node_id)
         self.missing_optional_objects: tuple[str, ...] = ()
         rest, stop_time = settings.magnitude(settings.tolerance), settings.stop_time
@@ -193,14 +189,13 @@ class Cia402Axis(Axis):
                 yield from reset_fault(self._link, self._settings)
             except StuckFaultError:
                 # What it was told in its set-up may have got lost: the next reset tells it again.
-                self._opening = _TO_BE_SET_UP
+                self._opening = 0
                 raise
             yield from self._refresh()
 
     def poll(self, now: float) -> AxisSnapshot:
         """Return the newest reply."""
-        machine = self._machine
-        fault = self._fault
+        machine, fault = self._machine, self._fault
         position = self._settings.position(machine.at.position - self._zero)
         told = self._settings.position(machine.target - self._zero)
         return AxisSnapshot(
@@ -304,16 +299,14 @@ class Cia402Axis(Axis):
         try:
             yield from write_limits(self._access, self._settings, homed=True)
         except LinkError:
-            # The link's loss has its own name.
-            return
+            return  # its loss has a name of its own
         except DriveError as error:
             self._machine.trouble = str(error)
             return
         self._limits_due = False
 
     def _count_from_home(self) -> None:
-        self._homing = None
-        self._homed = True
+        self._homing, self._homed = None, True
         self._origin += 1
 
     # ---- what is the matter -------------------------------------------------------------------
@@ -336,8 +329,7 @@ class Cia402Axis(Axis):
     def _refuse_fault(self) -> None:
         if not self._configured:
             raise AxisError(f"{self.name} axis is not configured")
-        fault = self._fault
-        if fault is not None:
+        if (fault := self._fault) is not None:
             raise AxisError(f"{self.name} axis: {fault[1]}", fault[0])
 
     @contextlib.contextmanager

@@ -6,7 +6,6 @@ import dataclasses
 from typing import TypeAlias
 
 from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.states import Activity, State
 
 SUCCEEDED = "succeeded"
 REPLACED = "replaced"
@@ -94,62 +93,3 @@ class Reply:
 
     success: bool
     message: str
-
-
-@dataclasses.dataclass(frozen=True)
-class DeviceStatus:
-    """Content of device/status.
-
-    Attributes
-    ----------
-    state : State
-        What the device may do.
-    activity : Activity
-        What moves.
-    homed : bool
-        Whether both axes are homed.
-    hold_owner : str
-        Whose hold counts; empty: nobody's.
-    press_again : str
-        Who presses without that it counts, and has to release first; empty: nobody.
-    speed_scale : float
-        The owner's share of the nominal speed.
-    insertion, rotation : float or None
-        Where the joints are [m], [rad]; None where that is not known.
-    fault : str
-        Why the state is FAULT or ESTOPPED; else empty.
-    reason : str
-        Why the device last stopped, refused or waits.
-    needle_out_confirmed : bool
-        Whether a person said that the needle is out.
-    watchdog_trips : int
-        How often a hold, tip or reply was too old; a lapse that only pauses is none.
-    commands_refused : int
-        How many commands were refused.
-    holds_ignored : int
-        How many hold messages came late, twice, or from a session that is over.
-    command_ns : int
-        Stamp of the newest command, whatever became of it [ns]; 0: none yet.
-    rotation_owed : float
-        How far the rotation is behind a needle that a hand pushes too fast for it [rad].
-    simulated : bool or None
-        Whether no real needle can move; None while that is not known.
-    """
-
-    state: State
-    activity: Activity
-    homed: bool
-    hold_owner: str
-    press_again: str
-    speed_scale: float
-    insertion: float | None
-    rotation: float | None
-    fault: str
-    reason: str
-    needle_out_confirmed: bool
-    watchdog_trips: int
-    commands_refused: int
-    holds_ignored: int
-    command_ns: int
-    rotation_owed: float
-    simulated: bool | None = None

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from needle_core.diagnostics import Level
 from needle_core.foreign_text import plain
 from needle_core.messages import HoldState
+from needle_core.status_messages import DeviceStatus
 from needle_device_driver.axes.axis import Axis
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import Leg
@@ -16,9 +18,10 @@ from needle_device_driver.supervisor.command_desk import CommandDesk
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold, HoldRefusals
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_device_driver.supervisor.reports import DeviceStatus, Event, Reply
+from needle_device_driver.supervisor.reports import Event, Reply
 from needle_device_driver.supervisor.states import Activity, State, Trigger
 
+_LEVELS = {State.FAULT: Level.ERROR, State.ESTOPPED: Level.ERROR, State.UNCONFIGURED: Level.WARN}
 _SWITCHING = "waiting for the axes to switch off"
 
 
@@ -106,26 +109,36 @@ class MotionSupervisor:
             return True
         return self._core.activity is not Activity.NONE and self.held(now)
 
-    def status(self, now: float, *, simulated: bool | None = None) -> DeviceStatus:
-        """Return the device's status; `simulated` is known to its owner alone."""
-        joints = self.joints(now)
+    @property
+    def fault(self) -> str:
+        """Reason for the state FAULT or ESTOPPED; else empty."""
+        return self._core.fault_now
+
+    def status(
+        self, now: float, source: str = "", *, simulated: bool | None = None
+    ) -> DeviceStatus:
+        """Return the device's status; name and `simulated` are known to its owner alone."""
+        joints, state, fault = self.joints(now), self._core.state, self.fault
         return DeviceStatus(
-            state=self._core.state,
-            activity=self._core.activity,
+            source=source,
+            level=_LEVELS.get(state, Level.OK),
+            text=fault or self._core.reason or state.value,
+            state=state.value,
+            activity=self._core.activity.value,
             homed=self._core.snapshot is not None and self._core.snapshot.homed,
             hold_owner=plain(self._hold.owner or ""),
             press_again=plain(self._hold.unheeded(now) or ""),
             speed_scale=self._hold.speed_scale,
-            insertion=None if joints is None else joints.insertion.position,
-            rotation=None if joints is None else joints.rotation.position,
-            fault=self._core.fault_now,
+            insertion_m=None if joints is None else joints.insertion.position,
+            rotation_rad=None if joints is None else joints.rotation.position,
+            fault=fault,
             reason=self._core.reason,
             needle_out_confirmed=self._needle_out,
             watchdog_trips=self._core.watchdog_trips,
             commands_refused=self._commands.refused,
             holds_ignored=self._hold.ignored,
             command_ns=self.command_ns,
-            rotation_owed=self._core.rotation_owed,
+            rotation_owed_rad=self._core.rotation_owed,
             simulated=simulated,
         )
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from needle_core.can_frame import CanFrame
 from needle_core.messages import HoldState
+from needle_core.status_messages import DeviceStatus
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
@@ -16,7 +17,7 @@ from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
-from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice, StepResult
+from needle_device_driver.supervisor.reports import Event, Notice, StepResult
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 

@@ -6,12 +6,13 @@ import itertools
 import math
 
 from needle_core.messages import HoldState
+from needle_core.status_messages import DeviceStatus
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
 from needle_device_driver.procedure import Procedure, run_at_once
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice, StepResult
+from needle_device_driver.supervisor.reports import Event, Notice, StepResult
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 

@@ -251,7 +251,7 @@ def test_an_axis_in_reverse_moves_the_other_way(
     bench.cycle(30, holding=True)
     assert bench.outcomes == ["succeeded"]
     assert bench.insertion.position == -20_000
-    assert bench.status.insertion == pytest.approx(0.001)
+    assert bench.status.insertion_m == pytest.approx(0.001)
 
 
 def test_rotation_stays_in_proportion_when_the_speed_changes(drive_bench: DriveBench) -> None:
@@ -308,7 +308,7 @@ def test_a_pushed_axis_is_told_nothing_that_moves(
     make_drive_bench: Callable[..., DriveBench],
 ) -> None:
     bench = pushed(make_drive_bench)
-    assert bench.status.insertion == pytest.approx(0.0)
+    assert bench.status.insertion_m == pytest.approx(0.0)
     bench.step(0.001, 0.2)
     push(bench, 5000)
     bench.hold(False)

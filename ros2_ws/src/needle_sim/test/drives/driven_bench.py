@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from needle_core.messages import HoldState
+from needle_core.status_messages import DeviceStatus
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
@@ -17,7 +18,7 @@ from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
 from needle_device_driver.supervisor.command import Command, CommandPoint
-from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice
+from needle_device_driver.supervisor.reports import Event, Notice
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
@@ -151,7 +152,7 @@ class DrivenBench:
         assert reply.success, reply.message
         for _ in range(most):
             self.cycle(1)
-            if self.status.state is not State.MOVING:
+            if self.supervisor.state is not State.MOVING:
                 return
         raise AssertionError(f"still homing at {self.insertion_mm:.2f} mm")
 

@@ -43,7 +43,7 @@ def test_drives_that_take_speeds_in_rpm_and_say_so_home_at_the_speed_that_they_a
     assert bench.insertion_mm == pytest.approx(0.0, abs=0.02)
     bench.enable()
     bench.wander(random.Random(1), 6)
-    assert bench.status.state in (State.HOLDING, State.MOVING), bench.status.fault
+    assert bench.supervisor.state in (State.HOLDING, State.MOVING), bench.status.fault
     assert bench.insertion_mm > 2.0
 
 
@@ -53,7 +53,7 @@ def test_drives_that_take_speeds_in_rpm_and_do_not_say_so_are_stopped_within_8_m
     bench = make(RPM, tells_units=False)
     bench.home()
     assert len(bench.cycles.missing_optional_objects) == 2, "a warning for each drive"
-    assert bench.status.state is State.FAULT
+    assert bench.supervisor.state is State.FAULT
     assert bench.notices[-1].rule is Rule.AXIS_SPEED
     assert "insertion axis: moves at 150 mm/s, at most 3.5 mm/s" in bench.status.fault
     bench.cycle(60)
@@ -67,7 +67,7 @@ def test_drives_that_take_speeds_in_rpm_and_do_not_say_so_are_stopped_within_8_m
 def test_an_axis_of_10_mm_whose_switch_never_comes_runs_12_mm(make: Make) -> None:
     bench = make({"insertion_start": 0.2}, max_depth=0.01)
     bench.home()
-    assert bench.status.state is State.FAULT
+    assert bench.supervisor.state is State.FAULT
     assert bench.notices[-1].rule is Rule.HOMING_TIME
     bench.cycle(20)
     assert 200.0 - bench.insertion_mm == pytest.approx(12.0, abs=0.15)
@@ -79,7 +79,7 @@ def test_homing_from_anywhere_is_no_alarm(make: Make, start: float, rpm: bool) -
     bench = make({"insertion_start": start, "rpm": rpm}, max_depth=0.01)
     bench.home()
     assert bench.status.homed, bench.status.fault
-    assert bench.status.state is State.DISABLED
+    assert bench.supervisor.state is State.DISABLED
 
 
 def test_homing_to_the_positive_switch_of_an_axis_in_reverse_is_no_alarm(make: Make) -> None:
@@ -108,9 +108,9 @@ def test_motions_that_are_broken_off_and_go_on_are_no_alarm(
     if late:
         bench.late = lambda: rng.choice((0.0, 0.0, 0.004, 0.02, 0.04))
     bench.wander(rng, 15)
-    assert bench.status.state in (State.HOLDING, State.MOVING), bench.status.fault
+    assert bench.supervisor.state in (State.HOLDING, State.MOVING), bench.status.fault
     assert bench.insertion_mm > 3.0
-    assert bench.supervisor.retract(bench.now).success or bench.status.state is State.MOVING
+    assert bench.supervisor.retract(bench.now).success or bench.supervisor.state is State.MOVING
     bench.cycle(100, hold=1.0)
     bench.supervisor.receive_estop(True)
     bench.cycle(60)

@@ -210,7 +210,7 @@ class SteeredNeedle:
         self._do(
             self.steering.on_device(
                 DeviceStatus(
-                    state=status.state.value,
+                    state=status.state,
                     homed=status.homed,
                     hold_owner=status.hold_owner,
                     reason=status.reason,

@@ -335,12 +335,12 @@ def test_max_rotation_rate_pushed_too_fast_is_said_at_once_and_no_longer_when_it
     bench = pushed_bench()
     path(bench, (0.0, 0.0), (1.0, 0.5), (2.0, 0.5))
     push(bench, 1.5e-3)
-    assert bench.status.rotation_owed == pytest.approx(0.5 - np.pi * bench.period)
+    assert bench.status.rotation_owed_rad == pytest.approx(0.5 - np.pi * bench.period)
     assert "pushed too fast: the rotation is 0.44 rad behind" in bench.status.reason
     assert bench.last_rule is Rule.MAX_ROTATION_RATE
     bench.cycle(10, holding=True)
     after = bench.status
-    assert after.rotation_owed == 0.0
+    assert after.rotation_owed_rad == 0.0
     assert bench.positions == pytest.approx((1.5e-3, 0.5))
     assert len([notice for notice in bench.notices if "pushed too fast" in notice.text]) == 1
 

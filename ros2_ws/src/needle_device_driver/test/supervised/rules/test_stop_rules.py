@@ -132,7 +132,7 @@ def test_reply_age_a_silent_axis_is_a_fault_and_hides_the_joints(bench: Bench) -
     assert bench.now - silent <= bench.limits.reply_age_limit + 2 * bench.period
     assert bench.last_rule is Rule.REPLY_AGE
     assert bench.supervisor.joints(bench.now) is None
-    assert bench.status.insertion is None
+    assert bench.status.insertion_m is None
     bench.hold(False)
     assert not bench.run(bench.supervisor.reset(bench.now)).success
     bench.rotation.silent_since = None
