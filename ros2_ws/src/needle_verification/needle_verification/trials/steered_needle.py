@@ -26,7 +26,6 @@ from needle_controller.protocol.steering_types import (
 )
 from needle_controller.protocol.tip_gate import TipMeasurement
 from needle_core.messages import HoldState
-from needle_core.status_messages import DeviceStatus
 from needle_device_driver.procedure import run_at_once
 from needle_device_driver.supervisor.command import (
     Command,
@@ -206,17 +205,7 @@ class SteeredNeedle:
             if isinstance(event, StepResult):
                 self.outcomes.append(event.outcome)
                 self._do(self.steering.on_result(event.stamp_ns, event.outcome, self.time_ns))
-        status = self.device.status(self.time_ns * 1e-9)
-        self._do(
-            self.steering.on_device(
-                DeviceStatus(
-                    state=status.state,
-                    homed=status.homed,
-                    hold_owner=status.hold_owner,
-                    reason=status.reason,
-                )
-            )
-        )
+        self._do(self.steering.on_device(self.device.status(self.time_ns * 1e-9)))
 
     def _do(self, actions: list[Action]) -> None:
         for action in actions:
