@@ -135,6 +135,10 @@ class PairAnswers:
     def add_insertion(self, stamp: int, insertion: float, now: float) -> Iterator[Answer]:
         """Take an insertion [m] sampled at `stamp` [ns]; then as `ready`."""
         self.joints_silent = False
+        if not self.insertions:
+            # Where the needle was before is never heard: whether a pair is answered depends on
+            # stamps, not on which topic was found first.
+            self._queue = deque(item for item in self._queue if item[1].stamp >= stamp)
         self.insertions.add(stamp, insertion)
         return self.ready(now)
 

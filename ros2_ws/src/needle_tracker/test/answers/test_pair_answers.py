@@ -31,3 +31,15 @@ def test_an_answer_is_out_before_what_it_does_not_need(
         for _ in answers.add_image("right", stamp, frame, 0.0):
             done.append("published")
     assert done == ["answered", "published", "caught up"] * 2
+
+
+def test_what_was_exposed_before_the_first_joint_state_is_not_answered(
+    calibration: StereoCalibration, settings: TrackerSettings
+) -> None:
+    answers = PairAnswers(calibration, settings, PairingSettings(None, 0.1, 0.0))
+    frame = Frame(np.zeros((768, 1024), np.uint8))
+    for stamp in (10, 20, 30):
+        for side in ("left", "right"):
+            assert not list(answers.add_image(side, stamp, frame, 0.0))
+    assert [a.pair.stamp for a in answers.add_insertion(20, 0.01, 0.0)] == [20]
+    assert [a.pair.stamp for a in answers.add_insertion(40, 0.01, 0.0)] == [30]
