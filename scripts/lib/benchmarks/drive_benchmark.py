@@ -52,6 +52,7 @@ PERIOD = 0.02
 CYCLES = 250
 TURNS = 3
 NODES = (1, 2)
+_SET_UP_PATIENCE = 5.0  # [s]
 BITRATE = 500_000
 # 2 mm/s and 1 rad/s.
 COUNTS_PER_CYCLE = (800, 209)
@@ -188,6 +189,8 @@ class Node402:
         self._nodes: list[Any] = [BaseNode402(node, _objects()) for node in NODES]  # type: ignore[no-untyped-call]
         for node in self._nodes:
             self._network.add_node(node)
+            # slcan falls behind where others keep the machine busy, and the set-up is not measured.
+            node.sdo.RESPONSE_TIMEOUT = _SET_UP_PATIENCE
         _map_pdos(lambda n, *entry: self._network[n].sdo.download(entry[0], entry[1], entry[2]))
         for node in self._nodes:
             # It wants to know the network state first.
