@@ -150,7 +150,8 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
     recorded: list[Record] = []
     outputs: list[Output] = []
     exposed: set[int] = set()
-    answered = _answered(run) if tracker is not None else set()
+    # The tracker answers every pair that it hears.
+    answered = set(run.tip_covariances.stamps.tolist())
     without_images = last_time = unanswered = 0
     for topic, sent, message in _inputs(run, watched | _topics(tracker)):
         last_time = max(last_time, sent.log_time)
@@ -256,11 +257,6 @@ def _recordable(
         newer = output.stamp > last.get(output.topic, 0)
         if not (newer and output.log_time > end - _LAST_ANSWERS):
             yield output
-
-
-def _answered(run: Run) -> set[int]:
-    """Return the stamps [ns] of the pairs that the recorded tracker answered; it answers each."""
-    return {nanoseconds(message.header.stamp) for _, _, message in _inputs(run, {POSE})}
 
 
 def _topics(stage: Stage | None) -> frozenset[str]:
