@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rclpy.node import Node
 
 # What the graph calls a node whose endpoint has come and whose name has not.
@@ -30,10 +32,7 @@ def publishers_of(node: Node, topic: str) -> list[str]:
         Its name as the node would give it.
     """
     infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-    return [
-        _NAMELESS if info.node_name == _UNKNOWN else full_name(info.node_namespace, info.node_name)
-        for info in infos
-    ]
+    return [_name_of(info) or _NAMELESS for info in infos]
 
 
 def subscribers_of(node: Node, topic: str) -> list[str]:
@@ -47,8 +46,10 @@ def subscribers_of(node: Node, topic: str) -> list[str]:
         Its name as the node would give it.
     """
     infos = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
-    return [
-        full_name(info.node_namespace, info.node_name)
-        for info in infos
-        if info.node_name != _UNKNOWN
-    ]
+    return [name for info in infos if (name := _name_of(info))]
+
+
+def _name_of(info: Any) -> str:
+    """Return the full name of an endpoint's node; empty while it is unknown."""
+    known = info.node_name != _UNKNOWN
+    return full_name(info.node_namespace, info.node_name) if known else ""
