@@ -20,12 +20,12 @@ from needle_console.view.snapshot import Array, Snapshot
 from needle_core import messages as m
 from needle_core.component import (
     BEST_EFFORT,
+    IMAGES_BEST_EFFORT,
     LATCHED,
     Actions,
     Answer,
     Call,
     Component,
-    Delivery,
     Diagnose,
     Exit,
     Input,
@@ -60,7 +60,6 @@ OF_BUTTON: Mapping[Button, Call] = {
 """Button to the call that it makes."""
 _VIEWS = {side: f"stereo/{side}/image_raw" for side in SIDES}
 _HOLD, _PLANE, _POINT, _RIG = "device/hold", "target_plane", "target_point", "rig"
-_IMAGES = Delivery(depth=2, reliable=False)
 _SHOW_PERIOD, _CHECK_PERIOD = 0.1, 1.0
 _HAND_WITHIN = 1.0
 """The hold's server says at least 12 times a second that it is there [s]."""
@@ -137,7 +136,7 @@ class Console(Component):
             Input(_PLANE, m.Pose, self._on_plane, LATCHED),
             Input("/diagnostics", m.Diagnostics, self._on_health),
             *(
-                Input(topic, m.Image, partial(self._on_image, side), _IMAGES, lazy=True)
+                Input(topic, m.Image, partial(self._on_image, side), IMAGES_BEST_EFFORT, lazy=True)
                 for side, topic in _VIEWS.items()
             ),
         )

@@ -32,6 +32,7 @@ from needle_controller.protocol.steering_types import (
 from needle_controller.protocol.tip_gate import TipCovariance, TipMeasurement
 from needle_core import messages as m
 from needle_core.component import (
+    JOINT_STATES,
     LATCHED,
     RELIABLE,
     Actions,
@@ -61,8 +62,6 @@ _LAST_STAYS = {
     TARGET_POINT: "the last target stays",
     OBSTACLES: "the last obstacles stay",
 }
-JOINT_STATES = Delivery(depth=200)
-"""While a tip is handled, the 50 joint states of each second wait."""
 # Time between two lines of log of one kind [s]: never every cycle.
 _LOG_PERIOD = 2.0
 

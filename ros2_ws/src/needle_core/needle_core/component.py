@@ -55,6 +55,10 @@ class Delivery:
 RELIABLE = Delivery()
 LATCHED = Delivery(depth=1, latched=True)
 BEST_EFFORT = Delivery(depth=1, reliable=False)
+JOINT_STATES = Delivery(depth=200)
+"""Four seconds of them, at 50 a second, for a receiver that stands still meanwhile."""
+IMAGES = Delivery(depth=5)
+IMAGES_BEST_EFFORT = Delivery(depth=2, reliable=False)
 
 
 # ---- Actions: all that a handler can bring about ---------------------------------------------

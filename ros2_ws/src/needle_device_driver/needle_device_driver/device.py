@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 from needle_core import messages as m
 from needle_core.component import (
+    JOINT_STATES,
     LATCHED,
     Actions,
     Delivery,
@@ -40,12 +41,10 @@ COMMANDS, HOLD, EMERGENCY_STOP = "device/joint_trajectory", "device/hold", "devi
 STATUS, RESULT, JOINTS = "device/status", "device/result", "joint_states"
 STOP = "device/stop"
 # Every message counts, also while somebody floods the topic.
-_HOLDS = Delivery(depth=100, reliable=False)
+HOLDS = Delivery(depth=100, reliable=False)
 _EMERGENCY_STOPS = Delivery(depth=1000)
 # Turning a message into Python takes up to 200 ns a byte [bytes].
 _LONGEST = 4096
-# Four seconds of them, at 50 Hz, for a receiver that stands still meanwhile.
-_JOINT_STATES = Delivery(depth=200)
 # Positions, or messages that are ignored, alone change device/status so often at most [s].
 _STATUS_PERIOD = 0.5
 _OFTEN = {"insertion_m", "rotation_rad", "holds_ignored"}
@@ -104,7 +103,7 @@ class DeviceRows:
         self._order: _Order | None = None
         self.inputs: Sequence[Input] = (
             Input(COMMANDS, m.Trajectory, self._on_command, longest=_LONGEST),
-            Input(HOLD, m.HoldState, self._on_hold, _HOLDS, _LONGEST),
+            Input(HOLD, m.HoldState, self._on_hold, HOLDS, _LONGEST),
             Input(
                 EMERGENCY_STOP,
                 m.EmergencyStop,
@@ -114,7 +113,7 @@ class DeviceRows:
             ),
         )
         self.outputs: Sequence[Output] = (
-            Output(JOINTS, m.JointState, _JOINT_STATES),
+            Output(JOINTS, m.JointState, JOINT_STATES),
             Output(RESULT, m.CommandResult),
             Output(STATUS, DeviceStatus, LATCHED, alone=True),
         )

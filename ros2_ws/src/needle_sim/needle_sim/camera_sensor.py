@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_core import messages as m
-from needle_core.component import Actions, Delivery, Output, Port, Publish, Send
+from needle_core.component import IMAGES, Actions, Output, Port, Publish, Send
 from needle_core.files.installed import find_shared
 from needle_sim.camera.image_folder import ImageFolder, truth_of
 from needle_sim.camera.renderer import StereoRenderer
@@ -21,7 +21,6 @@ from needle_sim.sim_rig_parameters import SimRigParameters
 
 CAMERAS = "cameras"
 """Name of the port."""
-_IMAGES = Delivery(depth=5)
 _FRAMES = ("left_camera_optical", "right_camera_optical")
 _CENTRELINE_SPACING = 0.001
 
@@ -68,7 +67,7 @@ class StereoCameras:
     """
 
     outputs = tuple(
-        Output(f"stereo/{side}/{name}", kind, _IMAGES)
+        Output(f"stereo/{side}/{name}", kind, IMAGES)
         for side in ("left", "right")
         for name, kind in (("image_raw", m.Image), ("camera_info", m.CameraInfo))
     )

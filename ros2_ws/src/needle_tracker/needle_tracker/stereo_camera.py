@@ -13,9 +13,9 @@ import numpy as np
 from needle_core import messages as m
 from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
 from needle_core.component import (
+    IMAGES,
     Actions,
     Component,
-    Delivery,
     Diagnose,
     Exit,
     Log,
@@ -42,7 +42,6 @@ from needle_tracker.sources.stereo_source import (
 )
 
 PAIRS = "pairs"
-_IMAGES = Delivery(depth=5)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +94,7 @@ class StereoCamera(Component):
 
     name = "stereo_camera"
     outputs = tuple(
-        Output(f"stereo/{side}/{topic}", message, _IMAGES)
+        Output(f"stereo/{side}/{topic}", message, IMAGES)
         for side in SIDES
         for topic, message in (("image_raw", m.Image), ("camera_info", m.CameraInfo))
     )

@@ -9,11 +9,13 @@ from pathlib import Path
 
 from needle_core import messages as m
 from needle_core.component import (
+    IMAGES,
+    IMAGES_BEST_EFFORT,
+    JOINT_STATES,
     LATCHED,
     RELIABLE,
     Actions,
     Component,
-    Delivery,
     Diagnose,
     Input,
     Log,
@@ -46,10 +48,6 @@ from needle_tracker.tracking.refusals import TrackState
 TIP, TIP_POSE = "needle/tip", "needle/tip_pose"
 ANNOTATED, CALIBRATION = "stereo_tracker/annotated_image", "stereo_tracker/calibration"
 TARGET_PLANE = "target_plane"
-JOINT_STATES = Delivery(depth=200)
-"""While a pair is measured, the 50 joint states of each second wait."""
-_IMAGES = Delivery(depth=5)
-_IMAGES_BEST_EFFORT = Delivery(depth=2, reliable=False)
 _CHECK_PERIOD = 0.05  # [s]
 
 
@@ -102,7 +100,7 @@ class StereoTipTracker(Component):
         self.outputs = (
             Output(TIP, m.Point),
             Output(TIP_POSE, m.PoseWithCovariance),
-            Output(ANNOTATED, m.Image, _IMAGES),
+            Output(ANNOTATED, m.Image, IMAGES),
             Output(CALIBRATION, m.Text, LATCHED),
         )
         self.timers = (Timer(_CHECK_PERIOD, self.check),)
@@ -143,7 +141,7 @@ class StereoTipTracker(Component):
         return rows
 
     def _image_rows(self) -> list[Input]:
-        delivery = _IMAGES if self.settings.reliable_images else _IMAGES_BEST_EFFORT
+        delivery = IMAGES if self.settings.reliable_images else IMAGES_BEST_EFFORT
         rows = []
         for side in SIDES:
             on_image, on_info = partial(self._on_image, side), partial(self._on_camera_info, side)

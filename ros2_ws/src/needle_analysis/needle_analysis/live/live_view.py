@@ -24,10 +24,10 @@ from needle_analysis.live.marked_image import marked_image
 from needle_analysis.live.needle_inputs import needle_inputs, refusing
 from needle_core import messages as m
 from needle_core.component import (
+    IMAGES_BEST_EFFORT,
     LATCHED,
     Actions,
     Component,
-    Delivery,
     Input,
     Listen,
     Moment,
@@ -47,7 +47,6 @@ PICTURES = {side: f"live_view/{side}/compressed" for side in SIDES}
 TF, TF_STATIC = "/tf", "/tf_static"
 _IMAGES = {side: f"stereo/{side}/image_raw" for side in SIDES}
 _CALIBRATION = "stereo_tracker/calibration"
-_BEST_EFFORT = Delivery(depth=2, reliable=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +99,9 @@ class LiveView(Component):
             *needle_inputs(needle),
             refusing(Input(_CALIBRATION, m.Text, self._on_calibration, LATCHED)),
             *(
-                refusing(Input(topic, m.Image, partial(self._on_image, s), _BEST_EFFORT, lazy=True))
+                refusing(
+                    Input(topic, m.Image, partial(self._on_image, s), IMAGES_BEST_EFFORT, lazy=True)
+                )
                 for s, topic in _IMAGES.items()
             ),
         )

@@ -11,7 +11,15 @@ import numpy as np
 from needle_analysis.live.live_needle import Belief, LiveNeedle, SeenTip
 from needle_controller.model.target_plane import plane_from_pose
 from needle_core import messages as m
-from needle_core.component import LATCHED, Actions, Delivery, Diagnose, Input, Log, Moment
+from needle_core.component import (
+    JOINT_STATES,
+    LATCHED,
+    Actions,
+    Diagnose,
+    Input,
+    Log,
+    Moment,
+)
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.status_messages import ControllerStatus
@@ -19,14 +27,13 @@ from needle_tracker.answers.tracker_messages import insertion_of, rotation_of
 
 # Nothing of a rig is farther off, or less certain [m], [m^2]; what says so is not believed.
 _FARTHEST = 10.0
-_JOINT_STATES = Delivery(depth=200)
 
 
 def needle_inputs(needle: LiveNeedle) -> tuple[Input, ...]:
     """Return the rows of all that fills a `LiveNeedle`."""
     rows = (
         Input("needle/tip_pose", m.PoseWithCovariance, partial(_on_tip, needle)),
-        Input("joint_states", m.JointState, partial(_on_joints, needle), _JOINT_STATES),
+        Input("joint_states", m.JointState, partial(_on_joints, needle), JOINT_STATES),
         Input("needle/estimate", m.PoseWithCovariance, partial(_on_estimate, needle)),
         Input(
             "needle/controller_status", ControllerStatus, partial(_on_controller, needle), LATCHED

@@ -13,6 +13,7 @@ from needle_bringup.simulation.virtual_run import make_tracker, settings_of
 from needle_core import messages as m
 from needle_core.commands.cli import EXIT_MISSED
 from needle_core.component import (
+    JOINT_STATES,
     LATCHED,
     Action,
     Actions,
@@ -30,7 +31,7 @@ from needle_core.process.worker import start_worker
 from needle_core.settings.parameter_files import Parameters
 from needle_sim.camera_sensor import CAMERAS, Exposure, StereoCameras
 from needle_sim.sim_rig_parameters import SimRigParameters
-from needle_tracker.stereo_tracker import CALIBRATION, JOINT_STATES, TIP, TIP_POSE
+from needle_tracker.stereo_tracker import CALIBRATION, TIP, TIP_POSE
 
 EYES = "eyes"
 """Name of the port between the tracker's stand-in and the process that works."""

@@ -6,6 +6,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from needle_core import component
 from needle_core.component import Delivery
 from needle_core.diagnostics import Diagnostic
 
@@ -14,28 +15,23 @@ NANOSECONDS = 1_000_000_000
 _FIRST_SEC, _LAST_SEC, _LAST_NANOSEC = -(2**31), 2**31 - 1, 2**32 - 1
 
 
-def _last(depth: int, reliability: ReliabilityPolicy) -> QoSProfile:
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability)
-
-
-RELIABLE = _last(10, ReliabilityPolicy.RELIABLE)
-# Four seconds of them, at 50 Hz, for a receiver that stands still meanwhile.
-JOINT_STATES = _last(200, ReliabilityPolicy.RELIABLE)
-LATCHED = _last(1, ReliabilityPolicy.RELIABLE)
-LATCHED.durability = DurabilityPolicy.TRANSIENT_LOCAL
-HOLD = _last(1, ReliabilityPolicy.BEST_EFFORT)
-# What a device hears while others flood the topic, from one look to the next: all of it counts.
-HOLDS_HEARD = _last(100, ReliabilityPolicy.BEST_EFFORT)
-IMAGES = _last(5, ReliabilityPolicy.RELIABLE)
-IMAGES_BEST_EFFORT = _last(2, ReliabilityPolicy.BEST_EFFORT)
-
-
 def to_qos(delivery: Delivery) -> QoSProfile:
     """Return the QoS profile of a component's row."""
-    if delivery.latched:
-        return LATCHED
-    reliable = ReliabilityPolicy.RELIABLE
-    return _last(delivery.depth, reliable if delivery.reliable else ReliabilityPolicy.BEST_EFFORT)
+    reliability, durability = ReliabilityPolicy, DurabilityPolicy
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=delivery.depth,
+        reliability=reliability.RELIABLE if delivery.reliable else reliability.BEST_EFFORT,
+        durability=durability.TRANSIENT_LOCAL if delivery.latched else durability.VOLATILE,
+    )
+
+
+RELIABLE = to_qos(component.RELIABLE)
+JOINT_STATES = to_qos(component.JOINT_STATES)
+LATCHED = to_qos(component.LATCHED)
+HOLD = to_qos(component.BEST_EFFORT)
+IMAGES = to_qos(component.IMAGES)
+IMAGES_BEST_EFFORT = to_qos(component.IMAGES_BEST_EFFORT)
 
 
 def to_nanoseconds(stamp: Time) -> int:

@@ -20,8 +20,9 @@ from needle_core.convert import from_ros
 from needle_core.errors import UserError
 from needle_core.messages import HoldState
 from needle_core.process.ros_domain import own_domain
-from needle_core.ros.conversions import HOLDS_HEARD, JOINT_STATES, RELIABLE, values_of
+from needle_core.ros.conversions import JOINT_STATES, RELIABLE, to_qos, values_of
 from needle_core.status_messages import DeviceStatus
+from needle_device_driver.device import HOLDS
 from needle_verification.ros.drive_hand import JOINTS, DriveHand
 from needle_verification.ros.listening_node import ros
 from needle_verification.soak.faults import Fault, Kind
@@ -65,7 +66,7 @@ class Witness(DriveHand):
         # Whose press it is that moves the needle.
         self._holder = PERSON
         self.create_subscription(JointState, "sim/drive_positions", self._on_places, JOINT_STATES)
-        self.create_subscription(Joy, "device/hold", self._on_hold, HOLDS_HEARD)
+        self.create_subscription(Joy, "device/hold", self._on_hold, to_qos(HOLDS))
         self.create_subscription(
             JointTrajectory, "device/joint_trajectory", self._on_command, RELIABLE
         )
