@@ -20,8 +20,8 @@ from std_srvs.srv import Trigger
 
 from needle_core.convert import Converter
 from needle_core.errors import UserError
-from needle_core.message_types import rclpy_types
-from needle_core.ros.conversions import IMAGES, NANOSECONDS, to_nanoseconds
+from needle_core.message_types import NANOSECONDS, rclpy_types
+from needle_core.ros.conversions import IMAGES, to_nanoseconds
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.camera_sensor import camera_info_message, image_message
 from needle_verification.ros.drive_hand import DriveHand

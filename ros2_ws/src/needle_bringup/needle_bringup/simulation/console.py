@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from needle_bringup.simulation.console_graph import run_console_graph
-from needle_bringup.simulation.console_options import ConsoleOptions, parse_console
+from needle_bringup.simulation.console_options import LOOPBACK, ConsoleOptions, parse_console
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_core.commands.cli import EXIT_INTERRUPTED, EXIT_MISSED, run_command
 from needle_core.process.end_request import EndRequest
@@ -19,7 +19,6 @@ from needle_core.settings.parameter_files import Parameters
 if TYPE_CHECKING:
     from needle_core.component import Component, RealPort
 
-LOOPBACK = "127.0.0.1"
 # As often as a page shows them [Hz].
 _CAMERA_RATE = 10.0
 _SLICE = 0.2

@@ -6,10 +6,10 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from needle_bringup.simulation.console_options import ConsoleOptions
+from needle_bringup.simulation.console_options import LOOPBACK, ConsoleOptions
+from needle_bringup.simulation.launch_nodes import LAUNCHED_PACKAGES
 from needle_bringup.simulation.node_graph import NodeGraph
 from needle_bringup.simulation.node_process import wait_for
-from needle_bringup.simulation.rig_configuration import PACKAGES
 from needle_core.commands.cli import EXIT_INTERRUPTED
 from needle_core.process.end_request import EndRequest
 from needle_core.process.reach import settle_environment
@@ -45,13 +45,13 @@ def run_console_graph(options: ConsoleOptions, rig: Parameters, end: EndRequest)
     settle_environment()
     nodes = {name: values for name, values in rig.items() if name not in _LEFT_OUT}
     nodes["console"] = {"port": options.port, "hold_port": options.port + 1}
-    packages = {**PACKAGES, "console": "needle_console", "live_view": "needle_analysis"}
+    packages = {**LAUNCHED_PACKAGES, "console": "needle_console"}
     folder = Path(tempfile.mkdtemp(prefix="needle_console_"))
     graph = NodeGraph(folder, nodes)
     try:
         for name in (*nodes, "live_view"):
             graph.start(packages[name], name)
-        print(f"http://127.0.0.1:{options.port}/   (Ctrl-C ends all)", flush=True)
+        print(f"http://{LOOPBACK}:{options.port}/   (Ctrl-C ends all)", flush=True)
         while not end.wanted:
             graph.check()
             wait_for([graph.nodes["console"]], _POLL)

@@ -46,6 +46,8 @@ _SHARED = {
 }
 # The page's, and the hold's beside it.
 _DEFAULT_PORT, _LAST_PORT = "8080", 65534
+LOOPBACK = "127.0.0.1"
+"""Where page and hold are served."""
 
 
 @dataclasses.dataclass(frozen=True)

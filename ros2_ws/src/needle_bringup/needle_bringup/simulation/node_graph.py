@@ -96,14 +96,12 @@ class NodeGraph:
 
         The driver switches the drives off before they, too, are gone.
         """
-        last = ("recorder",)
-        first = (OPERATOR, "device_driver")
-        rest = [node for name, node in self.nodes.items() if name not in (*first, *last)]
+        rest = dict(self.nodes)
+        recorder = rest.pop("recorder", None)
         warnings: list[str] = []
-        for name in first:
-            warnings += stop([self.nodes[name]]) if name in self.nodes else []
-        warnings += stop(rest)
-        recorder = self.nodes.get("recorder")
+        for first in (OPERATOR, "device_driver"):
+            warnings += stop([rest.pop(first)]) if first in rest else []
+        warnings += stop(rest.values())
         if recorder is not None:
             warnings += stop([recorder], RECORDER_GRACE)
             if recorder.exit_code == EXIT_MISSED:

@@ -6,13 +6,12 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from needle_core import component
+from needle_core import component, message_types
 from needle_core.component import Delivery
 from needle_core.diagnostics import Diagnostic
+from needle_core.message_types import rclpy_types
 
-NANOSECONDS = 1_000_000_000
-# A stamp's fields: int32 and uint32, also where more than a second is told in nanoseconds.
-_FIRST_SEC, _LAST_SEC, _LAST_NANOSEC = -(2**31), 2**31 - 1, 2**32 - 1
+_TYPES = rclpy_types()
 
 
 def to_qos(delivery: Delivery) -> QoSProfile:
@@ -36,7 +35,7 @@ IMAGES_BEST_EFFORT = to_qos(component.IMAGES_BEST_EFFORT)
 
 def to_nanoseconds(stamp: Time) -> int:
     """Return a message's stamp in ns since the clock's epoch, exactly."""
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+    return message_types.to_nanoseconds(stamp)
 
 
 def to_stamp(nanoseconds: int) -> Time:
@@ -44,9 +43,8 @@ def to_stamp(nanoseconds: int) -> Time:
 
     Whatever `to_nanoseconds` returned has one. A time beyond is the nearest that a stamp can tell.
     """
-    sec = min(max(nanoseconds // NANOSECONDS, _FIRST_SEC), _LAST_SEC)
-    nanosec = min(max(nanoseconds - sec * NANOSECONDS, 0), _LAST_NANOSEC)
-    return Time(sec=sec, nanosec=nanosec)
+    stamp: Time = _TYPES.time(nanoseconds)
+    return stamp
 
 
 def to_diagnostic_status(name: str, hardware_id: str, diagnostic: Diagnostic) -> DiagnosticStatus:

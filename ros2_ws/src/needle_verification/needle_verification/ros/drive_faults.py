@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from needle_core.errors import UserError
-from needle_core.ros.conversions import NANOSECONDS
+from needle_core.message_types import NANOSECONDS
 from needle_verification.ros.drive_hand import INSERTION_COUNT, DriveHand
 from needle_verification.trials.trial_processes import TrialProcesses, drives_and_driver
 from needle_verification.trials.trial_runner import Outcomes, Trial

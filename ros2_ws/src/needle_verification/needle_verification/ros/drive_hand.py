@@ -15,11 +15,11 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from needle_core.errors import UserError
+from needle_core.message_types import NANOSECONDS
 from needle_core.ros.base_node import STEADY_CLOCK
 from needle_core.ros.conversions import (
     JOINT_STATES,
     LATCHED,
-    NANOSECONDS,
     RELIABLE,
     to_nanoseconds,
     to_stamp,
