@@ -8,8 +8,8 @@ import pytest
 import benchmark
 import drive_benchmark
 import reference_loop
+from needle_bringup.studies.study_controllers import controller_factory
 from needle_sim.studies.study import run_study
-from needle_verification.studies.study_controllers import controller_factory
 
 NEEDLES = (0, 5_000, 9_999)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from needle_bringup.studies.study_controllers import controller_factory
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.steering_settings import PAPER_NOISE, PRESETS, SteeringSettings
 from needle_controller.protocol.plane_control import PlaneControl
@@ -23,7 +24,6 @@ from needle_sim.studies.study import StudySettings, run_study
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.tracking.tip_tracker import TipTracker
-from needle_verification.studies.study_controllers import controller_factory
 
 CALIBRATION = (
     Path(__file__).resolve().parents[2] / "ros2_ws/src/needle_tracker/config/calibration.yaml"

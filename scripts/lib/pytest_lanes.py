@@ -34,14 +34,8 @@ LONG_FILES = (
     "tests/test_lint.py",
     "tests/site/test_docs_site.py",
     "ros2_ws/src/needle_bringup/test/graph/test_graph_run.py",
-    "ros2_ws/src/needle_verification/test/checks/test_check_driver.py",
     "ros2_ws/src/needle_bringup/test/graph/test_graph_interrupt.py",
-    "ros2_ws/src/needle_verification/test/soak/test_rig_run.py",
-    "ros2_ws/src/needle_verification/test/studies/test_obstacle_study.py",
     "ros2_ws/src/needle_tracker/test/calibrating/test_calibration_commands.py",
-    "ros2_ws/src/needle_verification/test/checks/test_check_control.py",
-    "ros2_ws/src/needle_verification/test/checks/test_check_bags.py",
-    "ros2_ws/src/needle_verification/test/checks/test_check_console_hold.py",
 )
 IN_BACKGROUND = re.compile(
     r"tests/(test_(lint|reference)|(oracles|site)/\w+)\.py|"
@@ -49,8 +43,6 @@ IN_BACKGROUND = re.compile(
     r".*/needle_sim/test/(camera|needle|path_traced|studies)/.*|"
     r".*/needle_bags/test/(reading|recovery)/.*|"
     r".*/needle_analysis/test/(report/|run/|rerun/|ros/test_(rerun|hostile)).*|"
-    r".*/needle_verification/test/(studies|tracking|training|paper)/.*|"
-    r".*/needle_verification/test/(checks/test_check_control|soak/test_rig_run)\.py"
 )
 """Test files without processes or watchdogs of their own."""
 BACKGROUND_LIMIT = 900.0

@@ -7,9 +7,9 @@ import os
 import signal
 from pathlib import Path
 
-from needle_verification.soak.many_runs import run_part as run_seeds
-from needle_verification.soak.rig_run import RunResult
-from needle_verification.studies.cluster_study import ClusterPart, PartDone, run_part
+from needle_bringup.studies.cluster_study import ClusterPart, PartDone, run_part
+from scenario.many_runs import run_part as run_seeds
+from scenario.rig_run import RunResult
 
 
 def end_the_first(asked: tuple[Path, ClusterPart]) -> PartDone:

@@ -30,10 +30,10 @@ from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
-from needle_verification.soak import link_faults, rig_run
-from needle_verification.soak.judging import limit_witness
-from needle_verification.soak.judging.hold_witness import HoldWitness
-from needle_verification.soak.judging.invariants import Watch
+from scenario import link_faults, rig_run
+from scenario.judging import limit_witness
+from scenario.judging.hold_witness import HoldWitness
+from scenario.judging.invariants import Watch
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 

@@ -17,6 +17,8 @@ import latency_benchmark
 import recording_benchmark
 import reference_loop
 import tracker_benchmark
+from needle_bringup.descendants import ending_descendants
+from needle_bringup.studies.study_controllers import controller_factory, needles_at_a_time
 from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.model.reachability import reachability
 from needle_controller.model.target_plane import offset_plane
@@ -32,8 +34,6 @@ from needle_sim.studies.disturbances import Disturbances
 from needle_sim.studies.needle_batch import NeedleBatch
 from needle_sim.studies.start_grids import GRIDS, StartBounds
 from needle_sim.studies.study import StudySettings, run_study
-from needle_verification.descendants import ending_descendants
-from needle_verification.studies.study_controllers import controller_factory, needles_at_a_time
 
 DESCRIPTION = """\
 Measure what is fast enough and what is not, each figure beside a reference in the same run: the

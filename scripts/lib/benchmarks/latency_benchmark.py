@@ -21,6 +21,8 @@ import numpy as np
 
 import latency_rig
 import needle_tracker
+from campaign.trials.steered_needle import Hand, SteeredNeedle
+from campaign.trials.trial_processes import Parameters, TrialProcesses
 from needle_analysis.run.stage_timing import stage_timings
 from needle_bags.reading.bag_reader import read_run
 from needle_bringup.simulation.rig_configuration import GRAPH_WATCHDOG, can_adapter
@@ -30,8 +32,6 @@ from needle_core.process.ros_domain import own_domain
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.rig.bench import SimulatedBench
-from needle_verification.trials.steered_needle import Hand, SteeredNeedle
-from needle_verification.trials.trial_processes import Parameters, TrialProcesses
 
 CALIBRATION = Path(needle_tracker.__file__).resolve().parents[1] / "config" / "calibration.yaml"
 FRAME = 1.0 / 30.0

@@ -18,13 +18,13 @@ import rclpy
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_srvs.srv import Trigger
 
+from campaign.trials.drives.drive_hand import DriveHand
 from needle_core.convert import Converter
 from needle_core.errors import UserError
 from needle_core.message_types import NANOSECONDS, rclpy_types
 from needle_core.ros.conversions import IMAGES, to_nanoseconds
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.camera_sensor import camera_info_message, image_message
-from needle_verification.ros.drive_hand import DriveHand
 
 IMAGES_FILE, INSERTIONS_FILE = "images.npy", "insertions.npy"
 _PERIOD = 1.0 / 30.0

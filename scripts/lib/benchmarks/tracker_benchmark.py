@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import needle_tracker
+from campaign.tracking.tracker_sequences import Exposure, insertion_sequence
+from campaign.tracking.tracker_study import new_tracker, track_run
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
-from needle_verification.tracking.tracker_sequences import Exposure, insertion_sequence
-from needle_verification.tracking.tracker_study import new_tracker, track_run
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -1,7 +1,7 @@
 """Train the net that draws needle maps; scripts/train_needle_map runs this.
 
 Patches are drawn at random, or cut from scenes that are path-traced at random, by
-needle_verification.training. What comes out depends a little on the machine: another run gives
+needle_bringup.training. What comes out depends a little on the machine: another run gives
 another net, about as good.
 """
 
@@ -23,13 +23,13 @@ from torch import nn
 from torch.nn import functional
 from tqdm import tqdm
 
+from needle_bringup.training.patches import SIZE, patch
+from needle_bringup.training.traced_patches import BORDER, traced_patch
+from needle_bringup.training.traced_scenes import TracedScene, trace_scene
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_sim.path_traced.tracer import load_mitsuba
 from needle_sim.sequences.boxes import draw_box
 from needle_tracker.image.needle_map import normalized
-from needle_verification.training.patches import SIZE, patch
-from needle_verification.training.traced_patches import BORDER, traced_patch
-from needle_verification.training.traced_scenes import TracedScene, trace_scene
 
 Batch = tuple[NDArray[Any], NDArray[Any]]
 

@@ -4,6 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from needle_bringup.studies.study_controllers import (
+    CURVATURE,
+    STEP_LENGTH,
+    point_controller_factory,
+)
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
 from needle_sim.studies.disturbances import Disturbances
@@ -19,11 +24,6 @@ from needle_sim.studies.point_targets import (
 )
 from needle_sim.studies.start_grids import GRIDS, StartBounds
 from needle_sim.studies.study import StudySettings
-from needle_verification.studies.study_controllers import (
-    CURVATURE,
-    STEP_LENGTH,
-    point_controller_factory,
-)
 
 STARTS = GRIDS["random"](StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)), 1, 4)
 SETTINGS = StudySettings(CURVATURE, 0.150, STEP_LENGTH, Disturbances(), seed=1)

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from needle_bringup.studies.study_controllers import CURVATURE, STEP_LENGTH, controller_factory
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
 from needle_sim.studies.disturbances import Disturbances
 from needle_sim.studies.figures_of_merit import Outcomes, figures
 from needle_sim.studies.start_grids import GRIDS, StartBounds
 from needle_sim.studies.study import StudySettings, run_study
-from needle_verification.studies.study_controllers import CURVATURE, STEP_LENGTH, controller_factory
 
 STARTS = GRIDS["random"](StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)), 1, 4)[:60]
 TROUBLE = Disturbances(

@@ -1,0 +1,77 @@
+"""`scripts/paper`: every figure and number of [KC09] section IV, the paper's value beside ours."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Sequence
+
+from needle_bringup.descendants import ending_descendants
+from needle_bringup.workplace import checkout, make_folder, temporary_folder
+from needle_core.commands.cli import EXIT_DONE, run_command, write_json
+from needle_core.commands.options import CommandParser, output_file
+from needle_core.errors import UserError
+
+PAGE = "paper.md"
+IMAGES = "images"
+OUT = "bags/paper"
+DESCRIPTION = """\
+Run every figure and number of [KC09] section IV and write them beside the paper's values: paper.md
+and its figures under images/. Trials go through the whole node graph, studies through monte_carlo.
+"""
+EPILOG = """\
+examples:
+  scripts/paper                    all of it, into bags/paper/ (about ten minutes)
+  scripts/paper --out docs         the same, into the page that goes with this checkout
+  scripts/paper --quick --out /tmp/paper
+      three trials in place of nine, 1,000 runs in place of 10,000
+
+exit codes: 0 done, 2 bad input or something missing, 130 interrupted.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `paper`; returns its exit code."""
+    return run_command(lambda: _paper(sys.argv[1:] if arguments is None else arguments))
+
+
+def _paper(arguments: Sequence[str]) -> int:
+    parser = CommandParser("paper", DESCRIPTION, EPILOG)
+    parser.add_argument("--quick", action="store_true", help="fewer trials and runs")
+    parser.add_argument("--out", metavar="DIR", help=f"where to write (default: {OUT}/)")
+    parser.add_argument("--runs", metavar="DIR", help="keep bags and studies there and use them")
+    parser.add_argument("--seed", default="1", metavar="N", help="seed of all noise (default: 1)")
+    parser.add_argument("--json", metavar="FILE", help="write the figures as a flat JSON object")
+    given = parser.parse_args(arguments)
+    if not given.seed.isdecimal() or int(given.seed) >= 2**31 - 100:
+        raise UserError(f"--seed {given.seed!r} is not a whole number of at most 31 bits")
+    file = output_file("--json", given.json)
+    root = checkout()
+    out = make_folder("--out", given.out or str(root / OUT))
+    make_folder("--out", str(out / IMAGES))
+    # They take a second to import: not for a command line that is refused.
+    from needle_analysis.figures.figure_style import save  # noqa: PLC0415
+    from needle_bringup.paper.paper_figures import figures_of  # noqa: PLC0415
+    from needle_bringup.paper.paper_page import as_text, key_figures, page, table  # noqa: PLC0415
+    from needle_bringup.paper.paper_results import PaperRuns  # noqa: PLC0415
+    from needle_bringup.paper.paper_runs import Laboratory  # noqa: PLC0415
+
+    runs = given.runs and make_folder("--runs", given.runs)
+    with (
+        contextlib.nullcontext(runs) if runs else temporary_folder() as folder,
+        ending_descendants(),
+    ):
+        laboratory = Laboratory([str(root / "scripts" / "simulate")], folder)
+        results = PaperRuns(laboratory, int(given.seed), quick=given.quick)
+    for name, figure in figures_of(results).items():
+        save(figure, out / IMAGES / f"{name}.png")
+    (out / PAGE).write_text(page(results), encoding="utf-8")
+    print(as_text(list(table(results))))
+    print(f"written: {out / PAGE}")
+    if file is not None:
+        write_json(file, key_figures(results))
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,140 @@
+"""Work in parts on a Dask cluster: which worker does which part, and when, makes no difference.
+
+A worker that dies has its parts done by another. One that runs other code, or other versions of
+numerical libraries, ends the work: its results would not be those of this machine.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.metadata
+import importlib.util
+import logging
+import platform
+import re
+import socket
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from needle_core.errors import UserError
+
+Part = TypeVar("Part")
+Result = TypeVar("Result")
+
+CONNECTS_WITHIN = 30.0
+"""How long a scheduler has to answer [s]."""
+_NUMERICAL = ("numpy", "scipy", "numba")
+_PACKAGES = (
+    "needle_analysis", "needle_bags", "needle_bringup", "needle_core", "needle_console",
+    "needle_controller", "needle_device_driver", "needle_sim", "needle_tracker", "scenario",
+)  # fmt: skip
+
+
+def on_cluster(
+    address: str, work: Callable[[Part], Result], parts: Sequence[Part]
+) -> Iterator[Result]:
+    """Yield the results of `work` on each part, in the order of the parts.
+
+    A connection that is lost is made again, for the parts that are missing.
+
+    Parameters
+    ----------
+    address : str
+        The scheduler's, such as tcp://10.0.0.5:8786. Without workers it waits for some.
+    work : callable
+        A function of a module, which workers can import.
+    parts : sequence
+        What can be pickled.
+
+    Raises
+    ------
+    UserError
+        It is no address, Dask is not installed, the scheduler does not answer or is lost, a worker
+        runs something else, or a part ended several workers.
+    """
+    if re.fullmatch(r"(tcp|tls)://[^\s/]+:\d+", address) is None:
+        raise UserError(
+            f"--scheduler {address!r} is not tcp://HOST:PORT or tls://HOST:PORT, "
+            "as the scheduler prints it"
+        )
+    try:
+        # An extra, and a second of imports that only studies on a cluster pay for.
+        import distributed  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise UserError(
+            "--scheduler: Dask is not installed; scripts/dask --version installs it"
+        ) from error
+    # All that it logs comes as an exception, too.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    run = functools.partial(_run, work, identity())
+    # Results that have come before those of parts ahead of them.
+    early: dict[int, Result] = {}
+    told = 0
+    while told < len(parts):
+        missing = [number for number in range(told, len(parts)) if number not in early]
+        try:
+            client = distributed.Client(address, timeout=CONNECTS_WITHIN)
+        except OSError as error:
+            raise UserError(f"--scheduler {address}: {_line(error)}") from error
+        with client:
+            wanted = [parts[number] for number in missing]
+            futures = client.map(run, wanted, pure=False, batch_size=100)
+            numbers = {future.key: n for future, n in zip(futures, missing, strict=True)}
+            done = distributed.as_completed(futures)
+            futures.clear()
+            try:
+                for future in done:
+                    early[numbers[future.key]] = future.result()
+                    # The cluster may forget it.
+                    future.release()
+                    while told in early:
+                        yield early.pop(told)
+                        told += 1
+            except distributed.KilledWorker as error:
+                raise UserError(
+                    f"--scheduler {address}: {_line(error)} (out of memory? their logs say more)"
+                ) from error
+            except (OSError, distributed.CancelledError) as error:
+                # With the connection the scheduler forgets what it was asked for.
+                if told + len(early) == len(parts) - len(missing):
+                    raise UserError(
+                        f"--scheduler {address}: lost, with {told} of {len(parts)} parts done"
+                    ) from error
+
+
+@functools.lru_cache(maxsize=1)
+def identity() -> Mapping[str, str]:
+    """Return name to version, or digest, of the code that this process would run."""
+    code = hashlib.sha256()
+    for package in _PACKAGES:
+        spec = importlib.util.find_spec(package)
+        for place in spec.submodule_search_locations or () if spec is not None else ():
+            for module in sorted(Path(place).rglob("*.py")):
+                code.update(f"{package}/{module.relative_to(place)}\n".encode())
+                code.update(module.read_bytes())
+    versions = {name: importlib.metadata.version(name) for name in _NUMERICAL}
+    python = ".".join(platform.python_version_tuple()[:2])
+    return {"python": python, **versions, "code": code.hexdigest()[:12]}
+
+
+def _run(work: Callable[[Part], Result], wanted: Mapping[str, str], part: Part) -> Result:
+    """Do a part on a worker."""
+    here = identity()
+    differing = [
+        f"{name} {here[name]} in place of {wanted[name]}"
+        for name in wanted
+        if here[name] != wanted[name]
+    ]
+    if differing:
+        raise UserError(
+            f"the worker on {socket.gethostname()} has {', '.join(differing)}; all machines need "
+            "the same checkout, set up alike (docs/cluster.md)"
+        )
+    return work(part)
+
+
+def _line(error: BaseException) -> str:
+    """Return an exception's text as a line."""
+    return " ".join(str(error).split())

@@ -1,0 +1,142 @@
+"""`ros2 run needle_sim monte_carlo`: steers thousands of simulated needles and counts."""
+
+from __future__ import annotations
+
+import csv
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from needle_bringup.studies.cluster_study import run_parts
+from needle_bringup.studies.monte_carlo_options import MonteCarloOptions, parse
+from needle_bringup.studies.study_parts import parts_of, results_of, settings_of
+from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_core.errors import UserError
+from needle_sim.needle.se3 import FloatArray
+
+LABELS = {
+    "runs": "runs",
+    "converged_at_end": "within 1 mm at the end",
+    "converged_last_20": "within 1 mm, last 20 steps",
+    "rms_last_20_mm": "last 20 steps, rms [mm]",
+    "p95_last_20_mm": "last 20 steps, 95 % [mm]",
+    "max_last_20_mm": "last 20 steps, worst [mm]",
+    "settle_median_mm": "settled at, median [mm]",
+    "settle_p95_mm": "settled at, 95 % [mm]",
+    "within_1_mm_point": "within 1 mm of the point",
+    "rms_point_mm": "distance from it, rms [mm]",
+    "p95_point_mm": "distance from it, 95 % [mm]",
+    "max_point_mm": "distance from it, worst [mm]",
+    "rotation_mean_deg": "rotation, mean [deg]",
+    "rotation_p95_deg": "rotation, 95 % [deg]",
+    "missed_runs": "runs that missed",
+    "diverged": "  share that diverged",
+    "inside_2_sigma": "truth within 2 sigma",
+    "inside_3_sigma": "truth within 3 sigma",
+    "doubtful_at_end": "called doubtful at the end",
+    "trusted_far_off": "  more than 5 mm off, and not",
+    "wall_s": "time [s]",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `monte_carlo`; returns its exit code."""
+    words = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: monte_carlo(parse(words)))
+
+
+def monte_carlo(options: MonteCarloOptions) -> int:
+    """Run a study as asked, print its figures and write its files."""
+    parts = parts_of(options)
+    witness = parts[0].of_first(2)
+    # What is compiled is compiled now, not in the time that is reported.
+    witness.run()
+    begin, worked_before = time.perf_counter(), time.process_time()
+    steps = settings_of(options).steps
+    with tqdm(
+        total=sum(len(part.starts) for part in parts) * steps,
+        unit="step",
+        unit_scale=True,
+        delay=1.0,
+        leave=False,
+        disable=not sys.stderr.isatty(),
+    ) as bar:
+        if options.scheduler:
+            done = run_parts(
+                options.scheduler, parts, witness, lambda needles: bar.update(needles * steps)
+            )
+            outcomes, worked = done.outcomes, done.cpu_s
+            for machine in done.differing:
+                print(
+                    f"warning: {machine} rounds otherwise than this machine (another processor?): "
+                    "figures may differ in their last digits",
+                    file=sys.stderr,
+                )
+        else:
+            outcomes = [part.run(bar.update) for part in parts]
+            worked = time.process_time() - worked_before
+    results, wall = results_of(parts, outcomes), time.perf_counter() - begin
+    seen = {**results.figures, "cpu_s": worked, "wall_s": wall}
+    print(describe(seen))
+    if options.csv is not None:
+        write_csv(options.csv, results.columns, options.of_a_run)
+    if options.json is not None:
+        asked: dict[str, JsonValue] = {
+            "controller": options.controller,
+            "estimator": options.estimator,
+            "law": options.law,
+            "planner": options.planner,
+            "grid": options.grid,
+            "seed": options.seed,
+        }
+        # Of a plane there are no figures of points, and the other way round.
+        write_json(options.json, {**dict.fromkeys(LABELS), **seen, **asked})
+    return EXIT_DONE
+
+
+def describe(result: Mapping[str, JsonValue]) -> str:
+    """Return a study's figures as a person reads them."""
+    lines = []
+    for key, label in LABELS.items():
+        if key not in result:
+            continue
+        value = result[key]
+        text = f"{value:.4f}" if isinstance(value, float) else "-" if value is None else str(value)
+        lines.append(f"{label:28}{text}")
+    return "\n".join(lines)
+
+
+def write_csv(path: Path, columns: Mapping[str, FloatArray], of_all: Mapping[str, str]) -> None:
+    """Write one line for each run; `settle_mm` is empty where a run ends outside.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    columns : mapping of str to ndarray, shape (N,)
+        What differs from run to run.
+    of_all : mapping
+        What they have in common: the files of several studies make one table.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be written.
+    """
+    try:
+        with path.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["run", *columns, *of_all])
+            for number, row in enumerate(np.stack(list(columns.values()), axis=-1)):
+                values = (f"{value:.6g}" if np.isfinite(value) else "" for value in row)
+                writer.writerow([number, *values, *of_all.values()])
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,310 @@
+"""Generated scenes with obstacles: which can be solved, which are taken on, and how they end.
+
+python -m needle_bringup.studies.obstacle_study --scenes 1000 --seed 1
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from needle_bringup.studies.obstacle_scenes import ObstacleScene, clearance, make_scene
+from needle_bringup.studies.path_judge import way_after
+from needle_bringup.studies.study_controllers import NeedlesToPoints, rrt_law
+from needle_controller.laws.law import SteeringCommand
+from needle_controller.model.target_plane import offset_plane
+from needle_controller.presets.presets import make_controller
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.next_step import next_step
+from needle_controller.protocol.plane_control import PlaneControl
+from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_core.commands.options import CommandParser, number, output_file, whole_number
+from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_sim.needle.se3 import FloatArray
+
+NEEDLE_RADIUS = 0.00035
+CURVATURE = SteeringSettings.curvature
+SAMPLES = 4000
+"""Points of the search that judges a scene."""
+DEPTH = 0.2
+_SUBSTEPS = 4
+Drive = Callable[[FloatArray, JointSample], SteeringCommand | None]
+"""Takes a tip and the joints at its exposure; None where there is no way on."""
+LABELS = {
+    "scenes": "scenes",
+    "solvable": "solvable with 90 % of the curvature, 0.75 mm clear",
+    "solvable_taken": "  taken on",
+    "solvable_reached": "  reached within 1 mm, of those solvable",
+    "roomy": "solvable with 85 % of the curvature, 1.25 mm clear",
+    "roomy_reached": "  reached within 1 mm, of those",
+    "unsolvable": "no way with all the curvature, 0.35 mm clear",
+    "unsolvable_refused": "  refused before insertion, of those",
+    "taken": "taken on of all",
+    "reached_of_taken": "  reached within 1 mm, of those",
+    "stopped": "  stopped on the way",
+    "contacts": "needles that touched an obstacle",
+    "update_p95_ms": "estimate, plan and law, 95 % [ms of one core]",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneOutcome:
+    """End of a scene.
+
+    Attributes
+    ----------
+    bare, solvable, roomy : bool
+        Whether the judge finds a way with all, 90 % or 85 % of the curvature, 0.35, 0.75 or 1.25 mm
+        clear of everything.
+    taken, stopped : bool
+        Whether the controller set out, and whether it saw no way on.
+    miss : float
+        True distance from the target at the end [m]; inf where it was not taken on.
+    least : float
+        Least clearance of the true needle's surface [m]; likewise.
+    """
+
+    bare: bool
+    solvable: bool
+    roomy: bool
+    taken: bool = False
+    stopped: bool = False
+    miss: float = math.inf
+    least: float = math.inf
+
+
+def judge(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcome:
+    """Return whether a scene can be solved, of a needle that has not set out."""
+    bare, solvable, roomy = (
+        way_after(
+            scene.target,
+            scene.obstacles,
+            share * CURVATURE,
+            settings.max_rotation_per_length,
+            clear,
+            SAMPLES,
+            1,
+        )
+        >= 0
+        for share, clear in ((1.0, NEEDLE_RADIUS), (0.9, 0.00075), (0.85, 0.00125))
+    )
+    return SceneOutcome(bare, solvable, roomy)
+
+
+def steer(
+    scene: ObstacleScene,
+    judged: SceneOutcome,
+    settings: SteeringSettings,
+    rng: np.random.Generator,
+    times: list[float],
+    *,
+    rrt: bool = False,
+) -> SceneOutcome:
+    """Steer a needle through a scene as the node does; return how it ended.
+
+    Parameters
+    ----------
+    scene, judged : ObstacleScene, SceneOutcome
+        The scene, and what is known of it.
+    settings : SteeringSettings
+        The controller's; its `tip_noise_bound` is the largest error of a measured coordinate, too.
+    rng : numpy.random.Generator
+        Of the tips' noise.
+    times : list of float
+        What each update takes of the processor is added here [s].
+    rrt : bool
+        Whether the published planner leads it, which takes on whatever it is given.
+    """
+    drive = _reference(scene, settings) if rrt else _best(scene, settings)
+    if drive is None:
+        return judged
+    plant = NeedlePlant(initial_pose(scene.pitch, scene.roll), curvature=CURVATURE)
+    noise = settings.tip_noise_bound
+    joints, least = JointSample(0, 0.0, 0.0), math.inf
+    for k in itertools.count(1):
+        tip = _tip(plant) + rng.uniform(-noise, noise, 3)
+        begin = time.thread_time()
+        command = drive(tip, joints)
+        times.append(time.thread_time() - begin)
+        step = None
+        if command is not None:
+            step = next_step(k, joints, command, settings, slowly=False)
+        if step is None:
+            miss = float(np.linalg.norm(_tip(plant) - scene.target))
+            return dataclasses.replace(
+                judged, taken=True, stopped=command is None, miss=miss, least=least
+            )
+        length, turn = step.insertion - joints.insertion, step.rotation - joints.rotation
+        for _ in range(_SUBSTEPS):
+            plant.advance(length / _SUBSTEPS, turn / _SUBSTEPS)
+            least = min(least, clearance(scene.obstacles, _tip(plant)) - NEEDLE_RADIUS)
+        joints = JointSample(k, step.insertion, step.rotation)
+    raise AssertionError
+
+
+def _best(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
+    """Return what steers a needle as the node does, None where that refuses to start."""
+    obstacles = tuple(float(value) for value in scene.obstacles.ravel())
+    control = PlaneControl(dataclasses.replace(settings, obstacles=obstacles), offset_plane(0.0))
+    control.target_point = scene.target
+    if control.path_obstacle(0.0):
+        return None
+
+    def drive(tip: FloatArray, joints: JointSample) -> SteeringCommand | None:
+        update = control.update(tip, joints)
+        return None if update.blocked else update.command
+
+    return drive
+
+
+def _reference(scene: ObstacleScene, settings: SteeringSettings) -> Drive:
+    """Return what steers a needle by the published planner, with the estimator of `best`."""
+    needles = NeedlesToPoints(
+        make_controller(settings, np.eye(3), np.zeros(3))[0],
+        lambda motion: rrt_law(motion, settings, scene.obstacles),
+    )
+    needles.see_targets(0.0, scene.target[np.newaxis])
+    before: list[JointSample] = []
+
+    def drive(tip: FloatArray, joints: JointSample) -> SteeringCommand:
+        tips = tip[np.newaxis]
+        if before:
+            last = before.pop()
+            turned = np.array([joints.rotation - last.rotation])
+            rate = needles.step(joints.insertion - last.insertion, turned, tips, 0.0)
+        else:
+            rate = needles.start(tips)
+        before.append(joints)
+        return SteeringCommand(np.zeros(()), rate[0], needles.insertion_left()[0])
+
+    return drive
+
+
+def study(
+    scenes: int,
+    seed: int,
+    *,
+    rrt: bool = False,
+    pitch_bound: float,
+    roll_bound: float,
+    entry_angle_std: float,
+    noise: float,
+) -> dict[str, float | None]:
+    """Return the figures of some scenes, by the names of `LABELS`.
+
+    Parameters
+    ----------
+    scenes, seed : int
+        How many, and the key of all randomness.
+    pitch_bound, roll_bound : float
+        Of the needles at their entries [rad].
+    entry_angle_std : float
+        What the controller is told of that [rad].
+    noise : float
+        Largest error of a measured coordinate, as it is told [m].
+    rrt : bool
+        See `steer`.
+    """
+    settings = SteeringSettings(
+        depth=DEPTH,
+        entry_angle_std=entry_angle_std,
+        tip_covariance="configured",
+        tip_noise="bounded",
+        tip_noise_bound=noise,
+        measurement_std=noise / math.sqrt(3.0),
+    )
+    outcomes: list[SceneOutcome] = []
+    times: list[float] = []
+    for n in range(scenes):
+        scene = make_scene(
+            seed, n, curvature=CURVATURE, pitch_bound=pitch_bound, roll_bound=roll_bound
+        )
+        rng = np.random.default_rng([seed, n, 1])
+        outcomes.append(steer(scene, judge(scene, settings), settings, rng, times, rrt=rrt))
+    return figures(outcomes, times)
+
+
+def figures(outcomes: Sequence[SceneOutcome], times: Sequence[float]) -> dict[str, float | None]:
+    """Return the figures of some outcomes, by the names of `LABELS`; shares where they are of."""
+
+    def share(of: Sequence[SceneOutcome], what: Callable[[SceneOutcome], bool]) -> float | None:
+        return sum(what(one) for one in of) / len(of) if of else None
+
+    def reached(one: SceneOutcome) -> bool:
+        return one.miss <= 1e-3
+
+    solvable = [one for one in outcomes if one.solvable]
+    roomy = [one for one in outcomes if one.roomy]
+    unsolvable = [one for one in outcomes if not (one.bare or one.solvable or one.roomy)]
+    taken = [one for one in outcomes if one.taken]
+    return {
+        "scenes": len(outcomes),
+        "solvable": len(solvable),
+        "solvable_taken": share(solvable, lambda one: one.taken),
+        "solvable_reached": share(solvable, reached),
+        "roomy": len(roomy),
+        "roomy_reached": share(roomy, reached),
+        "unsolvable": len(unsolvable),
+        "unsolvable_refused": share(unsolvable, lambda one: not one.taken),
+        "taken": len(taken),
+        "reached_of_taken": share(taken, reached),
+        "stopped": sum(one.stopped for one in taken),
+        "contacts": sum(one.least < 0.0 for one in taken),
+        "update_p95_ms": 1e3 * float(np.percentile(times, 95.0)) if times else None,
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study; returns its exit code."""
+    words = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: _run(words))
+
+
+def _run(words: Sequence[str]) -> int:
+    parser = CommandParser("obstacle_study", "Steer needles past generated obstacles.", "")
+    for option, default, metavar, text in (
+        ("--scenes", "1000", "N", "how many"),
+        ("--seed", "1", "N", "seed of all randomness"),
+        ("--pitch-deg", "1", "P", "bound of the needles' pitch at their entries"),
+        ("--roll-deg", "10", "R", "bound of their roll"),
+        ("--told-deg", "2", "S", "standard deviation of the pitch that the controller is told"),
+        ("--noise-mm", "1", "A", "largest error of each coordinate of a measured tip, as is told"),
+    ):
+        parser.add_argument(
+            option, default=default, metavar=metavar, help=f"{text} (default: {default})"
+        )
+    parser.add_argument("--rrt", action="store_true", help="steer by the published RRT planner")
+    parser.add_argument("--json", metavar="FILE", help="write the figures there too")
+    given = parser.parse_args(words)
+    path = output_file("--json", given.json)
+    seen = study(
+        whole_number("--scenes", given.scenes, 1, 100_000),
+        whole_number("--seed", given.seed, 0, 2**31 - 1),
+        rrt=given.rrt,
+        pitch_bound=math.radians(number("--pitch-deg", given.pitch_deg, 0.0, 20.0, "deg")),
+        roll_bound=math.radians(number("--roll-deg", given.roll_deg, 0.0, 180.0, "deg")),
+        entry_angle_std=math.radians(number("--told-deg", given.told_deg, 0.1, 45.0, "deg")),
+        noise=number("--noise-mm", given.noise_mm, 0.01, 10.0, "mm") * 1e-3,
+    )
+    for name, label in LABELS.items():
+        value = seen[name]
+        print(f"{label:55s}", "-" if value is None else f"{value:.4g}")
+    if path is not None:
+        told: dict[str, JsonValue] = {**seen}
+        write_json(path, told)
+    return EXIT_DONE
+
+
+def _tip(plant: NeedlePlant) -> FloatArray:
+    return np.array(plant.T_rig_tip[:3, 3])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

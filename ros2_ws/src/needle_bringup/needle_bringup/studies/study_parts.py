@@ -1,0 +1,203 @@
+"""A study in parts that know nothing of each other: some needles each, and what became of them.
+
+Chance is keyed by the needle, and an own estimator's by the part, so that a part's outcomes do not
+depend on where or when it runs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from needle_bringup.studies.monte_carlo_options import MonteCarloOptions
+from needle_bringup.studies.study_controllers import (
+    CURVATURE,
+    STEP_LENGTH,
+    OwnParts,
+    controller_factory,
+    needles_at_a_time,
+    point_controller_factory,
+)
+from needle_core.commands.cli import JsonValue
+from needle_sim.needle.se3 import FloatArray
+from needle_sim.studies.figures_of_merit import Outcomes, figures, joined
+from needle_sim.studies.point_study import PointOutcomes, point_figures, run_point_study
+from needle_sim.studies.point_targets import MovingTargets, random_targets
+from needle_sim.studies.start_grids import GRIDS, POINTS
+from needle_sim.studies.study import StudySettings, run_study
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StudyPart:
+    """Some needles of a study that are steered at a time.
+
+    Attributes
+    ----------
+    options : MonteCarloOptions
+        What is asked for.
+    first : int
+        Number of the first needle.
+    starts : ndarray, shape (N, 3)
+        x [m], pitch, roll [rad] of each.
+    places : ndarray, shape (N, 3)
+        The point that each is to go to [m]; (0, 3) where it is the plane.
+    """
+
+    options: MonteCarloOptions
+    first: int
+    starts: FloatArray
+    places: FloatArray
+
+    def of_first(self, count: int) -> StudyPart:
+        """Return its first needles alone."""
+        return dataclasses.replace(
+            self, starts=self.starts[:count].copy(), places=self.places[:count].copy()
+        )
+
+    def run(self, on_progress: Callable[[int], None] = lambda _: None) -> Outcomes | PointOutcomes:
+        """Steer its needles; `on_progress` is told after each step how many have made one."""
+        return (_to_points if self.options.targets else _to_plane)(self, on_progress)
+
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """Results of all runs.
+
+    Attributes
+    ----------
+    figures : mapping
+        As `monte_carlo --json` has them.
+    columns : mapping of str to ndarray, shape (N,)
+        By the names of `monte_carlo --csv`.
+    """
+
+    figures: Mapping[str, JsonValue]
+    columns: Mapping[str, FloatArray]
+
+
+def settings_of(options: MonteCarloOptions) -> StudySettings:
+    """Return what the needles of a study have in common."""
+    return StudySettings(
+        CURVATURE,
+        options.depth,
+        STEP_LENGTH,
+        options.disturbances,
+        options.seed,
+        options.turn_delay,
+    )
+
+
+def parts_of(options: MonteCarloOptions) -> list[StudyPart]:
+    """Return a study's parts, in the order of its needles."""
+    starts = _starts(options)
+    places: FloatArray = np.empty((0, 3))
+    if options.targets:
+        places = random_targets(starts, CURVATURE, options.seed)
+    size = needles_at_a_time(options.controller)
+    return [
+        StudyPart(
+            options,
+            first,
+            starts[first : first + size].copy(),
+            places[first : first + size].copy(),
+        )
+        for first in range(0, len(starts), size)
+    ]
+
+
+def results_of(parts: Sequence[StudyPart], outcomes: Sequence[Outcomes | PointOutcomes]) -> Results:
+    """Return the results of a study from what became of its parts, in their order."""
+    x, pitch, roll = np.concatenate([part.starts for part in parts]).T
+    begun = {"x_mm": x * 1e3, "pitch_deg": np.rad2deg(pitch), "roll_deg": np.rad2deg(roll)}
+    whole = joined(outcomes)
+    if isinstance(whole, PointOutcomes):
+        ended = _of_points(whole, np.concatenate([part.places for part in parts]))
+    else:
+        ended = _of_plane(whole)
+    return Results({"runs": len(x), **ended.figures}, {**begun, **ended.columns})
+
+
+def _starts(options: MonteCarloOptions) -> FloatArray:
+    count = options.targets or POINTS**3 * options.draws
+    if options.initial is not None:
+        return np.tile(np.asarray(options.initial), (count, 1))
+    grid = "random" if options.targets else options.grid
+    draws = -(-count // POINTS**3)
+    return GRIDS[grid](options.bounds, draws, options.seed)[:count]
+
+
+def _own(part: StudyPart) -> OwnParts:
+    asked = part.options
+    return OwnParts(asked.estimator, asked.law, asked.planner, asked.seed, part.first)
+
+
+def _to_plane(part: StudyPart, on_progress: Callable[[int], None]) -> Outcomes:
+    options = part.options
+    flips = np.linspace(0.0, options.depth, options.flips + 2)[1:-1].tolist()
+    return run_study(
+        part.starts,
+        controller_factory(
+            options.controller,
+            options.claimed_bound,
+            flips,
+            sigma_scale=options.sigma_scale,
+            turn_delay=options.turn_delay,
+            own=_own(part),
+        ),
+        settings_of(options),
+        on_progress=on_progress,
+        chunk=len(part.starts),
+        first=part.first,
+    )
+
+
+def _to_points(part: StudyPart, on_progress: Callable[[int], None]) -> PointOutcomes:
+    options = part.options
+    return run_point_study(
+        part.starts,
+        MovingTargets(
+            part.places, options.target_drift, options.target_breath, options.seed, part.first
+        ),
+        point_controller_factory(
+            options.controller,
+            options.claimed_bound,
+            sigma_scale=options.sigma_scale,
+            rotation_budget=options.rotation_budget,
+            own=_own(part),
+        ),
+        settings_of(options),
+        on_progress=on_progress,
+        chunk=len(part.starts),
+        first=part.first,
+    )
+
+
+def _of_plane(outcomes: Outcomes) -> Results:
+    last = np.abs(outcomes.x_last) * 1e3
+    return Results(
+        {**figures(outcomes), "missed_runs": int(np.sum(~outcomes.converged_at_end))},
+        {
+            "r1_final_mm": outcomes.x_end * 1e3,
+            "rms_last_20_mm": np.sqrt(np.mean(last**2, axis=1)),
+            "max_last_20_mm": np.max(last, axis=1),
+            "settle_mm": outcomes.settled * 1e3,
+            "rotation_deg": np.rad2deg(outcomes.rotation),
+            "diverged": outcomes.diverged.astype(float),
+        },
+    )
+
+
+def _of_points(outcomes: PointOutcomes, places: FloatArray) -> Results:
+    x, y, z = places.T * 1e3
+    return Results(
+        {**point_figures(outcomes), "missed_runs": int(np.sum(~outcomes.reached))},
+        {
+            "target_x_mm": x,
+            "target_y_mm": y,
+            "target_z_mm": z,
+            "error_mm": outcomes.error * 1e3,
+            "rotation_deg": np.rad2deg(outcomes.rotation),
+        },
+    )

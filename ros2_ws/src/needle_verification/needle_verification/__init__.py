@@ -1,1 +1,0 @@
-"""Proof of what the rig's software must be able to do; no rig needs it."""

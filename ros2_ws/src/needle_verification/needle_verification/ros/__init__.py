@@ -1,1 +1,0 @@
-"""Trials of running nodes: bad input, faults, kills, floods."""

@@ -1,1 +1,0 @@
-"""The rig's own nodes on a virtual middleware, clock and bus."""

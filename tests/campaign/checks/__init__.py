@@ -1,0 +1,1 @@
+"""What each step must show, at full size."""

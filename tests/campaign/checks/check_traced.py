@@ -1,0 +1,102 @@
+"""Step C on metal under lamps: a tracker for real images, as far as path tracing goes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from campaign.checking import Check, Finding, Workbench
+from campaign.tracking.traced_set import HELD_BACK, RIGS, drawn, scenes
+from campaign.tracking.traced_study import Told, TracedAnswer, traced_looks
+from campaign.tracking.tracker_study import WRONG
+from needle_bringup.workplace import checkout
+
+_LEAST = {Told.EMPTY_PHANTOM: 0.97, Told.INSERTION: 0.97, Told.NOTHING: 0.92}
+_LEAST_OF_A_KIND = 0.85
+_LARGEST_P95 = {"bench": 0.3, "top_and_side": 0.25, "webcams": 0.3}  # [mm]
+_CHI_SQUARED_95 = 7.815  # of three degrees of freedom
+
+
+def path_traced(_: Workbench) -> Iterator[Finding]:
+    """Find metal needles under lamps, before backdrops of all kinds; say how well they are known.
+
+    Tells of the half of the set that nobody looks at, as far as `traced_set` has drawn it; what is
+    missing is drawn now.
+    """
+    looks = [
+        look
+        for sequence in drawn(checkout() / ".traced", scenes(HELD_BACK))
+        for look in traced_looks(sequence)
+    ]
+    needles = [look for look in looks if look.truth is not None]
+    for told, least in _LEAST.items():
+        found = _found([look for look in needles if look.told is told])
+        yield Finding(
+            f"path_traced_found_{told.name.lower()}",
+            f"path-traced, {told.value} insertion, {_pairs(needles)} pairs: a tip",
+            f">= {least:.0%}",
+            f"{found:.1%}",
+            found >= least,
+        )
+    yield from _kinds(needles)
+    for rig in RIGS:
+        yield from _errors(rig, [look for look in needles if look.scene.rig == rig])
+    tips = [look for look in needles if look.tip is not None]
+    inside = float(np.mean([look.normalised <= _CHI_SQUARED_95 for look in tips]))
+    yield Finding(
+        "path_traced_consistency",
+        f"path-traced: {len(tips)} tips within the 95 % ellipsoid that they claim",
+        "85 to 99.5 %",
+        f"{inside:.1%}",
+        0.85 <= inside <= 0.995,
+    )
+    empty = [look for look in looks if look.truth is None]
+    false = sum(look.tip is not None for look in empty)
+    yield Finding(
+        "path_traced_absent", f"no needle, {len(empty)} looks: tips", "0", str(false), false == 0
+    )
+
+
+CHECKS: tuple[Check, ...] = (path_traced,)
+
+
+def _found(looks: Sequence[TracedAnswer]) -> float:
+    return float(np.mean([look.tip is not None for look in looks]))
+
+
+def _pairs(looks: Sequence[TracedAnswer]) -> int:
+    return len(looks) // len(Told)
+
+
+def _kinds(needles: Sequence[TracedAnswer]) -> Iterator[Finding]:
+    """Tell of each rig, metal, light and floor by itself."""
+    kinds: dict[str, list[TracedAnswer]] = {}
+    for look in needles:
+        seen = look.scene.look
+        for kind in (look.scene.rig, seen.metal, seen.lamps, seen.floor):
+            kinds.setdefault(kind, []).append(look)
+    for kind, looks in sorted(kinds.items()):
+        shares = [_found([look for look in looks if look.told is told]) for told in _LEAST]
+        yield Finding(
+            f"path_traced_{kind}",
+            f"path-traced, {kind}, {_pairs(looks)} pairs: a tip with the empty phantom and the "
+            "insertion, with insertion, without",
+            f"each >= {_LEAST_OF_A_KIND:.0%}",
+            ", ".join(f"{share:.0%}" for share in shares),
+            min(shares) >= _LEAST_OF_A_KIND,
+        )
+
+
+def _errors(rig: str, needles: Sequence[TracedAnswer]) -> Iterator[Finding]:
+    tips = [look for look in needles if look.tip is not None]
+    errors = 1e3 * np.array([look.error for look in tips if look.told is not Told.NOTHING])
+    largest = 1e3 * max(look.error for look in tips)
+    p95 = float(np.percentile(errors, 95))
+    yield Finding(
+        f"path_traced_errors_{rig}",
+        f"path-traced, {rig}: error of {len(errors)} tips with insertion; largest of {len(tips)}",
+        f"95 % <= {_LARGEST_P95[rig]:g} mm; <= {1e3 * WRONG:g} mm",
+        f"95 % {p95:.2f} (median {np.median(errors):.2f}); {largest:.2f} mm",
+        p95 <= _LARGEST_P95[rig] and largest <= 1e3 * WRONG,
+    )

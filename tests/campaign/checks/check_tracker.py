@@ -1,0 +1,212 @@
+"""Step C: a stereo tracker that a lab would trust."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from ament_index_python.packages import get_package_share_directory
+
+from campaign.checking import Check, Finding, Workbench
+from campaign.tracking.calibration_study import calibrated_tip_errors
+from campaign.tracking.tracker_sequences import insertion_sequence
+from campaign.tracking.tracker_study import (
+    WRONG,
+    TrackedRun,
+    new_tracker,
+    run_scenario,
+    track_run,
+)
+from needle_tracker.optics.calibration import load_calibration
+from needle_tracker.tracking.refusals import TrackState
+
+STEPS = 120
+LOOPS = 20
+REALISTIC_LOOPS = 10
+REALISTIC = ("steel", "steel_on_graph_paper", "hard_shadow")
+"""Scenarios of real light."""
+SETS = 20
+# 95 % bounds of a chi-squared variable with three degrees of freedom's 95 % quantile.
+_QUANTILE_95 = 7.815
+_LEAST_INSIDE = 0.90
+# No lower bound: claims cover a ground face like the floor and light from one side, and the quick
+# renderer has neither. Whether they claim too much shows in path-traced images.
+_MOST_MEAN = 4.5
+
+
+def clean(_: Workbench) -> Iterator[Finding]:
+    """Measure the tip in clean images, noise up to 5 grey levels."""
+    runs = run_scenario(_calibration(), "clean", range(1, 6), STEPS, noise=5.0)
+    yield from _errors("clean", runs, 0.25, 0.10)
+    yield from _consistency("clean", runs)
+
+
+def clutter(_: Workbench) -> Iterator[Finding]:
+    """Measure the tip among bubbles, glints and uneven light."""
+    runs = run_scenario(_calibration(), "clutter", range(1, 11), STEPS)
+    yield from _errors("clutter", runs, 0.35, 0.25, 1.0)
+    yield from _consistency("clutter", runs)
+
+
+def heavy_clutter(_: Workbench) -> Iterator[Finding]:
+    """Never lose the track in heavy clutter with a moving line."""
+    runs = run_scenario(_calibration(), "heavy_clutter", range(1, 16), 130)
+    yield from _errors("heavy_clutter", runs, 0.5, 0.4)
+    states = [state for run in runs for state in run.states]
+    lost = states.count(TrackState.LOST)
+    yield Finding(
+        "heavy_clutter_lost",
+        f"heavy clutter, {len(states)} pairs: track lost",
+        "0",
+        str(lost),
+        lost == 0,
+    )
+    yield from _consistency("heavy_clutter", runs)
+
+
+def occlusion(_: Workbench) -> Iterator[Finding]:
+    """Believe nothing wrong while hands and covers block the view, and find the needle again."""
+    runs = run_scenario(_calibration(), "occlusion", range(1, 31), 130)
+    wrong = sum(int(np.count_nonzero(run.distances > WRONG)) for run in runs)
+    count = sum(len(run.states) for run in runs)
+    yield Finding(
+        "occlusion_wrong",
+        f"occlusions, {count} pairs: tips wrong by more than 1.5 mm",
+        "0",
+        f"{wrong} of {sum(int(run.found.sum()) for run in runs)} tips",
+        wrong == 0,
+    )
+    slowest = [run.slowest_recovery() for run in runs]
+    waits = sum(wait > 3 for wait in slowest)
+    yield Finding(
+        "occlusion_recovery",
+        "occlusions: pairs until a needle in full view of both cameras is found",
+        "<= 3",
+        f"at most {max(slowest)}; {waits} of {len(runs)} runs took longer than 3 somewhere",
+        max(slowest) <= 3,
+    )
+
+
+def absent(_: Workbench) -> Iterator[Finding]:
+    """Find no needle where there is none, with the stage's length known."""
+    runs = run_scenario(_calibration(), "absent", range(1, 7), STEPS)
+    found = sum(int(run.found.sum()) for run in runs)
+    count = sum(len(run.states) for run in runs)
+    yield Finding("absent_found", f"absent, {count} pairs: tips", "0", str(found), found == 0)
+
+
+def calibration(_: Workbench) -> Iterator[Finding]:
+    """Calibrate a rig from a board's corners, each good to 0.1 px."""
+    runs = [calibrated_tip_errors(_calibration(), seed, 0.1) for seed in range(1, SETS + 1)]
+    each = np.percentile(runs, 95, axis=1) * 1e3
+    p95 = float(np.percentile(runs, 95)) * 1e3
+    yield Finding(
+        "calibration_errors",
+        f"calibration at 0.1 px corners, {SETS} sets: 95 % error of tips",
+        "3D <= 0.06 mm",
+        f"{p95:.3f} mm; {each.min():.3f} to {each.max():.3f} from set to set",
+        p95 <= 0.06,
+    )
+
+
+def closed_loop(bench: Workbench) -> Iterator[Finding]:
+    """Hold the plane in clutter with the tracker's own noise."""
+    yield _closed_loop(bench, "clutter", LOOPS, 0.25)
+
+
+def closed_loop_realistic(bench: Workbench) -> Iterator[Finding]:
+    """Hold the plane under real light: bare steel, graph paper, a hard shadow."""
+    for scenario in REALISTIC:
+        yield _closed_loop(bench, scenario, REALISTIC_LOOPS, 0.10)
+
+
+def speed(_: Workbench) -> Iterator[Finding]:
+    """Keep up with fast cameras on one core."""
+    path = _calibration()
+    tracker = new_tracker(load_calibration(path))
+    exposures = list(insertion_sequence(path, "clutter", 1, STEPS))
+    track_run(tracker, exposures[:8])  # compiles
+    full = track_run(tracker, exposures, searching=True).seconds
+    median, slowest = float(np.median(full)), float(full.max())
+    yield Finding(
+        "speed_acquisition",
+        "clutter, everything searched: pairs/s on one core",
+        ">= 100, and never over 33 ms",
+        f"{1.0 / median:.0f}, slowest {slowest * 1e3:.1f} ms",
+        median <= 0.01 and slowest <= 0.033,
+    )
+    region = float(np.median(track_run(tracker, exposures).seconds[4:]))
+    yield Finding(
+        "speed_region",
+        "clutter, in the region: pairs/s on one core",
+        ">= 250 (aim: 1000)",
+        f"{1.0 / region:.0f}",
+        region <= 0.004,
+    )
+
+
+CHECKS: tuple[Check, ...] = (
+    clean,
+    clutter,
+    heavy_clutter,
+    occlusion,
+    absent,
+    calibration,
+    closed_loop,
+    closed_loop_realistic,
+    speed,
+)
+
+
+def _closed_loop(bench: Workbench, scenario: str, seeds: int, largest: float) -> Finding:
+    parameters = bench.folder / f"{scenario}.yaml"
+    text = f"sim_rig: {{ros__parameters: {{scenario: {scenario}}}}}\n"
+    parameters.write_text(text, encoding="utf-8")
+    squares = []
+    for seed in range(1, seeds + 1):
+        run = bench.run(f"{scenario}_{seed}", "--params", str(parameters), "--seed", str(seed))
+        rms = run.summary.get("r1_rms_last_20_mm")
+        # A run that ends early has held nothing.
+        squares.append(rms**2 if rms is not None and run.code == 0 else np.inf)
+    rms, missed = float(np.sqrt(np.mean(squares))), int(np.count_nonzero(np.isinf(squares)))
+    return Finding(
+        f"closed_loop_{scenario}",
+        f"level camera, {scenario}, {seeds} seeds: r1 over the last 20 mm",
+        f"<= {largest:.2f} mm rms",
+        f"{rms:.3f} mm rms; {missed} runs missed",
+        rms <= largest,
+    )
+
+
+def _calibration() -> Path:
+    return Path(get_package_share_directory("needle_tracker"), "config", "calibration.yaml")
+
+
+def _errors(
+    key: str, runs: Sequence[TrackedRun], distance: float, depth: float, largest: float = np.inf
+) -> Iterator[Finding]:
+    distances = np.concatenate([run.distances for run in runs]) * 1e3
+    depths = np.concatenate([run.depths for run in runs]) * 1e3
+    count = sum(len(run.states) for run in runs)
+    p95, depth_p95 = (float(np.percentile(values, 95)) for values in (distances, depths))
+    bound = f", largest <= {largest:g}" if np.isfinite(largest) else ""
+    yield Finding(
+        f"{key}_errors",
+        f"{key}: 95 % errors of {len(distances)} tips in {count} pairs",
+        f"3D <= {distance:g}, depth <= {depth:g}{bound} mm",
+        f"3D {p95:.3f}, depth {depth_p95:.3f}, largest {distances.max():.2f} mm",
+        p95 <= distance and depth_p95 <= depth and bool(distances.max() <= largest),
+    )
+
+
+def _consistency(key: str, runs: Sequence[TrackedRun]) -> Iterator[Finding]:
+    squares = np.concatenate([run.normalised[run.found] for run in runs])
+    inside, mean = float(np.mean(squares <= _QUANTILE_95)), float(squares.mean())
+    yield Finding(
+        f"{key}_consistency",
+        f"{key}: normalised error squared (3 when the covariance fits)",
+        f"mean <= {_MOST_MEAN:g}, >= {_LEAST_INSIDE:.0%} within the 95 % bound",
+        f"mean {mean:.2f}, {inside:.1%} within",
+        mean <= _MOST_MEAN and inside >= _LEAST_INSIDE,
+    )

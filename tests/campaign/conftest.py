@@ -1,0 +1,21 @@
+"""The campaign runs when it is asked for: `pytest -m campaign`, or `scripts/verify`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave the campaign out unless the command line asks for it."""
+    return None if config.getoption("markexpr") == "campaign" else True
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what stands in this folder."""
+    for item in items:
+        if item.path.is_relative_to(HERE):
+            item.add_marker("campaign")

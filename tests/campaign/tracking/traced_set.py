@@ -1,0 +1,180 @@
+"""`python -m campaign.tracking.traced_set`: draws the path-traced pairs of step C.
+
+Half of the set is for building on; the other half is for `scripts/verify C` and for nobody's eyes.
+A sequence that was drawn stays in the checkout's .traced, so that what was interrupted goes on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from ament_index_python.packages import get_package_share_directory
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from needle_core.commands.cli import EXIT_DONE, run_command
+from needle_core.commands.options import CommandParser
+from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.path_traced.appearance import Appearance, draw_appearance
+from needle_sim.path_traced.insertion import trace_insertion
+from needle_sim.path_traced.tracer import load_mitsuba
+from needle_sim.sequences.boxes import draw_box
+
+RIGS = ("bench", "top_and_side", "webcams")
+PAIRS = 6
+NEEDLES, ABSENT = 51, 21
+"""Sequences of each half, each rig in turn."""
+LOOKED_AT, HELD_BACK = 30_000, 40_000
+"""First seed of each half."""
+_STEP = 1e-3
+_BEGIN = (0.02, 0.085)  # insertion of the first pair; webcams see less of the way [m]
+_BEGIN_WEBCAMS = (0.015, 0.05)
+_STREAM = 23
+
+
+@dataclasses.dataclass(frozen=True)
+class TracedScene:
+    """A sequence by name: what it shows follows from this.
+
+    Attributes
+    ----------
+    rig : str
+        One of `RIGS`.
+    appearance : str
+        As `draw_appearance` takes it.
+    seed : int
+        Keys look, path, noise and a box.
+    """
+
+    rig: str
+    appearance: str
+    seed: int
+
+    @property
+    def look(self) -> Appearance:
+        """Metal, lamps, floor and dirt."""
+        return draw_appearance(self.appearance, self.seed)
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"{self.rig}_{self.appearance}_{self.seed}"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DrawnSequence:
+    """Images of a scene, and what is true of them.
+
+    Attributes
+    ----------
+    scene : TracedScene
+        What they show.
+    calibration : Path
+        Of the cameras.
+    empty, pairs : ndarray of uint8, shape (2, height, width), (N, 2, height, width)
+        Left and right, without the needle and with it.
+    insertions : ndarray, shape (N,)
+        What the stage says [m].
+    tips : ndarray, shape (N, 3)
+        The end of the shaft's axis in `rig` [m]; NaN where there is no needle.
+    seen : ndarray, shape (N, 2)
+        Share of the needle's last 10 mm in each camera's image.
+    """
+
+    scene: TracedScene
+    calibration: Path
+    empty: NDArray[np.uint8]
+    pairs: NDArray[np.uint8]
+    insertions: NDArray[np.float64]
+    tips: NDArray[np.float64]
+    seen: NDArray[np.float64]
+
+
+def scenes(first_seed: int) -> list[TracedScene]:
+    """Return the sequences of a half, those without a needle among the others."""
+    found = []
+    for number in range(NEEDLES):
+        found.append(TracedScene(RIGS[number % 3], "random", first_seed + number))
+        if number % 5 in (1, 3) and number // 5 * 2 < ABSENT:
+            at = len([scene for scene in found if scene.appearance == "absent"])
+            found.append(TracedScene(RIGS[at % 3], "absent", first_seed + 1000 + at))
+    return found
+
+
+def drawn(folder: Path, wanted: Sequence[TracedScene]) -> Iterator[DrawnSequence]:
+    """Yield sequences that are there; trace those that are not.
+
+    Parameters
+    ----------
+    folder : Path
+        Keeps them.
+    wanted : sequence of TracedScene
+        Which.
+
+    Raises
+    ------
+    UserError
+        If one has to be traced and the path tracer is not installed.
+    """
+    folder.mkdir(exist_ok=True)
+    for scene in wanted:
+        kept = folder / f"{scene.name}.npz"
+        calibration = _calibration(folder, scene)
+        if not kept.is_file():
+            partial = kept.with_suffix(".part.npz")
+            np.savez_compressed(partial, allow_pickle=False, **_traced(calibration, scene))
+            partial.rename(kept)
+        with np.load(kept) as arrays:
+            yield DrawnSequence(scene, calibration, **arrays)
+
+
+def _calibration(folder: Path, scene: TracedScene) -> Path:
+    if scene.rig == "webcams":
+        path = folder / f"{scene.name}.yaml"
+        path.write_text(draw_box(scene.seed), encoding="utf-8")
+        return path
+    name = {"bench": "calibration.yaml", "top_and_side": "calibration_top_and_side.yaml"}
+    return Path(get_package_share_directory("needle_tracker"), "config", name[scene.rig])
+
+
+def _traced(calibration: Path, scene: TracedScene) -> dict[str, NDArray[np.generic]]:
+    mitsuba, rig, look = load_mitsuba(), load_stereo_rig(calibration), scene.look
+    bounds = _BEGIN_WEBCAMS if scene.rig == "webcams" else _BEGIN
+    begin = float(np.random.default_rng([scene.seed, _STREAM]).uniform(*bounds))
+    depth = begin + (PAIRS - 1) * _STEP
+    empty, *pairs = trace_insertion(
+        mitsuba, rig, look, frames=PAIRS, depth=depth, begin=begin, empty_first=True
+    )
+    nowhere = np.full(3, np.nan)
+    return {
+        "empty": np.stack(empty.images),
+        "pairs": np.stack([np.stack(pair.images) for pair in pairs]),
+        "insertions": np.array([pair.insertion for pair in pairs]),
+        "tips": np.stack([nowhere if pair.truth is None else pair.truth.tip for pair in pairs]),
+        "seen": np.array([pair.share_seen for pair in pairs]),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Draw the set, or one half of it; returns the exit code."""
+    parser = CommandParser("traced_set", str(__doc__), "")
+    parser.add_argument("folder", metavar="DIR", help="takes it; what is there stays")
+    parser.add_argument("--held-back", action="store_true", help="only what nobody looks at")
+    given = parser.parse_args(arguments)
+    wanted = scenes(HELD_BACK) + ([] if given.held_back else scenes(LOOKED_AT))
+
+    def draw() -> int:
+        sequences = drawn(Path(given.folder).expanduser(), wanted)
+        for _ in tqdm(sequences, total=len(wanted), disable=not sys.stderr.isatty()):
+            pass
+        return EXIT_DONE
+
+    return run_command(draw)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

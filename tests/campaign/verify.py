@@ -1,0 +1,148 @@
+"""`scripts/verify`: runs what the steps of the project must show, at full size."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from campaign.checking import Check, Finding, Workbench
+from campaign.checks import (
+    check_bags,
+    check_computers,
+    check_console_hold,
+    check_continuous,
+    check_control,
+    check_driver,
+    check_hold_sources,
+    check_simulation,
+    check_traced,
+    check_tracker,
+)
+from needle_bringup.descendants import ending_descendants
+from needle_bringup.workplace import checkout, make_folder, temporary_folder
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
+
+STEPS: Mapping[str, tuple[Check, ...]] = {
+    "A": check_simulation.CHECKS,
+    "B": check_control.CHECKS,
+    "C": (*check_tracker.CHECKS, *check_traced.CHECKS),
+    "D": check_driver.CHECKS,
+    "E": check_bags.CHECKS,
+    "I": (*check_continuous.CHECKS, *check_hold_sources.CHECKS, *check_console_hold.CHECKS),
+    "K": check_computers.CHECKS,
+}
+
+DESCRIPTION = """\
+Run what each step of the project must show, at full size, and print wanted beside seen.
+"""
+EPILOG = """\
+examples:
+  scripts/verify A                 everything of step A
+  scripts/verify A --only interrupt --only open_loop
+  scripts/verify --list            the names of all checks
+
+exit codes: 0 all as wanted, 1 something falls short, 2 bad input, 130 interrupted.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `verify`; returns its exit code."""
+    return run_command(lambda: _verify(sys.argv[1:] if arguments is None else arguments))
+
+
+def _verify(arguments: Sequence[str]) -> int:
+    parser = CommandParser("verify", DESCRIPTION, EPILOG)
+    parser.add_argument("steps", nargs="*", metavar="STEP", help=f"{', '.join(STEPS)}; all if none")
+    parser.add_argument("--only", action="append", metavar="NAME", help="only this check")
+    parser.add_argument("--list", action="store_true", help="say what there is to check")
+    parser.add_argument("--keep", metavar="DIR", help="new folder that keeps the bags")
+    parser.add_argument("--json", metavar="FILE", help="write the findings as a flat JSON object")
+    given = parser.parse_args(arguments)
+    checks = _chosen(given.steps or list(STEPS), given.only)
+    if given.list:
+        for step, check in checks:
+            print(f"{step} {check.__name__:24} {(check.__doc__ or '').splitlines()[0]}")
+        return EXIT_DONE
+    begin = time.monotonic()
+    findings: list[tuple[str, Finding]] = []
+    tqdm.monitor_interval = 0  # its thread would outlive the bar
+    keep = given.keep and make_folder("--keep", given.keep, exist_ok=False)
+    with (
+        contextlib.nullcontext(keep) if keep else temporary_folder() as folder,
+        ending_descendants(),
+        _progress(len(checks)) as bar,
+    ):
+        bench = Workbench([str(checkout() / "scripts" / "simulate")], folder)
+        for step, check in checks:
+            bar.set_description(f"{step} {check.__name__}")
+            for finding in _findings(check, bench):
+                findings.append((step, finding))
+                with bar.external_write_mode():
+                    _show(step, finding)
+            bar.update()
+    failed = sum(not finding.passed for _, finding in findings)
+    print(f"{len(findings) - failed} of {len(findings)} as wanted")
+    if given.json:
+        write_json(Path(given.json), _flat(findings, time.monotonic() - begin))
+    return EXIT_MISSED if failed else EXIT_DONE
+
+
+def _progress(checks: int) -> Any:
+    """Return a bar over the checks, on a terminal; elsewhere the findings show how far it is."""
+    return tqdm(
+        total=checks,
+        leave=False,
+        disable=not sys.stderr.isatty(),
+        bar_format="{desc} {bar} {n_fmt} of {total_fmt} checks, {elapsed}",
+    )
+
+
+def _findings(check: Check, bench: Workbench) -> Iterator[Finding]:
+    """Run a check; one that cannot be made has missed."""
+    try:
+        yield from check(bench)
+    except UserError as error:
+        what = (check.__doc__ or "").splitlines()[0]
+        yield Finding(check.__name__, what, "can be checked", str(error), False)
+
+
+def _chosen(steps: Sequence[str], only: Sequence[str] | None) -> list[tuple[str, Check]]:
+    for step in steps:
+        if step not in STEPS:
+            raise UserError(f"step {step!r} does not exist (yet); there is {', '.join(STEPS)}")
+    checks = [(step, check) for step in steps for check in STEPS[step]]
+    names = [check.__name__ for _, check in checks]
+    for name in only or ():
+        if name not in names:
+            raise UserError(f"--only {name!r} is not one of {', '.join(names)}")
+    return [(step, check) for step, check in checks if not only or check.__name__ in only]
+
+
+def _show(step: str, finding: Finding) -> None:
+    mark = "ok  " if finding.passed else "MISS"
+    print(f"{mark} {step} {finding.what}")
+    print(f"         wanted {finding.wanted}\n         seen   {finding.seen}", flush=True)
+
+
+def _flat(findings: Sequence[tuple[str, Finding]], wall: float) -> dict[str, JsonValue]:
+    values: dict[str, JsonValue] = {
+        "passed": all(finding.passed for _, finding in findings),
+        "wall_s": wall,
+    }
+    for step, finding in findings:
+        values[f"{step}_{finding.key}"] = finding.passed
+        values[f"{step}_{finding.key}_wanted"] = finding.wanted
+        values[f"{step}_{finding.key}_seen"] = finding.seen
+    return values
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,108 @@
+"""The course of a schedule: each fault begins by what it meets, and ends after its time."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from needle_core.runners.timeline import Timeline
+from scenario.faults import Fault, Moment
+
+Undo = Callable[[], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Meeting:
+    """A moment that came.
+
+    Attributes
+    ----------
+    moment : Moment
+        Which.
+    nth : int
+        For the how manyth time, from 1.
+    at : float
+        When [s].
+    """
+
+    moment: Moment
+    nth: int
+    at: float
+
+
+class Course:
+    """Lets the faults of a schedule begin and end.
+
+    Parameters
+    ----------
+    timeline : Timeline
+        Its clock.
+    faults : sequence of Fault
+        The schedule.
+    begin : callable
+        Lets a fault begin, and returns what ends it.
+
+    Attributes
+    ----------
+    met : list of Meeting
+        All moments that came, in their order.
+    begun : list of tuple of Fault and float
+        Faults that happened, and when they began [s].
+    """
+
+    def __init__(
+        self, timeline: Timeline, faults: Sequence[Fault], begin: Callable[[Fault], Undo]
+    ) -> None:
+        self._timeline = timeline
+        self._begin = begin
+        self._waiting = list(faults)
+        self._under_way = 0
+        self._count: Counter[Moment] = Counter()
+        self.met: list[Meeting] = []
+        self.begun: list[tuple[Fault, float]] = []
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether a fault lasts, or its moment has come."""
+        return self._under_way > 0
+
+    @property
+    def waits(self) -> bool:
+        """Whether the moment of a fault has not come yet."""
+        return bool(self._waiting)
+
+    def meet(self, moment: Moment) -> None:
+        """Take note that a moment has come."""
+        self._count[moment] += 1
+        this = moment, self._count[moment]
+        self.met.append(Meeting(*this, self._timeline.now))
+        for fault in [one for one in self._waiting if (one.after, one.nth) == this]:
+            self._waiting.remove(fault)
+            self._under_way += 1
+            self._timeline.call_after(fault.at, partial(self._happen, fault))
+
+    def give_up(self) -> None:
+        """Wait for no moment any more."""
+        self._waiting.clear()
+
+    def _happen(self, fault: Fault) -> None:
+        self.begun.append((fault, self._timeline.now))
+        self._timeline.call_after(fault.lasts, partial(self._end, self._begin(fault)))
+
+    def _end(self, undo: Undo) -> None:
+        undo()
+        self._under_way -= 1
+
+
+def told_by_moments(course: Course) -> list[Fault]:
+    """Return the faults that happened, each told by the last moment that it met.
+
+    So a change that shifts what a run does shifts its faults with it.
+    """
+    told = []
+    for fault, begun in course.begun:
+        last = [one for one in course.met if one.at <= begun][-1]
+        told.append(dataclasses.replace(fault, after=last.moment, nth=last.nth, at=begun - last.at))
+    return told

@@ -1,0 +1,270 @@
+"""Effects of each fault of the vocabulary on the rig, at its begin and at its end."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import random
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.component import Call
+from needle_core.errors import UserError
+from needle_core.settings.parameter_fields import from_values
+from scenario import faults
+from scenario.course import Undo
+from scenario.faults import Fault, Kind
+from scenario.link_faults import LinkFault
+from scenario.parts.bench import Sight
+from scenario.parts.stranger import Stranger
+from scenario.rig import SECOND_JOYSTICK, SECOND_OPERATOR, SoakRig
+
+_LINKS = (*faults.TOPICS, *faults.SERVICES, faults.BUS, faults.PAGE_LINE)
+SLOWEST_HANDLER = 0.05
+"""What the slowest of nodes takes for each handler [s]."""
+LATEST_MESSAGE = 1.0
+"""What the worst of faults delays a message by [s]."""
+_LATEST_FRAME = 0.1
+_JUMP_NS = 20_000_000_000
+_DRIFT_NS, _DRIFT_PERIOD = 2_000_000, 0.02
+# Seconds between two changes of mind of a hand that trembles.
+_TREMBLING = (0.03, 0.3)
+_WAVERING = ((True, False), (False, False), (False, True), (True, True))
+_MOTION_ERROR = 0x5530
+_SIGHTS = {
+    Kind.OFF: Sight.BLACK,
+    Kind.STUCK: Sight.FROZEN,
+    Kind.WRONG: Sight.WRONG,
+    Kind.SLOW: Sight.LATE,
+    Kind.GARBAGE: Sight.WRONG,
+}
+_SWITCHED_ON = ("device/enable", "device/confirm_needle_out")
+
+
+def _nothing() -> None:
+    """Do nothing: the fault was over at once."""
+
+
+class FaultOrders:
+    """Lets faults begin and end.
+
+    Parameters
+    ----------
+    rig : SoakRig
+        What they happen to.
+    """
+
+    def __init__(self, rig: SoakRig) -> None:
+        self._rig = rig
+        self._timeline = rig.runner.timeline
+        self._strangers = itertools.count(1)
+        self._spoilers: dict[str, Callable[[Fault], Undo]] = {
+            **dict.fromkeys(
+                (*faults.PROCESSES, faults.CONSOLE, faults.RECORDER), self._spoil_process
+            ),
+            faults.DISK: self._spoil_disk,
+            **dict.fromkeys(_LINKS, self._spoil_link),
+            **dict.fromkeys(faults.DRIVES, self._spoil_drive),
+            faults.ADAPTER: self._unplug,
+            faults.PAGE: self._spoil_page,
+            faults.CAMERAS: self._spoil_cameras,
+            faults.CLOCK: self._spoil_clock,
+            faults.PERSON: self._confuse_person,
+            faults.SECOND_PERSON: self._let_second_person_in,
+            faults.PARAMETERS: self._change_parameters,
+        }
+
+    def begin(self, fault: Fault) -> Undo:
+        """Let a fault begin; returns what ends it."""
+        return self._spoilers.get(fault.part, self._let_stranger_act)(fault)
+
+    def _chance_of(self, fault: Fault) -> random.Random:
+        return self._timeline.stream(f"fault of {fault.part}")
+
+    # ---- parts ----------------------------------------------------------------------------------
+
+    def _spoil_process(self, fault: Fault) -> Undo:
+        rig, names = self._rig, self._rig.processes_of(fault.part)
+        if fault.kind is Kind.OFF:
+            for name in names:
+                rig.kill(name)
+
+            def start() -> None:
+                for name in names:
+                    rig.start(name)
+
+            return start
+        for name in filter(rig.runner.runs, names):
+            if fault.kind is Kind.STUCK:
+                rig.runner.freeze(name, fault.lasts)
+            else:
+                rig.runner.slow_down(name, fault.lasts, fault.size * SLOWEST_HANDLER)
+        return _nothing
+
+    def _unplug(self, _: Fault) -> Undo:
+        self._rig.unplug()
+        return self._rig.plug_in
+
+    def _spoil_page(self, fault: Fault) -> Undo:
+        rig = self._rig
+        if fault.kind is Kind.OFF:
+            if rig.runner.runs(faults.PAGE):
+                rig.runner.stop(faults.PAGE)
+            return partial(rig.start, faults.PAGE)
+        if fault.kind is Kind.STUCK:
+            return self._spoil_process(fault)
+        doing = "sends_garbage" if fault.kind is Kind.GARBAGE else "repeats"
+        setattr(rig.page, doing, True)
+        return lambda: setattr(rig.page, doing, False)
+
+    def _spoil_link(self, fault: Fault) -> Undo:
+        late = fault.size * (_LATEST_FRAME if fault.part == faults.BUS else LATEST_MESSAGE)
+        spoil = partial(LinkFault, self._timeline.now + fault.lasts)
+        spoilt = {
+            Kind.OFF: spoil(loss=1.0),
+            Kind.INTERMITTENT: spoil(loss=fault.size),
+            Kind.SLOW: spoil(late=late),
+            Kind.REORDERED: spoil(late=late, reorders=True),
+            Kind.DUPLICATED: spoil(late=late, duplicates=0.5, reorders=True),
+        }[fault.kind]
+        self._rig.faults.begin(fault.part, spoilt)
+        return partial(self._rig.faults.end, fault.part)
+
+    def _spoil_drive(self, fault: Fault) -> Undo:
+        axis, kind = fault.part.partition(" ")[0], fault.kind
+        bus = self._rig.drives.bus
+        drive = bus.drives[axis]
+        if kind is Kind.OFF:
+            bus.reboot(axis, self._timeline.now)
+            return _nothing
+        if kind is Kind.GARBAGE:
+            bus.emergency(axis, _MOTION_ERROR)
+            return _nothing
+        if kind is Kind.STUCK:
+            bus.stall(axis)
+            return partial(setattr, drive.motor, "stalled", False)
+        bus.hang(axis)
+
+        def go_on() -> None:
+            drive.hung = False
+            drive.tick(self._timeline.now)
+
+        return go_on
+
+    def _spoil_cameras(self, fault: Fault) -> Undo:
+        def see(sight: Sight) -> None:
+            self._rig.tracker.sight = sight
+
+        see(_SIGHTS[fault.kind])
+        return partial(see, Sight.CLEAR)
+
+    def _spoil_clock(self, fault: Fault) -> Undo:
+        timeline = self._timeline
+        if fault.kind is Kind.WRONG:
+            before = timeline.clock_offset_ns
+            timeline.clock_offset_ns += round((fault.size - 0.5) * 2.0 * _JUMP_NS)
+            return partial(setattr, timeline, "clock_offset_ns", before)
+
+        def drift() -> None:
+            timeline.clock_offset_ns -= round(fault.size * _DRIFT_NS)
+
+        self._again_and_again(fault, drift, lambda: _DRIFT_PERIOD)
+        return _nothing
+
+    def _confuse_person(self, fault: Fault) -> Undo:
+        person, hand = self._rig.person, self._rig.hand
+        person.absent = True
+
+        def tremble() -> None:
+            hand.insert = not hand.insert
+
+        if fault.kind is Kind.OFF:
+            hand.insert = hand.retract = hand.stop = False
+        elif fault.kind is Kind.INTERMITTENT:
+            self._again_and_again(fault, tremble)
+        elif fault.kind is Kind.WRONG:
+            hand.insert, hand.retract = fault.size < 0.6, fault.size > 0.4
+            hand.stop = fault.size > 0.9
+
+        def end() -> None:
+            person.absent = hand.stop = False
+
+        return end
+
+    def _spoil_disk(self, fault: Fault) -> Undo:
+        assert self._rig.disk is not None, "who records nothing has no disk"
+        return self._rig.disk.spoil(fault)
+
+    def _let_second_person_in(self, fault: Fault) -> Undo:
+        rig, hand, chance = self._rig, self._rig.second_hand, self._chance_of(fault)
+
+        def let_go() -> None:
+            hand.insert = hand.retract = False
+
+        def waver() -> None:
+            hand.insert, hand.retract = chance.choice(_WAVERING)
+
+        if fault.kind is Kind.INTERMITTENT:
+            self._again_and_again(fault, waver)
+            return let_go
+        hand.insert, hand.retract = fault.kind is not Kind.WRONG, fault.kind is Kind.WRONG
+        if fault.kind is not Kind.OFF:
+            return let_go
+        return partial(rig.kill, SECOND_JOYSTICK if fault.size < 0.5 else SECOND_OPERATOR)
+
+    def _again_and_again(
+        self, fault: Fault, act: Callable[[], None], pause: Callable[[], float] | None = None
+    ) -> None:
+        """Act now, and after each pause while a fault lasts."""
+        end, chance = self._timeline.now + fault.lasts, self._chance_of(fault)
+
+        def go_on() -> None:
+            if self._timeline.now < end:
+                act()
+                seconds = pause() if pause else chance.uniform(*_TREMBLING)
+                self._timeline.call_after(seconds, go_on)
+
+        go_on()
+
+    def _change_parameters(self, fault: Fault) -> Undo:
+        rig, values = self._rig, dataclasses.asdict(self._rig.steering)
+        wrong = {
+            "curvature": 4.0 + 10.0 * fault.size,
+            "step_length": 5e-4 + 2e-3 * fault.size,
+            "nominal_speed": 1e-3 + 1e-2 * fault.size,
+            "depth": 0.03 * fault.size,
+        }
+        garbage = {"curvature": math.nan, "step_length": -1.0, "curvatur": 1.0, "depth": "deep"}
+        choice: dict[str, Any] = wrong if fault.kind is Kind.WRONG else garbage
+        name = self._chance_of(fault).choice(tuple(choice))
+        try:
+            changed = from_values(
+                SteeringSettings, {**values, name: choice[name]}, "plane_controller"
+            )
+        except UserError:
+            return _nothing
+
+        def change_to(settings: SteeringSettings) -> None:
+            if rig.runner.runs("plane_controller"):
+                rig.runner.configure("plane_controller", settings)
+
+        change_to(changed)
+        return partial(change_to, rig.steering)
+
+    # ---- strangers ------------------------------------------------------------------------------
+
+    def _let_stranger_act(self, fault: Fault) -> Undo:
+        rig = self._rig
+        if not faults.strange_topic(fault):
+            name = fault.part.removeprefix(faults.STRANGER).removeprefix("/")
+            on = True if name in _SWITCHED_ON else None
+            if name.endswith(" off"):
+                name, on = name.removesuffix(" off"), False
+            rig.person.asides.append(Call(name, on))
+            return _nothing
+        name = f"stranger_{next(self._strangers)}"
+        rig.runner.start(Stranger(name, fault, rig.bench, self._chance_of(fault)))
+        return partial(rig.runner.stop, name)

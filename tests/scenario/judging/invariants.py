@@ -1,0 +1,326 @@
+"""Invariants of every run, judged from outside: motors, hand, and what is published."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from collections.abc import Sequence
+
+from needle_core.status_messages import ControllerStatus, DeviceStatus
+from scenario.judging.bag_witness import WAITING_LIMIT
+from scenario.judging.hold_witness import HoldWitness
+from scenario.judging.limit_witness import Bounds, LimitWitness
+
+# A motor that goes no farther in a tick rests [m], [rad].
+_REST_INSERTION, _REST_ROTATION = 2e-7, 5e-4
+# So near its set-point an axis has arrived [m], [rad] (config/drives.yaml); blocked there and freed
+# after a stop, it goes the rest of it.
+_ARRIVED_INSERTION, _ARRIVED_ROTATION = 5e-6, 1e-3
+# From a release, or a loss, to the last motion [s]: a joystick that falls silent (0.1), an operator
+# that stops (0.1), their looks and the driver's cycle (0.02 each), a driver that stops (0.02), the
+# ramp (0.03); and what each of them is late by itself.
+RELEASE_BOUND = 0.35
+# A stop by the watchdog of the drives, and the ramp [s].
+WATCHDOG_BOUND = 0.2
+# Who is new is heard so long after it began to speak, and that counts as its press (docs/safety.md,
+# hold_new_press) [s].
+DISCOVERED_WITHIN = 0.2
+# So long after the finger is off a page's hold may still be said [s]: an echo counts for 0.25 s
+# (docs/safety.md, hold's end), and the hand is looked at every 0.005 s.
+PAGE_LIFETIME = 0.26
+# How long a status may be behind the motors [s].
+_STATUS_LAG = 0.15
+# The controller knows of a motion when its next tip has come: two steps.
+_BELIEF = 0.0045
+# A needle may still be on its way by one of so many commands: a path ends when its tip is 2 s old,
+# also where newer ones were refused, and tips come 20 times a second.
+_COMMANDS = 50
+# Farther in than commanded [m], and farther turned than the part of the way that was made wants
+# [rad]: a rotation drive falls silent at 3 rad/s, and insertion goes on until that is noticed.
+_BEYOND_COMMAND, _OUT_OF_PROPORTION = 0.0006, 0.5
+# What is small has an eighth more room, and the last of it may go beyond [B].
+_WAITING = WAITING_LIMIT + WAITING_LIMIT // 8 + 70_000
+
+
+@dataclasses.dataclass(frozen=True)
+class Violation:
+    """One violation of an invariant.
+
+    Attributes
+    ----------
+    invariant : str
+        Its name.
+    at : float
+        When, from the start of the run [s].
+    text : str
+        What was seen, with values and units.
+    """
+
+    invariant: str
+    at: float
+    text: str
+
+
+class Watch:
+    """Watches one run. Times are seconds from its start.
+
+    Parameters
+    ----------
+    bounds : Bounds
+        Of the rig.
+    release_bound : float
+        From a release, or a loss, to the last motion [s].
+    late : float
+        How late the driver may send a set-point [s].
+
+    Attributes
+    ----------
+    violations : list of Violation
+        The first of each kind.
+    witness : HoldWitness
+        Of the holds that reach the device; it is asked where it hears any.
+    """
+
+    def __init__(
+        self, bounds: Bounds, release_bound: float = RELEASE_BOUND, late: float = 0.0
+    ) -> None:
+        self._release_bound = release_bound
+        self.violations: list[Violation] = []
+        self.witness = HoldWitness()
+        self._limits = LimitWitness(bounds, late)
+        self._before: tuple[float, float, float] | None = None
+        self._pressed_until = self._told_until = self._other_until = -1.0
+        self._pressed_since = self._other_since = -1.0
+        self._holds = False
+        self._page_holds = False
+        self._page_ended = -1.0
+        self._must_press_after = 0.0
+        self._status = DeviceStatus()
+        self._status_at = 0.0
+        self._homing_until = -1.0
+        self._silent_since: float | None = None
+        self._ends_until = -1.0
+        self._estop_since: float | None = None
+        self._zero = 0.0
+        self._commands: deque[tuple[tuple[float, float], ...]] = deque(maxlen=_COMMANDS)
+        self._moving_since: float | None = None
+        self._rest = (0.0, 0.0)
+
+    def violate(self, invariant: str, at: float, text: str) -> None:
+        """Note a violation; of each invariant the first counts."""
+        if all(one.invariant != invariant for one in self.violations):
+            self.violations.append(Violation(invariant, at, text))
+
+    # ---- what happens ---------------------------------------------------------------------------
+
+    def see_hand(self, at: float, *, holds: bool) -> None:
+        """Take whether the hand presses what could move the needle."""
+        if holds and not self._holds:
+            self._pressed_since = at
+        if holds:
+            self._pressed_until = at
+        self._holds = holds
+
+    def see_hold(self, at: float) -> None:
+        """Take a message by which the hand's own node says that it presses."""
+        self._told_until = at
+
+    def see_page_hold(self, at: float, *, pressed: bool) -> None:
+        """Take whether the console says that the hand, at its page, presses."""
+        idle = at - self._pressed_until
+        if pressed and idle > PAGE_LIFETIME:
+            self.violate(
+                "hold_is_of_now", at, f"said to be held {idle:.3f} s after the finger was off"
+            )
+        begins = pressed and not self._page_holds
+        if begins and self._pressed_since < self._page_ended - PAGE_LIFETIME:
+            self.violate(
+                "hold_is_of_now",
+                at,
+                f"held again by a press of {self._pressed_since:.3f} s, from before "
+                f"{self._page_ended:.3f} s, when its hold had ended",
+            )
+        if self._page_holds and not pressed:
+            self._page_ended = at
+        self._page_holds = pressed
+
+    def see_other_hold(self, at: float) -> None:
+        """Take that somebody else pressed: from outside that is a hold like any other."""
+        if at - self._other_until > self._release_bound:
+            self._other_since = at + DISCOVERED_WITHIN
+        self._other_until = at
+
+    def see_device(self, at: float, status: DeviceStatus) -> None:
+        """Take a device/status as it is published."""
+        state, before = status.state, self._status.state
+        if state in ("FAULT", "ESTOPPED") and not status.fault:
+            self.violate("faults_are_named", at, f"{state} without a word why")
+        if (
+            state != before
+            and state in ("HOLDING", "DISABLED")
+            and before not in ("MOVING", "HOLDING")
+        ):
+            # Enabled, or reset: a press from before may not count.
+            self._must_press_after = at
+        if self._is_homing:
+            # Whatever ends it, the drives' own watchdog bounds what is under way.
+            self._homing_until = at + WATCHDOG_BOUND
+            if status.homed and self._before is not None:
+                # The rotation is homed where it stands.
+                self._zero = self._before[2]
+        self._status, self._status_at = status, at
+        self.witness.see_owner(at, status.hold_owner)
+
+    def see_command(self, points: Sequence[tuple[float, float]]) -> None:
+        """Take a command for the joints, whoever sent it: insertion [m] and rotation [rad]."""
+        if self._before is not None:
+            _, insertion, rotation = self._before
+            # What comes late is taken up from where the needle is, on to the next point ahead.
+            ahead = [point for point in points if point[0] > insertion] or points[-1:]
+            self._commands.append(((insertion, rotation - self._zero), *ahead))
+
+    def see_driver(self, at: float, *, speaks: bool) -> None:
+        """Take whether the driver runs and hears its drives: else it cannot know better."""
+        if not speaks and self._silent_since is None:
+            self.witness.lose_device(at)
+        self._silent_since = None if speaks else self._silent_since or at
+        if not speaks:
+            self.witness.forget()
+            # Who starts anew has not heard it; it starts disabled.
+            self._estop_since = None
+
+    def see_estop(self, at: float, *, pressed: bool) -> None:
+        """Take what is said of the emergency stop."""
+        self._estop_since = (self._estop_since or at) if pressed else None
+
+    def see_set_point(self, at: float, axis: int, place: float | None) -> None:
+        """Take what is sent to a drive; see `LimitWitness.see_set_point`."""
+        for text in self._limits.see_set_point(at, axis, place):
+            self.violate("none_beyond_limits", at, text)
+
+    def see_drives_go_on(self, at: float) -> None:
+        """Take that the drives' own time stood still until now: what was under way ends by it."""
+        self._ends_until = at + WATCHDOG_BOUND
+
+    def see_motors(self, at: float, insertion: float, rotation: float) -> None:
+        """Take where the motors really are."""
+        before, self._before = self._before, (at, insertion, rotation)
+        for text in self._limits.see_motors(at, insertion, rotation):
+            self.violate("none_beyond_limits", at, text)
+        if before is None:
+            return
+        along, around = insertion - before[1], rotation - before[2]
+        moves = abs(along) > _REST_INSERTION or abs(around) > _REST_ROTATION
+        if self._moving_since is None:
+            moves = moves and (
+                abs(insertion - self._rest[0]) > _ARRIVED_INSERTION
+                or abs(rotation - self._rest[1]) > _ARRIVED_ROTATION
+            )
+        if not moves:
+            if self._moving_since is not None:
+                self._rest = insertion, rotation
+            self._moving_since = None
+            return
+        begins, self._moving_since = self._moving_since is None, self._moving_since or at
+        if self._is_homing or at <= self._homing_until:
+            return
+        self._judge_hold(at, begins=begins)
+        self._judge_status(at)
+        if along > _REST_INSERTION:
+            self._judge_way(at, insertion, rotation)
+
+    def see_waiting(self, at: float, waiting: int) -> None:
+        """Take how much waits for the recorder's disk [B]."""
+        if waiting > _WAITING:
+            self.violate("queues_are_bounded", at, f"{waiting} bytes wait, at most {_WAITING}")
+
+    def see_belief(self, at: float, status: ControllerStatus, *, joints_heard: bool) -> None:
+        """Take a needle/controller_status as it is published, while joints reach the controller."""
+        # Before its first step it has nothing but the needle's place of before.
+        steers = status.state == "STEERING" and status.step != 0
+        if not (steers and joints_heard) or self._before is None:
+            return
+        off = self._before[1] - status.insertion_m
+        if not -0.0005 <= off <= _BELIEF:
+            self.violate(
+                "belief_equals_joints",
+                at,
+                f"the controller says {status.insertion_m * 1e3:.2f} mm, the needle is "
+                f"{self._before[1] * 1e3:.2f} mm in",
+            )
+
+    # ---- judgement ------------------------------------------------------------------------------
+
+    @property
+    def _is_homing(self) -> bool:
+        return self._status.activity == "homing"
+
+    def _judge_hold(self, at: float, *, begins: bool) -> None:
+        if self._estop_since is not None and at - self._estop_since > self._release_bound:
+            self.violate(
+                "estop_stops", at, f"motion {at - self._estop_since:.3f} s after an emergency stop"
+            )
+        # The hand's hold lasts as long as it presses and its node says so.
+        idle = at - max(min(self._pressed_until, self._told_until), self._other_until)
+        if idle > self._release_bound and at > self._ends_until:
+            self.violate(
+                "no_motion_without_hold",
+                at,
+                f"motion {idle:.3f} s after the last moment in which anybody held and said so",
+            )
+        by_others = self.witness.idle(at) if self.witness.hears else 0.0
+        if by_others > RELEASE_BOUND and at > self._ends_until:
+            self.violate(
+                "no_motion_by_another",
+                at,
+                f"motion {by_others:.3f} s after the last press of an owner reached the device",
+            )
+        since = max(self._pressed_since, self._other_since)
+        if begins and since < self._must_press_after:
+            self.violate(
+                "no_motion_by_itself",
+                at,
+                f"motion by a press of {since:.3f} s, from before "
+                f"{self._must_press_after:.3f} s, when the device became ready",
+            )
+
+    def _judge_way(self, at: float, insertion: float, rotation: float) -> None:
+        """Judge a motion inwards: nobody but a command moves the needle there, and as it says."""
+        off = [
+            abs(rotation - self._zero - _rotation_at(insertion, command))
+            for command in self._commands
+            if insertion <= max(place[0] for place in command) + _BEYOND_COMMAND
+        ]
+        if not off:
+            self.violate(
+                "turns_as_commanded",
+                at,
+                f"it goes in to {insertion * 1e3:.2f} mm, which none of the last commands wants",
+            )
+        elif min(off) > _OUT_OF_PROPORTION:
+            self.violate(
+                "turns_as_commanded",
+                at,
+                f"at {insertion * 1e3:.2f} mm it is {min(off):.2f} rad from the nearest command",
+            )
+
+    def _judge_status(self, at: float) -> None:
+        state = self._status.state
+        if state not in ("HOLDING", "DISABLED") or self._silent_since is not None:
+            return
+        lag = at - max(self._status_at, self._moving_since or at)
+        if lag > _STATUS_LAG:
+            self.violate(
+                "status_is_true", at, f"it moves {lag:.3f} s after device/status said {state}"
+            )
+
+
+def _rotation_at(insertion: float, command: Sequence[tuple[float, float]]) -> float:
+    """Return the rotation that a command wants at an insertion, from where it began."""
+    before = command[0]
+    for place in command[1:]:
+        if insertion <= place[0]:
+            share = (insertion - before[0]) / max(place[0] - before[0], 1e-9)
+            return before[1] + min(max(share, 0.0), 1.0) * (place[1] - before[1])
+        before = place
+    return before[1]

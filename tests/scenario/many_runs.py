@@ -1,0 +1,73 @@
+"""Runs of many seeds, on all cores of this machine or on a cluster: the same results in order."""
+
+from __future__ import annotations
+
+import functools
+import gc
+import itertools
+import multiprocessing
+import os
+import signal
+import tempfile
+import threading
+from collections.abc import Iterator
+
+from tqdm import tqdm
+
+from needle_bringup.studies.cluster import on_cluster
+from scenario.rig_run import RunResult, run, schedule_of
+
+# Runs that a worker of a cluster does at once: some ten seconds.
+_PART = 10
+
+
+def results_here(seeds: range) -> Iterator[RunResult]:
+    """Yield the results of seeds, run by as many processes as there are cores for them."""
+    if not seeds:
+        return
+    # Fresh interpreters: a fork would share what numerical libraries keep for their threads.
+    workers = min(len(seeds), len(os.sched_getaffinity(0)))
+    context = multiprocessing.get_context("spawn")
+    # Where a worker that is ended in mid-run leaves nothing behind.
+    with (
+        tempfile.TemporaryDirectory(prefix="needle_soak_") as folder,
+        context.Pool(workers, _begin_worker, (folder,)) as pool,
+    ):
+        yield from pool.imap(_run_seed, seeds)
+
+
+def results_of_cluster(address: str, seeds: range) -> Iterator[RunResult]:
+    """Yield the results of seeds, run by the workers of a scheduler; `on_cluster` says more."""
+    parts = [seeds[first : first + _PART] for first in range(0, len(seeds), _PART)]
+    yield from itertools.chain.from_iterable(on_cluster(address, run_part, parts))
+
+
+def run_part(seeds: range) -> list[RunResult]:
+    """Run some seeds, on a worker."""
+    _settle_in()
+    return [_run_seed(seed) for seed in seeds]
+
+
+def _begin_worker(folder: str) -> None:
+    tempfile.tempdir = folder
+    os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
+    # Bars of recovered bags would share theirs with other processes: a semaphore, and who is ended
+    # in mid-run leaves it behind.
+    tqdm.set_lock(threading.RLock())
+    # Ctrl-C reaches the whole group: who asked for the runs ends those who do them.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _settle_in()
+
+
+@functools.lru_cache(maxsize=1)
+def _settle_in() -> None:
+    """Prepare this process for runs, once."""
+    # What is imported stays, and need not be looked at for garbage.
+    gc.freeze()
+
+
+def _run_seed(seed: int) -> RunResult:
+    try:
+        return run(seed, schedule_of(seed))
+    except Exception as error:
+        raise RuntimeError(f"the run of seed {seed} broke: {error!r}") from error

@@ -1,0 +1,78 @@
+"""The console's hold on the line of a page: its real talk, without sockets and without a thread."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from needle_console.console import PAGE, Hand
+from needle_console.hold.hold_state import HoldState
+from needle_console.hold.hold_talk import PERIOD, HoldTalk
+from needle_core.component import Action, Actions, Component, Log, Moment, Port, Send, Timer
+from scenario.faults import PAGE_LINE
+from scenario.parts.page import CONNECT, Said
+
+_LOOK = 0.005
+
+
+class HoldServer(Component):
+    """Serves the hold as `hold.hold_server` does; the console hears it at its port."""
+
+    name = "hold_server"
+
+    def __init__(self) -> None:
+        self._actions: list[Action] = []
+        self._talk = HoldTalk(lambda _: "", self._tell, self._notice, 0.0)
+        # Connection to the page's number.
+        self._pages: dict[int, int] = {}
+        self.ports = (Port(PAGE_LINE, self._take), Port(PAGE, lambda *_: ()))
+        self.timers = (Timer(_LOOK, self._look), Timer(PERIOD, self._send_counts))
+
+    def _tell(self, state: HoldState) -> None:
+        self._actions.append(Send(PAGE, (Hand(state, self._talk.refusals.counts()),)))
+
+    def _notice(self, text: str) -> None:
+        self._actions.append(Log("warning", text))
+
+    def _told(self) -> Actions:
+        actions, self._actions = self._actions, []
+        return actions
+
+    def _look(self, at: Moment) -> Actions:
+        self._talk.look(at.steady)
+        return self._told()
+
+    def _take(self, batch: Sequence[Said], at: Moment) -> Actions:
+        for said in batch:
+            yield from self._hear(said, at.steady)
+        yield from self._told()
+
+    def _hear(self, said: Said, now: float) -> Actions:
+        page = self._pages.get(said.connection)
+        if said.text is None:
+            # First of all: what a gone page held ends now.
+            if page is not None:
+                self._close(said.connection, now)
+        elif page is not None:
+            self._talk.hear(page, said.text, now)
+        elif said.text == CONNECT:
+            self._pages[said.connection] = self._talk.open(now, is_local=True)
+        else:
+            # Of a connection that nobody knows, as after a restart.
+            yield self._abort(said.connection, now)
+
+    def _send_counts(self, at: Moment) -> Actions:
+        for connection, page in tuple(self._pages.items()):
+            if self._talk.has_lost(page, at.steady):
+                yield self._abort(connection, at.steady)
+            else:
+                word = self._talk.word_for(page, at.steady)
+                yield Send(PAGE_LINE, (Said(connection, word),))
+        yield from self._told()
+
+    def _abort(self, connection: int, now: float) -> Action:
+        if connection in self._pages:
+            self._close(connection, now)
+        return Send(PAGE_LINE, (Said(connection),))
+
+    def _close(self, connection: int, now: float) -> None:
+        self._talk.close(self._pages.pop(connection), now)

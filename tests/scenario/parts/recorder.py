@@ -1,0 +1,223 @@
+"""A recorder on a disk that fills, stands still, is slow or broken: the rig's own `Recording`."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import random
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+from needle_bags.format.bag_writer import BagWriter
+from needle_bags.recording.free_space import FreeSpace
+from needle_bags.recording.recording import Received, Recording
+from needle_bags.recording.worker import Do, Job, nothing
+from needle_core.component import Actions, Component, Input, Moment, Output, Timer
+from needle_core.files.bag_topic import BagTopic
+from scenario.faults import Fault, Kind
+from scenario.judging.bag_witness import WAITING_LIMIT, BagWitness
+
+# How often the worker looks for jobs [s], and what each takes [s], at least and at most.
+_WORK, _JOB = 0.005, (2e-6, 40e-6)
+_SLOWEST_JOB = 0.005
+# A recording ends in order where no more is left [B].
+_RESERVE = 1_000_000
+_ROOM = 10**9
+
+
+class Disk:
+    """The disk of a recorder's bags: real files, spoilt on their way.
+
+    Attributes
+    ----------
+    room : int
+        What is said to be left [B].
+    error : int
+        What every write meets, as `errno` has it; 0: nothing.
+    stands_still : bool
+        Whether no write ends.
+    slowness : float
+        What each job takes longer [s].
+    """
+
+    def __init__(self) -> None:
+        self._folder = Path(tempfile.mkdtemp(prefix="needle_soak_"))
+        self.room, self.error = _ROOM, 0
+        self.stands_still = False
+        self.slowness = 0.0
+        self._count = 0
+
+    def next_bag(self) -> Path:
+        """Return where the next recorder records."""
+        self._count += 1
+        return self._folder / f"bag_{self._count}"
+
+    def spoil(self, fault: Fault) -> Callable[[], None]:
+        """Let a fault begin; returns what ends it."""
+        if fault.kind is Kind.STUCK:
+            self.stands_still = True
+        elif fault.kind is Kind.SLOW:
+            self.slowness = fault.size * _SLOWEST_JOB
+        elif fault.kind is Kind.GARBAGE:
+            self.error = errno.EIO
+        elif fault.size < 0.5:
+            # Others fill it, and it can be seen.
+            self.room = 0
+        else:
+            self.error = errno.ENOSPC
+        return self._mend
+
+    def _mend(self) -> None:
+        self.room, self.error, self.stands_still, self.slowness = _ROOM, 0, False, 0.0
+
+    def close(self) -> None:
+        """Remove all that is on it."""
+        shutil.rmtree(self._folder)
+
+
+class _File(io.FileIO):
+    def __init__(self, disk: Disk, path: Path) -> None:
+        super().__init__(path, "xb")
+        self._disk = disk
+
+    def write(self, data: Any) -> int:
+        if self._disk.error:
+            raise OSError(self._disk.error, os.strerror(self._disk.error))
+        return super().write(data)
+
+
+class _Bag(BagWriter):
+    def __init__(self, disk: Disk, directory: Path) -> None:
+        self._disk = disk
+        self.opened: list[_File] = []
+        super().__init__(directory)
+
+    def open_file(self, path: Path) -> IO[bytes]:
+        self.opened.append(_File(self._disk, path))
+        return io.BufferedWriter(self.opened[-1])
+
+
+class _Space(FreeSpace):
+    def __init__(self, disk: Disk) -> None:
+        self._disk = disk
+        self.reserve = _RESERVE
+
+    def usable(self) -> int:
+        return self._disk.room - self.reserve
+
+
+class _Jobs:
+    """A `Worker` whose jobs are done when time is given to it."""
+
+    def __init__(self, do: Do, end: Job) -> None:
+        self._do, self._end = do, end
+        self._jobs: deque[Job] = deque()
+        self._due = 0.0
+
+    @property
+    def waiting(self) -> int:
+        return len(self._jobs)
+
+    def put(self, job: Job) -> None:
+        self._jobs.append(job)
+
+    def work(self, now: float, seconds: float, cost: Callable[[], float]) -> None:
+        """Do as many jobs as `seconds` have time for."""
+        if not self._jobs and now >= self._due:
+            self._due = self._do(nothing)
+        while self._jobs and seconds > 0.0:
+            seconds -= cost()
+            self._due = self._do(self._jobs.popleft())
+
+    def finish(self) -> None:
+        while self._jobs:
+            self._do(self._jobs.popleft())
+        self._end()
+
+
+class RecorderStandIn(Component):
+    """Hands all that it hears to a `Recording`; text in the place of CDR.
+
+    Parameters
+    ----------
+    disk : Disk
+        Where it records.
+    topics : iterable of Output
+        What it hears.
+    chance : Random
+        Draws how long jobs take.
+
+    Attributes
+    ----------
+    recording : Recording
+        The rig's own.
+    """
+
+    name = "recorder"
+
+    def __init__(self, disk: Disk, topics: Iterable[Output], chance: random.Random) -> None:
+        self._disk, self._chance = disk, chance
+        self._now = 0.0
+        self._count = 0
+        self._killed_at: float | None = None
+        self._bag = _Bag(disk, disk.next_bag())
+        self._witness = BagWitness(self._bag.directory)
+        workers: list[_Jobs] = []
+
+        def make_worker(do: Do, end: Job) -> _Jobs:
+            workers.append(_Jobs(do, end))
+            return workers[0]
+
+        self.recording = Recording(
+            self._bag, _Space(disk), make_worker, WAITING_LIMIT, clock=lambda: self._now
+        )
+        self._jobs = workers[0]
+        rows = []
+        for output in topics:
+            self.recording.add_topic(BagTopic(output.topic, "std_msgs/msg/String", "string data"))
+            hear = partial(self._hear, output.topic)
+            rows.append(Input(output.topic, output.message, hear, output.delivery))
+        self.inputs = tuple(rows)
+        self.timers = (Timer(_WORK, self._work),)
+
+    def cut(self, now: float) -> None:
+        """End, as the kernel ends it for a process that is killed."""
+        self._killed_at = now
+        for file in self._bag.opened:
+            file.close()
+
+    def losses(self, *, judges_killed: bool) -> list[str]:
+        """End it in order, unless it was killed; return what its bag lacks and does not name.
+
+        Parameters
+        ----------
+        judges_killed : bool
+            Whether the bag of a killed one counts: nothing else kept it from writing.
+        """
+        if self._killed_at is not None:
+            return self._witness.losses_of_killed(self._killed_at) if judges_killed else []
+        self.recording.close()
+        if not self.recording.is_whole:
+            return [f"{self._bag.directory} is not whole: {self.recording.error}"]
+        return self._witness.losses_of_ended()
+
+    def _hear(self, topic: str, message: Any, at: Moment) -> Actions:
+        self._now = at.steady
+        self._count += 1
+        self._witness.take(at.steady, topic)
+        data = repr(message).encode()
+        self.recording.append(Received(topic, data, at.stamp_ns, at.sent_ns, self._count))
+        return ()
+
+    def _work(self, at: Moment) -> Actions:
+        self._now = at.steady
+        if not self._disk.stands_still:
+            draw, slowness = self._chance.uniform, self._disk.slowness
+            self._jobs.work(at.steady, _WORK, lambda: draw(*_JOB) + slowness)
+        return ()

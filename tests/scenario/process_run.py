@@ -1,0 +1,232 @@
+"""One run of the rig as real processes: some are killed or stopped, and judged from outside."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from sensor_msgs.msg import JointState, Joy
+from trajectory_msgs.msg import JointTrajectory
+
+from campaign.trials.drives.drive_hand import JOINTS, DriveHand
+from campaign.trials.listening_node import ros
+from campaign.trials.trial_processes import TrialProcesses, graph_in_real_time
+from needle_core.convert import from_ros
+from needle_core.errors import UserError
+from needle_core.messages import HoldState
+from needle_core.process.ros_domain import own_domain
+from needle_core.ros.conversions import JOINT_STATES, RELIABLE, to_qos, values_of
+from needle_core.status_messages import DeviceStatus
+from needle_device_driver.device import HOLDS
+from scenario.faults import Fault, Kind
+from scenario.judging.invariants import RELEASE_BOUND, Watch
+from scenario.parts.person import OUT
+from scenario.rig_run import RunResult, bounds_of_the_rig
+
+PERSON = "simulated_operator"
+PARTS = ("device_driver", "plane_controller", "stereo_tracker", PERSON)
+# The stand-in does not promise to speak often, as the operator of a person does (0.1 s): its hold
+# lives for the driver's own 0.25 s.
+_RELEASE_BOUND = RELEASE_BOUND - 0.1 + 0.25
+_MOST = 3
+_LATEST, _SHORTEST, _LONGEST = 3.0, 0.05, 3.0
+_DEEP_ENOUGH = 0.002
+_START, _DRAW_OUT, _STILL = 120.0, 60.0, 1.0
+# The emulated drives move on with each SYNC, and say so: without a driver they stand still [s].
+_WITHOUT_SYNC = 0.1
+
+
+class Witness(DriveHand):
+    """Hears holds, status and motors, and judges them; draws the needle out when it is asked to.
+
+    Times are those at which a message was sent, so that a witness who is late judges no other. It
+    judges motion from the first word of the person on: DDS may let it hear that later than the
+    driver does.
+
+    Attributes
+    ----------
+    watch : Watch
+        What it judges with.
+    """
+
+    def __init__(self) -> None:
+        self.watch = Watch(bounds_of_the_rig(), _RELEASE_BOUND)
+        self._begun = time.time()
+        self._moved_at = 0.0
+        self._hears_person = False
+        super().__init__(steers=False)
+        # Whose press it is that moves the needle.
+        self._holder = PERSON
+        self.create_subscription(JointState, "sim/drive_positions", self._on_places, JOINT_STATES)
+        self.create_subscription(Joy, "device/hold", self._on_hold, to_qos(HOLDS))
+        self.create_subscription(
+            JointTrajectory, "device/joint_trajectory", self._on_command, RELIABLE
+        )
+
+    @property
+    def now(self) -> float:
+        """System time since it began [s]."""
+        return time.time() - self._begun
+
+    def draw_out(self) -> None:
+        """Mend what a person can mend, then hold until the needle is out.
+
+        Raises
+        ------
+        UserError
+            If it does not come out.
+        """
+        self._holder = self.get_name()
+        end = self.now + _DRAW_OUT
+        while self.motors[-1].insertion > OUT:
+            state, activity = self.status.get("state"), self.status.get("activity")
+            if self.now > end:
+                raise UserError(f"it is {self.motors[-1].insertion * 1e3:.2f} mm in; {self.status}")
+            if state in ("FAULT", "ESTOPPED"):
+                self.pressed = False
+                self.call("reset")
+            elif state == "DISABLED":
+                self.call("enable", True)
+            elif self.status.get("hold_owner") != self.get_name():
+                # A hold that does not count has to be let go of first.
+                self.pressed = not self.pressed
+            elif activity != "retraction":
+                self.call("retract")
+            self.pause(0.2)
+        self.release()
+
+    def _on_hold(self, message: Joy, info: dict[str, int]) -> None:
+        hold = from_ros(HoldState, message)
+        if hold.source == self._holder:
+            self._hears_person = True
+            pressed, at = hold.pressed, self._sent_at(info)
+            self.watch.see_hand(at, holds=pressed)
+            if pressed:
+                self.watch.see_hold(at)
+
+    def _on_command(self, message: JointTrajectory) -> None:
+        self.watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
+
+    def _on_places(self, message: JointState, info: dict[str, int]) -> None:
+        before, self._moved_at = self._moved_at, self._sent_at(info)
+        if self._moved_at - before > _WITHOUT_SYNC:
+            self.watch.see_drives_go_on(self._moved_at)
+        if self._hears_person:
+            at = dict(zip(message.name, message.position, strict=True))
+            self.watch.see_motors(self._moved_at, *(at[joint] for joint in JOINTS))
+
+    def _sent_at(self, info: dict[str, int]) -> float:
+        return info["source_timestamp"] * 1e-9 - self._begun
+
+    def _on_status(self, message: DiagnosticStatus) -> None:
+        super()._on_status(message)
+        self.watch.see_device(self.now, DeviceStatus.parse(values_of(message)))
+
+
+def processes_schedule_of(seed: int) -> list[Fault]:
+    """Draw what happens to the processes, from the moment in which the needle is steered [s]."""
+    draw = random.Random(f"faults of processes {seed}")
+    return sorted(
+        (
+            Fault(
+                draw.choice(PARTS),
+                draw.choice((Kind.OFF, Kind.STUCK)),
+                draw.uniform(0.0, _LATEST),
+                _SHORTEST * (_LONGEST / _SHORTEST) ** draw.random(),
+                0.0,
+            )
+            for _ in range(draw.randint(1, _MOST))
+        ),
+        key=lambda fault: fault.at,
+    )
+
+
+def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResult]:
+    """Yield the results of runs of real processes; what they leave is kept if they violate."""
+    for seed in seeds:
+        with tempfile.TemporaryDirectory(prefix="needle_soak_") as name:
+            result = run_processes(seed, Path(name))
+            if result.violations and folder is not None:
+                shutil.copytree(name, folder / f"processes_{seed}", dirs_exist_ok=True)
+            yield result
+
+
+def run_processes(seed: int, folder: Path) -> RunResult:
+    """Run the rig in real time, in a ROS domain of its own.
+
+    Parameters
+    ----------
+    seed : int
+        Of the simulation and of what happens.
+    folder : Path
+        Takes the nodes' logs.
+    """
+    faults = processes_schedule_of(seed)
+    with (
+        own_domain() as domain,
+        ros(domain),
+        closing(Witness()) as witness,
+        closing(TrialProcesses(folder, domain, graph_in_real_time(seed))) as graph,
+    ):
+        _insert(witness, graph, faults)
+        violations = tuple(witness.watch.violations)
+        happened = tuple(faults)
+        return RunResult(
+            seed,
+            happened,
+            violations,
+            happened,
+            witness.now,
+            of_processes=True,
+        )
+
+
+def _insert(witness: Witness, graph: TrialProcesses, faults: Sequence[Fault]) -> None:
+    witness.until(
+        lambda: bool(witness.motors) and witness.motors[-1].insertion > _DEEP_ENOUGH,
+        "steering",
+        _START,
+    )
+    begun = witness.now
+    events: list[tuple[float, Callable[[], None]]] = []
+    for fault in faults:
+        events.append((begun + fault.at, partial(_begin, witness, graph, fault)))
+        events.append((begun + fault.at + fault.lasts, partial(_end, witness, graph, fault)))
+    for at, happen in sorted(events, key=lambda event: event[0]):
+        witness.pause(max(at - witness.now, 0.0))
+        happen()
+    witness.pause(_STILL)
+    # From here on there is one person, and it wants the needle out.
+    graph.end(PERSON)
+    try:
+        witness.draw_out()
+    except UserError as error:
+        witness.watch.violate("the_way_goes_on", witness.now, str(error))
+
+
+def _begin(witness: Witness, graph: TrialProcesses, fault: Fault) -> None:
+    if graph.exit_code(fault.part) is not None:
+        return
+    if fault.part == "device_driver":
+        witness.watch.see_driver(witness.now, speaks=False)
+    if fault.kind is Kind.OFF:
+        graph.kill(fault.part)
+    else:
+        graph.signal(fault.part, signal.SIGSTOP)
+
+
+def _end(witness: Witness, graph: TrialProcesses, fault: Fault) -> None:
+    if graph.exit_code(fault.part) is not None:
+        graph.start(fault.part)
+    else:
+        graph.signal(fault.part, signal.SIGCONT)
+    if fault.part == "device_driver":
+        witness.watch.see_driver(witness.now, speaks=True)

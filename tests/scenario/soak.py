@@ -1,0 +1,174 @@
+"""The soak: many runs of the virtual rig under faults, and the shortest way to each violation."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from needle_core.commands.cli import (
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    EXIT_MISSED,
+    run_command,
+    write_json,
+)
+from needle_core.errors import UserError
+from scenario.faults import Fault, read_schedule, write_schedule
+from scenario.judging.invariants import Violation
+from scenario.many_runs import results_here, results_of_cluster
+from scenario.process_run import results_of_processes
+from scenario.rig_run import RunResult, run
+from scenario.shrinking import shrink
+from scenario.tally import Tally
+
+HELP = """\
+Run the whole rig many times in simulated time, under random faults, and check its invariants.
+
+Each run has all nodes of the rig in one process, on one clock and one seed: driver with emulated
+drives, controller, operator, a person, and up to six faults (nodes killed, stopped, slow; topics,
+services and bus lossy, late, silent; drives, cameras, clocks and people that fail). The same seed
+gives the same run. The schedule of a run that violates an invariant is shortened, and kept as a
+file with --failures. What is interrupted says how far it came.
+
+With --processes, runs of real processes follow, in real time, one after the other: nodes are killed
+and stopped while a simulated needle is inserted. They need an otherwise idle machine.
+"""
+EXAMPLES = """\
+examples:
+  scripts/soak --runs 300                300 runs
+  scripts/soak --runs 1 --seed 4711      repeat the run of one seed
+  scripts/soak --runs 300 --processes 3  then three of real processes, some 25 s each
+  scripts/soak --runs 10000 --scheduler tcp://10.0.0.5:8786
+  scripts/soak --schedule FILE           replay a schedule that an earlier run kept
+
+exit codes: 0 no invariant violated, 1 at least one violated, 2 bad input, 130 interrupted.
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the soak; returns its exit code."""
+    return run_command(lambda: _soak(_options(arguments)))
+
+
+def _options(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="scripts/soak",
+        description=HELP,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--runs", type=int, default=300, metavar="N", help="number of runs (300)")
+    parser.add_argument(
+        "--processes", type=int, default=0, metavar="N", help="number of runs of real processes (0)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=1, metavar="S", help="seed of the first run (1)"
+    )
+    parser.add_argument(
+        "--schedule", type=Path, metavar="FILE", help="replay the seed and faults in this file"
+    )
+    parser.add_argument(
+        "--failures", type=Path, metavar="DIR", help="keep schedules that violate here"
+    )
+    parser.add_argument(
+        "--scheduler",
+        default="",
+        metavar="ADDRESS",
+        help="do the runs on the Dask cluster of this scheduler, such as tcp://10.0.0.5:8786, to "
+        "the same results (docs/cluster.md)",
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON")
+    return parser.parse_args(arguments)
+
+
+def _soak(options: argparse.Namespace) -> int:
+    for name, count in (("--runs", options.runs), ("--processes", options.processes)):
+        if count < 0:
+            raise UserError(f"{name} {count}: at least 0")
+    if options.runs == options.processes == 0:
+        raise UserError("--runs 0 and no --processes: nothing to do")
+    if options.schedule is not None:
+        tally = Tally(1, 0)
+        seed, faults = read_schedule(options.schedule)
+        results: Iterator[RunResult] = (run(seed, faults) for _ in range(1))
+    else:
+        tally = Tally(options.runs, options.processes)
+        seeds = range(options.seed, options.seed + options.runs)
+        processes = range(options.seed, options.seed + options.processes)
+        results = itertools.chain(
+            results_of_cluster(options.scheduler, seeds)
+            if options.scheduler
+            else results_here(seeds),
+            results_of_processes(processes, options.failures),
+        )
+    interrupted = False
+    try:
+        for result in results:
+            tally.add(
+                of_processes=result.of_processes,
+                faults=len(result.told_by_moments),
+                simulated=result.simulated,
+                violates=bool(result.violations),
+            )
+            if result.violations:
+                _tell(result, options.failures)
+            if sys.stderr.isatty():
+                print(f"\r{tally.progress}", end="", file=sys.stderr)
+    except KeyboardInterrupt:
+        # A night that somebody ends is worth what it has shown.
+        interrupted = True
+    if interrupted:
+        print(f"interrupted: {tally.progress}")
+    print(tally.line)
+    if options.json is not None:
+        write_json(options.json, tally.figures)
+    if interrupted:
+        return EXIT_INTERRUPTED
+    return EXIT_MISSED if tally.violations else EXIT_DONE
+
+
+def _tell(result: RunResult, folder: Path | None) -> None:
+    if result.of_processes:
+        # Real time cannot be had again: as it was, not shrunk.
+        _print_violations(f"processes, seed {result.seed}", result.violations)
+        _print_faults(result.faults)
+        return
+    why = "; ".join(f"{one.invariant}: {one.text}" for one in result.violations)
+    names = {one.invariant for one in result.violations}
+
+    def keep(faults: Sequence[Fault]) -> None:
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_schedule(folder / f"seed_{result.seed}.json", result.seed, faults, why)
+
+    def still(faults: list[Any]) -> bool:
+        return bool(names & {one.invariant for one in run(result.seed, faults).violations})
+
+    # Shrinking takes minutes, and may be interrupted.
+    _print_violations(f"seed {result.seed}", result.violations)
+    keep(result.faults)
+    kept = shrink(result.faults, still)
+    told = list(run(result.seed, kept).told_by_moments)
+    if still(told):
+        kept = told
+    _print_faults(kept)
+    keep(kept)
+
+
+def _print_violations(run_name: str, violations: Iterable[Violation]) -> None:
+    print(f"\n{run_name}:")
+    for violation in violations:
+        print(f"  {violation.at:.3f} s {violation.invariant}: {violation.text}")
+
+
+def _print_faults(faults: Iterable[Fault]) -> None:
+    for fault in faults:
+        print(f"    {fault}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

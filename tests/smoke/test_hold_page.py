@@ -1,0 +1,191 @@
+"""What hold.js makes of fingers, mouse and keys, in a real browser."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from campaign.trials.console.chromium import Chromium, Tab, chromium
+from needle_console.hold.hold_state import HoldState
+
+pytest.importorskip("websockets", reason="the console's lock is not installed: scripts/console")
+
+from campaign.trials.console.button_page import BUTTON, serving_button
+
+pytestmark = [
+    pytest.mark.timeout(300),
+    pytest.mark.skipif(chromium() is None, reason="no chromium: apt-get install chromium"),
+]
+
+PATIENCE = 30.0
+ELSEWHERE = (400.0, 300.0)
+_STATE = "document.documentElement.dataset.holdState"
+
+
+class Scene:
+    """The page in a browser, and what the server hands on."""
+
+    def __init__(self, tab: Tab, states: list[HoldState], counts: Callable[[], dict[str, int]]):
+        self.tab = tab
+        self.states = states
+        self._counts = counts
+
+    def until(self, condition: Callable[[], object], what: str) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < deadline, f"waited in vain: {what}"
+            time.sleep(0.005)
+
+    def until_released(self) -> None:
+        self.until(lambda: not self.states[-1].pressed, "released")
+
+    def let_pass(self, count: int) -> None:
+        """Let so many states be handed on."""
+        enough = len(self.states) + count
+        self.until(lambda: len(self.states) >= enough, "states")
+
+    def hold(self, press: Callable[[], None], let_go: Callable[[], None]) -> None:
+        """Press until it counts for a while: on a busy machine a hold may be lost at once."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            assert time.monotonic() < deadline, "no press counts"
+            let_go()
+            self.until(lambda: self.tab.run(_STATE) in ("ready", "again"), "ready")
+            press()
+            self.let_pass(15)
+            if self.states[-1].pressed:
+                return
+
+    def ends(self, hold: Callable[[], None], act: Callable[[], object]) -> None:
+        """See a hold end by an act: one that a busy machine has lost meanwhile is held again."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            assert time.monotonic() < deadline, "holds end by themselves alone"
+            hold()
+            lost = self._counts().get("hold lost", 0)
+            act()
+            self.until_released()
+            if self._counts().get("hold lost", 0) == lost:
+                return
+
+    def never_pressed(self, press: Callable[[], None]) -> bool:
+        """Press, and look whether that counts."""
+        self.until(lambda: self.tab.run(_STATE) in ("ready", "again"), "ready")
+        seen = len(self.states)
+        press()
+        # The browser has taken it when it answers.
+        self.tab.run("0")
+        self.let_pass(15)
+        return not any(state.pressed for state in self.states[seen:])
+
+    def hold_pointer(self) -> None:
+        self.hold(
+            lambda: self.tab.press_pointer(*BUTTON), lambda: self.tab.release_pointer(*BUTTON)
+        )
+
+    def hold_space(self) -> None:
+        self.hold(self.tab.press_space, self.tab.release_space)
+
+    def hold_touch(self) -> None:
+        self.hold(lambda: self.tab.touch(BUTTON), self.tab.touch)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+    folder: Path = tmp_path_factory.mktemp("browser")
+    states: list[HoldState] = []
+    with serving_button(states.append, lambda _: None) as (page_port, hold):
+        browser = Chromium(folder / "profile")
+        try:
+            tab = browser.open(f"http://127.0.0.1:{page_port}/?port={hold.port}")
+            yield Scene(tab, states, hold.counts)
+        finally:
+            browser.close()
+
+
+def test_mouse_space_bar_and_finger_hold_until_they_are_let_go(scene: Scene) -> None:
+    tab = scene.tab
+    scene.ends(scene.hold_pointer, lambda: tab.release_pointer(*BUTTON))
+    scene.ends(scene.hold_space, tab.release_space)
+    scene.ends(scene.hold_touch, tab.touch)
+
+
+def test_the_speed_is_what_was_set_last_and_is_one(scene: Scene) -> None:
+    scene.hold_pointer()
+    assert scene.states[-1].speed == 1.0
+    scene.tab.run("needleHold.setSpeed(0.25); needleHold.setSpeed(NaN); needleHold.setSpeed(2)")
+    scene.hold_pointer()
+    assert scene.states[-1].speed == 0.25
+    scene.tab.run("needleHold.setSpeed(1)")
+    scene.tab.release_pointer(*BUTTON)
+    scene.until_released()
+
+
+def test_a_second_finger_or_button_or_key_ends_a_hold(scene: Scene) -> None:
+    tab = scene.tab
+    scene.ends(scene.hold_touch, lambda: tab.touch(BUTTON, ELSEWHERE))
+    tab.touch()
+    scene.ends(scene.hold_touch, tab.cancel_touch)
+    scene.ends(scene.hold_pointer, lambda: tab.press_other_button(*BUTTON))
+    scene.ends(scene.hold_space, lambda: tab.press_key("Escape"))
+
+
+def test_a_button_that_goes_ends_its_hold(scene: Scene) -> None:
+    anew = "for (const old of document.querySelectorAll('button')) old.outerHTML = old.outerHTML"
+    scene.ends(scene.hold_pointer, lambda: scene.tab.run(anew))
+    # What takes its place is a button like it.
+    scene.ends(scene.hold_pointer, lambda: scene.tab.release_pointer(*BUTTON))
+
+
+def test_the_page_says_why_a_hold_ended_by_itself(scene: Scene) -> None:
+    tab = scene.tab
+
+    def why() -> str:
+        return str(tab.run("needleHold.status.why"))
+
+    def stand_still() -> None:
+        tab.run("const end = performance.now() + 500; while (performance.now() < end);")
+
+    scene.ends(scene.hold_pointer, lambda: tab.release_pointer(*BUTTON))
+    assert why() == ""
+    scene.ends(scene.hold_pointer, lambda: tab.press_other_button(*BUTTON))
+    assert why() == "hold ended: a second finger or mouse button"
+    scene.ends(scene.hold_space, lambda: tab.press_key("Escape"))
+    assert why() == "hold ended: another key was pressed"
+    scene.ends(scene.hold_touch, tab.cancel_touch)
+    assert why() == "hold ended: the browser took the pointer away"
+    scene.ends(scene.hold_pointer, lambda: tab.run("window.frames[0].focus()"))
+    assert why() == "hold ended: the window lost the focus"
+    tab.run("window.focus()")
+    scene.hold_pointer()
+    stand_still()
+    stalled = "hold ended: no echo from this page for 0.25 s (browser, network or console stalled)"
+    scene.until(lambda: why() == stalled, "it says why")
+    assert tab.run(_STATE) == "again"
+    # It goes with the next press.
+    scene.hold_pointer()
+    assert why() == ""
+    tab.release_pointer(*BUTTON)
+    scene.until_released()
+
+
+def test_what_is_no_press_does_not_hold(scene: Scene) -> None:
+    tab = scene.tab
+    tab.release_space()
+    assert scene.never_pressed(lambda: tab.press_space(repeat=True))
+    tab.release_space()
+    tab.run("document.querySelector('input').focus()")
+    assert scene.never_pressed(tab.press_space)
+    tab.release_space()
+    tab.run("document.activeElement.blur()")
+    tab.run("document.querySelector('[data-hold]').ariaDisabled = 'true'")
+    assert scene.never_pressed(lambda: tab.press_pointer(*BUTTON))
+    tab.release_pointer(*BUTTON)
+    assert scene.never_pressed(tab.press_space)
+    tab.release_space()
+    tab.run("document.querySelector('[data-hold]').ariaDisabled = 'false'")
+    assert scene.never_pressed(lambda: tab.press_pointer(*ELSEWHERE))
+    tab.release_pointer(*ELSEWHERE)
