@@ -1,0 +1,184 @@
+"""A pytest plugin of scripts/test: collect once, run on all cores, hold each test to its budget.
+
+The process that collected forks one shard per core. The shards take test files from one pipe, the
+longest ones first, and send their reports back. Smoke tests start real nodes: they run at the end,
+one after the other, with nothing beside them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import multiprocessing
+import os
+import re
+import signal
+from collections.abc import Iterator, Sequence
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+import pytest
+
+from cpu_budget import CpuBudget
+from left_processes import end_left_processes
+from needle_core.process.ros_domain import own_domain
+
+SHARDS = os.cpu_count() or 1
+# What takes longest is begun first, or one of them would hold up the end of the run.
+LONG = re.compile(r"tests/static/|tests/scenario/|.*_calibration|.*/test/(tracking|studies|curvature)/")
+SMOKE = "tests/smoke/"
+_INDEX_BYTES = 4
+_reserved = contextlib.ExitStack()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Reserve a ROS domain, and end as Ctrl-C does: with all cleaning up."""
+    os.environ["ROS_DOMAIN_ID"] = str(_reserved.enter_context(own_domain()))
+    # A shell that runs this in the background ignores SIGINT, and all below would, too.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+    config.pluginmanager.register(CpuBudget(), "cpu_budget")
+
+
+def pytest_unconfigure() -> None:
+    """Give the ROS domain back."""
+    _reserved.close()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop(session: pytest.Session) -> object:
+    """Run the collected tests: in shards, smoke tests afterwards."""
+    if session.config.option.collectonly or session.testsfailed:
+        return None
+    files = _by_file(session.items)
+    smoke = [item for file in files if file.startswith(SMOKE) for item in files[file]]
+    others = sorted(
+        (items for file, items in files.items() if not file.startswith(SMOKE)),
+        key=lambda items: LONG.match(items[0].nodeid) is None,
+    )
+    _run_in_shards(session, others)
+    _run_here(session, smoke)
+    return True
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail the session when processes are left, and end them."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    for line in end_left_processes():
+        session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+        if reporter is not None:
+            reporter.write_line(f"FAILED process left behind: {line}", red=True)
+
+
+class _Sender:
+    """What a shard has in place of a terminal: it sends its reports to the process that collected."""
+
+    def __init__(self, config: pytest.Config, to: Connection) -> None:
+        self._config, self._to = config, to
+
+    def pytest_runtest_logstart(self, nodeid: str, location: object) -> None:
+        """Say which test begins, for whoever has to name it if this process dies."""
+        self._to.send(nodeid)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Send a report."""
+        hook = self._config.hook
+        self._to.send(hook.pytest_report_to_serializable(config=self._config, report=report))
+
+
+def _by_file(items: Sequence[pytest.Item]) -> dict[str, list[pytest.Item]]:
+    files: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.nodeid.partition("::")[0], []).append(item)
+    return files
+
+
+def _run_in_shards(session: pytest.Session, files: Sequence[Sequence[pytest.Item]]) -> None:
+    if not files:
+        return
+    waiting, given_out = os.pipe()
+    gc.freeze()
+    shards: dict[Connection, int] = {}
+    for _ in range(min(SHARDS, len(files))):
+        ours, theirs = multiprocessing.Pipe(duplex=False)
+        process = os.fork()
+        if process == 0:
+            os.close(given_out)
+            _be_a_shard(session, theirs, _taken(waiting, files))
+        theirs.close()
+        shards[ours] = process
+    os.close(waiting)
+    os.write(given_out, b"".join(n.to_bytes(_INDEX_BYTES, "big") for n in range(len(files))))
+    os.close(given_out)
+    try:
+        _pass_on_reports(session, shards)
+    finally:
+        for process in shards.values():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGTERM)
+            os.waitpid(process, 0)
+
+
+def _taken(waiting: int, files: Sequence[Sequence[pytest.Item]]) -> Iterator[pytest.Item]:
+    """Yield the tests of the files that a shard takes."""
+    while index := os.read(waiting, _INDEX_BYTES):
+        yield from files[int.from_bytes(index, "big")]
+
+
+def _be_a_shard(session: pytest.Session, to: Connection, items: Iterator[pytest.Item]) -> None:
+    """Run tests in a forked process, to its end."""
+    plugins = session.config.pluginmanager
+    plugins.unregister(name="terminalreporter")
+    plugins.register(_Sender(session.config, to))
+    code = 1
+    try:
+        _run_all(items)
+        to.send(None)
+        code = 0
+    finally:
+        # Nothing of what the process that forked has to clean up is this one's to clean up.
+        os._exit(code)
+
+
+def _run_all(items: Iterator[pytest.Item]) -> None:
+    """Run tests; each is told the next one, since fixtures that both share stay."""
+    item = next(items, None)
+    while item is not None:
+        following = next(items, None)
+        item.ihook.pytest_runtest_protocol(item=item, nextitem=following)
+        item = following
+
+
+def _pass_on_reports(session: pytest.Session, shards: dict[Connection, int]) -> None:
+    """Hand the shards' reports to pytest until all shards are done."""
+    hook = session.config.hook
+    at_work = dict.fromkeys(shards, "a first test")
+    while at_work:
+        for shard in wait(list(at_work)):
+            assert isinstance(shard, Connection)
+            try:
+                told: Any = shard.recv()
+            except EOFError:
+                raise pytest.Exit.Exception(f"a shard died in {at_work[shard]}", 3) from None
+            if told is None:
+                del at_work[shard]
+            elif isinstance(told, str):
+                at_work[shard] = told
+            else:
+                report = hook.pytest_report_from_serializable(config=session.config, data=told)
+                hook.pytest_runtest_logreport(report=report)
+        _heed_wish_to_end(session)
+
+
+def _run_here(session: pytest.Session, items: Sequence[pytest.Item]) -> None:
+    for item, following in zip(items, [*items[1:], None], strict=True):
+        item.ihook.pytest_runtest_protocol(item=item, nextitem=following)
+        _heed_wish_to_end(session)
+
+
+def _heed_wish_to_end(session: pytest.Session) -> None:
+    """End as pytest's own loop does, after `-x` say."""
+    if session.shouldfail:
+        raise session.Failed(session.shouldfail)
+    if session.shouldstop:
+        raise session.Interrupted(session.shouldstop)

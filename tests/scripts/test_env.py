@@ -1,0 +1,163 @@
+"""scripts/env.sh, sourced in a checkout of its own whose path has a space."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+SHELLS = [
+    pytest.param(shell, marks=pytest.mark.skipif(not shutil.which(shell), reason=f"no {shell}"))
+    for shell in ("bash", "zsh")
+]
+OURS = ("AMENT_PREFIX_PATH", "PYTHONPATH", "ROS_", "RMW_", "FASTRTPS_", "VIRTUAL_ENV", "PATH=")
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    root = tmp_path / "with a space"
+    (root / "scripts").mkdir(parents=True)
+    shutil.copy(SCRIPTS / "env.sh", root / "scripts")
+    return root
+
+
+@pytest.fixture
+def set_up(checkout: Path) -> Path:
+    (checkout / ".venv").mkdir()
+    (checkout / ".venv" / ".needle-setup").write_text("wheels key key\n")
+    for name in ("needle_one", "needle_two"):
+        index = checkout / "ros2_ws/install" / name / "share/ament_index/resource_index/packages"
+        index.mkdir(parents=True)
+        (index / name).touch()
+    return checkout
+
+
+def shell(name: str, text: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    env = {"PATH": os.environ["PATH"], "HOME": "/nonexistent", **variables}
+    return subprocess.run(
+        [name, "-c", text], check=False, env=env, text=True, capture_output=True, cwd="/"
+    )
+
+
+def sourced(name: str, root: Path, times: int = 1, **variables: str) -> dict[str, str]:
+    source = f". {str(root / 'scripts' / 'env.sh')!r}; "
+    line = f"set -eu; {source * times} env -0"
+    result = shell(name, line, **variables)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+    return dict(item.split("=", 1) for item in result.stdout.split("\0") if "=" in item)
+
+
+@pytest.mark.parametrize("name", SHELLS)
+def test_sets_the_environment_under_strict_options_from_any_folder(name: str, set_up: Path) -> None:
+    env = sourced(name, set_up, LD_LIBRARY_PATH="/elsewhere", _ROS_WHEELS_BOOTSTRAP_COMPLETE="1")
+    assert env["PATH"].split(":")[0] == str(set_up / ".venv/bin")
+    assert set(env["AMENT_PREFIX_PATH"].split(":")) == {
+        str(set_up / "ros2_ws/install/needle_one"),
+        str(set_up / "ros2_ws/install/needle_two"),
+        str(set_up / ".venv"),
+    }
+    assert str(set_up / "ros2_ws/build/needle_two") in env["PYTHONPATH"].split(":")
+    assert env["ROS_PYTHON_CHECK_FIELDS"] == "1"
+    assert env["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+    assert env["RMW_IMPLEMENTATION"] == "rmw_fastrtps_cpp"
+    assert env["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("/needle_fastdds.xml")
+    assert "LD_LIBRARY_PATH" not in env
+    assert "_ROS_WHEELS_BOOTSTRAP_COMPLETE" not in env
+    assert "ROS_DOMAIN_ID" not in env
+
+
+@pytest.mark.parametrize("name", SHELLS)
+def test_sourced_twice_is_as_once(name: str, set_up: Path) -> None:
+    once, twice = sourced(name, set_up), sourced(name, set_up, times=2)
+    assert {k: v for k, v in once.items() if k != "_"} == {
+        k: v for k, v in twice.items() if k != "_"
+    }
+
+
+@pytest.mark.parametrize("name", SHELLS)
+def test_keeps_what_the_user_has_set(name: str, set_up: Path) -> None:
+    env = sourced(
+        name,
+        set_up,
+        ROS_DOMAIN_ID="42",
+        ROS_AUTOMATIC_DISCOVERY_RANGE="SUBNET",
+        PYTHONPATH="/mine:/too",
+    )
+    assert env["ROS_DOMAIN_ID"] == "42"
+    assert env["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SUBNET"
+    assert env["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("/needle_fastdds_network.xml")
+    assert env["PYTHONPATH"].endswith(":/mine:/too")
+
+
+@pytest.mark.parametrize("name", SHELLS)
+def test_profiles_of_the_users_own_stay_and_missing_ones_do_not(name: str, set_up: Path) -> None:
+    own = set_up / "profiles.xml"
+    own.touch()
+    env = sourced(name, set_up, FASTRTPS_DEFAULT_PROFILES_FILE=str(own))
+    assert env["FASTRTPS_DEFAULT_PROFILES_FILE"] == str(own)
+    line = f". {str(set_up / 'scripts' / 'env.sh')!r}; echo $FASTRTPS_DEFAULT_PROFILES_FILE"
+    result = shell(name, line, FASTRTPS_DEFAULT_PROFILES_FILE="/not/there.xml")
+    assert result.stdout.endswith("/needle_fastdds.xml\n")
+    assert result.stderr == (
+        "env.sh: FASTRTPS_DEFAULT_PROFILES_FILE=/not/there.xml ignored: no such file\n"
+    )
+
+
+@pytest.mark.parametrize("name", SHELLS)
+def test_another_middleware_is_named_and_replaced(name: str, set_up: Path) -> None:
+    source = f". {str(set_up / 'scripts' / 'env.sh')!r}"
+    line = f"set -eu; {source}; {source}; echo $RMW_IMPLEMENTATION"
+    result = shell(name, line, RMW_IMPLEMENTATION="rmw_cyclonedds_cpp")
+    assert result.stdout == "rmw_fastrtps_cpp\n"
+    assert result.stderr == (
+        "env.sh: RMW_IMPLEMENTATION=rmw_cyclonedds_cpp ignored: "
+        "the rig's nodes run on rmw_fastrtps_cpp\n"
+    )
+
+
+@pytest.mark.parametrize("name", SHELLS)
+def test_leaves_no_helpers(name: str, set_up: Path) -> None:
+    result = shell(name, f". {str(set_up / 'scripts/env.sh')!r}; set; typeset -f")
+    names = [line.partition("=")[0] for line in result.stdout.splitlines()]
+    assert not [line for line in names if "_needle" in line.split(" ")[0].lower()]
+
+
+@pytest.mark.parametrize("name", SHELLS)
+def test_one_line_where_set_up_has_not_run(name: str, checkout: Path) -> None:
+    result = shell(name, f". {str(checkout / 'scripts/env.sh')!r} || echo code $?")
+    assert result.stdout == "code 1\n"
+    assert result.stderr.splitlines() == [
+        f"env.sh: this checkout is not set up yet (or only half): run {checkout / 'scripts/setup'}"
+    ]
+
+
+def test_wheels_beside_a_sourced_ros_are_refused(set_up: Path) -> None:
+    result = shell(
+        "bash",
+        f". {str(set_up / 'scripts/env.sh')!r}",
+        ROS_DISTRO="jazzy",
+        AMENT_PREFIX_PATH="/opt/ros/jazzy",
+    )
+    assert result.returncode == 1
+    assert "ROS 2 jazzy is sourced" in result.stderr
+
+
+def test_with_ros_its_own_paths_stay_behind_ours(set_up: Path) -> None:
+    (set_up / ".venv" / ".needle-setup").write_text("ros key key\n")
+    env = sourced(
+        "bash",
+        set_up,
+        ROS_DISTRO="jazzy",
+        AMENT_PREFIX_PATH="/opt/ros/jazzy",
+        LD_LIBRARY_PATH="/opt/ros/jazzy/lib",
+    )
+    assert env["AMENT_PREFIX_PATH"].endswith("needle_one:/opt/ros/jazzy")
+    assert env["LD_LIBRARY_PATH"] == "/opt/ros/jazzy/lib"
+    result = shell("bash", f". {str(set_up / 'scripts/env.sh')!r}")
+    assert result.returncode == 1
+    assert "source its setup.bash first" in result.stderr

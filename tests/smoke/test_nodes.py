@@ -1,0 +1,85 @@
+"""Every node as a process: it starts, another one hears it, and it ends when it is told."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+
+from code_lines import ROOT
+from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
+from needle_core.commands.cli import EXIT_DONE, EXIT_INTERRUPTED
+from needle_core.files.installed import find_executable
+from reference.rig_nodes import executables
+
+PATIENCE = 60.0  # [s]
+# What the checkout's environment need not have.
+EXTRAS = {"console": "nicegui", "openigtlink": "pyigtl"}
+
+
+@pytest.fixture
+def listener() -> Iterator[Node]:
+    """Yield a node that is in the graph with those under test."""
+    context = Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("listener", context=context)
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def words(name: str, folder: Path) -> list[str]:
+    """Return what a node cannot do without, and a namespace in which it is alone."""
+    parameters = {
+        "operator": ["source:=joy", "key:=0"],
+        "recorder": [f"bag:={folder / 'bag'}"],
+        "stereo_camera": [f"left:={folder}", f"right:={folder}", "loop:=true"],
+    }
+    if name == "player":
+        return [str(ROOT / "bags" / "regression"), "--loop"]
+    given = [word for parameter in parameters.get(name, ()) for word in ("-p", parameter)]
+    return ["--ros-args", "-r", f"__ns:=/of_{name}", *given]
+
+
+def awaited(condition: Callable[[], bool]) -> bool:
+    """Return whether a condition comes true in time."""
+    until = time.monotonic() + PATIENCE
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.1)
+    return condition()
+
+
+def test_every_node_starts_is_heard_and_ends_on_sigterm(tmp_path: Path, listener: Node) -> None:
+    cv2.imwrite(str(tmp_path / "1.png"), np.zeros((768, 1024), np.uint8))
+    nodes = [
+        NodeProcess(
+            name,
+            [find_executable(package, name), *words(name, tmp_path)],
+            environment=os.environ,
+            log=tmp_path / f"{name}.log",
+        )
+        for package, name, _ in executables("node")
+        if importlib.util.find_spec(EXTRAS.get(name, "rclpy"))
+    ]
+    names = {node.name for node in nodes}
+    try:
+        awaited(lambda: names <= set(listener.get_node_names()))
+        assert names - set(listener.get_node_names()) == set()
+        for node in nodes:
+            node.signal_group(signal.SIGTERM)
+        assert wait_for(nodes, PATIENCE) == []
+    finally:
+        stop(nodes)
+    for node in nodes:
+        assert node.exit_code in (EXIT_DONE, EXIT_INTERRUPTED), node.describe_end()
+        assert "Traceback" not in "".join(node.tail(1000))

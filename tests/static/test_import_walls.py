@@ -1,0 +1,64 @@
+"""The contract that keeps ROS in its rooms must be able to fail."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from grimp import ImportGraph
+
+from import_walls import RosRoomContract
+
+CONFIGURATION = Path(__file__).parents[2] / "pyproject.toml"
+
+
+def broken(importer: str, imported: str) -> list[str]:
+    graph = ImportGraph()
+    for module in (importer, imported):
+        graph.add_module(module, is_squashed="." not in module)
+    graph.add_import(importer=importer, imported=imported, line_number=1, line_contents="")
+    options: dict[str, Any] = {"packages": ["needle_sim", "needle_core"]}
+    contract = RosRoomContract(name="wall", session_options={}, contract_options=options)
+    found: list[str] = contract.check(graph, verbose=False).metadata["broken"]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("importer", "imported"),
+    [
+        ("needle_sim.needle.plant", "rclpy"),
+        ("needle_sim.needle.any_new_module", "geometry_msgs"),
+        ("needle_sim.drives.ros", "rclpy"),
+        ("needle_sim.needle.plant", "std_srvs"),
+        ("needle_sim.needle.plant", "rcl_interfaces"),
+        # Through a module of the room, ROS would be imported all the same.
+        ("needle_sim.needle.plant", "needle_sim.ros.conversions"),
+        ("needle_sim.needle.plant", "needle_core.ros.base_node"),
+    ],
+)
+def test_a_pure_module_that_reaches_for_ros_breaks_the_wall(importer: str, imported: str) -> None:
+    assert broken(importer, imported) == [f"{importer} -> {imported} (line 1)"]
+
+
+@pytest.mark.parametrize(
+    ("importer", "imported"),
+    [
+        ("needle_sim.ros.sim_rig", "rclpy"),
+        ("needle_sim.ros.conversions", "geometry_msgs"),
+        ("needle_sim.ros.sim_rig", "needle_core.ros.parameters"),
+        ("needle_sim.ros.sim_rig", "needle_sim.ros.conversions"),
+        ("needle_sim.needle.plant", "numpy"),
+        ("needle_sim.needle.plant", "needle_core.errors"),
+    ],
+)
+def test_the_rest_is_allowed(importer: str, imported: str) -> None:
+    assert broken(importer, imported) == []
+
+
+def test_every_package_is_behind_the_walls() -> None:
+    sources = CONFIGURATION.parent / "ros2_ws" / "src"
+    text = CONFIGURATION.read_text("utf-8")
+    for package in sources.glob("*/package.xml"):
+        # root_packages, the contract on ROS, and at least one on its neighbours
+        assert text.count(f'"{package.parent.name}"') >= 3

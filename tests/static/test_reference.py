@@ -1,0 +1,143 @@
+"""The reference has every endpoint, parameter, diagnostic and command line that the code has."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+
+from code_lines import ROOT
+from needle_core.settings.parameter_fields import specs
+from reference.command_pages import commands_page, scripts
+from reference.diagnostic_pages import IN_EVERY_NODE, complaints, diagnostics_page
+from reference.endpoints import HEARS, MAKERS, OPEN_ENDED, PUBLISHES, SOURCES
+from reference.markdown import cell, code
+from reference.node_pages import node_page, topics_page
+from reference.rig_nodes import RigNode, executables, rig_nodes
+
+# Of every node or component, or of a command that ends by itself.
+BESIDE_NODES = (
+    "needle_core/ros/base_node.py",
+    "needle_core/ros/component_node.py",
+    "needle_tracker/ros/check_calibration.py",
+)
+
+
+@pytest.fixture(scope="module")
+def nodes() -> list[RigNode]:
+    return rig_nodes()
+
+
+def runtime_modules() -> Iterator[tuple[str, ast.Module]]:
+    """Yield (path below the package's folder, tree) of all modules that a rig runs."""
+    for path in sorted(SOURCES.glob("*/*/**/*.py")):
+        package, below, *_ = path.relative_to(SOURCES).parts
+        if below == package:
+            yield str(path.relative_to(SOURCES / package)), ast.parse(path.read_text("utf-8"))
+
+
+def makers_in(tree: ast.Module) -> Iterator[tuple[str, int, int]]:
+    """Yield (function, first line, last line) of what makes an endpoint."""
+    for part in ast.walk(tree):
+        if isinstance(part, ast.FunctionDef):
+            for call in ast.walk(part):
+                called = getattr(call, "func", None)
+                name = getattr(called, "attr", getattr(called, "id", ""))
+                if isinstance(call, ast.Call) and name in (*MAKERS, "listen"):
+                    yield part.name, call.lineno, call.end_lineno or call.lineno
+
+
+def test_every_place_that_makes_an_endpoint_was_seen_to(nodes: list[RigNode]) -> None:
+    seen = {place for node in nodes for _, noted in node.ways for place in noted.places}
+    missed = [
+        f"{path}:{first}"
+        for path, tree in runtime_modules()
+        if path not in BESIDE_NODES
+        for function, first, last in makers_in(tree)
+        if f"{path}:{function}" not in OPEN_ENDED
+        and not any(file == path and first <= line <= last for file, line in seen)
+    ]
+    assert missed == []
+
+
+def test_what_a_real_run_recorded_is_there_with_its_type(nodes: list[RigNode]) -> None:
+    page = topics_page(nodes)
+    text = (ROOT / "bags/regression/metadata.yaml").read_text("utf-8")
+    recorded = yaml.safe_load(text)["rosbag2_bagfile_information"]["topics_with_message_count"]
+    known = {
+        (end.name if end.name.startswith("/") else f"/{end.name}", end.type_name)
+        for node in nodes
+        for end, _ in node.endpoints(PUBLISHES)
+    }
+    for topic in (each["topic_metadata"] for each in recorded):
+        name, kind = topic["name"], topic["type"].replace("/msg/", "/")
+        # `small_bag` has compressed its images.
+        if name.endswith("/compressed") or name in ("/rosout", "/parameter_events"):
+            continue
+        assert (name, kind) in known
+        assert name == "/diagnostics" or code(kind) in page
+
+
+def test_every_parameter_is_there_with_its_words(nodes: list[RigNode]) -> None:
+    pages = {node.name: node_page(node) for node in nodes}
+    for node in nodes:
+        for name, spec, _ in specs(node.parameters):
+            assert f"| {code(name)} |" in pages[node.name]
+            assert cell(spec.description) in pages[node.name]
+    fields = {name for node in nodes for name, _, _ in specs(node.parameters)}
+    declared = {
+        part.target.id
+        for _, tree in runtime_modules()
+        for part in ast.walk(tree)
+        if isinstance(part, ast.AnnAssign)
+        and isinstance(part.target, ast.Name)
+        and isinstance(part.value, ast.Call)
+        and getattr(part.value.func, "id", "") in ("parameter", "fixed_parameter")
+    }
+    assert declared - fields == set()
+
+
+def test_every_part_and_complaint_of_diagnostics_is_there(nodes: list[RigNode]) -> None:
+    page = diagnostics_page(nodes)
+    parts = {part for node in nodes for part in node.parts} | set(IN_EVERY_NODE)
+    for path, tree in runtime_modules():
+        for call in ast.walk(tree):
+            if not isinstance(call, ast.Call) or getattr(call.func, "attr", "") != "set":
+                continue
+            if "_diagnostics" in ast.unparse(call.func) and isinstance(call.args[0], ast.Constant):
+                assert call.args[0].value in parts, path
+    found = complaints()
+    assert all(cell(code(each.text)) in page for each in found)
+    words = sum(
+        part.attr in ("WARN", "ERROR") and getattr(part.value, "id", "") == "Level"
+        for path, tree in runtime_modules()
+        for part in ast.walk(tree)
+        if isinstance(part, ast.Attribute)
+    )
+    compared = 4  # `is Level.ERROR`, `>= Level.WARN`, `== ...`: nothing is said there
+    assert words - compared <= len(found) <= words
+
+
+def test_every_command_line_is_there(nodes: list[RigNode]) -> None:
+    page = commands_page(nodes)
+    commands = [name for _, name, _ in executables("command")]
+    assert {node.name for node in nodes} == {name for _, name, _ in executables("node")}
+    for name in (*commands, *(f"scripts/{script}" for script in scripts())):
+        _, heading, text = page.partition(f"### {name}\n")
+        assert heading, name
+        assert "usage: " in text.partition("\n###")[0], name
+
+
+def test_the_picture_of_the_graph_is_as_the_nodes_are(nodes: list[RigNode]) -> None:
+    picture = ElementTree.parse(ROOT / "docs/images/graph.svg")
+    by_name = {node.name: node for node in nodes}
+    arrows = [part.attrib for part in picture.iter() if "data-topics" in part.attrib]
+    assert len(arrows) == 5
+    for arrow in arrows:
+        publisher, hearer = by_name[arrow["data-from"]], by_name[arrow["data-to"]]
+        topics = set(arrow["data-topics"].split())
+        assert topics <= {end.name for end, _ in publisher.endpoints(PUBLISHES)}
+        assert topics <= {end.name for end, _ in hearer.endpoints(HEARS)}

@@ -1,0 +1,70 @@
+"""The shape of the tree: modules and folders of a size to be read, and the counter of lines."""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+
+from code_lines import ROOT, code_lines, is_test, modules
+
+LONGEST_MODULE = 400
+MOST_MODULES = 15
+# Docstrings begin with a noun or a verb, not with a clause.
+CLAUSES = {"How", "Nobody", "What", "When", "Where", "Who", "Whoever", "Whose", "Why"}
+SOURCE = '''"""A docstring.
+
+Of three lines.
+"""
+
+# A comment
+X = """A value
+of two lines"""
+
+
+def double(x: int) -> int:  # beside code
+    """Return twice x."""
+
+    return (
+        # a comment within
+        2 * x
+    )
+
+
+class Empty:
+    """Nothing but a docstring."""
+'''
+
+
+def test_a_line_of_code_is_no_blank_comment_or_docstring() -> None:
+    assert code_lines(SOURCE) == 2 + 1 + 3 + 1
+
+
+def test_no_module_is_too_long_to_be_read_at_once() -> None:
+    long = {
+        str(module.relative_to(ROOT)): length
+        for module in modules(ROOT)
+        if (length := len(module.read_text("utf-8").splitlines())) > LONGEST_MODULE
+    }
+    assert not long
+
+
+def test_no_folder_holds_too_many_modules_to_be_found_in() -> None:
+    folders = Counter(module.parent for module in modules(ROOT) if module.name != "__init__.py")
+    full = {
+        str(folder.relative_to(ROOT)): number
+        for folder, number in folders.items()
+        if number > MOST_MODULES
+    }
+    assert not full
+
+
+def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
+    clauses = [
+        f"{module.relative_to(ROOT)}: {text}"
+        for module in modules(ROOT)
+        if not is_test(module, ROOT)
+        for node in ast.walk(ast.parse(module.read_text("utf-8")))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        if (text := (ast.get_docstring(node) or "").partition("\n")[0]).partition(" ")[0] in CLAUSES
+    ]
+    assert clauses == []
