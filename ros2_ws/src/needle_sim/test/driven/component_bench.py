@@ -32,6 +32,7 @@ from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.drive_emulator import DriveEmulator
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 
+_ALL = range(0x800)
 DRIVER, DRIVES = DeviceDriver.name, DriveEmulator.name
 # Events that only a runner knows of reach the driver by topics of the test's own.
 INJECTED = {PortChange: "test/port", Peers: "test/peers"}
@@ -137,21 +138,12 @@ class ComponentBench:
         axes = self.drives.bus.axes(self.runner.now)
         return axes["insertion"].position, axes["rotation"].position
 
-    def sent(self, since: float, *cob_ids: int) -> list[CanFrame]:
-        """Return the driver's frames of these COB-IDs since a time."""
-        return [
-            frame
-            for time, sender, frame in self.frames
-            if time > since and sender == DRIVER and frame.identifier in cob_ids
-        ]
-
-    def driver_frames(self, *cob_ids: int) -> list[tuple[float, CanFrame]]:
-        """Return the driver's frames of these COB-IDs since the mark, with their times."""
+    def sent(self, *cob_ids: int, by: str = DRIVER) -> list[tuple[float, CanFrame]]:
+        """Return frames of these COB-IDs since the mark, with their times."""
         return [
             (time, frame)
             for time, sender, frame in self.frames
-            if time >= self.marked and sender == DRIVER
-            if not cob_ids or frame.identifier in cob_ids
+            if time >= self.marked and sender == by and frame.identifier in (cob_ids or _ALL)
         ]
 
     @staticmethod
@@ -198,14 +190,21 @@ class ComponentBench:
         self.until(lambda: self.state == "DISABLED")
         self.succeed("confirm_needle_out", True)
 
-    def ready(self) -> None:
+    def home(self) -> None:
         self.set_up()
         assert self.call("home").success
-        self.until(lambda: self.person.status["homed"] == "true")
+
+    def arm(self) -> None:
+        """Enable once it is homed, and press the hold."""
+        self.until(lambda: self.person.status["homed"] == "true", 10.0)
         self.succeed("enable", True)
         self.run(0.3)
         self.person.pressed = True
         self.run(0.1)
+
+    def ready(self) -> None:
+        self.home()
+        self.arm()
 
     def step(self, length: float = 0.002, rotation: float = 0.5, duration: float = 1.0) -> None:
         insertion, turn = (
@@ -219,7 +218,8 @@ class ComponentBench:
 
     def moving(self) -> None:
         """Be in the middle of a step."""
-        self.ready()
+        if not self.person.pressed:
+            self.ready()
         begin = self.places[0]
         self.step()
         self.until(lambda: self.places[0] > begin + 0.0005)

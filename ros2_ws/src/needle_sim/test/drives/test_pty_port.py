@@ -1,0 +1,109 @@
+"""The adapter at a pseudo-terminal, reached with python-can, and what is plugged into what."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from needle_core.can_frame import CanFrame
+from needle_core.errors import UserError
+from needle_sim.bus.pty_port import PtyPort
+
+
+@pytest.fixture
+def port(tmp_path: Path) -> Iterator[PtyPort]:
+    port = PtyPort(tmp_path / "can")
+    yield port
+    port.unplug()
+    assert not (tmp_path / "can").is_symlink()
+
+
+def computer(port: PtyPort) -> Any:
+    return can.Bus(interface="slcan", channel=port.path, bitrate=500_000, sleep_after_open=0)
+
+
+def received(port: PtyPort) -> tuple[CanFrame, ...]:
+    """Return the frames that the adapter reads, in however many pieces they come."""
+    frames: tuple[CanFrame, ...] = ()
+    for _ in range(100):
+        frames += port.receive()
+    return frames
+
+
+def test_stock_slcan_exchanges_frames_through_the_port(port: PtyPort) -> None:
+    with computer(port) as bus:
+        bus.send(can.Message(arbitration_id=0x201, data=b"\x0f\0", is_extended_id=False))
+        assert received(port) == (CanFrame(0x201, b"\x0f\0"),)
+        port.send([CanFrame(0x181, b"\x37\2"), CanFrame(0x701, b"\5")])
+        heard = [bus.recv(1.0) for _ in range(2)]
+    assert [(m.arbitration_id, bytes(m.data)) for m in heard if m is not None] == [
+        (0x181, b"\x37\2"),
+        (0x701, b"\5"),
+    ]
+
+
+def test_an_unplugged_adapter_is_an_error_and_comes_back(port: PtyPort) -> None:
+    link = Path(port.path)
+    bus = computer(port)
+    port.unplug()
+    assert not link.is_symlink()
+    assert (port.filenos, port.receive()) == ([], ())
+    port.send([CanFrame(0x181)])
+    with pytest.raises((can.CanError, OSError)):
+        bus.recv(0.01)
+    with pytest.raises((can.CanError, OSError)):
+        bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+    bus.serialPortOrig.close()
+    bus._is_shutdown = True
+    port.plug_in()
+    with computer(port) as bus:
+        bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        assert received(port) == (CanFrame(0x80),)
+
+
+def read(terminal: int, count: int) -> bytes:
+    """Return so many bytes: a terminal hands on what was written in whatever pieces it likes."""
+    data = b""
+    while len(data) < count:
+        data += os.read(terminal, count - len(data))
+    return data
+
+
+def test_closing_the_channel_throws_away_what_waits_and_opening_it_nothing(port: PtyPort) -> None:
+    terminal = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        for words in (b"C\r", b"S6\r", b"O\r"):
+            os.write(terminal, words)
+            port.receive()
+        # Whoever waits at the port was told that there is something to read.
+        assert read(terminal, 3) == b"\r\r\r"
+        port.send([CanFrame(0x181, b"\1")])
+        for words in (b"C\r", b"N\r"):
+            os.write(terminal, words)
+            port.receive()
+        assert read(terminal, 7) == b"\rNSIM1\r"
+    finally:
+        os.close(terminal)
+
+
+def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:
+    file = tmp_path / "can"
+    file.write_text("mine")
+    with pytest.raises(UserError, match="can"):
+        PtyPort(file)
+    assert file.read_text() == "mine"
+    # What a killed emulator leaves leads nowhere, or by now to somebody else's terminal.
+    stale = tmp_path / "stale"
+    stale.symlink_to("/dev/pts/ptmx")
+    port = PtyPort(stale)
+    assert stale.resolve() != Path("/dev/pts/ptmx")
+    with pytest.raises(UserError, match="another emulator"):
+        PtyPort(stale)
+    assert stale.exists()
+    port.unplug()
+    assert list(tmp_path.iterdir()) == [file]
