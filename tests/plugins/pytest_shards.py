@@ -19,16 +19,20 @@ from typing import Any
 
 import pytest
 
+import compile_ahead
 from cpu_budget import CpuBudget
 from left_processes import end_left_processes
 from needle_core.process.ros_domain import own_domain
 
 SHARDS = os.cpu_count() or 1
 # What takes longest is begun first, or one of them would hold up the end of the run.
-LONG = re.compile(r"tests/static/|tests/scenario/|.*_calibration|.*/test/(tracking|studies|curvature)/")
+LONG = re.compile(r"tests/(static|scenario)/|.*/test/(tracking|studies|curvature)/")
 SMOKE = "tests/smoke/"
+WHOLE = 1000
+"""With more tests than this, a run is one of all."""
 _INDEX_BYTES = 4
 _reserved = contextlib.ExitStack()
+_budget = CpuBudget()
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -37,7 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
     # A shell that runs this in the background ignores SIGINT, and all below would, too.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    config.pluginmanager.register(CpuBudget(), "cpu_budget")
+    config.pluginmanager.register(_budget)
 
 
 def pytest_unconfigure() -> None:
@@ -50,6 +54,11 @@ def pytest_runtestloop(session: pytest.Session) -> object:
     """Run the collected tests: in shards, smoke tests afterwards."""
     if session.config.option.collectonly or session.testsfailed:
         return None
+    if len(session.items) > WHOLE:
+        # What a process has to load once counts to no test, and is loaded once for all shards.
+        for part in compile_ahead.PARTS.values():
+            part()
+        _budget.is_enforced = True
     files = _by_file(session.items)
     smoke = [item for file in files if file.startswith(SMOKE) for item in files[file]]
     others = sorted(
@@ -57,7 +66,7 @@ def pytest_runtestloop(session: pytest.Session) -> object:
         key=lambda items: LONG.match(items[0].nodeid) is None,
     )
     _run_in_shards(session, others)
-    _run_here(session, smoke)
+    _run_all(session, iter(smoke))
     return True
 
 
@@ -71,7 +80,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 class _Sender:
-    """What a shard has in place of a terminal: it sends its reports to the process that collected."""
+    """Stands in a shard for the terminal: sends reports to the process that collected."""
 
     def __init__(self, config: pytest.Config, to: Connection) -> None:
         self._config, self._to = config, to
@@ -132,7 +141,7 @@ def _be_a_shard(session: pytest.Session, to: Connection, items: Iterator[pytest.
     plugins.register(_Sender(session.config, to))
     code = 1
     try:
-        _run_all(items)
+        _run_all(session, items)
         to.send(None)
         code = 0
     finally:
@@ -140,12 +149,13 @@ def _be_a_shard(session: pytest.Session, to: Connection, items: Iterator[pytest.
         os._exit(code)
 
 
-def _run_all(items: Iterator[pytest.Item]) -> None:
+def _run_all(session: pytest.Session, items: Iterator[pytest.Item]) -> None:
     """Run tests; each is told the next one, since fixtures that both share stay."""
     item = next(items, None)
     while item is not None:
         following = next(items, None)
         item.ihook.pytest_runtest_protocol(item=item, nextitem=following)
+        _heed_wish_to_end(session)
         item = following
 
 
@@ -159,7 +169,7 @@ def _pass_on_reports(session: pytest.Session, shards: dict[Connection, int]) -> 
             try:
                 told: Any = shard.recv()
             except EOFError:
-                raise pytest.Exit.Exception(f"a shard died in {at_work[shard]}", 3) from None
+                pytest.exit(f"a shard died in {at_work[shard]}", pytest.ExitCode.INTERNAL_ERROR)
             if told is None:
                 del at_work[shard]
             elif isinstance(told, str):
@@ -167,12 +177,6 @@ def _pass_on_reports(session: pytest.Session, shards: dict[Connection, int]) -> 
             else:
                 report = hook.pytest_report_from_serializable(config=session.config, data=told)
                 hook.pytest_runtest_logreport(report=report)
-        _heed_wish_to_end(session)
-
-
-def _run_here(session: pytest.Session, items: Sequence[pytest.Item]) -> None:
-    for item, following in zip(items, [*items[1:], None], strict=True):
-        item.ihook.pytest_runtest_protocol(item=item, nextitem=following)
         _heed_wish_to_end(session)
 
 
