@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_console.console import PAGE, Console, Hand, Lag, PageEvent, View
+from needle_console.console import PAGE, Console, Hand, Lag, PageEvent
 from needle_console.console_parameters import ConsoleParameters
 from needle_console.hold.hold_state import RELEASED, HoldState, Mode
 from needle_console.page.desk import Desk
@@ -23,8 +23,10 @@ from needle_core.component import (
     Exit,
     Input,
     Listen,
+    Log,
     Moment,
     Output,
+    Peers,
     Port,
     Publish,
     Reply,
@@ -38,6 +40,8 @@ from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 INSERT = HoldState(True, 0.5, Mode.INSERT)
 RETRACT = HoldState(True, 0.5, Mode.RETRACT)
+TURN = (0.0, float(np.sin(np.pi / 12)), 0.0, float(np.cos(np.pi / 12)))
+"""By 30 degrees, as a plane's that rises inwards."""
 PERIOD = 0.02
 
 
@@ -50,17 +54,13 @@ class Page(Component):
         self.hand = RELEASED
         self.refused: dict[str, int] = {}
         self.wishes: list[PageEvent] = []
-        self.shown: list[Any] = []
+        self.snapshot = Snapshot()
         self.is_served = True
         self.ports = (Port(PAGE, self._see),)
         self.timers = (Timer(PERIOD, self._tell),)
 
-    @property
-    def snapshot(self) -> Snapshot:
-        return [shown for shown in self.shown if isinstance(shown, Snapshot)][-1]
-
     def _see(self, batch: Sequence[Any], at: Moment) -> Actions:
-        self.shown += batch
+        (self.snapshot,) = batch
         return ()
 
     def _tell(self, at: Moment) -> Actions:
@@ -76,7 +76,6 @@ class Rig(Component):
 
     def __init__(self) -> None:
         self.holds: list[m.HoldState] = []
-        self.targets: list[Any] = []
         self.calls: list[tuple[str, bool | None]] = []
         self.health: list[m.Status] = []
         self.device = {"state": "HOLDING", "activity": "none", "hold_owner": ""}
@@ -84,14 +83,11 @@ class Rig(Component):
         self.takes = True
         self.inputs = (
             Input("device/hold", m.HoldState, self._on_hold),
-            Input("target_plane", m.Pose, self._on_target, LATCHED),
-            Input("target_point", m.Point, self._on_target, LATCHED),
             Input("/diagnostics", m.Diagnostics, self._on_health),
         )
         self.outputs = (
             Output("device/status", DeviceStatus, LATCHED),
             Output("needle/controller_status", ControllerStatus, LATCHED),
-            Output("stereo/left/image_raw", m.Image),
         )
         self.services = tuple(
             Service(name, self._serve(name), has_argument="enable" in name or "confirm" in name)
@@ -106,9 +102,6 @@ class Rig(Component):
         )
         self.timers = (Timer(PERIOD, self._report),)
 
-    def level(self) -> Level:
-        return self.health[-1].level
-
     def _serve(self, name: str) -> Any:
         def serve(argument: bool | None, number: int, at: Moment) -> Actions:
             self.calls.append((name, argument))
@@ -120,10 +113,6 @@ class Rig(Component):
         self.holds.append(message)
         return ()
 
-    def _on_target(self, message: Any, at: Moment) -> Actions:
-        self.targets.append(message)
-        return ()
-
     def _on_health(self, message: m.Diagnostics, at: Moment) -> Actions:
         self.health += message.statuses
         return ()
@@ -131,27 +120,6 @@ class Rig(Component):
     def _report(self, at: Moment) -> Actions:
         yield Publish("device/status", DeviceStatus.parse(self.device))
         yield Publish("needle/controller_status", ControllerStatus.parse(self.controller))
-        image = m.Image(at.stamp_ns, "left", 2, 3, "mono8", 4, bytes(range(8)))
-        yield Publish("stereo/left/image_raw", image)
-
-
-class Taken:
-    """A desk, its clock, and what it hands over."""
-
-    def __init__(self) -> None:
-        self.now = 10.0
-        self.batches: list[Any] = []
-        self.desk = Desk(ConsoleParameters(), lambda: self.now)
-        self.desk.open(self.batches.append)
-
-    def events(self) -> list[PageEvent]:
-        """Return what is handed over now."""
-        batches = [batch() for batch in self.batches]
-        self.batches.clear()
-        return [event for batch in batches for event in batch]
-
-    def hands(self) -> list[HoldState]:
-        return [event.state for event in self.events() if isinstance(event, Hand)]
 
 
 class Scene:
@@ -159,18 +127,18 @@ class Scene:
 
     def __init__(self) -> None:
         self.page, self.rig = Page(), Rig()
-        console = Console(ConsoleParameters())
-        self.runner = VirtualRunner([console, self.page, self.rig])
-        self.forward(1.0)
-
-    def forward(self, seconds: float) -> None:
-        self.runner.run(seconds)
+        self.runner = VirtualRunner([Console(ConsoleParameters()), self.page, self.rig])
+        self.runner.run(1.0)
 
     def holds(self, seconds: float) -> list[m.HoldState]:
         """Return what is heard of the hold meanwhile."""
         begin = len(self.rig.holds)
-        self.forward(seconds)
+        self.runner.run(seconds)
         return self.rig.holds[begin:]
+
+    def wish(self, *events: PageEvent) -> None:
+        self.page.wishes = list(events)
+        self.runner.run(0.3)
 
 
 @pytest.fixture
@@ -184,29 +152,30 @@ def test_a_hold_is_told_as_it_comes_and_ends_with_its_lifetime(scene: Scene) -> 
     assert len(holds) == pytest.approx(1.0 / PERIOD, abs=2)
     last = holds[-1]
     assert (last.source, last.pressed, last.speed_scale) == ("console", True, 0.5)
-    assert last.lifetime == m.HOLD_LIFETIME
+    # The promise of docs/safety.md.
+    assert last.lifetime == m.HOLD_LIFETIME == 0.1
     # The component repeats nothing by itself: a page's server that is gone holds no longer.
     scene.page.is_served = False
-    scene.forward(PERIOD)
+    scene.runner.run(PERIOD)
     assert scene.holds(1.0) == []
 
 
-def test_a_release_is_told_at_once_and_counts_increase(scene: Scene) -> None:
+def test_a_release_is_told_at_once_and_no_press_that_had_to_wait(scene: Scene) -> None:
     scene.page.hand = INSERT
-    scene.forward(0.5)
+    scene.runner.run(0.5)
     scene.page.hand = RELEASED
-    holds = scene.holds(2.0 * PERIOD)
-    assert not holds[-1].pressed
-    assert holds[-1].speed_scale == 0.0
-    scene.page.wishes = [Hand(INSERT), Hand(RELEASED), Hand(INSERT)]
-    scene.forward(0.5)
+    last = scene.holds(2.0 * PERIOD)[-1]
+    assert (last.pressed, last.speed_scale) == (False, 0.0)
+    begin = len(scene.rig.holds)
+    scene.wish(Hand(INSERT), Hand(RELEASED), Hand(INSERT))
+    assert not any(hold.pressed for hold in scene.rig.holds[begin:])
     counts = [hold.count for hold in scene.rig.holds]
     assert counts == sorted(set(counts))
 
 
 def test_a_retraction_waits_for_the_end_of_steering_and_is_called_once(scene: Scene) -> None:
     scene.rig.controller["state"] = "STEERING"
-    scene.forward(0.1)
+    scene.runner.run(0.1)
     scene.page.hand = RETRACT
     assert not any(hold.pressed or hold.speed_scale for hold in scene.holds(0.5))
     assert scene.rig.calls == [("plane_controller/stop", None)]
@@ -216,20 +185,8 @@ def test_a_retraction_waits_for_the_end_of_steering_and_is_called_once(scene: Sc
     assert scene.rig.calls[1:] == [("device/retract", None)]
 
 
-def test_a_controller_that_is_gone_keeps_no_needle_in() -> None:
-    console, page = Console(ConsoleParameters()), Page()
-    runner = VirtualRunner([console, page])
-    steering = ControllerStatus(state="STEERING")
-    at = Moment(0.0, 1)
-    row = next(row for row in console.inputs if row.topic == "needle/controller_status")
-    assert list(row.handler(steering, at)) == []
-    runner.run(0.5)
-    assert page.snapshot.controller is None
-
-
 def test_buttons_call_their_services_and_answers_are_shown(scene: Scene) -> None:
-    scene.page.wishes = [Button.CONFIRM, Button.SWITCH_OFF, Button.STOP]
-    scene.forward(0.2)
+    scene.wish(Button.CONFIRM, Button.SWITCH_OFF, Button.STOP)
     assert set(scene.rig.calls) == {
         ("device/confirm_needle_out", True),
         ("device/enable", False),
@@ -237,108 +194,175 @@ def test_buttons_call_their_services_and_answers_are_shown(scene: Scene) -> None
     }
     assert scene.page.snapshot.answer.endswith(": as asked")
     scene.rig.takes = False
-    scene.page.wishes = [Button.START]
-    scene.forward(0.3)
-    assert scene.page.snapshot.answer == "plane_controller/start: refused: not now"
-    scene.page.wishes = [Button.HOME]
-    scene.forward(0.3)
-    assert scene.page.snapshot.answer == "device/home: no server"
+    for button, answer in (
+        (Button.START, "plane_controller/start: refused: not now"),
+        (Button.HOME, "device/home: no server"),
+    ):
+        scene.wish(button)
+        assert scene.page.snapshot.answer == answer
 
 
 def test_the_hands_server_that_falls_silent_is_named(scene: Scene) -> None:
     scene.page.refused = {"foreign Host": 3}
-    scene.forward(1.5)
-    assert scene.rig.health[-1].values == {"refused foreign Host": "3"}
-    assert scene.rig.level() == Level.OK
-    scene.page.is_served = False
-    scene.forward(3.0)
-    assert scene.rig.level() == Level.ERROR
+    for served, seconds, level in ((True, 1.5, Level.OK), (False, 3.0, Level.ERROR)):
+        scene.page.is_served = served
+        scene.runner.run(seconds)
+        last = scene.rig.health[-1]
+        assert (last.level, last.values) == (level, {"refused foreign Host": "3"})
     scene.page.is_served = True
-    scene.forward(0.2)
-    assert scene.rig.level() == Level.OK
-
-
-def test_targets_and_images_go_through(scene: Scene) -> None:
-    taken = Taken()
-    taken.desk.send_plane(plane_pose(4.0, 30.0))
-    taken.desk.send_point(target_point(10.0, -5.0, 100.0))
-    scene.page.wishes = taken.events()
-    scene.forward(0.3)
-    plane, point = scene.rig.targets
-    assert plane.orientation == pytest.approx((0.0, np.sin(np.pi / 12), 0.0, np.cos(np.pi / 12)))
-    assert point == m.Point(0, "rig", (0.01, -0.005, 0.1))
-    views = [shown for shown in scene.page.shown if isinstance(shown, View)]
-    assert views[-1].side == "left"
-    # What pads a row is left out.
-    assert views[-1].image.tolist() == [[0, 1, 2], [4, 5, 6]]
+    scene.runner.run(0.2)
+    assert scene.rig.health[-1].level == Level.OK
 
 
 def test_a_simulation_that_lags_is_named_while_it_does(scene: Scene) -> None:
     for seconds in (0.0, 0.01, 1.0):
         assert scene.page.snapshot.troubles == ()
-        scene.page.wishes = [Lag(seconds)]
-        scene.forward(0.3)
+        scene.wish(Lag(seconds))
     (text,) = scene.page.snapshot.troubles
     assert "1.0 s behind the clock" in text
     # It lags no more than it did.
-    scene.forward(2.0)
-    scene.page.wishes = [Lag(1.0)]
-    scene.forward(2.0)
+    scene.runner.run(2.0)
+    scene.wish(Lag(1.0))
+    scene.runner.run(2.0)
     assert scene.page.snapshot.troubles == ()
 
 
-# ---- the desk, with its own clock ---------------------------------------------------------------
+# ---- the component, called directly --------------------------------------------------------------
 
 
-def test_of_holds_that_wait_the_newest_counts_unless_one_was_a_release() -> None:
-    taken = Taken()
-    for state in (RETRACT, INSERT):
-        taken.desk.hold(state)
-    assert taken.hands() == [INSERT]
-    assert taken.hands() == []
-    for state in (INSERT, RELEASED, INSERT):
-        taken.desk.hold(state)
-    assert taken.hands() == [RELEASED]
-    taken.desk.hold(INSERT)
-    assert taken.hands() == [INSERT]
+class Bench:
+    """A console, and the desk of its page with a clock of its own."""
+
+    def __init__(self) -> None:
+        self.now = 10.0
+        self.console = Console(ConsoleParameters())
+        self.desk = Desk(ConsoleParameters(), lambda: self.now)
+        self._batches: list[Any] = []
+        self.desk.open(self._batches.append)
+
+    def hear(self, topic: str, message: Any) -> list[Any]:
+        (row,) = (row for row in self.console.inputs if row.topic == topic)
+        return list(row.handler(message, self.at))
+
+    def events(self) -> list[PageEvent]:
+        """Return what the desk hands over now."""
+        batches, self._batches[:] = [batch() for batch in self._batches], []
+        return [event for batch in batches for event in batch]
+
+    def hands(self) -> list[HoldState]:
+        return [event.state for event in self.events() if isinstance(event, Hand)]
+
+    def take(self) -> list[Any]:
+        """Let the console take what the desk hands over; return what it does."""
+        (port,) = self.console.ports
+        return list(port.handler(self.events(), self.at))
+
+    def snapshot(self) -> Snapshot:
+        (sent,) = self.console.timers[0].handler(self.at)
+        assert isinstance(sent, Send)
+        self.desk.send(sent.batch)
+        return self.desk.snapshot()
+
+    @property
+    def at(self) -> Moment:
+        return Moment(self.now, 1)
 
 
-def test_a_hold_that_has_waited_for_longer_than_it_counts_is_a_release() -> None:
-    taken = Taken()
-    taken.desk.hold(INSERT)
-    taken.now += m.HOLD_LIFETIME
-    assert taken.hands() == [INSERT]
-    taken.desk.hold(INSERT)
-    taken.now += 1.01 * m.HOLD_LIFETIME
-    assert taken.hands() == [RELEASED]
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
 
 
-def test_wishes_of_pages_that_nobody_takes_are_not_piled_up() -> None:
-    taken = Taken()
+def test_what_is_heard_of_the_rig_is_shown_in_its_frames_only(bench: Bench) -> None:
+    flat = tuple(np.diag([1e-8, 2e-8, 3e-8, 0.0, 0.0, 0.0]).ravel())
+    bench.hear("joint_states", m.JointState(1, (m.ROTATION_JOINT, m.INSERTION_JOINT), (2.0, 0.01)))
+    for frame, x in (("rig", 0.004), ("left_camera", 0.4)):
+        bench.hear("target_plane", m.Pose(0, frame, (x, 0.0, 0.0), TURN))
+        bench.hear("needle/tip_pose", m.PoseWithCovariance(1, frame, (x, 0.0, 0.01), TURN, flat))
+    bench.hear("needle/controller_status", ControllerStatus(state="STEERING"))
+    for frame in ("target_plane", "rig"):
+        estimate = m.PoseWithCovariance(1, frame, (0.0, 0.0, 0.01), TURN, flat)
+        bench.hear("needle/estimate", estimate)
+    sick = m.Status("sim_rig", "loop", Level.WARN, "slow", {})
+    bench.hear("/diagnostics", m.Diagnostics(1, (sick,)))
+    shown = bench.snapshot()
+    assert (shown.insertion, shown.rotation) == (0.01, 2.0)
+    assert shown.tip is not None
+    assert shown.tip.position == pytest.approx([0.004, 0.0, 0.01])
+    assert np.diag(shown.tip.covariance) == pytest.approx([1e-8, 2e-8, 3e-8])
+    assert shown.T_rig_plane[:3, :3] == pytest.approx(plane_pose(0.0, 30.0)[:3, :3])
+    assert shown.T_rig_plane[:3, 3] == pytest.approx([0.004, 0.0, 0.0])
+    (point,) = shown.course
+    assert point.position == pytest.approx([0.004 + 0.005, 0.0, 0.01 * np.sqrt(0.75)])
+    assert shown.troubles == ("sim_rig: loop: slow",)
+    # One that was killed while it steered must not keep the needle in.
+    assert list(bench.console.on_peers(Peers(), bench.at)) == []
+    assert bench.snapshot().controller is None
+
+
+def test_a_whole_image_is_shown_without_what_pads_its_rows(bench: Bench) -> None:
+    def shown(encoding: str, step: int, size: int) -> list[Any]:
+        image = m.Image(1, "left", 2, 3, encoding, step, bytes(range(size)))
+        return bench.hear("stereo/left/image_raw", image)
+
+    (sent,) = shown("mono8", 4, 8)
+    (view,) = sent.batch
+    assert (view.side, view.image.tolist()) == ("left", [[0, 1, 2], [4, 5, 6]])
+    for wrong in (("mono8", 4, 7), ("mono8", 2, 4), ("h264", 4, 8)):
+        assert shown(*wrong) == []
+
+
+def test_targets_and_lines_for_the_log_go_through(bench: Bench) -> None:
+    bench.desk.send_plane(plane_pose(4.0, 30.0))
+    bench.desk.send_point(target_point(10.0, -5.0, 100.0))
+    bench.desk.notice("a line")
+    plane, point, line = bench.take()
+    assert plane.message.orientation == pytest.approx(TURN)
+    assert point == Publish("target_point", m.Point(0, "rig", (0.01, -0.005, 0.1)))
+    assert line == Log("warning", "a line")
+
+
+def test_of_holds_that_wait_the_newest_counts_unless_one_was_a_release(bench: Bench) -> None:
+    for states, counts in (
+        ((RETRACT, INSERT), INSERT),
+        ((INSERT, RELEASED, INSERT), RELEASED),
+        ((INSERT,), INSERT),
+    ):
+        for state in states:
+            bench.desk.hold(state)
+        assert bench.hands() == [counts]
+        assert bench.hands() == []
+
+
+def test_a_hold_that_has_waited_for_longer_than_it_counts_is_a_release(bench: Bench) -> None:
+    for share, counts in ((0.99, INSERT), (1.01, RELEASED)):
+        bench.desk.hold(INSERT)
+        bench.now += share * m.HOLD_LIFETIME
+        assert bench.hands() == [counts]
+
+
+def test_wishes_of_pages_that_nobody_takes_are_not_piled_up(bench: Bench) -> None:
     for _ in range(1000):
-        taken.desk.press(Button.HOME)
-    assert 0 < len(taken.events()) < 100
-    assert taken.events() == []
+        bench.desk.press(Button.HOME)
+    assert 0 < len(bench.events()) < 100
+    assert bench.events() == []
 
 
-def test_images_are_wanted_while_a_page_asks_for_views() -> None:
-    console = Console(ConsoleParameters())
-    (port,) = console.ports
-    taken = Taken()
-
+def test_images_are_wanted_while_a_page_asks_for_views(bench: Bench) -> None:
     def listens(actions: Actions) -> dict[str, bool]:
         return {act.topic: act.on for act in actions if isinstance(act, Listen)}
 
     both = ("stereo/left/image_raw", "stereo/right/image_raw")
-    taken.desk.picture("left")
-    assert listens(port.handler(taken.events(), Moment(5.0, 1))) == dict.fromkeys(both, True)
-    check = console.timers[1].handler
-    assert listens(check(Moment(6.9, 1))) == {}
-    assert listens(check(Moment(7.1, 1))) == dict.fromkeys(both, False)
+    bench.desk.picture("left")
+    assert listens(bench.take()) == dict.fromkeys(both, True)
+    assert {row.topic for row in bench.console.inputs if row.lazy} == {*both}
+    check = bench.console.timers[1].handler
+    assert listens(check(Moment(11.9, 1))) == {}
+    assert listens(check(Moment(12.1, 1))) == dict.fromkeys(both, False)
 
 
-def test_its_end_releases_the_hold() -> None:
-    release, end = Console(ConsoleParameters()).on_stop(Moment(5.0, 1))
+def test_its_end_releases_the_hold(bench: Bench) -> None:
+    release, end = bench.console.on_stop(bench.at)
     assert isinstance(release, Publish)
     assert not release.message.pressed
     assert end == Exit(0)

@@ -126,8 +126,5 @@ class HoldArbiter:
         """Return why a page may only watch, and stop; empty: it may hold."""
         if why := self._why_not(self._pages[page].is_local):
             return why
-        is_free = self._owner in (None, page) or self._owner_is_idle(now)
+        is_free = self._owner in (None, page) or now - self._held_at > IDLE
         return "" if is_free else OTHER_PAGE
-
-    def _owner_is_idle(self, now: float) -> bool:
-        return not self.state(now).pressed and now - self._held_at > IDLE

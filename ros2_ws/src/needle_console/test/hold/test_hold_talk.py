@@ -1,4 +1,4 @@
-"""What pages are told of their hold, whatever is done first after a stall."""
+"""What pages and the taker of their hold are told, and when."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from needle_console.hold.hold_state import HoldState
-from needle_console.hold.hold_talk import HoldTalk
+from needle_console.hold.hold_arbiter import SILENCE
+from needle_console.hold.hold_state import RELEASED, HoldState
+from needle_console.hold.hold_talk import ALONE_PERIOD, PERIOD, HoldTalk
 from needle_console.hold.page_session import ECHO_AGE_LIMIT
 
 
@@ -17,8 +18,11 @@ class Scene:
 
     def __init__(self) -> None:
         self.states: list[HoldState] = []
-        self.talk = HoldTalk(lambda _: "", self.states.append, lambda _: None, 0.0)
-        self.page = self.talk.open(0.0, is_local=True)
+        self.notices: list[str] = []
+        self.talk = HoldTalk(lambda _: "", self.states.append, self.notices.append, 0.0)
+
+    def come(self, now: float) -> None:
+        self.page = self.talk.open(now, is_local=True)
 
     def told(self, now: float) -> dict[str, Any]:
         told: dict[str, Any] = json.loads(self.talk.word_for(self.page, now))
@@ -29,10 +33,17 @@ class Scene:
         message = {"count": count, "pressed": pressed, "speed": 0.5, "mode": "insert"}
         self.talk.hear(self.page, json.dumps(message), now)
 
+    def look_until(self, now: float, end: float) -> float:
+        """Look as often as the talk asks for; return when it would look next."""
+        while now < end:
+            now = self.talk.look(now)
+        return now
+
 
 @pytest.mark.parametrize("first", ["word", "message", "look"])
 def test_after_a_stall_the_page_is_told_why_its_hold_has_ended(first: str) -> None:
     scene = Scene()
+    scene.come(0.0)
     scene.say(False, 1.0)
     scene.say(True, 1.0)
     assert scene.states[-1].pressed
@@ -47,3 +58,47 @@ def test_after_a_stall_the_page_is_told_why_its_hold_has_ended(first: str) -> No
     assert scene.talk.refusals.counts()["hold lost"] == 1
     scene.talk.look(now)
     assert not scene.states[-1].pressed
+
+
+def test_the_hold_is_handed_on_every_20_ms_and_without_a_page_every_80_ms() -> None:
+    scene = Scene()
+    now = scene.look_until(0.0, 1.0)
+    assert set(scene.states) == {RELEASED}
+    assert len(scene.states) == pytest.approx(1.0 / ALONE_PERIOD, abs=1)
+    # The first page is not kept waiting for the slower look.
+    now += 0.1 * PERIOD - ALONE_PERIOD
+    scene.come(now)
+    assert scene.talk.look(now) <= now + PERIOD
+    scene.states.clear()
+    scene.look_until(now, now + 1.0)
+    assert len(scene.states) == pytest.approx(1.0 / PERIOD, abs=1)
+
+
+def test_a_hold_is_handed_on_at_once_when_it_begins_runs_out_or_its_page_goes() -> None:
+    scene = Scene()
+    scene.come(0.0)
+    for end in ("silence", "close"):
+        begin = scene.look_until(0.0, 1.0) if end == "silence" else 2.0
+        scene.say(False, begin)
+        scene.say(True, begin)
+        assert scene.states[-1] == HoldState(True, 0.5, scene.states[-1].mode)
+        if end == "close":
+            scene.talk.close(scene.page, begin)
+        else:
+            scene.look_until(begin, begin + ECHO_AGE_LIMIT)
+            assert scene.states[-1].pressed
+            now = scene.look_until(begin, begin + ECHO_AGE_LIMIT + 1e-9)
+            assert now <= begin + ECHO_AGE_LIMIT + 1e-3
+            scene.talk.look(now)
+        assert scene.states[-1] == RELEASED
+
+
+def test_what_is_refused_or_lost_is_counted_and_logged_once() -> None:
+    scene = Scene()
+    scene.come(0.0)
+    for _ in range(3):
+        scene.talk.hear(scene.page, "{", 0.0)
+    assert not scene.talk.has_lost(scene.page, SILENCE)
+    assert scene.talk.has_lost(scene.page, SILENCE + 1.0)
+    assert scene.talk.refusals.counts() == {"message not understood": 3, "silent page": 1}
+    assert scene.notices == ["hold: message not understood", "hold: silent page"]

@@ -38,6 +38,8 @@ def test_a_needle_that_is_out_already_leaves_no_hold() -> None:
     assert retraction.update(OUT, 0.0, steering=False, hold_counts=True) == Todo(True, (RETRACT,))
     assert retraction.update(OUT, 0.9, steering=False, hold_counts=True) == Todo(True)
     assert retraction.update(OUT, 1.1, steering=False, hold_counts=True) == Todo(False)
+    # A controller that steers meanwhile is left alone: nothing is held that it could answer.
+    assert retraction.update(OUT, 1.2, steering=True, hold_counts=False) == Todo(False)
 
 
 def test_steering_that_begins_meanwhile_gets_no_hold() -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
-
-import pytest
 
 from needle_console.view.advice import Button, advise, usable_buttons
 from needle_console.view.snapshot import Snapshot
@@ -15,43 +14,46 @@ ENABLED = DeviceStatus(state="HOLDING", homed=True)
 STEERING = ControllerStatus(state="STEERING")
 
 
-@pytest.mark.parametrize(
-    ("snapshot", "button"),
-    [
-        (Snapshot(), None),
-        (Snapshot(DISABLED), None),
-        (Snapshot(DISABLED, insertion=0.0), Button.CONFIRM),
-        (
-            Snapshot(DeviceStatus(state="DISABLED", needle_out_confirmed=True), insertion=0.0),
-            Button.HOME,
-        ),
-        (Snapshot(DeviceStatus(state="MOVING", activity="homing")), None),
-        (Snapshot(DeviceStatus(state="DISABLED", homed=True), insertion=0.0), Button.ENABLE),
-        (Snapshot(ENABLED, ControllerStatus(state="IDLE"), insertion=0.0), Button.START),
-        (Snapshot(ENABLED, STEERING, insertion=0.0), Button.INSERT),
-        (Snapshot(DeviceStatus(state="MOVING", activity="step"), STEERING), None),
-        (Snapshot(ENABLED, ControllerStatus(state="DONE"), insertion=0.12), Button.RETRACT),
-        (Snapshot(ENABLED, ControllerStatus(state="IDLE"), insertion=0.05), Button.RETRACT),
-        (Snapshot(DeviceStatus(state="HOLDING"), insertion=0.03), Button.RETRACT),
-        (Snapshot(DeviceStatus(state="FAULT", fault="following_error")), Button.RESET),
-        (Snapshot(DeviceStatus(state="ESTOPPED")), Button.RESET),
-    ],
-)
-def test_a_run_is_led_from_button_to_button(snapshot: Snapshot, button: Button | None) -> None:
-    advice = advise(snapshot, "console")
-    assert advice.button is button
-    assert advice.headline
-    assert advice.text
-    assert button is None or button in usable_buttons(snapshot)
+STEPS = [
+    (Snapshot(), None),
+    (Snapshot(DISABLED), None),
+    (Snapshot(DISABLED, insertion=0.0), Button.CONFIRM),
+    (
+        Snapshot(DeviceStatus(state="DISABLED", needle_out_confirmed=True), insertion=0.0),
+        Button.HOME,
+    ),
+    (Snapshot(DeviceStatus(state="MOVING", activity="homing")), None),
+    (Snapshot(DeviceStatus(state="DISABLED", homed=True), insertion=0.0), Button.ENABLE),
+    (Snapshot(ENABLED, ControllerStatus(state="IDLE"), insertion=0.0), Button.START),
+    (Snapshot(ENABLED, STEERING, insertion=0.0), Button.INSERT),
+    (Snapshot(DeviceStatus(state="MOVING", activity="step"), STEERING), None),
+    (Snapshot(ENABLED, ControllerStatus(state="DONE"), insertion=0.12), Button.RETRACT),
+    (Snapshot(ENABLED, ControllerStatus(state="IDLE"), insertion=0.05), Button.RETRACT),
+    (Snapshot(ENABLED, ControllerStatus(state="FAULT"), insertion=0.05), Button.RETRACT),
+    (Snapshot(ENABLED, ControllerStatus(state="FAULT"), insertion=0.0), Button.START),
+    (Snapshot(DeviceStatus(state="HOLDING"), insertion=0.03), Button.RETRACT),
+    (Snapshot(DeviceStatus(state="FAULT", fault="following_error")), Button.RESET),
+    (Snapshot(DeviceStatus(state="ESTOPPED")), Button.RESET),
+]
 
 
-def test_a_fault_is_named() -> None:
-    advice = advise(Snapshot(DeviceStatus(state="FAULT", fault="[reply_age] no reply")), "console")
-    assert "[reply_age] no reply" in advice.headline
+def test_a_run_is_led_from_button_to_button() -> None:
+    for snapshot, button in STEPS:
+        assert advise(snapshot, "console").button is button, snapshot
+
+
+def test_faults_and_who_holds_are_named() -> None:
+    waits = ControllerStatus(state="WAITING_FOR_TIP", reason="too dark")
+    for snapshot, words in (
+        (Snapshot(DeviceStatus(state="FAULT", fault="[reply_age] no reply")), "[reply_age] no rep"),
+        (Snapshot(ENABLED, waits, insertion=0.0), "too dark"),
+        (Snapshot(dataclasses.replace(ENABLED, hold_owner="pedal"), STEERING, 0.0), "pedal"),
+    ):
+        assert words in advise(snapshot, "console").headline
 
 
 def test_a_press_that_does_not_count_is_told_to_whose_it_is() -> None:
-    device = DeviceStatus(state="HOLDING", homed=True, press_again="console")
+    device = dataclasses.replace(ENABLED, press_again="console")
     snapshot = Snapshot(device, STEERING, insertion=0.01)
     assert "press and hold again" in advise(snapshot, "console").text
     assert "press and hold again" not in advise(snapshot, "pedal").text
@@ -59,10 +61,8 @@ def test_a_press_that_does_not_count_is_told_to_whose_it_is() -> None:
 
 def test_every_state_has_words_and_no_button_that_cannot_be_pressed() -> None:
     states = ("UNCONFIGURED", "DISABLED", "HOLDING", "MOVING", "FAULT", "ESTOPPED", "NEW")
-    controllers = (
-        None,
-        *(ControllerStatus(state=state) for state in ("IDLE", *_STEERING, "DONE", "FAULT")),
-    )
+    steered = ("IDLE", "STEERING", "WAITING_FOR_TIP", "DONE", "FAULT")
+    controllers = (None, *(ControllerStatus(state=state) for state in steered))
     booleans = (False, True)
     for state, controller, homed, out in itertools.product(states, controllers, booleans, booleans):
         device = DeviceStatus(state=state, homed=homed, needle_out_confirmed=out)
@@ -71,6 +71,3 @@ def test_every_state_has_words_and_no_button_that_cannot_be_pressed() -> None:
         assert advice.headline
         assert advice.text
         assert advice.button is None or advice.button in usable_buttons(snapshot), snapshot
-
-
-_STEERING = ("STEERING", "WAITING_FOR_TIP")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 from xml.etree import ElementTree
 
 import cv2
@@ -14,20 +15,13 @@ from needle_console.view.chart import chart
 from needle_console.view.dial import dial
 from needle_console.view.overlay import draw_view
 from needle_console.view.snapshot import CoursePoint, SeenTip, Snapshot
-from needle_console.view.space import (
-    ellipsoid,
-    plane_centre,
-    plane_rotation,
-    shaft_points,
-    to_view,
-)
+from needle_console.view.space import ellipsoid, plane_centre, plane_rotation, shaft_points, to_view
 from needle_console.view.targets import plane_pose, target_point
 from needle_core.errors import UserError
-from needle_core.files.installed import find_shared
-from needle_tracker.optics.calibration import load_calibration
-from needle_tracker.optics.refraction import RefractedCamera, stereo_views
+from needle_core.status_messages import ControllerStatus
 
 COVARIANCE = np.diag([4e-8, 1e-8, 9e-8])
+TIP = SeenTip(np.array([0.002, 0.001, 0.06]), COVARIANCE, 0.0)
 
 
 def course(*depths: float) -> tuple[CoursePoint, ...]:
@@ -37,44 +31,47 @@ def course(*depths: float) -> tuple[CoursePoint, ...]:
     )
 
 
-@pytest.fixture(scope="module")
-def left() -> RefractedCamera:
-    path = find_shared("needle_tracker", "config/calibration.yaml")
-    return stereo_views(load_calibration(path))[0]
+class Camera:
+    """Sees x upwards and z to the right; what lies behind the entry not at all."""
+
+    def __init__(self) -> None:
+        self.camera, self.width, self.height = self, 1280, 960
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        u, v = 100.0 + 8000.0 * points[:, 2], 480.0 - 8000.0 * points[:, 0]
+        return np.column_stack([np.where(u < 0.0, math.nan, u), v])
 
 
-def decoded(jpeg: bytes) -> np.ndarray:
+def view(snapshot: Snapshot, camera: Any, size: tuple[int, int]) -> np.ndarray:
+    """Return what is drawn into a black image of a size (height, width)."""
+    jpeg = draw_view(np.zeros(size, np.uint8), snapshot, camera)
     return np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), dtype=float)
 
 
-def test_shaft_and_tip_are_drawn_where_the_camera_sees_them(left: RefractedCamera) -> None:
-    tip = SeenTip(np.array([0.002, 0.001, 0.06]), COVARIANCE, 0.0)
-    snapshot = Snapshot(insertion=1.0, tip=tip, course=course(0.02, 0.04))
-    black = np.zeros((left.camera.height, left.camera.width), np.uint8)
-    picture = decoded(draw_view(black, snapshot, left))
+def test_shaft_tip_and_target_are_drawn_where_the_camera_sees_them() -> None:
+    camera, size = Camera(), (960, 1280)
+    target = (-0.01, 0.0, 0.08)
+    controller = ControllerStatus(target_point_m=target)
+    snapshot = Snapshot(None, controller, insertion=1.0, tip=TIP, course=course(0.02, 0.04))
+    picture = view(snapshot, camera, size)
     assert picture.shape == (480, 640, 3)
-    scale = 640 / left.camera.width
-    for place, blue in ((snapshot.course[0].position, True), (tip.position, False)):
-        x, y = np.rint((left.project(place[None])[0] + 0.5) * scale - 0.5).astype(int)
-        spot = picture[y - 1 : y + 2, x - 1 : x + 2].mean(axis=(0, 1))
-        assert (spot[0] > spot[2]) == blue
+    # A diamond is drawn around its place, the other marks on it.
+    for place, reach, is_blue in (
+        (snapshot.course[0].position, 1, True),
+        (TIP.position, 1, False),
+        (np.array(target), 9, False),
+    ):
+        x, y = np.rint((camera.project(place[None])[0] + 0.5) * 0.5 - 0.5).astype(int)
+        spot = picture[y - reach : y + reach + 1, x - reach : x + reach + 1]
+        blue, _, red = spot.mean(axis=(0, 1))
+        assert (blue > red) == is_blue
         assert spot.max() > 90.0
-    far = picture.sum(axis=2)
-    assert (far > 60.0).mean() < 0.02
-
-
-def test_without_a_fitting_calibration_nothing_is_drawn_in(left: RefractedCamera) -> None:
-    tip = SeenTip(np.array([0.002, 0.001, 0.06]), COVARIANCE, 0.0)
-    snapshot = Snapshot(insertion=1.0, tip=tip, course=course(0.02, 0.04))
-    for camera in (None, left):
-        picture = decoded(draw_view(np.zeros((480, 640), np.uint8), snapshot, camera))
-        assert picture.max() < 10.0
-
-
-def test_points_that_a_camera_cannot_see_do_no_harm(left: RefractedCamera) -> None:
-    tip = SeenTip(np.array([5.0, 5.0, -5.0]), COVARIANCE, 0.0)
-    image = np.zeros((left.camera.height, left.camera.width), np.uint8)
-    assert draw_view(image, Snapshot(insertion=9.0, tip=tip, course=course(0.1, 4.0)), left)
+    assert (picture.sum(axis=2) > 60.0).mean() < 0.02
+    # Without a fitting calibration nothing is drawn in; what cannot be seen does no harm.
+    for unfit in (None, camera):
+        assert view(snapshot, unfit, (480, 640)).max() < 10.0
+    beyond = SeenTip(np.array([5.0, 5.0, -5.0]), COVARIANCE, 0.0)
+    view(Snapshot(insertion=9.0, tip=beyond, course=course(0.1, 4.0)), camera, size)
 
 
 def test_views_are_drawn_for_who_asks_and_at_most_ten_times_a_second() -> None:
@@ -96,36 +93,28 @@ def test_views_are_drawn_for_who_asks_and_at_most_ten_times_a_second() -> None:
 
 def read(points: str, picture: ElementTree.Element) -> np.ndarray:
     """Return what points of a chart mean [mm], by the numbers along its edges."""
-    labels = [(text, float(str(text.text))) for text in picture.iter("text") if is_number(text)]
-    below = [(float(text.attrib["x"]), n) for text, n in labels if "middle" in text.attrib.values()]
-    # What is written stands 4 below its line.
-    beside = [
-        (float(text.attrib["y"]) - 4, n) for text, n in labels if "end" in text.attrib.values()
+    marks = [
+        (text.attrib, float(str(text.text)))
+        for text in picture.iter("text")
+        if str(text.text).lstrip("-").replace(".", "", 1).isdigit()
     ]
+    below = [(float(at["x"]), n) for at, n in marks if at["text-anchor"] == "middle"]
+    # What is written stands 4 below its line.
+    beside = [(float(at["y"]) - 4, n) for at, n in marks if at["text-anchor"] == "end"]
     assert len(below) > 3 and len(beside) > 3
-    x, y = np.array([point.split(",") for point in points.split()], dtype=float).T
-    return np.column_stack([on_scale(x, below), on_scale(y, beside)])
-
-
-def on_scale(values: np.ndarray, marks: list[tuple[float, float]]) -> np.ndarray:
-    """Return what places mean on a straight scale with these marks: places, and their numbers."""
-    places, numbers = np.transpose(marks)
-    return np.asarray(np.polyval(np.polyfit(places, numbers, 1), values))
-
-
-def is_number(text: ElementTree.Element) -> bool:
-    return str(text.text).lstrip("-").replace(".", "", 1).isdigit()
+    places = np.array([point.split(",") for point in points.split()], dtype=float).T
+    scales = [np.polyfit([at for at, _ in a], [n for _, n in a], 1) for a in (below, beside)]
+    return np.column_stack([np.polyval(s, p) for s, p in zip(scales, places, strict=True)])
 
 
 def test_the_chart_has_r1_its_band_and_the_goal_in_mm() -> None:
     picture = ElementTree.fromstring(chart(Snapshot(course=course(0.02, 0.04))))
     (line,), (band,) = picture.iter("polyline"), picture.iter("polygon")
-    assert read(line.attrib["points"], picture) == pytest.approx(
-        np.array([[20.0, -2.0], [40.0, -1.0]]), abs=0.02
-    )
-    assert read(band.attrib["points"], picture) == pytest.approx(
-        np.array([[20.0, -1.6], [40.0, -0.6], [40.0, -1.4], [20.0, -2.4]]), abs=0.02
-    )
+    for points, meant in (
+        (line.attrib["points"], [[20.0, -2.0], [40.0, -1.0]]),
+        (band.attrib["points"], [[20.0, -1.6], [40.0, -0.6], [40.0, -1.4], [20.0, -2.4]]),
+    ):
+        assert read(points, picture) == pytest.approx(np.array(meant), abs=0.02)
     goals = [one.attrib for one in picture.iter("line") if "stroke-dasharray" in one.attrib]
     heights = [read(f"{goal['x1']},{goal['y1']}", picture)[0, 1] for goal in goals]
     assert heights[:2] == pytest.approx([1.0, -1.0], abs=0.02)
@@ -133,13 +122,14 @@ def test_the_chart_has_r1_its_band_and_the_goal_in_mm() -> None:
 
 @pytest.mark.parametrize("deepest", [0.0005, 0.12, 0.45])
 def test_all_of_a_chart_lies_within_its_picture(deepest: float) -> None:
-    text = chart(Snapshot(course=course(*np.linspace(1e-4, deepest, 1000))))
+    text = chart(Snapshot(course=course(*np.linspace(1e-4, deepest, 50))))
     picture = ElementTree.fromstring(text)
     _, _, width, height = map(float, picture.attrib["viewBox"].split())
-    for part in picture.iter():
-        for point in part.attrib.get("points", "").split():
-            x, y = map(float, point.split(","))
-            assert 0.0 <= x <= width and 0.0 <= y <= height
+    points = [point for part in picture.iter() for point in part.attrib.get("points", "").split()]
+    assert len(points) > 100
+    for point in points:
+        x, y = map(float, point.split(","))
+        assert 0.0 <= x <= width and 0.0 <= y <= height
     assert "nan" not in chart(Snapshot())
 
 
@@ -151,21 +141,23 @@ def test_space_keeps_right_handed_axes_and_lengths() -> None:
 
 
 def test_the_ellipsoid_is_two_sigma_of_the_covariance() -> None:
-    found = ellipsoid(Snapshot(course=course(0.05)))
-    assert found is not None
-    centre, half, rotation = found
-    assert centre == pytest.approx(to_view(course(0.05)[0].position))
-    assert sorted(half) == pytest.approx([0.2, 0.4, 0.6])
-    assert np.linalg.det(rotation) == pytest.approx(1.0)
-    spread = rotation @ np.diag(half**2) @ rotation.T
-    # Along the insertion, the view's x, sigma is 0.3 mm; upwards, its z, 0.2 mm.
-    assert np.sqrt(np.diag(spread)) == pytest.approx([0.6, 0.2, 0.4])
     assert ellipsoid(Snapshot()) is None
+    for snapshot, place in (
+        (Snapshot(course=course(0.05), tip=TIP), course(0.05)[0].position),
+        (Snapshot(tip=TIP), TIP.position),
+    ):
+        found = ellipsoid(snapshot)
+        assert found is not None
+        centre, half, rotation = found
+        assert centre == pytest.approx(to_view(place))
+        assert np.linalg.det(rotation) == pytest.approx(1.0)
+        spread = rotation @ np.diag(half**2) @ rotation.T
+        # Along the insertion, the view's x, sigma is 0.3 mm; upwards, its z, 0.2 mm.
+        assert np.sqrt(np.diag(spread)) == pytest.approx([0.6, 0.2, 0.4])
 
 
 def test_the_shaft_is_drawn_from_the_entry_to_the_tip() -> None:
-    depths = np.arange(0.0005, 0.02, 0.0005)
-    snapshot = Snapshot(insertion=0.015, course=course(*depths))
+    snapshot = Snapshot(insertion=0.015, course=course(*np.arange(0.0005, 0.02, 0.0005)))
     points = shaft_points(snapshot)
     assert points[0] == pytest.approx([0.0, 0.0, 0.0])
     assert points[-1][0] == pytest.approx(15.0)
@@ -185,17 +177,14 @@ def test_a_tilted_plane_lies_where_it_was_asked_for() -> None:
     assert plane_centre(snapshot, 0.12)[2] > 4.0
 
 
-@pytest.mark.parametrize("wrong", [(math.nan, 0.0), (51.0, 0.0), (0.0, 46.0), (0.0, math.inf)])
-def test_a_plane_out_of_bounds_is_refused(wrong: tuple[float, float]) -> None:
-    with pytest.raises(UserError):
-        plane_pose(*wrong)
-
-
-def test_a_point_out_of_bounds_is_refused() -> None:
-    assert target_point(10.0, -5.0, 100.0) == pytest.approx([0.01, -0.005, 0.1])
-    for wrong in ((151.0, 0.0, 50.0), (0.0, 0.0, 0.0), (0.0, math.nan, 50.0)):
+def test_a_target_out_of_bounds_is_refused() -> None:
+    for plane in ((math.nan, 0.0), (50.1, 0.0), (-50.1, 0.0), (0.0, 45.1), (0.0, math.inf)):
         with pytest.raises(UserError):
-            target_point(*wrong)
+            plane_pose(*plane)
+    assert target_point(10.0, -150.0, 1.0) == pytest.approx([0.01, -0.15, 0.001])
+    for point in ((150.1, 0.0, 50.0), (0.0, -150.1, 50.0), (0.0, 0.0, 0.9), (0.0, math.nan, 50.0)):
+        with pytest.raises(UserError):
+            target_point(*point)
 
 
 def test_the_dial_points_up_at_0_and_to_the_right_after_a_quarter_turn() -> None:

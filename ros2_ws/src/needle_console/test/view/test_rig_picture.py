@@ -1,7 +1,8 @@
-"""What is heard becomes snapshots; what is old or makes no sense does not."""
+"""What is heard becomes snapshots and readings; what is old or makes no sense does not."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -14,13 +15,13 @@ from needle_console.view.targets import plane_pose
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 COVARIANCE = np.diag([1e-8, 4e-8, 9e-8])
+STEERING = ControllerStatus(state="STEERING", starts=1, target_offset_m=0.003)
+MINUS, NONE = "\N{MINUS SIGN}", "\N{EN DASH}"
 
 
 def seen(*depths: float) -> RigPicture:
     picture = RigPicture()
-    picture.see_controller(
-        ControllerStatus.parse({"state": "STEERING", "starts": "1", "target_offset_m": "0.003"})
-    )
+    picture.see_controller(STEERING)
     for depth in depths:
         picture.see_joints(depth, 0.1, now=0.0)
         picture.see_estimate(np.array([-0.003 + depth / 50, 0.0, depth]), COVARIANCE)
@@ -31,7 +32,7 @@ def test_joints_that_fall_silent_are_not_shown_as_if_they_were_there() -> None:
     picture = seen(0.01)
     assert picture.snapshot(0.9).insertion == 0.01
     assert math.isnan(picture.snapshot(1.1).insertion)
-    assert readings(picture.snapshot(1.1))["Depth"] == "\N{EN DASH}"
+    assert readings(picture.snapshot(1.1))["Depth"] == NONE
 
 
 def test_estimates_are_placed_in_rig_by_the_plane_in_force() -> None:
@@ -39,9 +40,6 @@ def test_estimates_are_placed_in_rig_by_the_plane_in_force() -> None:
     assert point.r1 == pytest.approx(-0.002)
     assert point.position == pytest.approx([0.001, 0.0, 0.05])
     assert point.sigma == pytest.approx(1e-4)
-
-
-def test_estimates_in_a_tilted_plane_are_turned_into_rig() -> None:
     picture = seen()
     picture.see_plane(plane_pose(3.0, 30.0))
     picture.see_joints(0.05, 0.1, now=0.0)
@@ -59,48 +57,35 @@ def test_a_plane_that_the_controller_did_not_take_is_not_shown() -> None:
     tilted = plane_pose(9.0, 36.0)
     picture.see_plane(tilted)
     assert picture.snapshot(0.0).T_rig_plane[0, 3] == pytest.approx(0.003)
-    picture.see_controller(
-        ControllerStatus.parse({"state": "STEERING", "starts": "1", "target_offset_m": "0.009"})
-    )
+    picture.see_controller(dataclasses.replace(STEERING, target_offset_m=0.009))
     assert picture.snapshot(0.0).T_rig_plane == pytest.approx(tilted)
 
 
 def test_why_the_device_ended_a_hold_outlasts_that_the_press_goes_on() -> None:
-    picture = RigPicture()
-    silent = "no hold message for 0.105 s, limit 0.1 s"
-    goes_on = "hold of 'console' does not count (hold_new_press)"
-    values = {"state": "HOLDING", "reason": goes_on, "press_again": "console"}
-    for told in (
-        {"state": "MOVING", "hold_owner": "console"},
-        {"state": "HOLDING", "reason": silent},
-        values,
-        {**values, "speed_scale": "0"},
+    moving = DeviceStatus(state="MOVING", hold_owner="console")
+    silent = DeviceStatus(state="HOLDING", reason="no hold message for 0.105 s, limit 0.1 s")
+    again = DeviceStatus(reason="hold of 'console' does not count (hold_new_press)")
+    stamps = DeviceStatus(reason="hold of 'console' does not count (hold_in_order)")
+    for told, why in (
+        ((moving, silent, again, again), silent.reason),
+        # Where the console stood still itself, it heard no more than that.
+        ((moving, again), again.reason),
+        ((moving, again, stamps), stamps.reason),
     ):
-        picture.see_device(DeviceStatus.parse(told))
-    device = picture.states().device
-    assert device is not None
-    assert (device.press_again, trouble_of(device)) == ("console", silent)
-    # Where the console stood still itself, it heard no more than that.
-    picture = RigPicture()
-    for told in ({"state": "MOVING", "hold_owner": "console"}, values):
-        picture.see_device(DeviceStatus.parse(told))
-    device = picture.states().device
-    assert device is not None
-    assert trouble_of(device) == goes_on
-    stamps = "hold of 'console' does not count (hold_in_order); device/reset ends this"
-    picture.see_device(DeviceStatus.parse({**values, "reason": stamps}))
-    device = picture.states().device
-    assert device is not None
-    assert trouble_of(device) == stamps
+        picture = RigPicture()
+        for status in told:
+            picture.see_device(status)
+        device = picture.states().device
+        assert device is not None
+        assert trouble_of(device) == why
 
 
 def test_a_controller_that_is_gone_steers_no_longer() -> None:
     picture = seen(0.01)
     picture.lose_controller()
     assert picture.states().controller is None
-    assert picture.snapshot(0.0).controller is None
-    picture.see_controller(ControllerStatus.parse({"state": "STEERING", "starts": "1"}))
-    assert picture.states().controller is not None
+    picture.see_controller(STEERING)
+    assert picture.snapshot(0.0).controller == STEERING
 
 
 def test_a_course_goes_deeper_only_and_a_new_start_begins_a_new_one() -> None:
@@ -110,14 +95,15 @@ def test_a_course_goes_deeper_only_and_a_new_start_begins_a_new_one() -> None:
     assert len(picture.snapshot(0.0).shaft) == 2
     picture.see_estimate(np.array([0.0, 0.0, 0.0105]), COVARIANCE)
     assert [point.depth for point in picture.snapshot(0.0).course] == [0.010, 0.0105]
-    picture.see_controller(ControllerStatus.parse({"state": "STEERING", "starts": "2"}))
+    picture.see_controller(ControllerStatus(state="STEERING", starts=2))
     assert picture.snapshot(0.0).course == ()
 
 
-def test_a_tip_that_is_lost_says_for_how_long() -> None:
+def test_a_tip_says_for_how_long_it_is_lost_or_old() -> None:
     picture = seen(0.01)
-    picture.see_tip(np.array([0.0, 0.0, 0.01]), COVARIANCE, now=1.0)
-    assert picture.snapshot(1.5).tip_lost_for == 0.0
+    picture.see_tip(np.array([0.0, -0.001, 0.01]), COVARIANCE, now=1.0)
+    for now, text in ((1.5, f"0.0, {MINUS}1.0, 10.0 mm"), (2.9, "no images for 2 s")):
+        assert readings(picture.snapshot(now))["Tip"] == text
     for now in (2.0, 3.0):
         picture.see_tip(np.zeros(3), np.full((3, 3), np.inf), now=now)
     assert picture.snapshot(4.5).tip_lost_for == pytest.approx(2.5)
@@ -146,36 +132,20 @@ def test_troubles_end_when_they_are_mended_or_no_longer_told() -> None:
     assert picture.snapshot(9.0).troubles == ()
 
 
-def test_statuses_that_say_nothing_sensible_become_states_without_numbers() -> None:
-    controller = ControllerStatus.parse(
-        {"state": "IDLE", "depth_m": "nan", "target_point_m": "1, x, 3"}
-    )
-    assert controller.depth_m is None
-    assert controller.target_point_m is None
-    assert controller.reachable is None
-    assert DeviceStatus.parse({"simulated": "yes"}).simulated is False
-    assert set(readings(Snapshot(DeviceStatus.parse({}), controller)).values()) == {"\N{EN DASH}"}
-
-
-def test_readings_are_in_mm_and_degrees() -> None:
+def test_readings_are_in_mm_and_degrees_and_a_dash_where_nothing_is_known() -> None:
+    assert set(readings(Snapshot(DeviceStatus(), ControllerStatus())).values()) == {NONE}
     picture = seen(0.05)
+    told = dataclasses.replace(STEERING, depth_m=0.12, r1_low_m=-0.0025, r1_high_m=-0.0015)
+    picture.see_controller(dataclasses.replace(told, reachable=True, reachable_depth_m=0.043))
+    shown = readings(picture.snapshot(0.0))
+    assert shown["Depth"] == "50.0 mm of 120 mm"
+    assert shown["Off the plane"] == f"{MINUS}2.00 mm (95 %: {MINUS}2.50 to {MINUS}1.50)"
+    assert shown["Turn of the base"].startswith("5.7")
+    assert shown["Reach"] == "the plane can be reached, from 43 mm on"
     picture.see_controller(
-        ControllerStatus.parse(
-            {
-                "state": "STEERING",
-                "starts": "1",
-                "depth_m": "0.12",
-                "target_offset_m": "0.003",
-                "r1_low_m": "-0.0025",
-                "r1_high_m": "-0.0015",
-                "reachable": "true",
-                "reachable_depth_m": "0.043",
-            }
+        dataclasses.replace(
+            told, reachable=False, target_point_m=(0.0, 0.0, 0.1), trusted="trusted"
         )
     )
-    minus = "\N{MINUS SIGN}"
-    told = readings(picture.snapshot(0.0))
-    assert told["Depth"] == "50.0 mm of 120 mm"
-    assert told["Off the plane"] == f"{minus}2.00 mm (95 %: {minus}2.50 to {minus}1.50)"
-    assert told["Turn of the base"].startswith("5.7")
-    assert told["Reach"] == "the plane can be reached, from 43 mm on"
+    shown = readings(picture.snapshot(0.0))
+    assert (shown["Reach"], shown["Estimate"]) == ("the point is out of reach", "trusted")
