@@ -198,7 +198,7 @@ class StereoTipTracker(Component):
         health.swapped = answers.swap.suspected
         yield from self._tell("track", health.track())
         yield from self._tell("images", health.images(at.steady, answers.matcher))
-        yield from self._tell("joints", health.joints(answers.insertions, answers.joints_silent))
+        yield from self._tell("joints", health.joints(answers))
 
     def _tell(self, part: str, diagnostic: Diagnostic) -> Actions:
         """Tell a part's health; log it where it turns bad, not each time it still is."""

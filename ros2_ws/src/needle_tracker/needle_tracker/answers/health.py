@@ -7,13 +7,14 @@ from collections import deque
 from typing import Any
 
 from needle_core.diagnostics import Diagnostic, Level
+from needle_tracker.answers.pair_answers import PairAnswers
 from needle_tracker.answers.swapped_images import SUSPICION
-from needle_tracker.sources.insertion_history import InsertionHistory
 from needle_tracker.sources.pairing import OTHER_SIDE, PairMatcher
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.refusals import TrackState
 
 TROUBLE_SHOWN = 5.0  # a warning stays this long after what caused it [s]
+CLOCKS_DIFFER = 1_000_000_000  # pairs so long before the first joint state are no start [ns]
 PARTNER_LATE = 0.5  # an image without a partner is reported after [s]
 _RATE_WINDOW = 5.0  # [s]
 _MOST_REASONS = 20  # told by name
@@ -138,14 +139,23 @@ class Health:
         values.update({f"refused: {reason}": str(n) for reason, n in self.refused.items()})
         return Diagnostic(*self._images_level(now, matcher), values)
 
-    def joints(self, history: InsertionHistory, silent: bool) -> Diagnostic:
+    def joints(self, answers: PairAnswers) -> Diagnostic:
         """Return the health of the joint states."""
+        history = answers.insertions
         values = {
             "without_insertion_joint": str(self.joints_without_insertion),
             "not_finite": str(history.refused),
             "time_ran_backwards": str(history.restarts),
+            "pairs_before_joint_states": str(answers.unanswered),
         }
-        if silent:
+        if answers.too_early > CLOCKS_DIFFER:
+            return Diagnostic(
+                Level.WARN,
+                f"no pair is answered: exposed {1e-9 * answers.too_early:.1f} s before the first"
+                " joint state",
+                values,
+            )
+        if answers.joints_silent:
             return Diagnostic(
                 Level.WARN, "no joint state follows the images: insertion unknown", values
             )

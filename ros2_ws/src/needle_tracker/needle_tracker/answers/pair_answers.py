@@ -1,7 +1,9 @@
 """Images and joint states in, one answer for every stereo pair out: what the tracker's node does.
 
 An answer depends on what came, in what order, and not on when: but for `joint_timeout`, after which
-a pair no longer waits for the joint state that follows it. Times are steady, and arguments.
+a pair no longer waits for the joint state that follows it. Times are steady, and arguments. Where
+the needle was before the first joint state is never heard: a pair exposed before it has no answer,
+whichever of both came first.
 """
 
 from __future__ import annotations
@@ -90,7 +92,7 @@ class Answer:
 
 
 class PairAnswers:
-    """Pairs images by stamp, joins the insertion at that stamp, answers every pair in order.
+    """Pairs images by stamp, joins the insertion at that stamp, answers the pairs in order.
 
     Parameters
     ----------
@@ -100,6 +102,13 @@ class PairAnswers:
         The tracker's settings.
     settings : PairingSettings
         What else is told.
+
+    Attributes
+    ----------
+    unanswered : int
+        Pairs exposed before the first joint state.
+    too_early : int
+        How long before it the last pair was exposed [ns]; 0 if that pair is answered.
     """
 
     def __init__(
@@ -114,6 +123,7 @@ class PairAnswers:
         self.matcher: PairMatcher[Frame] = PairMatcher(settings.pair_tolerance_ns)
         self.insertions = InsertionHistory()
         self.joints_silent = False
+        self.unanswered = self.too_early = 0
         self._settings = settings
         self._queue: deque[tuple[float, Pair[Frame]]] = deque()
         self._last_stamp: int | None = None
@@ -135,10 +145,6 @@ class PairAnswers:
     def add_insertion(self, stamp: int, insertion: float, now: float) -> Iterator[Answer]:
         """Take an insertion [m] sampled at `stamp` [ns]; then as `ready`."""
         self.joints_silent = False
-        if not self.insertions:
-            # Where the needle was before is never heard: whether a pair is answered depends on
-            # stamps, not on which topic was found first.
-            self._queue = deque(item for item in self._queue if item[1].stamp >= stamp)
         self.insertions.add(stamp, insertion)
         return self.ready(now)
 
@@ -157,6 +163,11 @@ class PairAnswers:
         """
         while self._queue:
             arrival, pair = self._queue[0]
+            self.too_early = 0 if self.joints_silent else self.insertions.time_before(pair.stamp)
+            if self.too_early:
+                self.unanswered += 1
+                self._queue.popleft()
+                continue
             if not (self.joints_silent or self.insertions.is_bracketed(pair.stamp)):
                 if now - arrival < self._settings.joint_timeout:
                     return

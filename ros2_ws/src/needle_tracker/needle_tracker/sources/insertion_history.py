@@ -13,6 +13,7 @@ class InsertionHistory:
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, float]] = deque(maxlen=_KEPT)
+        self._first = 0
         self.refused = 0
         self.restarts = 0
 
@@ -37,7 +38,16 @@ class InsertionHistory:
             self.restarts += 1
         elif self._samples and stamp == self._samples[-1][0]:
             self._samples.pop()
+        if not self._samples:
+            self._first = stamp
         self._samples.append((stamp, insertion))
+
+    def time_before(self, stamp: int) -> int:
+        """Return how long before the history began `stamp` is [ns]; 0 after it, or if it is empty.
+
+        The history begins with its first sample, whether that is still kept or not.
+        """
+        return max(0, self._first - stamp) if self._samples else 0
 
     def is_bracketed(self, stamp: int) -> bool:
         """Return whether a sample at or after `stamp` [ns] has come: no later one can matter."""

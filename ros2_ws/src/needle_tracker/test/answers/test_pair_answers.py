@@ -1,45 +1,119 @@
-"""What waits for what between a pair and its answer."""
+"""What waits for what between a pair and its answer, and which pairs have none."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
 
-from needle_tracker.answers.pair_answers import Frame, PairAnswers, PairingSettings
+from needle_tracker.answers.pair_answers import Answer, Frame, PairAnswers, PairingSettings
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.refusals import TrackState
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 
+FRAME = Frame(np.zeros((768, 1024), np.uint8))
+TIMEOUT = 0.1
 
-def test_an_answer_is_out_before_what_it_does_not_need(
-    calibration: StereoCalibration, settings: TrackerSettings, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    answers = PairAnswers(calibration, settings, PairingSettings(None, 0.1, 0.0))
-    done: list[str] = []
 
-    def process(*_: object) -> Measurement:
-        done.append("answered")
+class Answering:
+    """Pairs and joint states in; the stamps of answered pairs with the insertions given to them."""
+
+    def __init__(self, answers: PairAnswers) -> None:
+        self.answers = answers
+        self.given: dict[int, float | str | None] = {}
+        self._insertion: float | None = None
+
+    def process(self, left: object, right: object, insertion: float | None) -> Measurement:
+        self._insertion = insertion
         return Measurement(None, TrackState.SEARCHING, "")
 
-    monkeypatch.setattr(answers.tracker, "process", process)
-    monkeypatch.setattr(answers.tracker, "catch_up", lambda: done.append("caught up"))
-    frame = Frame(np.zeros((768, 1024), np.uint8))
-    answers.joints_silent = True
-    for stamp in (1, 2):
-        list(answers.add_image("left", stamp, frame, 0.0))
-        for _ in answers.add_image("right", stamp, frame, 0.0):
-            done.append("published")
-    assert done == ["answered", "published", "caught up"] * 2
+    def joint(self, stamp: int) -> None:
+        self._note(self.answers.add_insertion(stamp, stamp / 1000, 0.0))
 
-
-def test_what_was_exposed_before_the_first_joint_state_is_not_answered(
-    calibration: StereoCalibration, settings: TrackerSettings
-) -> None:
-    answers = PairAnswers(calibration, settings, PairingSettings(None, 0.1, 0.0))
-    frame = Frame(np.zeros((768, 1024), np.uint8))
-    for stamp in (10, 20, 30):
+    def pair(self, stamp: int) -> None:
         for side in ("left", "right"):
-            assert not list(answers.add_image(side, stamp, frame, 0.0))
-    assert [a.pair.stamp for a in answers.add_insertion(20, 0.01, 0.0)] == [20]
-    assert [a.pair.stamp for a in answers.add_insertion(40, 0.01, 0.0)] == [30]
+            self._note(self.answers.add_image(side, stamp, FRAME, 0.0))
+
+    def wait(self) -> None:
+        self._note(self.answers.ready(TIMEOUT))
+
+    def _note(self, answers: Iterable[Answer]) -> None:
+        for answer in answers:
+            self.given[answer.pair.stamp] = answer.refused or self._insertion
+
+
+@pytest.fixture
+def answering(
+    calibration: StereoCalibration, settings: TrackerSettings, monkeypatch: pytest.MonkeyPatch
+) -> Answering:
+    monkeypatch.setattr("needle_tracker.tracking.tip_tracker.TipTracker.warm_up", lambda _: None)
+    bench = Answering(PairAnswers(calibration, settings, PairingSettings(None, TIMEOUT, 0.0)))
+    monkeypatch.setattr(bench.answers.tracker, "process", bench.process)
+    monkeypatch.setattr(bench.answers.swap, "see", lambda *_: None)
+    return bench
+
+
+def test_an_answer_is_out_before_what_it_does_not_need(
+    answering: Answering, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+
+    def note(what: str) -> Callable[..., None]:
+        return lambda *_: done.append(what)
+
+    monkeypatch.setattr(answering.answers.tracker, "catch_up", note("caught up"))
+    monkeypatch.setattr(answering.answers.swap, "see", note("suspected"))
+    for stamp in (1, 2):
+        list(answering.answers.add_image("left", stamp, FRAME, 0.0))
+        list(answering.answers.add_image("right", stamp, FRAME, 0.0))
+    for _ in answering.answers.ready(TIMEOUT):
+        done.append("published")
+    assert done == ["published", "caught up", "suspected"] * 2
+
+
+def test_a_pair_waits_for_the_joint_state_that_follows_it(answering: Answering) -> None:
+    answering.joint(10)
+    answering.pair(15)
+    assert not answering.given
+    answering.joint(20)
+    assert answering.given == {15: 0.015}
+
+
+@pytest.mark.parametrize(
+    ("arrivals", "answered"),
+    [
+        # Which topic was heard first is no matter.
+        ("p10 p20 p30 j20 j40", {20: 0.020, 30: 0.030}),
+        ("j20 j40 p10 p20 p30", {20: 0.020, 30: 0.030}),
+        ("p10 j20 p20 j40 p30", {20: 0.020, 30: 0.030}),
+        # A stamp that runs backwards begins a new history.
+        ("j100 j200 j50 j80 p40 p60", {60: 0.060}),
+        ("j100 j200 p40 p60 j50 p70 j80", {70: 0.070}),
+        # Without joint states, at first or for good, nothing is left out.
+        ("p10 p20 wait p30", {10: None, 20: None, 30: None}),
+        ("p10 wait j20 p15 p25 j30", {10: None, 25: 0.025}),
+        ("j20 p30 wait p10 p40", {30: None, 10: "time of exposure ran backwards", 40: None}),
+    ],
+)
+def test_a_pair_exposed_before_the_first_joint_state_has_no_answer(
+    answering: Answering, arrivals: str, answered: dict[int, float | str | None]
+) -> None:
+    for arrival in arrivals.split():
+        if arrival == "wait":
+            answering.wait()
+        else:
+            take = answering.joint if arrival[0] == "j" else answering.pair
+            take(int(arrival[1:]))
+    assert answering.given == answered
+
+
+def test_the_first_joint_state_is_known_when_it_is_no_longer_kept(answering: Answering) -> None:
+    for stamp in range(100, 5000):
+        answering.joint(stamp)
+    answering.pair(99)
+    answering.pair(100)
+    answering.pair(4000)
+    assert answering.given == {100: None, 4000: 4.0}
+    assert answering.answers.unanswered == 1
