@@ -20,6 +20,7 @@ from code_lines import ROOT
 from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
 from needle_core.commands.cli import EXIT_DONE, EXIT_INTERRUPTED
 from needle_core.files.installed import find_executable
+from needle_tracker.optics.calibration import SIDES
 from reference.rig_nodes import executables
 
 PATIENCE = 60.0  # [s]
@@ -41,9 +42,11 @@ def listener() -> Iterator[Node]:
 def words(name: str, folder: Path) -> list[str]:
     """Return what a node cannot do without, and a namespace in which it is alone."""
     parameters = {
+        "device_driver": ["link:=slcan", f"channel:={folder / 'can'}", "connect_timeout:=60.0"],
+        "drive_emulator": [f"pty:={folder / 'can'}"],
         "operator": ["source:=joy", "key:=0"],
         "recorder": [f"bag:={folder / 'bag'}"],
-        "stereo_camera": [f"left:={folder}", f"right:={folder}", "loop:=true"],
+        "stereo_camera": [f"{side}:={folder / side}" for side in SIDES] + ["loop:=true"],
     }
     if name == "player":
         return [str(ROOT / "bags" / "regression"), "--loop"]
@@ -60,7 +63,9 @@ def awaited(condition: Callable[[], bool]) -> bool:
 
 
 def test_every_node_starts_is_heard_and_ends_on_sigterm(tmp_path: Path, listener: Node) -> None:
-    cv2.imwrite(str(tmp_path / "1.png"), np.zeros((768, 1024), np.uint8))
+    for side in SIDES:
+        (tmp_path / side).mkdir()
+        cv2.imwrite(str(tmp_path / side / "1.png"), np.zeros((768, 1024), np.uint8))
     nodes = [
         NodeProcess(
             name,
