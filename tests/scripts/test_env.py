@@ -95,20 +95,6 @@ def test_keeps_what_the_user_has_set(name: str, set_up: Path) -> None:
 
 
 @pytest.mark.parametrize("name", SHELLS)
-def test_profiles_of_the_users_own_stay_and_missing_ones_do_not(name: str, set_up: Path) -> None:
-    own = set_up / "profiles.xml"
-    own.touch()
-    env = sourced(name, set_up, FASTRTPS_DEFAULT_PROFILES_FILE=str(own))
-    assert env["FASTRTPS_DEFAULT_PROFILES_FILE"] == str(own)
-    line = f". {str(set_up / 'scripts' / 'env.sh')!r}; echo $FASTRTPS_DEFAULT_PROFILES_FILE"
-    result = shell(name, line, FASTRTPS_DEFAULT_PROFILES_FILE="/not/there.xml")
-    assert result.stdout.endswith("/needle_fastdds.xml\n")
-    assert result.stderr == (
-        "env.sh: FASTRTPS_DEFAULT_PROFILES_FILE=/not/there.xml ignored: no such file\n"
-    )
-
-
-@pytest.mark.parametrize("name", SHELLS)
 def test_another_middleware_is_named_and_replaced(name: str, set_up: Path) -> None:
     source = f". {str(set_up / 'scripts' / 'env.sh')!r}"
     line = f"set -eu; {source}; {source}; echo $RMW_IMPLEMENTATION"
@@ -121,30 +107,12 @@ def test_another_middleware_is_named_and_replaced(name: str, set_up: Path) -> No
 
 
 @pytest.mark.parametrize("name", SHELLS)
-def test_leaves_no_helpers(name: str, set_up: Path) -> None:
-    result = shell(name, f". {str(set_up / 'scripts/env.sh')!r}; set; typeset -f")
-    names = [line.partition("=")[0] for line in result.stdout.splitlines()]
-    assert not [line for line in names if "_needle" in line.split(" ")[0].lower()]
-
-
-@pytest.mark.parametrize("name", SHELLS)
 def test_one_line_where_set_up_has_not_run(name: str, checkout: Path) -> None:
     result = shell(name, f". {str(checkout / 'scripts/env.sh')!r} || echo code $?")
     assert result.stdout == "code 1\n"
     assert result.stderr.splitlines() == [
         f"env.sh: this checkout is not set up yet (or only half): run {checkout / 'scripts/setup'}"
     ]
-
-
-def test_wheels_beside_a_sourced_ros_are_refused(set_up: Path) -> None:
-    result = shell(
-        "bash",
-        f". {str(set_up / 'scripts/env.sh')!r}",
-        ROS_DISTRO="jazzy",
-        AMENT_PREFIX_PATH="/opt/ros/jazzy",
-    )
-    assert result.returncode == 1
-    assert "ROS 2 jazzy is sourced" in result.stderr
 
 
 def test_with_ros_its_own_paths_stay_behind_ours(set_up: Path) -> None:

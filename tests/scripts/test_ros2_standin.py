@@ -53,11 +53,6 @@ def test_run_passes_arguments_output_and_exit_code(prefix: Path) -> None:
     assert result.returncode == 7
 
 
-def test_run_also_takes_what_is_not_python(prefix: Path) -> None:
-    add(prefix, "tool", "#!/bin/sh\nexit 3\n")
-    assert ros2(prefix, "run", "needle_sim", "tool").returncode == 3
-
-
 def test_run_becomes_the_executable_so_that_signals_reach_it(prefix: Path) -> None:
     add(prefix, "pause", "#!/usr/bin/python3\nprint('up', flush=True)\ninput()\n")
     with subprocess.Popen(
@@ -79,24 +74,6 @@ def test_lists_executables(prefix: Path) -> None:
     expected = "needle_sim monte_carlo\nneedle_sim sim_rig\n"
     assert ros2(prefix, "pkg", "executables").stdout == expected
     assert ros2(prefix, "pkg", "executables", "needle_sim").stdout == expected
-
-
-def test_hides_the_generators_of_message_code(prefix: Path) -> None:
-    add(prefix, "sim_rig", "")
-    environment = Path(sys.executable).parents[1]
-    env = dict(os.environ, AMENT_PREFIX_PATH=f"{prefix}:{environment}")
-    listed = [
-        subprocess.run(
-            [sys.executable, "-I", "-S", str(STAND_IN), "pkg", "executables", *package],
-            check=True,
-            env=env,
-            text=True,
-            capture_output=True,
-        ).stdout
-        for package in ([], ["rosidl_adapter"])
-    ]
-    assert listed[0] == "needle_sim sim_rig\n"
-    assert "rosidl_adapter msg2idl.py" in listed[1]
 
 
 @pytest.mark.parametrize(
@@ -125,30 +102,3 @@ def test_says_that_the_environment_is_missing() -> None:
     result = ros2(None, "run", "needle_sim", "sim_rig")
     assert result.returncode == 1
     assert "source scripts/env.sh first" in result.stderr
-
-
-@pytest.mark.parametrize("arguments", [[], ["--help"], ["run", "--help"], ["pkg", "-h"]])
-def test_help_says_what_it_is(arguments: list[str]) -> None:
-    result = ros2(None, *arguments)
-    assert result.returncode == 0
-    assert "stand-in" in result.stdout
-
-
-@pytest.mark.parametrize(
-    ("variable", "value", "code", "line"),
-    [
-        ("ROS_DOMAIN_ID", "300", 2, "ros2: ROS_DOMAIN_ID=300 is not a number from 0 to 232"),
-        (
-            *("RMW_IMPLEMENTATION", "rmw_none", 0),
-            "RMW_IMPLEMENTATION=rmw_none ignored: the rig's nodes run on rmw_fastrtps_cpp",
-        ),
-    ],
-)
-def test_the_graph_is_asked_with_what_the_nodes_take(
-    monkeypatch: pytest.MonkeyPatch, variable: str, value: str, code: int, line: str
-) -> None:
-    monkeypatch.setenv(variable, value)
-    command = [sys.executable, "-I", "-S", str(STAND_IN), "node", "list", "--spin-time", "0"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == code
-    assert done.stderr.splitlines()[0] == line

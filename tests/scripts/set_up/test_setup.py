@@ -6,21 +6,17 @@ Of what it calls only pip, venv and colcon are replaced, so that no test downloa
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import threading
-import time
 import types
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-import setup_progress
 import setup_workspace
 
 Workspace = types.ModuleType
@@ -101,7 +97,7 @@ def test_a_renewed_lock_is_installed_into_the_environment(
 
 @pytest.mark.parametrize(
     "path",
-    ["setup.py", "needle_one/executables.py", "config/new.yaml", "launch/rig.launch.py"],
+    ["needle_one/executables.py", "launch/rig.launch.py"],
 )
 def test_a_new_executable_or_file_is_only_built(
     workspace: Workspace, commands: Commands, path: str
@@ -115,28 +111,16 @@ def test_a_new_executable_or_file_is_only_built(
     assert commands.names == ["colcon"]
 
 
-@pytest.mark.parametrize("path", ["fast.py", "room/fast.py"])
 def test_changed_compiled_code_is_compiled_and_not_built(
-    workspace: Workspace, commands: Commands, path: str
+    workspace: Workspace, commands: Commands
 ) -> None:
     workspace.main()
     commands.names.clear()
-    module = workspace.WORKSPACE / "src" / "needle_one" / "needle_one" / path
+    module = workspace.WORKSPACE / "src" / "needle_one" / "needle_one" / "fast.py"
     module.parent.mkdir(parents=True)
     module.write_text("from x import compiled\n\n@compiled\ndef f(): ...\n")
     assert workspace.main() == 0
     assert commands.names == ["compile"]
-    commands.names.clear()
-    assert workspace.main() == 0
-    assert commands.names == []
-
-
-def test_what_cannot_be_compiled_ahead_is_left_to_the_nodes(
-    workspace: Workspace, commands: Commands
-) -> None:
-    commands.fail["compile"] = workspace.CommandFailedError(1, "no compiler")
-    assert workspace.main() == 0
-    assert commands.names == FIRST
     commands.names.clear()
     assert workspace.main() == 0
     assert commands.names == []
@@ -152,21 +136,6 @@ def test_what_is_linked_needs_no_build(workspace: Workspace, commands: Commands)
     (package / "needle_one" / "plant.py").write_text("")
     assert workspace.main() == 0
     assert commands.names == []
-
-
-def test_a_file_that_is_gone_from_the_sources_does_not_break_the_build(
-    workspace: Workspace, commands: Commands
-) -> None:
-    package = workspace.WORKSPACE / "src" / "needle_one"
-    (package / "config" / "rig.yaml").write_text("a: 1")
-    link = workspace.WORKSPACE / "build" / "needle_one" / "config" / "rig.yaml"
-    link.parent.mkdir(parents=True)
-    link.symlink_to(package / "config" / "rig.yaml")
-    workspace.main()
-    assert link.exists()
-    (package / "config" / "rig.yaml").unlink()
-    assert workspace.main() == 0
-    assert not link.is_symlink()
 
 
 @pytest.mark.parametrize(("stage", "again"), [("pip", FIRST), ("import", FIRST), ("colcon", BUILD)])
@@ -232,97 +201,6 @@ def test_too_little_space_is_said_before_anything_is_done(
     assert commands.names == []
 
 
-@pytest.mark.parametrize(
-    ("error", "line"),
-    [
-        (OSError(28, "No space left on device", "/a/file"), "setup: disk full: /a/file"),
-        (
-            OSError(30, "Read-only file system", "/a"),
-            "setup: cannot write /a: Read-only file system",
-        ),
-    ],
-)
-def test_a_disk_that_takes_no_more(
-    workspace: Workspace,
-    commands: Commands,
-    capsys: pytest.CaptureFixture[str],
-    error: OSError,
-    line: str,
-) -> None:
-    commands.fail["venv"] = error
-    assert workspace.main() == 2
-    assert capsys.readouterr().err.splitlines()[-1] == line
-
-
-@pytest.mark.parametrize(
-    ("library", "found"), [(("glibc", "2.17"), "glibc 2.17"), (("", ""), "another C library")]
-)
-def test_an_old_c_library(
-    workspace: Workspace,
-    commands: Commands,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    library: tuple[str, str],
-    found: str,
-) -> None:
-    monkeypatch.setattr(workspace.platform, "libc_ver", lambda: library)
-    assert workspace.main() == 2
-    assert found in capsys.readouterr().err
-    assert commands.names == []
-
-
-def test_of_two_set_ups_at_a_time_the_second_waits_and_finds_all_done(
-    workspace: Workspace, commands: Commands, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    waiting, said = threading.Event(), workspace.say
-
-    def say(text: str) -> None:
-        said(text)
-        if "waiting" in text:
-            waiting.set()
-
-    monkeypatch.setattr(workspace, "say", say)
-    first = os.open(workspace.ROOT, os.O_RDONLY)
-    fcntl.flock(first, fcntl.LOCK_EX)
-    codes: list[int] = []
-    second = threading.Thread(target=lambda: codes.append(workspace.main()))
-    second.start()
-    assert waiting.wait(timeout=30)
-    assert commands.names == []
-    workspace.install("wheels", first)
-    workspace.build("wheels", first)
-    workspace.compile_ahead("wheels", first)
-    commands.names.clear()
-    os.close(first)
-    second.join(timeout=30)
-    assert codes == [0]
-    assert commands.names == []
-
-
-def test_an_interrupted_command_is_ended_with_all_that_it_started(workspace: Workspace) -> None:
-    workspace.LOG.parent.mkdir()
-    started: list[int] = []
-
-    def interrupt(line: str) -> None:
-        started.append(int(line))
-        raise KeyboardInterrupt
-
-    # The second process does not listen to SIGTERM.
-    script = "(trap '' TERM; exec sleep 600) & echo $!; wait"
-    with workspace.exclusive() as lock, pytest.raises(KeyboardInterrupt):
-        workspace.run(["sh", "-c", script], env=dict(os.environ), lock=lock, on_line=interrupt)
-    limit = time.monotonic() + 10
-    while is_running(started[0]):
-        assert time.monotonic() < limit
-
-
-def is_running(process: int) -> bool:
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
 def test_executables_run_from_a_path_with_a_space_and_old_ones_go(workspace: Workspace) -> None:
     python = workspace.VENV_PYTHON
     python.parent.mkdir(parents=True)
@@ -352,24 +230,3 @@ def test_executables_run_from_a_path_with_a_space_and_old_ones_go(workspace: Wor
     )
     # Nobody waits for a look into the package's metadata.
     assert (done.stdout, done.returncode) == ("False a b\n", 3), done.stderr
-
-
-def test_a_phase_shows_that_it_goes_on(
-    workspace: Workspace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(setup_progress, "TICK_OF_LINES", 0.01)
-    with workspace.Phase("unpacking"):
-        said = capsys.readouterr().err
-        while said.count("\n") < 3:
-            said += capsys.readouterr().err
-    first, second, *_ = said.splitlines()
-    assert first == "setup: unpacking ..."
-    assert second == "setup: unpacking ... 0 s"
-    assert capsys.readouterr().err.endswith("setup: unpacking: 0 s\n")
-
-
-def test_a_phase_that_fails_says_no_more(workspace: Workspace) -> None:
-    before = threading.active_count()
-    with pytest.raises(ZeroDivisionError), workspace.Phase("unpacking"):
-        _ = 1 / 0
-    assert threading.active_count() == before

@@ -5,10 +5,8 @@ The shell part runs for real, with stubs on the PATH.
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -59,10 +57,6 @@ def test_another_machine(checkout: Path, stubs: Path) -> None:
     assert "needs Linux on x86-64" in only_line(setup(checkout, stubs))
 
 
-def test_no_python(checkout: Path, stubs: Path) -> None:
-    assert "no Python 3.10-3.13 on the PATH" in only_line(setup(checkout, stubs))
-
-
 def test_a_shim_of_an_inactive_version_is_no_python(checkout: Path, stubs: Path) -> None:
     add(stubs, "python3", 'echo "pyenv: python3: command not found" >&2; exit 127')
     add(stubs, "python3.12", "exit 10")
@@ -92,13 +86,6 @@ def test_another_ros(checkout: Path, stubs: Path) -> None:
     assert "ROS 2 humble is sourced" in only_line(setup(checkout, stubs, ROS_DISTRO="humble"))
 
 
-def test_ros_that_the_python_cannot_import(checkout: Path, stubs: Path) -> None:
-    add(stubs, "ros2", "exit 0")
-    add(stubs, "python3", "exit 12")
-    line = only_line(setup(checkout, stubs, ROS_DISTRO="jazzy"))
-    assert "python3 cannot import rclpy" in line
-
-
 def test_ros_is_used_where_it_is_sourced_and_nothing_of_it_is_dropped(
     checkout: Path, stubs: Path
 ) -> None:
@@ -106,37 +93,3 @@ def test_ros_is_used_where_it_is_sourced_and_nothing_of_it_is_dropped(
     add(stubs, "python3", '[ "$1" = -c ] || echo "$@ $LD_LIBRARY_PATH"')
     result = setup(checkout, stubs, ROS_DISTRO="jazzy", LD_LIBRARY_PATH="/opt/ros/jazzy/lib")
     assert result.stdout.endswith("--mode ros /opt/ros/jazzy/lib\n")
-
-
-def test_the_stand_in_is_not_taken_for_ros(checkout: Path, stubs: Path) -> None:
-    add(stubs, "ros2", "exec python ros2_standin.py")
-    add(stubs, "python3", '[ "$1" = -c ] || echo "$@ ${LD_LIBRARY_PATH-}"')
-    result = setup(checkout, stubs, ROS_DISTRO="jazzy", LD_LIBRARY_PATH="/leaked")
-    assert result.stdout.endswith("--mode wheels \n")
-
-
-def test_an_unknown_argument(checkout: Path, stubs: Path) -> None:
-    result = subprocess.run(
-        [checkout / "scripts" / "setup", "--frce"],
-        check=False,
-        env={"PATH": str(stubs)},
-        text=True,
-        capture_output=True,
-    )
-    assert "unknown argument '--frce'" in only_line(result)
-
-
-def test_an_index_that_cannot_be_reached(checkout: Path) -> None:
-    result = setup(
-        checkout,
-        os.environ["PATH"],
-        NEEDLE_PYTHON=sys.executable,
-        PIP_CONFIG_FILE=os.devnull,
-        PIP_INDEX_URL="http://127.0.0.1:9/",
-        PIP_RETRIES="1",
-        PIP_NO_CACHE_DIR="1",
-    )
-    assert result.returncode == 2
-    last = result.stderr.splitlines()[-1]
-    assert "no network: the package index cannot be reached" in last
-    assert str(checkout / "ros2_ws" / "log" / "setup.log") in last
