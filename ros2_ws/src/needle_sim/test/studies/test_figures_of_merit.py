@@ -4,16 +4,11 @@ import numpy as np
 import pytest
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.figures_of_merit import (
-    Outcomes,
-    Tally,
-    figures,
-    joined,
-    trusted_far_off,
-)
+from needle_sim.studies.beliefs import Belief, BeliefTally
+from needle_sim.studies.figures_of_merit import Outcomes, Tally, figures, joined, trusted_far_off
 
 
-def outcomes(paths: list[FloatArray], turns: float = 0.0) -> Outcomes:
+def outcomes(*paths: FloatArray, turns: float = 0.0) -> Outcomes:
     """Follow needles along given distances from the plane [m], one step of 1 mm apart."""
     x = np.array(paths)
     tally = Tally(x[:, 0], x.shape[1] - 1)
@@ -22,64 +17,46 @@ def outcomes(paths: list[FloatArray], turns: float = 0.0) -> Outcomes:
     return tally.outcomes()
 
 
-def path(steps: int, *stretches: tuple[int, float]) -> FloatArray:
-    """Return distances after 0 ... steps: `(from, value)` holds from there on."""
-    x = np.zeros(steps + 1)
+def path(*stretches: tuple[int, float]) -> FloatArray:
+    """Return distances after 0 ... 50 steps: `(from, value)` holds from there on."""
+    x = np.zeros(51)
     for first, value in stretches:
         x[first:] = value
     return x
 
 
-def test_settled_is_the_last_entry_into_the_band() -> None:
+def test_settled_is_the_last_entry_into_the_band_and_converged_has_two_readings() -> None:
     found = outcomes(
-        [
-            path(50),
-            path(50, (0, 0.003), (10, 0.0)),
-            path(50, (0, 0.003), (10, 0.0), (20, -0.002), (25, 0.001)),
-            path(50, (49, 0.002)),
-        ]
+        path(),
+        path((0, 0.003), (10, 0.0), (20, -0.002), (25, 0.001)),
+        # Outside until step 30 of 50, until step 31, and at the very end.
+        path((0, 0.003), (31, 0.0)),
+        path((0, 0.003), (32, 0.0)),
+        path((50, 0.0011)),
+        path((0, -0.001)),
     )
-    np.testing.assert_allclose(found.settled, [0.0, 0.010, 0.025, np.inf])
-
-
-def test_both_readings_of_converged() -> None:
-    # outside until step 30 of 50, until step 31, and at the very end
-    found = outcomes(
-        [
-            path(50, (0, 0.003), (31, 0.0)),
-            path(50, (0, 0.003), (32, 0.0)),
-            path(50, (50, 0.0011)),
-            path(50, (0, -0.001)),
-        ]
-    )
-    np.testing.assert_array_equal(found.converged_at_end, [True, True, False, True])
-    np.testing.assert_array_equal(found.converged_last_steps, [True, False, False, True])
+    np.testing.assert_allclose(found.settled, [0.0, 0.025, 0.031, 0.032, np.inf, 0.0])
+    at_end, last_steps = found.converged_at_end, found.converged_last_steps
+    np.testing.assert_array_equal(at_end, [True, True, True, True, False, True])
+    np.testing.assert_array_equal(last_steps, [True, True, True, False, False, True])
 
 
 def test_a_run_that_missed_diverged_only_if_it_is_farther_than_ever_and_moving_away() -> None:
-    away = np.linspace(0.001, 0.010, 51)
-    still_coming = np.linspace(0.012, 0.002, 51)
-    found = outcomes([away, still_coming, path(50)])
-    np.testing.assert_array_equal(found.diverged, [True, False, False])
+    away, coming = np.linspace(0.001, 0.010, 51), np.linspace(0.012, 0.002, 51)
+    np.testing.assert_array_equal(outcomes(away, coming, path()).diverged, [True, False, False])
 
 
 def test_figures_of_known_runs() -> None:
-    seen = figures(outcomes([path(50, (0, 0.003), (10, 0.0005)), path(50, (0, -0.002))], 0.1))
+    known = [path((0, 0.003), (10, 0.0005)), path((0, -0.002))]
+    seen = figures(outcomes(*known, turns=0.1))
     assert seen["converged_at_end"] == 0.5
     assert seen["rms_last_20_mm"] == pytest.approx(np.sqrt((0.25 + 4.0) / 2.0))
     assert seen["max_last_20_mm"] == pytest.approx(2.0)
     assert seen["settle_median_mm"] == pytest.approx(10.0)
     assert seen["rotation_mean_deg"] == pytest.approx(np.rad2deg(5.0))
-
-
-def test_no_run_settled_is_no_figure() -> None:
-    seen = figures(outcomes([path(5, (0, 0.002))]))
-    assert seen["settle_median_mm"] is None
-    assert seen["settle_p95_mm"] is None
-
-
-def test_parts_join_in_order() -> None:
-    parts = [outcomes([path(30, (0, 0.001 * k))]) for k in range(3)]
+    assert seen["inside_2_sigma"] is None
+    assert figures(outcomes(known[1]))["settle_p95_mm"] is None
+    parts = [outcomes(path((0, 0.001 * k))) for k in range(3)]
     np.testing.assert_allclose(joined(parts).x_end, [0.0, 0.001, 0.002])
 
 
@@ -88,3 +65,20 @@ def test_ends_that_are_far_off_and_trusted_are_counted_on_both_sides() -> None:
     assert trusted_far_off(distance, np.zeros(5)) == 3.0
     assert trusted_far_off(distance, np.array([0.0, 0.0, 1.0, 0.0, 1.0])) == 1.0
     assert trusted_far_off(distance, np.full(5, np.nan)) is None
+
+
+def test_shares_within_2_and_3_sigma_count_x_and_pitch_alike() -> None:
+    # Off by 1, 2.5 and 4 standard deviations in x; by none, none and 2.5 in sin(pitch).
+    tally = BeliefTally(3)
+    truth = np.array([0.001, 0.0025, 0.004]), np.arcsin([0.0, 0.0, 0.025])
+    level, std = np.zeros(3), np.full(3, 0.001)
+    tally.add(None, *truth)
+    assert np.all(np.isnan(tally.inside))
+    tally.add(Belief(level, std, level, 10.0 * std), *truth)
+    np.testing.assert_allclose(tally.inside, [[1.0, 0.5, 0.0], [1.0, 1.0, 0.5]])
+    assert np.all(np.isnan(tally.doubtful))
+    # A second step in which all is as believed; of doubts the last word counts.
+    for doubtful in ([True, False, False], [False, True, False]):
+        tally.add(Belief(level, std, level, std, np.array(doubtful)), level, level)
+    np.testing.assert_allclose(tally.inside[0], [1.0, 2.5 / 3.0, 2.0 / 3.0])
+    np.testing.assert_array_equal(tally.doubtful, [0.0, 1.0, 0.0])

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -26,50 +28,43 @@ from needle_sim.studies.start_grids import GRIDS, StartBounds
 from needle_sim.studies.study import StudySettings
 
 STARTS = GRIDS["random"](StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)), 1, 4)
-SETTINGS = StudySettings(CURVATURE, 0.150, STEP_LENGTH, Disturbances(), seed=1)
+STRAIGHT = StudySettings(1e-6, 0.150, STEP_LENGTH, Disturbances(), seed=1)
 
 
-def in_start_frame(starts: FloatArray, points: FloatArray) -> FloatArray:
-    angles = np.column_stack([np.zeros(len(starts)), starts[:, 1:]])
-    off = points - np.column_stack([starts[:, 0], np.zeros((len(starts), 2))])
-    return np.asarray(Rotation.from_euler("XYZ", angles).inv().apply(off))
-
-
-def test_targets_lie_where_an_arc_of_the_allowed_curvature_leads() -> None:
-    local = in_start_frame(STARTS, random_targets(STARTS, CURVATURE, 3))
+def test_targets_lie_where_an_arc_of_the_allowed_curvature_leads_and_follow_the_seed() -> None:
+    targets = random_targets(STARTS, CURVATURE, 3)
+    angles = np.column_stack([np.zeros(len(STARTS)), STARTS[:, 1:]])
+    off = targets - np.column_stack([STARTS[:, 0], np.zeros((len(STARTS), 2))])
+    local = Rotation.from_euler("XYZ", angles).inv().apply(off)
     ahead, across = local[:, 2], np.hypot(local[:, 0], local[:, 1])
     assert NEAREST <= ahead.min() < NEAREST + 0.001
     assert FARTHEST - 0.001 < ahead.max() <= FARTHEST
-    # a circle that touches the heading and goes through the point has this curvature
+    # A circle that touches the heading and goes through the point has this curvature.
     share = 2.0 * across / (ahead**2 + across**2) / CURVATURE
     assert 0.99 * CURVATURE_SHARE < share.max() <= CURVATURE_SHARE + 1e-9
-    # uniform over the disc: half of them in the inner half of its area, five standard errors
+    # Uniform over the disc: half of them in the inner half of its area, five standard errors.
     tightest = CURVATURE_SHARE * CURVATURE
     widest = 1.0 / tightest - np.sqrt(1.0 / tightest**2 - ahead**2)
     inner = np.mean(across < widest / np.sqrt(2.0))
     assert abs(inner - 0.5) < 5.0 * 0.5 / np.sqrt(len(across))
     around = np.arctan2(local[:, 1], local[:, 0])
     assert np.hypot(np.mean(np.cos(around)), np.mean(np.sin(around))) < 0.1
-
-
-def test_targets_follow_the_seed() -> None:
-    base = random_targets(STARTS, CURVATURE, 3)
-    np.testing.assert_array_equal(random_targets(STARTS[:10], CURVATURE, 3), base[:10])
-    assert not np.any(random_targets(STARTS, CURVATURE, 4) == base)
+    np.testing.assert_array_equal(random_targets(STARTS[:10], CURVATURE, 3), targets[:10])
+    assert not np.any(random_targets(STARTS, CURVATURE, 4) == targets)
 
 
 def test_targets_drift_and_breathe_as_told_whichever_are_asked() -> None:
-    places = random_targets(STARTS, CURVATURE, 3)
+    places = random_targets(STARTS[:100], CURVATURE, 3)
     targets = MovingTargets(places, drift=0.002, breath=0.003, seed=5)
     period, whole = 1.0 / BREATHING_RATE, FARTHEST / INSERTION_SPEED
     assert whole % period == 0.0
     drifted = targets.at(whole) - targets.at(0.0)
     np.testing.assert_allclose(np.linalg.norm(drifted, axis=1), 0.002)
-    swings = np.stack([targets.at(t) - drifted * t / whole for t in np.arange(0.0, period, 0.01)])
+    swings = np.stack([targets.at(t) - drifted * t / whole for t in np.arange(0.0, period, 0.02)])
     widths = np.linalg.norm(swings - swings.mean(axis=0), axis=2).max(axis=0)
     np.testing.assert_allclose(widths, 0.003, rtol=1e-3)
-    some = targets.part(100, 7)
-    np.testing.assert_array_equal(some.at(3.3), targets.at(3.3)[100:107])
+    some = targets.part(50, 7)
+    np.testing.assert_array_equal(some.at(3.3), targets.at(3.3)[50:57])
     each = np.linspace(0.0, 6.0, 7)
     for k, time in enumerate(each):
         np.testing.assert_allclose(some.at(each)[k], some.at(float(time))[k])
@@ -81,10 +76,8 @@ class Straight:
     def __init__(self) -> None:
         self._targets = self._left = np.zeros(0)
         self.lengths: list[FloatArray] = []
-        self.seen: list[tuple[float, FloatArray]] = []
 
     def see_targets(self, time: float, targets: FloatArray) -> None:
-        self.seen.append((time, targets))
         self._targets = targets
         if not self.lengths:
             self._left = targets[:, 2]
@@ -111,39 +104,29 @@ class Straight:
 
 
 def test_each_needle_ends_at_its_own_point_with_a_short_last_step() -> None:
-    targets = np.array([[0.0, 0.0, 0.0105], [0.002, 0.0, 0.0203]])
-    made: list[Straight] = []
-
-    def new_controller() -> Straight:
-        made.append(Straight())
-        return made[-1]
-
-    straight = StudySettings(1e-6, 0.150, STEP_LENGTH, Disturbances(), seed=1)
-    found = run_point_study(np.zeros((2, 3)), MovingTargets(targets), new_controller, straight)
-    lengths = np.array(made[0].lengths)
+    targets = MovingTargets(np.array([[0.0, 0.0, 0.0105], [0.002, 0.0, 0.0203]]))
+    straight = Straight()
+    found = run_point_study(np.zeros((2, 3)), targets, lambda: straight, STRAIGHT)
+    lengths = np.array(straight.lengths)
     assert len(lengths) == 21
     np.testing.assert_allclose(lengths[:11, 0].sum(), 0.0105)
     np.testing.assert_allclose(lengths[:, 1].sum(), 0.0203)
     assert lengths[10, 0] == pytest.approx(0.0005, abs=1e-9)
     np.testing.assert_allclose(found.error, [0.0, 0.002], atol=1e-6)
-    # 10 rad/m from the second step on
+    # 10 rad/m from the second step on.
     np.testing.assert_allclose(found.rotation, 10.0 * np.array([0.0095, 0.0193]))
     np.testing.assert_array_equal(found.reached, [True, False])
-
-
-def test_no_needle_goes_beyond_the_depth() -> None:
-    shallow = StudySettings(1e-6, 0.0155, STEP_LENGTH, Disturbances(), seed=1)
-    found = run_point_study(
-        np.zeros((1, 3)), MovingTargets(np.array([[0.0, 0.0, 0.02]])), Straight, shallow
-    )
-    assert found.error[0] == pytest.approx(0.0045, abs=1e-9)
+    apart = run_point_study(np.zeros((2, 3)), targets, Straight, STRAIGHT, chunk=1)
+    np.testing.assert_allclose(apart.error, found.error, atol=1e-9)
+    # None goes beyond the depth.
+    shallow = dataclasses.replace(STRAIGHT, depth=0.0155)
+    found = run_point_study(np.zeros((2, 3)), targets, Straight, shallow)
+    assert found.error[1] == pytest.approx(np.hypot(0.002, 0.0048), abs=1e-6)
 
 
 def test_figures_of_known_ends() -> None:
-    nothing = np.full(2, np.nan)
-    ends = PointOutcomes(
-        np.array([0.0003, 0.0014]), np.array([1.0, 3.0]), nothing, nothing, nothing
-    )
+    unsaid = np.full(2, np.nan)
+    ends = PointOutcomes(np.array([0.0003, 0.0014]), np.array([1.0, 3.0]), unsaid, unsaid, unsaid)
     seen = point_figures(ends)
     assert seen["within_1_mm_point"] == 0.5
     assert seen["rms_point_mm"] == pytest.approx(np.sqrt((0.09 + 1.96) / 2.0))
@@ -152,24 +135,12 @@ def test_figures_of_known_ends() -> None:
     assert seen["doubtful_at_end"] is None
 
 
-def test_best_comes_to_points_and_the_chunks_do_not_matter() -> None:
-    noisy = StudySettings(CURVATURE, 0.150, STEP_LENGTH, Disturbances(noise=0.001), seed=7)
-    starts = STARTS[:60]
-    targets = MovingTargets(random_targets(starts, CURVATURE, 7))
-    found = run_point_study(starts, targets, point_controller_factory("best", 0.001), noisy)
-    # of thousands 99.7 % are: one of 60 may not be
-    assert np.mean(found.reached) >= 59 / 60
-    assert np.rad2deg(np.mean(found.rotation)) < 1300.0
-    again = run_point_study(
-        starts, targets, point_controller_factory("best", 0.001), noisy, chunk=7
-    )
-    np.testing.assert_allclose(again.error, found.error, atol=1e-9)
-
-
 def test_best_comes_to_points_that_drift_and_breathe() -> None:
     noisy = StudySettings(CURVATURE, 0.150, STEP_LENGTH, Disturbances(noise=0.001), seed=7)
-    starts = STARTS[:60]
-    moving = MovingTargets(random_targets(starts, CURVATURE, 7), 0.002, 0.003, seed=7)
+    places = random_targets(STARTS, CURVATURE, 7)
+    near = np.argsort(places[:, 2])[:5]
+    starts, moving = STARTS[near], MovingTargets(places[near], 0.002, 0.003, seed=7)
     found = run_point_study(starts, moving, point_controller_factory("best", 0.001), noisy)
-    # 0.25 mm of thousands; where nothing is foretold 2.2 mm
-    assert np.sqrt(np.mean(found.error**2)) < 0.0004
+    # 0.25 mm of thousands; where nothing is foretold 2.2 mm.
+    assert np.sqrt(np.mean(found.error**2)) < 0.0005
+    assert np.rad2deg(np.mean(found.rotation)) < 1300.0

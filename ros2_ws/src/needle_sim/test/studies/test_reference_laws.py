@@ -1,0 +1,97 @@
+"""The published laws: sliding mode, and RRT with its arcs, duty cycle and paths past obstacles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_sim.needle.se3 import FloatArray
+from needle_sim.studies.rrt_replanning import DutyCycle, arc_to, is_clear, move, plan
+from needle_sim.studies.sliding_mode import sliding_mode_rate
+
+CURVATURE = 1.0 / 0.122
+RATE = np.deg2rad(30.0) / 0.001
+STEP = 0.001
+TARGET = np.array([0.006, 0.004, 0.11])
+BALL = np.array([[0.002, 0.001, 0.05, 0.002, 0.001, 0.05, 0.003]])
+FREE = np.zeros((0, 7))
+
+
+def steered(rate: Callable[[FloatArray], float], length: float) -> tuple[float, float]:
+    """Return an exact needle's miss and its least distance from the ball [m]."""
+    plant, least = NeedlePlant(initial_pose(0.02, 0.3), curvature=CURVATURE), 1.0
+    pose = plant.T_rig_tip
+    while (ahead := float(pose[:3, 2] @ (TARGET - pose[:3, 3]))) > 1e-5:
+        step = min(length, ahead)
+        plant.advance(step, rate(pose) * step)
+        pose = plant.T_rig_tip
+        least = min(least, float(np.linalg.norm(pose[:3, 3] - BALL[0, :3])) - BALL[0, 6])
+    return float(np.linalg.norm(pose[:3, 3] - TARGET)), least
+
+
+def sliding(pose: FloatArray) -> float:
+    return float(sliding_mode_rate(pose[:3, :3].T @ (TARGET - pose[:3, 3]), RATE))
+
+
+def test_sliding_mode_turns_the_bevel_the_shorter_way_and_comes_as_near_as_published() -> None:
+    for aside in ((1.0, 0.0), (-1.0, 0.0), (0.5, -2.0), (-0.1, 1.0)):
+        plant = NeedlePlant(initial_pose(0.0, 0.0), curvature=CURVATURE)
+        target = np.array([*aside, 50.0]) * 1e-3
+        plant.advance(0.0, float(sliding_mode_rate(target, RATE)) * 1e-4)
+        towards = np.array(aside) / np.hypot(*aside)
+        assert -plant.T_rig_tip[:2, 1] @ towards > np.array([0.0, -1.0]) @ towards
+    # At 30 deg/mm and this curvature the bound is 0.41 mm, in steps far shorter than a turn.
+    assert steered(sliding, 2e-4)[0] < 0.00041
+
+
+def test_an_arc_ends_where_it_is_to_and_is_the_needle_s_own_at_the_edge() -> None:
+    plant = NeedlePlant(initial_pose(0.1, 0.4), curvature=CURVATURE)
+    pose = plant.T_rig_tip
+    place, ahead = pose[:3, 3].copy(), pose[:3, 2].copy()
+    plant.advance(0.06, 0.0)
+    there, bend, end, heading = plant.T_rig_tip, np.empty(3), np.empty(3), np.empty(3)
+    goal = there[:3, 3].copy()
+    length = arc_to(place, ahead, goal, 1.001 * CURVATURE, bend)
+    assert length == pytest.approx(0.06)
+    np.testing.assert_allclose(bend, -CURVATURE * pose[:3, 1], atol=1e-9)
+    move(place, ahead, bend, length, end, heading)
+    np.testing.assert_allclose(end, goal, atol=1e-12)
+    np.testing.assert_allclose(heading, there[:3, 2], atol=1e-9)
+    assert np.isinf(arc_to(place, ahead, goal, 0.99 * CURVATURE, bend))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_a_duty_cycle_spins_for_the_share_that_is_not_to_bend(share: float) -> None:
+    cycle, steps = DutyCycle(RATE, STEP), 600
+    ahead = np.array([[0.0, -1.0, share]])
+    turned = sum(abs(float(cycle.rates(ahead)[0])) * STEP for _ in range(steps))
+    assert turned == pytest.approx((1.0 - share) * steps * RATE * STEP, abs=2.0 * np.pi)
+
+
+@pytest.mark.parametrize("obstacles", [FREE, BALL], ids=["free", "ball"])
+def test_a_planned_needle_comes_near_and_past_what_is_in_the_way(obstacles: FloatArray) -> None:
+    rng, cycle, arc = np.random.default_rng(4), DutyCycle(RATE, STEP), np.zeros(3)
+
+    def planned(pose: FloatArray) -> float:
+        chance = rng.random((100, 4))
+        place, rotation = pose[:3, 3].copy(), pose[:3, :3].copy()
+        plan(place, rotation, TARGET, obstacles, CURVATURE, 0.001, chance, arc)
+        return float(cycle.rates(arc[np.newaxis])[0])
+
+    miss, least = steered(planned, STEP)
+    assert miss < 0.001
+    # Without it in its way the needle would have gone through the ball.
+    assert (least > 0.0) == bool(len(obstacles))
+
+
+def test_what_no_path_leads_to_is_said() -> None:
+    arc, chance = np.full(3, 7.0), np.random.default_rng(5).random((100, 4))
+    aside = np.array([0.05, 0.0, 0.02])
+    assert not plan(np.zeros(3), np.eye(3), aside, FREE, CURVATURE, 0.001, chance, arc)
+    np.testing.assert_array_equal(arc, 7.0)
+    straight, bend = np.array([0.0, 0.0, 1.0]), np.zeros(3)
+    assert is_clear(np.zeros(3), straight, bend, 0.03, BALL, 0.001)
+    assert not is_clear(np.zeros(3), straight, bend, 0.05, BALL, 0.001)
