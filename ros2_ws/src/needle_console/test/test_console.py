@@ -280,8 +280,8 @@ def test_what_is_heard_of_the_rig_is_shown_in_its_frames_only(bench: Bench) -> N
         bench.hear("target_plane", m.Pose(0, frame, (x, 0.0, 0.0), TURN))
         bench.hear("needle/tip_pose", m.PoseWithCovariance(1, frame, (x, 0.0, 0.01), TURN, flat))
     bench.hear("needle/controller_status", ControllerStatus(state="STEERING"))
-    for frame in ("target_plane", "rig"):
-        estimate = m.PoseWithCovariance(1, frame, (0.0, 0.0, 0.01), TURN, flat)
+    for frame, x in (("target_plane", 0.0), ("rig", 0.4)):
+        estimate = m.PoseWithCovariance(1, frame, (x, 0.0, 0.01), TURN, flat)
         bench.hear("needle/estimate", estimate)
     sick = m.Status("sim_rig", "loop", Level.WARN, "slow", {})
     bench.hear("/diagnostics", m.Diagnostics(1, (sick,)))

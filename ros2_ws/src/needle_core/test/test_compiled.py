@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import pwd
 import random
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,18 +25,16 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return package
 
 
-def test_it_is_kept_in_the_users_cache(package: Path, tmp_path: Path) -> None:
+def test_it_is_kept_in_the_users_cache_or_where_the_user_says(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = Path(compiled._cache_directory(package))
     assert folder.is_relative_to(tmp_path / "home" / ".cache")
     assert folder.stat().st_mode & 0o777 == 0o700
-
-
-@pytest.mark.parametrize("name", ["NUMBA_CACHE_DIR", "XDG_CACHE_HOME"])
-def test_it_is_kept_where_the_user_says(
-    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    monkeypatch.setenv(name, str(tmp_path / "named"))
-    assert Path(compiled._cache_directory(package)).is_relative_to(tmp_path / "named")
+    for name in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
+        monkeypatch.setenv(name, str(tmp_path / name))
+        compiled._cache_directory.cache_clear()
+        assert Path(compiled._cache_directory(package)).is_relative_to(tmp_path / name)
 
 
 def test_without_a_home_nothing_is_kept(
@@ -52,44 +47,27 @@ def test_without_a_home_nothing_is_kept(
     assert not list((tmp_path / "tmp").iterdir())
 
 
-CALLEE = """
-from needle_core.compiled import compiled
-
-@compiled
-def callee(x):
-    return x + {added}
-"""
-CALLER = """
-from needle_core.compiled import compiled
-from rooms.inner.callee import callee
-
-@compiled
-def caller(x):
-    return callee(x)
-"""
-
-
-def test_an_edited_callee_in_another_room_is_compiled_anew(tmp_path: Path) -> None:
-    rooms = tmp_path / "rooms"
-    for folder in (rooms, rooms / "inner", rooms / "outer"):
-        folder.mkdir()
+def test_code_that_is_edited_in_any_room_of_its_package_is_compiled_anew(package: Path) -> None:
+    room = package / "inner"
+    room.mkdir()
+    for folder in (package, room):
         (folder / "__init__.py").touch()
-    (rooms / "outer" / "caller.py").write_text(CALLER)
-    environment = {
-        **os.environ,
-        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
-        "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}",
-        # Sources of one second and size are told apart by nothing but their content.
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
-    said = []
-    for added in (1, 2):
-        (rooms / "inner" / "callee.py").write_text(CALLEE.format(added=added))
-        script = "from rooms.outer.caller import caller; print(caller(0))"
-        command = [sys.executable, "-c", script]
-        said.append(subprocess.check_output(command, env=environment, text=True, timeout=60))
-    assert list((tmp_path / "cache").rglob("*.nbi"))
-    assert said == ["1\n", "2\n"]
+    (room / "plain.py").write_text("x = 1\n")
+    assert compiled._package_root(room / "callee.py") == package
+    folders = []
+    for file, text in (
+        ("callee.py", "@compiled\ndef callee(x):\n    return x + 1\n"),
+        ("callee.py", "@compiled\ndef callee(x):\n    return x + 2\n"),
+        ("constants.py", "# Read by compiled code.\nx = 1\n"),
+        ("inlined.py", "@inlined\ndef f(x):\n    return x\n"),
+        ("plain.py", "x = 2\n"),
+    ):
+        (room / file).write_text(text)
+        compiled._cache_directory.cache_clear()
+        folders.append(compiled._cache_directory(package))
+    # What no compiled code reads changes nothing.
+    assert len(set(folders)) == 4
+    assert folders[-1] == folders[-2]
 
 
 @compiled.compiled

@@ -1,103 +1,184 @@
-"""Exit codes and one-line errors, as a shell sees them."""
+"""Entry points and exit codes: what a shell sees of a command or node, whatever comes."""
 
-import subprocess
+from __future__ import annotations
+
+import importlib
+import io
+import math
+import os
+import signal
 import sys
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NoReturn
 
 import pytest
 
-from needle_core.commands.cli import (
-    EXIT_BAD_INPUT,
-    EXIT_INTERNAL_ERROR,
-    EXIT_INTERRUPTED,
-    EXIT_MISSED,
-    run_command,
-)
+from needle_core.commands import cli, executables
+from needle_core.commands.cli import internal_error, run_command, write_json
+from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
+from needle_core.process.end_request import ENDING_SIGNALS, EndRequest, interruptible
+
+
+class LeftError(BaseException):
+    """Stands for the end of the process by `os._exit`."""
+
+
+@pytest.fixture(autouse=True)
+def _handlers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Let no process end, and leave every signal as it was."""
+
+    def leave(code: int) -> NoReturn:
+        raise LeftError(code)
+
+    monkeypatch.setattr(os, "_exit", leave)
+    before = {number: signal.getsignal(number) for number in ENDING_SIGNALS}
+    # A shell's background, where tests may run, ignores SIGINT.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 def raise_(error: BaseException) -> int:
     raise error
 
 
-def test_a_users_error_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(lambda: raise_(UserError("kappa = -1 1/m, must be > 0"))) == EXIT_BAD_INPUT
-    assert capsys.readouterr().err == "error: kappa = -1 1/m, must be > 0\n"
-
-
-def test_an_interrupt_is_exit_code_130(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(lambda: raise_(KeyboardInterrupt())) == EXIT_INTERRUPTED
-    assert capsys.readouterr().err == "interrupted\n"
-
-
-def test_the_commands_own_code_comes_through() -> None:
-    assert run_command(lambda: EXIT_MISSED) == EXIT_MISSED
-
-
-def test_an_internal_error_is_one_line_with_a_code_of_its_own(
+def test_what_a_user_can_cause_is_an_exit_code_and_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert run_command(lambda: raise_(ValueError("two\nlines"))) == EXIT_INTERNAL_ERROR == 3
+    assert run_command(lambda: cli.EXIT_MISSED) == 1
+    assert run_command(lambda: raise_(UserError("kappa = -1 1/m"))) == 2
+    assert run_command(lambda: raise_(KeyboardInterrupt())) == 130
+    assert capsys.readouterr().err == "error: kappa = -1 1/m\ninterrupted\n"
+
+
+def test_an_internal_error_is_one_line_and_in_development_a_traceback_before_it(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run_command(lambda: raise_(ValueError("two\nlines"))) == 3
     said = capsys.readouterr().err
-    assert said.startswith(
-        "error: internal error, please report it: ValueError: two lines (test_cl"
-    )
+    assert said.startswith("error: internal error, please report it: ValueError: two lines (test_c")
     assert said.count("\n") == 1
+    develops = types.SimpleNamespace(flags=types.SimpleNamespace(dev_mode=True), stderr=sys.stderr)
+    monkeypatch.setattr(cli, "sys", develops)
+    assert internal_error(ValueError("odd")) == 3
+    first, *_, last = capsys.readouterr().err.splitlines()
+    assert first == "ValueError: odd"
+    assert last.startswith("error: internal error")
 
 
-def test_development_mode_shows_the_traceback() -> None:
-    code = (
-        "import sys; from needle_core.commands.cli import run_command; "
-        "sys.exit(run_command(lambda: 1/0))"
-    )
-    process = subprocess.run(
-        [sys.executable, "-X", "dev", "-c", code], capture_output=True, text=True, check=False
-    )
-    assert process.returncode == EXIT_INTERNAL_ERROR
-    assert "Traceback" in process.stderr
-    assert process.stderr.splitlines()[-1].startswith("error: internal error")
+def test_a_reader_that_leaves_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        assert run_command(lambda: stream.write("x" * 10**6)) == 0
+        assert run_command(lambda: stream.write("x") - 1) == 0
 
 
-@pytest.mark.parametrize("lines", [1, 100_000])
-def test_a_reader_that_leaves_is_no_error(lines: int) -> None:
-    code = (
-        "import sys, time; from needle_core.commands.cli import run_command\n"
-        "sys.stdin.read()\n"
-        f"sys.exit(run_command(lambda: print('x\\n' * {lines}) or 0))"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    process.stdout.close()
-    assert process.stdin is not None
-    process.stdin.close()
-    process.stdin = process.stdout = None
-    _, said = process.communicate(timeout=60.0)
-    assert (process.returncode, said) == (0, "")
+def test_json_dash_is_all_there_is_on_standard_output(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "__stdout__", out := io.StringIO())
+
+    def command() -> int:
+        parser = CommandParser("c", "", "")
+        parser.add_argument("--json")
+        file = output_file("--json", parser.parse_args(["--json", "-"]).json)
+        print("words")
+        write_json(file, {"a": 1, "b": math.nan})
+        return 0
+
+    assert run_command(command) == 0
+    print("after")
+    assert out.getvalue() == '{\n  "a": 1,\n  "b": null\n}\n'
+    assert capsys.readouterr() == ("after\n", "words\n")
 
 
-def test_json_dash_is_all_there_is_on_standard_output() -> None:
-    code = """
-import sys
-from needle_core.commands.cli import run_command, write_json
-from needle_core.commands.options import CommandParser, output_file
-def command():
-    parser = CommandParser("c", "", "")
-    parser.add_argument("--json")
-    file = output_file("--json", parser.parse_args(["--json", "-"]).json)
-    print("words")
-    write_json(file, {"a": 1})
-    return 0
-code = run_command(command)
-print("after")
-sys.exit(code)
-"""
-    result = subprocess.run(
-        [sys.executable, "-c", code], check=False, capture_output=True, text=True
-    )
-    assert (result.returncode, result.stderr) == (0, "words\n")
-    assert result.stdout == '{\n  "a": 1\n}\nafter\n'
+def test_json_goes_into_a_file_or_says_why_not(tmp_path: Path) -> None:
+    write_json(tmp_path / "file", {"a": math.inf})
+    assert (tmp_path / "file").read_text() == '{\n  "a": null\n}\n'
+    with pytest.raises(UserError, match=r"cannot write .*: Is a directory"):
+        write_json(tmp_path, {})
+
+
+# ---- signals ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", ENDING_SIGNALS)
+def test_a_signal_sets_the_flag_and_ends_nothing(number: signal.Signals) -> None:
+    before = signal.getsignal(number)
+    with EndRequest() as end:
+        assert not end.wanted
+        for _ in range(2):
+            signal.raise_signal(number)
+            assert end.wanted
+    assert signal.getsignal(number) is before
+
+
+def test_a_hangup_that_is_ignored_stays_so() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with EndRequest() as end:
+        signal.raise_signal(signal.SIGHUP)
+        assert not end.wanted
+    with interruptible():
+        signal.raise_signal(signal.SIGHUP)
+
+
+@pytest.mark.parametrize("number", ENDING_SIGNALS)
+def test_a_command_cleans_up_undisturbed(number: signal.Signals) -> None:
+    done: list[str] = []
+
+    def work() -> int:
+        try:
+            signal.raise_signal(number)
+            done.append("not interrupted")
+        finally:
+            signal.raise_signal(number)
+            signal.raise_signal(signal.SIGINT)
+            done.append("clean")
+        return 0
+
+    assert run_command(work) == 130
+    assert done == ["clean"]
+
+
+@pytest.mark.parametrize("number", ENDING_SIGNALS)
+@pytest.mark.parametrize(("kind", "code"), [(executables.node, 0), (executables.command, 130)])
+def test_a_signal_while_modules_are_loaded_ends_at_once(
+    kind: Callable[[str], Any], code: int, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Also in a shell's background.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    monkeypatch.setattr(importlib, "import_module", lambda _: signal.raise_signal(number))
+    with pytest.raises(LeftError) as left:
+        kind("nothing")()
+    assert left.value.args == (code,)
+
+
+@pytest.mark.parametrize(
+    ("kind", "end"), [(executables.node, LeftError), (executables.command, SystemExit)]
+)
+def test_the_exit_code_and_the_last_words_come_through(
+    kind: Callable[[str], Any],
+    end: type[BaseException],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    file = tmp_path / "words"
+    with file.open("w") as stream:
+
+        def main() -> int:
+            monkeypatch.setattr(sys, "stdout", stream)
+            print("last words")
+            return 4
+
+        monkeypatch.setitem(sys.modules, "made_up", types.SimpleNamespace(main=main))
+        with pytest.raises(end) as left:
+            kind("made_up")()
+        assert left.value.args == (4,)
+        # A command leaves by the interpreter, which writes them.
+        assert file.read_text() == ("last words\n" if end is LeftError else "")

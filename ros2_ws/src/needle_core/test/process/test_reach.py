@@ -1,4 +1,4 @@
-"""Who reaches a node."""
+"""Who reaches a node: this machine alone, unless the user asks for a network."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from needle_core.process.reach import (
 )
 
 _NAMES = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"
+SERVER, LOCALHOST_ONLY = "ROS_DISCOVERY_SERVER", "ROS_LOCALHOST_ONLY"
 
 
 def kept(**environment: str) -> dict[str, str]:
@@ -28,64 +29,58 @@ def kept(**environment: str) -> dict[str, str]:
     return environment
 
 
-def test_who_says_nothing_is_closed() -> None:
-    assert kept() == {DISCOVERY_RANGE: "LOCALHOST", PROFILES: str(THIS_MACHINE)}
-    assert not is_open({})
-
-
-@pytest.mark.parametrize("before", ["", str(THIS_MACHINE), str(NETWORK), "/another/checkout.xml"])
-@pytest.mark.parametrize(
-    ("asked", "opened"), [("LOCALHOST", False), ("OFF", False), ("SUBNET", True)]
-)
-def test_the_discovery_range_decides(before: str, asked: str, opened: bool) -> None:
-    environment = kept(**{DISCOVERY_RANGE: asked, PROFILES: before})
-    assert environment[PROFILES] == str(NETWORK if opened else THIS_MACHINE)
-    assert environment[DISCOVERY_RANGE] == asked
-    assert is_open(environment) is opened
-
-
-def test_profiles_of_the_users_own_stay(tmp_path: Path) -> None:
-    own = tmp_path / "profiles.xml"
-    own.touch()
-    assert kept(**{PROFILES: str(own)})[PROFILES] == str(own)
+@pytest.fixture
+def own(tmp_path: Path) -> str:
+    """Profiles of the user's own."""
+    (tmp_path / "profiles.xml").touch()
+    return str(tmp_path / "profiles.xml")
 
 
 @pytest.mark.parametrize(
-    ("asked", "profiles", "opened"),
+    ("asked", "profiles", "without_shared_memory"),
     [
-        ("LOCALHOST", THIS_MACHINE_UDP, False),
-        ("OFF", THIS_MACHINE, False),
-        ("SUBNET", NETWORK_UDP, True),
-        ("SYSTEM_DEFAULT", NETWORK_UDP, True),
+        ("", THIS_MACHINE, THIS_MACHINE_UDP),
+        ("LOCALHOST", THIS_MACHINE, THIS_MACHINE_UDP),
+        ("OFF", THIS_MACHINE, THIS_MACHINE),
+        ("SUBNET", NETWORK, NETWORK_UDP),
+        ("SYSTEM_DEFAULT", NETWORK, NETWORK_UDP),
     ],
 )
-def test_without_shared_memory_as_many_are_reached(
-    asked: str, profiles: Path, opened: bool
+def test_the_discovery_range_decides_with_and_without_shared_memory(
+    asked: str, profiles: Path, without_shared_memory: Path
 ) -> None:
+    opened = profiles is NETWORK
+    for before in ("", str(THIS_MACHINE), str(NETWORK), "/another/checkout.xml"):
+        environment = kept(**{DISCOVERY_RANGE: asked, PROFILES: before})
+        assert environment == {DISCOVERY_RANGE: asked or "LOCALHOST", PROFILES: str(profiles)}
+        assert is_open(environment) is opened
     environment = {DISCOVERY_RANGE: asked}
     keep_to_this_machine(environment, shared_memory=False)
-    assert environment[PROFILES] == str(profiles)
+    assert environment[PROFILES] == str(without_shared_memory)
     assert is_open(environment) is opened
-    # What such a node starts has it again.
+    # What such a node starts has shared memory again.
     keep_to_this_machine(environment)
     assert environment == kept(**{DISCOVERY_RANGE: asked})
+    assert kept() == {DISCOVERY_RANGE: "LOCALHOST", PROFILES: str(THIS_MACHINE)}
 
 
-def test_profiles_of_the_users_own_keep_their_shared_memory(tmp_path: Path) -> None:
-    own = tmp_path / "profiles.xml"
-    own.touch()
-    environment = {PROFILES: str(own)}
-    keep_to_this_machine(environment, shared_memory=False)
-    assert environment == kept(**{PROFILES: str(own)})
+def test_profiles_of_the_users_own_stay_and_are_named(
+    own: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for shared_memory in (True, False):
+        environment = {PROFILES: own}
+        keep_to_this_machine(environment, shared_memory=shared_memory)
+        assert environment == {DISCOVERY_RANGE: "LOCALHOST", PROFILES: own}
+        assert capsys.readouterr().err == f"{PROFILES}={own}: it decides who is reached\n"
 
 
 @pytest.mark.parametrize(
     ("variable", "value", "effect"),
     [
         ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp", "the rig's nodes run on rmw_fastrtps_cpp"),
-        ("ROS_DISCOVERY_SERVER", "10.0.0.1:11811", "with it, nodes meet at a server only"),
+        (SERVER, "10.0.0.1:11811", "with it, nodes meet at a server only"),
         ("ROS_STATIC_PEERS", "10.0.0.1", f"{DISCOVERY_RANGE}=LOCALHOST looks for none"),
-        ("ROS_LOCALHOST_ONLY", "1", "nodes keep to this machine in any case"),
+        (LOCALHOST_ONLY, "1", "nodes keep to this machine in any case"),
         ("FASTDDS_DEFAULT_PROFILES_FILE", "/mine.xml", f"Fast DDS reads {PROFILES}"),
         (PROFILES, "/not/there.xml", "no such file"),
     ],
@@ -100,80 +95,44 @@ def test_what_another_set_up_left_is_named_and_dropped(
     assert capsys.readouterr().err == ""
 
 
-def test_what_asks_for_a_network_stays_and_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    own = tmp_path / "profiles.xml"
-    own.touch()
-    asked = {
-        DISCOVERY_RANGE: "SUBNET",
-        "ROS_STATIC_PEERS": "10.0.0.1",
-        "ROS_DISCOVERY_SERVER": "10.0.0.1:11811",
-        PROFILES: str(own),
-    }
-    assert kept(**asked) == asked
-    assert capsys.readouterr().err.splitlines() == [
-        "ROS_DISCOVERY_SERVER=10.0.0.1:11811: with it, nodes meet at a server only",
-        f"{PROFILES}={own}: it decides who is reached",
-    ]
+def test_what_asks_for_a_network_stays_and_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    asked = {DISCOVERY_RANGE: "SUBNET", "ROS_STATIC_PEERS": "10.0.0.1", SERVER: "a:1"}
+    assert kept(**asked) == {**asked, PROFILES: str(NETWORK)}
     assert kept(**{DISCOVERY_RANGE: "OFF"})[DISCOVERY_RANGE] == "OFF"
-    assert capsys.readouterr().err == f"{DISCOVERY_RANGE}=OFF: with it, no node finds another\n"
+    assert capsys.readouterr().err.splitlines() == [
+        f"{SERVER}=a:1: with it, nodes meet at a server only",
+        f"{DISCOVERY_RANGE}=OFF: with it, no node finds another",
+    ]
 
 
-@pytest.mark.parametrize("domain", ["300", "233", "-1", "abc", "7abc", "1.5", "1" * 5000])
-def test_a_domain_that_does_not_exist_is_refused(
-    capsys: pytest.CaptureFixture[str], domain: str
-) -> None:
-    with pytest.raises(UserError, match=f"^ROS_DOMAIN_ID={domain} is not a number from 0 to 232$"):
-        kept(ROS_DOMAIN_ID=domain)
-    # Nodes that are started together have a domain of their own.
-    environment = {"ROS_DOMAIN_ID": domain}
-    settle_environment(environment, own_graph=True)
-    assert environment == {}
-    assert capsys.readouterr().err.startswith(f"ROS_DOMAIN_ID={domain} ignored: it is not a numb")
-
-
-@pytest.mark.parametrize("domain", ["", "0", "7", "232"])
-def test_a_domain_that_exists_stays(capsys: pytest.CaptureFixture[str], domain: str) -> None:
-    assert kept(ROS_DOMAIN_ID=domain)["ROS_DOMAIN_ID"] == domain
-    assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize("asked", ["subnet", "LOCALHSOT", "1"])
-def test_a_range_that_does_not_exist_is_refused_and_opens_nothing(asked: str) -> None:
-    with pytest.raises(UserError, match=f"{DISCOVERY_RANGE}={asked} is not one of LOCALHOST, SUB"):
-        kept(**{DISCOVERY_RANGE: asked})
-
-
-def test_an_empty_range_is_none(capsys: pytest.CaptureFixture[str]) -> None:
-    assert kept(**{DISCOVERY_RANGE: ""}) == kept()
-    assert not is_open({DISCOVERY_RANGE: ""})
-    assert capsys.readouterr().err == ""
-
-
-def test_ranges_that_contradict_each_other_are_refused() -> None:
-    with pytest.raises(UserError, match=f"ROS_LOCALHOST_ONLY=1 contradicts {DISCOVERY_RANGE}=SUBN"):
-        kept(**{DISCOVERY_RANGE: "SUBNET", "ROS_LOCALHOST_ONLY": "1"})
-
-
-def test_nodes_that_are_started_together_find_each_other(
+def test_what_does_not_exist_or_contradicts_itself_is_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    environment = {DISCOVERY_RANGE: "OFF", "ROS_DISCOVERY_SERVER": "a:1", "CYCLONEDDS_URI": "x"}
+    for asked in ("subnet", "LOCALHSOT", "1"):
+        with pytest.raises(UserError, match=f"{DISCOVERY_RANGE}={asked} is not one of LOCALHOST"):
+            kept(**{DISCOVERY_RANGE: asked})
+    with pytest.raises(UserError, match=f"{LOCALHOST_ONLY}=1 contradicts {DISCOVERY_RANGE}=SUBNET"):
+        kept(**{DISCOVERY_RANGE: "SUBNET", LOCALHOST_ONLY: "1"})
+    for domain in ("", "0", "7", "232"):
+        assert kept(ROS_DOMAIN_ID=domain)["ROS_DOMAIN_ID"] == domain
+    assert capsys.readouterr().err == ""
+    for domain in ("233", "-1", "7abc", "1.5", "1" * 5000):
+        with pytest.raises(UserError, match=f"^ROS_DOMAIN_ID={domain} is not a number from 0 to 2"):
+            kept(ROS_DOMAIN_ID=domain)
+        # Nodes that are started together have a domain of their own.
+        environment = {"ROS_DOMAIN_ID": domain}
+        settle_environment(environment, own_graph=True)
+        assert environment == {}
+        assert capsys.readouterr().err.startswith(f"ROS_DOMAIN_ID={domain} ignored: ")
+
+
+def test_nodes_that_are_started_together_find_each_other() -> None:
+    environment = {DISCOVERY_RANGE: "OFF", SERVER: "a:1", "CYCLONEDDS_URI": "x"}
     settle_environment(environment, own_graph=True)
     assert environment == {"CYCLONEDDS_URI": "x"}
-    environment = {
-        DISCOVERY_RANGE: "SUBNET",
-        "ROS_DISCOVERY_SERVER": "a:1",
-        "ROS_STATIC_PEERS": "b",
-    }
+    environment = {DISCOVERY_RANGE: "SUBNET", SERVER: "a:1", "ROS_STATIC_PEERS": "b"}
     settle_environment(environment, own_graph=True)
     assert environment == {DISCOVERY_RANGE: "SUBNET", "ROS_STATIC_PEERS": "b"}
-    assert [line.partition(" ")[0] for line in capsys.readouterr().err.splitlines()] == [
-        f"{DISCOVERY_RANGE}=OFF",
-        "ROS_DISCOVERY_SERVER=a:1",
-        "ROS_DISCOVERY_SERVER=a:1",
-    ]
 
 
 def elements(file: Path, *left_out: str) -> list[tuple[str, str]]:
@@ -185,11 +144,11 @@ def elements(file: Path, *left_out: str) -> list[tuple[str, str]]:
         return {name, described or element.text} & {*left_out} != set()
 
     def walk(element: ElementTree.Element) -> list[tuple[str, str]]:
-        found = [(element.tag, (element.text or "").strip())]
-        for child in element:
-            if not is_left_out(child):
-                found += walk(child)
-        return found
+        children = [child for child in element if not is_left_out(child)]
+        return [
+            (element.tag, (element.text or "").strip()),
+            *(e for c in children for e in walk(c)),
+        ]
 
     return walk(ElementTree.parse(file).getroot())
 

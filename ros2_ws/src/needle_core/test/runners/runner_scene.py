@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 from needle_core.component import (
@@ -19,6 +20,7 @@ from needle_core.component import (
     Peers,
     Port,
     Publish,
+    Reply,
     Send,
     Service,
     Timer,
@@ -104,21 +106,29 @@ class Wired(Component):
 
 
 class Server(Component):
-    """Answers as it is told."""
+    """Answers as it is told; none at all by default."""
 
     name = "server"
 
-    def __init__(self, answer: Callable[[bool | None, int, Moment], Actions]) -> None:
-        self.services = (Service("serve", answer, has_argument=True),)
+    def __init__(self, *replies: Reply) -> None:
+        self.asked: list[tuple[int, bool | None]] = []
+        self._replies = replies
+        self.services = (Service("serve", self._answer, has_argument=True),)
+
+    def _answer(self, on: bool | None, number: int, at: Moment) -> Actions:
+        self.asked.append((number, on))
+        return [dataclasses.replace(reply, request=number) for reply in self._replies]
 
 
 def run(
     components: Sequence[Component], seconds: float = 3.0, **options: Any
-) -> tuple[VirtualRunner, list[tuple[Any, ...]]]:
-    told: list[tuple[Any, ...]] = []
-    tap = lambda stamp, sender, message, output: told.append(  # noqa: E731
-        (stamp, sender, output.topic, message)
-    )
+) -> tuple[VirtualRunner, list[tuple[int, str, Any]]]:
+    """Run; return what was said on all topics: stamp, topic, message."""
+    told: list[tuple[int, str, Any]] = []
+
+    def tap(stamp: int, sender: str, message: Any, output: Output) -> None:
+        told.append((stamp, output.topic, message))
+
     runner = VirtualRunner(components, taps=(tap,), **options)
     runner.run(seconds)
     return runner, told

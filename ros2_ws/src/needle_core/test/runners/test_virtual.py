@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import random
+from collections.abc import Sequence
+from typing import Any
+
 import pytest
 
 from needle_core.component import (
@@ -17,22 +21,36 @@ from needle_core.component import (
     Log,
     Moment,
     Port,
+    PortChange,
     Publish,
     Reply,
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.messages import EmergencyStop
 from needle_core.runners.faults import (
+    Arrival,
+    Arrivals,
     Fault,
+    Link,
     delay,
     drop,
     duplicate,
     silence,
 )
 from needle_core.runners.timeline import START_NS
-from needle_core.runners.virtual import DISCOVERY, VirtualRunner
+from needle_core.runners.virtual import DISCOVERY, LEASE, VirtualRunner
 
 from .runner_scene import Once, Receiver, Sender, Server, Wired, run
+
+NUMBER = 0
+"""Of a request: the scene's server knows it."""
+
+
+def texts(told: Sequence[tuple[int, str, Any]]) -> list[str]:
+    return [message.text for _, topic, message in told if topic == "/rosout"]
+
+
+# ---- messages -----------------------------------------------------------------------------------
 
 
 def test_the_same_seed_is_the_same_run_and_another_seed_another() -> None:
@@ -45,7 +63,7 @@ def test_the_same_seed_is_the_same_run_and_another_seed_another() -> None:
 def test_another_component_changes_no_draw_of_the_others() -> None:
     alone, beside = Receiver(), Receiver()
     run([Sender(), alone])
-    run([Once([]), Sender(), beside, Server(lambda *_: ())])
+    run([Once([]), Sender(), beside, Server()])
     # While the others are found, their news keep the receiver busy.
     settled = DISCOVERY[1] + 0.1
     late = [[item for item in r.received if item[1].steady > settled] for r in (alone, beside)]
@@ -53,12 +71,13 @@ def test_another_component_changes_no_draw_of_the_others() -> None:
 
 
 def test_a_message_takes_its_time_and_says_when_it_was_sent() -> None:
-    receiver = Receiver()
+    receiver, late = Receiver(), Receiver()
     run([Sender(), receiver])
     for _, at in receiver.received:
-        late = at.stamp_ns - at.sent_ns
-        assert 300_000 <= late <= 1_500_000
+        assert 300_000 <= at.stamp_ns - at.sent_ns <= 1_500_000
         assert at.stamp_ns == START_NS + round(at.steady * 1e9)
+    run([Sender(), late], faults=[delay("numbers", 0.4)])
+    assert all(at.stamp_ns - at.sent_ns >= 400_000_000 for _, at in late.received)
 
 
 def test_what_is_sent_before_discovery_is_lost_but_for_what_is_latched() -> None:
@@ -72,41 +91,27 @@ def test_what_is_sent_before_discovery_is_lost_but_for_what_is_latched() -> None
 
 def test_peers_are_told_as_they_are_found() -> None:
     receiver = Receiver()
-    run([Sender(), Sender("second"), receiver, Server(lambda *_: ())])
+    run([Sender(), Sender("second"), receiver, Server()])
     last = receiver.peers[-1]
     assert set(last.publishers["numbers"]) == {"sender", "second"}
     assert last.subscribers["numbers"] == ("receiver",)
     assert last.services == {"serve"}
+    assert last.nodes == {"sender", "second", "receiver", "server"}
     assert len(receiver.peers) == 3
 
 
-@pytest.mark.parametrize(
-    ("delivery", "expected"),
-    [(Delivery(depth=2, reliable=False), 2), (RELIABLE, 10)],
-)
-def test_a_frozen_receiver_keeps_what_its_queue_holds(delivery: Delivery, expected: int) -> None:
-    receiver = Receiver(delivery=delivery)
-    runner = VirtualRunner([Sender(), receiver], seed=1)
-    runner.run(1.0)
-    before = len(receiver.received)
-    runner.freeze("receiver", 1.0)
-    runner.run(0.999)
-    assert len(receiver.received) == before
-    runner.run(0.05)
-    assert len(receiver.received) - before in (expected, expected + 1)
+def test_messages_keep_their_order_but_for_what_overtakes() -> None:
+    def late(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
+        return (Arrival(0.35 if int(message.position[0]) % 5 == 0 else 0.0, message, overtakes),)
+
+    for overtakes in (False, True):
+        receiver = Receiver()
+        run([Sender(), receiver], faults=[late])
+        assert (receiver.numbers == sorted(receiver.numbers)) is not overtakes
+        assert {5, 6, 7, 8, 9, 10} <= set(receiver.numbers)
 
 
-def test_a_timer_that_was_missed_fires_once() -> None:
-    sender = Sender()
-    runner = VirtualRunner([sender], seed=1)
-    runner.run(1.0)
-    before = sender.count
-    runner.freeze("sender", 1.0)
-    runner.run(1.001)
-    assert sender.count - before in (1, 2)
-
-
-def test_faults_of_deliveries() -> None:
+def test_faults_lose_double_and_silence_what_they_are_meant_for() -> None:
     def numbers(*faults: Fault) -> list[int]:
         receiver = Receiver()
         run([Sender(), receiver], seed=1, faults=faults)
@@ -123,27 +128,31 @@ def test_faults_of_deliveries() -> None:
     assert max(lost) - min(lost) == 4
 
 
-def test_a_delayed_message_comes_late() -> None:
-    receiver = Receiver()
-    run([Sender(), receiver], faults=[delay("numbers", 0.4)])
-    assert all(at.stamp_ns - at.sent_ns >= 400_000_000 for _, at in receiver.received)
+# ---- services and actions -----------------------------------------------------------------------
 
 
-def test_a_call_is_answered_now_or_later() -> None:
-    def at_once(on: bool | None, number: int, at: Moment) -> Actions:
-        yield Reply(number, bool(on), f"asked {on}")
+def test_a_call_is_answered_once_by_its_server_or_given_up() -> None:
+    server = Server(Reply(NUMBER, True, "as asked"), Reply(NUMBER, False, "twice"))
+    for servers, answer in (
+        ([server], Answer("serve", True, "as asked")),
+        ([], Answer("serve", False, "no server", answered=False)),
+        ([Server()], Answer("serve", False, "no answer", answered=False)),
+    ):
+        once = Once([Call("serve", True)])
+        run([once, *servers], seconds=1.0 + ANSWER_TIMEOUT)
+        assert once.answers == [answer]
+    assert [on for _, on in server.asked] == [True]
 
-    once = Once([Call("serve", True)])
-    run([once, Server(at_once)])
-    assert once.answers == [Answer("serve", True, "asked True")]
 
-
-def test_a_call_without_server_or_answer_fails() -> None:
-    nobody, silent = Once([Call("serve", True)]), Once([Call("serve", True)])
-    run([nobody])
-    run([silent, Server(lambda *_: ())], seconds=1.0 + ANSWER_TIMEOUT)
-    assert nobody.answers == [Answer("serve", False, "no server", answered=False)]
-    assert silent.answers == [Answer("serve", False, "no answer", answered=False)]
+def test_faults_apply_to_calls_and_their_answers() -> None:
+    once, server = Once([Call("serve", True)]), Server(Reply(NUMBER, True))
+    run([once, server], faults=[duplicate("serve", 0.1)])
+    first, second = server.asked
+    assert first == second
+    assert len(once.answers) == 1
+    once, server = Once([Call("serve", True)]), Server(Reply(NUMBER, True))
+    run([once, server], faults=[drop("serve", 1.0)])
+    assert (server.asked, once.answers) == ([], [])
 
 
 def test_a_handler_that_raises_is_reported_and_ends_nothing() -> None:
@@ -155,17 +164,12 @@ def test_a_handler_that_raises_is_reported_and_ends_nothing() -> None:
 
     receiver = Receiver()
     _, told = run([Broken(), receiver])
-    lines = [message for _, _, topic, message in told if topic == "/rosout"]
-    assert [line.text for line in lines] == ["internal error: ZeroDivisionError: by zero"]
-    health = [message for _, _, topic, message in told if topic == "/diagnostics"]
+    assert texts(told) == ["internal error: ZeroDivisionError: by zero"]
+    health = [message for _, topic, message in told if topic == "/diagnostics"]
     assert health[0].statuses[0].level is Level.ERROR
     assert {4, 5, 6} <= set(receiver.numbers)
-
-
-def test_what_is_no_output_is_not_sent() -> None:
     _, told = run([Once([Publish("others", EmergencyStop(True))])])
-    (line,) = [message for *_, topic, message in told if topic == "/rosout"]
-    assert line.text == "internal error: ValueError: others is not among its outputs"
+    assert texts(told) == ["internal error: ValueError: others is not among its outputs"]
 
 
 def test_health_is_told_on_change_and_once_a_second() -> None:
@@ -173,7 +177,7 @@ def test_health_is_told_on_change_and_once_a_second() -> None:
     counted = Diagnose("part", Diagnostic(Level.OK, "well", {"count": "2"}))
     ill = Diagnose("part", Diagnostic(Level.WARN, "ill"))
     _, told = run([Once([well, counted, ill])])
-    health = [m.statuses[0].text for _, _, topic, m in told if topic == "/diagnostics"]
+    health = [m.statuses[0].text for _, topic, m in told if topic == "/diagnostics"]
     assert health == ["well", *["ill"] * 4]
 
 
@@ -182,16 +186,15 @@ def test_a_component_that_exits_does_nothing_more_and_ends_the_run() -> None:
     runner, told = run([once, Sender()])
     assert runner.exits == {"once": Exit(1, "done")}
     assert 0.5 <= runner.now < 0.7
-    assert not [message for *_, topic, message in told if topic == "/rosout"]
-
-
-def test_a_component_that_is_asked_to_end_exits() -> None:
-    runner = VirtualRunner([Sender()])
+    assert texts(told) == []
     runner.stop("sender")
     assert runner.run(1.0)
-    assert runner.exits == {"sender": Exit(0)}
+    assert runner.exits["sender"] == Exit(0)
     with pytest.raises(ValueError, match="no component 'nobody'"):
         runner.stop("nobody")
+
+
+# ---- ports --------------------------------------------------------------------------------------
 
 
 def test_what_goes_through_a_port_arrives_at_the_others_of_its_name_in_order() -> None:
@@ -204,9 +207,128 @@ def test_what_goes_through_a_port_arrives_at_the_others_of_its_name_in_order() -
     assert one.count - 12 < len(numbers) <= one.count
     assert other.arrived[0][0] < 0.003
     assert one.arrived == third.arrived == []
-
-
-def test_faults_apply_to_what_goes_through_a_port() -> None:
     one, other = Wired("one", sends=True), Wired("other")
     VirtualRunner([one, other], faults=(drop("wire", 0.5),)).run(0.1)
     assert 0.3 * one.count < len(other.arrived) < 0.7 * one.count
+
+
+def test_what_waits_at_a_port_is_one_batch() -> None:
+    batches: list[int] = []
+    one, other = Wired("one", sends=True), Wired("other")
+
+    def take(batch: Sequence[int], at: Moment) -> Actions:
+        batches.append(len(batch))
+        return other._take(batch, at)
+
+    other.ports = (Port("wire", take),)
+    runner = VirtualRunner([one, other])
+    runner.run(0.1)
+    assert max(batches) <= 6
+    runner.freeze("other", 0.1)
+    runner.run(0.2)
+    assert max(batches) > 100
+    numbers = [number for _, number in other.arrived]
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
+def test_a_port_is_lost_and_opened_also_for_who_starts_meanwhile() -> None:
+    changes: list[str] = []
+
+    def wired(name: str, *, sends: bool = False) -> Wired:
+        component = Wired(name, sends=sends)
+        component.ports = (Port("wire", component._take, note),)
+        return component
+
+    def note(change: PortChange, at: Moment) -> Actions:
+        changes.append(change.lost)
+        return ()
+
+    one, other = wired("one", sends=True), wired("other")
+    runner = VirtualRunner([one, other])
+    runner.run(0.1)
+    runner.lose_port("other", "wire", "unplugged")
+    runner.run(0.1)
+    assert 0 < len(other.arrived) < one.count - 100
+    runner.kill("other")
+    anew = wired("other")
+    runner.start(anew)
+    runner.run(0.1)
+    assert anew.arrived == []
+    runner.open_port("other", "wire")
+    runner.run(0.1)
+    assert anew.arrived
+    assert changes == ["unplugged", "unplugged", ""]
+
+
+# ---- what befalls components --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("delivery", "expected"), [(Delivery(depth=2, reliable=False), 2), (RELIABLE, 10)]
+)
+def test_who_stood_still_has_what_its_queue_holds_and_a_timer_fires_once(
+    delivery: Delivery, expected: int
+) -> None:
+    sender, receiver = Sender(), Receiver(delivery=delivery)
+    runner = VirtualRunner([sender, receiver], seed=1)
+    runner.run(1.0)
+    before = len(receiver.received)
+    runner.freeze("receiver", 1.0)
+    assert not runner.is_up("receiver")
+    runner.run(0.999)
+    assert len(receiver.received) == before
+    runner.run(0.05)
+    assert len(receiver.received) - before in (expected, expected + 1)
+    count = sender.count
+    runner.freeze("sender", 1.0)
+    runner.run(1.001)
+    assert sender.count - count in (1, 2)
+
+
+def test_a_killed_component_is_gone_with_what_it_had_and_missed_after_a_while() -> None:
+    sender, receiver, late = Sender(delivery=LATCHED), Receiver(), Receiver("late")
+    runner = VirtualRunner([sender, receiver], seed=1)
+    with pytest.raises(ValueError, match="component 'sender' runs already"):
+        runner.start(Sender())
+    runner.run(1.0)
+    count = sender.count
+    runner.kill("sender")
+    runner.start(late)
+    runner.run(LEASE - 0.1)
+    assert not runner.runs("sender")
+    assert (sender.count, late.numbers) == (count, [])
+    # It has found the one that came late.
+    assert receiver.peers[-1].nodes == {"sender", "receiver", "late"}
+    runner.start(Sender())
+    runner.run(0.25)
+    assert receiver.peers[-1].publishers["numbers"] == ("sender",)
+    # The new one counts anew.
+    assert receiver.numbers[-1] < 5
+    runner.stop("sender")
+    assert runner.run(1.0)
+    assert "numbers" not in receiver.peers[-1].publishers
+    runner.start(Sender())
+    assert runner.exits == {}
+
+
+def test_a_component_that_is_slowed_down_falls_behind_for_a_while() -> None:
+    receiver = Receiver()
+    runner = VirtualRunner([Sender(), receiver], seed=1)
+    runner.run(1.0)
+    runner.slow_down("receiver", 1.0, 0.25)
+    runner.run(1.0)
+    assert len(receiver.numbers) < 15
+    runner.run(1.0)
+    assert receiver.numbers[-10:] == list(range(receiver.numbers[-1] - 9, receiver.numbers[-1] + 1))
+
+
+def test_settings_and_the_clock_of_stamps_may_change() -> None:
+    class Settled(Sender):
+        def on_settings(self, settings: Any, at: Moment) -> Actions:
+            yield Log("info", f"{settings} at {at.steady:.1f}, {at.stamp_ns // 10**8}")
+
+    runner, told = run([Settled()], seconds=1.0)
+    runner.timeline.clock_offset_ns = -500_000_000
+    runner.configure("sender", 7)
+    runner.run(0.01)
+    assert texts(told) == ["7 at 1.0, 15"]

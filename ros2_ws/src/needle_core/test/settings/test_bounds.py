@@ -10,6 +10,13 @@ import pytest
 
 from needle_core.errors import OutOfBoundsError, UserError
 from needle_core.settings.bounds import ABOVE_0, Bounds, check_bounded_fields, check_bounds
+from needle_core.settings.parameter_fields import (
+    check_fields,
+    describe,
+    fixed_parameter,
+    from_values,
+    parameter,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,28 +35,55 @@ def test_what_is_within_its_bounds_passes() -> None:
     check_bounds("width", 0.0, 0.0, 1.0, "m")
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
+def test_what_is_not_is_told_with_its_bounds() -> None:
+    for settings, said in (
         (Settings(width=0.0), r"width = 0 m is outside"),
         (Settings(gate=-1.0), r"gate = -1 is outside"),
         (Settings(noise=5.1), r"noise = 5.1 m is outside \[0, 5\] m"),
         (Settings(noise=2147483648.0), r"noise = 2147483648 m is outside"),
         (Settings(noise=1e30), r"noise = 1e\+30 m is outside"),
-    ],
-)
-def test_what_is_not_is_told_with_its_bounds(settings: Settings, said: str) -> None:
-    with pytest.raises(OutOfBoundsError, match=said):
-        check_bounded_fields(settings)
+    ):
+        with pytest.raises(OutOfBoundsError, match=said):
+            check_bounded_fields(settings)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_number_that_is_none_is_refused(value: float) -> None:
-    with pytest.raises(UserError, match=f"width = {value} m is not finite"):
-        check_bounded_fields(Settings(width=value))
+def test_a_number_that_is_none_is_refused_and_infinity_where_it_is_no_value() -> None:
+    for value in (math.nan, math.inf, -math.inf):
+        with pytest.raises(UserError, match=f"width = {value} m is not finite"):
+            check_bounded_fields(Settings(width=value))
+    for value in (math.nan, -math.inf):
+        with pytest.raises(UserError, match=r"gate = .* is not finite"):
+            check_bounded_fields(Settings(gate=value))
 
 
-@pytest.mark.parametrize("value", [math.nan, -math.inf])
-def test_where_infinity_counts_nothing_else_does(value: float) -> None:
-    with pytest.raises(UserError, match=r"gate = .* is not finite"):
-        check_bounded_fields(Settings(gate=value))
+@dataclasses.dataclass(frozen=True)
+class Parameters:
+    """A number, a list and a text, as a node has them."""
+
+    rate: float = parameter(30.0, unit="Hz", lower=1.0, upper=100.0, description="A rate.")
+    gains: tuple[float, ...] = fixed_parameter((1.0,), "-", "Gains.", 0.0, 9.0)
+    law: str = parameter("mpc", unit="-", description="A law.", choices=("mpc", "pid"))
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+def test_parameters_are_taken_whole_and_typed_or_named_with_their_node() -> None:
+    values = {"rate": 100.0, "gains": [0.0, 9.0], "law": "pid"}
+    assert from_values(Parameters, values, "/rig") == Parameters(100.0, (0.0, 9.0), "pid")
+    for wrong, said in (
+        ({"rate": 100.1}, "rate = 100.1 Hz is outside [1, 100] Hz"),
+        ({"rate": 50}, "rate = 50 is not of type float (write 50.0)"),
+        ({"rate": True}, "rate = True is of type bool, wants float"),
+        ({"gains": [1.0, -0.1]}, "gains = -0.1 is outside [0, 9]"),
+        ({"law": "pdi"}, "law = 'pdi' is not one of mpc, pid"),
+        ({"raet": 20.0}, "unknown parameter 'raet' (did you mean 'rate'?)"),
+        ({"x": 20.0}, "unknown parameter 'x' (known: rate, gains, law)"),
+    ):
+        with pytest.raises(UserError) as caught:
+            from_values(Parameters, wrong, "/rig")
+        assert str(caught.value) == f"/rig: {said}"
+    rate, _, gains, _, law, _ = describe(Parameters).splitlines()
+    assert rate == "  rate: 30.0 Hz [1, 100]"
+    assert gains == "  gains: [1.0] [0, 9] (fixed at start)"
+    assert law == "  law: 'mpc' [mpc, pid]"

@@ -1,126 +1,28 @@
-"""A node's start and end, without a graph."""
+"""What only real processes and rcl itself show of `needle_core`."""
+
+from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import select
 import signal
 import subprocess
 import sys
+import uuid
+from pathlib import Path
+from typing import ClassVar
 
 import pytest
+from rclpy.context import Context
 from rclpy.node import Node
 
-from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL_ERROR
-from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
+from needle_core.process.claim import Claim
 from needle_core.process.end_request import ENDING_SIGNALS
 from needle_core.process.ros_domain import FIRST_PARTICIPANT, own_domain, ports_of
 from needle_core.process.shared_memory import SHARED_MEMORY
-from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
-
-
-@dataclasses.dataclass(frozen=True)
-class NoParameters:
-    """None."""
-
-
-def run(create: type[Node], *words: str) -> int:
-    return run_node(create, help_text="HELP", parameters=NoParameters, args=["node", *words])
-
-
-class Signalled(Node):
-    """Gets signals in the middle of a callback, which it ends."""
-
-    def __init__(self) -> None:
-        super().__init__("signalled")
-        self.create_timer(1e-3, self._on_timer, clock=STEADY_CLOCK)
-
-    def _on_timer(self) -> None:
-        for number in ENDING_SIGNALS:
-            os.kill(os.getpid(), number)
-        assert self.context.ok()
-        DiagnosticsPublisher(self).set("part", Diagnostic(Level.OK, "last words"))
-
-    def destroy_node(self) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-        super().destroy_node()
-
-
-class Fails(Node):
-    """Has a fault of its own."""
-
-    def __init__(self) -> None:
-        super().__init__("fails")
-        self.create_timer(1e-3, self._on_timer, clock=STEADY_CLOCK)
-
-    def _on_timer(self) -> None:
-        raise RuntimeError("a fault of its own")
-
-
-class Refuses(Node):
-    """Does not like its parameters."""
-
-    def __init__(self) -> None:
-        raise UserError("rate = 0 Hz, must be > 0")
-
-
-class MissesAnother(Node):
-    """Misses what ended on the same signal."""
-
-    def __init__(self) -> None:
-        super().__init__("misses_another")
-        os.kill(os.getpid(), signal.SIGINT)
-        raise UserError("the link is lost")
-
-
-def test_what_is_missed_after_a_signal_is_no_bad_input() -> None:
-    assert run(MissesAnother) == EXIT_DONE
-
-
-def test_signals_in_a_callback_and_at_the_end_are_a_clean_end() -> None:
-    assert run(Signalled) == EXIT_DONE
-
-
-def test_a_fault_in_a_callback_is_an_internal_error(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(Fails) == EXIT_INTERNAL_ERROR
-    assert "RuntimeError: a fault of its own (test_base_node.py:" in capsys.readouterr().err
-
-
-def test_bad_parameters_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(Refuses) == EXIT_BAD_INPUT
-    assert capsys.readouterr().err == "error: rate = 0 Hz, must be > 0\n"
-
-
-@pytest.mark.parametrize("word", ["--help", "-h"])
-def test_help_is_given_without_a_context(word: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(Refuses, word) == EXIT_DONE
-    assert capsys.readouterr().out.startswith("HELP\n")
-
-
-@pytest.mark.filterwarnings("ignore:Failed to fini rosout publisher:RuntimeWarning")
-def test_a_namespace_that_ros_does_not_take_is_bad_input(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert run(Signalled, "--ros-args", "-r", "__ns:=/rig1/") == EXIT_BAD_INPUT
-    assert capsys.readouterr().err.startswith("error: error creating node: invalid node namespace")
-
-
-def test_an_unknown_argument_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(Refuses, "--fast") == EXIT_BAD_INPUT
-    assert "'--fast'" in capsys.readouterr().err
-
-
-def test_a_parameter_before_ros_args_is_said_to_go_after(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert run(Refuses, "-p", "x:=1") == EXIT_BAD_INPUT
-    assert "'-p'; it goes after --ros-args" in capsys.readouterr().err
-
-
-def test_a_parameter_without_its_option_is_no_remapping(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(Refuses, "rate:=1", "--ros-args", "-p", "other:=1") == EXIT_BAD_INPUT
-    assert capsys.readouterr().err.endswith("is set by --ros-args -p rate:=1\n")
+from needle_core.process.worker import start_worker
+from needle_core.settings.parameter_files import values_for
 
 
 def test_a_node_begins_where_the_maker_of_a_port_ended_half_way() -> None:
@@ -225,3 +127,84 @@ def test_a_node_goes_when_what_it_said_has_reached_a_subscriber_that_stood_still
             hears.send_signal(signal.SIGCONT)
         assert says.wait(30.0) == 7
         assert hears.communicate(timeout=30.0)[0].split() == b"0 1 2 3 4 5 6 7 8 9".split()
+
+
+CLAIMS = """
+import sys
+from needle_core.process.claim import Claim
+claim = Claim(sys.argv[1], "/first")
+print("has it", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_kill_frees_the_name_that_a_process_has() -> None:
+    name = f"/device/status {uuid.uuid4()}"
+    with subprocess.Popen(
+        [sys.executable, "-c", CLAIMS, name], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as first:
+        assert first.stdout is not None
+        assert first.stdout.readline() == b"has it\n"
+        with pytest.raises(UserError, match=rf"/first \(process {first.pid}\) has {name}"):
+            Claim(name, "/second")
+        first.kill()
+        first.wait()
+        Claim(name, "/second").release()
+
+
+class Desk:
+    """What is prepared in the worker."""
+
+    lies_there: ClassVar[str] = ""
+
+    @staticmethod
+    def put(what: str) -> None:
+        Desk.lies_there = what
+
+    @staticmethod
+    def tell() -> tuple[int, str]:
+        return os.getpid(), Desk.lies_there
+
+
+@pytest.mark.parametrize("number", ENDING_SIGNALS)
+def test_a_signal_ends_no_worker_and_stays_one_for_its_parent(number: signal.Signals) -> None:
+    with start_worker(Desk.put, "images") as worker:
+        process, there = worker.submit(Desk.tell).result()
+        assert there == "images"
+        assert process != os.getpid()
+        os.kill(process, number)
+        assert worker.submit(Desk.tell).result() == (process, "images")
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & set(ENDING_SIGNALS)
+    assert Desk.lies_there == ""
+
+
+REMAPPINGS = {
+    "/device_driver": (),
+    "/rig1/device_driver": ("-r", "__ns:=/rig1"),
+    "/a/b/device_driver": ("-r", "__ns:=/a/b"),
+    "/other": ("-r", "__node:=other"),
+    "/rig1/other": ("-r", "device_driver:__node:=other", "-r", "other:__ns:=/rig1"),
+}
+NAMES = (
+    *("device_driver", "/device_driver", "other", "/rig1/device_driver", "rig1/device_driver"),
+    *("/rig1/other", "/rig2/device_driver", "/a/b/device_driver", "/**", "/*", "/*/*", "/rig1/*"),
+    *("/rig1/**", "/a/**", "/**/device_driver", "/**/other", "/*/device_driver", "**", "/**/b/*"),
+    *("/rig1/**/device_driver", "/**/rig1/device_driver", "/a/*/device_driver", "**/device_driver"),
+)
+
+
+@pytest.mark.parametrize("node", REMAPPINGS)
+def test_the_same_sections_reach_a_node_as_rcl_gives_it(tmp_path: Path, node: str) -> None:
+    sections = {name: {f"p{i}": i, "last": i} for i, name in enumerate(NAMES)}
+    file = tmp_path / "p.yaml"
+    file.write_text("".join(f"'{n}': {{ros__parameters: {v}}}\n" for n, v in sections.items()))
+    with own_domain() as domain:
+        context = Context()
+        words = ["--ros-args", "--params-file", str(file), *REMAPPINGS[node]]
+        context.init(["node", *words], domain_id=domain)
+        made = Node("device_driver", context=context)
+        given = {name: one.value for name, one in made._parameter_overrides.items()}
+        assert made.get_fully_qualified_name() == node
+        made.destroy_node()
+        context.try_shutdown()
+    assert given == values_for(file, sections, node, "device_driver")

@@ -1,19 +1,32 @@
-"""What killed processes leave in shared memory is taken away; what somebody uses stays."""
+"""A process' share of the machine: its name, its domain, and Fast DDS's shared memory."""
+
+from __future__ import annotations
 
 import fcntl
+import os
 import sys
+import uuid
 from pathlib import Path
 
 import pytest
 
+from needle_core.errors import UserError
+from needle_core.process.claim import Claim
 from needle_core.process.ros_domain import own_domain, ports_of
-from needle_core.process.shared_memory import (
-    dead_ports,
-    remove_dead_ports,
-    remove_half_made_ports,
-)
+from needle_core.process.shared_memory import dead_ports, remove_dead_ports, remove_half_made_ports
 
 PORTS = range(7400, 7410)
+
+
+def test_who_comes_second_is_told_who_has_a_name_and_a_released_one_is_free() -> None:
+    name = f"/device/status {uuid.uuid4()}"
+    first, other = Claim(name, "/first"), Claim(f"{name} too", "/other")
+    with pytest.raises(UserError, match=rf"/first \(process {os.getpid()}\) has {name}"):
+        Claim(name, "/second")
+    for _ in range(2):
+        first.release()
+    Claim(name, "/second").release()
+    other.release()
 
 
 def make_port(folder: Path, port: int) -> Path:
@@ -27,10 +40,11 @@ def make_port(folder: Path, port: int) -> Path:
 def test_dead_ports_go_and_others_stay(tmp_path: Path) -> None:
     make_port(tmp_path, 7400)
     listener = make_port(tmp_path, 7401)
+    make_port(tmp_path, 7402).unlink()
     make_port(tmp_path, 7410)
     with listener.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        assert dead_ports(PORTS, tmp_path) == ["fastrtps_port7400"]
+        assert dead_ports(PORTS, tmp_path) == ["fastrtps_port7400", "fastrtps_port7402"]
         remove_dead_ports(PORTS, tmp_path)
         assert dead_ports(PORTS, tmp_path) == []
         assert (tmp_path / "fastrtps_port7401").exists()
@@ -43,52 +57,41 @@ def test_dead_ports_go_and_others_stay(tmp_path: Path) -> None:
     }
 
 
-def test_a_port_whose_lock_is_gone_goes_too(tmp_path: Path) -> None:
-    make_port(tmp_path, 7400).unlink()
-    remove_dead_ports(PORTS, tmp_path)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_domain_is_left_as_clean_as_it_is_found() -> None:
-    with own_domain() as domain:
+def test_a_domain_is_one_holders_and_left_as_clean_as_it_is_found() -> None:
+    with own_domain() as domain, own_domain() as another:
+        assert domain != another
         assert dead_ports(ports_of(domain)) == []
         port = Path("/dev/shm") / f"fastrtps_port{ports_of(domain)[11]}"
         port.write_bytes(b"")
     assert not port.exists()
 
 
-def test_a_port_whose_maker_ended_half_way_goes_and_others_stay(tmp_path: Path) -> None:
+def word(state: int) -> bytes:
+    return state.to_bytes(4, sys.byteorder)
+
+
+def test_ports_whose_maker_ended_half_way_go_and_others_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = {"fastrtps_port7001": 2, "fastrtps_port7002": 3, "fastrtps_0123456789abcdef": 0}
     half = {"fastrtps_port7000": b"", "fastrtps_port7003": word(0), "fastrtps_port7004": word(1)}
     for name, state in made.items():
         (tmp_path / name).write_bytes(word(state))
     for name, data in half.items():
         (tmp_path / name).write_bytes(data)
-    listener = make_port(tmp_path, 7005)
-    with listener.open("rb") as file:
-        fcntl.flock(file, fcntl.LOCK_SH)
-        remove_half_made_ports(tmp_path)
-    left = {path.name for path in tmp_path.iterdir() if not path.name.endswith(("_el", "_mutex"))}
-    assert left == {*made, "fastrtps_port7005"}
-
-
-def test_a_port_that_is_being_made_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ready = tmp_path / "fastrtps_port7000"
-    renewed = tmp_path / "fastrtps_port7001"
+    ready, renewed = tmp_path / "fastrtps_port7006", tmp_path / "fastrtps_port7007"
     ready.write_bytes(word(1))
     renewed.write_bytes(b"")
 
-    def make_them(_: float) -> None:
+    def go_on_making(_: float) -> None:
         ready.write_bytes(word(2))
         # Somebody else has seen it, too, and makes it anew.
         (tmp_path / "new").write_bytes(word(1))
         (tmp_path / "new").rename(renewed)
 
-    monkeypatch.setattr("needle_core.process.shared_memory.time.sleep", make_them)
-    remove_half_made_ports(tmp_path)
-    assert ready.exists()
-    assert renewed.exists()
-
-
-def word(state: int) -> bytes:
-    return state.to_bytes(4, sys.byteorder)
+    monkeypatch.setattr("needle_core.process.shared_memory.time.sleep", go_on_making)
+    with make_port(tmp_path, 7005).open("rb") as listener:
+        fcntl.flock(listener, fcntl.LOCK_SH)
+        remove_half_made_ports(tmp_path)
+    left = {path.name for path in tmp_path.iterdir() if not path.name.endswith(("_el", "_mutex"))}
+    assert left == {*made, "fastrtps_port7005", ready.name, renewed.name}

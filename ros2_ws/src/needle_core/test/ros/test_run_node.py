@@ -1,0 +1,131 @@
+"""A node's start and end: exit codes, last words, and one line for what a person can cause."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rclpy.impl.implementation_singleton import rclpy_implementation
+
+from needle_core.errors import UserError
+from needle_core.ros import base_node
+from needle_core.ros.base_node import run_node
+from needle_core.ros.whole_node import WholeNode
+
+
+@dataclasses.dataclass(frozen=True)
+class NoParameters:
+    """None."""
+
+
+class Middleware:
+    """Stands for rclpy and its one node, which has one publisher."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.done: list[str] = []
+        for name in ("keep_to_this_machine", "remove_half_made_ports"):
+            monkeypatch.setattr(base_node, name, lambda **_: None)
+        monkeypatch.setattr(base_node, "rclpy", self)
+
+    def init(self, **_: Any) -> None:
+        self.done.append("init")
+
+    def try_shutdown(self) -> None:
+        self.done.append("shutdown")
+
+    def make(self) -> Any:
+        def wait(duration: Any) -> None:
+            self.done.append(f"acknowledged within {duration.nanoseconds * 1e-9:.1f} s")
+
+        return SimpleNamespace(
+            context=SimpleNamespace(ok=lambda: True),
+            publishers=[SimpleNamespace(wait_for_all_acked=wait)],
+            destroy_node=lambda: self.done.append("destroyed"),
+        )
+
+
+@pytest.fixture
+def middleware(monkeypatch: pytest.MonkeyPatch) -> Middleware:
+    return Middleware(monkeypatch)
+
+
+def run(create: Any, *words: str, spin: Any = None) -> int:
+    return run_node(
+        create, help_text="HELP", parameters=NoParameters, args=["node", *words], spin=spin
+    )
+
+
+def fail(error: Exception, *, signalled: bool = False) -> Any:
+    def act(*_: Any) -> Any:
+        if signalled:
+            signal.raise_signal(signal.SIGTERM)
+        raise error
+
+    return act
+
+
+def test_a_node_goes_when_what_it_said_is_acknowledged(middleware: Middleware) -> None:
+    def end_by_signal(_: Any, end: Any) -> int:
+        signal.raise_signal(signal.SIGINT)
+        return int(end.wanted)
+
+    for spin, code, seconds in ((lambda node, end: 7, 7, 5.0), (end_by_signal, 1, 0.5)):
+        middleware.done.clear()
+        assert run(middleware.make, spin=spin) == code
+        acknowledged = f"acknowledged within {seconds} s"
+        assert middleware.done == ["init", acknowledged, "destroyed", "shutdown"]
+
+
+def test_what_fails_is_bad_input_an_internal_error_or_missed_after_a_signal(
+    middleware: Middleware, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad, odd = UserError("rate = 0 Hz, must be > 0"), RuntimeError("a fault of its own")
+    for create, spin, code, said in (
+        (fail(bad), None, 2, "error: rate = 0 Hz, must be > 0\n"),
+        (fail(bad, signalled=True), None, 0, "error: rate = 0 Hz, must be > 0\n"),
+        (fail(rclpy_implementation.RCLError("bad name")), None, 2, "error: bad name\n"),
+        (fail(odd), None, 3, "error: internal error, "),
+        (middleware.make, fail(odd), 3, "error: internal error, "),
+        (middleware.make, fail(bad), 2, "error: rate = 0 Hz, must be > 0\n"),
+    ):
+        middleware.done.clear()
+        assert run(create, spin=spin) == code
+        assert capsys.readouterr().err.startswith(said)
+        assert middleware.done[-1] == "shutdown"
+        assert ("destroyed" in middleware.done) is (spin is not None)
+
+
+def test_words_are_explained_or_refused_before_anything_begins(
+    middleware: Middleware, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for word in ("--help", "-h"):
+        assert run(None, word) == 0
+        assert capsys.readouterr().out.startswith("HELP\n")
+    for words, said in (
+        (("--fast",), "'--fast'; see --help"),
+        (("-p", "x:=1"), "'-p'; it goes after --ros-args"),
+        (("rate:=1", "--ros-args", "-p", "other:=1"), "is set by --ros-args -p rate:=1"),
+        (("--ros-args", "--params-file", "none.yaml"), "none.yaml: cannot be read"),
+    ):
+        assert run(None, *words) == 2
+        assert said in capsys.readouterr().err
+    assert middleware.done == []
+
+
+def test_a_node_whose_construction_fails_is_gone() -> None:
+    gone: list[WholeNode] = []
+
+    class Half(WholeNode):
+        def __init__(self, error: Exception) -> None:
+            raise error
+
+        def destroy_node(self) -> None:
+            gone.append(self)
+            raise AttributeError("rclpy has not made its own part")
+
+    with pytest.raises(UserError, match="rate"):
+        Half(UserError("rate = 0 Hz, must be > 0"))
+    assert len(gone) == 1

@@ -1,0 +1,321 @@
+"""The one node class over real DDS: what comes from others and from ports reaches a component."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from needle_core import messages as m
+from needle_core.component import (
+    LATCHED,
+    Actions,
+    Answer,
+    Call,
+    Component,
+    Exit,
+    Input,
+    Listen,
+    Moment,
+    Output,
+    Port,
+    Publish,
+    Reply,
+    Send,
+    Service,
+    Timer,
+)
+from needle_core.errors import UserError
+from needle_core.process.ros_domain import own_domain
+from needle_core.ros import conversions
+from needle_core.ros.component_node import ComponentNode
+from needle_core.ros.main import run_component
+from needle_core.settings.parameter_fields import check_fields, parameter
+from own_context import own_context
+
+PATIENCE = 60.0  # [s]
+LONGEST = 1000
+NO_TYPE = 11
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """A number that may change."""
+
+    gain: float = parameter(1.0, unit="-", lower=0.0, upper=10.0, description="A number.")
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
+class Echo(Component):
+    """Says again what it hears, and does what a word asks for."""
+
+    name = "echo"
+
+    def __init__(self, settings: Settings, name: str = name) -> None:
+        self.name, self.settings = name, settings
+        self.answers: list[Answer] = []
+        self.waiting: int | None = None
+        self.inputs = (
+            Input("word", m.Text, self._on_word, longest=LONGEST),
+            Input("plan", m.Text, self._on_word, LATCHED),
+            Input("whisper", m.Text, self._on_word, lazy=True),
+        )
+        self.outputs = (Output("said", m.Text), Output("echo/kept", m.Text, LATCHED))
+        self.services = (
+            Service("echo/later", self._later),
+            Service("echo/twice", self._twice, has_argument=True),
+        )
+        self.timers = (Timer(0.05, self._tick),)
+        self.ports = (Port("wire", self._on_batch),)
+
+    def on_answer(self, answer: Answer, at: Moment) -> Actions:
+        self.answers.append(answer)
+        return ()
+
+    def on_settings(self, settings: Settings, at: Moment) -> Actions:
+        self.settings = settings
+        yield Publish("said", m.Text(f"gain {settings.gain:g}"))
+
+    def on_stop(self, at: Moment) -> Actions:
+        yield Exit(4, "asked to")
+
+    def _on_word(self, message: m.Text, at: Moment) -> Actions:
+        yield Publish("said", m.Text(message.text))
+        match message.text:
+            case "fail":
+                raise ValueError("no such word")
+            case "call":
+                yield Call("nobody/there")
+            case "keep":
+                yield Publish("echo/kept", m.Text("kept"))
+            case "listen" | "leave":
+                yield Listen("whisper", message.text == "listen")
+
+    def _later(self, _: bool | None, number: int, at: Moment) -> Actions:
+        self.waiting = number
+        return ()
+
+    def _twice(self, on: bool | None, number: int, at: Moment) -> Actions:
+        yield Reply(number, bool(on), "once")
+        yield Reply(number, not on, "twice")
+
+    def _tick(self, at: Moment) -> Actions:
+        if self.waiting is not None:
+            yield Reply(self.waiting, True, "later")
+            self.waiting = None
+
+    def _on_batch(self, batch: Any, at: Moment) -> Actions:
+        yield Send("wire", batch)
+        if batch == ("end",):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+class Wire:
+    """A port in memory, which brings in what it is made with."""
+
+    def __init__(self, *first: Any) -> None:
+        self.sent: list[Any] = []
+        self._first = first
+
+    def open(self, arrive: Callable[[Any], None]) -> None:
+        self.arrive = arrive
+        for batch in self._first:
+            arrive(batch)
+
+    def send(self, batch: tuple[Any, ...]) -> None:
+        self.sent.append(batch)
+
+    def close(self) -> None:
+        self.sent.append("closed")
+
+
+class Bench:
+    """The node, and somebody who talks to it."""
+
+    def __init__(self, context: Context) -> None:
+        self.context, self.wire = context, Wire()
+        self.node = self.make()
+        assert isinstance(self.node.component, Echo)
+        self.echo = self.node.component
+        self.other = Node("other", context=context)
+        self.heard: list[str] = []
+        self.health: dict[str, str] = {}
+        self.hear("said")
+        self.other.create_subscription(
+            DiagnosticArray, "/diagnostics", self._on_health, conversions.RELIABLE
+        )
+        self.words = self.other.create_publisher(String, "word", conversions.RELIABLE)
+        self._executor = SingleThreadedExecutor(context=context)
+        for node in (self.node, self.other):
+            self._executor.add_node(node)
+        self.until(lambda: self.words.get_subscription_count() > 0)
+        self.until(lambda: self.node.outputs["said"].get_subscription_count() > 0)
+
+    def make(self, **parameters: Any) -> ComponentNode:
+        given = [Parameter(name, value=value) for name, value in parameters.items()]
+        return ComponentNode(
+            "echo",
+            Settings,
+            Echo,
+            lambda _: {"wire": self.wire},
+            context=self.context,
+            parameter_overrides=given,
+        )
+
+    def hear(self, topic: str, delivery: Any = conversions.RELIABLE) -> None:
+        self.other.create_subscription(
+            String, topic, lambda text: self.heard.append(text.data), delivery
+        )
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        end = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < end, (self.heard, self.health, self.echo.answers)
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def say(self, text: str) -> None:
+        """Say a word, and wait until it is said again."""
+        before = len(self.heard)
+        self.words.publish(String(data=text))
+        self.until(lambda: text in self.heard[before:])
+
+    def call(self, kind: type[Any], name: str, **request: Any) -> Any:
+        client = self.other.create_client(kind, name)
+        self.until(client.service_is_ready)
+        future = client.call_async(kind.Request(**request))
+        self.until(future.done)
+        return future.result()
+
+    def close(self) -> None:
+        self.node.close()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self.other.destroy_node()
+
+    def _on_health(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            self.health[status.name] = f"{status.message} {values}"
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with own_context() as context:
+        bench = Bench(context)
+        yield bench
+        bench.close()
+
+
+def test_bad_bytes_long_ones_and_a_failing_handler_are_named_and_end_nothing(bench: Bench) -> None:
+    def health(part: str) -> str:
+        return bench.health.get(f"echo: {part}", "")
+
+    bench.words.publish(b"\x00\x01\x00")
+    bench.until(lambda: "undecodable" in health("input"))
+    bench.words.publish(String(data="x" * 2 * LONGEST))
+    bench.until(lambda: "too long" in health("input") and "'refused word': '2'" in health("input"))
+    # What a handler did before it failed is done.
+    bench.say("fail")
+    bench.until(lambda: "internal error: ValueError: no such word" in health("handlers"))
+    bench.say("on")
+    assert bench.heard == ["fail", "on"]
+
+
+def test_services_ports_and_calls_are_answered(bench: Bench) -> None:
+    later = bench.call(Trigger, "echo/later")
+    assert (later.success, later.message) == (True, "later")
+    for on in (True, False):
+        now = bench.call(SetBool, "echo/twice", data=on)
+        assert (now.success, now.message) == (on, "once")
+    bench.say("call")
+    bench.until(lambda: bool(bench.echo.answers))
+    assert bench.echo.answers == [Answer("nobody/there", False, "no server", answered=False)]
+    bench.wire.arrive((1, 2))
+    bench.wire.arrive(lambda: (3,))
+    bench.until(lambda: len(bench.wire.sent) == 2)
+    assert bench.wire.sent == [(1, 2), (3,)]
+    bench.node.stop()
+    bench.node.close()
+    assert bench.node.exit == Exit(4, "asked to")
+    assert bench.wire.sent[-1] == "closed"
+
+
+def test_latched_messages_lazy_inputs_and_peers_and_a_qos_that_does_not_fit(bench: Bench) -> None:
+    bench.say("keep")
+    bench.hear("echo/kept", conversions.LATCHED)
+    bench.until(lambda: "kept" in bench.heard)
+    whisper = bench.other.create_publisher(String, "whisper", conversions.RELIABLE)
+    for word, listeners in (("listen", 1), ("leave", 0)):
+        bench.say(word)
+        bench.until(lambda n=listeners: whisper.get_subscription_count() == n)  # type: ignore[misc]
+    bench.until(lambda: bench.node.peers.subscribers.get("said") == ("other",))
+    assert bench.node.peers.publishers["word"] == ("other",)
+    assert "echo/later" in bench.node.peers.services
+    assert {"echo", "other"} <= bench.node.peers.nodes
+    bench.other.create_publisher(String, "plan", conversions.RELIABLE)
+    bench.until(lambda: "--qos-durability transient_local" in bench.health.get("echo: input", ""))
+
+
+def test_parameters_are_taken_whole_typed_and_within_bounds_or_not_at_all(bench: Bench) -> None:
+    def message(value: Any) -> ParameterMessage:
+        return Parameter("gain", value=value).to_parameter_msg()
+
+    def set_to(*parameters: ParameterMessage) -> tuple[bool, str]:
+        answer = bench.call(SetParameters, "echo/set_parameters", parameters=list(parameters))
+        return answer.results[-1].successful, answer.results[0].reason
+
+    assert set_to(message(2.0)) == (True, "")
+    bench.until(lambda: bench.heard == ["gain 2"])
+    assert not set_to(message(20.0))[0]
+    untyped = ParameterMessage(name="gain", value=ParameterValue(type=NO_TYPE))
+    refused = (False, "gain: there is no parameter type 11")
+    assert set_to(message(3.0), untyped) == refused
+    name = "echo/set_parameters_atomically"
+    result = bench.call(SetParametersAtomically, name, parameters=[message(3.0), untyped]).result
+    assert (result.successful, result.reason) == refused
+    clock = Parameter("use_sim_time", value=True).to_parameter_msg()
+    assert set_to(clock) == (False, "use_sim_time is fixed at start")
+    assert bench.echo.settings == Settings(2.0)
+    for given, said in (
+        ({"gain": 5}, "gain = 5 is not of type float (write 5.0)"),
+        ({"gain": "high"}, "gain = 'high' is not of type float"),
+        ({"gain": 20.0}, "gain = 20.0 is outside [0, 10]"),
+        ({"gian": 2.0}, "unknown parameter 'gian' (did you mean 'gain'?)"),
+        ({"use_sim_time": True}, "use_sim_time = true: this node runs in real time"),
+    ):
+        with pytest.raises(UserError) as caught:
+            bench.make(**given)
+        assert str(caught.value).startswith(f"/echo: {said}")
+
+
+def test_a_node_ends_on_sigterm_as_its_component_wishes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wire = Wire(("end",))
+    with own_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        monkeypatch.setattr(sys, "argv", ["echo"])
+        code = run_component(
+            "echo", Settings, Echo, help_text="", ports=lambda _: {"wire": wire}, interrupted=130
+        )
+    assert code == 130
+    assert wire.sent == [("end",), "closed"]
+    assert "echo: asked to" in capsys.readouterr().err
