@@ -83,8 +83,6 @@ class OperatorSequence:
         How long the rig may take to get ready (partners, each service call's answer) [s].
     stall_timeout : float
         How long steering may show no progress [s].
-    look_around : float
-        How long another device has to show itself before anything is called [s].
     """
 
     def __init__(
@@ -94,7 +92,6 @@ class OperatorSequence:
         *,
         wait_timeout: float,
         stall_timeout: float,
-        look_around: float = 0.0,
     ) -> None:
         self._name = name
         self._wait_timeout = wait_timeout
@@ -104,7 +101,7 @@ class OperatorSequence:
         self._prepared = 0
         self._pending = False
         self._asked = False
-        self._retry_at = now + look_around
+        self._retry_at = now
         self._refusal = ""
         self._refused_since: float | None = None
         self._homed = False

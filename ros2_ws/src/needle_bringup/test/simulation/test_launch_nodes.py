@@ -21,111 +21,100 @@ from needle_core.settings.parameter_files import Parameters
 
 
 def simulated(**arguments: str) -> Parameters:
-    default = {
-        "level": "camera",
-        "seed": "1",
-        "controller": "best",
-        "simulated_operator": "false",
-        "bag": "",
-        "can": "/tmp/needle_can",
-        "params": "",
-    }
+    default = dict.fromkeys(("bag", "params"), "") | {"can": "/tmp/needle_can"}
+    default |= {"level": "camera", "seed": "1", "controller": "best", "simulated_operator": "false"}
     return simulated_nodes({**default, **arguments})
 
 
 def beside_rig(**arguments: str) -> Parameters:
     calibration = str(find_shared("needle_tracker", "config/calibration.yaml"))
-    default = {"calibration": calibration, "drives": "", "bag": "", "params": ""}
-    return nodes_beside_rig({**default, **arguments})
+    return nodes_beside_rig(
+        {"calibration": calibration, "drives": "", "bag": "", "params": "", **arguments}
+    )
 
 
-def file_of(folder: Path, document: Any) -> str:
-    path = folder / "file.yaml"
-    path.write_text(yaml.safe_dump(document))
+def file_of(folder: Path, node: str, **values: Any) -> str:
+    path = folder / f"{node.replace('/', '_')}.yaml"
+    path.write_text(yaml.safe_dump({node: {"ros__parameters": values}}))
     return str(path)
 
 
-@pytest.mark.parametrize(("start", "name"), [(beside_rig, "drives"), (beside_rig, "params")])
-def test_a_file_that_is_missing_starts_nothing(start: Any, name: str, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=f"{name}:=.*typo.yaml: no such file"):
-        start(**{name: str(tmp_path / "typo.yaml")})
-
-
-def test_a_calibration_or_simulated_params_that_are_missing_start_nothing(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"calibration:=.*no such file"):
-        beside_rig(calibration=str(tmp_path / "typo.yaml"))
-    with pytest.raises(UserError, match=r"params:=.*no such file"):
-        simulated(params=str(tmp_path / "typo.yaml"))
-    with pytest.raises(UserError, match=r"calibration:=.*: a folder, not a file"):
-        beside_rig(calibration=str(tmp_path))
-
-
-def test_drives_that_name_another_node_do_not_start_the_driver_on_its_defaults(
-    tmp_path: Path,
-) -> None:
-    wrong = file_of(tmp_path, {"drive_emulator": {"ros__parameters": {"channel": "x"}}})
-    with pytest.raises(UserError, match="'drive_emulator' is not started here, only device_driver"):
-        beside_rig(drives=wrong)
-    right = file_of(tmp_path, {"device_driver": {"ros__parameters": {"channel": "can7"}}})
-    assert beside_rig(drives=right)["device_driver"] == {"channel": "can7"}
-    assert "device_driver" not in beside_rig()
-
-
-@pytest.mark.parametrize("start", [beside_rig, simulated])
-def test_a_bag_that_is_there_starts_nothing(start: Any, tmp_path: Path) -> None:
+def test_what_cannot_be_meant_starts_nothing(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").touch()
-    with pytest.raises(UserError, match="holds a bag already"):
-        start(bag=str(tmp_path))
+    bag, typo = str(tmp_path), str(tmp_path / "typo.yaml")
+    emulator = file_of(tmp_path, "drive_emulator", channel="x")
+    operator = file_of(tmp_path, "simulated_operator", stall_timeout=1.0)
+    for start, arguments, said in (
+        (beside_rig, {"drives": typo}, "drives:=.*typo.yaml: no such file"),
+        (beside_rig, {"params": typo}, "params:=.*typo.yaml: no such file"),
+        (simulated, {"params": typo}, "params:=.*typo.yaml: no such file"),
+        (beside_rig, {"calibration": bag}, "calibration:=.*: a folder, not a file"),
+        (beside_rig, {"bag": bag}, "holds a bag already"),
+        (simulated, {"bag": bag}, "holds a bag already"),
+        (simulated, {"seed": "-1"}, "--seed = -1"),
+        # A driver that nobody configures would run on its defaults.
+        (beside_rig, {"drives": emulator}, "'drive_emulator' is not started here, only device_d"),
+        (simulated, {"params": operator}, "'simulated_operator' is not started here, only sim_rig"),
+        (
+            simulated,
+            {"params": file_of(tmp_path, "sim_rig", level="tip")},
+            "sim_rig: level is set by level:=",
+        ),
+    ):
+        with pytest.raises(UserError, match=said):
+            start(**arguments)
 
 
-@pytest.mark.parametrize("start", [beside_rig, simulated])
-def test_a_bag_says_how_it_was_made(start: Any, tmp_path: Path) -> None:
-    recorder = start(bag=str(tmp_path / "bag"))["recorder"]
-    assert recorder["bag"] == str(tmp_path / "bag")
-    assert recorder["run_info"]
+def test_a_rig_has_its_cameras_controller_and_what_its_files_say(tmp_path: Path) -> None:
+    plain = beside_rig()
+    assert set(plain) == {"stereo_tracker", "plane_controller"}
+    # Images that are sent best effort are heard.
+    assert plain["stereo_tracker"]["reliable_images"] is False
+    drives = file_of(tmp_path, "device_driver", channel="can7")
+    assert beside_rig(drives=drives)["device_driver"] == {"channel": "can7"}
+    depth = file_of(tmp_path, "plane_controller", depth=0.05)
+    assert beside_rig(params=depth)["plane_controller"] == {"depth": 0.05}
+    assert simulated(params=depth)["plane_controller"]["depth"] == 0.05
+    with pytest.raises(UserError, match="this node is /rig1/device_driver: write '/rig1/device_d"):
+        beside_rig(drives=drives, namespace="rig1")
+
+
+def test_a_bag_says_how_it_was_made(tmp_path: Path) -> None:
+    for start in (beside_rig, simulated):
+        recorder = start(bag=str(tmp_path / "bag"))["recorder"]
+        assert recorder["bag"] == str(tmp_path / "bag")
+        assert recorder["run_info"]
 
 
 def test_a_simulation_has_the_nodes_of_its_level_and_waits_for_a_recorder_only_if_there_is_one(
     tmp_path: Path,
 ) -> None:
     assert set(simulated(level="tip")) == {"sim_rig", "plane_controller"}
-    assert not any("wait_for_recorder" in values for values in simulated(level="drive").values())
-    with_all = simulated(
+    alone = simulated(level="drive", simulated_operator="true")
+    assert "wait_for_recorder" not in alone["simulated_operator"]
+    whole = simulated(
         level="drive", simulated_operator="true", bag=str(tmp_path / "bag"), can="/tmp/c"
     )
-    assert with_all["simulated_operator"]["wait_for_recorder"]
-    assert with_all["device_driver"]["channel"] == with_all["drive_emulator"]["pty"] == "/tmp/c"
-
-
-def test_what_an_argument_says_no_file_says(tmp_path: Path) -> None:
-    level = file_of(tmp_path, {"sim_rig": {"ros__parameters": {"level": "tip"}}})
-    with pytest.raises(UserError, match="level is set by level:="):
-        simulated(params=level)
-    other = file_of(tmp_path, {"simulated_operator": {"ros__parameters": {"stall_timeout": 1.0}}})
-    with pytest.raises(UserError, match="'simulated_operator' is not started here, only sim_rig, "):
-        simulated(params=other)
-    good = file_of(tmp_path, {"plane_controller": {"ros__parameters": {"depth": 0.05}}})
-    assert simulated(params=good)["plane_controller"]["depth"] == 0.05
-    assert beside_rig(params=good)["plane_controller"] == {"depth": 0.05}
+    assert whole["simulated_operator"]["wait_for_recorder"]
+    assert whole["device_driver"]["channel"] == whole["drive_emulator"]["pty"] == "/tmp/c"
 
 
 def test_a_file_of_two_rigs_has_both_namespaces(tmp_path: Path) -> None:
     depths = {f"/rig{n}/plane_controller": {"ros__parameters": {"depth": 0.01 * n}} for n in (1, 2)}
-    file = file_of(tmp_path, depths)
+    file = tmp_path / "two.yaml"
+    file.write_text(yaml.safe_dump(depths))
     for start in (beside_rig, simulated):
         for namespace in ("rig2", "/rig2/"):
-            given = start(params=file, namespace=namespace)["plane_controller"]
-            assert given["depth"] == 0.02
-        with pytest.raises(
-            UserError, match="is for /rig1/plane_controller, this node is /plane_co"
-        ):
-            start(params=file)
-    drives = file_of(tmp_path, {"device_driver": {"ros__parameters": {"channel": "can7"}}})
-    with pytest.raises(UserError, match="this node is /rig1/device_driver: write '/rig1/device_d"):
-        beside_rig(drives=drives, namespace="rig1")
+            given = start(params=str(file), namespace=namespace)
+            assert given["plane_controller"]["depth"] == 0.02
+        with pytest.raises(UserError, match="is for /rig1/plane_controller, this node is /plane_"):
+            start(params=str(file))
 
 
-def test_a_bag_is_played_for_viewers(tmp_path: Path) -> None:
+def test_a_bag_that_is_there_is_played_for_viewers(tmp_path: Path) -> None:
+    for bag, said in (("", "bag:= is missing"), (str(tmp_path), "no bag there")):
+        with pytest.raises(UserError, match=said):
+            replayed_nodes({"bag": bag})
     (tmp_path / "metadata.yaml").touch()
     arguments = {"bag": str(tmp_path), "rate": "0.5", "start": "2.0", "loop": "true"}
     assert replayed_nodes(arguments) == {"player": {}, "live_view": {}}
@@ -135,39 +124,9 @@ def test_a_bag_is_played_for_viewers(tmp_path: Path) -> None:
     assert "target_plane:=/replay/first/target_plane" in words["live_view"]
 
 
-def test_a_bag_that_is_not_there_is_not_played(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="bag:= is missing"):
-        replayed_nodes({"bag": ""})
-    with pytest.raises(UserError, match="no bag there"):
-        replayed_nodes({"bag": str(tmp_path)})
-
-
-def test_images_that_are_sent_best_effort_are_heard() -> None:
-    assert beside_rig()["stereo_tracker"]["reliable_images"] is False
-
-
-@pytest.mark.parametrize(("name", "text"), [("seed", "x"), ("seed", "-1")])
-def test_a_number_that_cannot_be_meant_starts_nothing(name: str, text: str) -> None:
-    with pytest.raises(UserError, match=text):
-        simulated(**{name: text})
-
-
-@pytest.mark.parametrize(
-    ("name", "meant"),
-    [
-        ("calibraton", "calibration"),
-        ("drive", "drives"),
-        ("parms", "params"),
-        ("Bag", "bag"),
-        ("bags", "bag"),
-    ],
-)
-def test_a_misspelt_argument_starts_nothing(name: str, meant: str) -> None:
+def test_a_misspelt_argument_is_named_and_those_of_an_including_file_pass() -> None:
     declared = ["calibration", "drives", "bag", "params", "namespace"]
-    with pytest.raises(UserError, match=f"unknown argument {name}:=, did you mean {meant}:="):
-        refuse_misspelt([*declared, name], declared)
-
-
-def test_the_arguments_of_an_including_launch_file_are_let_pass() -> None:
-    declared = ["calibration", "drives", "bag", "params", "namespace"]
+    for name, meant in (("calibraton", "calibration"), ("Bag", "bag"), ("bags", "bag")):
+        with pytest.raises(UserError, match=f"unknown argument {name}:=, did you mean {meant}:="):
+            refuse_misspelt([*declared, name], declared)
     refuse_misspelt([*declared, "ros_namespace", "cameras", "use_sim_time"], declared)

@@ -1,10 +1,24 @@
+"""What a command line sets in the nodes, all told of one needle; what contradicts is said."""
+
+from __future__ import annotations
+
+import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
+from needle_bringup.simulation.needle_options import (
+    CURVATURE,
+    PRE_BEND,
+    SHARED,
+    contradictions,
+    needle_parameters,
+)
 from needle_bringup.simulation.rig_configuration import (
+    NODES,
     PACKAGES,
     command_line_parameters,
     merge,
@@ -12,128 +26,158 @@ from needle_bringup.simulation.rig_configuration import (
     refuse_reserved,
     write_parameters,
 )
-from needle_bringup.simulation.simulate_options import SimulateOptions
+from needle_bringup.simulation.simulate_options import SimulateOptions, parse
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.errors import UserError
-from needle_core.settings.parameter_files import NODES, read_parameters
+from needle_core.settings import parameter_files
+from needle_core.settings.parameter_files import Parameters, read_parameters
+from needle_sim.needle.needle_shape import NeedleShape
+from needle_sim.sim_rig_parameters import SimRigParameters
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+
+STRAIGHT = NeedleShape(bend_angle=0.0, lean=0.0)
+CLASSES: dict[str, type[Any]] = {
+    "sim_rig": SimRigParameters,
+    "stereo_tracker": StereoTrackerParameters,
+    "plane_controller": SteeringSettings,
+}
 
 
-def test_the_start_is_converted_to_si_and_to_an_offset_of_the_plane() -> None:
-    options = SimulateOptions(initial_x_mm=-3.0, initial_pitch_deg=2.0, depth_mm=80.0)
-    parameters = command_line_parameters(options, Path("bags/x"))
-    assert parameters["plane_controller"]["target_offset"] == pytest.approx(0.003)
-    assert parameters["plane_controller"]["depth"] == pytest.approx(0.08)
-    assert parameters["sim_rig"]["initial_pitch"] == pytest.approx(math.radians(2.0))
+def told(words: str = "") -> Parameters:
+    return command_line_parameters(parse(words.split()), Path("bag"))
 
 
-def test_a_target_point_is_one_in_metres() -> None:
-    found = command_line_parameters(SimulateOptions(target_mm=(10.0, -5.0, 100.0)), Path("bag"))
-    assert found["plane_controller"]["target_point"] == pytest.approx([0.010, -0.005, 0.100])
-    assert (
-        "target_point"
-        not in command_line_parameters(SimulateOptions(), Path("b"))["plane_controller"]
-    )
+def test_the_command_line_is_converted_to_si_and_to_an_offset_of_the_plane() -> None:
+    found = told("--initial -3,2,15 --depth-mm 80 --play-deg 9 --lag-mm 2 --target 10,-5,100")
+    rig, controller = found["sim_rig"], found["plane_controller"]
+    assert controller["target_offset"] == pytest.approx(0.003)
+    assert controller["depth"] == pytest.approx(0.08)
+    assert controller["target_point"] == pytest.approx([0.010, -0.005, 0.100])
+    assert rig["initial_pitch"] == pytest.approx(math.radians(2.0))
+    assert rig["initial_roll"] == pytest.approx(math.radians(15.0))
+    assert rig["torsion_play"] == pytest.approx(math.radians(9.0))
+    assert rig["torsion_lag"] == pytest.approx(0.002)
+    own = told("--target 0,0,90 --planner mine --estimator its --law theirs --seed 7")
+    for name, value in {"planner": "mine", "estimator": "its", "law": "theirs", "seed": 7}.items():
+        assert own["plane_controller"][name] == value
 
 
 def test_obstacles_are_read_into_numbers(tmp_path: Path) -> None:
     path = tmp_path / "obstacles.yaml"
-    path.write_text(
-        "frame: rig\nspheres: [{center: [0.0, 0.001, 0.05], radius: 0.004}]\n", encoding="utf-8"
-    )
-    options = SimulateOptions(target_mm=(0.0, 0.0, 100.0), obstacles=path)
-    found = command_line_parameters(options, Path("bag"))["plane_controller"]["obstacles"]
+    path.write_text("frame: rig\nspheres: [{center: [0.0, 0.001, 0.05], radius: 0.004}]\n", "utf-8")
+    found = told(f"--target 0,0,100 --obstacles {path}")["plane_controller"]["obstacles"]
     assert found == [0.0, 0.001, 0.05, 0.0, 0.001, 0.05, 0.004]
-    path.write_text("frame: map\n", encoding="utf-8")
-    with pytest.raises(UserError, match="frame 'map'"):
-        command_line_parameters(options, Path("bag"))
 
 
-def test_only_the_nodes_of_the_level_run() -> None:
+def test_only_the_nodes_of_the_level_run_and_driver_and_drives_meet() -> None:
     everywhere = {"recorder", "sim_rig", "plane_controller", "simulated_operator"}
-    assert set(nodes_of(SimulateOptions(level="tip"))) == everywhere
-    assert set(nodes_of(SimulateOptions(level="camera"))) == everywhere | {"stereo_tracker"}
-    drives = {"drive_emulator", "device_driver"}
-    assert set(nodes_of(SimulateOptions(level="drive"))) == everywhere | {"stereo_tracker"} | drives
-
-
-def test_driver_and_drives_meet() -> None:
-    parameters = command_line_parameters(SimulateOptions(level="drive"), Path("bags/x"))
-    assert parameters["device_driver"]["channel"] == parameters["drive_emulator"]["pty"]
-
-
-def test_later_layers_win_one_parameter_at_a_time() -> None:
-    merged = merge({"a": {"x": 1, "y": 2}}, {"a": {"y": 3}, "b": {}})
-    assert merged == {"a": {"x": 1, "y": 3}, "b": {}}
-
-
-def test_a_written_file_reads_back(tmp_path: Path) -> None:
-    parameters = {"sim_rig": {"level": "tip", "curvature": 1e-5, "flag": True}}
-    write_parameters(tmp_path / "p.yaml", parameters)
-    assert read_parameters(tmp_path / "p.yaml", NODES) == parameters
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("controller: {ros__parameters: {x: 1}}", "unknown node 'controller'"),
-        ("joy_node: {ros__parameters: {x: 1}}", "'joy_node' is not started here"),
-        ("/rig1/sim_rig: {ros__parameters: {x: 1}}", "this node is /sim_rig"),
-        ("[1, 2", "not YAML"),
-        ("just text", "not a ROS parameter file"),
-        ("", "not a ROS parameter file"),
-    ],
-)
-def test_a_bad_file_is_named_in_one_line(tmp_path: Path, text: str, named: str) -> None:
-    path = tmp_path / "bad.yaml"
-    path.write_text(text)
-    with pytest.raises(UserError) as caught:
-        read_parameters(path, NODES)
-    assert named in str(caught.value)
-    assert str(path) in str(caught.value)
-    assert len(str(caught.value).splitlines()) == 1
-
-
-def test_a_file_may_not_contradict_the_command_line() -> None:
-    path = Path("p.yaml")
-    options = SimulateOptions(level="tip", noise_mm=1.0)
-    with pytest.raises(UserError, match="--depth-mm"):
-        refuse_reserved(path, {"plane_controller": {"depth": 0.1}}, options)
-    with pytest.raises(UserError, match="recorder: topics does not go into the file: simulate wa"):
-        refuse_reserved(path, {"recorder": {"topics": ["/needle/tip"]}}, options)
-    refuse_reserved(path, {"plane_controller": {"curvature": 8.0}}, options)
-
-
-def test_every_yaml_of_the_package_parses() -> None:
-    folder = Path(__file__).parents[2] / "config"
-    for path in folder.glob("*.yaml"):
-        assert yaml.safe_load(path.read_text())
+    camera = everywhere | {"stereo_tracker"}
+    drive = camera | {"drive_emulator", "device_driver"}
+    for level, nodes in (("tip", everywhere), ("camera", camera), ("drive", drive)):
+        assert set(nodes_of(SimulateOptions(level=level))) == nodes
+    found = told("--level drive --graph")
+    assert found["device_driver"]["channel"] == found["drive_emulator"]["pty"]
+    assert found["simulated_operator"]["wait_for_recorder"]
+    # Processes that share the cores wait for each other longer.
+    assert found["device_driver"]["watchdog"] > 0.1
+    assert set(PACKAGES) <= set(parameter_files.NODES)
 
 
 def test_the_controller_knows_the_sensor_of_its_level() -> None:
-    tip = command_line_parameters(SimulateOptions(level="tip", noise_mm=0.5), Path("bag"))
-    assert tip["plane_controller"]["tip_covariance"] == "configured"
-    assert tip["plane_controller"]["tip_noise"] == "bounded"
-    assert tip["plane_controller"]["tip_noise_bound"] == pytest.approx(0.0005)
-    exact = command_line_parameters(SimulateOptions(level="tip", noise_mm=0.0), Path("bag"))
-    assert exact["plane_controller"]["tip_noise_bound"] > 0.0
-    camera = command_line_parameters(SimulateOptions(), Path("bag"))
-    assert "tip_noise" not in camera["plane_controller"]
+    tip = told("--level tip --noise-mm 0.5")["plane_controller"]
+    assert (tip["tip_covariance"], tip["tip_noise"]) == ("configured", "bounded")
+    assert tip["tip_noise_bound"] == pytest.approx(0.0005)
+    assert tip["measurement_std"] == pytest.approx(0.0005 / math.sqrt(3.0))
+    assert told("--level tip --noise-mm 0")["plane_controller"]["tip_noise_bound"] > 0.0
+    assert "tip_noise" not in told()["plane_controller"]
 
 
 def test_by_hand_is_the_rig_that_simulate_runs() -> None:
     # What simulate tells the nodes beyond their defaults is said on the command line, or concerns
     # recording and the emulated adapter: nothing of it describes the rig.
-    set_by_simulate = command_line_parameters(SimulateOptions(level="drive"), Path("bag"))
     of_run = {"level", "seed", "preset"}
     of_needle = {"initial_pitch", "initial_roll", "torsion_play", "torsion_lag"}
-    told = {node: set(values) - of_run for node, values in set_by_simulate.items()}
-    assert told["sim_rig"] == of_needle
-    assert told["plane_controller"] == {"depth", "target_offset"}
-    assert told["stereo_tracker"] == set()
-    defaults = SteeringSettings()
-    assert defaults.tip_covariance == "from_tip_pose"
-    assert SimulateOptions().depth_mm == pytest.approx(defaults.depth * 1e3)
+    set_by_simulate = {node: set(values) - of_run for node, values in told("--level drive").items()}
+    assert set_by_simulate["sim_rig"] == of_needle
+    assert set_by_simulate["plane_controller"] == {"depth", "target_offset"}
+    assert set_by_simulate["stereo_tracker"] == set()
+    assert SteeringSettings().tip_covariance == "from_tip_pose"
+    assert parse([]).depth_mm == pytest.approx(SteeringSettings().depth * 1e3)
 
 
-def test_the_nodes_of_a_run_are_known_by_hand_too() -> None:
-    assert set(PACKAGES) <= set(NODES)
+def test_later_layers_win_one_parameter_at_a_time_and_a_written_file_reads_back(
+    tmp_path: Path,
+) -> None:
+    layers: list[Parameters] = [{"sim_rig": {"level": "tip", "seed": 2}}, {"sim_rig": {"seed": 3}}]
+    merged = merge(*layers, {"console": {}})
+    assert merged == {"sim_rig": {"level": "tip", "seed": 3}, "console": {}}
+    parameters = {"sim_rig": {"level": "tip", "curvature": 1e-5, "flag": True}}
+    write_parameters(tmp_path / "p.yaml", parameters)
+    assert read_parameters(tmp_path / "p.yaml", NODES) == parameters
+
+
+def test_a_file_may_not_contradict_the_command_line() -> None:
+    path, options = Path("p.yaml"), parse(["--level", "tip"])
+    for given, said in (
+        ({"plane_controller": {"depth": 0.1}}, "plane_controller: depth .* use --depth-mm"),
+        ({"simulated_operator": {"wait_for_recorder": True}}, "simulate sets it itself"),
+        ({"recorder": {"topics": ["/needle/tip"]}}, "recorder: topics does not go into the file"),
+    ):
+        with pytest.raises(UserError, match=said):
+            refuse_reserved(path, given, options)
+    refuse_reserved(path, {"plane_controller": {"curvature": 8.0}}, options)
+
+
+def test_every_yaml_of_the_package_parses() -> None:
+    files = list((Path(__file__).parents[2] / "config").glob("*.yaml"))
+    assert all(yaml.safe_load(path.read_text()) for path in files)
+
+
+def test_the_defaults_of_a_needle_are_those_of_the_nodes() -> None:
+    for shared in SHARED:
+        for node, name in shared.places:
+            default = getattr(CLASSES[node](), name)
+            if isinstance(shared.default, float):
+                # rad: the tracker's lean is rounded
+                assert default == pytest.approx(shared.default, abs=2e-4), (node, name)
+            else:
+                assert default == shared.default
+    assert SimRigParameters().pre_bend == pytest.approx(PRE_BEND)
+    assert contradictions({}, NODES) == []
+
+
+def test_the_options_of_a_needle_set_every_node_alike_also_beside_continuous_insertion() -> None:
+    given = told("--curvature 5 --diameter-mm 1.2 --pre-bend-deg 6 --insertion continuous")
+    nodes = {
+        node: kind(**{k: v for k, v in given[node].items() if k in kind.__dataclass_fields__})
+        for node, kind in CLASSES.items()
+    }
+    for shared in SHARED:
+        assert len({getattr(nodes[node], name) for node, name in shared.places}) == 1, shared
+    rig, tracker = nodes["sim_rig"], nodes["stereo_tracker"]
+    assert (rig.curvature, rig.needle_diameter) == (5.0, pytest.approx(0.0012))
+    assert rig.pre_bend == pytest.approx(math.radians(6.0))
+    assert rig.pre_bend_lean < rig.pre_bend
+    assert rig.camera_rate > 10.0
+    assert tracker.max_curvature > 5.0
+    assert tracker.tip_lean > tracker.lean
+    assert contradictions(given, NODES) == []
+    straight = needle_parameters(None, None, 0.0)["sim_rig"]
+    assert dataclasses.replace(SimRigParameters(), **straight).needle == STRAIGHT
+
+
+def test_what_contradicts_other_nodes_is_told() -> None:
+    for node, name, value, said in (
+        ("sim_rig", "curvature", 6.0, "sim_rig has curvature 6 1/m, plane_controller has"),
+        ("plane_controller", "curvature", 6.0, "--curvature sets it in all nodes"),
+        ("stereo_tracker", "needle_width", 0.001, "needle_width 0.001 m"),
+        ("sim_rig", "pre_bend_lean", 0.05, "lean of the needle's end differs"),
+        ("sim_rig", "calibration_file", "mine.yaml", "stereo_tracker has calibration_file ''"),
+    ):
+        (line,) = contradictions(merge(told(), {node: {name: value}}), NODES)
+        assert said in line
+    unseen: Parameters = {node: {"curvature": 12.0} for node in ("sim_rig", "plane_controller")}
+    (line,) = contradictions(unseen, NODES)
+    assert line == "sim_rig has curvature 12, but stereo_tracker looks for max_curvature 9"
+    assert contradictions(unseen, ("sim_rig", "plane_controller")) == []
+    assert contradictions({"sim_rig": {"curvature": CURVATURE * (1 + 1e-6)}}, NODES) == []

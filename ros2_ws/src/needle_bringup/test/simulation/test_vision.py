@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from needle_bringup.simulation import vision
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_bringup.simulation.simulate_options import parse
-from needle_bringup.simulation.virtual_run import settings_of
-from needle_bringup.simulation.vision import EYES, DistantTracker, Done, Eyes
+from needle_bringup.simulation.vision import EYES, DistantTracker, Eyes, EyesProcess
 from needle_core import messages as m
 from needle_core.component import (
     Action,
@@ -30,36 +33,67 @@ from needle_core.component import (
 from needle_core.runners.virtual import DIAGNOSTICS, VirtualRunner
 from needle_sim.camera_sensor import CAMERAS, Exposure
 from needle_sim.rig.bench import SimulatedBench
-from needle_sim.sim_rig_parameters import SimRigParameters
 
 PARAMETERS = command_line_parameters(parse(["--level", "camera"]), Path())
+STRAIGHT = {"pitch": 0.0, "roll": 0.0, "torsion_play": 0.0, "torsion_lag": 0.0, "tip_noise": 0.0}
+FIRST = Exposure.of(SimulatedBench(curvature=1.0 / 0.122, seed=1, **STRAIGHT), 0, 1_000_000_000)
 EXPOSURE_PERIOD = 0.1
 
 
-def exposure(number: int, insertion: float) -> Exposure:
-    settings = settings_of(SimRigParameters, PARAMETERS, "sim_rig")
-    bench = SimulatedBench(
-        curvature=settings.curvature,
-        pitch=settings.initial_pitch,
-        roll=settings.initial_roll,
-        torsion_play=0.0,
-        torsion_lag=0.0,
-        tip_noise=0.0,
-        seed=1,
-    )
-    bench.move_to(insertion, 0.0)
-    return Exposure.of(bench, number, 1_000_000_000 * (1 + number))
+def joints(insertion: float, stamp_ns: int) -> m.JointState:
+    return m.JointState(stamp_ns, (m.INSERTION_JOINT,), (insertion,))
 
 
-def test_an_exposure_becomes_images_and_a_tip_near_the_truth() -> None:
-    eyes, seen = Eyes(PARAMETERS), exposure(3, 0.05)
-    actions = list(eyes.handle(seen, Moment(3.0, seen.stamp_ns)))
-    for late in (0, 1):
-        joints = m.JointState(seen.stamp_ns + late, (m.INSERTION_JOINT,), (0.05,))
-        actions += eyes.handle(joints, Moment(3.0, seen.stamp_ns))
+class PlayedPool:
+    """Works in this process, at once; once it has ended it takes nothing."""
+
+    def __init__(self, begin: Callable[..., None], *given: object) -> None:
+        begin(*given)
+        self.is_broken = False
+
+    def submit(self, work: Callable[..., Any], *given: object) -> Future[Any]:
+        if self.is_broken:
+            raise BrokenProcessPool
+        done: Future[Any] = Future()
+        done.set_result(work(*given))
+        return done
+
+    def shutdown(self, **_: object) -> None:
+        self.is_broken = True
+
+
+@pytest.fixture(scope="module")
+def process() -> Iterator[tuple[EyesProcess, list[Any]]]:
+    """Return cameras and tracker as in their process, and what has arrived from there."""
+    arrived: list[Any] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(vision, "start_worker", PlayedPool)
+        made = EyesProcess(PARAMETERS)
+        made.open(arrived.append)
+        Eyes.work(FIRST, Moment(0.0, 1))
+        yield made, arrived
+
+
+def test_an_exposure_becomes_images_and_a_tip_near_the_truth(
+    process: tuple[EyesProcess, list[Any]],
+) -> None:
+    eyes, arrived = process
+    bench = SimulatedBench(curvature=1.0 / 0.122, seed=1, **STRAIGHT)
+    bench.move_to(0.05, 0.0)
+    seen = Exposure.of(bench, 3, 4_000_000_000)
+    at = Moment(3.0, seen.stamp_ns)
+    around = [joints(0.05, seen.stamp_ns + late) for late in (0, 1)]
+    eyes.send([(seen, at), *((item, at) for item in around), (None, at)])
+    actions: list[Action] = [action for batch in arrived for action in batch[0].result()]
     sent = {action.topic: action.message for action in actions if isinstance(action, Publish)}
     assert {"stereo/left/image_raw", "stereo/right/camera_info"} <= sent.keys()
     assert sent["needle/tip"].position == pytest.approx(tuple(seen.T_rig_tip[:3, 3]), abs=5e-4)
+    eyes.close()
+    eyes.send([(None, at)])
+    (lost,) = [batch for batch in arrived if isinstance(batch, PortChange)]
+    (port,) = (port for port in DistantTracker().ports if port.name == EYES)
+    assert list(port.on_change(lost, at)) == [Exit(1, lost.lost)]
+    assert "has ended" in lost.lost
 
 
 class Rig(Component):
@@ -79,8 +113,8 @@ class Rig(Component):
         self.timers = (Timer(EXPOSURE_PERIOD, self._expose),)
 
     def _expose(self, at: Moment) -> Actions:
-        yield Publish("joint_states", m.JointState(at.stamp_ns, (m.INSERTION_JOINT,), (0.0,)))
-        yield Send(CAMERAS, (exposure(self.exposed, 0.0),))
+        yield Publish("joint_states", joints(0.0, at.stamp_ns))
+        yield Send(CAMERAS, (dataclasses.replace(FIRST, number=self.exposed),))
         self.exposed += 1
 
     def _on_tip(self, message: m.Point, at: Moment) -> Actions:
@@ -110,31 +144,26 @@ class SlowEyes(Component):
 
     def _work(self, at: Moment) -> Actions:
         for item, _ in self._waiting:
-            done: Done = Future()
-            tip: list[Action] = []
-            if isinstance(item, Exposure):
-                self.worked += 1
-                tip.append(Publish("needle/tip", m.Point(item.stamp_ns, "rig", (0.0, 0.0, 0.0))))
+            done: vision.Done = Future()
+            seen = isinstance(item, Exposure)
+            self.worked += seen
+            tip = Publish("needle/tip", m.Point(at.stamp_ns, "rig", (0.0, 0.0, 0.0)))
             if self.fails:
                 done.set_exception(ValueError("cannot see"))
             else:
-                done.set_result(tip)
+                done.set_result([tip] if seen else [])
             yield Send(EYES, (done,))
         self._waiting = []
 
 
-def test_exposures_that_come_too_fast_are_lost_and_tips_come_back() -> None:
+def test_exposures_that_come_too_fast_are_lost_and_what_fails_ends_nothing() -> None:
     rig, eyes = Rig(), SlowEyes()
-    VirtualRunner([rig, eyes, DistantTracker()]).run(10.0)
+    runner = VirtualRunner([rig, eyes, DistantTracker()])
+    runner.run(10.0)
     assert rig.exposed == pytest.approx(100, abs=2)
     # Two wait whenever work begins.
     assert eyes.worked == pytest.approx(40, abs=4)
     assert len(rig.tips) == pytest.approx(eyes.worked, abs=4)
-
-
-def test_what_fails_there_is_named_here_and_ends_nothing() -> None:
-    rig, eyes = Rig(), SlowEyes()
-    runner = VirtualRunner([rig, eyes, DistantTracker()])
     eyes.fails = True
     runner.run(3.0)
     assert any("ValueError: cannot see" in text for text in rig.troubles)
@@ -142,10 +171,3 @@ def test_what_fails_there_is_named_here_and_ends_nothing() -> None:
     before = len(rig.tips)
     runner.run(3.0)
     assert len(rig.tips) > before
-
-
-def test_without_the_process_that_works_there_is_no_rig() -> None:
-    port = next(port for port in DistantTracker().ports if port.name == EYES)
-    assert list(port.on_change(PortChange("it has ended"), Moment(1.0, 1))) == [
-        Exit(1, "it has ended")
-    ]

@@ -1,3 +1,7 @@
+"""Nodes as processes: whatever they do about signals, and whoever is killed, none is left."""
+
+from __future__ import annotations
+
 import os
 import signal
 import subprocess
@@ -6,7 +10,6 @@ import textwrap
 from pathlib import Path
 
 from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
-from needle_core.process.ros_domain import own_domain
 
 
 def start(tmp_path: Path, script: str) -> NodeProcess:
@@ -118,9 +121,3 @@ def _state(pid: int) -> str:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
         return "Z"
-
-
-def test_two_holders_never_get_the_same_domain() -> None:
-    with own_domain() as one, own_domain() as other, own_domain() as third:
-        assert len({one, other, third}) == 3
-        assert all(0 < domain <= 101 for domain in (one, other, third))

@@ -1,0 +1,155 @@
+"""The command lines of `simulate` and `console`: what they mean, and what they refuse."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from needle_bringup.simulation.console import rig_parameters
+from needle_bringup.simulation.console_options import parse_console
+from needle_bringup.simulation.own_component import own_component
+from needle_bringup.simulation.simulate_options import (
+    CONTROLLERS,
+    SimulateOptions,
+    command_of,
+    parse,
+)
+from needle_controller.presets.steering_settings import PRESETS
+from needle_core.errors import UserError
+
+# Words that cannot be run, and what of them the one line names.
+REFUSED = (
+    ("--controller worst", "worst"),
+    ("--insertion sideways", "sideways"),
+    ("--initial -3,2", "X_MM,PITCH_DEG,ROLL_DEG"),
+    ("--initial -.5,-inf,2", "PITCH_DEG"),
+    ("--initial --seed", "--initial"),
+    ("--target 3,2", "X_MM,Y_MM,Z_MM"),
+    ("--target 3,2,-5", "--target Z_MM = -5"),
+    ("--level camera --noise-mm 0", "--noise-mm goes with --level tip"),
+    ("--planner mine", "--planner goes with --target"),
+    ("--obstacles x", "--obstacles goes with --target"),
+    ("--target 0,0,90 --obstacles /no", "--obstacles /no: no such file"),
+    ("--depth-mm 150.1", "--depth-mm"),
+    ("--depth-mm deep", "'deep'"),
+    ("--curvature 0", "--curvature = 0 1/m is outside"),
+    ("--diameter-mm 5", "--diameter-mm = 5 mm is outside"),
+    ("--pre-bend-deg nan", "--pre-bend-deg"),
+    ("--play-deg -1", "--play-deg"),
+    ("--lag-mm inf", "--lag-mm"),
+    ("--real-time-factor -1", "--real-time-factor"),
+    ("--real-time-factor 2 --graph", "--real-time-factor 2 does not go with --graph"),
+    ("--component probe", "'probe' is not MODULE:NAME"),
+    ("--component a:B --graph", "does not go with --graph"),
+    ("--seed 1.5", "--seed"),
+    ("--seed -1", "--seed"),
+    ("--bag /tmp", "exists already"),
+    ("--params /", "/: a folder, not a file"),
+    ("--json /no/such/x.json", "/no/such"),
+    ("--depth 5", "--depth"),
+    ("more", "more"),
+)
+REFUSED_BY_CONSOLE = (
+    ("--port 0", "--port"),
+    ("--port 65535", "--port"),
+    ("--level moon", "--level"),
+    ("--noise-mm 1", "--level tip only"),
+    ("--bag x", "--bag"),
+)
+PROBE = """
+from needle_core.component import Component
+
+class Probe(Component):
+    name = "probe"
+
+class Needy(Component):
+    def __init__(self, wanted):
+        pass
+
+class Other:
+    pass
+"""
+
+
+def test_what_cannot_be_run_is_named_in_one_line() -> None:
+    for understand, table in ((parse, REFUSED), (parse_console, REFUSED_BY_CONSOLE)):
+        for words, named in table:
+            with pytest.raises(UserError) as caught:
+                understand(words.split())
+            assert named in str(caught.value), words
+            assert len(str(caught.value).splitlines()) == 1
+
+
+def test_every_preset_of_the_controller_can_be_asked_for() -> None:
+    assert sorted(CONTROLLERS) == sorted(PRESETS)
+
+
+def test_the_defaults_are_the_designed_ones() -> None:
+    options = parse([])
+    assert options == SimulateOptions(level="camera", controller="best", depth_mm=120.0)
+    start = (options.initial_x_mm, options.initial_pitch_deg, options.initial_roll_deg)
+    assert start == (-3.0, 2.0, 15.0)
+    assert parse(["--level", "tip"]).noise_mm == 1.0
+
+
+def test_places_may_begin_with_a_minus_and_a_target_has_all_the_depth_there_is() -> None:
+    assert parse(["--initial", "-5,4,15"]).initial_x_mm == -5.0
+    for words in (["--target", "-8,5,90"], ["--target=-8,5,90"]):
+        options = parse(words)
+        assert (options.target_mm, options.depth_mm) == ((-8.0, 5.0, 90.0), 150.0)
+        assert parse([*words, "--depth-mm", "100"]).depth_mm == 100.0
+
+
+def test_the_command_that_is_recorded_runs_the_same_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a file.yaml").touch()
+    for line in (
+        "",
+        "--level tip --noise-mm 0 --controller open_loop --seed 7",
+        "--initial=-1.5,-4,30 --depth-mm 80.25 --play-deg 3 --lag-mm 2 --insertion continuous",
+        "--target=-8,5,90 --curvature 4 --diameter-mm 1 --pre-bend-deg 6 --obstacles 'a file.yaml'",
+        "--target=0,0,90 --depth-mm 120 --planner mine --estimator its --law theirs --graph",
+        "--level drive --real-time-factor 1 --params 'a file.yaml' --bag new --json out.json",
+        "--component my_probe:Probe --component other:One",
+    ):
+        options = parse(shlex.split(line))
+        program, *words = shlex.split(command_of(options))
+        assert program == "scripts/simulate"
+        assert parse(words) == dataclasses.replace(options, bag=None, json=None), line
+
+
+def test_the_console_has_the_rig_of_simulate_without_stops_and_seen_as_often_as_a_page_shows() -> (
+    None
+):
+    words = "--level tip --initial -5,1,0 --noise-mm 0.5"
+    rig = parse_console(words.split()).rig
+    assert rig == parse([*words.split(), "--insertion=continuous", "--real-time-factor=1"])
+    assert parse_console(["--insertion=stepwise"]).rig.insertion == "stepwise"
+    plain, graph = (rig_parameters(parse_console(words)) for words in ([], ["--graph"]))
+    assert plain["sim_rig"]["camera_rate"] == 10.0
+    for name in ("sim_rig", "stereo_tracker", "plane_controller"):
+        assert graph[name] == plain[name]
+
+
+def test_components_of_users_are_found_in_the_current_folder_and_what_is_none_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = "probe_of_a_user"
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    (tmp_path / f"{module}.py").write_text(PROBE)
+    monkeypatch.chdir(tmp_path)
+    assert own_component(f"{module}:Probe").name == "probe"
+    for name, said in (
+        (f"{module}:Missing", "has no attribute 'Missing'"),
+        (f"{module}:Needy", "missing 1 required positional argument: 'wanted'"),
+        (f"{module}:Other", "makes a Other, no Component"),
+        ("no_such_module:X", "--component no_such_module:X: No module named"),
+    ):
+        with pytest.raises(UserError, match=said):
+            own_component(name)

@@ -1,0 +1,206 @@
+"""A rig's nodes as processes that a test plays: started, watched, and ended in their order."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import ClassVar
+from unittest import mock
+
+import pytest
+
+from needle_bringup.simulation import console_graph, node_graph, node_process, simulate
+from needle_bringup.simulation.console import rig_parameters
+from needle_bringup.simulation.console_options import parse_console
+from needle_bringup.simulation.node_graph import NodeFailedError, NodeGraph
+from needle_bringup.simulation.node_process import NodeProcess, stop
+from needle_bringup.simulation.rig_configuration import PACKAGES
+from needle_bringup.simulation.simulate_options import parse
+from needle_core.errors import UserError
+from needle_core.process.end_request import EndRequest
+from needle_core.settings.parameter_files import NODES, read_parameters
+from reference.rig_nodes import executables
+
+INT, TERM, KILL = signal.SIGINT, signal.SIGTERM, signal.SIGKILL
+DRIVE_NODES = (
+    *("recorder", "sim_rig", "drive_emulator", "device_driver", "stereo_tracker"),
+    *("plane_controller", "simulated_operator"),
+)
+
+
+class Played(NodeProcess):
+    """A node's process as a test plays it; it ends on the signals that it heeds."""
+
+    all: ClassVar[dict[str, Played]] = {}
+    sent: ClassVar[list[tuple[str, signal.Signals]]] = []
+    ended: ClassVar[dict[str, int]] = {}
+    """Codes of nodes that end by themselves."""
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str] = (),
+        *,
+        environment: Mapping[str, str] = {},
+        log: Path,
+        pass_fds: Sequence[int] = (),
+    ) -> None:
+        self.name, self.log, self.command = name, log, list(command)
+        self.environment, self.kept_open = dict(environment), list(pass_fds)
+        self.code = self.ended.get(name)
+        self.heeds = {INT, KILL}
+        self.all[name] = self
+
+    @property
+    def exit_code(self) -> int | None:
+        return self.code
+
+    def signal_group(self, number: signal.Signals) -> None:
+        self.sent.append((self.name, number))
+        if self.code is None and number in self.heeds:
+            self.code = -number if number is KILL else 0
+
+
+@pytest.fixture(autouse=True)
+def played(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every node be played, and let nobody wait for one that stays."""
+    for kept in (Played.all, Played.sent, Played.ended):
+        kept.clear()
+    monkeypatch.setattr(node_graph, "NodeProcess", Played)
+    monkeypatch.setattr(node_process, "TERMINATE_GRACE", 0.0)
+
+
+def test_every_executable_is_a_node_that_parameter_files_know() -> None:
+    assert {name for _, name, _ in executables("node")} == set(NODES)
+
+
+def test_who_does_not_heed_a_signal_gets_a_stronger_one_and_is_named(tmp_path: Path) -> None:
+    orderly, slow, stubborn = (Played(name, log=tmp_path / name) for name in ("a", "b", "c"))
+    slow.heeds, stubborn.heeds = {TERM, KILL}, {KILL}
+    assert stop([orderly, slow, stubborn], grace=0.0) == [
+        "c did not end on SIGINT and SIGTERM, killed"
+    ]
+    assert [number for name, number in Played.sent if name == "a"] == [INT, KILL]
+    assert [number for name, number in Played.sent if name == "b"] == [INT, TERM, KILL]
+    assert stubborn.exit_code == -KILL
+
+
+def test_it_is_said_how_a_node_ended_and_what_it_said_last(tmp_path: Path) -> None:
+    node = Played("node", log=tmp_path / "node.log")
+    assert node.describe_end() == "node runs"
+    assert node.last_line == ""
+    node.log.write_bytes(b"one\ntwo\nerror: no \xff bus\n \n")
+    node.code = 3
+    assert node.describe_end() == "node ended with exit code 3: no \ufffd bus"
+    node.code = -TERM
+    assert "signal SIGTERM" in node.describe_end()
+
+
+def test_a_graph_ends_in_its_order_and_warns_of_what_its_recorder_lost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = NodeGraph(tmp_path, {"sim_rig": {"level": "tip"}}, EXTRA="x")
+    for name in DRIVE_NODES:
+        graph.start(PACKAGES[name], name)
+    assert read_parameters(tmp_path / "parameters.yaml", NODES) == {"sim_rig": {"level": "tip"}}
+    driver = Played.all["device_driver"]
+    assert driver.command[-2:] == ["--params-file", str(tmp_path / "parameters.yaml")]
+    assert driver.environment["EXTRA"] == "x"
+    graph.check()
+    recorder = Played.all["recorder"]
+    recorder.code = 1
+    recorder.log.write_text("error: the disk is full\n")
+    with pytest.raises(NodeFailedError, match=r"recorder ended.*disk is full.*recorder\.log"):
+        graph.check()
+    graph.stop()
+    ended = [name for name, number in Played.sent if number is KILL]
+    assert ended[:2] == ["simulated_operator", "device_driver"]
+    assert ended[-1] == "recorder"
+    assert set(ended) == set(DRIVE_NODES)
+    assert capsys.readouterr().err == "warning: the disk is full\n"
+
+
+@dataclasses.dataclass
+class Graph:
+    """A run of `simulate --graph` at level drive."""
+
+    bag: Path
+
+    def run(self) -> int:
+        with mock.patch.dict(os.environ):
+            words = ["--level", "drive", "--graph", "--bag", str(self.bag)]
+            return simulate.simulate(parse(words))
+
+
+@pytest.fixture
+def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Graph:
+    monkeypatch.setattr(simulate, "_report", lambda *_: 0)
+    return Graph(tmp_path / "bag")
+
+
+def test_a_graph_runs_until_its_operator_ends(graph: Graph) -> None:
+    Played.ended["simulated_operator"] = 1
+    assert graph.run() == 0
+    assert tuple(Played.all) == DRIVE_NODES
+    assert {node.environment["ROS_DOMAIN_ID"] for node in Played.all.values()} != {""}
+    operator = Played.all["simulated_operator"]
+    # The progress alone goes to the terminal.
+    assert operator.environment["NEEDLE_PROGRESS_FD"] == str(operator.kept_open[0])
+    assert all(node.exit_code is not None for node in Played.all.values())
+
+
+def test_bad_input_of_a_node_leaves_nothing_and_what_broke_leaves_its_logs(graph: Graph) -> None:
+    for ended, left in (
+        ({"device_driver": 2}, False),
+        ({"device_driver": 3}, True),
+        ({"simulated_operator": 2}, True),
+    ):
+        Played.ended.clear()
+        Played.ended.update(ended)
+        (name,) = ended
+        with pytest.raises(UserError, match=f"{name} ended with exit code"):
+            graph.run()
+        assert graph.bag.exists() is left
+        if left:
+            (graph.bag / "logs").rmdir()
+            (graph.bag / "parameters.yaml").unlink()
+            graph.bag.rmdir()
+
+
+def test_an_interrupt_while_nodes_start_ends_them(
+    graph: Graph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: Callable[..., NodeProcess] = NodeGraph.start
+
+    def start(self: NodeGraph, package: str, name: str, pass_fds: Sequence[int] = ()) -> None:
+        started(self, package, name, pass_fds)
+        if name == "device_driver":
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(NodeGraph, "start", start)
+    with pytest.raises(KeyboardInterrupt):
+        graph.run()
+    assert tuple(Played.all) == DRIVE_NODES[:4]
+    assert all(node.exit_code is not None for node in Played.all.values())
+    assert not graph.bag.exists()
+
+
+def test_the_console_s_graph_has_the_page_and_a_live_view_and_no_stand_in(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    end = EndRequest()
+
+    def wait(nodes: Sequence[NodeProcess], _: float) -> None:
+        end.wanted = True
+
+    monkeypatch.setattr(console_graph, "wait_for", wait)
+    options = parse_console(["--graph", "--port", "9000"])
+    with end, mock.patch.dict(os.environ):
+        assert console_graph.run_console_graph(options, rig_parameters(options), end) == 130
+    rig = ["sim_rig", "stereo_tracker", "plane_controller"]
+    assert list(Played.all) == [*rig, "console", "live_view"]
+    assert "http://127.0.0.1:9000/" in capsys.readouterr().out
+    assert all(node.exit_code == 0 for node in Played.all.values())
