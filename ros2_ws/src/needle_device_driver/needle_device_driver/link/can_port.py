@@ -68,6 +68,7 @@ class CanPort:
         self._settings = settings
         self._clock = clock
         self._closed = threading.Event()
+        self._heard_at = 0.0
         # Of the adapter: the thread greets it while others send.
         self._lock = threading.Lock()
         self._bus: can.BusABC | None = None
@@ -77,9 +78,13 @@ class CanPort:
 
     def open(self, arrive: Callable[[Batch | PortChange], None]) -> None:
         """Begin, with one attempt at once; `arrive` is called by whatever thread."""
+        self.begin(arrive)
+        self._thread.start()
+
+    def begin(self, arrive: Callable[[Batch | PortChange], None]) -> None:
+        """Open the adapter as `open` does, and leave it to the caller to `step`."""
         self._arrive = arrive
         self._open()
-        self._thread.start()
 
     def send(self, frames: tuple[CanFrame, ...]) -> None:
         """Send frames; an adapter that takes none for `write_timeout` is lost, and that is told."""
@@ -100,7 +105,8 @@ class CanPort:
     def close(self) -> None:
         """Let go of the adapter. May be called twice."""
         self._closed.set()
-        self._thread.join(_JOIN_WAIT)
+        if self._thread.is_alive():
+            self._thread.join(_JOIN_WAIT)
         with self._lock:
             self._let_go()
 
@@ -116,7 +122,7 @@ class CanPort:
             self._tell(PortChange(_plainly(error)))
             return
         self._errors = self._refusals = 0
-        self._bus = bus
+        self._bus, self._heard_at = bus, self._clock()
         self._tell(PortChange())
 
     def _lose(self, error: Exception) -> None:
@@ -140,28 +146,30 @@ class CanPort:
     # ---- the thread -----------------------------------------------------------------------------
 
     def _run(self) -> None:
-        heard_at = self._clock()
         while not self._closed.is_set():
-            bus = self._bus
-            if bus is None:
-                if not self._closed.wait(_OPEN_AGAIN):
-                    self._open()
-                    heard_at = self._clock()
-                continue
-            try:
-                batch = self._receive(bus)
-                if batch:
-                    heard_at = self._clock()
-                    self._arrive(batch)
-                if self._clock() - heard_at > _SILENCE and isinstance(bus, SlcanBus):
-                    heard_at = self._clock()
-                    with self._lock:
-                        bus.greet()
-            # python-can's adapters raise what their operating system has.
-            except Exception as error:  # noqa: BLE001
+            self.step()
+
+    def step(self) -> None:
+        """Hand on what is there, once something is or a while is over; open what is lost."""
+        bus = self._bus
+        if bus is None:
+            if not self._closed.wait(_OPEN_AGAIN):
+                self._open()
+            return
+        try:
+            batch = self._receive(bus)
+            if batch:
+                self._heard_at = self._clock()
+                self._arrive(batch)
+            if self._clock() - self._heard_at > _SILENCE and isinstance(bus, SlcanBus):
+                self._heard_at = self._clock()
                 with self._lock:
-                    if self._bus is bus:
-                        self._lose(error)
+                    bus.greet()
+        # python-can's adapters raise what their operating system has.
+        except Exception as error:  # noqa: BLE001
+            with self._lock:
+                if self._bus is bus:
+                    self._lose(error)
 
     def _receive(self, bus: can.BusABC) -> Batch:
         """Return what is there, once something is or a while is over."""

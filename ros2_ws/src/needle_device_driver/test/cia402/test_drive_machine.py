@@ -23,38 +23,39 @@ def machine() -> DriveMachine:
     return DriveMachine(rest_counts=2, period=0.02, stop_time=0.05, at=said(DISABLED))
 
 
-def enabled(machine: DriveMachine) -> None:
-    machine.want(Goal.ON)
-    for statusword in (DISABLED, READY, ON, ENABLED):
-        machine.next_order()
-        machine.update(said(statusword))
-    assert machine.ready
+def orders(machine: DriveMachine, *answers: Feedback) -> list[DriveCommand]:
+    """Return what is ordered after each answer."""
+    machine.next_order()
+    given = []
+    for answer in answers:
+        machine.update(answer)
+        given.append(machine.next_order()[0])
+    return given
 
 
-def test_switching_on_takes_a_step_for_each_statusword(machine: DriveMachine) -> None:
+def enabled(machine: DriveMachine, position: int = 0) -> None:
     machine.want(Goal.ON)
-    orders = []
-    for statusword in (DISABLED, DISABLED, READY, ON, ENABLED):
-        machine.update(said(statusword))
-        orders.append(machine.next_order()[0])
-    assert orders == [
-        DriveCommand.SHUTDOWN,
-        DriveCommand.SHUTDOWN,
-        DriveCommand.SWITCH_ON,
-        DriveCommand.ENABLE_OPERATION,
-        DriveCommand.ENABLE_OPERATION,
-    ]
+    assert machine.switching
+    orders(machine, *(said(word, position) for word in (DISABLED, READY, ON, ENABLED)))
     assert machine.ready
     assert not machine.switching
 
 
-def test_until_it_is_ready_the_set_point_is_where_the_axis_stands(machine: DriveMachine) -> None:
+def test_switching_on_takes_a_step_for_each_statusword_and_begins_where_the_axis_stands(
+    machine: DriveMachine,
+) -> None:
     machine.want(Goal.ON)
-    for position, statusword in ((5, DISABLED), (70, READY), (900, ON)):
-        machine.update(said(statusword, position))
-        assert machine.target == position
-    machine.update(said(ENABLED, 901))
-    assert machine.target == 900
+    for word, position, target, order in (
+        (DISABLED, 5, 5, DriveCommand.SHUTDOWN),
+        (DISABLED, 70, 70, DriveCommand.SHUTDOWN),
+        (READY, 900, 900, DriveCommand.SWITCH_ON),
+        (ON, 900, 900, DriveCommand.ENABLE_OPERATION),
+        (ENABLED, 901, 900, DriveCommand.ENABLE_OPERATION),
+    ):
+        assert not machine.ready
+        assert orders(machine, said(word, position)) == [order]
+        assert machine.target == target
+    assert machine.ready
 
 
 @pytest.mark.parametrize("goal", [Goal.OFF, Goal.ON])
@@ -64,30 +65,21 @@ def test_after_a_quick_stop_nothing_is_ordered_before_the_axis_stands(
     enabled(machine)
     machine.stop()
     machine.want(goal)
-    position = 0
-    for speed in (400, 300, 200, 100, 3):
-        position += speed
-        machine.update(said(QUICK_STOP, position))
-        assert machine.next_order()[0] is DriveCommand.QUICK_STOP
-        assert not machine.ready
-    for _ in range(3):
-        # It trembles by two counts.
-        position += 2
-        assert machine.next_order()[0] is DriveCommand.QUICK_STOP
-        machine.update(said(QUICK_STOP, position))
+    # It trembles by two counts at last, for three cycles.
+    ways = [*itertools.accumulate((400, 300, 200, 100, 3, 2, 2))]
+    given = orders(machine, *(said(QUICK_STOP, position) for position in ways))
+    assert given == [DriveCommand.QUICK_STOP] * 7
     wanted = {Goal.OFF: DriveCommand.DISABLE_VOLTAGE, Goal.ON: DriveCommand.ENABLE_OPERATION}
-    assert machine.next_order()[0] is wanted[goal]
-    assert machine.target == position
+    assert orders(machine, said(QUICK_STOP, 1009)) == [wanted[goal]]
+    assert machine.target == 1009
 
 
 def test_a_stop_holds_until_the_drive_has_said_that_it_took_it(machine: DriveMachine) -> None:
     enabled(machine)
     machine.stop()
     machine.want(Goal.ON)
-    for _ in range(5):
-        assert machine.next_order()[0] is DriveCommand.QUICK_STOP
-        machine.update(said(ENABLED))
-        assert not machine.ready
+    assert orders(machine, *[said(ENABLED)] * 5) == [DriveCommand.QUICK_STOP] * 5
+    assert not machine.ready
 
 
 @pytest.mark.parametrize("behind", [3, -3])
@@ -96,23 +88,15 @@ def test_a_stopped_axis_that_its_drive_would_pull_on_is_switched_off(
 ) -> None:
     enabled(machine)
     machine.stop()
-    machine.next_order()
-    for position in (400, 500, 500, 500, 500):
-        assert not machine.let_go
-        machine.update(said(QUICK_STOP, position, behind=2))
-        assert machine.next_order()[0] is DriveCommand.QUICK_STOP
-    machine.update(said(QUICK_STOP, 500, behind=behind))
+    places = (400, 500, 500, 500, 500)
+    given = orders(machine, *(said(QUICK_STOP, place, behind=behind // 3 * 2) for place in places))
+    assert (given, machine.let_go) == ([DriveCommand.QUICK_STOP] * 5, False)
+    assert orders(machine, said(QUICK_STOP, 500, behind=behind)) == [DriveCommand.DISABLE_VOLTAGE]
     assert machine.let_go
     assert machine.powered, "it is stopped, it has not lost its power"
-    assert machine.next_order()[0] is DriveCommand.DISABLE_VOLTAGE
-    machine.update(said(DISABLED, 500))
-    assert machine.next_order()[0] is DriveCommand.DISABLE_VOLTAGE
+    assert orders(machine, said(DISABLED, 500)) == [DriveCommand.DISABLE_VOLTAGE]
     assert machine.trouble == ""
-    machine.want(Goal.ON)
-    for statusword in (DISABLED, READY, ON, ENABLED):
-        machine.next_order()
-        machine.update(said(statusword, 500))
-    assert machine.ready
+    enabled(machine, 500)
     assert not machine.let_go
 
 
@@ -131,50 +115,36 @@ def test_a_stopped_axis_that_its_drive_would_pull_on_is_switched_off(
 def test_a_drive_that_runs_on_in_its_quick_stop_is_switched_off(
     machine: DriveMachine, ways: list[int], off: bool
 ) -> None:
-    enabled(machine)
-    machine.stop()
-    orders = [machine.next_order()[0]]
-    for position in itertools.accumulate(ways):
-        machine.update(said(QUICK_STOP, position))
-        orders.append(machine.next_order()[0])
-    # 50 ms of ramp are 3 cycles, 2 more for late answers, and 5 to see where it goes.
-    assert orders[:10] == [DriveCommand.QUICK_STOP] * 10
-    assert orders[10:] == [DriveCommand.DISABLE_VOLTAGE if off else DriveCommand.QUICK_STOP] * 11
-    assert ("runs on in its quick stop" in machine.trouble) is off
-
-
-def test_a_stop_after_one_that_ran_on_is_a_new_one(machine: DriveMachine) -> None:
     for _ in range(2):
         enabled(machine)
         machine.stop()
-        for position in range(0, 2000, 100):
-            machine.next_order()
-            machine.update(said(QUICK_STOP, position))
-        assert machine.next_order()[0] is DriveCommand.DISABLE_VOLTAGE
-        assert "runs on" in machine.trouble
-        machine.begin_anew(said(DISABLED, 2000))
+        given = orders(machine, *(said(QUICK_STOP, at) for at in itertools.accumulate(ways)))
+        # 50 ms of ramp are 3 cycles, 2 more for late answers, and 5 to see where it goes.
+        assert given[:9] == [DriveCommand.QUICK_STOP] * 9
+        late = DriveCommand.DISABLE_VOLTAGE if off else DriveCommand.QUICK_STOP
+        assert given[9:] == [late] * 11
+        assert ("runs on in its quick stop" in machine.trouble) is off
+        machine.begin_anew(said(DISABLED))
 
 
 def test_the_mode_changes_only_while_the_drive_is_off(machine: DriveMachine) -> None:
     enabled(machine)
     machine.mode = Mode.HOMING
-    assert machine.next_order() == (
-        DriveCommand.QUICK_STOP,
-        Mode.CYCLIC_SYNCHRONOUS_POSITION,
-    )
-    for _ in range(4):
-        machine.update(said(QUICK_STOP))
-    assert machine.next_order() == (
-        DriveCommand.DISABLE_VOLTAGE,
-        Mode.CYCLIC_SYNCHRONOUS_POSITION,
-    )
-    machine.update(said(DISABLED))
-    assert machine.next_order() == (DriveCommand.SHUTDOWN, Mode.HOMING)
-    machine.update(said(ON))
-    # Not enabled before the drive shows the mode.
-    assert machine.next_order()[0] is DriveCommand.SWITCH_ON
-    machine.update(said(ON, mode=6))
-    assert machine.next_order()[0] is DriveCommand.ENABLE_OPERATION
+    position = Mode.CYCLIC_SYNCHRONOUS_POSITION
+    # It has stood since it was enabled.
+    assert machine.next_order() == (DriveCommand.QUICK_STOP, position)
+    for answer, order in (
+        (said(QUICK_STOP), (DriveCommand.DISABLE_VOLTAGE, position)),
+        (said(DISABLED), (DriveCommand.SHUTDOWN, Mode.HOMING)),
+        # Not enabled before the drive shows the mode.
+        (said(ON), (DriveCommand.SWITCH_ON, Mode.HOMING)),
+        (said(ON, mode=6), (DriveCommand.ENABLE_OPERATION, Mode.HOMING)),
+    ):
+        machine.update(answer)
+        assert machine.next_order() == order
+        assert not machine.powered
+    machine.update(said(ENABLED, mode=6))
+    assert (machine.powered, machine.ready) == (True, False)
 
 
 def test_an_axis_that_never_comes_to_rest_is_switched_off_all_the_same(
@@ -182,21 +152,27 @@ def test_an_axis_that_never_comes_to_rest_is_switched_off_all_the_same(
 ) -> None:
     enabled(machine)
     machine.want(Goal.OFF)
-    for count in range(60):
-        machine.update(said(QUICK_STOP, 1000 * count))
-    assert machine.next_order()[0] is DriveCommand.DISABLE_VOLTAGE
+    # On and on, but never far: it is no drive that runs on.
+    given = orders(machine, *(said(QUICK_STOP, 8 + 8 * (count % 2)) for count in range(51)))
+    assert given == [DriveCommand.QUICK_STOP] * 50 + [DriveCommand.DISABLE_VOLTAGE]
+
+
+def test_a_drive_that_ignores_the_stop_is_switched_off_later(machine: DriveMachine) -> None:
+    enabled(machine)
+    machine.stop()
+    given = orders(machine, *(said(ENABLED, 100 * count) for count in range(35)))
+    assert given == [DriveCommand.QUICK_STOP] * 34 + [DriveCommand.DISABLE_VOLTAGE]
+    assert "runs on when stopped" in machine.trouble
 
 
 def test_a_fault_is_left_alone_and_a_word_of_no_state_is_trouble(machine: DriveMachine) -> None:
     enabled(machine)
-    machine.update(said(FAULT))
-    assert machine.next_order()[0] is DriveCommand.DISABLE_VOLTAGE
+    assert orders(machine, said(FAULT)) == [DriveCommand.DISABLE_VOLTAGE]
     assert machine.trouble == ""
     machine.update(said(0x0025))
-    assert "0x0025" in machine.trouble
-    machine.begin_anew(said(DISABLED))
-    assert machine.trouble == ""
-    assert machine._goal is Goal.OFF
+    assert machine.trouble == "says 0x0025, no statusword of CiA 402"
+    machine.begin_anew(said(DISABLED, 7))
+    assert (machine.trouble, machine.target, machine.switching) == ("", 7, False)
 
 
 @pytest.mark.parametrize(("statusword", "told"), [(0x0250, False), (0x0050, True)])
@@ -204,7 +180,8 @@ def test_a_drive_that_does_not_listen_to_the_bus_is_told(
     machine: DriveMachine, statusword: int, told: bool
 ) -> None:
     machine.want(Goal.ON)
-    for _ in range(102):
-        machine.update(said(statusword))
+    orders(machine, *[said(statusword)] * 100)
+    assert machine.trouble == ""
+    machine.update(said(statusword))
     assert "is not on after 2 s: SWITCH_ON_DISABLED, mode 8" in machine.trouble
     assert ("not under the bus's control (bit 9)" in machine.trouble) is told

@@ -2,42 +2,33 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
-from needle_core.messages import HoldState
-from needle_core.status_messages import DeviceStatus
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
-from needle_device_driver.procedure import Procedure, run_at_once
-from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.command import Command, CommandPoint
+from needle_device_driver.procedure import Procedure, T, run_at_once
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_device_driver.supervisor.reports import Event, Notice, StepResult
-from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
-PERIOD = 0.02
+from .supervisor_bench import PERIOD, SupervisorBench
 
 
-class FakeAxis(Axis):
+class IdealAxis(Axis):
     """Goes where it is told; fails, lags or falls silent when told to."""
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.position = 0.0
-        self.target: float | None = None
-        self.speed = 0.0
-        self.powered = False
-        self.homed = False
-        self.homing = False
+        self.position = self.speed = 0.0
+        self.target = math.nan
+        self.powered = self.homed = self.homing = False
+        self.unplugged = self.stuck = self.inner_switch = False
         self.switch: bool | None = None
-        self.inner_switch = False
+        self.silent_since = math.inf
         self.fault = ""
-        self.unplugged = False
-        self.silent_since: float | None = None
-        self.stuck = False
-        self.stops = 0
         self.orders: list[str] = []
+
+    @property
+    def stops(self) -> int:
+        return self.orders.count("stop")
 
     def _order(self, name: str) -> None:
         if self.unplugged:
@@ -50,7 +41,7 @@ class FakeAxis(Axis):
 
     def power(self, on: bool) -> None:
         self._order("on" if on else "off")
-        self.powered, self.target, self.homing = on, None, False
+        self.powered, self.target, self.homing = on, math.nan, False
 
     def home(self, speed: float) -> Procedure[None]:
         yield from ()
@@ -64,8 +55,7 @@ class FakeAxis(Axis):
 
     def stop(self) -> None:
         self._order("stop")
-        self.stops += 1
-        self.target, self.homing = None, False
+        self.target, self.homing = math.nan, False
 
     def reset(self) -> Procedure[None]:
         yield from ()
@@ -74,149 +64,101 @@ class FakeAxis(Axis):
 
     def close(self) -> Procedure[None]:
         yield from ()
+        self._order("close")
         self.powered = False
 
     def poll(self, now: float) -> AxisSnapshot:
-        switch = self.position <= 0.0 if self.switch is None else self.switch
         return AxisSnapshot(
-            time=now if self.silent_since is None else self.silent_since,
+            time=min(now, self.silent_since),
             position=self.position,
             set_point=self.position,
             velocity=0.0,
             powered=self.powered,
             homed=self.homed,
             moving=self.homing,
-            at_home_switch=switch,
+            at_home_switch=self.position <= 0.0 if self.switch is None else self.switch,
             at_inner_switch=self.inner_switch,
             fault=self.fault,
         )
 
     def advance(self, period: float) -> None:
-        if self.target is None or not self.powered or self.stuck:
+        if math.isnan(self.target) or not self.powered or self.stuck:
             return
-        way = self.target - self.position
-        reach = self.speed * period
+        way, reach = self.target - self.position, self.speed * period
         if abs(way) <= reach * (1 + 1e-9):
             self.position = self.target
-            self.homed = self.homed or self.homing
-            self.homing = False
+            self.homed, self.homing = self.homed or self.homing, False
         else:
-            self.position += reach if way > 0 else -reach
+            self.position += math.copysign(reach, way)
 
 
-class Bench:
-    """Drives a supervisor cycle by cycle and remembers what it tells."""
-
-    period = PERIOD
-    run = staticmethod(run_at_once)
+class Bench(SupervisorBench):
+    """A supervisor on two ideal axes."""
 
     def __init__(self, **limits: float) -> None:
-        self.insertion = FakeAxis("insertion")
-        self.rotation = FakeAxis("rotation")
+        super().__init__()
+        self.insertion, self.rotation = IdealAxis("insertion"), IdealAxis("rotation")
         self.limits = SafetyLimits(**limits)
-        self.supervisor = MotionSupervisor(
-            self.insertion,
-            self.rotation,
-            self.limits,
-        )
-        self.now = 100.0
-        self.ros_ns = 1_000_000_000
-        self.stamps = itertools.count(1)
-        self.events: list[Event] = []
+        self.supervisor = MotionSupervisor(self.insertion, self.rotation, self.limits)
         self.supervisor.note_time(0, self.now)
         self.supervisor.note_time(self.ros_ns, self.now)
 
-    @property
-    def state(self) -> State:
-        return self.supervisor.state
+    def run(self, procedure: Procedure[T]) -> T:
+        return run_at_once(procedure)
 
-    @property
-    def status(self) -> DeviceStatus:
-        return self.supervisor.status(self.now)
+    def exchange(self) -> None:
+        self.supervisor.drive(PERIOD, self.now)
+        self.insertion.advance(PERIOD)
+        self.rotation.advance(PERIOD)
+        self.supervisor.observe(self.now)
 
-    @property
-    def results(self) -> list[StepResult]:
-        self._collect()
-        return [event for event in self.events if isinstance(event, StepResult)]
-
-    @property
-    def notices(self) -> list[Notice]:
-        self._collect()
-        return [event for event in self.events if isinstance(event, Notice)]
-
-    @property
-    def last_rule(self) -> Rule | None:
-        notices = self.notices
-        return notices[-1].rule if notices else None
+    def axis(self, name: str) -> IdealAxis:
+        return {"insertion": self.insertion, "rotation": self.rotation}[name]
 
     @property
     def positions(self) -> tuple[float, float]:
         return self.insertion.position, self.rotation.position
 
-    def _collect(self) -> None:
-        self.events += self.supervisor.take_events()
+    def homed(self) -> Bench:
+        """Be configured, and homed or on the way."""
+        assert self.configure().success
+        assert self.home().success
+        return self
 
-    def hold(
-        self,
-        pressed: bool = True,
-        *,
-        sender: str = "a",
-        scale: float = 1.0,
-        session: str = "",
-        count: int | None = None,
-        lifetime: float = math.inf,
-    ) -> None:
-        number = next(self.stamps) if count is None else count
-        message = HoldState(sender, session, number, pressed, scale, lifetime)
-        self.supervisor.receive_hold(message, self.now)
+    def ready(self) -> Bench:
+        """Be enabled and held."""
+        self.homed()
+        assert self.enable().success
+        self.hold()
+        return self
 
-    def cycle(self, count: int = 1, *, holding: bool = False, scale: float = 1.0) -> None:
-        for _ in range(count):
-            self.now += PERIOD
-            self.ros_ns += 20_000_000
-            if holding:
-                self.hold(scale=scale)
-            self.supervisor.note_time(self.ros_ns, self.now)
-            self.supervisor.drive(PERIOD, self.now)
-            self.insertion.advance(PERIOD)
-            self.rotation.advance(PERIOD)
-            self.supervisor.observe(self.now)
-
-    def home(self) -> None:
-        self.run(self.supervisor.configure(self.now))
-        self.supervisor.confirm_needle_out(True)
-        assert self.run(self.supervisor.home(self.now)).success
-
-    def ready(self, *, holding: bool = True) -> None:
-        self.home()
-        assert self.supervisor.enable(True, self.now).success
-        if holding:
-            self.hold()
-
-    @staticmethod
-    def step_command(
-        insertion: float, rotation: float, stamp_ns: int, duration: float = 0.5
-    ) -> Command:
-        return Command(
-            stamp_ns,
-            ("insertion_joint", "rotation_joint"),
-            (CommandPoint((insertion, rotation), (), duration),),
-        )
-
-    def command(
+    def step(
         self,
         length: float = 0.001,
         rotation: float = 0.1,
-        *,
         duration: float = 0.5,
-        publishers: int = 1,
+        *,
         stamp_ns: int | None = None,
+        publishers: int = 1,
     ) -> int:
-        stamp = self.ros_ns if stamp_ns is None else stamp_ns
-        here = self.positions
-        self.supervisor.submit(
-            self.step_command(here[0] + length, here[1] + rotation, stamp, duration),
-            self.now,
-            publishers,
-        )
-        return stamp
+        """Command a step from where the axes are; return its stamp."""
+        at = self.positions
+        point = at[0] + length, at[1] + rotation, duration
+        return self.submit(point, stamp_ns=stamp_ns, publishers=publishers)
+
+    def moving(self) -> Bench:
+        """Be in the middle of a step of 2 mm and 0.1 rad in 2 s."""
+        self.ready()
+        self.step(0.002, 0.1, 2.0)
+        self.go(5)
+        assert self.state == "MOVING"
+        return self
+
+    def refused(self, rule: str) -> str:
+        """Check that the last command was refused whole by a rule; return the reason."""
+        self.go(3)
+        assert self.rule == rule
+        assert self.state != "MOVING"
+        assert self.outcomes[-1].startswith("aborted: ")
+        assert self.positions == (0.0, 0.0)
+        return self.outcomes[-1]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 
 from needle_core.can_frame import CanFrame
 
@@ -55,6 +56,12 @@ class ScriptedDrive:
         self.mode = 0
         # What it takes by SDO.
         self.modes = {6, 8}
+        # Orders that it ignores; whether it answers to SYNC, and has heartbeats; counts that it
+        # goes at each SYNC by itself, in a state and while it homes.
+        self.deaf_to: set[str] = set()
+        self.syncs = self.beats = True
+        self.drift: dict[str, int] = {}
+        self.search: Iterator[int] = iter(())
         self.inputs = 0
         self.status_size = 7
         self.place_size = 8
@@ -75,8 +82,16 @@ class ScriptedDrive:
         self.stale_homing = False
         self.out: list[tuple[int, bytes]] = []
 
+    def tells(self, values: dict[tuple[int, int], int], size: int = 4) -> None:
+        """Have these values in its objects."""
+        self.objects |= {at: value.to_bytes(size, "little") for at, value in values.items()}
+
+    def holds(self, index: int, sub: int = 0) -> int:
+        """Return what an object holds."""
+        return int.from_bytes(self.objects[index, sub], "little", signed=index == 0x607D)
+
     def say(self, function: int, data: bytes) -> None:
-        if not self.silent:
+        if not self.silent and (self.beats or function != 0x700):
             self.out.append((function + self.node, data))
 
     def reboot(self) -> None:
@@ -113,6 +128,8 @@ class ScriptedDrive:
             self.sync()
 
     def sync(self) -> None:
+        if not self.syncs:
+            return
         status = self.statusword.to_bytes(2, "little") + bytes([self.mode])
         status += self.inputs.to_bytes(4, "little")
         place = self.position.to_bytes(4, "little", signed=True)
@@ -131,8 +148,18 @@ class ScriptedDrive:
                 self.homing_for = -1
                 self.position = 0
                 self.more_status = 0x1400
+            elif self.state == "enabled":
+                self.position += next(self.search, 0)
         else:
             self.follow()
+        if self.state in self.drift:
+            self.position += self.drift[self.state]
+            self.demand = self.position
+
+    def searches(self, *ways: int, forever: int = 0) -> None:
+        """Go so many counts a cycle while it homes, and never find a home."""
+        self.home_after = 10**9
+        self.search = itertools.chain(ways, itertools.repeat(forever))
 
     def answer(self) -> None:
         """Say what is not held back any more."""
@@ -150,6 +177,9 @@ class ScriptedDrive:
             self.position = self.demand
 
     def command(self, word: int) -> None:
+        order = "quick stop" if word & 0x06 == 0x02 else "" if word & 0x02 else "off"
+        if {order, "all"} & self.deaf_to:
+            return
         if self.state == "fault":
             if word & 0x80 and not self.last_word & 0x80 and not self.deaf_to_reset:
                 self.state = "disabled"

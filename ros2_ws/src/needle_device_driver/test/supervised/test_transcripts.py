@@ -6,74 +6,60 @@ drives are told. Lines that begin with # explain.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from .drive_bench import DriveBench
 
 FOLDER = Path(__file__).resolve().parent / "transcripts"
-HEARTBEAT = 0x77F
 
 
-def set_up(bench: DriveBench) -> int:
-    bench.run(bench.supervisor.configure(bench.clock()))
-    return 0
+def set_up(bench: DriveBench) -> None:
+    bench.configure()
 
 
-def home(bench: DriveBench) -> int:
+def home(bench: DriveBench) -> None:
     bench.configured()
-    start = len(bench.bus.sent)
-    bench.supervisor.confirm_needle_out(True)
-    bench.run(bench.supervisor.home(bench.clock()))
-    bench.cycle(16)
-    return start
+    bench.bus.sent.clear()
+    bench.home()
+    bench.wait(16)
 
 
-def move(bench: DriveBench) -> int:
+def move(bench: DriveBench) -> None:
     bench.homed()
-    start = len(bench.bus.sent)
-    bench.supervisor.enable(True, bench.clock())
-    bench.cycle(4)
-    bench.hold(False)
-    bench.hold()
+    bench.bus.sent.clear()
+    bench.enable()
+    bench.wait(4)
+    bench.press()
     bench.step(0.0004, -0.1, 0.08)
-    bench.cycle(6, holding=True)
-    assert bench.outcomes == ["succeeded"]
-    return start
+    bench.go(6)
 
 
-def quick_stop(bench: DriveBench) -> int:
+def quick_stop(bench: DriveBench) -> None:
     bench.moving()
-    start = len(bench.bus.sent)
-    bench.cycle(1, holding=True)
+    bench.bus.sent.clear()
+    bench.go()
     bench.hold(False)
-    bench.cycle(2)
-    return start
+    bench.wait(2)
 
 
-def fault_and_reset(bench: DriveBench) -> int:
+def fault_and_reset(bench: DriveBench) -> None:
     bench.moving()
-    start = len(bench.bus.sent)
-    bench.rotation.fail(0x8611)
-    bench.bus.flush()
-    bench.cycle(1, holding=True)
+    bench.bus.sent.clear()
+    bench.after(lambda: bench.rotation.fail(0x8611))
     bench.hold(False)
-    bench.cycle(5)
-    assert bench.run(bench.supervisor.reset(bench.clock())).success
-    bench.cycle(3)
-    return start
+    bench.wait(5)
+    assert bench.reset().success
+    bench.wait(3)
 
 
 @pytest.mark.parametrize("scene", [set_up, home, move, quick_stop, fault_and_reset])
-def test_the_bytes_are_those_of_the_transcript(drive_bench: DriveBench, scene: Any) -> None:
-    start = scene(drive_bench)
-    sent = [
-        f"{cob_id:03X}#{data.hex().upper()}"
-        for cob_id, data in drive_bench.bus.sent[start:]
-        # Its times are test_drive_rules' concern.
-        if cob_id != HEARTBEAT
-    ]
+def test_the_bytes_are_those_of_the_transcript(scene: Callable[[DriveBench], None]) -> None:
+    bench = DriveBench()
+    scene(bench)
+    # Heartbeats are test_bus_rules' concern.
+    sent = [f"{cob:03X}#{data.hex().upper()}" for cob, data in bench.bus.sent if cob != 0x77F]
     lines = (FOLDER / f"{scene.__name__}.txt").read_text("utf-8").splitlines()
     assert sent == [line.split()[0] for line in lines if line and not line.startswith("#")]

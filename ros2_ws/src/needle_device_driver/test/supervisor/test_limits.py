@@ -9,8 +9,9 @@ import pytest
 
 from needle_core.errors import OutOfBoundsError, UserError
 from needle_device_driver.parameters import DeviceDriverParameters
-from needle_device_driver.supervisor import command_stamps, hold, limits, stamp_ages
+from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_device_driver.supervisor.reports import Notice, NoticeLimit
 
 BOUNDS = {
     "max_depth": 0.2,
@@ -37,30 +38,38 @@ HARD = {
     "retraction_speed": 0.005,
     "homing_speed": 0.005,
     "hold_timeout": 0.5,
+    "reply_age_limit": 0.5,
 }
 
 
-def test_bounds_of_the_driver_are_those_of_the_document() -> None:
+def test_bounds_of_the_driver_are_those_of_the_document_and_parameters_of_their_name() -> None:
     assert dataclasses.asdict(DeviceDriverParameters().limits) == BOUNDS
+    for name, bound in BOUNDS.items():
+        given = DeviceDriverParameters(**{name: 0.9 * bound}).limits
+        assert dataclasses.asdict(given) == BOUNDS | {name: 0.9 * bound}
+    # Ideal axes come nearer to their targets.
+    ideal = BOUNDS | {"insertion_tolerance": 1e-6, "rotation_tolerance": 1e-4}
+    assert dataclasses.asdict(SafetyLimits()) == ideal
+    assert SafetyLimits().longest_homings == pytest.approx((150.0, 1.5 * 20.0 * math.pi))
 
 
-@pytest.mark.parametrize("name", HARD)
-def test_a_hard_bound_is_the_largest_that_can_be_configured(name: str) -> None:
-    assert getattr(SafetyLimits(**{name: HARD[name]}), name) == HARD[name]
-    with pytest.raises(OutOfBoundsError, match=name):
-        SafetyLimits(**{name: HARD[name] * 1.001})
+def test_a_bound_is_finite_positive_and_no_more_than_the_hard_one() -> None:
+    for name, bound in HARD.items():
+        assert getattr(SafetyLimits(**{name: bound}), name) == bound
+        with pytest.raises(OutOfBoundsError, match=name):
+            SafetyLimits(**{name: bound * 1.001})
+    for name in BOUNDS:
+        for bad in (0.0, -1.0, math.nan, math.inf):
+            with pytest.raises(UserError, match=name):
+                SafetyLimits(**{name: bad})
 
 
-@pytest.mark.parametrize("name", BOUNDS)
-@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
-def test_a_bound_that_bounds_nothing_is_refused(name: str, bad: float) -> None:
-    with pytest.raises(UserError, match=name):
-        SafetyLimits(**{name: bad})
-
-
-def test_bounds_that_are_no_parameters_are_those_of_the_document() -> None:
-    assert limits.HARD_STEP_TIME_CAP == 600.0
-    assert hold.MAX_SOURCES == 16
-    assert command_stamps._REMEMBERED_STEPS == 2000
-    assert stamp_ages.AHEAD_NS == 100_000_000
-    assert SafetyLimits().longest_homings == pytest.approx((1.5 * 100.0, 1.5 * 62.83), rel=1e-4)
+def test_a_flood_of_notices_is_counted_and_not_told_but_for_other_rules_and_faults() -> None:
+    limit, refused = NoticeLimit(), Notice("refused", Rule.TIP_AGE)
+    told = [limit.admit(refused, 100.0 + number * 1e-3) for number in range(999)]
+    assert [text for text in told if text] == ["refused [tip_age]"] * 5
+    assert limit.admit(Notice("late", Rule.HOLD_AGE), 100.9) == "late [hold_age]"
+    assert limit.admit(Notice("stopped", Rule.TIP_AGE, fault=True), 100.9) == "stopped [tip_age]"
+    assert limit.admit(Notice("by nobody"), 100.9) == "by nobody"
+    assert limit.admit(refused, 101.0) == "refused [tip_age] (994 more were not told)"
+    assert limit.admit(refused, 101.1) == "refused [tip_age]"

@@ -11,307 +11,237 @@ from needle_device_driver.cia402.pdo_setup import silence_unused
 from needle_device_driver.link.frame_link import LinkError
 from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.procedure import Procedure
-from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.states import State
 
-from ..checks import failed, in_state, recovers
 from ..drive_bench import DriveBench
 
-INSERTION = 1
+WATCHDOG = 127 << 16 | 100
 
 
-def test_loop_heartbeat_comes_with_each_cycle_and_never_without(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.configured()
-    sent = len(bench.bus.sent)
-    bench.cycle(5)
-    frames = bench.bus.sent[sent:]
-    assert [data for cob, data in frames if cob == 0x77F] == [b"\x05"] * 5
-    assert [cob for cob, _ in frames[:1]] == [0x77F]
-
-
-def test_loop_heartbeat_goes_on_while_the_other_drive_is_set_up(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.configured()
+def test_loop_heartbeat_comes_first_in_each_cycle_and_before_each_request() -> None:
+    bench = DriveBench().configured()
     cobs = [cob for cob, _ in bench.bus.sent]
-    requests = [i for i, cob in enumerate(cobs) if cob in (0x601, 0x602)]
-    assert all(cobs[i - 1] == 0x77F for i in requests)
+    requests = [number for number, cob in enumerate(cobs) if cob in (0x601, 0x602)]
+    assert all(cobs[number - 1] == 0x77F for number in requests)
+    bench.bus.sent.clear()
+    bench.wait(5)
+    assert [data for cob, data in bench.bus.sent if cob == 0x77F] == [b"\x05"] * 5
+    assert bench.bus.sent[0][0] == 0x77F
 
 
-def test_link_loss_is_named_and_reset_opens_the_link_anew(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
+def test_link_loss_is_named_and_reset_opens_the_link_anew() -> None:
+    bench = DriveBench().moving()
     bench.broken = "takes nothing for 0.05 s"
-    bench.cycle(1, holding=True)
-    failed(bench, Rule.LINK_LOSS, "link virtual test is lost: takes nothing")
-    # Without a computer the drives' watchdogs trip.
+    bench.go()
+    bench.failed("link_loss", "link virtual test is lost: takes nothing")
+    # Without a computer the drives' watchdogs trip, and nobody knows what else happened to them.
     bench.insertion.state = bench.rotation.state = "fault"
+    bench.insertion.tells({(0x1016, 1): 0})
     bench.hold(False)
     bench.no_adapter = True
-    reply = bench.run(bench.supervisor.reset(bench.clock()))
-    assert not reply.success
-    assert "cannot open" in reply.message
-    assert in_state(bench, State.FAULT)
+    assert "cannot open" in bench.reset().message
+    assert bench.state == "FAULT"
     bench.no_adapter = False
-    # Nobody knows what happened to the drives meanwhile.
-    bench.insertion.objects[0x1016, 1] = bytes(4)
-    recovers(bench)
+    bench.stopped("link_loss", "takes nothing")
     assert bench.link.openings == 2
-    assert bench.written(INSERTION, 0x1016, 1) != bytes(4)
+    assert bench.insertion.holds(0x1016, 1) == WATCHDOG
 
 
-def test_link_loss_while_nothing_is_sent_is_noticed_too(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.configured()
+def test_link_loss_while_nothing_is_sent_and_before_the_start() -> None:
+    bench = DriveBench().configured()
     bench.link.change("gone")
-    bench.supervisor.observe(bench.clock())
-    assert in_state(bench, State.FAULT)
-    assert bench.notices[-1].rule is Rule.LINK_LOSS
-
-
-def test_link_loss_before_the_start_refuses_the_configuration(drive_bench: DriveBench) -> None:
-    bench = drive_bench
+    bench.supervisor.observe(bench.now)
+    assert (bench.state, bench.rule) == ("FAULT", "link_loss")
+    bench = DriveBench()
     bench.no_adapter = True
-    assert "cannot open" in bench.run(bench.supervisor.configure(bench.clock())).message
+    assert "cannot open" in bench.configure().message
+    assert bench.rule == "link_loss"
     with pytest.raises(LinkError, match="not open"):
         bench.link.send(0x80)
 
 
-def test_reply_age_a_cut_bus_reports_nothing_and_is_found(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
+# ---- answers that do not come, or late ----------------------------------------------------------
+
+
+def test_reply_age_a_cut_bus_reports_nothing_and_is_found() -> None:
+    bench = DriveBench().moving()
     bench.bus.cut = True
-    bench.cycle(1, holding=True)
-    assert in_state(bench, State.MOVING)
+    bench.go()
+    assert bench.state == "MOVING"
     bench.now += 0.1
-    bench.cycle(1, holding=True)
-    failed(bench, Rule.REPLY_AGE, "no reply from an axis")
-    assert bench.supervisor.joints(bench.clock()) is None
-    assert not bench.run(bench.supervisor.reset(bench.clock())).success
+    bench.go()
+    bench.failed("reply_age", "no reply from an axis")
+    assert bench.supervisor.joints(bench.now) is None
+    assert not bench.reset().success
     bench.bus.cut = False
     bench.insertion.state = bench.rotation.state = "fault"
-    recovers(bench)
+    bench.stopped("reply_age", "no reply")
 
 
-def test_reply_age_a_heartbeat_keeps_positions_fresh_only_while_no_sync_is_unanswered(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.configured()
+def test_reply_age_a_heartbeat_keeps_positions_fresh_only_while_no_sync_is_unanswered() -> None:
+    bench = DriveBench().configured()
     for _ in range(5):
         bench.now += 0.05
         bench.drives.beat()
-        bench.supervisor.observe(bench.clock())
-    assert in_state(bench, State.DISABLED)
-    # TPDOs end, heartbeats do not.
-    bench.insertion.sync = lambda: None  # type: ignore[method-assign]
-    bench.cycle(8)
-    assert in_state(bench, State.FAULT)
-    assert bench.notices[-1].rule is Rule.REPLY_AGE
+        bench.supervisor.observe(bench.now)
+    assert bench.state == "DISABLED"
+    bench.insertion.syncs = False
+    bench.wait(8)
+    assert (bench.state, bench.rule) == ("FAULT", "reply_age")
+    # Nor do the heartbeats of a drive that left the operational state.
+    bench = DriveBench().configured()
+    bench.insertion.nmt = 0x7F
+    bench.now += 0.2
+    bench.drives.beat()
+    bench.supervisor.observe(bench.now)
+    assert bench.axes[1].poll(bench.now).time > bench.now - 0.1
+    assert bench.supervisor.joints(bench.now) is None
 
 
-@pytest.mark.parametrize("which", ["insertion", "rotation"])
-@pytest.mark.parametrize("late", [2, 3, 4])
-def test_reply_age_an_axis_that_answers_late_is_not_sent_on_meanwhile(
-    drive_bench: DriveBench, which: str, late: int
+@pytest.mark.parametrize(
+    ("late", "cycles", "rule"),
+    [
+        (lambda _: 1, 80, ""),
+        (lambda _: 4, 80, ""),
+        (lambda _: 5, 80, "reply_age"),
+        (lambda cycle: cycle // 40, 400, "following_error"),
+    ],
+    ids=["20 ms", "80 ms", "100 ms", "growing"],
+)
+def test_reply_age_joints_are_no_older_than_answers_are_late(
+    late: Callable[[int], int], cycles: int, rule: str
 ) -> None:
-    bench = drive_bench
-    bench.moving()
-    getattr(bench, which).answers_late = late
-    for _ in range(40):
-        bench.cycle(1, holding=True)
-        joints = bench.supervisor.joints(bench.clock())
-        if joints is not None:
-            # Three cycles' way at 2 mm/s; answers to SYNCs of long ago would be off by more.
-            assert abs(joints.insertion.position - bench.insertion.position / 20e6) <= 0.0001201
-    assert bench.drives.unanswered > 10
+    bench = DriveBench().ready()
+    drive, at, worst, most = bench.insertion, 0, 0.0, 0
+    take, sync = drive.take, drive.sync
 
-
-def staleness(bench: DriveBench, late: Callable[[int], int], cycles: int) -> float:
-    """Insert at 5 mm/s while answers come so many cycles late, between two SYNCs.
-
-    Returns
-    -------
-    float
-        How far the joints were off from where the drive was at the last SYNC at most [m].
-    """
-    bench.ready()
-    bench.cycle(1, holding=True)
-    drive, took, sync = bench.insertion, bench.insertion.take, bench.insertion.sync
-    at, worst = 0, 0.0
-
-    def take(cob_id: int, data: bytes) -> None:
+    def without_heartbeats(cob_id: int, data: bytes) -> None:
         # No heartbeat brings an answer.
-        drive.say(0x700, bytes([drive.nmt])) if cob_id == 0x77F else took(cob_id, data)
+        drive.say(0x700, bytes([drive.nmt])) if cob_id == 0x77F else take(cob_id, data)
 
-    def note_sync() -> None:
+    def noted() -> None:
         nonlocal at
         at = drive.position
         sync()
 
-    drive.take, drive.sync = take, note_sync  # type: ignore[method-assign]
+    drive.take, drive.sync = without_heartbeats, noted  # type: ignore[method-assign]
     for number in range(cycles):
         drive.answers_late = late(number)
-        if in_state(bench, State.HOLDING):
-            told = [axis.poll(bench.clock()).set_point for axis in bench.axes]
-            step = bench.command(told[0] + 0.002, told[1], bench.ros_ns, 0.4)
-            bench.supervisor.submit(step, bench.clock())
-        bench.cycle(1, holding=True)
-        joints = bench.supervisor.joints(bench.clock())
+        most = max(most, drive.answers_late)
+        if bench.state == "HOLDING":
+            # At 5 mm/s.
+            bench.submit((bench.joint(0) + 0.002, bench.joint(1), 0.4))
+        bench.go()
+        joints = bench.supervisor.joints(bench.now)
         if joints is not None:
             worst = max(worst, abs(joints.insertion.position - at / 20e6))
         drive.held_back = [(count - 1, frames) for count, frames in drive.held_back]
         drive.answer()
         bench.bus.flush()
-        if in_state(bench, State.FAULT):
+        if bench.state == "FAULT":
             break
-    return worst
+    assert worst <= min(most * 0.0001, 0.0006) + 1e-9
+    assert (bench.rule if bench.state == "FAULT" else "") == rule
+    assert rule or bench.drives.unanswered == cycles
 
 
-@pytest.mark.parametrize("late", [1, 2, 3, 4])
-def test_reply_age_joints_are_no_older_than_answers_are_late(
-    drive_bench: DriveBench, late: int
-) -> None:
-    assert staleness(drive_bench, lambda _: late, 150) <= late * 0.0001 + 1e-9
-    assert not in_state(drive_bench, State.FAULT)
-    assert drive_bench.drives.unanswered == 150
+@pytest.mark.parametrize("which", ["insertion", "rotation"])
+def test_reply_age_an_axis_that_answers_late_is_not_sent_on_meanwhile(which: str) -> None:
+    for late in (2, 4):
+        bench = DriveBench().moving()
+        getattr(bench, which).answers_late = late
+        for _ in range(20):
+            bench.go()
+            joints = bench.supervisor.joints(bench.now)
+            assert joints is not None
+            # Three cycles' way at 2 mm/s; answers to SYNCs of long ago would be off by more.
+            assert abs(joints.insertion.position - bench.insertion.position / 20e6) <= 0.0001201
+        assert bench.drives.unanswered > 5
 
 
-@pytest.mark.parametrize(
-    ("late", "rule"),
-    [(lambda _: 5, Rule.REPLY_AGE), (lambda cycle: cycle // 40, Rule.FOLLOWING_ERROR)],
-    ids=["100 ms", "growing"],
-)
-def test_reply_age_answers_that_are_too_late_end_the_motion(
-    drive_bench: DriveBench, late: Callable[[int], int], rule: Rule
-) -> None:
-    assert staleness(drive_bench, late, 400) <= 0.0006 + 1e-9
-    assert in_state(drive_bench, State.FAULT)
-    assert drive_bench.notices[-1].rule is rule
-
-
-def test_reply_age_one_lost_answer_is_counted_and_holds_nothing_up(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.moving()
+def test_reply_age_lost_answers_are_counted_and_given_up_after_a_pause() -> None:
+    bench = DriveBench().moving()
     for _ in range(3):
         bench.insertion.loses = 1
-        bench.cycle(30, holding=True)
+        bench.go(30)
     assert bench.drives.unanswered == 3
-    bench.cycle(30, holding=True)
-    assert bench.outcomes[-1] == "succeeded"
-
-
-def test_reply_age_two_lost_answers_are_given_up_after_two_cycles_without_sync(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.insertion.loses = 2
-    bench.cycle(3, holding=True)
-    # The third answer may be to the first SYNC: nothing is sent on.
-    waiting = bench.insertion.next_target
-    bench.cycle(2, holding=True)
-    assert bench.insertion.next_target == waiting
-    bench.cycle(60, holding=True)
     assert bench.outcomes == ["succeeded"]
+    bench.step(0.002, 0.2, 1.0)
+    bench.go(5)
+    bench.insertion.loses = 2
+    bench.go(3)
+    # The third answer may be to the first SYNC: nothing is sent on, for two cycles.
+    waiting, syncs = bench.insertion.next_target, len(bench.bus.sent)
+    bench.go(2)
+    assert bench.insertion.next_target == waiting
+    assert 0x80 not in [cob for cob, _ in bench.bus.sent[syncs:]]
+    bench.go(2)
+    assert bench.insertion.next_target > waiting
+    bench.go(60)
+    assert bench.outcomes == ["succeeded"] * 2
+    values = bench.drives.health("", {}).values
+    assert values["unanswered_syncs"] == str(bench.drives.unanswered)
 
 
-def test_reply_age_heartbeats_of_a_drive_that_left_operational_keep_nothing_fresh(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.configured()
-    assert bench.supervisor.joints(bench.clock()) is not None
-    bench.insertion.nmt = 0x7F
-    bench.now += 0.2
-    bench.drives.beat()
-    bench.supervisor.observe(bench.clock())
-    assert bench.axes[1].poll(bench.clock()).time > bench.clock() - 0.1
-    assert bench.supervisor.joints(bench.clock()) is None
+# ---- a drive that starts anew -------------------------------------------------------------------
 
 
-def test_drive_reboot_is_a_fault_and_unhomes(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.cycle(20, holding=True)
+def set_up_again(bench: DriveBench) -> None:
+    bench.hold(False)
+    bench.wait(8)
+    assert bench.reset().success
+    bench.wait(5)
+    bench.enabled()
+
+
+def test_drive_reboot_is_a_fault_and_leaves_the_way_out_by_the_depth_known_before() -> None:
+    bench = DriveBench().moving()
+    bench.go(20)
     # Deeper than the software limits reach outward: un-homed, they do not count.
-    deep = bench.insertion.position
+    deep, drawn_out = bench.insertion.position, 0
     assert deep > 20_000
-    bench.insertion.reboot()
+    # A second one on the way out leaves what is left of the way.
+    for cycles in (10, 100):
+        bench.after(bench.insertion.reboot)
+        bench.failed("drive_reboot", "home position is lost")
+        assert not bench.is_homed()
+        set_up_again(bench)
+        assert bench.insertion.nmt == 0x05
+        assert bench.insertion.holds(0x1016, 1) == WATCHDOG
+        assert bench.insertion.holds(0x607D, 1) == -(2**31)
+        bench.step()
+        assert bench.rule == "homed_first"
+        assert bench.retract().success
+        bench.go(cycles)
+        drawn_out -= bench.insertion.position
+    # What was last heard is a cycle old.
+    assert drawn_out == pytest.approx(deep, abs=4000)
+    assert bench.retract().message == "the needle is out"
+
+
+def test_drive_reboot_one_that_starts_by_itself_is_set_up_anew_all_the_same() -> None:
+    bench = DriveBench().homed()
+    for drive in (bench.insertion, bench.rotation):
+        drive.reboot()
+        drive.nmt = 0x05
+        drive.tells({(0x1016, 1): 0})
     bench.bus.flush()
-    bench.cycle(1, holding=True)
-    failed(bench, Rule.DRIVE_REBOOT, "home position is lost")
-    assert not bench.status.homed
-    bench.hold(False)
-    assert bench.run(bench.supervisor.reset(bench.clock())).success
-    assert bench.insertion.nmt == 0x05
-    assert bench.written(INSERTION, 0x1016, 1) == (127 << 16 | 100).to_bytes(4, "little")
-    # No software limits before it is homed again.
-    assert bench.written(INSERTION, 0x607D, 1) == bytes.fromhex("00000080")
-    bench.cycle(5)
-    assert bench.supervisor.enable(True, bench.clock()).success
-    bench.cycle(12)
-    bench.hold(False)
-    bench.cycle(1, holding=True)
-    bench.step()
-    assert bench.notices[-1].rule is Rule.HOMED_FIRST
-    # Outward by the depth that was known, in the new count.
-    assert bench.supervisor.retract(bench.clock()).success
-    bench.cycle(100, holding=True)
-    # The last that was heard is a cycle old.
-    assert bench.insertion.position == pytest.approx(-deep, abs=2000)
-    assert "out" in bench.supervisor.retract(bench.clock()).message
+    bench.wait(5)
+    assert bench.state == "FAULT"
+    assert bench.reset().success
+    assert bench.insertion.holds(0x1016, 1) == bench.rotation.holds(0x1016, 1) == WATCHDOG
+    assert not bench.is_homed()
 
 
-def test_drive_reboot_one_that_starts_by_itself_is_set_up_anew_all_the_same(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.insertion.reboot()
-    bench.insertion.nmt = 0x05
-    bench.insertion.objects[0x1016, 1] = bytes(4)
-    bench.bus.flush()
-    bench.cycle(1, holding=True)
-    bench.hold(False)
-    bench.cycle(5)
-    assert bench.run(bench.supervisor.reset(bench.clock())).success
-    assert bench.written(INSERTION, 0x1016, 1) != bytes(4)
-    assert not bench.status.homed
-
-
-def test_drive_reboot_a_node_that_left_operational_is_found_by_its_heartbeat(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.moving()
+def test_drive_reboot_a_node_that_left_operational_is_found_by_its_heartbeat() -> None:
+    bench = DriveBench().moving()
     bench.rotation.nmt = 0x7F
     bench.drives.beat()
-    bench.cycle(1, holding=True)
-    failed(bench, Rule.DRIVE_REBOOT, "left the operational state")
+    bench.go()
+    bench.failed("drive_reboot", "left the operational state")
 
 
-def test_drive_reboot_during_the_set_up_of_a_reset_is_not_forgotten(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.homed()
-    bench.insertion.reboot()
-    bench.rotation.reboot()
-    bench.bus.flush()
-    bench.cycle(1)
-    assert in_state(bench, State.FAULT)
-    assert bench.run(bench.supervisor.reset(bench.clock())).success
-    assert not bench.status.homed
-
-
-def test_drive_reboot_within_its_set_up_voids_it(
-    drive_bench: DriveBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench = drive_bench
-    bench.homed()
+def test_drive_reboot_within_its_set_up_voids_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = DriveBench().homed()
     reboots = [True]
 
     def reboots_once(access: ObjectAccess) -> Procedure[None]:
@@ -322,41 +252,13 @@ def test_drive_reboot_within_its_set_up_voids_it(
         yield from silence_unused(access)
 
     monkeypatch.setattr(drive_setup, "silence_unused", reboots_once)
-    bench.insertion.reboot()
-    bench.bus.flush()
-    bench.cycle(1)
-    assert in_state(bench, State.FAULT)
+    bench.after(bench.insertion.reboot)
+    bench.hold(False)
     # What it was told before it started anew is gone: only a whole set-up counts.
-    refused = bench.run(bench.supervisor.reset(bench.clock()))
-    assert not refused.success
-    assert "started anew while it was set up" in refused.message
-    assert bench.run(bench.supervisor.reset(bench.clock())).success
-    bench.cycle(5)
-    assert in_state(bench, State.DISABLED)
-
-
-def test_drive_reboot_on_the_way_out_leaves_what_is_left_of_the_way(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.cycle(20, holding=True)
-    depth, drawn_out = bench.insertion.position, 0
-    for cycles in (10, 100):
-        bench.insertion.reboot()
-        bench.bus.flush()
-        bench.hold(False)
-        bench.cycle(8)
-        assert bench.run(bench.supervisor.reset(bench.clock())).success
-        bench.cycle(5)
-        assert bench.supervisor.enable(True, bench.clock()).success
-        bench.cycle(12)
-        bench.hold(False)
-        bench.cycle(1, holding=True)
-        assert bench.supervisor.retract(bench.clock()).success
-        bench.cycle(cycles, holding=True)
-        drawn_out -= bench.insertion.position
-    assert drawn_out == pytest.approx(depth, abs=4000)
+    assert "started anew while it was set up" in bench.reset().message
+    assert bench.reset().success
+    bench.wait(5)
+    assert bench.state == "DISABLED"
 
 
 @pytest.mark.parametrize(
@@ -368,11 +270,9 @@ def test_drive_reboot_on_the_way_out_leaves_what_is_left_of_the_way(
     ],
 )
 def test_one_master_another_on_the_bus_is_named_and_stops_both(
-    drive_bench: DriveBench, cob_id: int, data: bytes, what: str
+    cob_id: int, data: bytes, what: str
 ) -> None:
-    bench = drive_bench
-    bench.moving()
+    bench = DriveBench().moving()
     bench.bus.put(cob_id, data)
-    bench.cycle(1, holding=True)
-    failed(bench, Rule.ONE_MASTER, f"another master is on the bus: it sends {what}")
-    recovers(bench)
+    bench.go()
+    bench.stopped("one_master", f"another master is on the bus: it sends {what}")

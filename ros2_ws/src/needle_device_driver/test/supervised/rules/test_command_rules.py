@@ -2,274 +2,277 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import pytest
 
 from needle_core.errors import OutOfBoundsError
-from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.command import Command, CommandPoint
+from needle_device_driver.supervisor.command import Command, CommandPoint, Refusal, check_form
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_device_driver.supervisor.states import State
 
-from ..checks import in_state, refused
 from ..ideal_axes import Bench
+from ..supervisor_bench import NAMES, command
 
-NAMES = ("insertion_joint", "rotation_joint")
-POINT = CommandPoint((0.001, 0.1), (), 0.5)
-
-
-def test_command_state_only_in_holding(make_bench: type[Bench]) -> None:
-    bench = make_bench()
-    bench.home()
-    bench.command()
-    assert bench.last_rule is Rule.COMMAND_STATE
-    assert "DISABLED" in bench.results[-1].outcome
+MS = 1_000_000
+Point = tuple[float, float, float]
 
 
-def test_command_state_not_before_both_axes_are_powered(bench: Bench) -> None:
-    bench.ready()
+# ---- state --------------------------------------------------------------------------------------
+
+
+def test_command_state_only_in_holding_and_with_power() -> None:
+    bench = Bench().homed()
+    bench.step()
+    assert bench.rule == "command_state"
+    assert "DISABLED" in bench.outcomes[-1]
+    bench = Bench().ready()
     bench.rotation.powered = False
-    bench.command()
-    assert bench.last_rule is Rule.COMMAND_STATE
-    assert "not powered yet" in bench.results[-1].outcome
-    assert in_state(bench, State.HOLDING)
+    bench.step()
+    assert bench.outcomes == ["aborted: the axes are not powered yet"]
+    assert (bench.rule, bench.state) == ("command_state", "HOLDING")
+    assert bench.status.commands_refused == 1
+
+
+def test_command_state_a_second_command_leaves_the_running_step_alone() -> None:
+    bench = Bench().ready()
+    stamp = bench.step()
+    bench.go(5)
+    other = bench.step(0.002, 1.0)
+    # Its own stamp would tell its sender that the running one has ended.
+    bench.step(0.002, 1.0, stamp_ns=stamp)
+    bench.go(20)
+    refusal = "aborted: the device is MOVING, not HOLDING"
+    assert bench.results == [(other, refusal), (stamp, "succeeded")]
+    assert bench.positions == (0.001, 0.1)
 
 
 @pytest.mark.parametrize("which", ["insertion", "rotation"])
-def test_reply_age_no_step_begins_where_an_axis_is_silent(bench: Bench, which: str) -> None:
-    bench.ready()
-    getattr(bench, which).silent_since = bench.now - 0.101
-    bench.command()
-    assert bench.last_rule is Rule.REPLY_AGE
-    assert in_state(bench, State.HOLDING)
+def test_reply_age_no_step_begins_where_an_axis_is_silent(which: str) -> None:
+    bench = Bench().ready()
+    bench.axis(which).silent_since = bench.now - 0.101
+    bench.step()
+    assert (bench.rule, bench.state) == ("reply_age", "HOLDING")
+    bench.axis(which).silent_since = bench.now - 0.099
+    bench.step()
+    assert bench.state == "MOVING"
 
 
-def test_inner_limit_switch_no_step_begins_there(bench: Bench) -> None:
-    bench.ready()
+def test_inner_limit_switch_no_step_begins_there() -> None:
+    bench = Bench().ready()
     bench.insertion.inner_switch = True
-    bench.command()
-    assert bench.last_rule is Rule.INNER_LIMIT_SWITCH
-    assert in_state(bench, State.HOLDING)
+    bench.step()
+    assert (bench.rule, bench.state) == ("inner_limit_switch", "HOLDING")
 
 
-def test_command_state_a_second_command_leaves_the_running_step_alone(bench: Bench) -> None:
-    bench.ready()
-    stamp = bench.command()
-    bench.cycle(5, holding=True)
-    other = bench.command(0.002, 1.0)
-    bench.command(0.002, 1.0, stamp_ns=stamp)
-    bench.cycle(20, holding=True)
-    assert [(r.stamp_ns, r.outcome) for r in bench.results] == [
-        (other, "aborted: the device is MOVING, not HOLDING"),
-        (stamp, "succeeded"),
-    ]
-    assert bench.positions == (0.001, 0.1)
+def test_command_one_publisher() -> None:
+    bench = Bench().ready()
+    bench.step(publishers=2)
+    assert "2 nodes" in bench.refused("command_one_publisher")
 
 
-def test_command_one_publisher(bench: Bench) -> None:
-    bench.ready()
-    bench.command(publishers=2)
-    assert "2 nodes" in refused(bench, Rule.COMMAND_ONE_PUBLISHER)
+def test_homed_first() -> None:
+    bench = Bench()
+    bench.configure()
+    assert bench.enable().success
+    bench.hold()
+    bench.step()
+    bench.refused("homed_first")
 
 
-@pytest.mark.parametrize(
-    ("names", "points"),
-    [
-        ((), (POINT,)),
-        (("insertion_joint",), (CommandPoint((0.001,), (), 0.5),)),
-        (("insertion_joint", "roll"), (POINT,)),
-        (("insertion_joint", "insertion_joint"), (POINT,)),
-        ((*NAMES, "more"), (CommandPoint((0.001, 0.1, 0.0), (), 0.5),)),
-        ((*NAMES, NAMES[0]), (CommandPoint((0.001, 0.1, 0.001), (), 0.5),)),
-        (NAMES, ()),
-        (NAMES, (POINT, POINT)),
-        (NAMES, (CommandPoint((0.001,), (), 0.5),)),
-        (NAMES, (dataclasses.replace(POINT, time_from_start=0.0),)),
-        (NAMES, (dataclasses.replace(POINT, time_from_start=-0.5),)),
-        (NAMES, (dataclasses.replace(POINT, time_from_start=600.1),)),
-        (NAMES, (dataclasses.replace(POINT, time_from_start=2147483647.0),)),
-    ],
-)
-def test_command_form(
-    bench: Bench, names: tuple[str, ...], points: tuple[CommandPoint, ...]
-) -> None:
-    bench.ready()
-    bench.supervisor.submit(Command(bench.ros_ns, names, points), bench.now)
-    refused(bench, Rule.COMMAND_FORM)
+# ---- form ---------------------------------------------------------------------------------------
 
 
-def test_command_form_what_others_call_their_joints_is_told_in_short(bench: Bench) -> None:
-    bench.ready()
-    names = tuple("joint\n" * 100_000 for _ in range(300))
-    bench.supervisor.submit(Command(bench.ros_ns, names, (POINT,)), bench.now)
-    reason = refused(bench, Rule.COMMAND_FORM)
+def form(names: tuple[str, ...], *points: CommandPoint) -> str:
+    refusal = check_form(Command(1, names, points))
+    return "" if refusal is None else refusal.rule.value
+
+
+def test_command_form() -> None:
+    def point(*positions: float, time: float = 0.5) -> CommandPoint:
+        return CommandPoint(positions, (), time)
+
+    good = point(0.001, 0.1)
+    assert form(NAMES, good) == form(NAMES[::-1], good) == ""
+    assert form(NAMES, point(1.0, 1.0, time=1e-9)) == form(NAMES, point(1.0, 1.0, time=600.0)) == ""
+    path = [point(0.0, 0.0, time=float(number)) for number in range(33)]
+    assert form(NAMES, *path[:32]) == ""
+    for names, points in (
+        ((), [good]),
+        (("insertion_joint",), [point(0.001)]),
+        (("insertion_joint", "roll"), [good]),
+        ((NAMES[0], NAMES[0]), [good]),
+        ((*NAMES, "more"), [point(0.001, 0.1, 0.0)]),
+        ((*NAMES, NAMES[0]), [point(0.001, 0.1, 0.001)]),
+        (NAMES, []),
+        (NAMES, path),
+        (NAMES, [good, good]),
+        (NAMES, [point(0.001)]),
+        (NAMES, [point(0.001, 0.1, time=0.0)]),
+        (NAMES, [point(0.001, 0.1, time=-0.5), good]),
+        (NAMES, [point(0.001, 0.1, time=600.001)]),
+        (NAMES, [good, point(0.002, 0.1, time=600.001)]),
+    ):
+        assert form(names, *points) == "command_form", (names, points)
+
+
+def test_command_form_is_checked_and_told_in_short_and_joints_come_in_any_order() -> None:
+    bench = Bench().ready()
+    point = CommandPoint((0.1, 0.001), (), 0.5)
+    names = tuple("joint\n" * 1000 for _ in range(300))
+    bench.supervisor.submit(Command(bench.ros_ns, names, (point,)), bench.now)
+    reason = bench.refused("command_form")
     assert len(reason) < 500
     assert reason.isprintable()
     assert "and 296 more" in reason
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("where", ["insertion", "rotation", "others", "time"])
-def test_command_finite(bench: Bench, bad: float, where: str) -> None:
-    bench.ready()
-    point = CommandPoint(
-        (bad if where == "insertion" else 0.001, bad if where == "rotation" else 0.1),
-        (bad,) if where == "others" else (0.0,),
-        bad if where == "time" else 0.5,
-    )
-    bench.supervisor.submit(Command(bench.ros_ns, NAMES, (point,)), bench.now)
-    refused(bench, Rule.COMMAND_FINITE)
-
-
-def test_command_joints_may_come_in_any_order(bench: Bench) -> None:
-    bench.ready()
-    point = CommandPoint((0.1, 0.001), (), 0.5)
     bench.supervisor.submit(Command(bench.ros_ns, NAMES[::-1], (point,)), bench.now)
-    bench.cycle(25, holding=True)
+    bench.go(25)
     assert bench.positions == (0.001, 0.1)
 
 
-@pytest.mark.parametrize("older_by_ns", [0, 1])
-def test_command_newer_than_the_last(bench: Bench, older_by_ns: int) -> None:
-    bench.ready()
-    stamp = bench.command()
-    bench.cycle(25, holding=True)
-    bench.command(stamp_ns=stamp - older_by_ns)
-    assert bench.last_rule is Rule.COMMAND_NEWER
-    assert in_state(bench, State.HOLDING)
+def test_command_finite() -> None:
+    for bad in (math.nan, math.inf, -math.inf):
+        for point in (
+            CommandPoint((bad, 0.1), (), 0.5),
+            CommandPoint((0.001, bad), (), 0.5),
+            CommandPoint((0.001, 0.1), (0.0, bad), 0.5),
+            CommandPoint((0.001, 0.1), (), bad),
+        ):
+            assert form(NAMES, point) == "command_finite"
 
 
-def test_command_newer_a_reset_keeps_no_stamp_out_that_would_have_counted(bench: Bench) -> None:
-    bench.ready()
-    bench.command()
-    bench.cycle(25, holding=True)
-    assert bench.run(bench.supervisor.reset(bench.now)).success
-    bench.hold(False)
-    bench.hold()
-    bench.command(stamp_ns=bench.ros_ns - 40_000_000)
-    assert in_state(bench, State.MOVING)
+# ---- stamps -------------------------------------------------------------------------------------
 
 
-def test_tip_age_on_the_steady_clock_while_ros_time_stands_still(bench: Bench) -> None:
-    bench.ready()
+def test_command_newer_than_the_last() -> None:
+    bench = Bench().ready()
+    stamp = bench.step()
+    bench.go(25)
+    for older_by in (0, 1):
+        bench.step(stamp_ns=stamp - older_by)
+        assert (bench.rule, bench.state) == ("command_newer", "HOLDING")
+    bench.step(stamp_ns=stamp + 1)
+    assert bench.state == "MOVING"
+
+
+def test_command_newer_a_reset_keeps_no_stamp_out_that_would_have_counted() -> None:
+    bench = Bench().ready()
+    bench.step()
+    bench.go(25)
+    assert bench.reset().success
+    bench.press()
+    bench.step(stamp_ns=bench.ros_ns - 40 * MS)
+    assert bench.state == "MOVING"
+
+
+def test_tip_age_counts_steady_seconds_whatever_ros_time_does() -> None:
+    bench = Bench().ready()
+    # It stands still.
     stamp = bench.ros_ns
-    bench.now += bench.limits.tip_age_limit + 0.1
-    bench.hold(False)
-    bench.hold()
+    bench.now += 2.1
+    bench.press()
     bench.supervisor.note_time(stamp, bench.now)
-    bench.supervisor.observe(bench.now)
-    bench.command(stamp_ns=stamp)
-    assert "old" in refused(bench, Rule.TIP_AGE)
-    assert bench.status.watchdog_trips == 1
+    bench.step(stamp_ns=stamp)
+    assert "2.100 s old, limit 2 s" in bench.outcomes[-1]
+    # It runs fast.
+    bench = Bench().ready()
+    for second in range(100):
+        bench.supervisor.note_time(stamp + second * 1000 * MS, bench.now + second * 0.002)
+    bench.now += 0.2
+    bench.step(stamp_ns=stamp)
+    assert bench.state == "MOVING"
 
 
-def test_tip_age_counts_steady_seconds_while_ros_time_runs_fast(bench: Bench) -> None:
-    bench.ready()
-    stamp = bench.ros_ns
-    for _ in range(100):
-        bench.ros_ns += 1_000_000_000
-        bench.now += 0.001
-        bench.supervisor.note_time(bench.ros_ns, bench.now)
-    bench.supervisor.observe(bench.now)
-    bench.command(stamp_ns=stamp)
-    assert in_state(bench, State.MOVING)
+def test_tip_age_unknown_old_or_from_the_future() -> None:
+    for offset_ms, why in (
+        (-1000, "inf s old, limit 2 s"),
+        (101, "the tip is from the future: its stamp is 0.101 s ahead of this computer's clock"),
+    ):
+        bench = Bench().ready()
+        bench.step(stamp_ns=bench.ros_ns + offset_ms * MS)
+        assert why in bench.refused("tip_age")
+        assert bench.status.watchdog_trips == 1
+    for offset_ms in (1, 100):
+        bench = Bench().ready()
+        bench.step(stamp_ns=bench.ros_ns + offset_ms * MS)
+        assert bench.state == "MOVING"
 
 
-@pytest.mark.parametrize("offset_ns", [-1_000_000_000, 200_000_000])
-def test_tip_age_unknown_or_from_the_future(bench: Bench, offset_ns: int) -> None:
-    bench.ready()
-    bench.command(stamp_ns=bench.ros_ns + offset_ns)
-    refused(bench, Rule.TIP_AGE)
+def test_tip_age_bound_is_two_seconds() -> None:
+    for seconds, state in ((1.98, "MOVING"), (2.02, "HOLDING")):
+        bench = Bench().ready()
+        bench.wait()
+        stamp = bench.ros_ns
+        bench.wait(round(seconds / 0.02))
+        bench.press()
+        bench.step(stamp_ns=stamp + 1)
+        assert bench.state == state, seconds
 
 
-def test_tip_age_tells_how_far_a_clock_is_ahead(bench: Bench) -> None:
-    bench.ready()
-    bench.command(stamp_ns=bench.ros_ns + 200_000_000)
-    why = refused(bench, Rule.TIP_AGE)
-    assert "the tip is from the future: its stamp is 0.200 s ahead of this computer's clock" in why
+# ---- bounds -------------------------------------------------------------------------------------
 
 
-def test_homed_first(bench: Bench) -> None:
-    bench.run(bench.supervisor.configure(bench.now))
-    bench.supervisor.enable(True, bench.now)
-    bench.hold()
-    bench.command()
-    refused(bench, Rule.HOMED_FIRST)
+def bounded(rule: str, within: Point, beyond: Point, **limits: float) -> None:
+    """Check that a step just beyond a bound is refused by its rule, and one just within goes."""
+    bench = Bench(**limits).ready()
+    bench.submit(beyond)
+    assert "is beyond" in bench.refused(rule)
+    bench.submit(within)
+    assert bench.state == "MOVING", bench.outcomes
 
 
-@pytest.mark.parametrize("length", [0.0, -0.001])
-def test_forward_only(bench: Bench, length: float) -> None:
-    bench.ready()
-    bench.command(length)
-    refused(bench, Rule.FORWARD_ONLY)
+def test_forward_only() -> None:
+    for length in (0.0, -0.001):
+        bench = Bench().ready()
+        bench.step(length)
+        bench.refused("forward_only")
+    bench.step(1e-5)
+    assert bench.state == "MOVING"
 
 
-def test_max_depth(make_bench: type[Bench]) -> None:
-    bench = make_bench(max_depth=0.0015)
-    bench.ready()
-    bench.command(0.00151)
-    refused(bench, Rule.MAX_DEPTH)
-    bench.command(0.0015)
-    assert in_state(bench, State.MOVING)
+def test_max_depth() -> None:
+    bounded("max_depth", (0.0015, 0.0, 0.5), (0.001500001, 0.0, 0.5), max_depth=0.0015)
 
 
-def test_max_step_length_also_in_the_wrong_unit(bench: Bench) -> None:
-    bench.ready()
-    bench.command(0.00201, duration=1.0)
-    assert "2.01 mm is beyond 2 mm" in refused(bench, Rule.MAX_STEP_LENGTH)
-    bench.command(1.0, duration=1.0)
-    refused(bench, Rule.MAX_DEPTH)
+def test_max_step_length_also_in_the_wrong_unit() -> None:
+    bounded("max_step_length", (0.002001, 0.0, 0.5), (0.00200101, 0.0, 0.5))
+    bench = Bench().ready()
+    bench.step(1.0)
+    bench.refused("max_depth")
 
 
-def test_max_speed_of_5_mm_a_second_is_a_hard_cap(bench: Bench) -> None:
-    bench.ready()
-    bench.command(0.001, duration=0.199)
-    refused(bench, Rule.MAX_SPEED)
+def test_max_speed_of_5_mm_a_second_is_a_hard_cap() -> None:
+    # 1 um of the way is the tolerance; a message's time is whole nanoseconds.
+    bounded("max_speed", (0.001001, 0.0, 0.2), (0.001001, 0.0, 0.199_999))
     with pytest.raises(OutOfBoundsError, match="max_speed"):
-        SafetyLimits(max_speed=0.0051)
+        SafetyLimits(max_speed=0.00501)
 
 
-def test_max_speed_takes_a_step_at_the_bound_whatever_its_time_is_rounded_to(bench: Bench) -> None:
-    bench.ready()
-    # A nanosecond less than the way takes at 5 mm/s, as a message has it.
-    bench.command(0.0003, duration=0.059_999_999)
-    assert bench.state is State.MOVING
+def test_max_rotation_step_counts_from_where_the_rotation_is() -> None:
+    bounded("max_rotation_step", (0.001, 1.2001, 0.5), (0.001, 1.20011, 0.5))
+    bounded("max_rotation_step", (0.001, -1.2001, 0.5), (0.001, -1.20011, 0.5))
+    bench = Bench().ready()
+    bench.step(0.001, 1.0)
+    bench.go(25)
+    bench.step(0.001, -1.21)
+    assert bench.rule == "max_rotation_step"
+    bench.step(0.001, 1.0)
+    assert bench.state == "MOVING"
 
 
-def test_max_rotation_step(bench: Bench) -> None:
-    bench.ready()
-    bench.command(0.001, -1.21)
-    refused(bench, Rule.MAX_ROTATION_STEP)
+def test_max_rotation_rate() -> None:
+    time = 1.0 / math.pi
+    bounded("max_rotation_rate", (0.001, 1.0001, time), (0.001, 1.0001, time - 1e-6))
+    bounded("max_rotation_rate", (0.001, -1.0001, time), (0.001, -1.0001, time - 1e-6))
 
 
-def test_max_rotation_step_counts_from_where_the_rotation_is(bench: Bench) -> None:
-    bench.ready()
-    bench.command(0.001, 1.0)
-    bench.cycle(25, holding=True)
-    bench.command(0.001, -1.21)
-    assert bench.last_rule is Rule.MAX_ROTATION_STEP
-    bench.command(0.001, 1.0)
-    assert in_state(bench, State.MOVING)
+def test_max_turns() -> None:
+    for sign in (1, -1):
+        turn = sign * 0.1 * 2.0 * math.pi
+        bounded("max_turns", (0.001, turn, 0.5), (0.001, turn * 1.000001, 0.5), max_turns=0.1)
 
 
-def test_max_rotation_rate(bench: Bench) -> None:
-    bench.ready()
-    bench.command(0.001, 1.0, duration=0.31)
-    refused(bench, Rule.MAX_ROTATION_RATE)
-
-
-def test_max_turns(make_bench: type[Bench]) -> None:
-    bench = make_bench(max_turns=0.1)
-    bench.ready()
-    bench.command(0.001, -0.63)
-    refused(bench, Rule.MAX_TURNS)
-    bench.command(0.001, -0.62)
-    assert in_state(bench, State.MOVING)
-
-
-def test_a_command_at_its_limits_passes(bench: Bench) -> None:
-    bench.ready()
-    bench.supervisor.submit(bench.step_command(0.002, 1.2, bench.ros_ns, 0.4), bench.now)
-    assert in_state(bench, State.MOVING)
+def test_a_refusal_names_value_and_bound() -> None:
+    bench = Bench().ready()
+    bench.step(0.00201)
+    assert bench.outcomes == ["aborted: step 2.01 mm is beyond 2 mm"]
+    assert isinstance(check_form(command(1)), Refusal)

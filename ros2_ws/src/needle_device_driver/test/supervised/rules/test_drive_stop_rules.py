@@ -1,265 +1,252 @@
-"""How drives stop, and what stops both, named as in docs/safety.md."""
+"""How drives stop, what stops both, and those that ignore it, named as in docs/safety.md."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any
 
 import pytest
 
 from needle_device_driver.axes.axis import AxisError
-from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.states import State
 
-from ..checks import failed, in_state, recovers
-from ..drive_bench import DriveBench
+from ..drive_bench import RAD, DriveBench
 
-INSERTION, ROTATION = 1, 2
+QUICK_STOP = b"\x02\x00\x08"
 
 
-def test_quick_stop_goes_out_at_once_to_both(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    sent = len(bench.bus.sent)
+def test_quick_stop_goes_out_at_once_stays_and_forgets_the_set_point() -> None:
+    bench = DriveBench().moving()
+    bench.bus.sent.clear()
     bench.hold(False)
-    frames = bench.bus.sent[sent:]
-    assert [(cob, data) for cob, data in frames if cob in (0x201, 0x202)] == [
-        (0x201, b"\x02\x00\x08"),
-        (0x202, b"\x02\x00\x08"),
-    ]
-    assert not any(cob == 0x80 for cob, _ in frames)
-
-
-def test_quick_stop_stays_and_forgets_the_set_point(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    for node in (INSERTION, ROTATION):
-        assert bench.written(node, 0x605A) == b"\x06\x00"
-    bench.hold(False)
+    assert bench.bus.sent == [(0x201, QUICK_STOP), (0x202, QUICK_STOP)]
     at = bench.positions
-    bench.cycle(20, holding=True)
+    bench.go(20)
     assert bench.insertion.state == bench.rotation.state == "quick stop"
     assert bench.positions == at
-    bench.step()
-    bench.cycle(40, holding=True)
+    bench.steps()
     assert bench.outcomes == ["aborted: hold released", "succeeded"]
-    assert bench.positions[0] == at[0] + 20_000
 
 
-def test_quick_stop_that_a_drive_only_says_switches_both_off(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    drive = bench.insertion
-    follow = drive.follow
-
-    def run_on() -> None:
-        # A ramp that is none: 1 mm/s, as long as it has power.
-        drive.demand += 400 * (drive.state == "quick stop")
-        follow()
-
-    drive.follow = run_on  # type: ignore[method-assign]
+def test_quick_stop_that_a_drive_only_says_switches_both_off() -> None:
+    bench = DriveBench().moving()
+    # A ramp that is none: 1 mm/s, as long as it has power.
+    bench.insertion.drift = {"quick stop": 400}
+    at = bench.insertion.position
     bench.hold(False)
-    at = drive.position
-    bench.cycle(30)
-    assert drive.state == bench.rotation.state == "disabled"
-    assert drive.position - at <= 4_000, "0.2 mm: 0.2 s of them"
-    failed(bench, Rule.ONE_FAULT_STOPS_BOTH, "runs on in its quick stop (2000 counts in 0.1 s)")
-    drive.follow = follow  # type: ignore[method-assign]
-    recovers(bench)
-
-
-def test_quick_stop_option_that_a_drive_does_not_take_refuses_the_drive(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    sdo = bench.insertion.sdo
-
-    def ignoring(data: bytes) -> None:
-        sdo(data)
-        bench.insertion.objects[0x605A, 0] = b"\x02\x00"
-
-    bench.insertion.sdo = ignoring  # type: ignore[method-assign]
-    reply = bench.run(bench.supervisor.configure(bench.clock()))
-    assert not reply.success
-    assert "took 6 for 0x605A:0 quick stop option and has 2" in reply.message
-
-
-def test_drive_watchdog_is_armed_last_and_read_back(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.configured()
-    for node in (INSERTION, ROTATION):
-        assert bench.written(node, 0x1016, 1) == (127 << 16 | 100).to_bytes(4, "little")
-        assert bench.written(node, 0x6007) == b"\x01\x00"
-        assert bench.written(node, 0x605E) == b"\x02\x00"
-        writes = [d for c, d in bench.bus.sent if c == 0x600 + node and d[0] & 0xE0 == 0x20]
-        assert writes[-1] == bytes.fromhex("2316100164007f00")
-
-
-def test_drive_watchdog_that_a_drive_does_not_keep_refuses_the_drive(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.insertion.stores = lambda index, value: bytes(4) if index == 0x1016 else value
-    reply = bench.run(bench.supervisor.configure(bench.clock()))
-    assert not reply.success
-    assert "0x1016:1 consumer heartbeat time and has 0" in reply.message
-
-
-def test_drive_watchdog_that_tripped_stops_both_and_has_its_name(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.rotation.fail(0x8130)
-    bench.bus.flush()
-    bench.cycle(1, holding=True)
-    failed(bench, Rule.DRIVE_WATCHDOG, "heartbeat was missed")
-    assert bench.insertion.state == "disabled"
-    recovers(bench)
-
-
-def test_drive_watchdog_is_released_at_the_end(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.close()
+    bench.wait(30)
     assert bench.insertion.state == bench.rotation.state == "disabled"
-    for node in (INSERTION, ROTATION):
-        assert bench.written(node, 0x1016, 1) == bytes(4)
+    assert bench.insertion.position - at <= 4_400, "0.2 mm: 0.2 s of them"
+    bench.insertion.drift = {}
+    bench.stopped("one_fault_stops_both", "runs on in its quick stop (2000 counts in 0.1 s)")
+    bench = DriveBench().moving()
+    bench.insertion.drift = {"quick stop": 400}
+    assert bench.enable(False).success
+    bench.wait(20)
+    assert bench.state == "FAULT"
+    assert "runs on in its quick stop" in bench.status.fault
+    assert bench.insertion.state == "disabled"
 
 
-def test_drive_watchdog_that_tripped_before_the_start_is_told_at_the_start(
-    drive_bench: DriveBench,
+# What the drive does after an emergency stop; what is said of it after how many cycles; how it ends.
+Row = tuple[str, dict[str, Any], list[tuple[int, str]], str]
+UNSTOPPED: dict[str, Row] = {
+    "stops": ("insertion", {}, [(cycle, "") for cycle in (1, 8, 9, 45, 52)], "disabled"),
+    "only says": ("insertion", {"drift": {"quick stop": 400}}, [(20, ""), (10, "")], "disabled"),
+    "ignores the stop": (
+        "insertion",
+        {"drift": {"enabled": 400}, "deaf_to": {"quick stop"}},
+        [(12, "still moving"), (30, ""), (10, "")],
+        "disabled",
+    ),
+    "keeps its power": (
+        "rotation",
+        {"deaf_to": {"off"}},
+        [(49, ""), (5, "still powered"), (0, "still powered")],
+        "quick stop",
+    ),
+    "stands and takes no stop": (
+        "insertion",
+        {"deaf_to": {"quick stop"}},
+        [(50, ""), (2, "still powered"), (53, "")],
+        "disabled",
+    ),
+    "runs on powered": (
+        "insertion",
+        {"drift": {"enabled": 400}, "deaf_to": {"quick stop", "off"}},
+        [(60, "still powered and moving")],
+        "enabled",
+    ),
+    "runs on without power": (
+        "insertion",
+        {"drift": {"quick stop": 400, "disabled": 400}},
+        [(60, "still moving")],
+        "disabled",
+    ),
+    "is silent": ("rotation", {"silent": True}, [(3, ""), (5, "silent")], "quick stop"),
+}
+
+
+@pytest.mark.parametrize("name", UNSTOPPED)
+def test_quick_stop_a_drive_that_ignores_an_emergency_stop_is_told_while_it_lasts(
+    name: str,
 ) -> None:
-    bench = drive_bench
+    which, changes, cycles, end = UNSTOPPED[name]
+    bench = DriveBench().moving()
+    drive = getattr(bench, which)
+    for attribute, value in changes.items():
+        setattr(drive, attribute, value)
+    bench.supervisor.receive_estop(True)
+    assert bench.status.fault == "emergency stop"
+    told = []
+    for number, what in cycles:
+        for _ in range(number):
+            bench.wait()
+            told += [bench.status.fault] * (bench.status.fault not in told)
+        suffix = f"; {which} axis {what}" if what else ""
+        assert bench.status.fault == f"emergency stop{suffix}"
+    assert drive.state == end
+    said = [str(notice) for notice in bench.notices if notice.fault][1:]
+    assert said == [f"{fault[16:]} [quick_stop]" for fault in told[1:]]
+    # It ends when the drive is mended, and with a reset.
+    bench.supervisor.receive_estop(False)
+    bench.hold(False)
+    drive.drift, drive.silent, drive.state = {}, False, "disabled"
+    bench.wait(12)
+    assert bench.status.fault == "emergency stop"
+    assert bench.reset().success
+    bench.wait(2)
+    assert bench.status.fault == ""
+
+
+def test_quick_stop_once_it_is_off_a_hand_may_move_an_axis() -> None:
+    bench = DriveBench().moving()
+    bench.supervisor.receive_estop(True)
+    bench.wait(12)
+    bench.insertion.drift = {"disabled": 800}
+    bench.wait(20)
+    assert bench.status.fault == "emergency stop"
+
+
+def test_quick_stop_a_homing_drive_that_ignores_it_and_one_after_a_fault_are_told_too() -> None:
+    bench = DriveBench()
+    bench.insertion.home_after = 10**9
+    bench.insertion.deaf_to, bench.insertion.drift = {"quick stop", "off"}, {"enabled": -400}
+    bench.homing()
+    bench.wait(15)
+    assert bench.insertion.position < 0
+    bench.supervisor.receive_estop(True)
+    bench.wait(60)
+    assert bench.status.fault == "emergency stop; insertion axis still powered and moving"
+    bench = DriveBench().moving()
+    bench.insertion.drift = {"quick stop": 400, "disabled": 400}
+    bench.after(lambda: bench.rotation.fail(0x2310))
+    bench.wait(60)
+    reports = "rotation axis: the drive reports 0x2310 continuous over-current"
+    assert bench.status.fault == f"{reports}; insertion axis still moving"
+
+
+# ---- watchdog and emergencies -------------------------------------------------------------------
+
+
+def test_drive_watchdog_is_armed_last_and_released_at_the_end() -> None:
+    bench = DriveBench().configured()
+    for drive in (bench.insertion, bench.rotation):
+        assert (drive.holds(0x6007), drive.holds(0x605E)) == (1, 2)
+        sent = [d for c, d in bench.bus.sent if c == 0x600 + drive.node and d[0] & 0xE0 == 0x20]
+        assert sent[-1] == bytes.fromhex("2316100164007f00")
+    bench = DriveBench().moving()
+    # One that does not say that it is off keeps it.
+    bench.insertion.syncs = False
+    assert not bench.run(bench.supervisor.deconfigure()).success
+    assert "insertion axis: does not say that it is off" in bench.notices[-1].text
+    assert bench.insertion.holds(0x1016, 1) == 127 << 16 | 100
+    assert (bench.rotation.holds(0x1016, 1), bench.rotation.state) == (0, "disabled")
+    with pytest.raises(AxisError, match="insertion axis is not configured"):
+        bench.axes[0].start_move(0.0, 0.001)
+
+
+def test_drive_watchdog_that_tripped_has_its_name_also_before_the_start() -> None:
+    bench = DriveBench().moving()
+    bench.after(lambda: bench.rotation.fail(0x8130))
+    bench.stopped("drive_watchdog", "heartbeat was missed")
+    bench = DriveBench()
     bench.insertion.fail(0x8130)
     bench.insertion.out.clear()
-    bench.run(bench.supervisor.configure(bench.clock()))
-    assert in_state(bench, State.FAULT)
-    assert bench.notices[-1].rule is Rule.DRIVE_WATCHDOG
+    bench.configure()
+    assert (bench.state, bench.rule) == ("FAULT", "drive_watchdog")
     assert "insertion axis: the drive reports 0x8130" in bench.status.fault
     assert bench.insertion.state == "fault"
-    assert bench.run(bench.supervisor.reset(bench.clock())).success
-    bench.cycle(3)
-    assert in_state(bench, State.DISABLED)
+    assert bench.reset().success
+    bench.wait(3)
+    assert bench.state == "DISABLED"
 
 
-@pytest.mark.parametrize(("code", "words"), [(0x2310, "over-current"), (0x7305, "encoder")])
-def test_drive_emergency_stops_both_and_says_why(
-    drive_bench: DriveBench, code: int, words: str
-) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.insertion.fail(code)
-    bench.bus.flush()
-    bench.cycle(1, holding=True)
-    failed(bench, Rule.DRIVE_EMERGENCY, words)
-    assert bench.rotation.state == "disabled"
-    recovers(bench)
-
-
-def test_drive_emergency_a_fault_without_message_counts_too(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.rotation.state = "fault"
-    bench.cycle(1, holding=True)
-    failed(bench, Rule.DRIVE_EMERGENCY, "rotation axis: the drive is in FAULT")
-    recovers(bench)
-
-
-def test_drive_emergency_no_reset_while_the_other_axis_is_still_stopping(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.insertion.fail(0x7305)
-    bench.bus.flush()
-    bench.cycle(1, holding=True)
-    bench.hold(False)
+def test_drive_emergency_stops_both_says_why_and_is_acknowledged_in_the_process_data() -> None:
+    bench = DriveBench().moving()
+    for drive in (bench.insertion, bench.rotation):
+        drive.ignores_sdo_orders = True
+        # They answer with what they sampled at the SYNC before.
+        drive.tells_late = True
+    bench.after(lambda: bench.insertion.fail(0x7305))
     assert bench.rotation.state == "quick stop"
-    reply = bench.run(bench.supervisor.reset(bench.clock()))
-    assert reply.message == "rotation axis: is still stopping: reset again when it stands"
-    assert in_state(bench, State.FAULT)
-    bench.cycle(5)
-    assert bench.rotation.state == "disabled"
-    assert bench.run(bench.supervisor.reset(bench.clock())).success
-
-
-def test_drive_emergency_that_stays_keeps_the_device_in_fault(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.insertion.fail(0x7121)
-    bench.insertion.deaf_to_reset = True
-    bench.bus.flush()
+    for axis_order in (lambda a: a.power(True), lambda a: bench.run(a.home(0.001))):
+        with pytest.raises(AxisError, match="encoder error"):
+            axis_order(bench.axes[0])
     bench.hold(False)
-    bench.cycle(5)
-    took = bench.insertion.sdo
+    stopping = "rotation axis: is still stopping: reset again when it stands"
+    assert bench.reset().message == stopping
+    assert bench.state == "FAULT"
+    bench.stopped("drive_emergency", "the drive reports 0x7305 encoder error")
+    # A fault without message counts, too.
+    bench.rotation.state = "fault"
+    bench.go(2)
+    bench.failed("drive_emergency", "rotation axis: the drive is in FAULT")
 
-    def late(data: bytes) -> None:
-        bench.now += 0.05
-        took(data)
 
-    bench.insertion.sdo = late  # type: ignore[method-assign]
-    reply = bench.run(bench.supervisor.reset(bench.clock()))
-    assert not reply.success
-    assert "0x7121 motor blocked" in reply.message
-    assert in_state(bench, State.FAULT)
+@pytest.mark.parametrize(
+    ("lacking", "why"), [(set(), ": 0x7121 motor blocked"), ({0x603F}, "")], ids=["code", "none"]
+)
+def test_drive_emergency_that_stays_keeps_the_device_in_fault(lacking: set[int], why: str) -> None:
+    bench = DriveBench().homed()
+    drive = bench.insertion
+    drive.deaf_to_reset, drive.missing_objects = True, lacking
+    bench.after(lambda: drive.fail(0x7121))
+    bench.hold(False)
+    bench.wait(5)
+    bench.sdo_time = 0.05
+    reset = bench.reset()
+    assert reset.message == f"insertion axis: the drive does not leave its fault{why}"
+    assert bench.state == "FAULT"
     # The edge counts: the order before was one to reset, too.
-    bench.insertion.deaf_to_reset = False
-    assert bench.run(bench.supervisor.reset(bench.clock())).success
+    drive.deaf_to_reset, drive.missing_objects = False, set()
+    assert bench.reset().success
 
 
-def test_drive_emergency_a_drive_in_fault_takes_no_order_to_move(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    axis = bench.axes[0]
-    bench.insertion.fail(0x2310)
-    bench.bus.flush()
-    orders: tuple[Callable[[], None], ...] = (
-        lambda: axis.power(True),
-        lambda: bench.run(axis.home(0.001)),
-        lambda: axis.start_move(axis.poll(0.0).set_point, 0.001),
-    )
-    for order in orders:
-        with pytest.raises(AxisError, match="over-current"):
-            order()
-
-
-def test_one_fault_stops_both_a_drive_that_switches_itself_off(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.rotation.state = "disabled"
-    bench.cycle(1, holding=True)
-    failed(bench, Rule.ONE_FAULT_STOPS_BOTH, "by itself")
+def test_one_fault_stops_both_a_drive_that_switches_itself_off() -> None:
+    bench = DriveBench().moving()
+    bench.after(lambda: setattr(bench.rotation, "state", "disabled"))
+    bench.failed("one_fault_stops_both", "went from OPERATION_ENABLED to SWITCH_ON_DISABLED by its")
     assert bench.insertion.state == "disabled"
 
 
 @pytest.mark.parametrize("reverse", [False, True])
-def test_inner_limit_switch_stops_both_axes_at_once_and_leaves_the_way_out(
-    make_drive_bench: Callable[..., DriveBench], reverse: bool
-) -> None:
-    bench = make_drive_bench(insertion_reverse=reverse)
-    bench.ready()
-    bench.cycle(1, holding=True)
+def test_inner_limit_switch_stops_both_axes_at_once_and_leaves_the_way_out(reverse: bool) -> None:
+    bench = DriveBench(insertion_reverse=reverse).ready()
     bench.step(0.002, 0.2, 1.0)
-    bench.cycle(10, holding=True)
+    bench.go(10)
     # Its drive stops at the switch by itself, and says no more than that.
-    bench.insertion.inputs = 1 if reverse else 2
-    bench.insertion.blocked = True
+    bench.insertion.inputs, bench.insertion.blocked = 1 if reverse else 2, True
     before = bench.rotation.position
-    bench.cycle(2, holding=True)
-    failed(bench, Rule.INNER_LIMIT_SWITCH, "inner limit switch")
-    turned = (
-        abs(bench.rotation.position - before) / bench.settings.drive("rotation").counts_per_unit
-    )
+    bench.go(2)
+    bench.failed("inner_limit_switch", "inner limit switch")
     # Set-points of two cycles: 0.2 rad/s.
-    assert turned <= 0.0081
+    assert abs(bench.rotation.position - before) / RAD <= 0.0081
     bench.insertion.blocked = False
     bench.hold(False)
-    assert bench.run(bench.supervisor.reset(bench.clock())).success
-    assert bench.supervisor.enable(True, bench.clock()).success
-    bench.cycle(12)
-    bench.hold(False)
-    bench.cycle(1, holding=True)
+    assert bench.reset().success
+    bench.enabled()
     bench.step(0.001)
-    assert bench.notices[-1].rule is Rule.INNER_LIMIT_SWITCH
-    assert bench.supervisor.retract(bench.clock()).success
+    assert bench.rule == "inner_limit_switch"
+    assert bench.retract().success
     at = abs(bench.insertion.position)
-    bench.cycle(3, holding=True)
+    bench.go(3)
     assert abs(bench.insertion.position) < at

@@ -2,213 +2,232 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
-from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.states import Activity, State
-
-from ..checks import in_state
 from ..ideal_axes import Bench
+from ..supervisor_bench import PERIOD
 
 
-def test_a_step_goes_exactly_to_its_target_and_answers_with_its_stamp(bench: Bench) -> None:
-    bench.ready()
-    stamp = bench.command(0.001, -0.3)
-    assert in_state(bench, State.MOVING)
-    bench.cycle(24, holding=True)
-    assert bench.results == []
-    bench.cycle(1, holding=True)
+def test_a_step_goes_exactly_to_its_target_and_answers_with_its_stamp() -> None:
+    bench = Bench().ready()
+    stamp = bench.step(0.001, -0.3)
+    bench.go(24)
+    assert (bench.results, bench.state) == ([], "MOVING")
+    assert bench.status.command_ns == stamp
+    bench.go()
     assert bench.positions == (0.001, -0.3)
-    assert [(r.stamp_ns, r.outcome) for r in bench.results] == [(stamp, "succeeded")]
-    assert in_state(bench, State.HOLDING)
+    assert (bench.results, bench.state) == ([(stamp, "succeeded")], "HOLDING")
+    assert (bench.status.text, bench.status.level, bench.status.activity) == ("HOLDING", 0, "none")
 
 
-def test_coordinated_in_proportion_whatever_the_speed(bench: Bench) -> None:
-    bench.ready()
-    bench.command(0.001, -0.5)
+def test_coordinated_in_proportion_whatever_the_speed() -> None:
+    bench = Bench().ready()
+    bench.step(0.001, -0.5)
     for scale in (1.0, 0.2, 0.7, 0.0, 0.05, 1.0, 0.5):
-        bench.cycle(3, holding=True, scale=scale)
+        bench.go(3, scale)
         insertion, rotation = bench.positions
         assert rotation == pytest.approx(insertion / 0.001 * -0.5, rel=1e-12)
-    bench.cycle(25, holding=True)
+    bench.go(25)
     assert bench.positions == (0.001, -0.5)
 
 
-@pytest.mark.parametrize("which", ["insertion", "rotation"])
-def test_following_error_of_one_axis_stops_both(bench: Bench, which: str) -> None:
-    bench.ready()
-    getattr(bench, which).stuck = True
-    bench.command(0.002, 1.0, duration=0.5)
-    bench.cycle(25, holding=True)
-    assert bench.last_rule is Rule.FOLLOWING_ERROR
-    assert in_state(bench, State.FAULT)
-    assert which in bench.status.fault
-    assert abs(bench.insertion.position) <= bench.limits.insertion_following_error + 1e-4
-    assert bench.insertion.stops == bench.rotation.stops == 1
-
-
 @pytest.mark.parametrize(("which", "bound"), [("insertion", 0.0005), ("rotation", 0.1)])
-@pytest.mark.parametrize("share", [0.99, 1.01])
-def test_following_error_counts_from_its_bound_on(
-    bench: Bench, which: str, bound: float, share: float
-) -> None:
-    bench.ready()
-    bench.command()
-    bench.cycle(5, holding=True)
-    axis = getattr(bench, which)
-    axis.position -= share * bound
-    bench.now += bench.period
-    bench.hold()
-    bench.supervisor.drive(bench.period, bench.now)
-    assert in_state(bench, State.FAULT if share > 1.0 else State.MOVING)
+def test_following_error_counts_from_its_bound_on_and_stops_both(which: str, bound: float) -> None:
+    for share, state in ((0.999, "MOVING"), (1.001, "FAULT")):
+        bench = Bench().ready()
+        bench.step()
+        bench.go(5)
+        bench.axis(which).position -= share * bound
+        bench.now += PERIOD
+        bench.hold()
+        bench.supervisor.drive(PERIOD, bench.now)
+        assert bench.state == state, bench.status.fault
+    assert bench.rule == "following_error"
+    assert f"the {which} axis is" in bench.status.fault
+    assert f"limit {bound * 1e3:g} mm" in bench.status.fault or which == "rotation"
+    assert bench.insertion.stops == bench.rotation.stops == 1
+    assert not bench.insertion.powered
+    assert not bench.rotation.powered
 
 
-def test_retraction_waits_for_power(bench: Bench) -> None:
-    inserted(bench)
+@pytest.mark.parametrize(("which", "tolerance"), [("insertion", 1e-6), ("rotation", 1e-4)])
+def test_settling_time_is_a_second_beside_the_target(which: str, tolerance: float) -> None:
+    for off, state in ((0.99 * tolerance, "HOLDING"), (1.01 * tolerance, "MOVING")):
+        bench = Bench().ready()
+        bench.step()
+        bench.go(24)
+        axis = bench.axis(which)
+        axis.stuck, axis.position = True, {"insertion": 0.001, "rotation": 0.1}[which] - off
+        bench.go()
+        assert bench.state == state
+    bench.go(49)
+    assert bench.state == "MOVING"
+    bench.go(2)
+    assert (bench.state, bench.rule) == ("FAULT", "settling_time")
+    assert "not at their target 1 s after the last set-point" in bench.status.fault
+
+
+# ---- retraction ---------------------------------------------------------------------------------
+
+
+def inserted() -> Bench:
+    """Return a device 3 mm deep."""
+    bench = Bench().ready()
+    for _ in range(3):
+        bench.go()
+        bench.step(0.001, 0.2)
+        bench.go(25)
+    return bench
+
+
+def test_retraction_moves_insertion_only_slowly_and_with_the_hold() -> None:
+    bench = inserted()
     bench.insertion.powered = False
-    assert "not powered yet" in bench.supervisor.retract(bench.now).message
-    assert in_state(bench, State.HOLDING)
-
-
-def inserted(bench: Bench, steps: int = 3) -> None:
-    bench.ready()
-    for _ in range(steps):
-        bench.cycle(1, holding=True)
-        bench.command(0.001, 0.2)
-        bench.cycle(25, holding=True)
-
-
-def test_retraction_moves_insertion_only_slowly_and_with_the_hold(bench: Bench) -> None:
-    inserted(bench)
+    assert bench.retract().message == "the axes are not powered yet"
+    bench.insertion.powered = True
     bench.hold(False)
-    assert not bench.supervisor.retract(bench.now).success
+    assert not bench.retract().success
     bench.hold()
     rotation = bench.rotation.position
     bench.rotation.orders.clear()
-    assert bench.supervisor.retract(bench.now).success
-    start = bench.now, bench.insertion.position
-    bench.cycle(10, holding=True)
-    speed = (start[1] - bench.insertion.position) / (bench.now - start[0])
-    assert speed == pytest.approx(bench.limits.retraction_speed)
+    assert bench.retract().message == "retracting 3.0 mm while the hold lasts"
+    assert not bench.retract().success
+    bench.go(10)
+    assert bench.insertion.position == pytest.approx(0.003 - 10 * 0.002 * PERIOD)
     bench.hold(False)
     at = bench.insertion.position
-    bench.cycle(5)
+    bench.wait(5)
     assert bench.insertion.position == at
     bench.hold()
-    assert bench.supervisor.retract(bench.now).success
-    bench.cycle(100, holding=True)
+    assert bench.retract().success
+    bench.go(100)
     assert bench.positions == (0.0, rotation)
     assert "move" not in bench.rotation.orders
-    assert in_state(bench, State.HOLDING)
-    assert [r.outcome for r in bench.results] == ["succeeded"] * 3
+    assert bench.state == "HOLDING"
+    assert bench.outcomes == ["succeeded"] * 3
+    assert bench.retract().message == "the needle is out"
 
 
-def rebooted(bench: Bench) -> None:
-    """Let the insertion drive lose its home at 3 mm depth; it counts from 0 again."""
-    inserted(bench)
-    bench.insertion.homed = False
-    bench.insertion.switch = False
-    bench.insertion.position, bench.insertion.target = 0.0, None
-    bench.cycle(1, holding=True)
+def test_retraction_goes_on_at_the_inner_switch_and_whatever_the_rotation_does() -> None:
+    bench = inserted()
+    bench.insertion.inner_switch = True
+    assert bench.retract().success
+    bench.rotation.position += 1.0
+    bench.go(10)
+    assert bench.activity == "retraction"
+    bench.insertion.position += 0.00051
+    bench.go()
+    assert (bench.state, bench.rule) == ("FAULT", "following_error")
 
 
-def test_unhomed_outward_only_by_the_last_known_depth(bench: Bench) -> None:
-    rebooted(bench)
-    assert not bench.status.homed
-    bench.cycle(1, holding=True)
-    bench.command(0.001)
-    assert bench.last_rule is Rule.HOMED_FIRST
-    assert bench.supervisor.retract(bench.now).success
-    bench.cycle(200, holding=True)
+def rebooted() -> Bench:
+    """Return a device whose insertion drive lost its home at 3 mm depth; it counts from 0 again."""
+    bench = inserted()
+    bench.insertion.homed = bench.insertion.switch = False
+    bench.insertion.position, bench.insertion.target = 0.0, math.nan
+    bench.go()
+    return bench
+
+
+def test_unhomed_outward_only_by_the_last_known_depth() -> None:
+    bench = rebooted()
+    assert not bench.is_homed()
+    bench.go()
+    bench.step()
+    assert bench.rule == "homed_first"
+    assert bench.retract().success
+    bench.go(40)
+    bench.hold(False)
+    # Counted where it stands now, what was drawn out is out.
+    bench.hold()
+    assert bench.retract().message == "retracting 1.4 mm while the hold lasts"
+    bench.go(100)
     assert bench.insertion.position == pytest.approx(-0.003)
-    assert in_state(bench, State.HOLDING)
-    assert "out" in bench.supervisor.retract(bench.now).message
+    assert bench.state == "HOLDING"
+    assert bench.retract().message == "the needle is out"
 
 
-def test_unhomed_outward_only_not_from_the_switch(bench: Bench) -> None:
-    rebooted(bench)
+def test_unhomed_outward_only_to_the_switch_and_by_all_the_depth_where_none_was_known() -> None:
+    bench = rebooted()
+    assert bench.retract().success
+    bench.go(10)
     bench.insertion.switch = True
-    assert "out" in bench.supervisor.retract(bench.now).message
-    assert in_state(bench, State.HOLDING)
-
-
-def test_unhomed_outward_only_ends_at_the_switch(bench: Bench) -> None:
-    rebooted(bench)
-    assert bench.supervisor.retract(bench.now).success
-    bench.cycle(10, holding=True)
-    bench.insertion.switch = True
-    bench.cycle(1, holding=True)
-    assert in_state(bench, State.HOLDING)
+    bench.go()
+    assert bench.state == "HOLDING"
     at = bench.insertion.position
-    bench.cycle(10, holding=True)
+    bench.go(10)
     assert bench.insertion.position == at
+    assert bench.retract().message == "the needle is out"
+    bench = Bench(max_depth=0.1)
+    bench.insertion.switch = False
+    bench.configure()
+    assert bench.enable().success
+    bench.hold()
+    assert bench.retract().message == "retracting 100.0 mm while the hold lasts"
 
 
-def test_homing_needle_out_must_be_confirmed_and_a_step_ends_that(bench: Bench) -> None:
-    bench.run(bench.supervisor.configure(bench.now))
-    assert "confirm" in bench.run(bench.supervisor.home(bench.now)).message
-    inserted(bench, steps=0)
-    assert bool(bench.status.needle_out_confirmed)
-    bench.cycle(1, holding=True)
-    bench.command()
-    bench.cycle(25, holding=True)
-    assert not bench.status.needle_out_confirmed
-    bench.supervisor.enable(False, bench.now)
-    assert not bench.run(bench.supervisor.home(bench.now)).success
+# ---- homing -------------------------------------------------------------------------------------
 
 
-def test_homing_needle_out_only_when_disabled_and_can_be_stopped(bench: Bench) -> None:
+def test_homing_needle_out_must_be_confirmed_and_a_step_ends_that() -> None:
+    bench = Bench()
+    bench.configure()
+    confirm = "confirm first that the needle is out (confirm_needle_out)"
+    assert bench.run(bench.supervisor.home(bench.now)).message == confirm
+    assert bench.home().success
+    assert bench.enable().success
+    assert not bench.home().success, "only while disabled"
+    bench.hold()
+    bench.step(-1.0)
+    assert str(bench.status.needle_out_confirmed) == "True", "it was refused"
+    bench.step()
+    assert str(bench.status.needle_out_confirmed) == "False"
+    bench.go(25)
+    bench.enable(False)
+    assert bench.run(bench.supervisor.home(bench.now)).message == confirm
+    bench.supervisor.confirm_needle_out(True)
+    bench.supervisor.confirm_needle_out(False)
+    assert bench.run(bench.supervisor.home(bench.now)).message == confirm
+
+
+def test_homing_needle_out_can_be_stopped_and_ends_without_power() -> None:
+    bench = Bench()
     bench.insertion.position = 0.01
-    bench.home()
-    assert bench.supervisor.activity is Activity.HOMING
+    bench.configure()
+    assert bench.home().message == "homing"
+    assert (bench.state, bench.activity) == ("MOVING", "homing")
+    assert bench.supervisor.may_move(bench.now), "without a hold"
     assert not bench.supervisor.confirm_needle_out(False).success
-    bench.cycle(5)
+    bench.wait(5)
     at = bench.positions
-    bench.supervisor.stop()
-    bench.cycle(5)
-    assert bench.positions == at
-    assert in_state(bench, State.DISABLED)
+    assert at == (pytest.approx(0.01 - 5 * 0.002 * PERIOD), 0.0)
+    assert bench.supervisor.stop().message == "homing stopped"
+    bench.wait(5)
+    assert (bench.positions, bench.state) == (at, "DISABLED")
     assert not bench.insertion.powered
-    assert bench.run(bench.supervisor.home(bench.now)).success
-    bench.cycle(500)
-    assert bench.positions == (0.0, 0.0)
-    assert bench.status.homed
-    assert in_state(bench, State.DISABLED)
-    bench.supervisor.enable(True, bench.now)
-    assert not bench.run(bench.supervisor.home(bench.now)).success
+    assert bench.home().success
+    bench.wait(500)
+    assert (bench.positions, bench.state) == ((0.0, 0.0), "DISABLED")
+    assert bench.is_homed()
+    assert bench.rotation.orders[-1] == "off"
+    assert bench.supervisor.stop().message == "nothing moves"
 
 
 @pytest.mark.parametrize(
-    ("which", "longest"), [("insertion", 1.5 * 0.002 / 0.002), ("rotation", 1.5 * 0.6283 / 1.0)]
+    ("which", "longest"), [("insertion", 1.5 * 0.002 / 0.002), ("rotation", 1.5 * 0.62832 / 1.0)]
 )
-def test_homing_time_is_bounded_by_each_axis_own_travel(
-    make_bench: type[Bench], which: str, longest: float
-) -> None:
-    # The other axis has a long way, and may take its time.
-    bench = make_bench(
-        max_depth=0.002 if which == "insertion" else 0.2,
-        max_turns=0.1 if which == "rotation" else 10.0,
-    )
-    axis = getattr(bench, which)
-    axis.position = 0.001
-    axis.stuck = True
-    bench.home()
-    start = bench.now
-    while in_state(bench, State.MOVING):
-        assert bench.now - start < 10.0
-        bench.cycle(1)
-    assert bench.now - start == pytest.approx(longest, abs=2.1 * bench.period)
-    assert in_state(bench, State.FAULT)
-    assert bench.last_rule is Rule.HOMING_TIME
-    assert f"no home switch of the {which} axis in" in bench.status.fault
-
-
-def test_homing_time_on_the_switch_counts_a_quarter(make_bench: type[Bench]) -> None:
-    bench = make_bench(max_depth=0.002, max_turns=0.1)
-    bench.insertion.position, bench.insertion.switch = 0.001, True
-    bench.insertion.stuck = True
-    bench.home()
-    bench.cycle(290)
-    assert in_state(bench, State.MOVING)
-    bench.cycle(20)
-    assert in_state(bench, State.FAULT)
+def test_homing_time_is_bounded_by_each_axis_own_travel(which: str, longest: float) -> None:
+    # The other axis has a long way, and may take its time; on the switch it counts a quarter.
+    depth, turns = (0.002, 10.0) if which == "insertion" else (0.2, 0.1)
+    for switch, factor in ((False, 1.0), (True, 4.0)):
+        bench = Bench(max_depth=depth, max_turns=turns)
+        axis = bench.axis(which)
+        axis.position, axis.stuck, axis.switch = 0.001, True, switch
+        bench.homed()
+        bench.wait(math.floor(factor * longest / PERIOD) - 1)
+        assert bench.state == "MOVING"
+        bench.wait(3)
+        assert (bench.state, bench.rule) == ("FAULT", "homing_time")
+        assert f"no home switch of the {which} axis in" in bench.status.fault

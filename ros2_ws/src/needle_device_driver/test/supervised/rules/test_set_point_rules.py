@@ -2,71 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 
 import pytest
 
+from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.states import State
 
-from ..checks import failed, in_state, recovers
-from ..drive_bench import DriveBench
-from ..ideal_axes import Bench
-
-INSERTION, ROTATION = 1, 2
+from ..drive_bench import RAD, DriveBench
 
 
-def test_look_ahead_is_one_cycle_at_every_moment(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.ready()
-    bench.cycle(1, holding=True)
+def refused(bench: DriveBench, target: float, rule: Rule, axis: int = 0) -> str:
+    with pytest.raises(AxisError) as caught:
+        bench.axes[axis].start_move(target, 0.005)
+    assert caught.value.rule is rule
+    return str(caught.value)
+
+
+def test_look_ahead_is_one_cycle_at_every_moment() -> None:
+    bench = DriveBench().ready()
     bench.step(0.002, 1.2, 0.4)
-    bound = 0.005 * 0.02 * 20e6
     for _ in range(25):
         before = bench.insertion.position
-        bench.cycle(1, holding=True)
-        assert bench.insertion.next_target - before <= bound * 1.02
+        bench.go()
+        assert bench.insertion.next_target - before <= 2000
     assert bench.outcomes == ["succeeded"]
+
+
+def test_look_ahead_refuses_a_set_point_that_is_further() -> None:
+    bench = DriveBench().moving()
+    # A cycle's way at 5 mm/s, 1 % and a count.
+    at = bench.joint()
+    assert "ahead in a cycle" in refused(bench, at + 2022 / 20e6, Rule.LOOK_AHEAD)
+    bench.axes[0].start_move(at + 2021 / 20e6, 0.005)
+    bench.axes[0].start_move(at, 0.005)
+    most = (math.pi * 0.02 * 1.01 * RAD) + 1
+    refused(bench, bench.joint(1) + (most + 1) / RAD, Rule.LOOK_AHEAD, 1)
+    bench.axes[1].start_move(bench.joint(1) + (most - 1) / RAD, 0.005)
 
 
 @pytest.mark.parametrize("left_over", [-90, 90])
 def test_look_ahead_counts_from_the_last_set_point_where_a_motor_rests_beside_it(
-    make_drive_bench: Callable[..., DriveBench], left_over: int
+    left_over: int,
 ) -> None:
-    bench = make_drive_bench(retraction_speed=0.005)
-    bench.ready()
-    bench.insertion.left_over = left_over
+    bench = DriveBench(retraction_speed=0.005).ready()
     # As much as its tolerance has room for.
-    bench.rotation.left_over = left_over // 10
-    bench.cycle(1, holding=True)
+    bench.insertion.left_over, bench.rotation.left_over = left_over, left_over // 10
+    bench.go()
     for number in (1, 2):
         # As far and as fast as may be, from where the last step was to end.
-        target = Bench.step_command(0.002 * number, 1.1999 * number, bench.ros_ns, 0.4)
-        bench.supervisor.submit(target, bench.clock())
-        bench.cycle(30, holding=True)
+        bench.submit((0.002 * number, 1.1999 * number, 0.4))
+        bench.go(30)
     assert bench.outcomes == ["succeeded", "succeeded"]
-    assert bench.supervisor.retract(bench.clock()).success
-    bench.cycle(60, holding=True)
-    assert not in_state(bench, State.FAULT), bench.status.reason
+    assert bench.retract().success
+    bench.go(60)
+    assert bench.state != "FAULT", bench.status.reason
     assert abs(bench.insertion.position) <= 100
 
 
-def test_look_ahead_refuses_a_set_point_that_is_further(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    told = bench.axes[0].poll(0.0).set_point
-    bench.axes[0].start_move(told + 0.0001, 0.005)
-    # A cycle's way at 5 mm/s, 1 % and a count.
-    with pytest.raises(Exception, match="ahead in a cycle") as caught:
-        bench.axes[0].start_move(told + 0.0002012, 0.005)
-    assert getattr(caught.value, "rule", None) is Rule.LOOK_AHEAD
-
-
-def test_look_ahead_without_further_set_points_the_drive_ends_its_motion(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.moving()
+def test_look_ahead_without_further_set_points_the_drive_ends_its_motion() -> None:
+    bench = DriveBench().moving()
     last = bench.insertion.next_target
     for _ in range(10):
         # The computer is dead; something else still sends SYNC.
@@ -74,209 +69,146 @@ def test_look_ahead_without_further_set_points_the_drive_ends_its_motion(
     assert bench.insertion.position == last
 
 
-def test_look_ahead_an_axis_that_has_not_answered_is_not_sent_on(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.ready()
-    bench.cycle(1, holding=True)
-    bench.step(0.001, 1.0, 0.35)
-    bench.cycle(3, holding=True)
-    sync = bench.rotation.sync
-    bench.rotation.sync = lambda: None  # type: ignore[method-assign]
-    bench.cycle(1, holding=True)
+def test_look_ahead_an_axis_that_has_not_answered_is_not_sent_on() -> None:
+    bench = DriveBench().moving()
+    bench.rotation.syncs = False
+    bench.go()
     waiting = bench.insertion.next_target, bench.rotation.next_target
-    bench.cycle(2, holding=True)
+    bench.go(2)
     assert (bench.insertion.next_target, bench.rotation.next_target) == waiting
-    assert in_state(bench, State.MOVING)
+    assert bench.state == "MOVING"
     # It was but a moment.
-    bench.rotation.sync = sync  # type: ignore[method-assign]
-    bench.cycle(30, holding=True)
+    bench.rotation.syncs = True
+    bench.go(50)
     assert bench.outcomes == ["succeeded"]
 
 
-def test_look_ahead_an_answer_that_comes_late_counts_in_the_next_cycle(
-    make_drive_bench: Callable[..., DriveBench],
+@pytest.mark.parametrize("late", [False, True])
+def test_following_error_counts_from_the_set_point_that_was_due_also_in_late_answers(
+    late: bool,
 ) -> None:
     # Half a cycle's way: a position that is a cycle too old would break it.
-    bench = make_drive_bench(insertion_following_error=5e-5)
-    bench.ready()
-    bench.cycle(1, holding=True)
+    bench = DriveBench(insertion_following_error=5e-5).ready()
     bench.step(0.001, 0.1, 0.2)
-    bench.bus.late = True
+    bench.bus.late = late
     for _ in range(20):
-        bench.cycle(1, holding=True)
+        bench.go()
         bench.bus.flush()
     assert bench.outcomes == ["succeeded"]
 
 
-def test_software_limits_in_the_drives_come_with_homing(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.configured()
-    for node in (INSERTION, ROTATION):
-        assert bench.written(node, 0x607D, 1) == bytes.fromhex("00000080")
-        assert bench.written(node, 0x607D, 2) == bytes.fromhex("ffffff7f")
-    bench.supervisor.confirm_needle_out(True)
-    bench.run(bench.supervisor.home(bench.clock()))
-    bench.cycle(30)
-    lower, upper = (
-        int.from_bytes(bench.written(INSERTION, 0x607D, sub), "little", signed=True)
-        for sub in (1, 2)
-    )
-    assert (lower, upper) == (-20_000, 4_020_000)
+def test_following_error_of_a_blocked_motor() -> None:
+    bench = DriveBench().moving()
+    bench.insertion.blocked = True
+    while bench.state == "MOVING":
+        bench.go()
+    assert bench.insertion.next_target - bench.insertion.position <= 0.7e-3 * 20e6
+    bench.failed("following_error", "mm off its set-point")
+    bench.insertion.blocked = False
+    # A motor that comes free has no power to go on.
+    bench.stopped("following_error", "mm off its set-point")
 
 
-def test_software_limits_in_the_drives_end_while_they_are_homed_again(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.homed()
-    assert bench.run(bench.supervisor.home(bench.clock())).success
-    for node in (INSERTION, ROTATION):
-        assert bench.written(node, 0x607D, 1) == bytes.fromhex("00000080")
+@pytest.mark.parametrize("tells", [True, False])
+def test_following_error_of_a_motor_that_comes_free_after_the_stop(tells: bool) -> None:
+    bench = DriveBench()
+    if not tells:
+        bench.insertion.missing_objects, bench.insertion.place_size = {0x60F4}, 4
+    bench.moving()
+    bench.insertion.blocked = True
+    bench.go(3)
+    bench.hold(False)
+    bench.wait(8)
+    assert bench.state == "HOLDING"
+    if not tells:
+        assert bench.insertion.state == "quick stop", "it is where it was left, for all one knows"
+        return
+    assert bench.insertion.state == "disabled"
+    assert "insertion: blocked when it was stopped" in bench.status.reason
+    assert [n.rule for n in bench.notices].count(Rule.FOLLOWING_ERROR) == 1
+    at = bench.positions
+    bench.insertion.blocked = False
+    bench.wait(10)
+    assert bench.positions == at, "nobody holds"
+    bench.hold()
+    bench.steps()
 
 
-@pytest.mark.parametrize("limit", ["00000080", "ffffff7f"], ids=["lower", "upper"])
-def test_software_limits_that_a_drive_does_not_keep_refuse_the_drive(
-    drive_bench: DriveBench, limit: str
-) -> None:
-    bench = drive_bench
-    bench.insertion.stores = lambda index, value: (
-        bytes(4) if index == 0x607D and value == bytes.fromhex(limit) else value
-    )
-    assert "and has 0" in bench.run(bench.supervisor.configure(bench.clock())).message
+def test_following_error_that_a_drive_reports() -> None:
+    bench = DriveBench().moving()
+    bench.rotation.STATES = {**bench.rotation.STATES, "enabled": 0x2237}
+    bench.go()
+    bench.failed("following_error", "the drive reports a following error")
 
 
-def test_software_limits_in_the_driver_refuse_a_set_point(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.ready()
-    with pytest.raises(Exception, match="outside the drive's limits") as caught:
-        bench.axes[0].start_move(0.3, 0.001)
-    assert getattr(caught.value, "rule", None) is Rule.SOFTWARE_LIMITS
+def test_settling_time_names_an_axis_that_does_not_arrive() -> None:
+    bench = DriveBench().moving()
+    bench.go(30)
+    # 0.1 mm before the target, within the following error.
+    bench.insertion.blocked = True
+    bench.go(12)
+    bench.insertion.position = 38_000
+    bench.go(45)
+    assert bench.state == "MOVING"
+    bench.go(20)
+    bench.failed("settling_time", "insertion 0.1000 mm")
+
+
+# ---- software limits ----------------------------------------------------------------------------
+
+
+def test_software_limits_in_the_drives_come_with_homing_and_end_when_they_home_again() -> None:
+    bench = DriveBench().configured()
+
+    def limits() -> list[int]:
+        drives = bench.insertion, bench.rotation
+        return [drive.holds(0x607D, sub) for drive in drives for sub in (1, 2)]
+
+    none = [-(2**31), 2**31 - 1] * 2
+    assert limits() == none
+    assert bench.home().success
+    bench.wait(30)
+    # -1 mm to 201 mm, 10 turns and 0.2 rad either way.
+    assert limits() == [-20_000, 4_020_000, -657_446, 657_446]
+    assert bench.home().success
+    assert limits() == none
+
+
+def test_software_limits_in_the_driver_refuse_a_set_point() -> None:
+    bench = DriveBench().ready()
+    limits = "outside the drive's limits [-0.001, 0.201]"
+    for target in (0.201 + 1e-7, -0.001 - 1e-7):
+        assert limits in refused(bench, target, Rule.SOFTWARE_LIMITS)
+    for target in (0.201, -0.001):
+        refused(bench, target, Rule.LOOK_AHEAD)
 
 
 @pytest.mark.parametrize(("reverse", "at"), [(False, -(2**31)), (True, 2**31 - 1)])
 def test_software_limits_of_an_axis_without_home_are_where_its_counter_ends(
-    make_drive_bench: Callable[..., DriveBench], reverse: bool, at: int
+    reverse: bool, at: int
 ) -> None:
-    bench = make_drive_bench(insertion_reverse=reverse)
+    bench = DriveBench(insertion_reverse=reverse)
     drive = bench.insertion
     drive.position = drive.target = drive.next_target = at + (-5000 if reverse else 5000)
     bench.configured()
-    assert bench.supervisor.enable(True, bench.clock()).success
-    bench.cycle(12)
-    bench.hold(False)
-    bench.hold()
-    bench.cycle(1, holding=True)
-    assert bench.supervisor.retract(bench.clock()).success
-    bench.cycle(30, holding=True)
-    assert in_state(bench, State.FAULT)
-    assert bench.notices[-1].rule is Rule.SOFTWARE_LIMITS
+    bench.enabled()
+    assert bench.retract().success
+    bench.go(30)
+    assert (bench.state, bench.rule) == ("FAULT", "software_limits")
     assert "outside the drive's counter; home it, or set it nearer 0" in bench.status.fault
     assert abs(drive.position - at) < 1000
 
 
-def test_following_error_of_a_blocked_motor(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.insertion.blocked = True
-    for _ in range(20):
-        bench.cycle(1, holding=True)
-        if in_state(bench, State.FAULT):
-            break
-    failed(bench, Rule.FOLLOWING_ERROR, "mm off its set-point")
-    assert bench.insertion.next_target - bench.insertion.position <= 0.7e-3 * 20e6
-    at = bench.positions
-    bench.insertion.blocked = False
-    bench.cycle(10, holding=True)
-    assert bench.positions == at, "a motor that comes free has no power to go on"
-    recovers(bench)
-
-
-def blocked_when_the_hold_is_let_go(bench: DriveBench) -> None:
-    bench.moving()
-    bench.insertion.blocked = True
-    bench.cycle(3, holding=True)
-    assert bench.insertion.demand > bench.insertion.position
-    bench.hold(False)
-    bench.cycle(8)
-    assert bench.state is State.HOLDING
-
-
-def test_following_error_of_a_motor_that_comes_free_after_the_stop(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    blocked_when_the_hold_is_let_go(bench)
-    assert bench.insertion.state == "disabled"
-    assert "insertion: blocked when it was stopped" in bench.status.reason
-    at = bench.positions
-    bench.insertion.blocked = False
-    bench.cycle(10)
-    assert bench.positions == at, "nobody holds"
-    assert [n.rule for n in bench.notices if n.rule is Rule.FOLLOWING_ERROR] != []
-    bench.hold()
-    bench.step()
-    bench.cycle(40, holding=True)
-    assert bench.outcomes[-1] == "succeeded"
-
-
-def test_following_error_that_a_drive_does_not_tell_is_told_at_the_set_up(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.insertion.missing_objects = {0x60F4}
-    bench.insertion.place_size = 4
-    blocked_when_the_hold_is_let_go(bench)
-    assert bench.insertion.state == "quick stop", "it is where it was left, for all one knows"
-    assert "no following error to map" in bench.drives.missing_optional_objects[0]
-
-
-def test_following_error_that_a_drive_reports(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.rotation.STATES = {**bench.rotation.STATES, "enabled": 0x2237}
-    bench.cycle(1, holding=True)
-    failed(bench, Rule.FOLLOWING_ERROR, "the drive reports a following error")
-
-
-def test_following_error_counts_from_the_set_point_that_was_due(
-    make_drive_bench: Callable[..., DriveBench],
-) -> None:
-    # A cycle's way at full speed is twice this bound.
-    bench = make_drive_bench(insertion_following_error=5e-5)
-    bench.ready()
-    bench.cycle(1, holding=True)
-    bench.step(0.002, 0.3, 0.4)
-    bench.cycle(30, holding=True)
-    assert bench.outcomes == ["succeeded"]
-
-
-def test_settling_time_names_an_axis_that_does_not_arrive(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.moving()
-    bench.cycle(30, holding=True)
-    # 0.1 mm before the target, within the following error.
-    bench.insertion.blocked = True
-    bench.cycle(12, holding=True)
-    bench.insertion.position = 38_000
-    bench.cycle(45, holding=True)
-    assert in_state(bench, State.MOVING)
-    bench.cycle(20, holding=True)
-    failed(bench, Rule.SETTLING_TIME, "insertion 0.1000 mm")
-
-
-def test_no_motion_by_itself_set_up_enabling_and_reset_leave_a_drive_where_it_is(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
+def test_no_motion_by_itself_set_up_enabling_and_reset_leave_a_drive_where_it_is() -> None:
+    bench = DriveBench()
     # Where the drive was left, with a set-point of someone else's.
     bench.insertion.position, bench.insertion.next_target = 12_345, 99_999
     bench.configured()
-    bench.cycle(5)
+    bench.wait(5)
     assert bench.insertion.position == 12_345
     # Someone turns the motor while it is off.
     bench.insertion.position = 55_555
-    bench.cycle(1)
-    assert bench.supervisor.enable(True, bench.clock()).success
-    bench.cycle(20)
-    assert bench.insertion.state == "enabled"
-    assert bench.insertion.position == 55_555
+    bench.wait()
+    assert bench.enable().success
+    bench.wait(20)
+    assert (bench.insertion.state, bench.insertion.position) == ("enabled", 55_555)

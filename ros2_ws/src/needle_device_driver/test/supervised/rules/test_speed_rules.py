@@ -3,189 +3,115 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Callable, Iterable
+import math
+from typing import Any
 
 import pytest
 
 from needle_device_driver.cia402.axis_speed import SpeedWatch
 from needle_device_driver.cia402.drive_monitor import Feedback
 from needle_device_driver.parameters import DeviceDriverParameters
-from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.states import State
 
-from ..checks import in_state
-from ..drive_bench import DriveBench
-from ..scripted_drives import ScriptedDrive
+from ..drive_bench import RAD, DriveBench
 
 PERIOD = 0.02
-Make = Callable[..., DriveBench]
 # Counts in a cycle at 1 mm/s.
 MM_S = 400
 
 
-def searches(drive: ScriptedDrive, ways: Iterable[int]) -> None:
-    """Let a drive go so many counts a cycle while it homes, and never find its home."""
-    drive.home_after = 10**9
-    sync, rest = drive.sync, iter(ways)
-
-    def moving() -> None:
-        sync()
-        if drive.homing_for >= 0 and drive.state == "enabled":
-            drive.position += next(rest, 0)
-
-    drive.sync = moving  # type: ignore[method-assign]
-
-
-def homing(bench: DriveBench) -> None:
-    bench.configured()
-    bench.supervisor.confirm_needle_out(True)
-    assert bench.run(bench.supervisor.home(bench.clock())).success
-
-
-def until_fault(bench: DriveBench, most: int = 1000) -> None:
-    for _ in range(most):
-        if in_state(bench, State.FAULT):
-            return
-        bench.cycle(1)
-    raise AssertionError(f"no fault: {bench.positions}")
-
-
-# ---- speed -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("mm_s", [-150.0, 150.0, -4.0, -3.6])
-def test_axis_speed_a_homing_that_is_too_fast_is_stopped_in_two_cycles(
-    drive_bench: DriveBench, mm_s: float
-) -> None:
-    bench = drive_bench
-    way = round(mm_s * MM_S)
-    searches(bench.insertion, itertools.repeat(way))
-    homing(bench)
-    until_fault(bench)
-    assert bench.notices[-1].rule is Rule.AXIS_SPEED
-    assert f"insertion axis: moves at {abs(mm_s):.4g} mm/s, at most 3.5 mm/s" in bench.status.fault
-    assert "2 mm/s are commanded" in bench.status.fault
-    assert bench.insertion.state == "quick stop"
-    # Two cycles that are seen, one that was under way.
-    assert abs(bench.insertion.position) <= 3 * abs(way)
+def until_fault(bench: DriveBench, rule: str) -> str:
+    """Run cycles until there is a fault, of this rule; return its text."""
+    for _ in range(1000):
+        if bench.state == "FAULT":
+            break
+        bench.wait()
+    assert bench.rule == rule
     at = bench.positions
-    bench.cycle(10)
-    assert bench.positions == at
-    assert bench.insertion.state == bench.rotation.state == "disabled"
-    assert bench.run(bench.supervisor.reset(bench.clock())).success
+    bench.wait(10)
+    # One that was under way.
+    assert abs(bench.positions[0] - at[0]) <= 150 * MM_S
+    return bench.status.fault
 
 
-def test_axis_speed_stops_both_in_the_cycle_that_shows_it(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    searches(bench.insertion, itertools.repeat(-40 * MM_S))
-    searches(bench.rotation, itertools.repeat(0))
-    homing(bench)
+# ---- speed --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mm_s", [-150.0, 150.0, -3.55])
+def test_axis_speed_a_homing_that_is_too_fast_is_stopped_in_two_cycles(mm_s: float) -> None:
+    bench = DriveBench()
+    way = round(mm_s * MM_S)
+    bench.insertion.searches(forever=way)
+    bench.homing()
     while not bench.insertion.position:
-        bench.cycle(1)
-    bench.cycle(1)
-    assert in_state(bench, State.MOVING), "once is not twice"
-    sent = len(bench.bus.sent)
-    bench.cycle(1)
-    assert in_state(bench, State.FAULT)
-    stops = [cob for cob, data in bench.bus.sent[sent:] if data[:1] == b"\x02"]
-    assert stops == [0x201, 0x202]
+        bench.wait()
+    bench.wait()
+    assert bench.state == "MOVING", "once is not twice"
+    bench.bus.sent.clear()
+    bench.wait()
+    stops = [cob for cob, data in bench.bus.sent if data[:1] == b"\x02"]
+    assert (bench.state, stops) == ("FAULT", [0x201, 0x202])
+    text = f"insertion axis: moves at {abs(mm_s):.4g} mm/s, at most 3.5 mm/s where 2 mm/s are comm"
+    assert text in until_fault(bench, "axis_speed")
+    # Two cycles that are seen, one that was under way.
+    assert abs(bench.insertion.position) == 3 * abs(way)
+    assert bench.insertion.state == bench.rotation.state == "disabled"
+    assert bench.reset().success
 
 
-@pytest.mark.parametrize("mm_s", [-2.0, -3.4])
-def test_axis_speed_a_homing_at_its_speed_goes_on(drive_bench: DriveBench, mm_s: float) -> None:
-    bench = drive_bench
-    searches(bench.insertion, itertools.repeat(round(mm_s * MM_S)))
-    homing(bench)
-    bench.cycle(60)
-    assert in_state(bench, State.MOVING), bench.status.fault
+def test_axis_speed_a_homing_at_its_speed_goes_on_also_where_answers_are_lost() -> None:
+    for mm_s, loses, state in ((-3.45, 0, "MOVING"), (-2.0, 1, "MOVING"), (-20.0, 1, "FAULT")):
+        bench = DriveBench()
+        bench.insertion.searches(forever=round(mm_s * MM_S))
+        bench.homing()
+        for _ in range(10):
+            bench.wait(3)
+            bench.insertion.loses = loses
+            bench.wait()
+        assert bench.state == state, bench.status.fault
 
 
-def test_axis_speed_a_drive_that_counts_anew_at_its_home_is_not_fast(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
+def test_axis_speed_a_drive_that_counts_anew_at_its_home_is_not_fast() -> None:
+    bench = DriveBench()
     bench.insertion.position = 1_234_567
     bench.homed()
     # A homing whose end comes later than its new count, as where the edge is latched.
-    ways = [-2 * MM_S] * 20 + [-2_000_000] + [MM_S // 2] * 20
     bench.insertion.position = 500_000
-    bench.cycle(5)
-    searches(bench.insertion, ways)
-    bench.supervisor.confirm_needle_out(True)
-    assert bench.run(bench.supervisor.home(bench.clock())).success
-    bench.cycle(60)
-    assert in_state(bench, State.MOVING), bench.status.fault
+    bench.wait(5)
+    bench.insertion.searches(*[-2 * MM_S] * 20, -2_000_000, *[MM_S // 2] * 20)
+    assert bench.home().success
+    bench.wait(60)
+    assert bench.state == "MOVING", bench.status.fault
 
 
-@pytest.mark.parametrize(("rad_s", "fast"), [(1.55, False), (1.65, True)])
-def test_axis_speed_of_the_rotation_axis(make_drive_bench: Make, rad_s: float, fast: bool) -> None:
-    bench = make_drive_bench(rotation_homing_method=19)
-    searches(bench.rotation, itertools.repeat(round(rad_s * PERIOD * 65536 / 6.283185307)))
-    searches(bench.insertion, itertools.repeat(0))
-    homing(bench)
-    bench.cycle(30)
-    assert in_state(bench, State.FAULT if fast else State.MOVING)
-    assert not fast or "rotation axis: moves at 1.649 rad/s, at most 1.6" in bench.status.fault
+def test_axis_speed_of_the_rotation_axis() -> None:
+    for rad_s, state in ((1.59, "MOVING"), (1.61, "FAULT")):
+        bench = DriveBench(rotation_homing_method=19)
+        bench.rotation.searches(forever=round(rad_s * PERIOD * RAD))
+        bench.insertion.searches()
+        bench.homing()
+        bench.wait(30)
+        assert bench.state == state
+    assert "rotation axis: moves at 1.611 rad/s, at most 1.6 rad/s" in bench.status.fault
 
 
-@pytest.mark.parametrize(("mm_s", "fast"), [(0.45, False), (0.55, True)])
-def test_axis_speed_an_axis_that_drifts_while_nothing_is_commanded(
-    drive_bench: DriveBench, mm_s: float, fast: bool
-) -> None:
-    bench = drive_bench
-    bench.ready()
-    # What was commanded before fades.
-    bench.cycle(50, holding=True)
-    for _ in range(4):
-        bench.insertion.left_over += round(mm_s * MM_S)
-        bench.cycle(1, holding=True)
-    assert in_state(bench, State.FAULT if fast else State.HOLDING)
-    assert not fast or bench.notices[-1].rule is Rule.AXIS_SPEED
+def test_axis_speed_an_axis_that_drifts_while_nothing_is_commanded() -> None:
+    for mm_s, state in ((0.49, "HOLDING"), (0.51, "FAULT")):
+        bench = DriveBench().ready()
+        # What was commanded before fades.
+        bench.go(60)
+        for _ in range(4):
+            bench.insertion.left_over += round(mm_s * MM_S)
+            bench.go()
+        assert bench.state == state
 
 
-def test_axis_speed_an_axis_that_is_off_may_be_moved_by_hand(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    bench.configured()
+@pytest.mark.parametrize("drive", ["motor", "hand"])
+def test_axis_speed_an_axis_that_is_off_or_that_a_hand_moves_is_not_judged(drive: str) -> None:
+    bench = DriveBench(insertion_drive=drive).configured()
     for _ in range(20):
         bench.insertion.position += 100 * MM_S
-        bench.cycle(1)
-    assert in_state(bench, State.DISABLED)
-
-
-def test_axis_speed_an_axis_that_a_hand_moves_is_not_judged(make_drive_bench: Make) -> None:
-    bench = make_drive_bench(insertion_drive="hand")
-    bench.ready()
-    bench.cycle(1, holding=True)
-    bench.step()
-    for _ in range(4):
-        bench.insertion.position += 10 * MM_S
-        bench.cycle(1, holding=True)
-    assert not in_state(bench, State.FAULT)
-
-
-def test_axis_speed_answers_that_are_lost_are_time_that_went_by(drive_bench: DriveBench) -> None:
-    bench = drive_bench
-    searches(bench.insertion, itertools.repeat(-2 * MM_S))
-    homing(bench)
-    for _ in range(20):
-        bench.cycle(1)
-        bench.insertion.loses = 1
-        bench.cycle(1)
-    assert in_state(bench, State.MOVING), bench.status.fault
-
-
-def test_axis_speed_a_fast_axis_whose_answers_are_lost_is_fast_all_the_same(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    searches(bench.insertion, itertools.repeat(-20 * MM_S))
-    homing(bench)
-    for _ in range(10):
-        bench.cycle(3)
-        bench.insertion.loses = 1
-        bench.cycle(1)
-    assert bench.notices[-1].rule is Rule.AXIS_SPEED
+        bench.wait()
+    assert bench.state == "DISABLED"
 
 
 class Answers:
@@ -193,11 +119,13 @@ class Answers:
 
     def __init__(self) -> None:
         settings = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
-        self.watch = SpeedWatch(dataclasses.replace(settings, counts_per_unit=2e7), PERIOD)
+        self.watch = SpeedWatch(settings, PERIOD)
         self.at = Feedback(0, 0, 0, 0, 0, 0)
 
-    def answer(self, *, mm: float, syncs: int, numbers: int, seconds: float) -> bool:
-        """Return whether the next answer is plausible."""
+    def answer(
+        self, mm: float, syncs: int = 1, numbers: int = 1, seconds: float = PERIOD, to: float = 2e-3
+    ) -> bool:
+        """Return whether the next answer is plausible, where a speed is commanded [m/s]."""
         before = self.at
         self.at = dataclasses.replace(
             before,
@@ -206,14 +134,12 @@ class Answers:
             syncs=before.syncs + syncs,
             time=before.time + seconds,
         )
-        self.watch.command(0.002)
+        self.watch.command(to)
         return self.watch.judge(before, self.at, powered=True)
 
 
-@pytest.mark.parametrize(
-    ("syncs", "numbers", "seconds", "periods"),
-    [
-        (1, 1, 0.020, 1),
+def test_axis_speed_is_judged_by_elapsed_sync_periods() -> None:
+    for syncs, numbers, seconds, periods in (
         # Jitter of an answer counts for nothing, that of a SYNC by half its period.
         (1, 1, 0.001, 1),
         (1, 1, 0.029, 1),
@@ -225,121 +151,93 @@ class Answers:
         (1, 1, 0.100, 5),
         # A simulation that is faster than its time.
         (3, 1, 0.001, 3),
-    ],
-)
-def test_axis_speed_is_judged_by_elapsed_sync_periods(
-    syncs: int, numbers: int, seconds: float, periods: int
-) -> None:
-    answers = Answers()
-    bound = 3.5 * PERIOD * periods
-    for share, plausible in ((0.99, True), (1.01, False), (-1.01, False)):
-        told = answers.answer(mm=share * bound, syncs=syncs, numbers=numbers, seconds=seconds)
-        assert told is plausible
-    assert answers.watch.trouble
+    ):
+        answers = Answers()
+        bound = 3.5 * PERIOD * periods
+        for share, plausible in ((0.99, True), (1.01, False), (-1.01, False)):
+            assert answers.answer(share * bound, syncs, numbers, seconds) is plausible
+        assert answers.watch.trouble
 
 
-def test_axis_speed_once_too_fast_is_forgiven_and_twice_is_not() -> None:
+def test_axis_speed_once_too_fast_is_forgiven_and_what_was_commanded_fades() -> None:
     answers = Answers()
     for mm in (1.0, 0.04) * 5:
-        answers.answer(mm=mm, syncs=1, numbers=1, seconds=PERIOD)
+        answers.answer(mm)
         assert not answers.watch.trouble
+    # Ten cycles are a time constant: 0.5 mm/s, and 3 mm/s that fade.
+    for _ in range(10):
+        answers.answer(0.0, to=0.0)
+    assert answers.answer((0.5 + 3.0 * math.exp(-1.1)) * PERIOD - 1e-4, to=0.0)
+    assert not answers.answer((0.5 + 3.0 * math.exp(-1.2)) * PERIOD + 1e-4, to=0.0)
     for mm in (1.0, 1.0):
-        answers.answer(mm=mm, syncs=1, numbers=1, seconds=PERIOD)
-    assert "moves at 50 mm/s" in answers.watch.trouble
+        answers.answer(mm, to=0.0)
+    assert "moves at" in answers.watch.trouble
+    answers.watch.forget()
+    assert answers.watch.trouble == ""
+    assert not answers.answer(0.51 * PERIOD, to=0.0)
 
 
-# ---- way of a homing ---------------------------------------------------------------------------
+# ---- way of a homing ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("parameters", "most_mm"),
     [
-        ({"max_depth": 0.01}, 12.0),
-        ({"max_depth": 0.002}, 2.4),
+        ({}, 12.0),
         # A screw of 1 mm, that the drive tells or the parameter; a method without index pulse.
-        ({"max_depth": 0.01, "insertion_homing_method": 1}, 13.0),
-        ({"max_depth": 0.01, "insertion_homing_method": 33}, 13.0),
-        (
-            {
-                "max_depth": 0.01,
-                "insertion_homing_method": 2,
-                "insertion_counts_per_turn": 40_000.0,
-            },
-            14.0,
-        ),
-        ({"max_depth": 0.01, "insertion_homing_method": 20}, 12.0),
+        ({"insertion_homing_method": 1}, 13.0),
+        ({"insertion_homing_method": 33}, 13.0),
+        ({"insertion_homing_method": 2, "insertion_counts_per_turn": 40_000.0}, 14.0),
+        ({"insertion_homing_method": 20}, 12.0),
     ],
 )
 def test_homing_time_an_axis_goes_no_farther_than_its_own_travel_and_a_fifth(
-    make_drive_bench: Make, parameters: dict[str, float], most_mm: float
+    parameters: dict[str, Any], most_mm: float
 ) -> None:
-    bench = make_drive_bench(**parameters)
-    bench.insertion.objects |= {
-        (0x608F, 1): (20_000).to_bytes(4, "little"),
-        (0x608F, 2): (1).to_bytes(4, "little"),
-    }
-    searches(bench.insertion, itertools.repeat(-3 * MM_S))
-    homing(bench)
-    until_fault(bench)
-    assert bench.notices[-1].rule is Rule.HOMING_TIME
-    assert f"without finding its home, at most {most_mm:.4g} mm" in bench.status.fault
+    bench = DriveBench(max_depth=0.01, **parameters)
+    bench.insertion.tells({(0x608F, 1): 20_000, (0x608F, 2): 1})
+    bench.insertion.searches(forever=-3 * MM_S)
+    bench.homing()
+    text = f"without finding its home, at most {most_mm:.4g} mm"
+    assert text in until_fault(bench, "homing_time")
     # One cycle to see it, one that was under way.
     assert most_mm < abs(bench.insertion.position) / 2e4 <= most_mm + 2 * 0.06
-    at = bench.positions
-    bench.cycle(10)
-    assert bench.positions == at
-
-
-@pytest.mark.parametrize("method", [17, 18])
-@pytest.mark.parametrize("reverse", [False, True])
-def test_homing_time_a_drive_that_goes_away_from_its_switch_is_stopped(
-    make_drive_bench: Make, method: int, reverse: bool
-) -> None:
-    bench = make_drive_bench(insertion_homing_method=method, insertion_reverse=reverse)
-    away = 1 if method == 17 else -1
-    searches(bench.insertion, itertools.repeat(away * 2 * MM_S))
-    homing(bench)
-    until_fault(bench)
-    assert bench.notices[-1].rule is Rule.HOMING_TIME
-    assert f"away from the limit switch of homing method {method}" in bench.status.fault
-    assert abs(bench.insertion.position) <= 10_000 + 4 * MM_S, "0.5 mm and two cycles"
 
 
 @pytest.mark.parametrize(("method", "switch"), [(17, 1), (18, 2)])
-def test_homing_time_off_its_switch_a_drive_goes_the_other_way(
-    make_drive_bench: Make, method: int, switch: int
+def test_homing_time_a_drive_that_goes_away_from_its_switch_is_stopped(
+    method: int, switch: int
 ) -> None:
-    bench = make_drive_bench(insertion_homing_method=method)
-    bench.insertion.inputs = switch
     away = 1 if method == 17 else -1
-    searches(bench.insertion, itertools.repeat(away * MM_S // 2))
-    homing(bench)
-    bench.cycle(50)
-    bench.insertion.inputs = 0
-    bench.cycle(150)
-    assert abs(bench.insertion.position) > 30_000
-    assert in_state(bench, State.MOVING), bench.status.fault
+    for reverse in (False, True):
+        bench = DriveBench(insertion_homing_method=method, insertion_reverse=reverse)
+        bench.insertion.searches(forever=away * 2 * MM_S)
+        bench.homing()
+        text = f"away from the limit switch of homing method {method}"
+        assert text in until_fault(bench, "homing_time")
+        assert 10_000 < abs(bench.insertion.position) <= 10_000 + 3 * MM_S, "0.5 mm, two cycles"
+    # Off its switch it goes the other way; one that tells no switches is not judged.
+    for tells in (True, False):
+        bench = DriveBench(insertion_homing_method=method)
+        if not tells:
+            bench.insertion.missing_objects, bench.insertion.status_size = {0x60FD}, 3
+        bench.insertion.inputs = switch * tells
+        bench.insertion.searches(forever=away * MM_S)
+        bench.homing()
+        bench.wait(10)
+        bench.insertion.inputs = 0
+        bench.wait(60)
+        assert abs(bench.insertion.position) > 20_000
+        assert bench.state == "MOVING", bench.status.fault
 
 
-def test_homing_time_the_direction_is_not_judged_where_a_drive_tells_no_switches(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    bench.insertion.missing_objects, bench.insertion.status_size = {0x60FD}, 3
-    searches(bench.insertion, itertools.repeat(MM_S // 2))
-    homing(bench)
-    bench.cycle(150)
-    assert in_state(bench, State.MOVING), bench.status.fault
-
-
-def test_homing_time_a_drive_that_reports_a_failure_has_no_other_name(
-    drive_bench: DriveBench,
-) -> None:
-    bench = drive_bench
-    searches(bench.insertion, itertools.repeat(0))
-    homing(bench)
-    bench.cycle(6)
+def test_homing_time_a_drive_that_reports_a_failure_has_no_other_name() -> None:
+    bench = DriveBench()
+    bench.insertion.searches()
+    bench.homing()
+    bench.wait(6)
     bench.insertion.more_status = 0x2000
-    bench.cycle(1)
-    assert bench.notices[-1].rule is Rule.ONE_FAULT_STOPS_BOTH
+    bench.wait()
+    assert (bench.state, bench.rule) == ("FAULT", "one_fault_stops_both")
     assert bench.status.fault == "insertion axis: the drive reports that homing failed"
+    assert bench.insertion.state == "quick stop"

@@ -2,165 +2,210 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
-from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.states import State
-
-from ..checks import in_state
 from ..ideal_axes import Bench
 
 
-def test_estop_latches_until_released_hold_off_and_reset(bench: Bench) -> None:
-    bench.ready()
-    bench.command()
-    bench.cycle(3, holding=True)
+def test_estop_latches_until_released_hold_off_and_reset() -> None:
+    bench = Bench().moving()
     at = bench.positions
     bench.supervisor.receive_estop(True)
-    assert in_state(bench, State.ESTOPPED)
-    assert bench.insertion.stops == bench.rotation.stops == 1
-    assert bench.results[-1].outcome == "aborted: emergency stop"
-    assert bench.last_rule is Rule.ESTOP_LATCHES
+    assert (bench.state, bench.rule) == ("ESTOPPED", "estop_latches")
+    assert bench.insertion.orders[-2:] == bench.rotation.orders[-2:] == ["stop", "off"]
+    assert bench.outcomes == ["aborted: emergency stop"]
     assert bench.notices[-1].fault
-    bench.cycle(1, holding=True)
-    assert "still pressed" in bench.run(bench.supervisor.reset(bench.now)).message
+    assert (bench.status.fault, bench.status.level) == ("emergency stop", 2)
+    bench.go()
+    assert bench.reset().message == "the emergency stop is still pressed"
     bench.supervisor.receive_estop(False)
-    assert in_state(bench, State.ESTOPPED)
-    assert not bench.supervisor.enable(True, bench.now).success
-    assert "hold" in bench.run(bench.supervisor.reset(bench.now)).message
+    assert bench.state == "ESTOPPED"
+    assert not bench.enable().success
+    assert bench.reset().message == "release the hold first"
     bench.hold(False)
-    assert bench.run(bench.supervisor.reset(bench.now)).success
-    assert in_state(bench, State.DISABLED)
-    bench.cycle(20, holding=True)
+    assert bench.reset().message == "reset; enable to go on"
+    assert (bench.state, bench.status.fault) == ("DISABLED", "")
+    bench.go(20)
     assert bench.positions == at
+    assert bench.reset().message == "nothing to reset"
 
 
 @pytest.mark.parametrize("state", ["UNCONFIGURED", "DISABLED", "HOLDING", "FAULT"])
-def test_estop_latches_from_every_state(bench: Bench, state: str) -> None:
+def test_estop_latches_from_every_state(state: str) -> None:
+    bench = Bench()
     if state != "UNCONFIGURED":
-        bench.home()
+        bench.homed()
     if state == "HOLDING":
-        bench.supervisor.enable(True, bench.now)
+        bench.enable()
     if state == "FAULT":
         bench.supervisor.fail("test")
-    assert bench.state.value == state
-    bench.supervisor.receive_estop(True)
-    bench.supervisor.receive_estop(True)
-    assert in_state(bench, State.ESTOPPED)
+    assert bench.state == state
+    for stops in (1, 2):
+        bench.supervisor.receive_estop(True)
+        assert bench.state == "ESTOPPED"
+        assert bench.supervisor.stops == stops + (state == "FAULT")
+    bench.supervisor.fail("later")
+    assert bench.status.fault == "emergency stop"
     bench.supervisor.receive_estop(False)
-    assert bench.run(bench.supervisor.reset(bench.now)).success
-    wanted = State.UNCONFIGURED if state == "UNCONFIGURED" else State.DISABLED
-    assert in_state(bench, wanted)
+    assert bench.reset().success
+    assert bench.state == ("UNCONFIGURED" if state == "UNCONFIGURED" else "DISABLED")
 
 
-def test_one_device_stops_and_refuses_everything_until_it_is_alone_and_reset(
-    bench: Bench,
-) -> None:
-    bench.ready()
-    bench.command()
-    bench.cycle(3, holding=True)
+def test_one_device_stops_and_refuses_everything_until_it_is_alone_and_reset() -> None:
+    bench = Bench().moving()
+    supervisor, other = bench.supervisor, "another device is there: /sim_rig"
     at = bench.positions
-    bench.supervisor.see_others("another device is there: /sim_rig")
-    assert in_state(bench, State.FAULT)
-    assert bench.last_rule is Rule.ONE_DEVICE
-    assert bench.results[-1].outcome == "aborted: another device is there: /sim_rig"
-    bench.cycle(20, holding=True)
-    bench.command()
+    supervisor.see_others(other)
+    supervisor.see_others(other)
+    assert (bench.state, bench.rule) == ("FAULT", "one_device")
+    assert bench.outcomes == [f"aborted: {other}"]
+    assert supervisor.stops == 1
+    bench.go(20)
+    bench.step()
     bench.hold(False)
-    supervisor = bench.supervisor
     for reply in (
-        supervisor.enable(True, bench.now),
-        bench.run(supervisor.home(bench.now)),
-        supervisor.retract(bench.now),
+        bench.enable(),
+        bench.home(),
+        bench.retract(),
         supervisor.confirm_needle_out(True),
-        bench.run(supervisor.reset(bench.now)),
+        bench.reset(),
     ):
         assert not reply.success
-    assert "/sim_rig" in bench.run(supervisor.reset(bench.now)).message
+    assert bench.reset().message == other
     supervisor.see_others("")
-    assert in_state(bench, State.FAULT)
-    assert bench.run(supervisor.reset(bench.now)).success
+    assert bench.state == "FAULT"
+    assert bench.reset().success
     assert bench.positions == at
-
-
-def test_one_device_takes_back_the_word_that_the_needle_is_out(bench: Bench) -> None:
-    bench.run(bench.supervisor.configure(bench.now))
-    bench.supervisor.confirm_needle_out(True)
-    bench.supervisor.see_others("another device is there: /sim_rig")
-    bench.supervisor.see_others("")
-    assert bench.run(bench.supervisor.reset(bench.now)).success
-    assert "confirm first" in bench.run(bench.supervisor.home(bench.now)).message
+    # Whoever said that a needle is out may have meant the other's.
+    supervisor.confirm_needle_out(True)
+    supervisor.see_others(other)
+    supervisor.see_others("")
+    assert bench.reset().success
+    assert "confirm first" in bench.run(supervisor.home(bench.now)).message
 
 
 @pytest.mark.parametrize("which", ["insertion", "rotation"])
-@pytest.mark.parametrize("how", ["fault", "power", "home", "unplugged"])
-def test_one_fault_stops_both(bench: Bench, which: str, how: str) -> None:
-    bench.ready()
-    bench.command()
-    bench.cycle(5, holding=True)
-    axis = getattr(bench, which)
-    other = bench.rotation if axis is bench.insertion else bench.insertion
-    if how == "fault":
-        axis.fault = "overcurrent"
-    elif how == "power":
-        axis.powered = False
-    elif how == "home":
-        axis.homed = False
-    else:
-        axis.unplugged = True
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"fault": "overcurrent"}, "{} axis: overcurrent"),
+        ({"powered": False}, "an axis lost its power"),
+        ({"homed": False}, "an axis lost its home position"),
+        ({"unplugged": True}, "{}: no link"),
+    ],
+    ids=["fault", "power", "home", "link"],
+)
+def test_one_fault_stops_both(which: str, change: dict[str, Any], text: str) -> None:
+    bench = Bench().moving()
+    axis = bench.axis(which)
+    (other,) = {bench.insertion, bench.rotation} - {axis}
+    for name, value in change.items():
+        setattr(axis, name, value)
     before = other.position
-    bench.cycle(1, holding=True)
-    assert in_state(bench, State.FAULT)
-    assert bench.last_rule is Rule.ONE_FAULT_STOPS_BOTH
-    assert bench.results[-1].outcome.startswith("aborted: ")
-    assert other.stops == 1
+    bench.go()
+    assert (bench.state, bench.status.fault) == ("FAULT", text.format(which))
+    faults = [notice for notice in bench.notices if notice.fault]
+    assert [str(notice) for notice in faults] == [f"{text.format(which)} [one_fault_stops_both]"]
+    assert bench.outcomes == [f"aborted: {text.format(which)}"]
+    assert other.orders[-2:] == ["stop", "off"]
     # What was ordered before the fault showed: one period at most.
     at = other.position
-    assert abs(at - before) <= 0.1 * bench.period / 0.5 + 1e-9
-    bench.cycle(10, holding=True)
+    assert abs(at - before) <= {"insertion": 1e-3, "rotation": 2e-5}[which] + 1e-9
+    bench.go(10)
     assert other.position == at
 
 
-def test_reply_age_a_silent_axis_is_a_fault_and_hides_the_joints(bench: Bench) -> None:
-    bench.ready()
-    bench.command(0.002, 0.1, duration=2.0)
-    bench.cycle(5, holding=True)
-    bench.rotation.silent_since = bench.now
-    silent = bench.now
-    while in_state(bench, State.MOVING):
-        bench.cycle(1, holding=True)
-    assert bench.now - silent <= bench.limits.reply_age_limit + 2 * bench.period
-    assert bench.last_rule is Rule.REPLY_AGE
-    assert bench.supervisor.joints(bench.now) is None
-    assert bench.status.insertion_m is None
+def test_one_fault_stops_both_while_nothing_moves_and_needs_no_home() -> None:
+    bench = Bench().ready()
+    bench.insertion.homed = False
+    bench.go()
+    assert bench.state == "HOLDING"
+    bench.rotation.powered = False
+    bench.go()
+    assert bench.state == "FAULT"
+    bench = Bench().homed()
+    bench.rotation.fault = "hot"
+    bench.wait()
+    assert bench.status.fault == "rotation axis: hot"
+    bench.insertion.fault = "cold"
     bench.hold(False)
-    assert not bench.run(bench.supervisor.reset(bench.now)).success
-    bench.rotation.silent_since = None
-    assert bench.run(bench.supervisor.reset(bench.now)).success
+    bench.rotation.unplugged = True
+    assert bench.reset().message == "rotation: no link"
+    bench.rotation.unplugged = False
+    assert bench.reset().success
+    bench.wait()
+    assert bench.state == "DISABLED"
 
 
-def test_disable_stop_and_close_end_a_motion(bench: Bench) -> None:
-    bench.ready()
-    bench.command()
-    bench.cycle(2, holding=True)
-    assert bench.supervisor.enable(False, bench.now).success
-    assert in_state(bench, State.DISABLED)
-    assert not bench.insertion.powered
-    assert bench.results[-1].outcome == "aborted: disabled on request"
-    bench.supervisor.enable(True, bench.now)
+@pytest.mark.parametrize("which", ["insertion", "rotation"])
+def test_reply_age_a_silent_axis_is_a_fault_and_hides_the_joints(which: str) -> None:
+    bench = Bench().moving()
+    axis = bench.axis(which)
+    axis.silent_since = bench.now
+    bench.now += 0.06
+    bench.go()
+    assert bench.supervisor.joints(axis.silent_since + 0.0999) is not None
+    assert bench.supervisor.joints(axis.silent_since + 0.1001) is None
+    bench.now = axis.silent_since + 0.0999
+    bench.supervisor.observe(bench.now)
+    assert bench.state == "MOVING"
+    bench.now = axis.silent_since + 0.1001
+    bench.supervisor.observe(bench.now)
+    assert (bench.state, bench.rule) == ("FAULT", "reply_age")
+    assert bench.status.fault == "no reply from an axis for 0.100 s, limit 0.1 s"
+    assert bench.status.watchdog_trips == 1
+    assert bench.status.insertion_m is bench.status.rotation_rad is None
     bench.hold(False)
-    bench.hold()
-    bench.command(stamp_ns=bench.ros_ns)
-    stops = bench.insertion.stops, bench.rotation.stops
-    bench.run(bench.supervisor.deconfigure())
-    assert bench.results[-1].outcome == "aborted: disabled on request"
-    assert (bench.insertion.stops, bench.rotation.stops) == (stops[0] + 1, stops[1] + 1)
+    assert "no reply" in bench.reset().message
+    axis.silent_since = float("inf")
+    assert bench.reset().success
 
 
-def test_configuration_that_fails_is_a_fault_with_the_reason(bench: Bench) -> None:
+def test_no_motion_by_itself_on_configure_enable_reset() -> None:
+    bench = Bench().moving()
+    bench.insertion.fault = "stalled"
+    bench.go()
+    at = bench.positions
+    assert bench.state == "FAULT"
+    bench.insertion.orders.clear()
+    bench.rotation.orders.clear()
+    bench.hold(False)
+    assert bench.reset().success
+    assert bench.enable().success
+    bench.wait(5)
+    bench.go(20)
+    assert bench.positions == at
+    assert bench.insertion.orders == bench.rotation.orders == ["reset", "off", "on"]
+
+
+def test_disable_and_close_end_a_motion() -> None:
+    bench = Bench().moving()
+    assert bench.enable(False).message == "disabled"
+    assert bench.state == "DISABLED"
+    assert bench.insertion.orders[-2:] == bench.rotation.orders[-2:] == ["stop", "off"]
+    assert bench.outcomes == ["aborted: disabled on request"]
+    assert bench.enable().success
+    assert bench.enable().message == "already enabled"
+    bench.press()
+    bench.step()
+    assert bench.run(bench.supervisor.deconfigure()).success
+    assert bench.outcomes == ["aborted: disabled on request"] * 2
+    assert bench.insertion.orders[-3:] == bench.rotation.orders[-3:] == ["stop", "off", "close"]
+    assert (bench.state, bench.status.insertion_m) == ("UNCONFIGURED", None)
+    assert bench.enable().message == "the device is UNCONFIGURED, not DISABLED"
+    assert bench.enable(False).success
+    bench.supervisor.fail("test")
+    assert bench.run(bench.supervisor.deconfigure()).message == "the device is FAULT"
+
+
+def test_configuration_that_fails_is_a_fault_with_the_reason() -> None:
+    bench = Bench()
     bench.insertion.unplugged = True
-    assert not bench.run(bench.supervisor.configure(bench.now)).success
-    assert in_state(bench, State.FAULT)
-    assert "no link" in bench.status.fault
-    assert bench.run(bench.supervisor.reset(bench.now)).success
-    assert in_state(bench, State.UNCONFIGURED)
+    assert bench.configure().message == "insertion: no link"
+    assert (bench.state, bench.status.fault) == ("FAULT", "insertion: no link")
+    assert not bench.configure().success
+    assert bench.reset().message == "reset; the device is not configured"
+    assert bench.state == "UNCONFIGURED"
+    assert bench.status.level == 1

@@ -1,0 +1,404 @@
+"""What the set-up makes of drives of any maker: what it writes, does without, or refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from needle_device_driver.axes.axis import AxisError
+
+from .drive_bench import DriveBench
+from .scripted_drives import ScriptedDrive
+
+Change = Callable[[ScriptedDrive], None]
+Values = dict[tuple[int, int], int]
+
+READ_ONLY, TOO_LONG, NOT_MAPPABLE = 0x0601_0002, 0x0607_0012, 0x0604_0041
+RANGE, OTHER_STATE = 0x0609_0030, 0x0800_0022
+COUNTS, COUNTS_2, RPM, RPM_S = 0x00B5_0300, 0x00B5_5700, 0x00B4_4700, 0x00C0_0300
+TURN = {(0x608F, 1): 20_000, (0x608F, 2): 1}
+IN_RPM = {(0x60A9, 0): RPM, (0x60AA, 0): RPM_S, **TURN}
+# 5 mm/s, 2 mm/s to the switch, a quarter off it; 50 mm/s^2, stops at 500 mm/s^2.
+SPEEDS = {(0x607F, 0): 100_000, (0x6081, 0): 100_000, (0x6099, 1): 40_000, (0x6099, 2): 10_000}
+RAMPS = {(0x6083, 0): 10**6, (0x6084, 0): 10**6, (0x609A, 0): 10**6, (0x6085, 0): 10**7}
+
+
+def all_of(*changes: Change) -> Change:
+    def change(drive: ScriptedDrive) -> None:
+        for one in changes:
+            one(drive)
+
+    return change
+
+
+def has(**attributes: object) -> Change:
+    return lambda drive: drive.__dict__.update(attributes)
+
+
+def tells(values: Values) -> Change:
+    """Let a drive have values."""
+    return lambda drive: drive.tells(values)
+
+
+def lacks(*indices: int) -> Change:
+    return has(missing_objects=set(indices))
+
+
+def refuses(code: int, *indices: int, but: bytes = b"none") -> Change:
+    """Let a drive refuse to have objects written, but for one value."""
+    return has(refuses=lambda i, sub, value: code if i in indices and value != but else 0)
+
+
+def makes(index: int, wanted: int, made: int) -> Change:
+    """Let a drive make something else of a value."""
+
+    def stores(at: int, value: bytes) -> bytes:
+        size = len(value)
+        is_it = at == index and value == wanted.to_bytes(size, "little", signed=wanted < 0)
+        return made.to_bytes(size, "little") if is_it else value
+
+    return has(stores=stores)
+
+
+def kept(index: int, wanted: int, made: int) -> tuple[Change, str]:
+    return makes(index, wanted, made), f"took {wanted} for 0x{index:04X}"
+
+
+def in_unit(index: int, code: int, told: str) -> tuple[Change, str]:
+    what = {0x60A8: "positions", 0x60A9: "speeds", 0x60AA: "ramps"}[index]
+    text = f"the drive counts {what} in {told} (0x{index:04X} = 0x{code:08X}), wanted counts"
+    return tells({**TURN, (index, 0): code}), text
+
+
+def needs(index: int) -> tuple[Change, str]:
+    return refuses(RANGE, index), "node 1 refuses to write"
+
+
+def fed(*ratio: int) -> Change:
+    """Let a drive in rpm have a gear of 5 : 2, and say how many counts its feed is."""
+    gear = {(0x6091, 1): 5, (0x6091, 2): 2, (0x6092, 1): ratio[0], (0x6092, 2): ratio[1]}
+    return tells(IN_RPM | gear)
+
+
+REFUSED: list[tuple[Change, str]] = [
+    (tells({(0x1000, 0): 401}), "node 1 is of device profile 401, wanted 402"),
+    (tells({(0x6502, 0): 0x205}), "node 1 has no homing mode (0x6502 = 0x00000205)"),
+    (
+        all_of(tells({(0x6502, 0): 0x225}), has(modes={6})),
+        "node 1 has no cyclic synchronous position mode (0x6060 = 8, 0x6061 = 0)",
+    ),
+    (
+        all_of(tells({(0x6502, 0): 0x225}), refuses(RANGE, 0x6060)),
+        "node 1 refuses to write 8 to 0x6060:0 mode of operation",
+    ),
+    (all_of(lacks(0x6502), refuses(RANGE, 0x6060, but=b"\x06")), "write 8 to 0x6060:0 mode"),
+    (all_of(lacks(0x6502), refuses(RANGE, 0x6060, but=b"\x08")), "write 6 to 0x6060:0 mode"),
+    (lacks(0x1016), "refuses to write 0 to 0x1016:1 consumer heartbeat time"),
+    (makes(0x1016, 127 << 16 | 100, 0), "0x1016:1 consumer heartbeat time and has 0"),
+    (lacks(0x1017), "refuses to write 30 to 0x1017:0"),
+    (all_of(tells({(0x1017, 0): 0}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
+    (all_of(tells({(0x1017, 0): 201}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
+    *(needs(index) for index in (0x605A, 0x605E, 0x6007, 0x6065, 0x6085, 0x60C2, 0x607C, 0x6098)),
+    # By chance it has what an un-homed drive shall have.
+    (
+        all_of(tells({(0x607D, 1): 2**31, (0x607D, 2): 2**31 - 1}), refuses(READ_ONLY, 0x607D)),
+        "refuses to write -2147483648 to 0x607D:1",
+    ),
+    # Following error: rounded down, never up. Quick stop ramp: rounded, but not clipped.
+    kept(0x6065, 10_000, 10_001),
+    kept(0x6065, 10_000, 5000),
+    kept(0x6085, 10_000_000, 5_000_000),
+    kept(0x6085, 10_000_000, 20_000_001),
+    kept(0x605A, 6, 2),
+    kept(0x605E, 2, 1),
+    kept(0x6007, 1, 0),
+    kept(0x607C, 0, 5),
+    kept(0x60C2, 20, 10),
+    kept(0x607D, -(2**31), 0),
+    kept(0x607D, 2**31 - 1, 0),
+    (all_of(tells(IN_RPM), makes(0x6085, 30_000, 60_001)), "took 30000 for 0x6085:0"),
+    # Neither in counts nor in rpm.
+    in_unit(0x60A9, 0x0001_0300, "m/s"),
+    in_unit(0x60A9, 0xFD01_0300, "10^-3 m/s"),
+    in_unit(0x60A9, 0x0010_0300, "rad/s"),
+    in_unit(0x60A9, 0xFAB4_0300, "10^-6 turns/s"),
+    in_unit(0x60A9, 0x00B5_4700, "counts/min"),
+    in_unit(0x60A9, 0x0041_4700, "deg/min"),
+    in_unit(0x60A9, 0xFF00_0000, "10^-1 counts"),
+    in_unit(0x60A9, 0x7F77_9900, "10^127 unit 0x77 per unit 0x99"),
+    in_unit(0x60A9, RPM_S, "rpm/s"),
+    in_unit(0x60AA, 0x0001_5700, "m/s^2"),
+    in_unit(0x60AA, RPM, "rpm"),
+    in_unit(0x60A8, 0x00B4_0000, "turns"),
+    in_unit(0x60A8, 0xFFB5_0000, "10^-1 counts"),
+    (tells({(0x60A9, 0): 0x0001_0300}), "wanted counts/s or rpm"),
+    # Turns whose counts are not known, or known twice; a factor that is none.
+    *(
+        (
+            tells({(0x60A9, 0): RPM} | turn),
+            "speeds in rpm (0x60A9 = 0x00B44700), wanted counts/s; *_counts_per_turn converts rpm",
+        )
+        for turn in ({}, {(0x608F, 1): 0, (0x608F, 2): 1}, {(0x608F, 1): 20_000})
+    ),
+    (fed(360, 1), "tells 50000 (0x608F, 0x6091) and 360 (0x6092) counts in a turn"),
+    (
+        all_of(lacks(0x60A9, 0x60AA), tells({(0x6096, 1): 60, (0x6096, 2): 20_000})),
+        "the drive scales speeds by 0.003 (0x6096), wanted counts/s",
+    ),
+    # It answers no SYNC.
+    (refuses(RANGE, 0x1800), "node 1 refuses to write"),
+    (has(state="enabled", deaf_to={"all"}), "node 1 does not switch off"),
+    (has(beats=False), "node 1 sends no heartbeat (0x1017)"),
+]
+
+
+@pytest.mark.parametrize(("change", "text"), REFUSED)
+def test_a_drive_that_lacks_what_is_needed_is_refused_by_value_and_wish(
+    change: Change, text: str
+) -> None:
+    bench = DriveBench()
+    change(bench.insertion)
+    bench.sdo_time = 0.02
+    refusal = bench.refusal()
+    assert refusal.startswith("insertion axis: ")
+    assert text in refusal
+    # The other axis waits for nobody's heartbeat.
+    assert bench.rotation.holds(0x1016, 1) == 0
+    assert bench.state == "FAULT"
+
+
+def test_the_other_drive_is_judged_alike_and_may_be_set_up_once_the_first_is_mended() -> None:
+    bench = DriveBench()
+    change, text = in_unit(0x60A9, 0x0001_0300, "m/s")
+    change(bench.rotation)
+    assert f"rotation axis: {text}" in bench.refusal()
+    bench.rotation.tells({(0x60A9, 0): COUNTS})
+    assert bench.reset().success
+    bench.steps()
+    bench = DriveBench()
+    bench.rotation.silent = True
+    assert "rotation axis: node 2 does not answer" in bench.run(bench.drives.probe())
+
+
+def no_types(types: bytes) -> Change:
+    """Let a drive lack one or two transmission types of what it receives."""
+    lacking = types[:1], types[1:]
+    return has(
+        refuses=lambda i, sub, v: RANGE * (i & 0xFF00 == 0x1400 and sub == 2 and v in lacking)
+    )
+
+
+def while_powered(drive: ScriptedDrive) -> None:
+    """Refuse settings while the drive is on."""
+    drive.refuses = lambda index, sub, value: (
+        OTHER_STATE * (index == 0x607D and drive.state in ("enabled", "quick stop"))
+    )
+
+
+def strict_process_data(drive: ScriptedDrive) -> None:
+    """Take another address or mapping of process data only while it is off."""
+    drive.tells({(0x1801, 1): 0x4000_0291})
+
+    def refuses(index: int, sub: int, value: bytes) -> int:
+        if not 0x1400 <= index <= 0x1BFF:
+            return 0
+        cob_id = drive.holds(index & ~0x200, 1)
+        on, new = not cob_id >> 31, int.from_bytes(value, "little")
+        if sub != 1 or index & 0x200:
+            return OTHER_STATE * on
+        if index >= 0x1800 and not new & 1 << 30:
+            return RANGE
+        return OTHER_STATE * (on and bool((new ^ cob_id) & 0x7FF))
+
+    drive.refuses = refuses
+
+
+Row = tuple[Change, Values, str]
+
+
+def units(speed: int, ramp: int, more: Values, per_speed: float, per_ramp: float) -> Row:
+    """Return a drive with units, and what its speeds and ramps are to be."""
+    wanted = {at: max(1, round(counts / per_speed)) for at, counts in SPEEDS.items()}
+    wanted |= {at: round(counts / per_ramp) for at, counts in RAMPS.items()}
+    return tells({(0x60A9, 0): speed, (0x60AA, 0): ramp, **more}), wanted, ""
+
+
+ASSUMED = "does not tell its units; assumed: "
+UNTOLD = f"{ASSUMED}counts/s (0x60A9), counts/s^2 (0x60AA);"
+WIDTHS = {(0x605A, 0): 1, (0x6066, 0): 4, (0x60C2, 1): 2}
+TAKEN: list[Row] = [
+    (has(), {(0x6065, 0): 10_000, (0x607D, 1): -20_000, (0x607D, 2): 4_020_000}, ""),
+    units(COUNTS, COUNTS_2, {}, 1.0, 1.0),
+    # Without dimension, bits that mean nothing; 0.1 counts/s and 10 counts/s^2 (Copley).
+    units(0x0000_035A, 0x0000_5700, {}, 1.0, 1.0),
+    units(0xFFB5_0300, 0x01B5_5700, {}, 0.1, 10.0),
+    units(RPM, RPM_S, TURN, 20_000 / 60, 20_000 / 60),
+    # 0.1 rpm with ramps in rpm/s; a gear, and one that is none; rpm with ramps in counts.
+    units(0xFFB4_4700, RPM_S, TURN, 2000 / 60, 20_000 / 60),
+    units(RPM, RPM_S, {**TURN, (0x6091, 1): 5, (0x6091, 2): 2}, 50_000 / 60, 50_000 / 60),
+    units(RPM, RPM_S, {**TURN, (0x6091, 1): 0, (0x6091, 2): 0}, 20_000 / 60, 20_000 / 60),
+    units(RPM, COUNTS_2, TURN, 20_000 / 60, 1.0),
+    units(COUNTS, RPM_S, {**TURN, (0x6096, 1): 60, (0x6096, 2): 1}, 1.0, 20_000 / 60),
+    (fed(100_000, 2), {(0x6085, 0): 12_000}, ""),
+    (fed(50_000, 0), {(0x6085, 0): 12_000}, ""),
+    (all_of(tells(TURN), lacks(0x60A8, 0x60A9, 0x60AA)), SPEEDS | RAMPS, UNTOLD),
+    (tells({(0x60A9, 0): 0, (0x60AA, 0): 0}), SPEEDS | RAMPS, UNTOLD),
+    (lacks(0x60A9), SPEEDS | RAMPS, f"{ASSUMED}counts/s (0x60A9);"),
+    (lacks(0x60AA), SPEEDS | RAMPS, f"{ASSUMED}the unit of its speeds per second (0x60AA);"),
+    (all_of(tells(IN_RPM), lacks(0x60AA)), {(0x6085, 0): 30_000}, ASSUMED),
+    (all_of(lacks(0x60A9), tells({(0x6096, 1): 7, (0x6096, 2): 7})), SPEEDS, ASSUMED),
+    # What no rule hangs on; a heartbeat that is fixed; what it has already.
+    (refuses(RANGE, 0x605B, 0x1029, 0x1006), {}, "keeps its own 0x605B"),
+    (lacks(0x1006, 0x1029, 0x6007), {}, "has no 0x6007"),
+    (makes(0x6083, 10**6, 65_535), {(0x6083, 0): 65_535}, ""),
+    (makes(0x6065, 10_000, 5001), {}, ""),
+    (makes(0x6085, 10**7, 5_000_001), {}, ""),
+    (makes(0x6085, 10**7, 2 * 10**7), {}, ""),
+    (all_of(tells({(0x1017, 0): 200}), refuses(READ_ONLY, 0x1017)), {(0x1017, 0): 200}, ""),
+    (all_of(tells({(0x1017, 0): 1}), refuses(READ_ONLY, 0x1017)), {}, ""),
+    (all_of(tells({(0x605A, 0): 6}), refuses(READ_ONLY, 0x605A)), {(0x605A, 0): 6}, ""),
+    # Modes that are not listed are tried, once it is off (an EPOS4 lists 0x225).
+    (tells({(0x6502, 0): 0x225}), {}, ""),
+    (all_of(lacks(0x6502), has(state="enabled")), {(0x6040, 0): 0}, ""),
+    # Objects wider and narrower than in the standard; counters of less than 32 bits.
+    (
+        all_of(
+            has(objects=ScriptedDrive(1).objects | {at: bytes(n) for at, n in WIDTHS.items()}),
+            has(refuses=lambda i, s, v: TOO_LONG * (len(v) != WIDTHS.get((i, s), len(v)))),
+        ),
+        {(0x605A, 0): 6, (0x6066, 0): 50, (0x60C2, 1): 20},
+        "",
+    ),
+    # What it receives acts at once where it does not take type 1 or 255.
+    (no_types(b"\xff"), {(0x1400, 2): 0xFE, (0x1401, 2): 1}, ""),
+    (no_types(b"\x01"), {(0x1400, 2): 0xFF, (0x1401, 2): 0xFF}, ""),
+    (no_types(b"\x01\xff"), {(0x1400, 2): 0xFE, (0x1401, 2): 0xFE}, ""),
+    # Process data that nobody asked for.
+    (tells({(0x1802, 1): 0x4000_0381}), {(0x1802, 1): 0xC000_0381, (0x1800, 3): 0}, ""),
+    (all_of(lacks(0x60FD), has(status_size=3)), {(0x1A00, 0): 2}, "has no digital inputs to map"),
+    (
+        has(
+            refuses=lambda i, s, v: NOT_MAPPABLE * ((i, v) == (0x1A00, b"\x20\x00\xfd\x60")),
+            status_size=3,
+        ),
+        {(0x1A00, 0): 2},
+        "has no digital inputs to map",
+    ),
+    (all_of(lacks(0x60F4), has(place_size=4)), {(0x1A01, 0): 1}, "has no following error to map"),
+    # A node that another program stopped.
+    (has(nmt=0x04), {}, ""),
+    (while_powered, {(0x607D, 1): -20_000}, ""),
+    (strict_process_data, {(0x1801, 1): 0x4000_0281}, ""),
+]
+
+
+@pytest.mark.parametrize(("change", "wanted", "missing"), TAKEN)
+def test_a_drive_of_any_maker_is_set_up_as_it_is_and_steps(
+    change: Change, wanted: Values, missing: str
+) -> None:
+    bench = DriveBench()
+    change(bench.insertion)
+    bench.run(bench.drives.probe())
+    bench.steps()
+    assert {at: bench.insertion.holds(*at) for at in wanted} == wanted
+    told = bench.drives.missing_optional_objects
+    assert told[0].startswith(f"insertion drive {missing}") if missing else told == ()
+
+
+def test_parameters_go_before_what_a_drive_tells() -> None:
+    bench = DriveBench(insertion_counts_per_turn=50_000.0, rotation_max_torque=0.8)
+    fed(360, 1)(bench.insertion)
+    bench.configured()
+    assert bench.insertion.holds(0x6085) == 12_000
+    assert (0x6072, 0) not in bench.insertion.objects
+    assert bench.rotation.holds(0x6072) == 800
+    # 100 rad/s^2 are 955 rpm/s.
+    bench = DriveBench(rotation_counts_per_turn=65536.0)
+    bench.rotation.tells({(0x60A9, 0): RPM, (0x60AA, 0): RPM_S})
+    bench.configured()
+    assert bench.rotation.holds(0x6085) == 955
+
+
+def test_a_drive_that_started_anew_is_asked_anew() -> None:
+    bench = DriveBench()
+    bench.insertion.tells(IN_RPM)
+    bench.configured()
+    assert bench.insertion.holds(0x6085) == 30_000
+    bench.insertion.tells({(0x608F, 1): 10_000})
+    bench.after(bench.insertion.reboot)
+    bench.hold(False)
+    assert bench.reset().success
+    assert bench.insertion.holds(0x6085) == 60_000
+
+
+def test_where_it_stands_has_two_numbers() -> None:
+    bench = DriveBench()
+    refuses(RANGE, 0x6098, but=b"\x23")(bench.rotation)
+    bench.steps()
+    assert bench.rotation.holds(0x6098) == 35
+
+
+def test_an_encoder_of_a_hand_moved_axis_needs_positions_in_counts_alone() -> None:
+    bench = DriveBench(insertion_drive="hand")
+    bench.insertion.tells({(0x60A9, 0): 0x0001_0300, (0x60AA, 0): 0})
+    bench.configured()
+    assert bench.drives.missing_optional_objects == ()
+    bench = DriveBench(insertion_drive="hand")
+    bench.insertion.tells({(0x60A8, 0): 0x0001_0000})
+    assert "insertion axis: the drive counts positions in m (0x60A8" in bench.refusal()
+
+
+def test_a_homing_that_is_slower_than_the_unit_of_the_drive_is_refused() -> None:
+    bench = DriveBench(homing_speed=1e-5)
+    bench.insertion.tells(IN_RPM)
+    bench.configured()
+    assert "homing at 1e-05/s is less than one of the drive's units" in bench.home().message
+    bench.wait(20)
+    assert (bench.state, bench.positions) == ("FAULT", (0, 0))
+
+
+# ---- software limits ----------------------------------------------------------------------------
+
+
+def test_no_limits_are_as_wide_as_the_drive_counts() -> None:
+    bench = DriveBench()
+    bench.insertion.refuses = lambda index, sub, value: (
+        RANGE * (index == 0x607D and abs(int.from_bytes(value, "little", signed=True)) > 2**30)
+    )
+    bench.configured()
+    assert [bench.insertion.holds(0x607D, sub) for sub in (1, 2)] == [-(2**30), 2**30 - 1]
+
+
+def test_limits_that_a_homed_drive_does_not_take_keep_it_from_being_switched_on() -> None:
+    bench = DriveBench().homing()
+    refuses(RANGE, 0x607D)(bench.insertion)
+    bench.wait(30)
+    assert "refuses to write -20000 to 0x607D:1" in bench.status.fault
+    bench.reset()
+    assert not bench.enable().success
+    with pytest.raises(AxisError, match="insertion axis has no software limits yet"):
+        bench.axes[0].power(True)
+    bench.wait()
+    assert bench.state == "FAULT"
+    assert "refuses to write -20000 to 0x607D:1" in bench.status.fault
+
+
+def test_between_homing_and_its_limits_nothing_is_switched_on() -> None:
+    bench = DriveBench().homing()
+    while not (bench.is_homed() and bench.enable().success):
+        # Whoever is in a hurry is asked to call again, and breaks nothing.
+        assert bench.state != "FAULT"
+        bench.wait()
+    assert bench.state == "HOLDING"
+    assert bench.insertion.holds(0x607D, 1) == -20_000
+
+
+def test_limits_are_taken_from_slow_drives_with_few_heartbeats() -> None:
+    bench = DriveBench().configured()
+    bench.sdo_time, bench.insertion.beats, bench.rotation.beats = 0.09, False, False
+    assert bench.home().success
+    bench.wait(30)
+    assert (bench.state, bench.is_homed()) == ("DISABLED", True), bench.status.fault
+    assert bench.insertion.holds(0x607D, 1) == -20_000
+    assert bench.enable().success
