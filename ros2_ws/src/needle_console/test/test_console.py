@@ -1,14 +1,13 @@
-"""The console as a component, on the virtual runner: what a page does, and what the rig is told."""
+"""The console as a component, called directly: what a page does, and what the rig is told."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
-from needle_console.console import PAGE, Console, Hand, Lag, PageEvent
+from needle_console.console import Console, Hand, Lag, PageEvent
 from needle_console.console_parameters import ConsoleParameters
 from needle_console.hold.hold_state import RELEASED, HoldState, Mode
 from needle_console.page.desk import Desk
@@ -17,217 +16,25 @@ from needle_console.view.snapshot import Snapshot
 from needle_console.view.targets import plane_pose, target_point
 from needle_core import messages as m
 from needle_core.component import (
-    LATCHED,
     Actions,
-    Component,
+    Answer,
+    Call,
+    Diagnose,
     Exit,
-    Input,
     Listen,
     Log,
     Moment,
-    Output,
     Peers,
-    Port,
     Publish,
-    Reply,
     Send,
-    Service,
-    Timer,
 )
 from needle_core.diagnostics import Level
-from needle_core.runners.virtual import VirtualRunner
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 INSERT = HoldState(True, 0.5, Mode.INSERT)
 RETRACT = HoldState(True, 0.5, Mode.RETRACT)
 TURN = (0.0, float(np.sin(np.pi / 12)), 0.0, float(np.cos(np.pi / 12)))
 """By 30 degrees, as a plane's that rises inwards."""
-PERIOD = 0.02
-
-
-class Page(Component):
-    """Pages and the hold's server in one: tells its hand as often as the server does."""
-
-    name = "page"
-
-    def __init__(self) -> None:
-        self.hand = RELEASED
-        self.refused: dict[str, int] = {}
-        self.wishes: list[PageEvent] = []
-        self.snapshot = Snapshot()
-        self.is_served = True
-        self.ports = (Port(PAGE, self._see),)
-        self.timers = (Timer(PERIOD, self._tell),)
-
-    def _see(self, batch: Sequence[Any], at: Moment) -> Actions:
-        (self.snapshot,) = batch
-        return ()
-
-    def _tell(self, at: Moment) -> Actions:
-        events, self.wishes = tuple(self.wishes), []
-        hands = (Hand(self.hand, self.refused),) if self.is_served else ()
-        yield Send(PAGE, (*events, *hands))
-
-
-class Rig(Component):
-    """Device and controller: says what it is told to, and notes what it hears."""
-
-    name = "rig"
-
-    def __init__(self) -> None:
-        self.holds: list[m.HoldState] = []
-        self.calls: list[tuple[str, bool | None]] = []
-        self.health: list[m.Status] = []
-        self.device = {"state": "HOLDING", "activity": "none", "hold_owner": ""}
-        self.controller = {"state": "IDLE"}
-        self.takes = True
-        self.inputs = (
-            Input("device/hold", m.HoldState, self._on_hold),
-            Input("/diagnostics", m.Diagnostics, self._on_health),
-        )
-        self.outputs = (
-            Output("device/status", DeviceStatus, LATCHED),
-            Output("needle/controller_status", ControllerStatus, LATCHED),
-        )
-        self.services = tuple(
-            Service(name, self._serve(name), has_argument="enable" in name or "confirm" in name)
-            for name in (
-                "device/confirm_needle_out",
-                "device/enable",
-                "device/stop",
-                "device/retract",
-                "plane_controller/start",
-                "plane_controller/stop",
-            )
-        )
-        self.timers = (Timer(PERIOD, self._report),)
-
-    def _serve(self, name: str) -> Any:
-        def serve(argument: bool | None, number: int, at: Moment) -> Actions:
-            self.calls.append((name, argument))
-            yield Reply(number, self.takes, "as asked" if self.takes else "not now")
-
-        return serve
-
-    def _on_hold(self, message: m.HoldState, at: Moment) -> Actions:
-        self.holds.append(message)
-        return ()
-
-    def _on_health(self, message: m.Diagnostics, at: Moment) -> Actions:
-        self.health += message.statuses
-        return ()
-
-    def _report(self, at: Moment) -> Actions:
-        yield Publish("device/status", DeviceStatus.parse(self.device))
-        yield Publish("needle/controller_status", ControllerStatus.parse(self.controller))
-
-
-class Scene:
-    """A console between a page and a rig."""
-
-    def __init__(self) -> None:
-        self.page, self.rig = Page(), Rig()
-        self.runner = VirtualRunner([Console(ConsoleParameters()), self.page, self.rig])
-        self.runner.run(1.0)
-
-    def holds(self, seconds: float) -> list[m.HoldState]:
-        """Return what is heard of the hold meanwhile."""
-        begin = len(self.rig.holds)
-        self.runner.run(seconds)
-        return self.rig.holds[begin:]
-
-    def wish(self, *events: PageEvent) -> None:
-        self.page.wishes = list(events)
-        self.runner.run(0.3)
-
-
-@pytest.fixture
-def scene() -> Scene:
-    return Scene()
-
-
-def test_a_hold_is_told_as_it_comes_and_ends_with_its_lifetime(scene: Scene) -> None:
-    scene.page.hand = INSERT
-    holds = scene.holds(1.0)
-    assert len(holds) == pytest.approx(1.0 / PERIOD, abs=2)
-    last = holds[-1]
-    assert (last.source, last.pressed, last.speed_scale) == ("console", True, 0.5)
-    # The promise of docs/safety.md.
-    assert last.lifetime == m.HOLD_LIFETIME == 0.1
-    # The component repeats nothing by itself: a page's server that is gone holds no longer.
-    scene.page.is_served = False
-    scene.runner.run(PERIOD)
-    assert scene.holds(1.0) == []
-
-
-def test_a_release_is_told_at_once_and_no_press_that_had_to_wait(scene: Scene) -> None:
-    scene.page.hand = INSERT
-    scene.runner.run(0.5)
-    scene.page.hand = RELEASED
-    last = scene.holds(2.0 * PERIOD)[-1]
-    assert (last.pressed, last.speed_scale) == (False, 0.0)
-    begin = len(scene.rig.holds)
-    scene.wish(Hand(INSERT), Hand(RELEASED), Hand(INSERT))
-    assert not any(hold.pressed for hold in scene.rig.holds[begin:])
-    counts = [hold.count for hold in scene.rig.holds]
-    assert counts == sorted(set(counts))
-
-
-def test_a_retraction_waits_for_the_end_of_steering_and_is_called_once(scene: Scene) -> None:
-    scene.rig.controller["state"] = "STEERING"
-    scene.runner.run(0.1)
-    scene.page.hand = RETRACT
-    assert not any(hold.pressed or hold.speed_scale for hold in scene.holds(0.5))
-    assert scene.rig.calls == [("plane_controller/stop", None)]
-    scene.rig.controller["state"] = "IDLE"
-    scene.rig.device["hold_owner"] = "console"
-    assert scene.holds(0.5)[-1].pressed
-    assert scene.rig.calls[1:] == [("device/retract", None)]
-
-
-def test_buttons_call_their_services_and_answers_are_shown(scene: Scene) -> None:
-    scene.wish(Button.CONFIRM, Button.SWITCH_OFF, Button.STOP)
-    assert set(scene.rig.calls) == {
-        ("device/confirm_needle_out", True),
-        ("device/enable", False),
-        ("device/stop", None),
-    }
-    assert scene.page.snapshot.answer.endswith(": as asked")
-    scene.rig.takes = False
-    for button, answer in (
-        (Button.START, "plane_controller/start: refused: not now"),
-        (Button.HOME, "device/home: no server"),
-    ):
-        scene.wish(button)
-        assert scene.page.snapshot.answer == answer
-
-
-def test_the_hands_server_that_falls_silent_is_named(scene: Scene) -> None:
-    scene.page.refused = {"foreign Host": 3}
-    for served, seconds, level in ((True, 1.5, Level.OK), (False, 3.0, Level.ERROR)):
-        scene.page.is_served = served
-        scene.runner.run(seconds)
-        last = scene.rig.health[-1]
-        assert (last.level, last.values) == (level, {"refused foreign Host": "3"})
-    scene.page.is_served = True
-    scene.runner.run(0.2)
-    assert scene.rig.health[-1].level == Level.OK
-
-
-def test_a_simulation_that_lags_is_named_while_it_does(scene: Scene) -> None:
-    for seconds in (0.0, 0.01, 1.0):
-        assert scene.page.snapshot.troubles == ()
-        scene.wish(Lag(seconds))
-    (text,) = scene.page.snapshot.troubles
-    assert "1.0 s behind the clock" in text
-    # It lags no more than it did.
-    scene.runner.run(2.0)
-    scene.wish(Lag(1.0))
-    scene.runner.run(2.0)
-    assert scene.page.snapshot.troubles == ()
-
-
-# ---- the component, called directly --------------------------------------------------------------
 
 
 class Bench:
@@ -240,6 +47,10 @@ class Bench:
         self._batches: list[Any] = []
         self.desk.open(self._batches.append)
 
+    @property
+    def at(self) -> Moment:
+        return Moment(self.now, 1)
+
     def hear(self, topic: str, message: Any) -> list[Any]:
         (row,) = (row for row in self.console.inputs if row.topic == topic)
         return list(row.handler(message, self.at))
@@ -249,13 +60,22 @@ class Bench:
         batches, self._batches[:] = [batch() for batch in self._batches], []
         return [event for batch in batches for event in batch]
 
-    def hands(self) -> list[HoldState]:
-        return [event.state for event in self.events() if isinstance(event, Hand)]
-
-    def take(self) -> list[Any]:
-        """Let the console take what the desk hands over; return what it does."""
+    def take(self, *events: PageEvent) -> list[Any]:
+        """Let the console take what a page does; return what it does."""
         (port,) = self.console.ports
-        return list(port.handler(self.events(), self.at))
+        return list(port.handler(events or self.events(), self.at))
+
+    def hold(self, *states: HoldState) -> tuple[list[m.HoldState], list[Call]]:
+        """Let hands be taken in one batch; return what is said of the hold, and the calls."""
+        actions = self.take(*map(Hand, states))
+        said = [one.message for one in actions if isinstance(one, Publish)]
+        return said, [one for one in actions if isinstance(one, Call)]
+
+    def check(self) -> tuple[Diagnose, dict[str, bool]]:
+        """Return what the console checks once a second: health, and topics that it leaves."""
+        diagnose, *listens = self.console.timers[1].handler(self.at)
+        assert isinstance(diagnose, Diagnose)
+        return diagnose, listened(listens)
 
     def snapshot(self) -> Snapshot:
         (sent,) = self.console.timers[0].handler(self.at)
@@ -263,14 +83,86 @@ class Bench:
         self.desk.send(sent.batch)
         return self.desk.snapshot()
 
-    @property
-    def at(self) -> Moment:
-        return Moment(self.now, 1)
+
+def listened(actions: Actions) -> dict[str, bool]:
+    return {act.topic: act.on for act in actions if isinstance(act, Listen)}
 
 
 @pytest.fixture
 def bench() -> Bench:
     return Bench()
+
+
+def test_a_hold_is_told_as_it_comes_with_a_lifetime_and_a_release_at_once(bench: Bench) -> None:
+    (said,), calls = bench.hold(INSERT)
+    assert (said.source, said.pressed, said.speed_scale, calls) == ("console", True, 0.5, [])
+    # The promise of docs/safety.md. Nothing is repeated by itself: no timer says it.
+    assert said.lifetime == m.HOLD_LIFETIME == 0.1
+    (released,), _ = bench.hold(RELEASED)
+    assert (released.pressed, released.speed_scale) == (False, 0.0)
+    # A press that had to wait is none of now.
+    late, _ = bench.hold(INSERT, RELEASED, INSERT)
+    assert [hold.pressed for hold in late] == [False, True]
+    assert [hold.count for hold in (said, released, *late)] == [1, 2, 3, 4]
+
+
+def test_a_retraction_waits_for_the_end_of_steering_and_is_called_once(bench: Bench) -> None:
+    bench.hear("needle/controller_status", ControllerStatus(state="STEERING"))
+    for calls in ([Call("plane_controller/stop")], []):
+        (said,), made = bench.hold(RETRACT)
+        assert (said.pressed, made) == (False, calls)
+    bench.hear("needle/controller_status", ControllerStatus(state="IDLE"))
+    bench.hear("device/status", DeviceStatus(state="MOVING", hold_owner="pedal"))
+    assert bench.hold(RETRACT)[1] == []
+    bench.hear("device/status", DeviceStatus(state="HOLDING", hold_owner="console"))
+    for calls in ([Call("device/retract")], []):
+        (said,), made = bench.hold(RETRACT)
+        assert (said.pressed, made) == (True, calls)
+
+
+def test_buttons_call_their_services_and_answers_are_shown(bench: Bench) -> None:
+    for button, call in (
+        (Button.CONFIRM, Call("device/confirm_needle_out", True)),
+        (Button.ENABLE, Call("device/enable", True)),
+        (Button.SWITCH_OFF, Call("device/enable", False)),
+        (Button.STOP, Call("device/stop")),
+        (Button.RESET, Call("device/reset")),
+    ):
+        bench.desk.press(button)
+        assert bench.take() == [call]
+    for answer, shown in (
+        (Answer("device/home", True, "homes"), "device/home: homes"),
+        (Answer("device/home", False, "not now"), "device/home: refused: not now"),
+        (Answer("device/home", False, "no server", answered=False), "device/home: no server"),
+    ):
+        assert list(bench.console.on_answer(answer, bench.at)) == []
+        assert bench.snapshot().answer == shown
+
+
+def test_the_hands_server_that_falls_silent_is_named(bench: Bench) -> None:
+    bench.desk.refused = lambda: {"foreign Host": 3}
+    for silent_for, level in ((0.9, Level.OK), (1.1, Level.ERROR)):
+        bench.desk.hold(RELEASED)
+        back = [one for one in bench.take() if isinstance(one, Diagnose)]
+        # That it is there again is told at once.
+        assert [one.diagnostic.level for one in back] == ([Level.OK] if level == Level.OK else [])
+        bench.now += silent_for
+        health, _ = bench.check()
+        assert health.diagnostic.level == level
+        assert health.diagnostic.values == {"refused foreign Host": "3"}
+
+
+def test_a_simulation_that_lags_is_named_while_it_does(bench: Bench) -> None:
+    for seconds, named in ((0.0, False), (0.01, False), (1.0, True)):
+        bench.desk.note_lag(seconds)
+        assert bench.take() == []
+        assert bool(bench.snapshot().troubles) is named
+    (text,) = bench.snapshot().troubles
+    assert "1.0 s behind the clock" in text
+    # It lags no more than it did.
+    bench.now += 4.0
+    bench.take(Lag(1.0))
+    assert bench.snapshot().troubles == ()
 
 
 def test_what_is_heard_of_the_rig_is_shown_in_its_frames_only(bench: Bench) -> None:
@@ -322,23 +214,20 @@ def test_targets_and_lines_for_the_log_go_through(bench: Bench) -> None:
     assert line == Log("warning", "a line")
 
 
-def test_of_holds_that_wait_the_newest_counts_unless_one_was_a_release(bench: Bench) -> None:
-    for states, counts in (
-        ((RETRACT, INSERT), INSERT),
-        ((INSERT, RELEASED, INSERT), RELEASED),
-        ((INSERT,), INSERT),
+def test_of_holds_that_wait_the_newest_counts_unless_one_was_a_release_or_it_is_old(
+    bench: Bench,
+) -> None:
+    for states, waited, counts in (
+        ((RETRACT, INSERT), 0.99, INSERT),
+        ((INSERT, RELEASED, INSERT), 0.0, RELEASED),
+        ((INSERT,), 0.0, INSERT),
+        ((INSERT,), 1.01, RELEASED),
     ):
         for state in states:
             bench.desk.hold(state)
-        assert bench.hands() == [counts]
-        assert bench.hands() == []
-
-
-def test_a_hold_that_has_waited_for_longer_than_it_counts_is_a_release(bench: Bench) -> None:
-    for share, counts in ((0.99, INSERT), (1.01, RELEASED)):
-        bench.desk.hold(INSERT)
-        bench.now += share * m.HOLD_LIFETIME
-        assert bench.hands() == [counts]
+        bench.now += waited * m.HOLD_LIFETIME
+        assert bench.events() == [Hand(counts)]
+        assert bench.events() == []
 
 
 def test_wishes_of_pages_that_nobody_takes_are_not_piled_up(bench: Bench) -> None:
@@ -349,16 +238,13 @@ def test_wishes_of_pages_that_nobody_takes_are_not_piled_up(bench: Bench) -> Non
 
 
 def test_images_are_wanted_while_a_page_asks_for_views(bench: Bench) -> None:
-    def listens(actions: Actions) -> dict[str, bool]:
-        return {act.topic: act.on for act in actions if isinstance(act, Listen)}
-
     both = ("stereo/left/image_raw", "stereo/right/image_raw")
     bench.desk.picture("left")
-    assert listens(bench.take()) == dict.fromkeys(both, True)
+    assert listened(bench.take()) == dict.fromkeys(both, True)
     assert {row.topic for row in bench.console.inputs if row.lazy} == {*both}
-    check = bench.console.timers[1].handler
-    assert listens(check(Moment(11.9, 1))) == {}
-    assert listens(check(Moment(12.1, 1))) == dict.fromkeys(both, False)
+    for waited, left in ((1.9, {}), (0.2, dict.fromkeys(both, False))):
+        bench.now += waited
+        assert bench.check()[1] == left
 
 
 def test_its_end_releases_the_hold(bench: Bench) -> None:

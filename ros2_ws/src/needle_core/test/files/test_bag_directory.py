@@ -26,6 +26,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
+from needle_bags.recovery.bag_recovery import recover_bag
 from needle_core.errors import UserError
 from needle_core.files.bag_directory import BagDirectory
 from needle_core.files.bag_path import BrokenBagError, require_bag
@@ -109,6 +110,17 @@ def reason(path: Path) -> str:
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 700 * 1024
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+def refusal(bag: Path) -> str:
+    """Why a bag is refused: what reads it and `recover` say the same, and change nothing."""
+    before = {file: file.read_bytes() for file in bag.iterdir()}
+    said = reason(bag)
+    with pytest.raises(UserError) as caught:
+        recover_bag(bag)
+    assert str(caught.value) == said
+    assert {file: file.read_bytes() for file in bag.iterdir()} == before
+    return said
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -340,8 +352,9 @@ def test_what_is_kept_in_another_way_is_not_broken(
     change(bag, version=10, something_new={"a": 1})
     assert read(bag) == ALL
     change(bag, **{"version": 9, **values})
-    assert words in reason(bag)
-    assert "recover" not in reason(bag)
+    said = refusal(bag)
+    assert words in said
+    assert "recover" not in said
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
@@ -352,12 +365,12 @@ def test_a_truncated_sqlite_bag_has_one_remedy(tmp_path: Path, share: float) -> 
     file.write_bytes(data[: int(len(data) * share)])
     remedy = f"mends MCAP only: `sqlite3 {file} .recover` may still read a part"
     write_mcap(bag / "stranger.mcap")
-    assert reason(bag).endswith(remedy)
+    assert refusal(bag).endswith(remedy)
     for other in ("metadata.yaml", "stranger.mcap"):
         (bag / other).unlink()
-    assert reason(bag).endswith(remedy)
+    assert refusal(bag).endswith(remedy)
     file.write_bytes(data)
-    assert reason(bag).endswith(f"run `ros2 bag reindex {bag}`")
+    assert refusal(bag).endswith(f"run `ros2 bag reindex {bag}`")
     packed = rosbag(tmp_path / "packed", StoragePlugin.SQLITE3, CompressionMode.FILE)
     (file,) = packed.glob("*.zstd")
     file.write_bytes(file.read_bytes()[:-100])
@@ -384,7 +397,7 @@ def test_a_journal_beside_a_sqlite_bag_is_to_be_taken_in(tmp_path: Path, mode: s
         assert read(killed) == ALL
         (killed / "metadata.yaml").unlink()
     journal = killed / f"{file.name}-{'wal' if mode == 'WAL' else 'journal'}"
-    said = reason(killed)
+    said = refusal(killed)
     assert f"SQLite has not taken in {journal.name} yet: run `sqlite3 " in said
     program, name, statement = said.partition("run `")[2].rstrip("`").split(" ", 2)
     assert (program, Path(name)) == ("sqlite3", killed / file.name)
@@ -394,4 +407,4 @@ def test_a_journal_beside_a_sqlite_bag_is_to_be_taken_in(tmp_path: Path, mode: s
     if mode == "DELETE":
         assert read(killed) == ALL
     else:
-        assert "ros2 bag reindex" in reason(killed)
+        assert "ros2 bag reindex" in refusal(killed)
