@@ -7,117 +7,40 @@ import random
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from needle_core import messages as m
 from needle_core.can_frame import CAN, CanFrame
-from needle_core.component import (
-    BEST_EFFORT,
-    LATCHED,
-    Action,
-    Actions,
-    Answer,
-    Call,
-    Component,
-    Input,
-    Moment,
-    Output,
-    Peers,
-    PortChange,
-    Publish,
-    Timer,
-)
+from needle_core.component import Component, Output
 from needle_core.runners.faults import Arrival, Arrivals, Fault, Link
-from needle_core.runners.virtual import DIAGNOSTICS, VirtualRunner
+from needle_core.status_messages import DeviceStatus
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.drive_emulator import DriveEmulator
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 
+from .person import VirtualBench
+
 _ALL = range(0x800)
 DRIVER, DRIVES = DeviceDriver.name, DriveEmulator.name
-# Events that only a runner knows of reach the driver by topics of the test's own.
-INJECTED = {PortChange: "test/port", Peers: "test/peers"}
 
 
-class Person(Component):
-    """Holds, and does what a test asks for."""
+class AnotherDevice(Component):
+    """Says that it is the device."""
 
-    name = "person"
-
-    def __init__(self) -> None:
-        self.status: dict[str, str] = {}
-        self.health: dict[str, dict[str, str]] = {}
-        self.outcomes: list[str] = []
-        self.answers: list[Answer] = []
-        self.pressed = False
-        self.actions: list[Action] = []
-        self.inputs = (
-            Input("device/status", m.Status, self._on_status, LATCHED),
-            Input("device/result", m.CommandResult, self._on_result),
-            Input(DIAGNOSTICS.topic, m.Diagnostics, self._on_health),
-        )
-        self.outputs = (
-            Output("device/hold", m.HoldState, BEST_EFFORT),
-            Output("device/joint_trajectory", m.Trajectory),
-            Output("device/estop", m.EmergencyStop),
-            *(Output(topic, kind) for kind, topic in INJECTED.items()),
-        )
-        self.timers = (Timer(0.01, self._act),)
-
-    def on_answer(self, answer: Answer, at: Moment) -> Actions:
-        self.answers.append(answer)
-        return ()
-
-    def _on_status(self, message: m.Status, at: Moment) -> Actions:
-        self.status = message.values
-        return ()
-
-    def _on_health(self, message: m.Diagnostics, at: Moment) -> Actions:
-        for status in message.statuses:
-            if status.source == DRIVER:
-                self.health[status.part] = {"text": status.text, **status.values}
-        return ()
-
-    def _on_result(self, message: m.CommandResult, at: Moment) -> Actions:
-        self.outcomes.append(message.outcome)
-        return ()
-
-    def _act(self, at: Moment) -> Actions:
-        scale = 1.0 if self.pressed else 0.0
-        yield Publish(
-            "device/hold", m.HoldState("person", "", at.stamp_ns, self.pressed, scale, 0.1)
-        )
-        yield from self.actions
-        self.actions = []
+    name = "sim_rig"
+    outputs = (Output("device/status", DeviceStatus),)
 
 
-class ComponentBench:
+class ComponentBench(VirtualBench):
     """The three, and every frame between driver and drives."""
 
     def __init__(
-        self,
-        *,
-        seed: int = 1,
-        fault: Fault | None = None,
-        drives: dict[str, Any] | None = None,
-        **driver: Any,
+        self, *, fault: Fault | None = None, drives: dict[str, Any] | None = None, **driver: Any
     ) -> None:
         self.drives = DriveEmulator(DriveEmulatorParameters(**(drives or {})))
-        settings = DeviceDriverParameters(link="virtual", channel=CAN, **driver)
-        self.driver = DeviceDriver(settings)
-        handlers: dict[type[Any], Callable[[Any, Moment], Actions]] = {
-            PortChange: self.driver.ports[0].on_change,
-            Peers: self.driver.on_peers,
-        }
-        injected = (Input(topic, kind, handlers[kind]) for kind, topic in INJECTED.items())
-        self.driver.inputs = (*self.driver.inputs, *injected)
-        self.person = Person()
+        self.driver = DeviceDriver(DeviceDriverParameters(link="virtual", channel=CAN, **driver))
         self.frames: list[tuple[float, str, CanFrame]] = []
         self.marked = 0.0
-        self.runner = VirtualRunner(
-            [self.drives, self.driver, self.person],
-            seed,
-            faults=(self._note, *([] if fault is None else [fault])),
-        )
+        faults = (self._note, *(() if fault is None else (fault,)))
+        super().__init__(self.drives, self.driver, faults=faults)
 
     def _note(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
         if link.topic == CAN:
@@ -125,18 +48,20 @@ class ComponentBench:
         return (Arrival(0.0, message),)
 
     @property
-    def state(self) -> str:
-        return self.person.status.get("state", "")
-
-    @property
-    def fault(self) -> str:
-        return self.person.status["fault"]
-
-    @property
     def places(self) -> tuple[float, float]:
         """Where the motors really are [m], [rad]."""
         axes = self.drives.bus.axes(self.runner.now)
         return axes["insertion"].position, axes["rotation"].position
+
+    @property
+    def error_codes(self) -> set[int]:
+        return {drive.error_code for drive in self.drives.bus.drives.values()}
+
+    @property
+    def ended(self) -> tuple[int, str] | None:
+        """The driver's exit code and last words."""
+        end = self.runner.exits.get(DRIVER)
+        return None if end is None else (end.code, end.text)
 
     def sent(self, *cob_ids: int, by: str = DRIVER) -> list[tuple[float, CanFrame]]:
         """Return frames of these COB-IDs since the mark, with their times."""
@@ -154,40 +79,8 @@ class ComponentBench:
     def mark(self) -> None:
         self.marked = self.runner.now
 
-    def inject(self, event: PortChange | Peers) -> None:
-        self.person.actions.append(Publish(INJECTED[type(event)], event))
-
-    def run(self, seconds: float) -> None:
-        end = self.runner.now + seconds
-        while self.runner.now < end - 1e-9:
-            self.runner.run(end - self.runner.now)
-
-    def until(self, condition: Callable[[], bool], seconds: float = 5.0) -> float:
-        """Run until something is so; return how long that took [s]."""
-        begin = self.runner.now
-        while not condition():
-            assert self.runner.now < begin + seconds, self.person.status
-            self.run(0.002)
-        return self.runner.now - begin
-
-    def ask(self, service: str, request: bool | None = None) -> None:
-        self.person.actions.append(Call(f"device/{service}", request))
-
-    def call(self, service: str, request: bool | None = None) -> Answer:
-        count = len(self.person.answers)
-        self.ask(service, request)
-        self.until(lambda: len(self.person.answers) > count)
-        return self.person.answers[-1]
-
-    def succeed(self, service: str, request: bool | None = None) -> None:
-        """Call a service until it is done: drives take a while to switch off."""
-        self.until(lambda: self.call(service, request).success)
-
-    def press_stop(self, pressed: bool = True) -> None:
-        self.person.actions.append(Publish("device/estop", m.EmergencyStop(pressed)))
-
     def set_up(self) -> None:
-        self.until(lambda: self.state == "DISABLED")
+        self.until(lambda: self.status.state == "DISABLED")
         self.succeed("confirm_needle_out", True)
 
     def home(self) -> None:
@@ -196,33 +89,28 @@ class ComponentBench:
 
     def arm(self) -> None:
         """Enable once it is homed, and press the hold."""
-        self.until(lambda: self.person.status["homed"] == "true", 10.0)
+        self.until(lambda: self.status.homed)
         self.succeed("enable", True)
         self.run(0.3)
         self.person.pressed = True
         self.run(0.1)
 
-    def ready(self) -> None:
-        self.home()
-        self.arm()
-
     def step(self, length: float = 0.002, rotation: float = 0.5, duration: float = 1.0) -> None:
-        insertion, turn = (
-            float(self.person.status[key]) for key in ("insertion_m", "rotation_rad")
-        )
-        point = m.TrajectoryPoint((insertion + length, turn + rotation), duration)
-        names = (m.INSERTION_JOINT, m.ROTATION_JOINT)
-        stamp_ns = 1_000_000_000 + round(self.runner.now * 1e9)
-        command = m.Trajectory(stamp_ns, names, (point,))
-        self.person.actions.append(Publish("device/joint_trajectory", command))
+        self.command(length, rotation, duration)
 
     def moving(self) -> None:
         """Be in the middle of a step."""
         if not self.person.pressed:
-            self.ready()
+            self.home()
+            self.arm()
         begin = self.places[0]
         self.step()
         self.until(lambda: self.places[0] > begin + 0.0005)
+
+    def release(self) -> None:
+        self.until(lambda: self.status.state == "FAULT", 2.0)
+        self.person.pressed = False
+        self.run(0.5)
 
     def rests(self, seconds: float = 0.5) -> bool:
         """Tell whether neither motor moves for some time."""

@@ -8,25 +8,17 @@ from collections.abc import Callable
 
 import pytest
 
-from needle_core.component import Answer, Peers
-
-from .component_bench import DRIVER, DRIVES, ComponentBench, losing
+from .component_bench import DRIVES, AnotherDevice, ComponentBench, losing
 
 SDO = (0x601, 0x602)
 LIMITS, HOMING_SPEEDS, DEVICE_TYPE = 0x607D, 0x6099, 0x1000
 
 
-def reset(bench: ComponentBench) -> None:
+def fault(bench: ComponentBench) -> None:
     """Have a fault in the middle of a step, and be where a reset may be ordered."""
     bench.moving()
     bench.drives.bus.emergency("insertion", 0x2310)
-    bench.until(lambda: bench.state == "FAULT")
-    bench.person.pressed = False
-    bench.run(0.5)
-
-
-def another_device(bench: ComponentBench) -> None:
-    bench.inject(Peers(publishers={"device/status": (DRIVER, "sim_rig")}))
+    bench.release()
 
 
 def test_both_drives_are_asked_side_by_side_and_a_reset_is_answered_when_it_has_ended() -> None:
@@ -47,11 +39,11 @@ def test_both_drives_are_asked_side_by_side_and_a_reset_is_answered_when_it_has_
     bench.home()
     check()
     bench.arm()
-    reset(bench)
+    fault(bench)
     bench.mark()
     assert bench.call("reset").success
     check()
-    assert bench.state == "DISABLED"
+    assert bench.status.state == "DISABLED"
     bench.run(0.5)
     assert bench.sent(*SDO) == []
 
@@ -67,7 +59,7 @@ def test_homing_begins_when_both_drives_have_taken_limits_and_speeds(slow: int) 
     bench.mark()
     assert bench.call("home").success
     replied = bench.runner.now
-    bench.until(lambda: bench.person.status["homed"] == "true")
+    bench.until(lambda: bench.status.homed)
     first = min(t for t, f in bench.sent(0x201, 0x202) if f.data[0] & 0x10)
     taken = {
         (f.identifier, *bench.entry(f)): t
@@ -82,15 +74,15 @@ def test_home_is_answered_when_it_has_begun_and_retract_at_once() -> None:
     bench = ComponentBench(drives={"insertion_start": 0.002})
     bench.home()
     bench.run(0.002)
-    assert (bench.person.status["activity"], bench.person.status["homed"]) == ("homing", "false")
+    assert (bench.status.activity, bench.status.homed) == ("homing", False)
     assert bench.places[0] > 0.001
     bench.arm()
     bench.step()
-    bench.until(lambda: bool(bench.person.outcomes))
+    bench.until(lambda: bench.outcomes)
     bench.ask("retract")
     # The person acts every 0.01 s; on the way there and back a message takes 1.5 ms at most.
-    assert bench.until(lambda: bench.person.answers[-1].service == "device/retract") < 0.02
-    assert bench.person.answers[-1].success
+    assert bench.until(lambda: "retract" in bench.answers) < 0.02
+    assert bench.answers["retract"].success
 
 
 # ---- called off --------------------------------------------------------------------------------
@@ -100,7 +92,7 @@ CALLS_OFF: dict[str, Callable[[ComponentBench], None]] = {
     "stop": lambda b: b.ask("stop"),
     "disable": lambda b: b.ask("enable", False),
     "fault": lambda b: b.drives.bus.reboot("insertion", b.runner.now),
-    "another device": another_device,
+    "another device": lambda b: b.runner.start(AnotherDevice()),
 }
 
 
@@ -118,7 +110,7 @@ def test_an_order_that_is_called_off_sends_nothing_more_and_moves_nothing(
     drives = {} if order == "reset" else {"insertion_start": 0.01, "boot_time": 0.0}
     bench = ComponentBench(fault=losing([0x582], lambda: lost[0]), drives=drives)
     if order == "reset":
-        reset(bench)
+        fault(bench)
     else:
         bench.set_up()
     bench.mark()
@@ -126,18 +118,11 @@ def test_an_order_that_is_called_off_sends_nothing_more_and_moves_nothing(
     bench.ask(order)
     # The insertion drive has acknowledged all of its own; the rotation drive is silent.
     bench.until(lambda: bool(bench.sent(0x602)))
-    answers = len(bench.person.answers)
+    bench.person.answers.clear()
     CALLS_OFF[why](bench)
-
-    def reply() -> Answer | None:
-        heard = {answer.service: answer for answer in bench.person.answers[answers:]}
-        return heard.get(f"device/{order}")
-
-    bench.until(lambda: reply() is not None)
-    replied = reply()
-    assert replied is not None
-    assert not replied.success
-    assert "called off" in replied.text
+    bench.until(lambda: order in bench.answers)
+    assert not bench.answers[order].success
+    assert "called off" in bench.answers[order].text
     starts = [frame for _, frame in bench.sent(0x201, 0x202) if frame.data[0] & 0x10]
     assert starts == []
     bench.mark()
@@ -158,22 +143,22 @@ def test_heartbeat_goes_on_while_a_drive_is_silent_and_no_second_order_is_taken(
     beats = [time for time, _ in bench.sent(0x77F)]
     assert max(later - before for before, later in itertools.pairwise(beats)) < 0.04
     assert "another order is under way" in bench.call("reset").text
-    bench.until(lambda: bench.state == "FAULT", 2.0)
-    assert "node 2 does not answer" in bench.fault
-    assert not bench.person.answers[-1].success
+    bench.until(lambda: bench.status.state == "FAULT", 2.0)
+    assert "node 2 does not answer" in bench.status.fault
+    assert not bench.answers["home"].success
 
 
 def test_an_emergency_stop_calls_a_set_up_off_until_it_is_released() -> None:
     bench = ComponentBench()
     bench.until(lambda: len(bench.sent(0x601)) > 10)
     bench.press_stop()
-    bench.until(lambda: bench.state == "ESTOPPED")
+    bench.until(lambda: bench.status.state == "ESTOPPED")
     bench.mark()
     bench.run(1.5)
     # It looks whether they are still there, and no more.
     assert {bench.entry(frame)[0] for _, frame in bench.sent(*SDO)} == {DEVICE_TYPE}
     bench.press_stop(False)
-    bench.until(lambda: bench.state == "DISABLED")
+    bench.until(lambda: bench.status.state == "DISABLED")
 
 
 # ---- begin -------------------------------------------------------------------------------------
@@ -182,22 +167,21 @@ def test_an_emergency_stop_calls_a_set_up_off_until_it_is_released() -> None:
 def test_a_drive_that_refuses_its_set_up_ends_the_driver_at_once() -> None:
     bench = ComponentBench()
     del bench.drives.bus.drives["rotation"]._objects._entries[0x605A, 0]
-    assert bench.until(lambda: DRIVER in bench.runner.exits) < 3.0
-    ended = bench.runner.exits[DRIVER]
-    assert ended.code == 2
-    assert "rotation axis: node" in ended.text
-    assert "refuses to write 6 to 0x605A" in ended.text
+    assert bench.until(lambda: bench.ended) < 3.0
+    code, text = bench.ended or (0, "")
+    assert code == 2
+    assert "rotation axis: node" in text
+    assert "refuses to write 6 to 0x605A" in text
     # The other one does not wait for a computer that is gone.
     bench.run(0.5)
-    assert all(drive.error_code == 0 for drive in bench.drives.bus.drives.values())
+    assert bench.error_codes == {0}
 
 
 def test_with_another_device_nothing_begins() -> None:
     bench = ComponentBench()
-    # Not before they know each other.
-    bench.run(0.25)
-    assert bench.state == "UNCONFIGURED"
-    another_device(bench)
-    bench.until(lambda: DRIVER in bench.runner.exits)
-    assert bench.runner.exits[DRIVER].code == 2
-    assert "another device is there: sim_rig" in bench.runner.exits[DRIVER].text
+    bench.runner.start(AnotherDevice())
+    bench.until(lambda: bench.ended)
+    code, text = bench.ended or (0, "")
+    assert code == 2
+    assert "another device is there: sim_rig" in text
+    assert {bench.entry(frame)[0] for _, frame in bench.sent(*SDO)} <= {DEVICE_TYPE}
