@@ -1,9 +1,11 @@
+"""Bags as rosbags and mcap read them; a recording that a disk refuses or is too slow for."""
+
 from __future__ import annotations
 
+import dataclasses
 import errno
 import io
 import json
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +22,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition
+from needle_bags.recording import recording as recording_module
 from needle_bags.recording.free_space import FreeSpace
-from needle_bags.recording.recording import (
-    WAITING_LIMIT,
-    Received,
-    Recording,
-    open_recording,
-)
+from needle_bags.recording.recorder_health import WARN_WAITING, RecorderHealth
+from needle_bags.recording.recording import Received, Recording, open_recording
+from needle_bags.recording.worker import Do, Job
+from needle_core.diagnostics import Level
 from needle_core.errors import UserError
 from needle_core.files.bag_topic import BagTopic
 
@@ -34,23 +35,15 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TIME = 1_700_000_000_000_000_000
 RIG_TYPES = (
-    "sensor_msgs/msg/Image",
-    "sensor_msgs/msg/CameraInfo",
-    "sensor_msgs/msg/JointState",
-    "sensor_msgs/msg/Joy",
-    "geometry_msgs/msg/PointStamped",
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "geometry_msgs/msg/Vector3Stamped",
-    "std_msgs/msg/Bool",
-    "std_msgs/msg/Header",
-    "trajectory_msgs/msg/JointTrajectory",
-    "diagnostic_msgs/msg/DiagnosticStatus",
-    "diagnostic_msgs/msg/DiagnosticArray",
-    "rosgraph_msgs/msg/Clock",
-    "rcl_interfaces/msg/ParameterEvent",
-    "rcl_interfaces/msg/Log",
+    *(f"sensor_msgs/msg/{name}" for name in ("Image", "CameraInfo", "JointState", "Joy")),
+    *(f"geometry_msgs/msg/{name}Stamped" for name in ("Point", "Pose", "Vector3")),
+    *(f"std_msgs/msg/{name}" for name in ("Bool", "Header", "String")),
+    *(f"rcl_interfaces/msg/{name}" for name in ("ParameterEvent", "Log")),
+    *("trajectory_msgs/msg/JointTrajectory", "rosgraph_msgs/msg/Clock"),
+    *("diagnostic_msgs/msg/DiagnosticArray", TYPE),
 )
+TOPIC = BagTopic("/t", TYPE, full_definition(TYPE))
+FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
 def pose(number: int) -> bytes:
@@ -70,7 +63,14 @@ def pose(number: int) -> bytes:
     return bytes(STORE.serialize_cdr(message, TYPE))
 
 
-def write_poses(directory: Path, count: int) -> None:
+def received(number: int = 1, topic: str = "/t") -> Received:
+    return Received(topic, pose(number), TIME, TIME)
+
+
+@pytest.fixture(scope="module")
+def poses(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag of 200 poses with all that a bag can carry."""
+    directory = tmp_path_factory.mktemp("writer") / "bag"
     bag = BagWriter(directory, chunk_size=4096)
     qos = (
         USUAL_QOS._replace(history=QosHistory.KEEP_LAST, depth=10),
@@ -80,53 +80,50 @@ def write_poses(directory: Path, count: int) -> None:
             lifespan=QosTime(10, 7),
         ),
     )
-    topic = BagTopic("/needle/tip_pose", TYPE, full_definition(TYPE), STORE.hash_rihs01(TYPE), qos)
-    channel = bag.add_topic(topic)
-    for number in range(count):
+    channel = bag.add_topic(
+        dataclasses.replace(TOPIC, type_hash=STORE.hash_rihs01(TYPE), offered_qos=qos)
+    )
+    for number in range(200):
         bag.write(channel, pose(number), TIME + number * 1000, TIME + number * 1000 - 10)
     bag.set_custom_data("run_info", "level: tip\nseed: 1\n")
     bag.add_attachment("calibration.yaml", "application/yaml", b"left: {}\n", TIME)
     bag.close()
+    return directory
 
 
-@pytest.mark.parametrize("type_name", RIG_TYPES)
-def test_definitions_hash_as_rosbags_computes(type_name: str) -> None:
-    types = get_types_from_msg(full_definition(type_name), type_name)
-    fresh = get_typestore(Stores.EMPTY)
-    fresh.register(types)
-    assert fresh.hash_rihs01(type_name) == STORE.hash_rihs01(type_name)
+def test_definitions_hash_as_rosbags_computes() -> None:
+    for type_name in RIG_TYPES:
+        fresh = get_typestore(Stores.EMPTY)
+        fresh.register(get_types_from_msg(full_definition(type_name), type_name))
+        assert fresh.hash_rihs01(type_name) == STORE.hash_rihs01(type_name)
+    with pytest.raises(UserError, match="no_such_msgs/msg/Thing is not installed"):
+        full_definition("no_such_msgs/msg/Thing")
 
 
-def test_round_trip_with_rosbags(tmp_path: Path) -> None:
-    write_poses(tmp_path / "bag", 500)
-    with AnyReader([tmp_path / "bag"]) as reader:
+def test_rosbags_reads_the_messages_and_what_is_said_of_their_topic(poses: Path) -> None:
+    with AnyReader([poses]) as reader:
         messages = list(reader.messages())
-        assert reader.message_count == 500
-        assert [time for _, time, _ in messages] == [TIME + n * 1000 for n in range(500)]
-        assert [bytes(data) for _, _, data in messages] == [pose(n) for n in range(500)]
+        assert reader.message_count == 200
+        assert [time for _, time, _ in messages] == [TIME + n * 1000 for n in range(200)]
+        assert [bytes(data) for _, _, data in messages] == [pose(n) for n in range(200)]
         connection, _, data = messages[-1]
         last: Any = reader.deserialize(data, connection.msgtype)
-        assert last.header.stamp.sec == 499
-
-
-def test_topic_metadata_read_by_rosbags(tmp_path: Path) -> None:
-    write_poses(tmp_path / "bag", 3)
-    with Reader(tmp_path / "bag") as reader:
-        (connection,) = reader.connections
+        assert last.header.stamp.sec == 199
+    with Reader(poses) as bag:
+        (connection,) = bag.connections
         assert connection.digest == STORE.hash_rihs01(TYPE)
-        assert reader.ros_distro == "jazzy"
+        assert bag.ros_distro == "jazzy"
         first, second = connection.ext.offered_qos_profiles  # type: ignore[union-attr]
-        assert (first.history, first.depth) == (QosHistory.KEEP_LAST, 10)
-        assert first.reliability is QosReliability.RELIABLE
-        assert second.reliability is QosReliability.BEST_EFFORT
-        assert second.durability is QosDurability.TRANSIENT_LOCAL
-        assert (second.lifespan.sec, second.lifespan.nsec) == (10, 7)
-        assert (first.deadline.sec, first.deadline.nsec) == (9223372036, 854775807)
+    assert (first.history, first.depth) == (QosHistory.KEEP_LAST, 10)
+    assert first.reliability is QosReliability.RELIABLE
+    assert second.reliability is QosReliability.BEST_EFFORT
+    assert second.durability is QosDurability.TRANSIENT_LOCAL
+    assert (second.lifespan.sec, second.lifespan.nsec) == (10, 7)
+    assert (first.deadline.sec, first.deadline.nsec) == (9223372036, 854775807)
 
 
-def test_read_by_mcap(tmp_path: Path) -> None:
-    write_poses(tmp_path / "bag", 200)
-    with (tmp_path / "bag" / "bag_0.mcap").open("rb") as stream:
+def test_mcap_reads_the_file_alone(poses: Path) -> None:
+    with (poses / "bag_0.mcap").open("rb") as stream:
         reader = make_reader(stream)
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
@@ -143,36 +140,28 @@ def test_read_by_mcap(tmp_path: Path) -> None:
     assert attachment.data == b"left: {}\n"
 
 
-def test_metadata_has_no_anchors_and_keeps_texts(tmp_path: Path) -> None:
-    write_poses(tmp_path / "bag", 1)
-    text = (tmp_path / "bag" / "metadata.yaml").read_text()
+def test_metadata_has_no_anchors_and_keeps_texts(poses: Path) -> None:
+    text = (poses / "metadata.yaml").read_text()
     assert "&id" not in text
     information = yaml.safe_load(text)["rosbag2_bagfile_information"]
     assert information["version"] == 9
     assert information["custom_data"] == {"run_info": "level: tip\nseed: 1\n"}
 
 
-def test_empty_bag_opens(tmp_path: Path) -> None:
-    BagWriter(tmp_path / "bag").close()
-    with Reader(tmp_path / "bag") as reader:
+def test_a_bag_is_begun_where_none_is_and_replaces_none(poses: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="holds a bag already"):
+        BagWriter(poses)
+    (tmp_path / "parameters.yaml").write_text("{}")
+    with pytest.raises(UserError, match="it is a file"):
+        BagWriter(tmp_path / "parameters.yaml")
+    BagWriter(tmp_path).close()
+    with Reader(tmp_path) as reader:
         assert reader.message_count == 0
 
 
-def test_existing_bag_is_refused(tmp_path: Path) -> None:
-    write_poses(tmp_path / "bag", 1)
-    with pytest.raises(UserError, match="holds a bag already"):
-        BagWriter(tmp_path / "bag")
-
-
-def test_a_folder_without_a_bag_is_accepted(tmp_path: Path) -> None:
-    (tmp_path / "parameters.yaml").write_text("{}")
-    BagWriter(tmp_path).close()
-    assert (tmp_path / "metadata.yaml").is_file()
-
-
-def test_unknown_type_is_named() -> None:
-    with pytest.raises(UserError, match="no_such_msgs/msg/Thing is not installed"):
-        full_definition("no_such_msgs/msg/Thing")
+class _BrokenFile(io.FileIO):
+    def write(self, _: object) -> int:
+        raise OSError(errno.EIO, "Input/output error")
 
 
 def test_a_disk_that_takes_nothing_is_said_at_the_start(
@@ -183,28 +172,11 @@ def test_a_disk_that_takes_nothing_is_said_at_the_start(
     with pytest.raises(UserError, match=r"cannot record into .*bag: Input/output error"):
         open_recording(tmp_path / "bag")
     monkeypatch.undo()
+    monkeypatch.setattr(FreeSpace, "usable", lambda _: -1)
+    with pytest.raises(UserError, match=r"cannot record into .*bag: \d+ MB free, 1 MB are kept"):
+        open_recording(tmp_path / "bag", reserve=1_000_001)
+    monkeypatch.undo()
     open_recording(tmp_path / "bag").close()
-
-
-class _BrokenFile(io.FileIO):
-    def write(self, _: object) -> int:
-        raise OSError(errno.EIO, "Input/output error")
-
-
-def test_a_full_disk_ends_the_recording_with_its_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    recording = open_recording(tmp_path / "bag")
-    recording.add_topic(BagTopic("/t", TYPE, full_definition(TYPE)))
-    monkeypatch.setattr("mcap.writer.Writer.add_message", full)
-    for number in range(10):
-        recording.append(Received("/t", pose(number), TIME, TIME))
-    recording.close()
-    assert recording.error is not None
-    assert recording.error.endswith("bag_0.mcap: No space left on device")
 
 
 def test_what_a_disk_that_fills_at_the_very_end_drops_is_named_in_the_bag(
@@ -214,77 +186,134 @@ def test_what_a_disk_that_fills_at_the_very_end_drops_is_named_in_the_bag(
 
     def full_once(writer: Writer) -> None:
         monkeypatch.setattr(Writer, "finish", finish)
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise FULL
 
     monkeypatch.setattr(BagWriter, "flush", lambda _: None)
     monkeypatch.setattr(Writer, "finish", full_once)
     recording = open_recording(tmp_path / "bag")
-    recording.add_topic(BagTopic("/t", TYPE, full_definition(TYPE)))
+    recording.add_topic(TOPIC)
     for number in range(10):
-        recording.append(Received("/t", pose(number), TIME, TIME))
+        recording.append(received(number))
     recording.close({"/t": 2, "/other": 1})
     assert recording.is_whole
+    assert recording.error is not None
+    assert recording.error.endswith("bag_0.mcap: No space left on device")
     text = (tmp_path / "bag" / "metadata.yaml").read_text()
     custom = yaml.safe_load(text)["rosbag2_bagfile_information"]["custom_data"]
     assert json.loads(custom["messages_lost"]) == {"/t": 12, "/other": 1}
 
 
-def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(
+def test_a_recording_ends_in_order_before_its_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A disk that stands still: images fill the memory that there is, commands still get in."""
-    moves = threading.Event()
-    write = BagWriter.write
-
-    def slow(*given: Any) -> None:
-        assert moves.wait(20.0)
-        write(*given)
-
-    monkeypatch.setattr(BagWriter, "write", slow)
     recording = open_recording(tmp_path / "bag")
+    recording.add_topic(TOPIC)
+    recording.append(received())
+    monkeypatch.setattr(FreeSpace, "usable", lambda _: -1)
+    monkeypatch.setattr(recording_module, "_LOOK_EVERY", 1)
+    recording.append(received())
+    recording.close()
+    assert recording.is_whole
+    assert recording.error is not None
+    assert recording.error.startswith(f"the disk of {tmp_path / 'bag'} has only")
+    with Reader(tmp_path / "bag") as reader:
+        assert 1 <= reader.message_count <= 2
+
+
+class HeldWorker:
+    """A worker that does nothing before the end: its disk stands still."""
+
+    def __init__(self, do: Do, end: Job) -> None:
+        self._do, self._end = do, end
+        self._jobs: list[Job] = []
+
+    @property
+    def waiting(self) -> int:
+        return len(self._jobs)
+
+    def put(self, job: Job) -> None:
+        self._jobs.append(job)
+
+    def finish(self) -> None:
+        for job in self._jobs:
+            self._do(job)
+        self._end()
+
+
+def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(tmp_path: Path) -> None:
+    """Images fill the memory that there is, commands still get in."""
+    limit = 1_000_000
+    bag, space = BagWriter(tmp_path / "bag"), FreeSpace(tmp_path, 0)
+    recording = Recording(bag, space, HeldWorker, waiting_limit=limit)
     for name in ("/image", "/command"):
-        recording.add_topic(BagTopic(name, TYPE, full_definition(TYPE)))
-    image = bytes(WAITING_LIMIT // 8)
+        recording.add_topic(dataclasses.replace(TOPIC, name=name))
     for _ in range(12):
-        recording.append(Received("/image", image, TIME, TIME))
-    for _ in range(100):
-        recording.append(Received("/command", pose(1), TIME, TIME))
-    assert recording.bytes_waiting < 1.2 * WAITING_LIMIT
+        recording.append(Received("/image", bytes(limit // 8), TIME, TIME))
+    for _ in range(50):
+        recording.append(received(topic="/command"))
+    assert recording.bytes_waiting < 1.2 * limit
     assert recording.dropped.keys() == {"/image"}
-    dropped = recording.dropped["/image"]
-    moves.set()
+    # Tiny messages are bounded by what they take in memory.
+    for _ in range(1000):
+        recording.append(Received("/command", b"", TIME, TIME))
+    assert recording.bytes_waiting < 1.2 * limit
+    dropped = dict(recording.dropped)
+    assert 800 < dropped["/command"] < 1000
     recording.close()
     assert recording.is_whole
     with Reader(tmp_path / "bag") as reader:
         counts = {c.topic: c.msgcount for c in reader.connections}
-    assert counts == {"/image": 12 - dropped, "/command": 100}
-
-
-def test_a_flood_of_tiny_messages_is_bounded_by_what_they_take_in_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    moves = threading.Event()
-    monkeypatch.setattr(BagWriter, "write", lambda *_: moves.wait(20.0))
-    space = FreeSpace(tmp_path, 0)
-    recording = Recording(BagWriter(tmp_path / "bag"), space, waiting_limit=900_000)
-    recording.add_topic(BagTopic("/t", TYPE, full_definition(TYPE)))
-    for _ in range(5000):
-        recording.append(Received("/t", b"", TIME, TIME))
-    assert 1000 < recording.messages_waiting < 1400
-    assert recording.dropped["/t"] + recording.messages_received == 5000
-    moves.set()
-    recording.close()
+    assert counts == {"/image": 12 - dropped["/image"], "/command": 1050 - dropped["/command"]}
 
 
 def test_a_message_that_cannot_be_written_ends_the_recording_in_order(tmp_path: Path) -> None:
     """The thread that writes may not end in silence: all that comes after would wait for ever."""
     recording = open_recording(tmp_path / "bag")
-    recording.add_topic(BagTopic("/t", TYPE, full_definition(TYPE)))
-    recording.append(Received("/t", pose(1), TIME, TIME))
-    recording.append(Received("/nobody_described_it", pose(2), TIME, TIME))
-    recording.append(Received("/t", pose(3), TIME, TIME))
+    recording.add_topic(TOPIC)
+    recording.append(received(1))
+    recording.append(received(2, "/nobody_described_it"))
+    recording.append(received(3))
     recording.close()
     assert recording.error == "KeyError: '/nobody_described_it'"
     assert recording.is_whole
     with Reader(tmp_path / "bag") as reader:
         assert reader.message_count == 1
+
+
+class _Told:
+    """A recording as its health looks at it."""
+
+    def __init__(self) -> None:
+        self.error: str | None = None
+        self.bytes_received = self.bytes_waiting = 0
+        self.space = self
+        self.reserve, self.left = 1_000_000, 10**9
+
+    def usable(self) -> int:
+        if self.left < 0:
+            raise OSError(errno.EIO, "Input/output error")
+        return self.left
+
+
+def test_health_tells_the_worst_first() -> None:
+    told: Any = _Told()
+    health = RecorderHealth(told, Path("bag"))
+    assert health.look(0.5, {}, []) == (Level.OK, "recording")
+    assert health.look(0.5, {}, ["/odd is not recorded"]) == (Level.WARN, "/odd is not recorded")
+    # 10 MB/s for a second: 120 s of it do not fit.
+    told.bytes_received = 10_000_000
+    for _ in range(2):
+        health.look(0.5, {}, [])
+        told.bytes_received += 5_000_000
+    level, text = health.look(0.5, {}, [])
+    assert (level, text) == (
+        Level.WARN,
+        "the disk of bag is nearly full: recording ends at 1 MB free",
+    )
+    told.left = -1
+    assert health.look(0.5, {}, [])[1] == "cannot look at the disk of bag: Input/output error"
+    told.bytes_waiting = WARN_WAITING + 1
+    assert "slower than the graph: 50 MB wait" in health.look(0.5, {}, [])[1]
+    assert health.look(0.5, {"/t": 3}, []) == (Level.WARN, "messages lost on /t")
+    told.error = "broken"
+    assert health.look(0.5, {"/t": 3}, []) == (Level.ERROR, "recording ended: broken")

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import pytest
 
 from needle_bags.format.message_loss import CERTAIN_AFTER, SequenceGaps
@@ -10,9 +8,7 @@ from needle_bags.format.message_loss import CERTAIN_AFTER, SequenceGaps
 @pytest.mark.parametrize(
     ("numbers", "missing"),
     [
-        ((1, 2, 3, 4), 0),
         ((7, 8, 9), 0),  # the recorder came late
-        ((1, 2, 5, 6), 2),
         ((1, 3, 5), 2),
         ((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 20), 9),
         ((1, 2, 1001, 3), 0),  # a second publisher that was not announced
@@ -20,7 +16,7 @@ from needle_bags.format.message_loss import CERTAIN_AFTER, SequenceGaps
         ((5, 6, 6, 7), 0),  # a repeat
     ],
 )
-def test_gaps(numbers: Sequence[int], missing: int) -> None:
+def test_gaps(numbers: tuple[int, ...], missing: int) -> None:
     gaps = SequenceGaps()
     for number in numbers:
         gaps.take(number)

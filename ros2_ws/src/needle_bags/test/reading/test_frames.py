@@ -1,9 +1,11 @@
-"""Bags as frames: beside what the typed reader reads of the same bag."""
+"""Bags as frames: the rows beside what the typed reader reads of the same bag."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,62 @@ TYPES = get_typestore(Stores.ROS2_JAZZY).types
 POSE = [f"position.{axis}" for axis in "xyz"] + [f"orientation.{axis}" for axis in "xyzw"]
 
 
+@pytest.fixture(scope="module")
+def rows() -> dict[str, list[dict[str, Any]]]:
+    """What a bag has for pandas, which is an extra."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "pandas", SimpleNamespace())
+        patch.setattr(frames, "_frame", lambda _, found: found)
+        return read_frames(BAG)
+
+
+def test_rows_have_what_the_typed_reader_has(rows: dict[str, list[dict[str, Any]]]) -> None:
+    run = read_run(BAG)
+    joints = [f"position.{joint}_joint" for joint in ("insertion", "rotation")]
+    commands = [f"points.0.positions.{joint}_joint" for joint in ("insertion", "rotation")]
+
+    def table(topic: str, columns: Sequence[str]) -> np.ndarray:
+        return np.array([[row[name] for name in columns] for row in rows[topic]], float)
+
+    wanted: dict[str, tuple[Series, list[str]]] = {
+        "/needle/tip": (run.tips, [f"point.{axis}" for axis in "xyz"]),
+        "/sim/tip_pose": (run.truth, [f"pose.{name}" for name in POSE]),
+        "/needle/estimate": (run.estimate, [f"pose.pose.{name}" for name in POSE]),
+        "/joint_states": (run.joints, joints),
+        "/device/joint_trajectory": (run.commands, commands),
+    }
+    for topic, (series, columns) in wanted.items():
+        found = table(topic, ["stamp", "received", *columns])
+        # The typed reader keeps the first of equal stamps, and their order.
+        _, first = np.unique(found[:, 0], return_index=True)
+        np.testing.assert_allclose(found[first, 0], series.stamps * 1e-9, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found[first, 1], series.received * 1e-9, rtol=1e-12)
+        np.testing.assert_array_equal(found[first, 2:], series.values)
+    covariance = [f"pose.covariance.{k}" for k in range(36)]
+    np.testing.assert_array_equal(
+        table("/needle/estimate", covariance), run.estimate_covariances.values
+    )
+    last, status = run.controller_status[-1].values, rows["/needle/controller_status"][-1]
+    assert {f"values.{key}": value for key, value in last.items()}.items() <= status.items()
+    # Without a header its time is that of its arrival.
+    assert status["stamp"] == status["received"]
+    assert [result.outcome for result in run.results] == [
+        row["frame_id"] for row in rows["/device/result"]
+    ]
+    # Of a picture there is no table, and of a type's constants no column.
+    assert set(rows) == {topic for topic in run.topics if "image" not in topic}
+    assert "OK" not in status
+
+
+def test_what_frames_need_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(UserError, match=r"pandas is not installed; docs/notebooks\.md"):
+        read_frames(BAG)
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace())
+    with pytest.raises(UserError, match=r"no topic /needle/top \(it has /device/hold, "):
+        read_frames(BAG, ["/needle/top"])
+
+
 def message(kind: str, **fields: Any) -> Any:
     return TYPES[kind](**fields)
 
@@ -29,59 +87,12 @@ def header(sec: int = 3, nanosec: int = 500_000_000) -> Any:
     return message("std_msgs/msg/Header", stamp=stamp, frame_id="rig")
 
 
-def test_frames_have_what_the_typed_reader_has() -> None:
-    pytest.importorskip("pandas", reason="the notebooks' lock is not installed: docs/notebooks.md")
-    bag, run = read_frames(BAG), read_run(BAG)
-    joints = [f"position.{joint}_joint" for joint in ("insertion", "rotation")]
-    commands = [f"points.0.positions.{joint}_joint" for joint in ("insertion", "rotation")]
-    covariance = [f"pose.covariance.{k}" for k in range(36)]
-    wanted: dict[str, tuple[Series, list[str]]] = {
-        "/needle/tip": (run.tips, [f"point.{axis}" for axis in "xyz"]),
-        "/sim/tip_pose": (run.truth, [f"pose.{name}" for name in POSE]),
-        "/needle/estimate": (run.estimate, [f"pose.pose.{name}" for name in POSE]),
-        "/needle/reduced_state": (run.reduced_state, [f"vector.{axis}" for axis in "xyz"]),
-        "/joint_states": (run.joints, joints),
-        "/device/joint_trajectory": (run.commands, commands),
-    }
-    for topic, (series, columns) in wanted.items():
-        # The typed reader keeps the first of equal stamps.
-        frame = bag[topic][~bag[topic].index.duplicated()].sort_index()
-        np.testing.assert_allclose(frame.index, series.stamps * 1e-9, rtol=0, atol=1e-9)
-        np.testing.assert_array_equal(frame[columns].to_numpy(float), series.values)
-        np.testing.assert_allclose(frame["received"], series.received * 1e-9, rtol=1e-12)
-    estimate = bag["/needle/estimate"]
-    np.testing.assert_array_equal(estimate[covariance], run.estimate_covariances.values)
-    status = bag["/needle/controller_status"]
-    last = run.controller_status[-1].values
-    assert status["values.state"].iloc[-1] == last["state"]
-    assert status["values.insertion_m"].iloc[-1] == float(last["insertion_m"])
-    assert status["values.reachable_depth_m"].dtype == float
-    np.testing.assert_array_equal(status.index, status["received"])
-    assert [result.outcome for result in run.results] == list(bag["/device/result"]["frame_id"])
-    # Of a picture there is no table, and of a type's constants no column.
-    assert set(bag) == {topic for topic in run.topics if "image" not in topic}
-    assert "OK" not in status
-
-
-def test_some_topics_alone() -> None:
-    pytest.importorskip("pandas", reason="the notebooks' lock is not installed: docs/notebooks.md")
-    assert list(read_frames(BAG, ["/needle/tip"])) == ["/needle/tip"]
-    with pytest.raises(UserError, match=r"no topic /needle/top \(it has /device/hold, "):
-        read_frames(BAG, ["/needle/top"])
-
-
 def test_health_has_a_row_for_each_status() -> None:
     pair = message("diagnostic_msgs/msg/KeyValue", key="rate_hz", value="30")
+    fields = {"message": "well", "hardware_id": "", "values": [pair]}
     parts = [
-        message(
-            "diagnostic_msgs/msg/DiagnosticStatus",
-            level=level,
-            name=f"part {level}",
-            message="well",
-            hardware_id="",
-            values=[pair],
-        )
-        for level in (0, 1)
+        message("diagnostic_msgs/msg/DiagnosticStatus", level=k, name=f"part {k}", **fields)
+        for k in (0, 1)
     ]
     health = message("diagnostic_msgs/msg/DiagnosticArray", header=header(), status=parts)
     first, second = frames._rows(health)
@@ -91,24 +102,15 @@ def test_health_has_a_row_for_each_status() -> None:
 
 def test_points_have_numbers_and_their_joints_names() -> None:
     after = message("builtin_interfaces/msg/Duration", sec=1, nanosec=250_000_000)
+    nothing = dict.fromkeys(("velocities", "accelerations", "effort"), np.array([]))
+    kind = "trajectory_msgs/msg/JointTrajectoryPoint"
     points = [
-        message(
-            "trajectory_msgs/msg/JointTrajectoryPoint",
-            positions=np.array([k, 10.0 * k]),
-            velocities=np.array([]),
-            accelerations=np.array([]),
-            effort=np.array([]),
-            time_from_start=after,
-        )
+        message(kind, positions=np.array([k, 10.0 * k]), time_from_start=after, **nothing)
         for k in (1.0, 2.0)
     ]
-    path = message(
-        "trajectory_msgs/msg/JointTrajectory",
-        header=header(),
-        joint_names=["insertion_joint", "rotation_joint"],
-        points=points,
-    )
-    (row,) = frames._rows(path)
+    names = ["insertion_joint", "rotation_joint"]
+    kind = "trajectory_msgs/msg/JointTrajectory"
+    (row,) = frames._rows(message(kind, header=header(), joint_names=names, points=points))
     assert row == {
         "stamp": 3.5,
         "header.frame_id": "rig",
@@ -119,9 +121,3 @@ def test_points_have_numbers_and_their_joints_names() -> None:
         "points.1.positions.rotation_joint": 20.0,
         "points.1.time_from_start": 1.25,
     }
-
-
-def test_without_pandas_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(UserError, match=r"pandas is not installed; docs/notebooks\.md"):
-        read_frames(BAG)

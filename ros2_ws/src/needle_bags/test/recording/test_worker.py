@@ -2,53 +2,24 @@
 
 from __future__ import annotations
 
-import threading
-import time
+import queue
 
 from needle_bags.recording.worker import Job, WorkerThread, nothing
 
-LONG = 3600.0
 
-
-def test_a_job_ends_the_wait_for_what_is_due() -> None:
-    begun, done = threading.Event(), threading.Event()
-
-    def do(job: Job) -> float:
-        job()
-        begun.set()
-        return time.monotonic() + LONG
-
-    worker = WorkerThread(do, nothing)
-    assert begun.wait(20.0)
-    worker.put(done.set)
-    assert done.wait(20.0)
-    worker.finish()
-
-
-def test_what_is_due_needs_no_job() -> None:
-    looks: list[Job] = []
-    over = threading.Event()
-
-    def do(job: Job) -> float:
-        looks.append(job)
-        if len(looks) == 3:
-            over.set()
-        return time.monotonic() + (LONG if over.is_set() else 0.01)
-
-    worker = WorkerThread(do, nothing)
-    assert over.wait(20.0)
-    assert set(looks) == {nothing}
-    worker.finish()
-
-
-def test_finish_waits_for_all_jobs_and_the_end() -> None:
+def test_jobs_are_done_in_order_with_looks_between_and_the_end_after_all() -> None:
     done: list[str] = []
+    looked: queue.SimpleQueue[Job] = queue.SimpleQueue()
 
     def do(job: Job) -> float:
         job()
-        return time.monotonic() + LONG
+        if job is nothing:
+            looked.put(job)
+        return 0.0  # it wants to be called at once
 
     worker = WorkerThread(do, lambda: done.append("end"))
+    for _ in range(3):
+        assert looked.get(timeout=20.0) is nothing
     names = [f"job {number}" for number in range(5)]
     for name in names:
         worker.put(lambda name=name: done.append(name))  # type: ignore[misc]
@@ -58,3 +29,16 @@ def test_finish_waits_for_all_jobs_and_the_end() -> None:
     # Asked for again it has nothing to do.
     worker.finish()
     assert done[-2:] == [names[-1], "end"]
+
+
+def test_a_job_ends_the_wait_for_what_is_due_much_later() -> None:
+    done: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+    def do(job: Job) -> float:
+        job()
+        return float("1e9")
+
+    worker = WorkerThread(do, nothing)
+    worker.put(lambda: done.put(1))
+    assert done.get(timeout=20.0) == 1
+    worker.finish()

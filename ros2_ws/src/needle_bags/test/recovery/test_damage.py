@@ -28,7 +28,9 @@ from .numbered_bag import (
     write_unchunked,
 )
 
-COUNT = 300
+COUNT = 150
+SPLIT = 240
+HARMS = ("bit", "zeros", "noise", "cut", "cut to zeros")
 KINDS = ("chunked", "zstd", "unchunked", "split", "unfinished")
 
 
@@ -39,7 +41,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write(folder / "chunked", COUNT)
     write(folder / "zstd", COUNT, compression="zstd")
     write_unchunked(folder / "unchunked", COUNT)
-    write(folder / "split", COUNT, max_file_size=15_000)
+    write(folder / "split", COUNT, max_file_size=7500)
     unfinished = write(folder / "unfinished", COUNT)
     (unfinished / "metadata.yaml").unlink()
     file = unfinished / "unfinished_0.mcap"
@@ -83,14 +85,14 @@ def hurt(data: bytes, kind: str, start: int, end: int, rng: np.random.Generator)
     return data[:start] + middle + data[end:]
 
 
-@pytest.mark.parametrize("harm", ["bit", "zeros", "noise", "cut", "cut to zeros"])
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_damaged_bag_is_all_before_the_damage(
-    tmp_path: Path, bags: Path, kind: str, harm: str
+    tmp_path: Path, bags: Path, kind: str, seed: int
 ) -> None:
-    rng = np.random.default_rng([KINDS.index(kind), len(harm)])
-    for trial in range(12):
-        bag = tmp_path / str(trial) / kind
+    rng = np.random.default_rng([seed, KINDS.index(kind)])
+    for harm in HARMS:
+        bag = tmp_path / harm / kind
         shutil.copytree(bags / kind, bag)
         file = rng.choice(sorted(bag.glob("*.mcap")))
         data = file.read_bytes()
@@ -99,7 +101,7 @@ def test_a_damaged_bag_is_all_before_the_damage(
         least = whole_before(bag, kind, file.name, start)
         file.write_bytes(hurt(data, harm, start, end, rng))
         before = contents(bag)
-        what = f"{trial}: {start} to {end} of {len(data)} bytes of {file.name}"
+        what = f"{harm}: {start} to {end} of {len(data)} bytes of {file.name}"
         try:
             recovery = recover_bag(bag)
         except UserError as error:
@@ -118,10 +120,6 @@ def test_a_damaged_bag_is_all_before_the_damage(
         assert set(before.values()) <= set(contents(bag).values()), what
         assert not [path for path in bag.iterdir() if path.name.startswith(".")]
         assert recover_bag(bag).was_whole
-
-
-def seconds(kept: int, count: int = COUNT) -> float:
-    return (count - kept) * STEP / 1e9
 
 
 @pytest.mark.parametrize("told", ["metadata", "index", "chunks", "nothing"])
@@ -145,9 +143,9 @@ def test_the_time_that_follows_is_told_as_well_as_it_is_known(tmp_path: Path, to
         assert recovery.seconds_lost is None
         assert recovery.lost.endswith("on: how much time follows cannot be told")
     else:
-        assert recovery.seconds_lost == pytest.approx(seconds(kept))
+        assert recovery.seconds_lost == pytest.approx((300 - kept) * STEP / 1e9)
         least = "at least " if told == "chunks" else ""
-        assert recovery.lost.endswith(f"on: {least}{seconds(kept):.1f} s follow")
+        assert recovery.lost.endswith(f"on: {least}{recovery.seconds_lost:.1f} s follow")
 
 
 def test_where_a_recorder_was_killed_between_chunks_half_a_second_is_gone(
@@ -161,118 +159,108 @@ def test_where_a_recorder_was_killed_between_chunks_half_a_second_is_gone(
     assert "(the file ends there) on: half a second at most if a kill ended it" in recovery.lost
 
 
-def test_a_bag_of_several_files_ends_at_the_damage(tmp_path: Path) -> None:
-    bag = write(tmp_path / "bag", 1000, max_file_size=40_000)
-    names = sorted(file.name for file in bag.glob("*.mcap"))
-    assert len(names) == 3
-    before = contents(bag)
-    first = damage(bag / "bag_1.mcap")
-    recovery = recover_bag(bag)
-    kept = numbers(bag)
+def seconds_behind(kept: int) -> float:
+    return (SPLIT - kept) * STEP / 1e9
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> Path:
+    """A bag of three files."""
+    bag = write(tmp_path / "bag", SPLIT, max_file_size=11_000)
+    assert len(list(bag.glob("*.mcap"))) == 3
+    return bag
+
+
+def test_a_bag_of_several_files_ends_at_the_damage(split: Path) -> None:
+    before = contents(split)
+    first = damage(split / "bag_1.mcap")
+    recovery = recover_bag(split)
+    kept = numbers(split)
     assert kept == list(range(len(kept)))
     assert len(kept) <= first < len(kept) + 60
-    assert recovery.seconds_lost == pytest.approx(seconds(len(kept), 1000))
-    assert recovery.left_out == [f"{name}: behind the damage" for name in names[2:]]
+    assert recovery.seconds_lost == pytest.approx(seconds_behind(len(kept)))
+    assert recovery.left_out == ["bag_2.mcap: behind the damage"]
     assert recovery.kept == ["metadata.yaml.damaged", "bag_1.mcap.damaged"]
-    after = contents(bag)
-    assert all(after[name] == before[name] for name in (names[0], *names[2:]))
-    (again,) = {line.partition(" (it begins ")[0][10:] for line in recover_bag(bag).left_out}
+    after = contents(split)
+    assert all(after[name] == before[name] for name in ("bag_0.mcap", "bag_2.mcap"))
+    (again,) = {line.partition(" (it begins ")[0][10:] for line in recover_bag(split).left_out}
     assert again == ": not of this bag"
 
 
 @pytest.mark.parametrize("has_metadata", [True, False])
-def test_a_bag_ends_before_a_missing_file(tmp_path: Path, has_metadata: bool) -> None:
-    bag = write(tmp_path / "bag", 1000, max_file_size=40_000)
-    (bag / "bag_1.mcap").rename(tmp_path / "elsewhere")
+def test_a_bag_ends_before_a_missing_file(split: Path, has_metadata: bool) -> None:
+    (split / "bag_1.mcap").unlink()
     if not has_metadata:
-        (bag / "metadata.yaml").unlink()
-    recovery = recover_bag(bag)
-    kept = numbers(bag)
+        (split / "metadata.yaml").unlink()
+    recovery = recover_bag(split)
+    kept = numbers(split)
     assert kept == list(range(len(kept)))
-    assert 300 < len(kept) < 400
-    follow = f"{seconds(len(kept), 1000):.1f} s follow"
+    assert 60 < len(kept) < 120
+    follow = f"{seconds_behind(len(kept)):.1f} s follow"
     assert recovery.lost == f"all from bag_1.mcap (it is missing) on: {follow}"
     assert recovery.left_out == ["bag_2.mcap: behind the damage"]
 
 
-def test_the_time_of_a_missing_last_file_is_not_known_without_metadata(tmp_path: Path) -> None:
-    bag = write(tmp_path / "bag", 1000, max_file_size=40_000)
-    (bag / "bag_2.mcap").unlink()
-    document = yaml.safe_load((bag / "metadata.yaml").read_text())
+def test_the_time_of_a_missing_last_file_is_not_known_without_metadata(split: Path) -> None:
+    (split / "bag_2.mcap").unlink()
+    document = yaml.safe_load((split / "metadata.yaml").read_text())
     del document["rosbag2_bagfile_information"]["duration"]
-    (bag / "metadata.yaml").write_text(yaml.safe_dump(document))
-    recovery = recover_bag(bag)
+    (split / "metadata.yaml").write_text(yaml.safe_dump(document))
+    recovery = recover_bag(split)
     assert recovery.seconds_lost is None
     assert "bag_2.mcap (it is missing)" in recovery.lost
 
 
-def test_a_damaged_index_costs_nothing_and_no_file_behind_it(tmp_path: Path) -> None:
-    bag = write(tmp_path / "bag", 1000, max_file_size=40_000)
+def test_a_damaged_index_costs_nothing_and_no_file_behind_it(split: Path) -> None:
     for name in ("bag_0.mcap", "bag_2.mcap"):
-        data = bytearray((bag / name).read_bytes())
+        data = bytearray((split / name).read_bytes())
         data[-60] ^= 1
-        (bag / name).write_bytes(data)
-    recovery = recover_bag(bag)
+        (split / name).write_bytes(data)
+    recovery = recover_bag(split)
     assert (recovery.lost, recovery.seconds_lost, recovery.left_out) == ("", 0.0, [])
-    assert numbers(bag) == list(range(1000))
-
-
-@pytest.mark.parametrize("bit", range(8))
-def test_a_chunk_whose_type_is_wrong_is_damage(tmp_path: Path, bit: int) -> None:
-    """Readers pass over a record of a type that they do not know."""
-    bag = write(tmp_path / "bag")
-    file = bag / "bag_0.mcap"
-    with file.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    chunks = summary.chunk_indexes
-    data = bytearray(file.read_bytes())
-    data[chunks[3].chunk_start_offset] ^= 1 << bit
-    file.write_bytes(data)
-    recover_bag(bag)
-    before = (chunks[3].message_start_time - START) // STEP
-    assert numbers(bag) == list(range(before))
+    assert numbers(split) == list(range(SPLIT))
 
 
 @pytest.mark.parametrize("compression", ["none", "zstd"])
-def test_a_chunk_whose_header_is_zero_is_not_an_empty_one(tmp_path: Path, compression: str) -> None:
+def test_a_chunk_whose_type_or_header_is_wrong_is_damage(tmp_path: Path, compression: str) -> None:
+    """Readers pass over a record of a type that they do not know, and over an empty chunk."""
     bag = write(tmp_path / "bag", compression=compression)
     file = bag / "bag_0.mcap"
     with file.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
     chunk = summary.chunk_indexes[3]
-    data = bytearray(file.read_bytes())
-    begin = chunk.chunk_start_offset + 9
-    data[begin : begin + 48] = bytes(48)
-    file.write_bytes(data)
-    recover_bag(bag)
-    assert numbers(bag) == list(range((chunk.message_start_time - START) // STEP))
+    whole, start = file.read_bytes(), chunk.chunk_start_offset
+    types = [bytes([whole[start] ^ 1 << bit]) + whole[start + 1 : start + 57] for bit in (0, 3, 7)]
+    for head in (*types, whole[start : start + 9] + bytes(48)):
+        file.write_bytes(whole[:start] + head + whole[start + 57 :])
+        recover_bag(bag)
+        assert numbers(bag) == list(range((chunk.message_start_time - START) // STEP))
 
 
-@pytest.mark.parametrize("bit", [0, 1, 2, 6, 7, 8, 15, 24, 30, 63])
+@pytest.mark.parametrize("bit", [0, 6, 8, 63])
 def test_a_message_whose_length_is_wrong_is_damage(tmp_path: Path, bit: int) -> None:
     """Without chunks all that tells where a message ends is the length before it."""
-    bag = write_unchunked(tmp_path / "bag")
+    bag = write_unchunked(tmp_path / "bag", 60)
     file = bag / "bag_0.mcap"
     data = bytearray(file.read_bytes())
-    place = data.index(payload(100)) - 30
+    place = data.index(payload(40)) - 30
     data[place + bit // 8] ^= 1 << bit % 8
     file.write_bytes(data)
     with pytest.raises(UserError, match="recover"), BagDirectory(bag) as directory:
         list(directory.messages(lambda _: True))
     recover_bag(bag)
-    assert numbers(bag) == list(range(100))
+    assert numbers(bag) == list(range(40))
 
 
 def test_the_time_of_a_message_that_the_index_contradicts_is_damage(tmp_path: Path) -> None:
-    bag = write_unchunked(tmp_path / "bag")
+    bag = write_unchunked(tmp_path / "bag", 60)
     file = bag / "bag_0.mcap"
     data = bytearray(file.read_bytes())
-    data[data.index(payload(100)) - 9] ^= 1
+    data[data.index(payload(40)) - 9] ^= 1
     file.write_bytes(data)
     assert "a message is not of the recording's time" in recover_bag(bag).lost
-    assert numbers(bag) == list(range(100))
+    assert numbers(bag) == list(range(40))
 
 
 def test_zeros_in_images_are_no_chunks(tmp_path: Path) -> None:

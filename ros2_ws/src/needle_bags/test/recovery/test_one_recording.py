@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from needle_analysis.report import report
-from needle_analysis.ros import rerun
 from needle_bags.reading.bag_files import read_contents
 from needle_bags.recovery import recover
 from needle_bags.recovery.bag_recovery import recover_bag
@@ -18,8 +15,7 @@ from needle_core.files.bag_path import recording_files
 
 from .numbered_bag import RUN, contents, damage, kill, numbers, write
 
-MakeRun = Callable[..., Path]
-REGRESSION = Path(__file__).resolve().parents[5] / "bags/regression/regression_0.mcap"
+OTHER = {"commit": "7654def", "run_info": "seed: 4"}
 
 
 def put(folder: Path, *bags: tuple[Path, str]) -> Path:
@@ -30,45 +26,39 @@ def put(folder: Path, *bags: tuple[Path, str]) -> Path:
     return folder
 
 
-def test_two_recordings_in_one_folder_are_not_merged(
-    tmp_path: Path, make_run: MakeRun, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = put(tmp_path / "dl", (make_run(), "monday.mcap"), (REGRESSION.parent, "tuesday.mcap"))
-    before = contents(folder)
-    for act in (report, recover):
-        assert act.main([str(folder)]) == 2
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1
-        assert "two recordings in one folder (monday.mcap, tuesday.mcap)" in said
-        assert "give each a folder of its own, or name one of the files" in said
-    assert contents(folder) == before
+@pytest.fixture
+def stranger(tmp_path: Path) -> Path:
+    """A recording of another run, days later."""
+    return write(tmp_path / "stranger", 90, first=30_000_000, run=OTHER)
 
 
-def test_one_file_is_read_alone(
-    tmp_path: Path, make_run: MakeRun, capsys: pytest.CaptureFixture[str]
+def test_two_recordings_in_one_folder_are_not_merged_but_each_is_read_alone(
+    tmp_path: Path, stranger: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = put(tmp_path / "dl", (make_run(), "mon.day.mcap"), (REGRESSION.parent, "tuesday.mcap"))
+    bag = write(tmp_path / "bag", 90)
+    folder = put(tmp_path / "dl", (bag, "mon.day.mcap"), (stranger, "tuesday.mcap"))
     before = contents(folder)
-    assert report.main([str(folder / "mon.day.mcap")]) == 0
-    assert (folder / "mon.day_report" / "report.html").is_file()
-    assert rerun.main([str(folder / "tuesday.mcap")]) == 0
-    assert "UNCHANGED" in capsys.readouterr().out
+    assert recover.main([str(folder)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "two recordings in one folder (mon.day.mcap, tuesday.mcap)" in said
+    assert "give each a folder of its own, or name one of the files" in said
+    alone, whole = read_contents(folder / "tuesday.mcap"), read_contents(stranger)
+    assert alone.topics == whole.topics
+    assert alone.counts == +whole.counts
+    assert whole.custom_data.items() <= alone.custom_data.items()
+    assert (alone.start, alone.end, alone.distribution) == (whole.start, whole.end, "jazzy")
     assert contents(folder) == before
-    alone, bag = read_contents(folder / "tuesday.mcap"), read_contents(REGRESSION.parent)
-    assert alone.topics == bag.topics
-    assert alone.counts == +bag.counts
-    assert alone.custom_data == bag.custom_data
-    assert (alone.start, alone.end, alone.distribution) == (bag.start, bag.end, bag.distribution)
 
 
 @pytest.mark.parametrize("harm", ["nothing", "metadata", "data"])
 def test_a_stranger_beside_a_bag_is_named_and_left(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], harm: str
+    tmp_path: Path, stranger: Path, capsys: pytest.CaptureFixture[str], harm: str
 ) -> None:
     """Without metadata.yaml, the bag is the files that are called as its folder."""
     path = write(tmp_path / "bag", max_file_size=20_000)
-    put(path, (REGRESSION.parent, "a_stranger.mcap"))
-    stranger = (path / "a_stranger.mcap").read_bytes()
+    put(path, (stranger, "a_stranger.mcap"))
+    data = (path / "a_stranger.mcap").read_bytes()
     if harm == "metadata":
         (path / "metadata.yaml").unlink()
     elif harm == "data":
@@ -77,7 +67,7 @@ def test_a_stranger_beside_a_bag_is_named_and_left(
     said = capsys.readouterr().out
     assert "left out: a_stranger.mcap: not of this bag (it begins " in said
     assert "days after the bag, another commit, another run_info)" in said
-    assert (path / "a_stranger.mcap").read_bytes() == stranger
+    assert (path / "a_stranger.mcap").read_bytes() == data
     kept = numbers(path)
     assert kept == list(range(len(kept)))
     assert len(kept) == 300 or (harm == "data" and len(kept) > 200)
@@ -85,7 +75,7 @@ def test_a_stranger_beside_a_bag_is_named_and_left(
 
 
 def test_a_stranger_that_is_not_whole_is_named_too(tmp_path: Path) -> None:
-    path = write(tmp_path / "bag")
+    path = write(tmp_path / "bag", 30)
     (path / "notes.mcap").write_bytes(b"no MCAP file")
     (path / "._bag_0.mcap").write_bytes(b"another system's notes of bag_0.mcap")
     recovery = recover_bag(path)
@@ -93,9 +83,9 @@ def test_a_stranger_that_is_not_whole_is_named_too(tmp_path: Path) -> None:
     assert recovery.left_out == ["notes.mcap: not of this bag (not whole)"]
 
 
-def test_a_killed_file_among_others_is_made_whole_alone(tmp_path: Path) -> None:
+def test_a_killed_file_among_others_is_made_whole_alone(tmp_path: Path, stranger: Path) -> None:
     killed = kill(write(tmp_path / "killed"))
-    folder = put(tmp_path / "dl", (killed, "a.mcap"), (REGRESSION.parent, "b.mcap"))
+    folder = put(tmp_path / "dl", (killed, "a.mcap"), (stranger, "b.mcap"))
     before = contents(folder)
     with pytest.raises(UserError, match=r"recover .*/dl/a\.mcap`$"):
         read_contents(folder / "a.mcap")
@@ -133,22 +123,17 @@ def test_a_file_of_a_bag_is_recovered_with_its_bag(tmp_path: Path) -> None:
     assert 0 < len(numbers(path)) < 300
 
 
-OTHER = {"commit": "7654def", "run_info": "seed: 4"}
-
-
 @pytest.mark.parametrize(
-    ("first", "run", "words"),
+    ("first", "run", "is_killed", "words"),
     [
-        (400, RUN, "x_1.mcap is the beginning of a recording"),
-        (0, {}, "x_1.mcap begins 3.0 s before x_0.mcap ends"),
-        (100, {}, "x_1.mcap begins 2.0 s before x_0.mcap ends"),
-        (30_000_000, {}, "x_1.mcap begins 3.5 days after x_0.mcap ends"),
-        (10_000, {}, "x_1.mcap begins 97.0 s after x_0.mcap ends"),
+        (400, RUN, False, "x_1.mcap is the beginning of a recording"),
+        (100, {}, True, "x_1.mcap begins 2.0 s before x_0.mcap ends"),
+        (10_000, {}, False, "x_1.mcap begins 97.0 s after x_0.mcap ends"),
+        (30_000_000, {}, True, "x_1.mcap begins 3.5 days after x_0.mcap ends"),
     ],
 )
-@pytest.mark.parametrize("is_killed", [False, True])
 def test_one_stem_of_two_recordings_is_not_merged(
-    tmp_path: Path, first: int, run: dict[str, str], words: str, is_killed: bool
+    tmp_path: Path, first: int, run: dict[str, str], is_killed: bool, words: str
 ) -> None:
     one, two = write(tmp_path / "one"), write(tmp_path / "two", first=first, run=run)
     if is_killed:
@@ -162,10 +147,8 @@ def test_one_stem_of_two_recordings_is_not_merged(
 
 def test_another_run_is_told_by_what_ends_its_file(tmp_path: Path) -> None:
     """The last file of a recording has no record of its own of the run, but all of the bag's."""
-    one, two = (
-        write(tmp_path / "one"),
-        write(tmp_path / "two", first=300, run=OTHER, max_file_size=30_000),
-    )
+    one = write(tmp_path / "one")
+    two = write(tmp_path / "two", first=300, run=OTHER, max_file_size=30_000)
     folder = put(tmp_path / "dl", (one, "x_0.mcap"))
     shutil.copyfile(max(two.glob("*.mcap")), folder / "x_1.mcap")
     with pytest.raises(UserError, match=r"x_1\.mcap has another commit, another run_info"):
@@ -181,7 +164,7 @@ def test_a_damaged_file_is_not_followed_by_another_recording(tmp_path: Path) -> 
 
 
 def test_metadata_that_name_none_of_the_files(tmp_path: Path) -> None:
-    path = write(tmp_path / "bag")
+    path = write(tmp_path / "bag", 30)
     (path / "bag_0.mcap").rename(path / "monday.mcap")
     before = contents(path)
     with pytest.raises(UserError, match=r"nothing comes before bag_0\.mcap \(it is missing\)"):
@@ -189,25 +172,18 @@ def test_metadata_that_name_none_of_the_files(tmp_path: Path) -> None:
     assert contents(path) == before
 
 
-@pytest.mark.parametrize(
-    ("names", "found"),
-    [
-        (
-            ["bag_0.mcap", "bag_10.mcap", "bag_2.mcap"],
-            ["bag_0.mcap", "bag_1.mcap", "bag_2.mcap", "bag_3.mcap", "bag_10.mcap"],
-        ),
-        (["x.mcap", "bag_3.mcap"], ["bag_3.mcap"]),
-        (["x_1.mcap.zstd", "x_1.mcap", "x_2.mcap.zstd"], ["x_1.mcap", "x_2.mcap.zstd"]),
-        (
-            ["x_0.mcap.damaged", "._x_0.mcap", "x_0.db3", "2026-03-01_10-20-30_x.mcap"],
-            ["2026-03-01_10-20-30_x.mcap"],
-        ),
-        ([], []),
-    ],
-)
-def test_files_of_a_recording(tmp_path: Path, names: list[str], found: list[str]) -> None:
-    folder = tmp_path / "bag"
-    folder.mkdir()
-    for name in names:
-        (folder / name).write_bytes(b"")
-    assert [file.name for file in recording_files(folder)] == found
+def test_files_of_a_recording(tmp_path: Path) -> None:
+    dated = "2026-03-01_10-20-30_x.mcap"
+    table = {
+        "bag_0.mcap bag_10.mcap bag_2.mcap": [*(f"bag_{n}.mcap" for n in (0, 1, 2, 3, 10))],
+        "x.mcap bag_3.mcap": ["bag_3.mcap"],
+        "x_1.mcap.zstd x_1.mcap x_2.mcap.zstd": ["x_1.mcap", "x_2.mcap.zstd"],
+        f"x_0.mcap.damaged ._x_0.mcap x_0.db3 {dated}": [dated],
+        "": [],
+    }
+    for number, (names, found) in enumerate(table.items()):
+        folder = tmp_path / str(number) / "bag"
+        folder.mkdir(parents=True)
+        for name in names.split():
+            (folder / name).write_bytes(b"")
+        assert [file.name for file in recording_files(folder)] == found

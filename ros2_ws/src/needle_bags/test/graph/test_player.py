@@ -1,0 +1,280 @@
+"""The player before a played graph: what it plays under which name when, and never to a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.interfaces import Qos, QosDurability, QosReliability
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Joy
+from std_msgs.msg import Bool, Int32, String
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory
+
+from needle_bags.format.bag_metadata import USUAL_QOS
+from needle_bags.format.bag_writer import BagWriter
+from needle_bags.format.message_definitions import full_definition
+from needle_bags.player.terminal_keys import FASTER, ON, PAUSE, Keys
+from needle_bags.ros import player as node
+from needle_core.files.bag_topic import BagTopic
+
+from .played_graph import STORE, PlayedGraph, type_name
+
+START = 1_700_000_000_000_000_000
+KEPT = USUAL_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
+UNSURE = USUAL_QOS._replace(reliability=QosReliability.BEST_EFFORT)
+GUARDED: dict[str, type] = {
+    "/device/joint_trajectory": JointTrajectory,
+    "/device/hold": Joy,
+    "/device/estop": Bool,
+    "/target_plane": PoseStamped,
+}
+OFFERS: dict[str, tuple[type, Qos]] = {
+    "/plane": (String, KEPT),
+    "/numbered": (Int32, USUAL_QOS),
+    "/noisy": (Int32, UNSURE),
+    "/clock": (Clock, USUAL_QOS),
+    **{topic: (kind, USUAL_QOS) for topic, kind in GUARDED.items()},
+}
+# Topics that cannot be played here: another distribution's definition, an unknown type.
+OTHERWISE = {"/old": "std_msgs/msg/Header", "/odd": "no_msgs/msg/Such"}
+COUNT = 20
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twenty messages of each topic, a second apart; one is latched and comes at once."""
+    path = tmp_path_factory.mktemp("player") / "bag"
+    writer = BagWriter(path)
+    numbers = {}
+    for name, (kind, qos) in OFFERS.items():
+        told = type_name(kind)
+        topic = BagTopic(name, told, full_definition(told), STORE.hash_rihs01(told), (qos,))
+        numbers[name] = writer.add_topic(topic)
+    for name, told in OTHERWISE.items():
+        unknown = writer.add_topic(BagTopic(name, told, "uint32 seq\n"))
+        writer.write(unknown, bytes([0, 1, 0, 0, 0, 0, 0, 0]), START, START)
+    for second in range(COUNT):
+        for name, (kind, _) in OFFERS.items():
+            if name != "/plane" or not second:
+                message = Int32(data=second) if kind is Int32 else kind()
+                time = START + second * 10**9
+                writer.write(numbers[name], serialize_message(message), time, time)
+    writer.close()
+    return path
+
+
+class AtOnce:
+    """Reads as much ahead as is asked for."""
+
+    def __init__(self, make: Callable[[], Iterator[Any]]) -> None:
+        self._items = make()
+
+    def next(self) -> Any:
+        return next(self._items, None)
+
+    def close(self) -> None:
+        """Nothing runs."""
+
+
+class Scene(PlayedGraph):
+    """A player and its graph."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, bag: Path) -> None:
+        super().__init__(monkeypatch, node)
+        self.bag = bag
+        self.ended = SimpleNamespace(wanted=False)
+        self.pressed: list[str] = []
+
+        def run_node(create: Any, *, spin: Any, args: list[str], **_: object) -> int:
+            return int(spin(create(), self.ended))
+
+        monkeypatch.setattr(node, "run_node", run_node)
+        monkeypatch.setattr(node, "NodeParameters", lambda *_: None)
+        monkeypatch.setattr(node, "SingleThreadedExecutor", self.executor)
+        monkeypatch.setattr(node, "ReadAhead", AtOnce)
+        monkeypatch.setattr(Keys, "pressed", lambda _: self._take_keys())
+
+    def _take_keys(self) -> list[str]:
+        taken, self.pressed = self.pressed, []
+        return taken
+
+    def play(self, options: str = "") -> int:
+        return node.main(["player", str(self.bag), *options.split()])
+
+    def change(self, **values: float) -> None:
+        self.set_parameters([Parameter(name, value=value) for name, value in values.items()])
+
+    def pause(self, paused: bool) -> str:
+        answer = self.services["~/pause"](SetBool.Request(data=paused), SetBool.Response())
+        return str(answer.message)
+
+    def when(self, number: int, act: Callable[[], Any]) -> None:
+        """Do something right after a number was played, once."""
+        self.at(0.0, lambda: self._look(number, act))
+
+    def _look(self, number: int, act: Callable[[], Any]) -> None:
+        if number in self.numbers("/numbered"):
+            act()
+        else:
+            self.when(number, act)
+
+    def numbers(self, topic: str) -> list[int]:
+        return [deserialize_message(data, Int32).data for data in self.heard[topic]]
+
+    def offered(self) -> set[str]:
+        return {one.topic_name for one in self.publishers} - {"/diagnostics"}
+
+
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch, bag: Path) -> Scene:
+    return Scene(monkeypatch, bag)
+
+
+def test_all_is_played_but_nothing_that_a_rig_obeys(
+    scene: Scene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begin = scene.now
+    assert scene.play() == 0
+    assert f"played {1 + 7 * COUNT} messages" in capsys.readouterr().out
+    assert scene.now - begin == pytest.approx(node.DISCOVERY + COUNT - 1, abs=0.2)
+    assert scene.numbers("/numbered") == scene.numbers("/noisy") == list(range(COUNT))
+    for topic in GUARDED:
+        assert topic not in scene.heard
+        assert len(scene.heard[f"/replay{topic}"]) == COUNT
+    assert not scene.offered() & GUARDED.keys()
+    qos = {one.topic_name: one.qos for one in scene.publishers}
+    assert qos["/plane"].durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert qos["/noisy"].reliability == ReliabilityPolicy.BEST_EFFORT
+    old, odd = scene.logged
+    assert "/old is not played: std_msgs/msg/Header is defined otherwise" in old
+    assert "/odd is not played: the definition of no_msgs/msg/Such is not installed" in odd
+
+
+def test_part_of_a_bag_under_another_name_at_another_rate(scene: Scene) -> None:
+    begin = scene.now
+    options = "--start 2 --end 7 --rate 0.5 --topics numbered --remap numbered:=other --clock 10"
+    assert scene.play(options) == 0
+    assert scene.numbers("/other") == list(range(2, 8))
+    assert scene.offered() == {"/other", "/clock"}
+    assert scene.now - begin == pytest.approx(node.DISCOVERY + 10.0, abs=0.2)
+    # The clock is that of recording, at 10 Hz of the wall's.
+    stamps = [message.clock.sec for message in scene.heard["/clock"]]
+    assert 80 < len(stamps) <= 101
+    assert stamps[-1] - START // 10**9 == pytest.approx(7, abs=1)
+
+
+def test_paused_a_latched_message_is_there_and_loops_go_on_until_the_end(scene: Scene) -> None:
+    def begin() -> None:
+        # The latched message lies before --start: who joins late gets it all the same.
+        assert len(scene.heard["/plane"]) == 1
+        assert scene.heard["/numbered"] == []
+        assert scene.pause(False) == "playing"
+
+    def stop() -> None:
+        scene.ended.wanted = True
+
+    scene.at(9.0, begin)
+    scene.at(9.0 + 2.5 * (COUNT - 5), stop)
+    assert scene.play("--paused --loop --start 5") == 0
+    heard = scene.numbers("/numbered")
+    assert heard[: 2 * COUNT - 9] == [*range(5, COUNT), *range(5, COUNT), 5][: 2 * COUNT - 9]
+    assert len(heard) > 2 * COUNT - 10
+
+
+def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
+    scene.when(0, lambda: scene.change(seek=15.0))
+    scene.when(15, lambda: scene.change(seek=4.0))
+    scene.when(4, lambda: scene.change(seek=4.0))
+    # From 4 five seconds on; then a pause that takes no time of the bag's.
+    scene.when(5, lambda: scene.pressed.append(ON))
+    scene.when(11, lambda: scene.pressed.append(PAUSE))
+    scene.when(11, lambda: scene.at(10.0, lambda: scene.pressed.extend([PAUSE, FASTER])))
+    assert scene.play("--regex ^/n|plane --exclude-regex noisy") == 0
+    assert scene.numbers("/numbered") == [0, 15, 4, 4, 5, *range(11, COUNT)]
+    assert scene.offered() == {"/numbered", "/plane", "/replay/target_plane"}
+    # At each jump the latched message is sent again, to who has joined.
+    assert len(scene.heard["/plane"]) == 1 + 4
+
+
+def test_beside_a_rig_all_is_under_replay(scene: Scene) -> None:
+    scene.at(1.5, lambda: scene.offer("/device/status", DiagnosticStatus, node="device_driver"))
+    assert scene.play("--clock") == 0
+    assert any("all is played under /replay" in line for line in scene.logged)
+    assert all(topic.startswith("/replay/") for topic in scene.offered())
+    assert scene.numbers("/replay/numbered") == list(range(COUNT))
+    assert not scene.heard.keys() - {"/diagnostics"} - scene.offered()
+
+
+def test_a_rig_that_comes_up_ends_the_playing(
+    scene: Scene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # One of its own, replayed, is none.
+    scene.offer("/replay/device/status", DiagnosticStatus, node="other_player")
+    topic = "/bench/device/status"
+    scene.when(3, lambda: scene.offer(topic, DiagnosticStatus, node="device_driver"))
+    assert scene.play() == 1
+    assert f"device_driver publishes {topic}" in capsys.readouterr().err
+    assert scene.numbers("/numbered") == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("played", "remapped", "options"),
+    [
+        ("/replay/device/hold", "/device/hold", ""),
+        ("/numbered", "/device/estop", ""),
+        ("/numbered", "/target_plane", "--topics numbered"),
+    ],
+)
+def test_a_ros_remapping_does_not_reach_a_rig_either(
+    scene: Scene,
+    played: str,
+    remapped: str,
+    options: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    scene.remaps = {played: remapped}
+    assert scene.play(options) == 2
+    assert f"as {remapped}: a rig would obey it" in capsys.readouterr().err
+    assert scene.heard.keys() <= {"/diagnostics"}
+
+
+def test_who_listens_already_is_waited_for(scene: Scene) -> None:
+    begun: list[float] = []
+    scene.request("/numbered", Int32)
+    scene.unmatched.add("/numbered")
+    end, begin = node.DISCOVERY + 0.8 * node.MATCHING, scene.now
+    scene.at(end, scene.unmatched.clear)
+    scene.when(0, lambda: begun.append(scene.now - begin))
+    assert scene.play("--topics numbered") == 0
+    assert begun == [pytest.approx(end, abs=0.2)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("{bag}/nothing", "no such bag directory"),
+        ("{bag} --topics nonsense", "/nonsense is not in"),
+        ("{bag} --start 30", "--start 30 s"),
+        ("{bag} --rate fast", "invalid float value"),
+        ("{bag} --regex (", "is not a regular expression"),
+        ("{bag} --regex nonsense", "no topic is chosen; it has /plane"),
+        ("{bag} --topics odd", "none of its topics can be played"),
+    ],
+)
+def test_what_cannot_be_played_is_one_line(
+    scene: Scene, capsys: pytest.CaptureFixture[str], arguments: str, words: str
+) -> None:
+    assert node.main(["player", *arguments.format(bag=scene.bag).split()]) == 2
+    errors = capsys.readouterr().err
+    assert words in errors
+    assert errors.count("\n") == 1

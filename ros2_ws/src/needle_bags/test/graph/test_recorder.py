@@ -1,0 +1,290 @@
+"""The recorder before a played graph: what its bag holds, what it says, and how it ends."""
+
+from __future__ import annotations
+
+import errno
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from mcap.writer import Writer
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.parameter import Parameter
+from rosbags.interfaces import QosDurability, QosReliability
+from std_msgs.msg import Int32, String
+from std_srvs.srv import Trigger
+
+from needle_bags.format.bag_writer import BagWriter
+from needle_bags.reading.bag_files import read_contents, read_messages
+from needle_bags.recording.free_space import FreeSpace
+from needle_bags.recording.recording import Recording
+from needle_bags.recording.worker import Do, Job
+from needle_bags.ros import graph_topics, question
+from needle_bags.ros import recorder as node
+from needle_bags.ros.recorder_parameters import RecorderParameters
+from needle_core.errors import UserError
+
+from .played_graph import BEST_EFFORT, LATCHED, PlayedGraph
+
+EVENTS, STATUS = "/parameter_events", "/bench/device/status"
+
+
+class AtOnce:
+    """A worker that does each job where it is put."""
+
+    waiting = 0
+
+    def __init__(self, do: Do, end: Job) -> None:
+        self._do, self._ends = do, [end]
+
+    def put(self, job: Job) -> None:
+        self._do(job)
+
+    def finish(self) -> None:
+        while self._ends:
+            self._ends.pop()()
+
+
+class Scene(PlayedGraph):
+    """A recorder that begins and ends when the test says so."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+        super().__init__(monkeypatch, node, graph_topics, question)
+        self.bag = folder / "bag"
+
+        def begin(bag: Path, *, reserve: int, **how: Any) -> Recording:
+            writer, space = BagWriter(bag, **how), FreeSpace(bag, reserve)
+            return Recording(writer, space, AtOnce, clock=lambda: self.now)
+
+        monkeypatch.setattr(node, "open_recording", begin)
+        monkeypatch.setattr(node, "commit", lambda: "0123abc")
+        self._patch = partial(monkeypatch.setattr, node)
+
+    def record(self, act: Callable[[], None], **settings: Any) -> int:
+        """Run the executable; `act` is what happens between its start and the signal."""
+        self._patch(
+            "NodeParameters",
+            lambda *_: SimpleNamespace(
+                values=RecorderParameters(bag=str(self.bag), reserve=0, **settings)
+            ),
+        )
+        ended = SimpleNamespace(wanted=False)
+
+        def act_and_end() -> None:
+            act()
+            ended.wanted = True
+
+        self.at(0.3, act_and_end)
+
+        def run_node(create: Any, *, spin: Any, **_: object) -> int:
+            return int(spin(create(), ended))
+
+        self._patch("run_node", run_node)
+        self._patch("SingleThreadedExecutor", self.executor)
+        return node.main()
+
+    def health(self, part: str) -> DiagnosticStatus:
+        """Return what it said last of a part."""
+        told = [s for message in self.heard["/diagnostics"] for s in message.status]
+        return [s for s in told if s.name == f"recorder: {part}"][-1]
+
+    def numbers(self, topic: str) -> list[int]:
+        return [message.data for _, _, message in read_messages(self.bag, topic.__eq__)]
+
+
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Scene:
+    return Scene(monkeypatch, tmp_path)
+
+
+def test_all_that_is_sent_is_in_the_bag_with_what_repeats_the_run(
+    scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration = tmp_path / "calibration.yaml"
+    calibration.write_text("phantom: {}\n")
+    scene.parameters["/source"] = {"gain": 1.5}
+    scene.offer("/state", String, LATCHED)
+    scene.offer("/numbered", Int32)
+    scene.offer("/tracker/annotated_image", Int32)
+    scene.offer(EVENTS, ParameterEvent)
+
+    def act() -> None:
+        scene.answer_all()
+        scene.run(0.1)
+        scene.send("/state", String(data="once"))
+        scene.send("/numbered", *(Int32(data=number) for number in range(200)))
+        event = ParameterEvent(node="/source")
+        event.changed_parameters = [Parameter("gain", value=2.5).to_parameter_msg()]
+        scene.send(EVENTS, event)
+        scene.offer("/rig/late", Int32, BEST_EFFORT)
+        scene.run(0.1)
+        # What comes after the signal is waited for.
+        scene.at(0.1, lambda: scene.send("/rig/late", Int32(data=1)))
+        scene.at(0.35, lambda: scene.send("/rig/late", Int32(data=2)))
+
+    assert scene.record(act, calibration_file=str(calibration), run_info="seed: 4") == 0
+    assert f"recorded 204 messages of 4 topics into {scene.bag}" in capsys.readouterr().out
+    assert scene.numbers("/numbered") == list(range(200))
+    assert scene.numbers("/rig/late") == [1, 2]
+    contents = read_contents(scene.bag)
+    qos = {name: topic.offered_qos[0] for name, topic in contents.topics.items()}
+    assert qos["/state"].durability is QosDurability.TRANSIENT_LOCAL
+    assert qos["/rig/late"].reliability is QosReliability.BEST_EFFORT
+    custom = contents.custom_data
+    assert (custom["calibration"], custom["run_info"]) == ("phantom: {}\n", "seed: 4")
+    assert yaml.safe_load(custom["parameters"])["/source"] == {"ros__parameters": {"gain": 1.5}}
+    (change,) = yaml.safe_load(custom["parameter_changes"])
+    assert (change["node"], change["name"], change["value"]) == ("/source", "gain", 2.5)
+    data = (scene.bag / "bag_0.mcap").read_bytes()
+    assert all(text in data for text in (b"gain: 1.5", b"parameter_change", b"0123abc"))
+    assert scene.health("parameters_of").message == "/recorder, /source"
+
+
+def test_what_cannot_be_understood_is_told_recorded_and_ends_nothing(scene: Scene) -> None:
+    scene.offer(EVENTS, ParameterEvent)
+    malformed = (b"\0\1\0\0" + bytes(8) + b"\xff\xff\xff\x7fmore", b"\xff" * 8)
+
+    def strange() -> None:
+        raise ValueError("a service's bytes")
+
+    scene.at(0.25, strange)
+
+    def act() -> None:
+        scene.send(EVENTS, *malformed)
+        scene.run(1.0)
+
+    assert scene.record(act) == 0
+    said = scene.health("input")
+    assert said.level == DiagnosticStatus.WARN
+    assert {pair.key: pair.value for pair in said.values} == {
+        EVENTS: "2",
+        "a service or the graph": "1",
+    }
+    assert "a service's bytes" in said.message
+    assert read_contents(scene.bag).counts[EVENTS] == 2
+    assert len(scene.logged) == 3
+
+
+def test_a_disk_that_fills_ends_the_recording_and_nothing_else(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene.offer("/numbered", Int32)
+    write, written = Writer.add_message, iter(range(6))
+
+    def full_after_six(*given: Any) -> None:
+        if next(written, None) is None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(*given)
+
+    monkeypatch.setattr(Writer, "add_message", full_after_six)
+
+    def act() -> None:
+        scene.send("/numbered", *(Int32(data=number) for number in range(5)))
+        scene.run(0.2)
+        # The first of these has all before it written out, the second meets the full disk.
+        scene.send("/numbered", *(Int32(data=number) for number in range(5, 9)))
+        scene.run(0.5)
+        # It listens to nothing more.
+        assert scene.subscriptions == []
+        scene.run(0.5)
+
+    assert scene.record(act) == 1
+    said = scene.health("bag")
+    assert said.level == DiagnosticStatus.ERROR
+    assert f"cannot write {scene.bag}/bag_0.mcap: No space left on device" in said.message
+    assert sum("recording ended" in line for line in scene.logged) == 1
+    errors = capsys.readouterr().err
+    assert "the bag is whole up to there" in errors
+    assert 'messages lost: {"/numbered": 3}' in errors
+    assert scene.numbers("/numbered") == [0, 1, 2, 3, 4, 5]
+    custom = read_contents(scene.bag).custom_data
+    assert "No space left" in custom["recording_ended"]
+    assert json.loads(custom["messages_lost"]) == {"/numbered": 3}
+
+
+def test_snapshots_when_asked_and_a_second_after_a_fault(scene: Scene) -> None:
+    scene.offer("/plane", Int32, LATCHED)
+    scene.offer("/numbered", Int32)
+    scene.offer(STATUS, DiagnosticStatus, LATCHED)
+    answer = Trigger.Response()
+
+    def say(state: str) -> None:
+        values = [KeyValue(key="state", value=state)]
+        scene.send(STATUS, DiagnosticStatus(values=values))
+
+    def act() -> None:
+        scene.send("/plane", Int32(data=7))
+        say("HOLDING")
+        # More than fits: the first go, the latched ones stay.
+        scene.send("/numbered", *(Int32(data=number) for number in range(1400)))
+        scene.run(0.5)
+        assert not int({p.key: p.value for p in scene.health("bag").values}["messages"])
+        scene.services["~/snapshot"](Trigger.Request(), answer)
+        scene.send("/numbered", Int32(data=-1))
+        scene.send(STATUS, b"\xff\xff\xff")
+        say("FAULT")
+        scene.run(0.9)
+        scene.send("/numbered", Int32(data=-2))
+        scene.run(0.5)
+        # No fault is left to be told.
+        scene.send("/numbered", Int32(data=-3))
+        say("FAULT")
+
+    settings = {"snapshot_seconds": 600.0, "snapshot_size": 1_000_000}
+    assert scene.record(act, **settings) == 0
+    assert answer.success
+    assert "asked for" in answer.message
+    kept = scene.numbers("/numbered")
+    assert kept[0] > 150
+    assert kept == [*range(kept[0], 1400), -1, -2]
+    assert scene.numbers("/plane") == [7]
+    assert read_contents(scene.bag).counts[STATUS] == 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "chosen"),
+    [
+        ({}, {"/rig/one", "/rig/two", "/other"}),
+        (
+            {"topics": ("a/annotated_image",), "regex": "^/rig/", "exclude_regex": "two|view"},
+            {"/rig/one", "/a/annotated_image"},
+        ),
+    ],
+)
+def test_pictures_are_left_out_and_topics_chosen(settings: Any, chosen: set[str]) -> None:
+    choice = RecorderParameters(**settings).choice
+    topics = ("/a/annotated_image", "/rig/live_view/path", "/rig/one", "/rig/two", "/other")
+    assert {topic for topic in topics if topic in choice} == chosen
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"regex": "("}, "is not a regular expression"),
+        ({"topics": (1, 2)}, "are not names"),
+        ({"compression": "lz4"}, "compression = 'lz4'"),
+        ({"snapshot_size": 10}, "snapshot_size = 10"),
+    ],
+)
+def test_bad_parameters_are_one_line(settings: Any, words: str) -> None:
+    with pytest.raises(UserError) as caught:
+        RecorderParameters(**settings)
+    assert words in str(caught.value)
+
+
+def test_a_recorder_that_cannot_start_leaves_a_bag_that_is_whole(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("no graph")
+
+    monkeypatch.setattr(node, "ParameterSnapshots", broken)
+    with pytest.raises(RuntimeError, match="no graph"):
+        scene.record(lambda: None)
+    assert not read_contents(scene.bag).counts
