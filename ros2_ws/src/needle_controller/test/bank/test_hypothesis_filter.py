@@ -92,7 +92,7 @@ def test_covariance_is_honest_for_gaussian_noise() -> None:
     rng = np.random.default_rng(7)
     std, count = 0.0005, 40
     squares = []
-    for _ in range(60):
+    for _ in range(18):
         yaw, pitch = rng.normal(0.0, settings.initial_angle_std, 2)
         roll = rng.normal(0.0, roll_std)
         turns = turns_for(count, seed=int(rng.integers(1 << 30)))

@@ -53,47 +53,41 @@ def test_exact_tips_give_the_exact_curvature(known: bool) -> None:
     ],
 )
 def test_60_mm_of_noisy_tips(settings: CurvatureFitSettings, known: bool) -> None:
-    """2,500 seeds: the spread is at most 6.5 %, the bias at most 0.5 %, the interval honest.
-
-    With the entry unknown, 1 / kappa, being skewed, spreads by 0.1 % more than kappa.
-    """
+    """Of 2,500 seeds the spread is 6.5 %, the bias 0.5 %; these are 160."""
     rng = default_rng(2)
-    tips, insertion = insertion_tips(2500, 0.06, rng)
+    tips, insertion = insertion_tips(160, 0.06, rng)
     fit = fit_curvature(uniform(tips, rng), insertion if known else None, settings)
     share = fit.radius / RADIUS
-    # The standard error of the mean over 2,500 is 0.13 %.
-    assert abs(np.mean(share) - 1.0) <= 0.005
-    assert abs(np.mean(1.0 / share) - 1.0) <= 0.005
-    assert np.std(share) <= 0.0665
-    assert np.std(1.0 / share) <= 0.065
+    # The standard error of the mean over 160 is 0.5 %, that of the spread 0.4 %.
+    assert abs(np.mean(share) - 1.0) <= 0.015
+    assert np.std(share) <= 0.077
     low, high = fit.radius_interval()
-    assert 0.93 <= np.mean((low < RADIUS) & (high > RADIUS)) <= 0.98
+    assert 0.9 <= np.mean((low < RADIUS) & (high > RADIUS)) <= 0.99
     np.testing.assert_allclose(np.median(fit.measurement_std), 1e-3 / math.sqrt(3.0), rtol=0.02)
 
 
-@pytest.mark.parametrize("slip", [0.0, 0.05, -0.1])
-@pytest.mark.parametrize("entry_std", [1e-6, 0.0005])
+@pytest.mark.parametrize(("entry_std", "slip"), [(1e-6, -0.1), (0.0005, 0.0), (0.0005, 0.05)])
 def test_a_stage_that_slips_is_seen_and_changes_no_curvature(slip: float, entry_std: float) -> None:
-    """1,000 seeds; before slip was an unknown 5 % of it made 4 to 19 % of the radius."""
+    """Before slip was an unknown 5 % of it made 4 to 19 % of the radius."""
     rng = default_rng(12)
-    tips, insertion = insertion_tips(1000, 0.06, rng)
+    tips, insertion = insertion_tips(160, 0.06, rng)
     settings = CurvatureFitSettings(entry_std=entry_std)
     fit = fit_curvature(uniform(tips, rng), insertion * (1.0 + slip), settings)
-    assert abs(np.mean(fit.radius / RADIUS) - 1.0) <= 0.01
+    assert abs(np.mean(fit.radius / RADIUS) - 1.0) <= 0.02
     low, high = fit.radius_interval()
-    assert 0.92 <= np.mean((low < RADIUS) & (high > RADIUS)) <= 0.98
-    assert np.mean(fit.slip) == pytest.approx(slip, abs=0.001)
-    assert 0.92 <= np.mean(np.abs(fit.slip - slip) < 1.96 * fit.slip_std) <= 0.98
+    assert 0.9 <= np.mean((low < RADIUS) & (high > RADIUS)) <= 0.99
+    assert np.mean(fit.slip) == pytest.approx(slip, abs=0.002)
+    assert 0.9 <= np.mean(np.abs(fit.slip - slip) < 1.96 * fit.slip_std) <= 0.99
 
 
 def test_plain_circle_is_a_quarter_too_curved() -> None:
     rng = default_rng(3)
-    tips, _ = insertion_tips(500, 0.06, rng)
+    tips, _ = insertion_tips(200, 0.06, rng)
     assert np.mean(circle_curvature(uniform(tips, rng))) * RADIUS == pytest.approx(1.25, abs=0.03)
 
 
 def test_outliers_do_not_count() -> None:
-    rng, count = default_rng(4), 600
+    rng, count = default_rng(4), 100
     exact, insertion = insertion_tips(count, 0.06, rng)
     tips = uniform(exact, rng)
     away = rng.normal(0.0, 1.0, tips.shape)
@@ -102,7 +96,7 @@ def test_outliers_do_not_count() -> None:
     )
     off = rng.random(tips.shape[:2]) < 0.05
     fit = fit_curvature(tips + away * off[..., None], insertion)
-    assert np.std(fit.radius / RADIUS) < 0.07
+    assert np.std(fit.radius / RADIUS) < 0.08
     assert np.mean(fit.weights[off] < 0.5) > 0.99
     assert np.mean(fit.weights[~off] > 0.99) > 0.99
 

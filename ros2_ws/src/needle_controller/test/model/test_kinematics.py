@@ -1,9 +1,10 @@
+"""(3) to (8) of [KC09] against scipy: exponentials, Euler angles, integrated trajectories."""
+
 from __future__ import annotations
 
 import math
 
 import numpy as np
-import pytest
 from numpy.random import default_rng
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -35,14 +36,10 @@ from needle_controller.model.kinematics import (
 CURVATURE = 1.0 / 0.122
 
 
-def some_coordinates(count: int, seed: int = 1) -> Array:
-    rng = default_rng(seed)
+def some_coordinates(count: int) -> Array:
+    rng = default_rng(1)
     angles = rng.uniform(-1.0, 1.0, (count, 3)) * [np.pi, 1.4, np.pi]
     return np.concatenate([rng.normal(0.0, 0.02, (count, 3)), angles], axis=1)
-
-
-def some_reduced(count: int, seed: int = 2) -> Array:
-    return default_rng(seed).uniform(-1.0, 1.0, (count, 3)) * [0.01, 1.3, 1.4]
 
 
 def screw(coordinates: Array, rate: float, length: float) -> Array:
@@ -55,34 +52,13 @@ def screw(coordinates: Array, rate: float, length: float) -> Array:
     return np.asarray(pose @ expm(twist * length))
 
 
-def test_rotation_is_that_of_intrinsic_xyz_angles() -> None:
+def test_rotations_are_those_of_intrinsic_xyz_angles_and_of_quaternions() -> None:
     angles = some_coordinates(50)[:, 3:]
-    expected = Rotation.from_euler("XYZ", angles).as_matrix()
-    np.testing.assert_allclose(rotation_from_angles(angles), expected, atol=1e-14)
-
-
-def test_rotation_is_that_of_quaternions() -> None:
-    rotations = Rotation.random(50, random_state=2)
+    expected = Rotation.from_euler("XYZ", angles)
+    np.testing.assert_allclose(rotation_from_angles(angles), expected.as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(angles_from_rotation(expected.as_matrix()), angles, atol=1e-12)
     np.testing.assert_allclose(
-        rotation_from_quaternion(rotations.as_quat()), rotations.as_matrix(), atol=1e-14
-    )
-
-
-def test_angles_round_trip() -> None:
-    angles = some_coordinates(200)[:, 3:]
-    np.testing.assert_allclose(
-        angles_from_rotation(rotation_from_angles(angles)), angles, atol=1e-12
-    )
-
-
-def test_heading_gives_pitch_and_yaw_as_the_design_says() -> None:
-    angles = some_coordinates(50)[:, 3:]
-    heading = rotation_from_angles(angles)[:, :, 2]
-    np.testing.assert_allclose(np.arcsin(heading[:, 0]), angles[:, 1], atol=1e-12)
-    np.testing.assert_allclose(
-        np.arctan2(-heading[:, 1] / np.cos(angles[:, 1]), heading[:, 2] / np.cos(angles[:, 1])),
-        angles[:, 0],
-        atol=1e-12,
+        rotation_from_quaternion(expected.as_quat()), expected.as_matrix(), atol=1e-14
     )
 
 
@@ -95,20 +71,15 @@ def test_coordinate_rates_are_the_flow_on_se3() -> None:
         turned = np.angle(np.exp(1j * (angles[1] - angles[0]))) / (2 * h)
         rates = coordinate_rates(coordinates, rate, CURVATURE)
         np.testing.assert_allclose(rates, [*moved, *turned], rtol=1e-5, atol=1e-5)
-
-
-def test_reduced_rates_are_rows_of_the_full_ones() -> None:
-    coordinates = some_coordinates(30)
-    rate = np.linspace(-400, 400, 30)
-    np.testing.assert_array_equal(
-        reduced_rates(coordinates[:, REDUCED], rate, CURVATURE),
-        coordinate_rates(coordinates, rate, CURVATURE)[:, REDUCED],
-    )
+        reduced = reduced_rates(coordinates[list(REDUCED)], rate, CURVATURE)
+        np.testing.assert_array_equal(reduced, rates[list(REDUCED)])
+    upright = np.zeros(6)
+    upright[PITCH] = np.pi / 2
+    assert abs(coordinate_rates(upright, 0.0, CURVATURE)[3]) > 1e15
 
 
 def test_angle_axes_turn_the_tip_as_its_angles_do() -> None:
-    angles = some_coordinates(20)[:, 3:]
-    h = 1e-6
+    angles, h = some_coordinates(20)[:, 3:], 1e-6
     for i in range(3):
         change = np.eye(3)[i] * h
         turn = rotation_from_angles(angles + change) @ np.swapaxes(
@@ -118,30 +89,25 @@ def test_angle_axes_turn_the_tip_as_its_angles_do() -> None:
         np.testing.assert_allclose(vector, angle_axes(angles)[:, :, i], atol=1e-8)
 
 
-def test_linearized_state_round_trip() -> None:
-    reduced = some_reduced(200)
+def test_linearized_state_and_virtual_input_round_trip() -> None:
+    reduced = default_rng(2).uniform(-1.0, 1.0, (200, 3)) * [0.01, 1.3, 1.4]
     linearized = linearized_from_reduced(reduced, CURVATURE)
     np.testing.assert_allclose(
         reduced_from_linearized(linearized, CURVATURE), reduced, rtol=0, atol=1e-12
     )
-
-
-def test_no_reduced_state_outside_the_region() -> None:
+    rate = np.linspace(-500, 500, 200)
+    virtual = virtual_input(reduced, rate, CURVATURE)
+    np.testing.assert_allclose(rotation_rate(reduced, virtual, CURVATURE), rate, rtol=1e-10)
+    # No reduced state is outside the region.
     outside = [[0.0, 1.5, 0.0], [0.0, 0.8, 0.7 * CURVATURE]]
     assert np.all(np.isnan(reduced_from_linearized(outside, CURVATURE)[:, 2]))
 
 
-def test_virtual_input_round_trip() -> None:
-    reduced, rate = some_reduced(100), np.linspace(-500, 500, 100)
-    virtual = virtual_input(reduced, rate, CURVATURE)
-    np.testing.assert_allclose(rotation_rate(reduced, virtual, CURVATURE), rate, rtol=1e-10)
-
-
-@pytest.mark.parametrize("roll", [np.pi / 2, -np.pi / 2, np.pi / 2 + 1e-9, np.pi / 2 - 1e-9])
-def test_inverse_of_7_is_bounded_where_turning_does_not_steer(roll: float) -> None:
-    rate = rotation_rate([0.0, 0.1, roll], 1000.0, CURVATURE)
-    assert np.isfinite(rate)
-    assert abs(rate) <= (1000.0 / CURVATURE + CURVATURE) / SMALLEST_STEERING
+def test_inverse_of_7_is_bounded_where_turning_does_not_steer() -> None:
+    for roll in (np.pi / 2, -np.pi / 2, np.pi / 2 + 1e-9, np.pi / 2 - 1e-9):
+        rate = rotation_rate([0.0, 0.1, roll], 1000.0, CURVATURE)
+        assert np.isfinite(rate)
+        assert abs(rate) <= (1000.0 / CURVATURE + CURVATURE) / SMALLEST_STEERING
 
 
 def test_linearized_system_along_a_trajectory_of_the_reduced_one() -> None:
@@ -169,35 +135,12 @@ def test_linearized_system_along_a_trajectory_of_the_reduced_one() -> None:
         np.testing.assert_allclose((s_after - s_before) / (2 * h), expected, rtol=1e-4, atol=1e-6)
 
 
-def test_transition_is_the_matrix_exponential() -> None:
-    for length in (0.0, 1e-3, 0.05):
-        np.testing.assert_allclose(transition(length), expm(A * length), atol=1e-15)
-
-
-def test_process_covariance_is_van_loans() -> None:
+def test_transition_and_process_covariance_are_matrix_exponentials() -> None:
     density = np.array([[2.0, 0.3, 0.1], [0.3, 5.0, -1.0], [0.1, -1.0, 9.0]])
-    for length in (1e-3, 0.2):
+    for length in (0.0, 1e-3, 0.2):
+        np.testing.assert_allclose(transition(length), expm(A * length), atol=1e-15)
+        # Van Loan's.
         block = np.block([[-A, density], [np.zeros((3, 3)), A.T]]) * length
         exponential = expm(block)
         expected = exponential[3:, 3:].T @ exponential[:3, 3:]
         np.testing.assert_allclose(process_covariance(density, length), expected, rtol=1e-12)
-
-
-def test_broadcasting_equals_looping() -> None:
-    coordinates = some_coordinates(12).reshape(3, 4, 6)
-    rates = np.linspace(-100, 100, 12).reshape(3, 4)
-    curvatures = np.linspace(5, 10, 4)
-    whole = coordinate_rates(coordinates, rates, curvatures)
-    linear = linearized_from_reduced(coordinates[..., REDUCED], curvatures)
-    virtual = virtual_input(coordinates[..., REDUCED], rates, curvatures)
-    for i in np.ndindex(3, 4):
-        q, u, k = coordinates[i], rates[i], curvatures[i[1]]
-        np.testing.assert_array_equal(whole[i], coordinate_rates(q, u, k))
-        np.testing.assert_array_equal(linear[i], linearized_from_reduced(q[list(REDUCED)], k))
-        np.testing.assert_array_equal(virtual[i], virtual_input(q[list(REDUCED)], u, k))
-
-
-def test_pitch_is_singular_at_a_right_angle() -> None:
-    coordinates = np.zeros(6)
-    coordinates[PITCH] = np.pi / 2
-    assert abs(coordinate_rates(coordinates, 0.0, CURVATURE)[3]) > 1e15

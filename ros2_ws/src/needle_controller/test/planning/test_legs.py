@@ -1,3 +1,5 @@
+"""Legs: the advance against scipy's exponential, what they lead to, miss, and are cut to."""
+
 from __future__ import annotations
 
 import math
@@ -27,51 +29,49 @@ def pose_of(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Array:
     return pose
 
 
-@pytest.mark.parametrize(("length", "turn"), [(0.03, 1.5), (1e-5, 0.0), (0.002, -3.0), (0.0, 1.0)])
-def test_an_advance_is_the_exponential_of_its_twist(length: float, turn: float) -> None:
+def test_an_advance_is_the_exponential_of_its_twist() -> None:
     pose, moved = pose_of(0.7, 0.3, -0.2), np.empty((3, 4))
-    move(pose, length, turn, CURVATURE, moved)
-    bend = CURVATURE * length
-    twist = np.array(
-        [[0, -turn, 0, 0], [turn, 0, -bend, 0], [0, bend, 0, length], [0, 0, 0, 0]], dtype=float
-    )
     before = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(moved, (before @ expm(twist))[:3], atol=1e-12)
-    move(pose, length, turn, CURVATURE, pose)
-    np.testing.assert_allclose(pose, moved)
+    for length, turn in ((0.03, 1.5), (1e-5, 0.0), (0.002, -3.0), (0.0, 1.0)):
+        move(pose, length, turn, CURVATURE, moved)
+        twist = np.zeros((4, 4))
+        twist[1, 2], twist[2, 1] = -CURVATURE * length, CURVATURE * length
+        twist[0, 1], twist[1, 0], twist[2, 3] = -turn, turn, length
+        np.testing.assert_allclose(moved, (before @ expm(twist))[:3], atol=1e-12)
+    in_place = pose.copy()
+    move(in_place, 0.0, 1.0, CURVATURE, in_place)
+    np.testing.assert_allclose(in_place, moved)
 
 
-@pytest.mark.parametrize("seed", range(40))
-def test_a_leg_leads_to_its_aim(seed: int) -> None:
-    rng = np.random.default_rng([11, seed])
-    pose = pose_of(*rng.uniform([-math.pi, -0.3, -0.3], [math.pi, 0.3, 0.3]))
-    aim = pose[:, :3] @ [*rng.uniform(-0.008, 0.008, 2), rng.uniform(0.06, 0.12)]
-    leg = leg_towards(pose, aim, CURVATURE, 0.8, RATE)
+def test_a_leg_leads_to_its_aim() -> None:
     points, end = np.empty((MOST_POINTS, 4)), np.empty((3, 4))
-    count = trace(pose, leg, CURVATURE, 0.01, points, end)
-    assert leg.miss == leg.scarce == 0.0
-    assert leg.turning in (0.0, pytest.approx(abs(leg.turn) / RATE))
-    assert leg.curvature <= CURVATURE
-    np.testing.assert_allclose(end[:, 3], aim, atol=1e-4)
-    np.testing.assert_allclose(points[count - 1, :3], end[:, 3])
-    assert points[0, 3] == 0.01
-    assert points[count - 1, 3] == pytest.approx(0.01 + leg_length(leg))
-    assert np.all(np.linalg.norm(np.diff(points[:count, :3], axis=0), axis=1) < 0.0101)
+    for seed in range(40):
+        rng = np.random.default_rng([11, seed])
+        pose = pose_of(*rng.uniform([-math.pi, -0.3, -0.3], [math.pi, 0.3, 0.3]))
+        aim = pose[:, :3] @ [*rng.uniform(-0.008, 0.008, 2), rng.uniform(0.06, 0.12)]
+        leg = leg_towards(pose, aim, CURVATURE, 0.8, RATE)
+        count = trace(pose, leg, CURVATURE, 0.01, points, end)
+        assert leg.miss == leg.scarce == 0.0
+        assert leg.turning in (0.0, pytest.approx(abs(leg.turn) / RATE))
+        assert leg.curvature <= CURVATURE
+        np.testing.assert_allclose(end[:, 3], aim, atol=1e-4)
+        np.testing.assert_allclose(points[count - 1, :3], end[:, 3])
+        assert points[0, 3] == 0.01
+        assert points[count - 1, 3] == pytest.approx(0.01 + leg_length(leg))
+        assert np.all(np.linalg.norm(np.diff(points[:count, :3], axis=0), axis=1) < 0.0101)
 
 
 def test_an_aim_within_the_circle_is_missed_by_how_deep_it_lies() -> None:
     # The needle bends to -y; the circle's centre is at y = -R. Here 3 mm within it.
     radius = 1.0 / CURVATURE
-    aim = np.array([0.0, -radius + (radius - 0.003) * math.cos(0.4), 0.0])
-    aim[2] = (radius - 0.003) * math.sin(0.4)
+    inner = radius - 0.003
+    aim = np.array([0.0, -radius + inner * math.cos(0.4), inner * math.sin(0.4)])
     leg = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
     assert leg.miss == pytest.approx(0.003, abs=1e-6)
     assert leg.scarce > leg.miss
     behind = leg_towards(pose_of(), np.array([0.0, -0.001, -0.02]), CURVATURE, 0.8, RATE)
     assert behind.miss > 0.02
-
-
-def test_scarce_is_what_a_share_of_the_curvature_misses() -> None:
+    # Scarce is what a share of the curvature misses.
     aim = np.array([0.0, -0.0148, 0.0605])
     full = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
     share = leg_towards(pose_of(), aim, 0.8 * CURVATURE, 1.0, RATE)
@@ -80,13 +80,14 @@ def test_scarce_is_what_a_share_of_the_curvature_misses() -> None:
     assert full.scarce > 1e-4
 
 
-@pytest.mark.parametrize("longest", [0.001, 0.01, 0.06, 1.0])
-def test_a_leg_is_cut_where_its_whole_goes_through(longest: float) -> None:
+def test_a_leg_is_cut_where_its_whole_goes_through() -> None:
     aim = np.array([0.006, 0.003, 0.09])
     whole = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
-    part = cut_short(whole, longest)
-    assert leg_length(part) == pytest.approx(min(longest, leg_length(whole)))
     points, end = np.empty((MOST_POINTS, 4)), np.empty((3, 4))
-    trace(pose_of(), part, CURVATURE, 0.0, points, end)
-    rest = leg_towards(end, aim, CURVATURE, 0.8, RATE)
-    assert leg_length(part) + leg_length(rest) == pytest.approx(leg_length(whole), abs=1e-4)
+    for longest in (0.001, 0.01, 0.06, 1.0):
+        part = cut_short(whole, longest)
+        assert leg_length(part) == pytest.approx(min(longest, leg_length(whole)))
+        trace(pose_of(), part, CURVATURE, 0.0, points, end)
+        rest = leg_towards(end, aim, CURVATURE, 0.8, RATE)
+        both = leg_length(part) + leg_length(rest)
+        assert both == pytest.approx(leg_length(whole), abs=1e-4)

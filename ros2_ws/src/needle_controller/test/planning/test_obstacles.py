@@ -1,62 +1,28 @@
+"""Obstacles: distances against least squares, and where they are given: file, message, settings."""
+
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
+from scipy.optimize import lsq_linear
 
-from needle_controller.model.arrays import Array
+from needle_controller.planning.marked_obstacles import CYLINDER, SPHERE, obstacles_from_markers
 from needle_controller.planning.obstacle_files import read_obstacles
 from needle_controller.planning.obstacles import MOST_OBSTACLES, Obstacle, Obstacles
 from needle_controller.planning.segments import segment_distance
 from needle_core.errors import UserError
+from needle_core.messages import Marker, Markers
 
-SPHERE = Obstacle((0.0, 0.0, 0.05), (0.0, 0.0, 0.05), 0.004)
-
-
-def test_the_distance_of_segments_is_the_least_of_any_two_of_their_points() -> None:
-    rng = np.random.default_rng(3)
-    for _ in range(60):
-        a, b, c, d = rng.normal(size=(4, 3))
-        d = c if rng.random() < 0.2 else d
-        b = a + (d - c) * rng.normal() if rng.random() < 0.2 else b
-
-        def apart(at: Array, a: Array = a, b: Array = b, c: Array = c, d: Array = d) -> float:
-            return float(np.sum((a + at[0] * (b - a) - c - at[1] * (d - c)) ** 2))
-
-        best = min(
-            minimize(apart, start, bounds=[(0, 1), (0, 1)], tol=1e-14).fun
-            for start in ((0.5, 0.5), (0.0, 1.0), (1.0, 0.0))
-        )
-        assert segment_distance(a, b, c, d) == pytest.approx(math.sqrt(best), abs=1e-4)
-
-
-def test_clearance_is_from_the_surface_of_the_nearest() -> None:
-    capsule = Obstacle((0.0, -0.01, 0.08), (0.0, 0.01, 0.08), 0.003)
-    obstacles = Obstacles([SPHERE, capsule])
-    assert obstacles.clearance([0.01, 0.0, 0.05]) == pytest.approx(0.006)
-    assert obstacles.clearance([0.0, 0.02, 0.08]) == pytest.approx(0.007)
-    assert obstacles.clearance([0.0, 0.005, 0.08]) == pytest.approx(-0.003)
-    assert Obstacles().clearance([0.0, 0.0, 0.0]) == math.inf
-
-
-@pytest.mark.parametrize(
-    ("obstacles", "words"),
-    [
-        ([Obstacle((0.0, math.nan, 0.0), (0.0, 0.0, 0.0), 0.01)], "y of obstacle 1 = nan"),
-        ([SPHERE, Obstacle((0.0, 0.0, 50.0), (0.0, 0.0, 50.0), 0.01)], "z of obstacle 2 = 50 m"),
-        ([Obstacle((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)], "radius of obstacle 1 = 0 m"),
-        ([SPHERE] * (MOST_OBSTACLES + 1), "65 obstacles"),
-    ],
-)
-def test_what_is_no_obstacle_is_refused_by_name(obstacles: list[Obstacle], words: str) -> None:
-    with pytest.raises(UserError, match=words):
-        Obstacles(obstacles)
-
-
-GOOD = """
+ROUND = Obstacle((0.0, 0.0, 0.05), (0.0, 0.0, 0.05), 0.004)
+STRAIGHT = (0.0, 0.0, 0.0, 1.0)
+CUBE, DELETEALL = 1, 3
+BALL = Marker("rig", "bone", 4, SPHERE, 0, (0.01, -0.02, 0.05), STRAIGHT, (0.006, 0.006, 0.006))
+FILE = """
 frame: rig
 spheres:
   - {center: [0.0, 0.002, 0.05], radius: 0.004}
@@ -65,18 +31,44 @@ capsules:
 """
 
 
-def test_a_file_is_read(tmp_path: Path) -> None:
+def test_the_distance_of_segments_is_the_least_of_any_two_of_their_points() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        a, b, c, d = rng.normal(size=(4, 3))
+        d = c if rng.random() < 0.2 else d
+        b = a + (d - c) * rng.normal() if rng.random() < 0.2 else b
+        at = lsq_linear(np.stack([b - a, c - d], axis=1), c - a, bounds=(0.0, 1.0)).x
+        least = np.linalg.norm(a + at[0] * (b - a) - c - at[1] * (d - c))
+        assert segment_distance(a, b, c, d) == pytest.approx(least, abs=1e-6)
+
+
+def test_clearance_is_from_the_surface_of_the_nearest() -> None:
+    obstacles = Obstacles([ROUND, Obstacle((0.0, -0.01, 0.08), (0.0, 0.01, 0.08), 0.003)])
+    assert obstacles.clearance([0.01, 0.0, 0.05]) == pytest.approx(0.006)
+    assert obstacles.clearance([0.0, 0.02, 0.08]) == pytest.approx(0.007)
+    assert obstacles.clearance([0.0, 0.005, 0.08]) == pytest.approx(-0.003)
+    assert Obstacles().clearance([0.0, 0.0, 0.0]) == math.inf
+
+
+def test_what_is_no_obstacle_is_refused_by_name() -> None:
+    for obstacles, words in (
+        ([Obstacle((0.0, math.nan, 0.0), (0.0, 0.0, 0.0), 0.01)], "y of obstacle 1 = nan"),
+        ([ROUND, Obstacle((0.0, 0.0, 50.0), (0.0, 0.0, 50.0), 0.01)], "z of obstacle 2 = 50 m"),
+        ([Obstacle((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)], "radius of obstacle 1 = 0 m"),
+        ([ROUND] * (MOST_OBSTACLES + 1), "65 obstacles"),
+    ):
+        with pytest.raises(UserError, match=words):
+            Obstacles(obstacles)
+
+
+def test_a_file_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "obstacles.yaml"
-    path.write_text(GOOD, encoding="utf-8")
+    path.write_text(FILE, encoding="utf-8")
     np.testing.assert_allclose(
         read_obstacles(path).table,
         [[0.0, 0.002, 0.05, 0.0, 0.002, 0.05, 0.004], [-0.02, 0.0, 0.07, 0.02, 0.0, 0.07, 0.003]],
     )
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
+    for old, new, words in (
         ("frame: rig", "frame: world", "frame 'world', wants 'rig'"),
         ("spheres:", "cubes:", "cubes is not one of"),
         ("radius: 0.004", "size: 0.004", "spheres, number 1: wants center, radius"),
@@ -84,17 +76,38 @@ def test_a_file_is_read(tmp_path: Path) -> None:
         ("[0.0, 0.002, 0.05]", "[0.0, 0.05]", "center = .* wants three numbers"),
         ("radius: 0.003", "radius: '3 mm'", "capsules, number 1: radius = '3 mm'"),
         ("frame: rig", "frame: [", "not YAML in line 4"),
+        (FILE, "- 3", "wants"),
         ("spheres:", "spheres: 3\nboxes:", "boxes is not one of"),
-    ],
-)
-def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, old: str, new: str, words: str) -> None:
-    path = tmp_path / "obstacles.yaml"
-    path.write_text(GOOD.replace(old, new), encoding="utf-8")
-    with pytest.raises(UserError, match=words) as error:
-        read_obstacles(path)
-    assert "\n" not in str(error.value)
-
-
-def test_a_file_that_is_missing_is_said(tmp_path: Path) -> None:
+    ):
+        path.write_text(FILE.replace(old, new), encoding="utf-8")
+        with pytest.raises(UserError, match=words) as error:
+            read_obstacles(path)
+        assert "\n" not in str(error.value)
     with pytest.raises(UserError, match=r"no\.yaml: cannot be read"):
         read_obstacles(tmp_path / "no.yaml")
+
+
+def test_markers_become_capsules_or_are_named() -> None:
+    half = math.sqrt(0.5)
+    # A quarter turn about x takes z to -y.
+    lying = dataclasses.replace(
+        BALL, kind=CYLINDER, orientation=(half, 0.0, 0.0, half), scale=(0.004, 0.004, 0.03)
+    )
+    deleting = dataclasses.replace(BALL, action=DELETEALL, frame_id="")
+    expected = [
+        [0.01, -0.02, 0.05, 0.01, -0.02, 0.05, 0.003],
+        [0.01, -0.005, 0.05, 0.01, -0.035, 0.05, 0.002],
+    ]
+    found = obstacles_from_markers(Markers((deleting, BALL, lying)))
+    np.testing.assert_allclose(found.table, expected, atol=1e-12)
+    rows: list[tuple[dict[str, Any], str]] = [
+        ({"frame_id": "map"}, r"obstacle 1 \('bone' 4\) is given in frame 'map', wants 'rig'"),
+        ({"kind": CUBE}, "of type 1, wants SPHERE"),
+        ({"scale": (0.006, 0.01, 0.006)}, "is not round"),
+        ({"position": (0.01, -0.02, math.nan)}, "is not finite"),
+        ({"kind": CYLINDER, "orientation": (0.0, 0.0, 0.0, 0.0)}, "quaternion has length 0"),
+        ({"position": (0.01, -0.02, 50.0)}, "z of obstacle 1 = 50 m"),
+    ]
+    for spoilt, words in rows:
+        with pytest.raises(UserError, match=words):
+            obstacles_from_markers(Markers((dataclasses.replace(BALL, **spoilt),)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -13,16 +15,19 @@ from needle_core.component import Log
 from needle_core.status_messages import DeviceStatus
 
 TICK = 20_000_000
+SECOND = 10**9
+ENOUGH = 5
+"""So many good tips must be enough to go on after whatever was wrong."""
 
 
-def device(state: str, homed: bool, hold_owner: str, reason: str = "") -> DeviceStatus:
+def device(state: str, homed: bool = True, owner: str = "", reason: str = "") -> DeviceStatus:
     """Return a device/status."""
-    return DeviceStatus(state=state, homed=homed, hold_owner=hold_owner, reason=reason)
+    return DeviceStatus(state=state, homed=homed, hold_owner=owner, reason=reason)
 
 
-HELD = device("HOLDING", True, "operator")
-MOVING = device("MOVING", True, "operator")
-FREE = device("HOLDING", True, "")
+HELD = device("HOLDING", owner="operator")
+MOVING = device("MOVING", owner="operator")
+FREE = device("HOLDING")
 
 
 class Rig:
@@ -40,22 +45,29 @@ class Rig:
         rotation: float = 0.0,
         way: str = "stepwise",
     ) -> None:
-        settings = SteeringSettings(
-            preset=preset,
-            depth=depth,
-            target_offset=0.003,
-            tip_covariance=tip_covariance,
-            insertion=way,
+        self.steering = make_steering(
+            SteeringSettings(
+                preset=preset,
+                depth=depth,
+                target_offset=0.003,
+                tip_covariance=tip_covariance,
+                insertion=way,
+            )
         )
-        self.steering = make_steering(settings)
         self.now = TICK
         self.insertion = insertion
         self.rotation = rotation
         self.steering.on_device(HELD if held else FREE)
         self.joints()
         if started:
-            reply, _ = self.steering.on_start()
-            assert reply.success, reply.message
+            assert self.start() == "steering"
+
+    def start(self) -> str:
+        """Ask to steer; return the answer, which is "steering" where it does."""
+        reply, actions = self.steering.on_start()
+        assert reply.success == (reply.message == "steering")
+        assert reply.message in logged(actions)
+        return reply.message
 
     def joints(self) -> list[Action]:
         return self.steering.on_joints(JointSample(self.now, self.insertion, self.rotation))
@@ -68,14 +80,15 @@ class Rig:
             actions += self.joints()
         return actions
 
-    def measured(self, x: float = 0.0) -> TipMeasurement:
-        return TipMeasurement(self.now, "rig", np.array([x, 0.0, self.insertion]))
+    def measured(self, x: float = 0.0, ahead: int = 0) -> TipMeasurement:
+        """Return a tip of where the needle is now, or is said to be `ahead` ns from now."""
+        return TipMeasurement(self.now + ahead, "rig", np.array([x, 0.0, self.insertion]))
 
-    def expose(self, tip: TipMeasurement | None = None) -> list[Action]:
+    def expose(self, tip: TipMeasurement | None = None, x: float = 0.0) -> list[Action]:
         """One tick: joints, then the tip."""
         self.now += TICK
         actions = self.joints()
-        return actions + self.steering.on_tip(tip or self.measured())
+        return actions + self.steering.on_tip(tip or self.measured(x))
 
     def run(self, step: SendStep, part: float = 1.0, text: str = "succeeded") -> list[Action]:
         """Carry out a part of a step and answer."""
@@ -86,6 +99,18 @@ class Rig:
             self.rotation = start[1] + share * (step.rotation - start[1])
             self.joints()
         return self.steering.on_result(step.stamp_ns, text)
+
+    def steps(self, count: int) -> None:
+        for _ in range(count):
+            self.run(sent(self.expose()))
+
+    def good_tips(self, most: int = ENOUGH) -> SendStep:
+        """Expose good tips until one leads to a step."""
+        for _ in range(most):
+            actions = self.expose()
+            if not none_sent(actions):
+                return sent(actions)
+        raise AssertionError(f"{most} good tips, no step: {where(self)} {self.steering.reason}")
 
 
 def sent(actions: list[Action]) -> SendStep:
@@ -104,3 +129,19 @@ def logged(actions: list[Action]) -> str:
 
 def where(rig: Rig) -> tuple[SteeringState, Awaiting]:
     return rig.steering.state, rig.steering.awaiting
+
+
+def spied(
+    rig: Rig, patch: Callable[[object, str, object], None], method: str
+) -> list[tuple[object, ...]]:
+    """Return the list that gets the arguments of every further call of the estimator."""
+    calls: list[tuple[object, ...]] = []
+    estimator = rig.steering.control._estimator
+    original = getattr(estimator, method)
+
+    def spy(*arguments: object) -> None:
+        calls.append(arguments)
+        original(*arguments)
+
+    patch(estimator, method, spy)
+    return calls

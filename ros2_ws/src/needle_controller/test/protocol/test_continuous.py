@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
@@ -14,17 +16,20 @@ from needle_controller.protocol.steering_types import (
     SteeringState,
 )
 from needle_controller.protocol.step_watch import MOST_REFUSALS
-from needle_controller.protocol.tip_gate import TipMeasurement
 
-from .rig import FREE, HELD, MOVING, TICK, Rig, logged, sent, where
+from .rig import FREE, HELD, MOVING, TICK, Rig, logged, sent, spied, where
 
 MM = 1e-3
+AT_WORK = (SteeringState.STEERING, Awaiting.TIP)
+
+
+def paths_in(actions: list[Action]) -> list[SendPath]:
+    return [action for action in actions if isinstance(action, SendPath)]
 
 
 def path_in(actions: list[Action]) -> SendPath:
-    paths = [action for action in actions if isinstance(action, SendPath)]
-    assert len(paths) == 1, actions
-    return paths[0]
+    (path,) = paths_in(actions)
+    return path
 
 
 def updates_in(actions: list[Action]) -> int:
@@ -36,24 +41,33 @@ class ContinuousRig(Rig):
 
     path: SendPath | None = None
 
-    def __init__(self, *, depth: float = 0.12, held: bool = True) -> None:
-        super().__init__(depth=depth, held=held, way="continuous")
+    def __init__(self, *, depth: float = 0.12) -> None:
+        super().__init__(depth=depth, way="continuous")
 
-    def go(self, distance: float) -> list[Action]:
-        """Go on along the path, then see the tip; return what that leads to."""
+    def go_to(self, insertion: float) -> None:
+        """Go on along the path, no farther than that leads."""
         assert self.path is not None
         knots = np.array(self.path.points)
-        self.insertion = min(self.insertion + distance, knots[-1, 0])
+        self.insertion = min(insertion, knots[-1, 0])
         self.rotation = float(np.interp(self.insertion, knots[:, 0], knots[:, 1]))
+
+    def go(self, distance: float) -> list[Action]:
+        """Go on, then see the tip; return what that leads to."""
+        self.go_to(self.insertion + distance)
         return self.see()
 
     def see(self, x: float = 0.0) -> list[Action]:
-        actions = self.expose(
-            TipMeasurement(self.now + 20_000_000, "rig", np.array([x, 0.0, self.insertion]))
-        )
-        paths = [action for action in actions if isinstance(action, SendPath)]
-        self.path = paths[-1] if paths else self.path
+        actions = self.expose(x=x)
+        self.path = [self.path, *paths_in(actions)][-1]
         return actions
+
+    def refused(self) -> Iterator[int]:
+        """See tips whose paths are refused at once; yield how many until it gives up."""
+        count = 0
+        while self.steering.state is SteeringState.STEERING:
+            count += 1
+            yield count
+            self.steering.on_result(path_in(self.see()).stamp_ns, "aborted: no")
 
 
 def test_a_tip_leads_to_the_turn_of_a_step_and_a_path_beyond() -> None:
@@ -63,8 +77,8 @@ def test_a_tip_leads_to_the_turn_of_a_step_and_a_path_beyond() -> None:
     assert start == (0.0, 0.0, 0.0)
     assert knot == pytest.approx((step.insertion, step.rotation, step.duration))
     assert end == pytest.approx((2 * MM, step.rotation, 2 * step.duration))
-    assert path.stamp_ns == rig.now
-    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
+    assert path.stamp_ns == rig.steering.command_ns == rig.now
+    assert where(rig) == AT_WORK
 
 
 def test_a_tip_within_a_step_length_only_renews_the_path() -> None:
@@ -75,11 +89,11 @@ def test_a_tip_within_a_step_length_only_renews_the_path() -> None:
     assert updates_in(actions) == 0
     assert again.stamp_ns > first.stamp_ns
     assert again.points[:2] == first.points[:2]
-    assert again.points[2][0] == pytest.approx(2.4 * MM)
-    assert again.points[2][1] == first.points[2][1]
-    assert rig.steering.step == 0
-    assert updates_in(rig.go(0.6 * MM)) == 1
-    assert rig.steering.step == 1
+    assert again.points[2][:2] == pytest.approx((2.4 * MM, first.points[2][1]))
+    assert updates_in(rig.go(0.598 * MM)) == rig.steering.step == 0
+    # At rest no tip is used twice.
+    assert updates_in(rig.see()) == updates_in(rig.see()) == 0
+    assert updates_in(rig.go(0.0015 * MM)) == rig.steering.step == 1
 
 
 def test_the_path_of_a_needle_that_went_back_begins_where_the_needle_is() -> None:
@@ -88,59 +102,32 @@ def test_the_path_of_a_needle_that_went_back_begins_where_the_needle_is() -> Non
     rig.insertion = -0.2 * MM
     again = path_in(rig.see())
     assert again.points[0] == (-0.2 * MM, 0.0, 0.0)
-    assert [point[:2] for point in again.points[1:2]] == [first.points[1][:2]]
-    speed = first.points[1][0] / first.points[1][2]
-    assert again.points[1][2] == pytest.approx((first.points[1][0] + 0.2 * MM) / speed)
-
-
-@pytest.mark.parametrize("tips_per_step", [2, 6, 20])
-def test_what_is_believed_and_turned_does_not_depend_on_how_many_tips_there_are(
-    tips_per_step: int,
-) -> None:
-    rng = np.random.default_rng(3)
-    noise = rng.uniform(-MM, MM, 8)
-    few, many = ContinuousRig(), ContinuousRig()
-    for rig, parts in ((few, 1), (many, tips_per_step)):
-        rig.see(float(noise[0]))
-        for x in noise[1:]:
-            for part in range(1, parts):
-                # Of the same place on the path, with errors of their own.
-                rig.insertion += MM / parts
-                knots = np.array(rig.path.points) if rig.path else np.zeros((1, 3))
-                rig.rotation = float(np.interp(rig.insertion, knots[:, 0], knots[:, 1]))
-                rig.see(5e-4 * part / parts)
-            knots = np.array(rig.path.points) if rig.path else np.zeros((1, 3))
-            rig.insertion = knots[1, 0]
-            rig.rotation = knots[1, 1]
-            rig.see(float(x))
-    a, b = (rig.steering.control for rig in (few, many))
-    assert few.steering.step == many.steering.step == 7
-    assert few.path is not None
-    assert many.path is not None
-    # The way is followed in pieces or at once: the filter is linear in neither to the last bit.
-    np.testing.assert_allclose(many.path.points, few.path.points, rtol=0, atol=2e-3)
-    assert a.started
-    assert b.started
-
-
-def test_at_rest_no_tip_is_used_twice() -> None:
-    rig = ContinuousRig()
-    rig.see()
-    for _ in range(50):
-        assert updates_in(rig.see()) == 0
-    assert rig.steering.step == 0
+    assert again.points[1][:2] == first.points[1][:2]
+    assert again.points[2] == pytest.approx((1.8 * MM, first.points[1][1], 1.0))
+    assert again.points[1][2] == pytest.approx(0.6)
 
 
 def test_the_path_ends_at_the_depth_and_steering_there() -> None:
     rig = ContinuousRig(depth=2.5 * MM)
     rig.see()
-    while rig.insertion < 2.5 * MM:
-        rig.go(0.3 * MM)
+    while rig.insertion < 2.5 * MM - 1.1e-5:
+        assert rig.steering.state is SteeringState.STEERING
+        rig.go_to(min(rig.insertion + 0.3 * MM, 2.5 * MM - 0.9e-5))
+        rig.see()
         assert rig.path is not None
         assert rig.path.points[-1][0] <= 2.5 * MM
+    # An axis rests beside its goal: the last tip is used there, and a path leads to the very end.
+    assert rig.steering.insertion == rig.insertion
+    rig.go(MM)
     assert rig.steering.state is SteeringState.DONE
-    assert "reached" in rig.steering.reason
-    assert rig.steering.on_result(rig.steering.command_ns, "succeeded") == []
+    assert "insertion 0.0025 m reached" in rig.steering.reason
+    assert rig.steering.on_result(rig.steering.command_ns, "aborted: no") == []
+
+
+def test_the_path_ends_at_the_point_before_the_depth() -> None:
+    rig = ContinuousRig()
+    rig.steering.control.target_point = np.array([0.0, 0.0, 0.0015])
+    assert path_in(rig.see()).points[-1][0] == pytest.approx(1.5 * MM, rel=0.01)
 
 
 def test_without_hold_no_path_and_after_it_only_from_a_new_tip() -> None:
@@ -148,26 +135,35 @@ def test_without_hold_no_path_and_after_it_only_from_a_new_tip() -> None:
     rig.see()
     rig.steering.on_device(MOVING)
     rig.go(0.4 * MM)
-    command = rig.steering.command_ns
-    rig.steering.on_result(command, "aborted: hold released")
+    said = rig.steering.on_result(rig.steering.command_ns, "aborted: hold released")
+    assert logged(said) == "path aborted: hold released"
     rig.steering.on_device(FREE)
     assert where(rig) == (SteeringState.STEERING, Awaiting.HOLD)
-    assert not [action for action in rig.see() if isinstance(action, SendPath)]
+    assert not paths_in(rig.see())
     assert rig.steering.on_device(HELD) == []
     assert path_in(rig.see()).stamp_ns == rig.now
 
 
-def test_an_answer_that_a_path_was_taken_asks_for_nothing() -> None:
+def test_an_answer_that_a_path_was_taken_asks_for_nothing_and_forgets_refusals() -> None:
     rig = ContinuousRig()
-    first = path_in(rig.see())
-    rig.go(0.2 * MM)
     for text in ("replaced", "succeeded"):
+        for count in rig.refused():
+            if count == MOST_REFUSALS:
+                break
+        first = path_in(rig.see())
+        rig.see()
         assert rig.steering.on_result(first.stamp_ns, text) == []
-    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
+        assert where(rig) == AT_WORK
+    # Of a path that was never sent nothing is believed.
+    for stamp in (rig.steering.command_ns + 1, rig.steering.command_ns + TICK):
+        assert rig.steering.on_result(stamp, "aborted: no") == []
+    rig.steering.on_recorded_step(rig.steering.command_ns, JointSample(0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize("late", [1, 3])
-def test_refusals_that_come_when_newer_paths_are_sent_are_a_fault_too(late: int) -> None:
+@pytest.mark.parametrize("late", [0, 1, 3])
+def test_refusals_in_a_row_are_a_fault_each_of_what_was_sent_when_the_one_before_was_known(
+    late: int,
+) -> None:
     rig = ContinuousRig()
     stamps = [path_in(rig.see()).stamp_ns for _ in range(late)]
     heard = 0
@@ -176,8 +172,8 @@ def test_refusals_that_come_when_newer_paths_are_sent_are_a_fault_too(late: int)
         stamps.append(path_in(rig.see()).stamp_ns)
         rig.steering.on_result(stamps[-1 - late], "aborted: no")
         assert heard < 100
-    # Each that counts was sent when the one before was known.
     assert heard == 1 + (MOST_REFUSALS - 1) * (late + 1)
+    assert rig.steering.state is SteeringState.FAULT
     assert "without motion" in rig.steering.reason
 
 
@@ -186,7 +182,7 @@ def test_refusals_of_all_that_a_cut_cable_held_back_count_once() -> None:
     stamps = [path_in(rig.see()).stamp_ns for _ in range(3 * MOST_REFUSALS)]
     for stamp in stamps:
         rig.steering.on_result(stamp, "aborted: nobody holds to run")
-    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
+    assert where(rig) == AT_WORK
 
 
 def test_paths_count_again_after_time_was_set_back_and_steering_started() -> None:
@@ -197,27 +193,26 @@ def test_paths_count_again_after_time_was_set_back_and_steering_started() -> Non
     rig.now = TICK
     rig.settle()
     assert rig.steering.state is SteeringState.IDLE
-    assert rig.steering.on_start()[0].success
-    assert "aborted" in logged(rig.steering.on_result(path_in(rig.see()).stamp_ns, "aborted: no"))
-
-
-def test_paths_that_are_refused_in_a_row_are_a_fault() -> None:
-    rig = ContinuousRig()
-    for _ in range(MOST_REFUSALS):
-        assert rig.steering.state is SteeringState.STEERING
-        path = path_in(rig.see())
-        rig.steering.on_result(path.stamp_ns, "aborted: no")
-    assert rig.steering.state is SteeringState.FAULT
+    assert rig.start() == "steering"
+    actions = rig.see()
+    # A needle that is out is another one: the path is its own.
+    assert updates_in(actions) == 1
+    assert "aborted" in logged(rig.steering.on_result(path_in(actions).stamp_ns, "aborted: no"))
 
 
 def test_no_tips_is_waiting_and_a_good_one_ends_it() -> None:
     rig = ContinuousRig()
     rig.see()
-    rig.steering.on_time(0.0)
-    rig.steering.on_time(2.1)
+    for second in range(10):
+        # Tips that renew the path are good ones.
+        assert rig.steering.on_time(float(second)) == []
+        rig.see()
+    rig.steering.on_time(10.0)
+    rig.steering.on_time(12.1)
     assert where(rig)[0] is SteeringState.WAITING_FOR_TIP
     assert "a good tip came" in logged(rig.go(0.2 * MM))
     assert where(rig)[0] is SteeringState.STEERING
+    assert rig.steering.reason == ""
 
 
 def test_the_estimator_is_moved_along_the_way_that_the_joints_went(
@@ -225,19 +220,10 @@ def test_the_estimator_is_moved_along_the_way_that_the_joints_went(
 ) -> None:
     rig = ContinuousRig()
     rig.see()
-    way: list[tuple[float, float]] = []
-    estimator = rig.steering.control._estimator
-    advance = estimator.advance
-
-    def spy(length: float, turn: float) -> None:
-        way.append((length, turn))
-        advance(length, turn)
-
-    monkeypatch.setattr(estimator, "advance", spy)
-    for mm, rad in ((0.25, 0.0), (0.5, 0.1), (0.75, 0.2), (1.0, 0.4)):
-        rig.now += 20_000_000
-        rig.steering.on_joints(JointSample(rig.now, mm * MM, rad))
-    rig.insertion, rig.rotation = MM, 0.4
+    way = spied(rig, monkeypatch.setattr, "advance")
+    for mm, rad in ((0.25, 0.0), (0.3, 0.05), (0.5, 0.1), (0.75, 0.2), (1.0, 0.4)):
+        rig.insertion, rig.rotation = mm * MM, rad
+        rig.settle(1)
     rig.see()
     assert np.array(way) == pytest.approx(
         np.array([[0.25e-3, 0.0], [0.25e-3, 0.1], [0.25e-3, 0.1], [0.25e-3, 0.2]])

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from needle_controller.protocol.steering_types import Awaiting, SteeringState
-from needle_controller.protocol.step_watch import MOST_REFUSALS
-from needle_core.status_messages import DeviceStatus
+from needle_controller.protocol.step_watch import MOST_REFUSALS, MOST_UNFOLLOWED
 
 from .rig import FREE, HELD, MOVING, TICK, Rig, device, logged, none_sent, sent, where
+
+IDLE, FAULT = SteeringState.IDLE, SteeringState.FAULT
+NOTHING = Awaiting.NOTHING
 
 
 def test_a_lost_answer_ends_in_a_fault_and_moves_nothing() -> None:
@@ -19,23 +20,21 @@ def test_a_lost_answer_ends_in_a_fault_and_moves_nothing() -> None:
     # It moves for as long as it likes; the time runs from when it stands again.
     rig.steering.on_device(MOVING)
     for second in range(100):
-        rig.now += TICK
-        rig.joints()
+        rig.settle(1)
         assert rig.steering.on_time(float(second)) == []
     rig.steering.on_device(HELD)
-    assert rig.steering.on_time(99.0 + 0.9 * timeout) == []
+    assert rig.steering.on_time(99.0 + 0.99 * timeout) == []
     actions = rig.steering.on_time(99.0 + timeout)
     assert none_sent(actions)
-    assert "no device/result for step 1" in logged(actions)
-    assert where(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
+    assert "no device/result for step 1 in 10 s" in logged(actions)
+    assert where(rig) == (FAULT, NOTHING)
     assert rig.steering.watchdog_trips == 1
     assert rig.steering.on_result(step.stamp_ns, "succeeded") == []
     assert rig.expose() == []
     # A person starts it again from where the needle really is.
     rig.insertion = 0.0006
-    rig.now += TICK
-    rig.joints()
-    assert rig.steering.on_start()[0].success
+    rig.settle(1)
+    assert rig.start() == "steering"
     assert sent(rig.expose()).insertion == pytest.approx(0.0016)
 
 
@@ -43,9 +42,8 @@ def test_a_slow_step_of_a_device_that_never_says_moving_is_no_lost_answer() -> N
     rig = Rig()
     step = sent(rig.expose())
     for tenth in range(400):
-        rig.now += TICK
         rig.insertion += 2.5e-6
-        rig.joints()
+        rig.settle(1)
         assert rig.steering.on_time(0.1 * tenth) == []
     rig.run(step)
     assert rig.steering.state is SteeringState.STEERING
@@ -53,83 +51,89 @@ def test_a_slow_step_of_a_device_that_never_says_moving_is_no_lost_answer() -> N
 
 def test_a_device_that_falls_silent_within_a_step_is_named_and_heard_again() -> None:
     rig = Rig()
-    step = sent(rig.expose())
+    for by_joints in (True, False):
+        step = sent(rig.expose())
+        rig.steering.on_device(MOVING)
+        rig.steering.on_time(0.0)
+        assert rig.steering.on_time(9.9) == []
+        assert "nothing heard of the device for 10 s" in logged(rig.steering.on_time(10.0))
+        assert rig.steering.patience.silence
+        assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
+        assert rig.steering.on_time(1e3) == []
+        heard = rig.settle(1) if by_joints else rig.steering.on_device(MOVING)
+        assert "heard again" in logged(heard)
+        assert not rig.steering.patience.silence
+        rig.steering.on_device(HELD)
+        rig.run(step)
+        rig.steering.on_time(2e3)
+    # No silence is left of a run that has ended.
+    rig.expose()
     rig.steering.on_device(MOVING)
     rig.steering.on_time(0.0)
-    said = logged(rig.steering.on_time(rig.steering.settings.result_timeout))
-    assert "nothing heard of the device" in said
-    assert rig.steering.patience.silence
-    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
-    assert rig.steering.on_time(1e3) == []
-    rig.run(step)
+    rig.steering.on_time(10.0)
+    rig.steering.on_stop()
     assert not rig.steering.patience.silence
-    rig.steering.on_device(HELD)
-    sent(rig.expose())
 
 
 def test_a_retraction_ends_steering_until_the_needle_is_out() -> None:
     rig = Rig()
-    for _ in range(5):
-        rig.run(sent(rig.expose()))
+    rig.steps(5)
     rig.settle()
-    rig.insertion -= 0.0001
+    rig.insertion -= 0.00019
     assert rig.settle() == []
-    rig.now += TICK
-    rig.insertion -= 0.0002
-    assert "retracted" in logged(rig.settle())
-    assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
-    assert "retracted" in rig.steering.on_start()[0].message
+    rig.insertion -= 0.00002
+    assert "IDLE: needle retracted to 0.00479 m" in logged(rig.settle())
+    assert where(rig) == (IDLE, NOTHING)
+    assert not rig.steering.control.started
+    assert rig.steering.intake.last is None
     rig.insertion = 0.004
     rig.settle()
-    assert not rig.steering.on_start()[0].success
+    assert "retracted: draw it out first" in rig.start()
     while rig.insertion > 0.0:
         rig.insertion = max(rig.insertion - 0.0005, 0.0)
-        rig.settle(1)
+        # Nobody is told of it again.
+        assert rig.settle(1) == []
     rig.settle()
-    assert rig.steering.on_start()[0].success
+    assert rig.start() == "steering"
     assert sent(rig.expose()).insertion == pytest.approx(0.001)
 
 
-def test_stop_and_start_go_on_with_what_is_known() -> None:
-    rig = Rig()
-    for _ in range(5):
-        rig.run(sent(rig.expose()))
-    rig.steering.on_stop()
-    assert rig.steering.on_start()[0].success
-    actions = rig.expose()
-    assert sent(actions).insertion == pytest.approx(0.006)
-    assert rig.steering.step == 5
-
-
-@pytest.mark.parametrize(
-    ("device", "state"),
-    [
-        (device("FAULT", True, "", "following error"), SteeringState.FAULT),
-        (device("ESTOPPED", True, "", "pressed"), SteeringState.FAULT),
-        (device("DISABLED", True, ""), SteeringState.IDLE),
-        (device("UNCONFIGURED", False, ""), SteeringState.IDLE),
-    ],
-)
-def test_a_device_that_stops_ends_steering(device: DeviceStatus, state: SteeringState) -> None:
-    rig = Rig()
-    step = sent(rig.expose())
-    actions = rig.steering.on_device(device)
-    assert where(rig) == (state, Awaiting.NOTHING)
-    assert device.reason in logged(actions)
-    assert rig.steering.on_result(step.stamp_ns, "aborted: stopped") == []
-    assert rig.expose() == []
-    rig.steering.on_device(HELD)
-    assert rig.steering.on_start()[0].success
-
-
-def test_commands_that_never_move_end_in_a_fault() -> None:
-    rig = Rig()
-    for _ in range(MOST_REFUSALS):
-        assert rig.steering.state is SteeringState.STEERING
+def test_a_device_that_stops_ends_steering() -> None:
+    for status, state, severity in (
+        (device("FAULT", reason="following error"), FAULT, "error"),
+        (device("ESTOPPED", reason="pressed"), FAULT, "error"),
+        (device("DISABLED"), IDLE, "warning"),
+        (device("UNCONFIGURED", False), IDLE, "warning"),
+    ):
+        rig = Rig()
         step = sent(rig.expose())
-        actions = rig.steering.on_result(step.stamp_ns, "aborted: beyond a limit")
-    assert where(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
-    assert "beyond a limit" in logged(actions)
+        (log,) = rig.steering.on_device(status)
+        assert where(rig) == (state, NOTHING)
+        assert getattr(log, "severity", "") == severity
+        said = logged([log])
+        assert f"{state.value}: device is {status.state}" in said
+        assert status.reason in said
+        assert rig.steering.on_result(step.stamp_ns, "aborted: stopped") == []
+        assert rig.expose() == []
+        rig.steering.on_device(HELD)
+        assert rig.start() == "steering"
+
+
+def test_commands_that_never_move_end_in_a_fault_and_a_start_counts_anew() -> None:
+    rig = Rig()
+    for _ in range(2):
+        for _ in range(MOST_REFUSALS):
+            assert rig.steering.state is SteeringState.STEERING
+            step = sent(rig.expose())
+            actions = rig.steering.on_result(step.stamp_ns, "aborted: beyond a limit")
+        assert where(rig) == (FAULT, NOTHING)
+        assert "10 commands in a row ended without motion" in logged(actions)
+        assert "beyond a limit" in logged(actions)
+        assert rig.start() == "steering"
+    # One that moved a little is no refusal.
+    for _ in range(2 * MOST_REFUSALS):
+        rig.run(sent(rig.expose()), part=0.01, text="aborted: slow")
+    assert rig.steering.state is SteeringState.STEERING
 
 
 def test_a_person_who_lets_go_at_once_many_times_is_no_fault() -> None:
@@ -142,23 +146,30 @@ def test_a_person_who_lets_go_at_once_many_times_is_no_fault() -> None:
     assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
 
 
-def test_commands_follow_data_alone() -> None:
-    """Two runs over the same data, their topics interleaved differently: the same commands."""
-    runs = []
-    for order in (0, 1):
-        rig, commands = Rig(), []
-        rng = np.random.default_rng(11)
-        for _ in range(30):
-            rig.now += TICK
-            tip = rig.measured(float(rng.uniform(-1e-3, 1e-3)))
-            if order == 0:
-                actions = rig.joints() + rig.steering.on_tip(tip)
-            else:
-                actions = rig.steering.on_tip(tip) + rig.joints()
-            step = sent(actions)
-            commands.append(step)
-            rig.steering.on_device(MOVING)
-            rig.run(step)
-            rig.steering.on_device(HELD)
-        runs.append(commands)
-    assert runs[0] == runs[1]
+@pytest.mark.parametrize("share", [0.0, 0.9])
+def test_steps_that_the_joints_do_not_follow_are_a_fault(share: float) -> None:
+    rig = Rig()
+    rig.steps(3)
+    for count in range(1, MOST_UNFOLLOWED + 1):
+        assert rig.steering.state is SteeringState.STEERING
+        rig.run(rig.good_tips(), part=share)
+        said = logged(rig.settle())
+        assert "said to have succeeded" in said
+        assert ("so were 3 in a row" in said) is (count == MOST_UNFOLLOWED)
+    assert where(rig) == (FAULT, NOTHING)
+    assert rig.steering.step == 3
+    # A person has looked after it.
+    assert rig.start() == "steering"
+    rig.run(rig.good_tips())
+    assert rig.steering.step == 4
+
+
+def test_a_step_that_was_followed_forgets_those_that_were_not() -> None:
+    rig = Rig()
+    for _ in range(MOST_UNFOLLOWED + 1):
+        rig.run(rig.good_tips(), part=0.5)
+        rig.settle()
+        assert "said to have succeeded" in rig.steering.reason
+        assert rig.steering.intake.after_ns <= rig.now - TICK
+        rig.run(rig.good_tips())
+    assert rig.steering.state is SteeringState.STEERING

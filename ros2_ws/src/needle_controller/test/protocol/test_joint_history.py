@@ -1,13 +1,22 @@
+"""The joints of the last seconds: between samples, and what does not follow from the last."""
+
 from __future__ import annotations
 
 import math
 
 import pytest
 
-from needle_controller.protocol.joint_history import CONFIRMED_BY, Heard, JointHistory, JointSample
+from needle_controller.protocol.joint_history import (
+    CONFIRMED_BY,
+    LARGEST_GAP_NS,
+    Heard,
+    JointHistory,
+    JointSample,
+)
 
 TICK = 20_000_000
 HOUR = 3600 * 10**9
+START = 2 * HOUR
 
 
 def history(*samples: tuple[int, float, float]) -> JointHistory:
@@ -17,84 +26,93 @@ def history(*samples: tuple[int, float, float]) -> JointHistory:
     return made
 
 
-def test_nothing_before_two_sides_are_known() -> None:
+def test_joints_are_linear_between_samples_and_unknown_beyond_them() -> None:
     empty = JointHistory()
-    assert empty.at(5) is None
-    assert empty.latest is None
-    assert empty.oldest is None
-    one = history((100, 1.0, 2.0))
-    assert one.at(99) is None
-    assert one.at(101) is None
-    assert one.at(100) == JointSample(100, 1.0, 2.0)
-
-
-def test_linear_between_samples_and_exact_on_them() -> None:
+    assert (empty.at(5), empty.latest, empty.oldest) == (None, None, None)
+    first, last = JointSample(100, 1e-5, 0.0), JointSample(400, 2e-5, 0.0)
     three = history((100, 1e-5, 0.0), (200, 2e-5, -0.04), (400, 2e-5, 0.0))
-    assert three.at(200) == JointSample(200, 2e-5, -0.04)
+    assert (three.oldest, three.latest) == (first, last)
+    assert (three.at(100), three.at(400)) == (first, last)
     assert three.at(125) == JointSample(125, 1.25e-5, -0.01)
     assert three.at(300) == JointSample(300, 2e-5, -0.02)
-    assert list(three.after(200)) == [JointSample(400, 2e-5, 0.0)]
-    assert next(iter(three.after(199))).stamp_ns == 200
+    assert (three.at(99), three.at(401)) == (None, None)
+    assert list(three.after(200)) == [last]
+    assert [sample.stamp_ns for sample in three.after(199)] == [200, 400]
+    # Stamps of a real clock lose nothing.
+    begin = 1_700_000_000_000_000_001
+    two = history((begin, 0.0, 0.0), (begin + 2, 2e-6, 0.0))
+    assert two.at(begin + 1) == JointSample(begin + 1, 1e-6, 0.0)
 
 
-def test_stamps_of_a_real_clock_lose_nothing() -> None:
-    start = 1_700_000_000_000_000_001
-    two = history((start, 0.0, 0.0), (start + 2, 2e-6, 0.0))
-    assert two.at(start + 1) == JointSample(start + 1, 1e-6, 0.0)
-
-
-@pytest.mark.parametrize(
-    "sample", [(200, 1.0, 1.0), (50, 1.0, 1.0), (300, math.nan, 0.0), (300, 0.0, math.inf)]
-)
-def test_old_or_broken_samples_are_not_taken(sample: tuple[int, float, float]) -> None:
-    one = history((200, 1.0, 2.0))
-    assert one.add(JointSample(*sample)) is not Heard.TAKEN
-    assert one.latest == JointSample(200, 1.0, 2.0)
+def test_samples_on_a_way_are_spaced_out() -> None:
+    made = history(*((k * TICK, 1e-4 * k, 0.0) for k in range(12)))
+    start, end = JointSample(TICK, 1e-4, 0.0), JointSample(10 * TICK, 1e-3, 0.0)
+    kept = made.between(start, end, 2.9e-4)
+    assert [sample.stamp_ns // TICK for sample in kept] == [4, 7]
+    assert [s.stamp_ns // TICK for s in made.between(start, end, 1e-5)] == list(range(2, 10))
 
 
 def test_memory_is_bounded() -> None:
     made = JointHistory(length=10)
     for i in range(1000):
         made.add(JointSample(i, 1e-6 * i, 0.0))
+        assert made.oldest is not None
+        assert i - made.oldest.stamp_ns < 20
     assert made.oldest is not None
-    assert 1000 - 20 <= made.oldest.stamp_ns <= 990
+    assert made.oldest.stamp_ns <= 990
     assert made.at(995) == JointSample(995, 1e-6 * 995, 0.0)
 
 
-SPIKES = {
-    "insertion": (TICK, 0.0, 0.0),
-    "rotation": (TICK, 0.05, 3.0),
-    "an hour ahead": (HOUR, 0.05, 0.0),
-    "an hour ago": (-HOUR, 0.05, 0.0),
-}
+def test_a_sample_counts_that_follows_from_the_one_before() -> None:
+    for gap_ns, insertion, rotation, heard in (
+        # As far as a hand pushes and a motor turns in the time, and the noise of both.
+        (TICK, 1.199e-3, 0.699, Heard.TAKEN),
+        (TICK, -1.199e-3, -0.699, Heard.TAKEN),
+        (TICK, 1.201e-3, 0.0, Heard.DOUBTED),
+        (TICK, 0.0, -0.701, Heard.DOUBTED),
+        # Unseen for no longer than 40 ms.
+        (LARGEST_GAP_NS, 2.199e-3, 1.299, Heard.TAKEN),
+        (LARGEST_GAP_NS, 2.201e-3, 0.0, Heard.DOUBTED),
+        (LARGEST_GAP_NS, 0.0, 1.301, Heard.DOUBTED),
+        (LARGEST_GAP_NS + 1, 0.0, 0.0, Heard.DOUBTED),
+        (1, 0.0, 0.0, Heard.TAKEN),
+        (0, 1e-4, 0.0, Heard.REPEATED),
+        (-LARGEST_GAP_NS, 9.0, 9.0, Heard.REPEATED),
+        (-LARGEST_GAP_NS - 1, 0.0, 0.0, Heard.DOUBTED),
+        (TICK, math.nan, 0.0, Heard.DOUBTED),
+        (TICK, 0.0, math.inf, Heard.DOUBTED),
+    ):
+        made, row = history((START, 0.05, 1.0)), (gap_ns, insertion, rotation)
+        sample = JointSample(START + gap_ns, 0.05 + insertion, 1.0 + rotation)
+        finite = math.isfinite(insertion + rotation)
+        # A repeated one, and one that is no number, are not even counted.
+        doubted = heard is Heard.DOUBTED and finite
+        assert made.add(sample) is heard, row
+        assert (made.latest == sample) is (heard is Heard.TAKEN), row
+        assert (made.doubted, bool(made.complaint)) == (int(doubted), doubted), row
+        assert JointHistory().add(sample) is (Heard.TAKEN if finite else Heard.DOUBTED), row
 
 
-@pytest.mark.parametrize("spike", SPIKES.values(), ids=SPIKES)
-def test_a_spike_changes_nothing_but_a_count(spike: tuple[int, float, float]) -> None:
-    start = 2 * HOUR
-    made = history((start, 0.05, 0.0))
+SPIKES = [(TICK, 0.0, 0.0), (TICK, 0.05, 3.0), (HOUR, 0.05, 0.0), (-HOUR, 0.05, 0.0)]
+
+
+@pytest.mark.parametrize("spike", SPIKES)
+def test_a_spike_is_dropped_and_what_stays_is_the_new_truth(
+    spike: tuple[int, float, float],
+) -> None:
     stamp, insertion, rotation = spike
-    assert made.add(JointSample(start + stamp, insertion, rotation)) is Heard.DOUBTED
-    assert made.latest == JointSample(start, 0.05, 0.0)
-    assert made.doubted == 1
+    made = history((START, 0.05, 0.0))
+    made.add(JointSample(START + stamp, insertion, rotation))
     assert "do not follow from the last" in made.complaint
-    for tick in range(1, CONFIRMED_BY):
-        assert made.add(JointSample(start + tick * TICK, 0.05, 0.0)) is Heard.TAKEN
-    assert made.complaint == ""
-
-
-@pytest.mark.parametrize("spike", SPIKES.values(), ids=SPIKES)
-def test_what_stays_is_the_new_truth(spike: tuple[int, float, float]) -> None:
-    start = 2 * HOUR
-    made = history((start, 0.05, 0.0))
-    stamp, insertion, rotation = spike
+    # One that does not follow from the spike either begins the count anew.
+    assert made.add(JointSample(START + 5 * HOUR, 1.0, 0.0)) is Heard.DOUBTED
     heard = [
-        made.add(JointSample(start + stamp + tick * TICK, insertion, rotation))
+        made.add(JointSample(START + stamp + tick * TICK, insertion, rotation))
         for tick in range(CONFIRMED_BY)
     ]
     assert heard == [Heard.DOUBTED] * (CONFIRMED_BY - 1) + [Heard.JUMPED]
-    assert made.oldest == JointSample(start + stamp, insertion, rotation)
-    assert made.complaint == ""
+    assert made.oldest == JointSample(START + stamp, insertion, rotation)
+    assert (made.complaint, made.doubted) == ("", CONFIRMED_BY + 2)
 
 
 def test_two_truths_in_turn_leave_the_first() -> None:
@@ -102,3 +120,4 @@ def test_two_truths_in_turn_leave_the_first() -> None:
     for tick in range(2, 40, 2):
         assert made.add(JointSample(tick * TICK, 0.0, 0.0)) is Heard.DOUBTED
         assert made.add(JointSample((tick + 1) * TICK, 0.05, 0.0)) is Heard.TAKEN
+        assert made.complaint == ""

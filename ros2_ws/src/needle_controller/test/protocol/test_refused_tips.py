@@ -1,95 +1,82 @@
-"""Tips that are refused, and the wait for a good one."""
+"""Tips that are refused, covariances that come with them, and the wait for a good one."""
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 import pytest
 
-from needle_controller.protocol.steering_types import Awaiting, SteeringState
-from needle_controller.protocol.tip_gate import Fault, TipMeasurement
+from needle_controller.model.target_plane import plane_from_pose
+from needle_controller.protocol.steering_types import Action, Awaiting, PublishUpdate, SteeringState
+from needle_controller.protocol.tip_gate import Fault, TipCovariance, TipMeasurement
 from needle_core.component import Log
 
-from .rig import HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
+from .rig import HELD, MOVING, SECOND, TICK, Rig, logged, none_sent, sent, spied, where
+
+STEERING = SteeringState.STEERING
 
 
-@pytest.mark.parametrize(
-    ("position", "frame", "said"),
-    [
-        ([np.nan, 0.0, 0.0], "rig", "not finite"),
-        ([0.0, 0.0, 0.0], "left_camera_optical", "left_camera_optical"),
-        ([0.5, 0.2, 1.0], "rig", "from the entry point"),
-        # Too large to be squared.
-        ([-1e300, 0.2, 1.0], "rig", "from the entry point"),
-    ],
-)
-def test_a_refused_tip_moves_nothing_and_asks_for_another(
-    position: list[float], frame: str, said: str
-) -> None:
-    rig = Rig()
-    before = rig.steering.control.started
-    bad = TipMeasurement(rig.now + TICK, frame, np.array(position))
-    actions = rig.expose(bad)
-    assert none_sent(actions)
-    assert said in logged(actions)
-    assert rig.steering.intake.refused.total() == 1
-    assert said in rig.steering.reason
-    assert rig.steering.control.started == before
-    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
-    assert rig.steering.intake.after_ns == bad.stamp_ns
-    sent(rig.expose())
-    assert rig.steering.rejection == ""
+def bad(rig: Rig, position: list[float], frame: str = "rig", ahead: int = TICK) -> TipMeasurement:
+    return TipMeasurement(rig.now + ahead, frame, np.array(position))
 
 
-def test_millimetres_are_a_jump_no_needle_makes() -> None:
-    rig = Rig()
-    rig.run(sent(rig.expose()))
-    rig.now += TICK
-    rig.joints()
-    bad = TipMeasurement(rig.now, "rig", np.array([0.1, 0.0, 1.0]))
-    assert "from the entry point" in logged(rig.steering.on_tip(bad))
-    for _ in range(2):
-        rig.run(sent(rig.expose()))
-    rig.now += TICK
-    rig.joints()
-    bad = TipMeasurement(rig.now, "rig", np.array([0.0, 0.0, -0.0035]))
-    assert "jumped" in logged(rig.steering.on_tip(bad))
+def told(rig: Rig, std: float = 1e-4, ahead: int = 0) -> TipCovariance:
+    """What a source says of the tip exposed now."""
+    return TipCovariance(rig.now + ahead, "rig", np.eye(3) * std**2)
+
+
+def test_a_refused_tip_moves_nothing_and_asks_for_another() -> None:
+    kinds = set()
+    for position, frame, fault, said in (
+        ([np.nan, 0.0, 0.0], "rig", Fault.NOT_FINITE, "not finite"),
+        ([0.0, 0.0, 0.0], "map", Fault.FRAME, "'map'"),
+        ([0.5, 0.2, 1.0], "rig", Fault.TOO_FAR, "from the entry point"),
+    ):
+        rig = Rig()
+        tip = bad(rig, position, frame)
+        (log,) = rig.expose(tip)
+        assert isinstance(log, Log)
+        assert said in log.text
+        kinds.add(log.kind)
+        assert rig.steering.intake.refused == {fault: 1}
+        assert said in rig.steering.rejection
+        assert rig.steering.reason == f"tip refused: {rig.steering.rejection}"
+        assert not rig.steering.control.started
+        assert where(rig) == (STEERING, Awaiting.TIP)
+        assert rig.steering.intake.after_ns == tip.stamp_ns
+        sent(rig.expose())
+        assert rig.steering.rejection == ""
+    # Each reason is told for itself.
+    assert len(kinds) == 3
 
 
 def test_a_tip_that_nobody_waits_for_is_told_of_where_no_needle_can_be() -> None:
     rig = Rig()
     step = sent(rig.expose())
-    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
-    bad = TipMeasurement(rig.now + TICK // 2, "rig", np.array([0.1, 0.0, 1.0]))
-    assert "from the entry point" in logged(rig.steering.on_tip(bad))
-    assert rig.steering.intake.refused.total() == 1
-    good = TipMeasurement(rig.now + TICK // 2, "rig", np.array([0.0, 0.0, 1e-3]))
-    assert rig.steering.on_tip(good) == []
+    assert "from the entry point" in logged(rig.steering.on_tip(bad(rig, [0.1, 0.0, 1.0])))
+    assert rig.steering.on_tip(bad(rig, [0.0, 0.0, 1e-3])) == []
+    assert rig.steering.intake.refused == {Fault.TOO_FAR: 1}
     rig.run(step)
-    sent(rig.expose())
-
-
-def test_an_old_stamp_is_refused_and_does_not_set_the_clock_back() -> None:
-    rig = Rig()
     rig.run(sent(rig.expose()))
+    rig.steering.on_stop()
+    rig.steering.on_tip(bad(rig, [0.1, 0.0, 1.0]))
+    assert rig.steering.intake.refused == {Fault.TOO_FAR: 2}
+    assert rig.steering.reason == "stopped"
+
+
+def test_a_stamp_that_is_old_or_far_ahead_does_not_set_the_clock() -> None:
+    rig = Rig()
+    rig.steps(1)
     after = rig.steering.intake.after_ns
-    old = TipMeasurement(TICK, "rig", np.zeros(3))
-    assert "not newer" in logged(rig.steering.on_tip(old))
+    assert "not newer" in logged(rig.steering.on_tip(bad(rig, [0.0] * 3, ahead=TICK - rig.now)))
+    future = bad(rig, [0.0] * 3, ahead=3600 * SECOND)
+    assert "ahead of joint_states" in logged(rig.steering.on_tip(future))
     assert rig.steering.intake.after_ns == after
     sent(rig.expose())
-
-
-def test_a_stamp_far_ahead_is_refused_and_does_not_block() -> None:
-    rig = Rig()
-    future = TipMeasurement(rig.now + 3600 * 10**9, "rig", np.zeros(3))
-    assert "ahead of joint_states" in logged(rig.steering.on_tip(future))
-    assert rig.steering.intake.after_ns < future.stamp_ns
-    sent(rig.expose())
-
-
-def test_a_tip_older_than_the_joints_kept_is_refused() -> None:
-    rig = Rig()
-    rig.steering.intake.after_ns = 0
-    assert "older" in logged(rig.steering.on_tip(TipMeasurement(1, "rig", np.zeros(3))))
+    other = Rig()
+    other.steering.intake.after_ns = 0
+    assert "older" in logged(other.steering.on_tip(TipMeasurement(1, "rig", np.zeros(3))))
 
 
 def test_no_tip_in_time_waits_and_a_good_one_goes_on() -> None:
@@ -97,16 +84,33 @@ def test_no_tip_in_time_waits_and_a_good_one_goes_on() -> None:
     timeout = rig.steering.settings.tip_timeout
     assert rig.steering.on_time(100.0) == []
     assert rig.steering.on_time(100.0 + 0.99 * timeout) == []
-    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
-    assert "no good tip" in logged(rig.steering.on_time(100.0 + timeout))
+    assert where(rig) == (STEERING, Awaiting.TIP)
+    said = logged(rig.steering.on_time(100.0 + timeout))
+    assert said == "WAITING_FOR_TIP: no good tip for 2 s"
     assert where(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
     assert rig.steering.watchdog_trips == 1
     assert rig.steering.on_time(100.0 + 3 * timeout) == []
-    bad = TipMeasurement(rig.now + TICK, "rig", np.full(3, np.nan))
-    rig.expose(bad)
+    rig.expose(bad(rig, [np.nan] * 3))
     assert where(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
-    sent(rig.expose())
-    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
+    actions = rig.expose()
+    assert "STEERING: a good tip came" in logged(actions)
+    sent(actions)
+    assert where(rig) == (STEERING, Awaiting.RESULT)
+    # Stopping and starting work while it waits, too.
+    other = Rig()
+    other.expose(bad(other, [np.nan] * 3))
+    other.steering.on_time(0.0)
+    assert "the last one was refused: tip is not finite" in logged(other.steering.on_time(2.0))
+    assert other.start() == "already steering"
+    assert other.steering.on_stop()[0].message == "stopped"
+
+
+def test_a_step_whose_end_no_joints_show_is_named_after_the_time_of_a_tip() -> None:
+    rig = Rig()
+    rig.steering.on_result(sent(rig.expose()).stamp_ns, "succeeded")
+    rig.steering.on_time(0.0)
+    said = logged(rig.steering.on_time(2.0))
+    assert said == "WAITING_FOR_TIP: joint_states do not show the end of step 1"
 
 
 def test_time_does_not_run_while_a_person_pauses() -> None:
@@ -114,22 +118,23 @@ def test_time_does_not_run_while_a_person_pauses() -> None:
     rig.steering.on_time(0.0)
     assert rig.steering.on_time(1e6) == []
     rig.steering.on_device(HELD)
+    assert rig.steering.on_time(2e6) == []
     step = sent(rig.expose())
     rig.steering.on_device(MOVING)
-    rig.steering.on_time(1e6)
-    rig.joints()
-    assert "nothing heard" in logged(rig.steering.on_time(2e6))
-    rig.run(step)
     assert rig.steering.on_time(3e6) == []
-    assert rig.steering.state is SteeringState.STEERING
+    rig.run(step)
+    rig.steering.on_device(HELD)
+    assert rig.steering.on_time(4e6) == []
+    assert rig.steering.state is STEERING
 
 
 def test_a_tip_whose_joints_never_come_is_given_up() -> None:
     rig = Rig()
     # Also while waiting for one already.
     for start in (0.0, 100.0):
-        rig.steering.on_tip(TipMeasurement(rig.now + TICK, "rig", np.zeros(3)))
+        rig.steering.on_tip(rig.measured(ahead=TICK))
         rig.steering.on_time(start)
+        assert "no joint_states" not in logged(rig.steering.on_time(start + 1.99))
         assert "no joint_states" in logged(rig.steering.on_time(start + 2.0))
         rig.now += 2 * TICK
     assert rig.steering.intake.refused == {Fault.NO_JOINTS: 2}
@@ -137,12 +142,101 @@ def test_a_tip_whose_joints_never_come_is_given_up() -> None:
     sent(rig.expose())
 
 
-def test_each_reason_to_refuse_a_tip_is_told_for_itself() -> None:
-    rig = Rig()
-    kinds = set()
-    for position, frame in ((np.full(3, np.nan), "rig"), (np.zeros(3), "map"), (np.ones(3), "rig")):
-        (log,) = rig.expose(TipMeasurement(rig.now + TICK, frame, position))
-        assert isinstance(log, Log)
-        kinds.add(log.kind)
-    assert len(kinds) == 3
-    assert rig.steering.intake.refused.total() == 3
+def test_a_tip_waits_for_its_covariance_in_whatever_order_they_come() -> None:
+    steps = []
+    for order in itertools.permutations(range(3)):
+        rig = Rig(tip_covariance="from_tip_pose")
+        rig.now += TICK
+        tip, covariance = rig.measured(0.0004), told(rig)
+        actions: list[Action] = []
+        for number, topic in enumerate(order):
+            assert none_sent(actions), order[:number]
+            actions += (
+                rig.joints,
+                lambda rig=rig, tip=tip: rig.steering.on_tip(tip),
+                lambda rig=rig, c=covariance: rig.steering.on_tip_pose(c),
+            )[topic]()
+        steps.append(sent(actions))
+    assert len(set(steps)) == 1
+
+
+def test_the_covariance_decides_what_a_tip_is_worth_and_turns_with_the_plane(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = []
+    for std in (1e-4, 2e-3):
+        rig = Rig(tip_covariance="from_tip_pose")
+        rig.expose()
+        for _ in range(4):
+            rig.run(sent(rig.steering.on_tip_pose(told(rig))))
+            rig.expose()
+        rig.run(sent(rig.steering.on_tip_pose(told(rig))))
+        rig.expose(x=0.0005)
+        (update,) = (
+            a for a in rig.steering.on_tip_pose(told(rig, std)) if isinstance(a, PublishUpdate)
+        )
+        seen.append(update.update.estimate.position[0] + 0.003)
+    # Believed if it is known to 0.1 mm, hardly if only to 2 mm.
+    assert seen[0] > 3 * seen[1] > 0.0
+    rig = Rig(tip_covariance="from_tip_pose")
+    # x of this plane is y of rig.
+    rig.steering.control.plane = plane_from_pose(
+        "rig", [0.0, 0.003, 0.0], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]
+    )
+    calls = spied(rig, monkeypatch.setattr, "correct")
+    rig.expose()
+    rig.run(sent(rig.steering.on_tip_pose(told(rig))))
+    rig.expose()
+    matrix = np.diag([1.0, 4.0, 9.0]) * 1e-8
+    matrix[0, 2] = matrix[2, 0] = 1e-8
+    sent(rig.steering.on_tip_pose(TipCovariance(rig.now, "rig", matrix)))
+    wanted = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, 9.0]]) * 1e-8
+    # Added is what no source knows.
+    wanted += rig.steering.settings.measurement_std**2 * np.eye(3)
+    np.testing.assert_allclose(np.asarray(calls[0][1]), wanted, atol=1e-14)
+
+
+def test_a_tip_with_a_bad_covariance_is_refused() -> None:
+    rig = Rig(tip_covariance="from_tip_pose")
+    rig.expose()
+    actions = rig.steering.on_tip_pose(TipCovariance(rig.now, "map", np.eye(3)))
+    assert none_sent(actions)
+    assert "frame 'map'" in logged(actions)
+    assert rig.steering.intake.refused == {Fault.BAD_COVARIANCE: 1}
+    rig.expose()
+    sent(rig.steering.on_tip_pose(told(rig)))
+
+
+def test_a_covariance_of_a_later_tip_says_that_the_tips_own_is_lost() -> None:
+    rig = Rig(tip_covariance="from_tip_pose")
+    rig.expose()
+    assert rig.steering.on_tip_pose(told(rig, ahead=-TICK)) == []
+    actions = rig.steering.on_tip_pose(told(rig, ahead=TICK))
+    assert "no needle/tip_pose" in logged(actions)
+    assert "set it to configured" in logged(actions)
+    assert rig.steering.intake.refused == {Fault.NO_COVARIANCE: 1}
+    assert rig.steering.watchdog_trips == 0
+    assert rig.steering.intake.after_ns == rig.now
+    # The tip of that one is there for the next step.
+    sent(rig.expose())
+
+
+def test_a_source_of_tips_alone_is_told_what_to_set() -> None:
+    rig = Rig(tip_covariance="from_tip_pose")
+    rig.expose()
+    rig.steering.on_time(0.0)
+    assert rig.steering.on_time(1.9) == []
+    rig.steering.on_time(2.0)
+    assert rig.steering.state is SteeringState.WAITING_FOR_TIP
+    assert "set it to configured" in rig.steering.reason
+    assert rig.steering.intake.refused == {Fault.NO_COVARIANCE: 1}
+    # Configured, it asks for none and uses none.
+    steps = []
+    for spoilt in (False, True):
+        rig = Rig()
+        for _ in range(3):
+            if spoilt:
+                rig.steering.on_tip_pose(TipCovariance(rig.now + TICK, "rig", np.zeros((3, 3))))
+            steps.append(sent(rig.expose()))
+            rig.run(steps[-1])
+    assert steps[:3] == steps[3:]

@@ -1,130 +1,138 @@
-"""What it takes to start steering."""
+"""What it takes to start steering, and other settings on the way."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from dataclasses import replace
+import dataclasses
+import math
 
-import numpy as np
 import pytest
 
+from needle_controller.model.target_plane import offset_plane
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import Awaiting, SteeringState
-from needle_core.status_messages import DeviceStatus
 
 from .rig import HELD, MOVING, Rig, device, sent, where
 
-ELSEWHERE = replace(device("HOLDING", True, ""), insertion_m=0.0, rotation_rad=0.0)
+SETTINGS = SteeringSettings(target_offset=0.003)
+HOLDING = dataclasses.replace(HELD, insertion_m=0.0, rotation_rad=0.0)
 
 
-@pytest.mark.parametrize(
-    ("device", "said"),
-    [
-        (None, "device/status"),
-        (device("HOLDING", False, ""), "not homed"),
-        (device("DISABLED", True, ""), "not enabled"),
-        (device("ESTOPPED", True, ""), "not enabled"),
-    ],
-)
-def test_start_says_why_not(device: DeviceStatus | None, said: str) -> None:
+def test_start_says_which_device_it_waits_for() -> None:
+    bare = Steering(SETTINGS)
+    assert "no device/status has come" in bare.on_start()[0].message
+    bare.on_device(HELD)
+    assert bare.on_start()[0].message == "no joint_states have come"
     rig = Rig(started=False)
-    rig.steering._device = device
-    reply, _ = rig.steering.on_start()
-    assert not reply.success
-    assert said in reply.message
-    assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
-
-
-def test_start_needs_joints() -> None:
-    fresh = Steering(Rig(started=False).steering.settings)
-    fresh.on_device(HELD)
-    reply, _ = fresh.on_start()
-    assert (reply.success, reply.message) == (False, "no joint_states have come")
-
-
-def test_start_refuses_a_needle_it_did_not_follow() -> None:
-    rig = Rig(started=False, insertion=0.05)
-    reply, _ = rig.steering.on_start()
-    assert not reply.success
-    assert "0.05 m in" in reply.message
-
-
-def test_start_refuses_a_roll_its_coordinates_cannot_say() -> None:
-    rig = Rig(started=False, preset="paper", rotation=2.0)
-    reply, _ = rig.steering.on_start()
-    assert not reply.success
-    assert "roll" in reply.message
-
-
-@pytest.mark.parametrize("turned", [2.0, np.pi, -8.0])
-def test_best_starts_with_its_base_turned_however_the_last_run_left_it(turned: float) -> None:
-    rig = Rig(started=False, rotation=turned)
-    assert rig.steering.on_start()[0].success
-    assert sent(rig.expose()).rotation == pytest.approx(turned, abs=0.53)
-
-
-def test_start_twice_and_stop_twice() -> None:
-    rig = Rig()
-    assert not rig.steering.on_start()[0].success
-    assert rig.steering.on_stop()[0].success
-    assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
-    assert rig.steering.on_stop()[0].success
-
-
-def test_tips_move_nothing_while_idle() -> None:
-    rig = Rig(started=False)
-    assert rig.expose() == []
-
-
-@pytest.mark.parametrize(
-    ("device", "said"),
-    [
+    for status, said in (
         (MOVING, "waiting for the device, which moves"),
-        (device("MOVING", False, ""), "waiting for the device, which moves"),
-        (ELSEWHERE, "waiting for joint_states"),
-    ],
-)
-def test_a_start_waits_for_the_end_of_homing(device: DeviceStatus, said: str) -> None:
+        (device("MOVING", False), "waiting for the device, which moves"),
+        (device("HOLDING", False), "not homed"),
+        (device("DISABLED"), "not enabled (DISABLED)"),
+        (device("ESTOPPED"), "not enabled (ESTOPPED)"),
+    ):
+        rig.steering.on_device(status)
+        assert said in rig.start()
+        assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
+
+
+def test_start_waits_for_joints_that_say_what_the_device_does() -> None:
     """The joints lag behind the device: homing has ended there, and not here."""
+    for insertion, rotation, agree in (
+        (4.9e-5, -1.9e-2, True),
+        (5.1e-5, 0.0, False),
+        (0.0, 2.1e-2, False),
+    ):
+        rig = Rig(started=False)
+        rig.steering.on_device(
+            dataclasses.replace(HOLDING, insertion_m=insertion, rotation_rad=rotation)
+        )
+        assert ("waiting for joint_states to say" not in rig.start()) is agree
+    for unsaid in (
+        dataclasses.replace(HOLDING, insertion_m=None),
+        dataclasses.replace(HOLDING, rotation_rad=None),
+    ):
+        rig = Rig(started=False, insertion=0.001)
+        rig.steering.on_device(unsaid)
+        assert rig.start() == "steering"
     rig = Rig(started=False, insertion=0.0015)
-    rig.steering.on_device(device)
-    reply, _ = rig.steering.on_start()
-    assert not reply.success
-    assert reply.message.startswith(said)
+    rig.steering.on_device(HOLDING)
+    assert "waiting for joint_states" in rig.start()
     rig.insertion = 0.0
     rig.settle()
-    rig.steering.on_device(replace(ELSEWHERE, hold_owner="operator"))
-    assert rig.steering.on_start()[0].success
+    assert rig.start() == "steering"
     sent(rig.expose())
 
 
-NEVER_COMPILED = """
-import sys
-import numpy as np
-from numba.core.dispatcher import Dispatcher
-from needle_controller.model.target_plane import offset_plane
-from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
-from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.plane_control import PlaneControl
-
-def compiled():
-    every = (vars(module) for name, module in sys.modules.items() if "needle_" in name)
-    found = [one for names in every for one in names.values() if isinstance(one, Dispatcher)]
-    return {f"{one.py_func.__module__}.{one.__name__}": len(one.signatures) for one in found}
-
-control = PlaneControl(SteeringSettings(preset=sys.argv[1], **PAPER_NOISE), offset_plane(0.003))
-ahead = compiled()
-for step in range(20):
-    joints = JointSample(step, step * 0.001, 0.1 * step)
-    control.update(np.array([0.0, 0.0, step * 0.001]), joints)
-assert ahead and compiled() == ahead, (ahead, compiled())
-"""
+def test_start_refuses_a_needle_that_is_in_or_at_the_depth_or_turned_too_far() -> None:
+    assert Rig(started=False, insertion=0.002).start() == "steering"
+    assert "is 0.0021 m in and was not followed" in Rig(started=False, insertion=0.0021).start()
+    for short, said in ((0.9e-6, "is at the depth 0.001 m"), (1.1e-6, "steering")):
+        assert said in Rig(started=False, depth=0.001, insertion=0.001 - short).start()
+    for degrees, started in ((79.0, True), (-79.0, True), (81.0, False), (-81.0, False)):
+        said = Rig(started=False, preset="paper", rotation=math.radians(degrees)).start()
+        assert ("roll in target_plane" not in said) is started, degrees
 
 
-@pytest.mark.parametrize("preset", ["best", "paper"])
-def test_nothing_is_compiled_while_a_needle_is_steered(preset: str) -> None:
-    """In a process of its own: what another test has compiled hides what is missing."""
-    command = [sys.executable, "-c", NEVER_COMPILED, preset]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert ended.returncode == 0, ended.stderr
+@pytest.mark.parametrize("turned", [2.0, -8.0])
+def test_best_starts_with_its_base_turned_however_the_last_run_left_it(turned: float) -> None:
+    rig = Rig(started=False, rotation=turned)
+    assert rig.start() == "steering"
+    assert sent(rig.expose()).rotation == pytest.approx(turned, abs=0.53)
+
+
+def test_start_and_stop_count_only_where_they_change_something() -> None:
+    rig = Rig(started=False)
+    # Tips move nothing while nobody has started.
+    assert rig.expose() == []
+    assert rig.steering.starts == 0
+    assert rig.start() == "steering"
+    assert rig.start() == "already steering"
+    assert rig.steering.starts == 1
+    rig.steps(5)
+    for said in ("stopped", "was not steering (IDLE)"):
+        reply, _ = rig.steering.on_stop()
+        assert (reply.success, reply.message) == (True, said)
+        assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
+    # It goes on with what is known.
+    assert rig.start() == "steering"
+    assert rig.steering.reason == ""
+    assert sent(rig.expose()).insertion == pytest.approx(0.006)
+    assert (rig.steering.step, rig.steering.starts) == (5, 2)
+
+
+def test_a_needle_that_is_out_is_another_one() -> None:
+    rig = Rig(insertion=0.0)
+    rig.steps(2)
+    rig.steering.on_stop()
+    assert rig.start() == "steering"
+    assert rig.steering.step == 0
+    assert not rig.steering.control.started
+    assert rig.steering.intake.last is None
+
+
+def test_settings_change_protocol_controller_and_plane_on_the_way() -> None:
+    steering = Steering(SETTINGS)
+    law = steering.control._law
+    steering.control.plane = offset_plane(0.005)
+    shallower = dataclasses.replace(SETTINGS, depth=0.1, tip_timeout=3.0)
+    steering.configure(shallower)
+    assert steering.settings is shallower
+    # A given plane stays unless the offset is another.
+    assert steering.control.plane.offset == 0.005
+    steering.configure(dataclasses.replace(shallower, target_offset=0.002, preset="open_loop"))
+    assert steering.control.plane.offset == 0.002
+    assert steering.control._settings.preset == "open_loop"
+    assert steering.control._law is not law
+
+
+def test_start_says_where_no_path_leads_past_obstacles() -> None:
+    buried = (0.0, 0.0, 0.06, 0.0, 0.0, 0.06, 0.004)
+    steering = Steering(
+        dataclasses.replace(SETTINGS, target_point=(0.0, 0.0, 0.06), obstacles=buried)
+    )
+    rig = Rig(started=False)
+    rig.steering = steering
+    steering.on_device(HELD)
+    rig.joints()
+    assert "the target point is" in rig.start()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -12,82 +14,55 @@ from needle_controller.presets.own_parts import OwnPart
 from needle_controller.presets.presets import observer_settings
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import Awaiting, PublishUpdate, SteeringState
+from needle_controller.protocol.steering_types import (
+    Action,
+    Awaiting,
+    PublishUpdate,
+    SendStep,
+    SteeringState,
+)
 from needle_controller.protocol.tip_gate import TipMeasurement
 
 from .rig import FREE, HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
 
-
-def test_start_without_hold_asks_for_no_tip_until_somebody_holds() -> None:
-    rig = Rig(held=False)
-    assert where(rig) == (SteeringState.STEERING, Awaiting.HOLD)
-    assert none_sent(rig.expose())
-    assert rig.steering.on_device(HELD) == []
-    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
-    # The tip seen before the hold is not used, a new one is asked for.
-    assert rig.steering.intake.after_ns == rig.now
-    sent(rig.expose())
+STEERING = SteeringState.STEERING
 
 
-def test_a_tip_leads_to_one_step() -> None:
+def test_a_tip_leads_to_one_step_and_its_end_to_the_wish_for_another() -> None:
     rig = Rig()
-    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
+    assert where(rig) == (STEERING, Awaiting.TIP)
     actions = rig.expose()
     step = sent(actions)
     assert step.stamp_ns == rig.now
-    assert step.insertion == pytest.approx(0.001)
-    assert step.duration == pytest.approx(0.5)
-    assert abs(step.rotation) <= np.deg2rad(30.0) + 1e-12
+    assert (step.insertion, step.duration) == pytest.approx((0.001, 0.5))
     # Below the plane: the needle is turned so that it bends up, towards +x.
-    assert step.rotation > 0.0
+    assert 0.0 < step.rotation <= np.deg2rad(30.0) + 1e-12
     update = next(action for action in actions if isinstance(action, PublishUpdate))
-    assert update.stamp_ns == rig.now
+    assert update.stamp_ns == rig.steering.command_ns == rig.now
     assert update.update.estimate.reduced[0] == pytest.approx(-0.003)
-    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
-    # One tip, one step.
+    assert rig.steering.reach is update.update.reach
+    assert where(rig) == (STEERING, Awaiting.RESULT)
     assert none_sent(rig.expose())
-
-
-def test_a_finished_step_asks_for_a_tip_exposed_after_its_end() -> None:
-    rig = Rig()
-    step = sent(rig.expose())
+    # Answers to other commands are not ours.
+    assert rig.steering.on_result(step.stamp_ns - 1, "succeeded") == []
+    assert where(rig) == (STEERING, Awaiting.RESULT)
     assert none_sent(rig.run(step))
     end = rig.now
-    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
-    assert rig.steering.step == 1
-    assert rig.steering.intake.after_ns == end
+    assert where(rig) == (STEERING, Awaiting.TIP)
+    assert (rig.steering.step, rig.steering.intake.after_ns) == (1, end)
     early = TipMeasurement(end - TICK // 2, "rig", np.array([0.0, 0.0, 0.0009]))
     assert rig.steering.on_tip(early) == []
     assert rig.steering.intake.refused.total() == 0
     assert sent(rig.expose()).insertion == pytest.approx(0.002)
-
-
-def test_the_tip_asked_for_does_not_depend_on_what_arrives_first() -> None:
-    """The answer may come before the last joints or after those of the next exposure."""
-    steps = []
-    for late in (0, 1):
-        rig = Rig()
-        step = sent(rig.expose())
-        rig.now += TICK
-        rig.insertion, rig.rotation = step.insertion, step.rotation
-        rig.joints()
-        if late == 0:
-            rig.steering.on_result(step.stamp_ns, "succeeded")
-        rig.now += TICK
-        rig.joints()
-        if late == 1:
-            rig.steering.on_result(step.stamp_ns, "succeeded")
-        steps.append(sent(rig.steering.on_tip(rig.measured())))
-    assert steps[0] == steps[1]
+    assert rig.steering.insertion == pytest.approx(0.001)
 
 
 def test_a_tip_waits_for_its_joints() -> None:
     rig = Rig()
     rig.now += TICK
     assert rig.steering.on_tip(rig.measured()) == []
-    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
-    step = sent(rig.joints())
-    rig.run(step)
+    assert where(rig) == (STEERING, Awaiting.TIP)
+    rig.run(sent(rig.joints()))
     # Joints interpolated at the exposure, between two samples.
     rig.now += TICK
     tip = TipMeasurement(rig.now - TICK // 2, "rig", np.array([0.0, 0.0, 0.001]))
@@ -95,39 +70,37 @@ def test_a_tip_waits_for_its_joints() -> None:
     assert sent(rig.joints()).stamp_ns == tip.stamp_ns
 
 
-def test_a_step_waits_for_a_device_that_still_says_moving() -> None:
-    rig = Rig()
-    rig.steering.on_device(MOVING)
-    assert none_sent(rig.expose())
-    assert where(rig) == (SteeringState.STEERING, Awaiting.DEVICE)
-    sent(rig.steering.on_device(HELD))
-    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
-
-
-def test_a_hold_lost_before_the_step_asks_for_a_fresh_tip() -> None:
-    rig = Rig()
+def test_without_hold_no_tip_is_used_and_after_it_a_fresh_one() -> None:
+    rig = Rig(held=False)
+    for _ in range(2):
+        assert where(rig) == (STEERING, Awaiting.HOLD)
+        assert none_sent(rig.expose())
+        assert rig.steering.on_device(HELD) == []
+        assert where(rig) == (STEERING, Awaiting.TIP)
+        assert rig.steering.intake.after_ns == rig.now
+        # A step waits for a device that still moves; a hold lost meanwhile asks anew.
+        rig.steering.on_device(MOVING)
+        assert none_sent(rig.expose())
+        assert where(rig) == (STEERING, Awaiting.DEVICE)
+        assert none_sent(rig.steering.on_device(FREE))
     rig.steering.on_device(MOVING)
     rig.expose()
-    assert none_sent(rig.steering.on_device(FREE))
-    assert where(rig) == (SteeringState.STEERING, Awaiting.HOLD)
-    assert none_sent(rig.steering.on_device(HELD))
-    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
-    assert rig.steering.intake.after_ns == rig.now
-    sent(rig.expose())
+    sent(rig.steering.on_device(HELD))
+    assert where(rig) == (STEERING, Awaiting.RESULT)
 
 
 def test_an_aborted_step_resumes_from_where_the_joints_are() -> None:
     rig = Rig()
     step = sent(rig.expose())
     rig.steering.on_device(FREE)
-    rig.run(step, part=0.3, text="aborted: hold released")
-    assert where(rig) == (SteeringState.STEERING, Awaiting.HOLD)
+    said = rig.run(step, part=0.3, text="aborted: hold released")
+    assert logged(said) == "step 1 aborted: hold released"
+    assert where(rig) == (STEERING, Awaiting.HOLD)
     assert rig.steering.step == 0
-    assert "hold released" in rig.steering.reason
+    assert rig.steering.reason == "step aborted: hold released"
     assert none_sent(rig.expose())
     rig.steering.on_device(HELD)
-    again = sent(rig.expose())
-    assert again.insertion == pytest.approx(0.0003 + 0.001)
+    assert sent(rig.expose()).insertion == pytest.approx(0.0003 + 0.001)
 
 
 def test_joints_that_are_heard_late_do_not_show_a_standstill() -> None:
@@ -147,31 +120,110 @@ def test_joints_that_are_heard_late_do_not_show_a_standstill() -> None:
         rig.now += TICK
         place = share * step.insertion, share * step.rotation
         rig.steering.on_joints(JointSample(rig.now, *place, sent_ns=answered))
-    assert rig.steering.step == 1
-    assert rig.steering.intake.after_ns == rig.now
+    assert (rig.steering.step, rig.steering.intake.after_ns) == (1, rig.now)
 
 
-def test_answers_to_other_commands_are_not_ours() -> None:
-    rig = Rig()
-    step = sent(rig.expose())
-    assert rig.steering.on_result(step.stamp_ns - 1, "succeeded") == []
-    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
+def test_the_command_follows_from_stamps_whatever_order_the_topics_come_in() -> None:
+    """The answer, the tips and the joints of a step, each topic in its own order."""
+    after = set()
+    for order in itertools.permutations(("answer", "tips", "before", "after")):
+        if order.index("before") > order.index("after"):
+            continue
+        rig = Rig()
+        rig.steps(3)
+        step = sent(rig.expose())
+        start = rig.insertion, rig.rotation
+        tips, joints = [], []
+        for share in (0.0, 0.0, 0.4, 0.8, 1.0, 1.0, 1.0):
+            rig.now += TICK
+            rig.insertion = start[0] + share * (step.insertion - start[0])
+            rig.rotation = start[1] + share * (step.rotation - start[1])
+            joints.append(JointSample(rig.now, rig.insertion, rig.rotation))
+            tips.append(rig.measured())
+        actions: list[Action] = []
+        for topic in order:
+            if topic == "answer":
+                actions += rig.steering.on_result(step.stamp_ns, "succeeded")
+            elif topic == "tips":
+                for tip in tips:
+                    actions += rig.steering.on_tip(tip)
+            else:
+                for sample in joints[:3] if topic == "before" else joints[3:]:
+                    actions += rig.steering.on_joints(sample)
+        after.add(sent(actions))
+    (command,) = after
+    # Not one exposed before or in the motion: the first of the needle at rest.
+    assert command.stamp_ns == tips[5].stamp_ns
+
+
+@pytest.mark.parametrize(
+    ("moved", "turned", "looked_at_anew"),
+    [(1.01e-4, 0.0, True), (0.99e-4, 0.0, False), (0.0, 2.1e-2, True), (0.0, -1.9e-2, False)],
+)
+def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew(
+    moved: float, turned: float, looked_at_anew: bool
+) -> None:
+    for waiting in ("for the tip", "for the device"):
+        rig = Rig()
+        rig.steps(3)
+        if waiting == "for the device":
+            rig.steering.on_device(MOVING)
+            rig.expose()
+        else:
+            early = rig.measured(ahead=TICK)
+            rig.settle(1)
+        rig.insertion += moved
+        rig.rotation += turned
+        rig.settle(1)
+        if waiting == "for the device":
+            actions = rig.steering.on_device(HELD)
+        else:
+            actions = rig.steering.on_tip(early)
+        assert none_sent(actions) is looked_at_anew, waiting
+        if looked_at_anew:
+            assert where(rig) == (STEERING, Awaiting.TIP)
+            assert sent(rig.expose()).insertion == pytest.approx(rig.insertion + 0.001)
 
 
 def test_the_last_step_ends_at_the_depth_and_then_it_is_done() -> None:
     rig = Rig(depth=0.0025)
     ends = []
-    while rig.steering.state is SteeringState.STEERING:
+    while rig.steering.state is STEERING:
         actions = rig.expose()
-        if rig.steering.state is SteeringState.STEERING:
+        if rig.steering.state is STEERING:
             step = sent(actions)
             ends.append((step.insertion, step.duration))
             rig.run(step)
     np.testing.assert_allclose(ends, [(0.001, 0.5), (0.002, 0.5), (0.0025, 0.25)])
-    assert ends[-1][0] == 0.0025
+    assert ends[-1][0] == rig.steering.insertion == 0.0025
     assert where(rig) == (SteeringState.DONE, Awaiting.NOTHING)
-    assert rig.steering.insertion == 0.0025
-    assert not rig.steering.on_start()[0].success
+    # It says how sure it is, and that the needle ends away from its plane.
+    assert "insertion 0.0025 m reached; r1 = " in rig.steering.reason
+    assert "m (95 %), doubtful: " in rig.steering.reason
+    assert rig.steering.trust.is_doubtful
+    assert "at the depth" in rig.start()
+
+
+def test_in_doubt_it_goes_on_at_half_the_speed() -> None:
+    rig = Rig()
+    while not rig.steering.trust.is_doubtful:
+        # This needle does not bend at all.
+        step = sent(rig.expose())
+        rig.run(step)
+        assert rig.steering.step < 119
+    assert step.duration == pytest.approx(1.0)
+
+
+def test_a_recorded_device_may_have_made_another_step() -> None:
+    rig = Rig()
+    rig.steering.on_recorded_step(5, JointSample(0, 0.0, 0.0))
+    assert rig.steering.on_result(5, "succeeded") == []
+    step = sent(rig.expose())
+    other = JointSample(0, step.insertion + 0.0004, step.rotation)
+    rig.steering.on_recorded_step(step.stamp_ns + 1, other)
+    assert rig.steering.on_result(step.stamp_ns, "succeeded") == []
+    rig.run(SendStep(step.stamp_ns + 1, other.insertion, other.rotation, 0.5))
+    assert (rig.steering.step, rig.steering.intake.after_ns) == (1, rig.now)
 
 
 def test_an_own_estimator_that_fails_on_the_way_stops_the_needle() -> None:
@@ -186,10 +238,10 @@ def test_an_own_estimator_that_fails_on_the_way_stops_the_needle() -> None:
                 raise RuntimeError("no")
 
     rig = Rig()
-    settings, rng = rig.steering.settings, np.random.default_rng(0)
     part = OwnPart("estimator", "broken", "package 1.0, module:Broken", Broken)
-    own = OwnEstimator(part, settings, np.eye(3), np.zeros(3), rng)
-    rig.steering.control._estimator = own
+    rig.steering.control._estimator = OwnEstimator(
+        part, rig.steering.settings, np.eye(3), np.zeros(3), np.random.default_rng(0)
+    )
     rig.run(sent(rig.expose()))
     actions = rig.expose()
     assert none_sent(actions)
@@ -199,5 +251,5 @@ def test_an_own_estimator_that_fails_on_the_way_stops_the_needle() -> None:
     # A tip that comes later moves nothing either.
     Broken.is_mended = True
     assert none_sent(rig.expose())
-    assert rig.steering.on_start()[0].success
-    assert not none_sent(rig.expose())
+    assert rig.start() == "steering"
+    sent(rig.expose())

@@ -1,0 +1,174 @@
+"""Reach of planes and points: closed forms against paths that are integrated step by step."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+from numpy.random import default_rng
+
+from needle_controller.model.arrays import Array
+from needle_controller.model.point_reach import (
+    check_point,
+    least_insertion_to_point,
+    point_from_message,
+    point_reachability,
+    widest_at,
+)
+from needle_controller.model.reachability import (
+    check_offset,
+    farthest_offsets,
+    least_insertion,
+    reachability,
+)
+from needle_core.errors import UserError
+from needle_sim.needle.plant import NeedlePlant, initial_pose
+
+CURVATURE = 1.0 / 0.122
+
+
+def test_the_plant_gets_there_in_the_least_insertion() -> None:
+    """On SE(3), rolls of +-90 deg: the closed form is exact."""
+    x, pitch = -0.004, 0.05
+    least = float(least_insertion([x, pitch, 0.0], CURVATURE))
+    top = math.acos(0.5 * (1.0 + math.cos(pitch) + CURVATURE * x))
+    plant = NeedlePlant(initial_pose(pitch, 0.5 * math.pi), curvature=CURVATURE)
+    plant.advance((top - pitch) / CURVATURE, 0.0)
+    plant.advance(0.0, math.pi)
+    plant.advance(top / CURVATURE, 0.0)
+    assert plant.T_rig_tip[0, 3] + x == pytest.approx(0.0, abs=1e-12)
+    assert plant.T_rig_tip[0, 2] == pytest.approx(0.0, abs=1e-12)
+    assert float(plant.insertion) == pytest.approx(least, abs=1e-12)
+
+
+def test_random_rolls_never_beat_the_farthest_offsets_and_those_take_all_insertion() -> None:
+    rng, count, h = default_rng(1), 5_000, 0.06 / 240
+    x, pitch, sine = np.zeros(count), np.full(count, 0.1), np.zeros(count)
+    for k in range(240):
+        sine = rng.uniform(-1, 1, count) if k % 40 == 0 else sine
+        x = x + h * np.sin(pitch + 0.5 * h * CURVATURE * sine)
+        pitch = pitch + h * CURVATURE * sine
+    level = np.abs(pitch) < 0.02
+    lowest, highest = farthest_offsets(0.1, CURVATURE, 0.06 + 0.02 / CURVATURE)
+    assert np.sum(level) > 100
+    assert np.all((x[level] > lowest) & (x[level] < highest))
+    for start, far in ((0.0, 0.12), (-0.3, 0.1), (0.0, 0.6)):
+        for offset in farthest_offsets(start, CURVATURE, far):
+            least = least_insertion([-float(offset), start, 0.0], CURVATURE)
+            assert float(least) == pytest.approx(far, rel=1e-9)
+
+
+def test_a_pitch_limit_adds_a_straight_stretch() -> None:
+    limit = math.radians(20.0)
+    least = float(least_insertion([-0.05, 0.0, 0.0], CURVATURE, pitch_limit=limit))
+    arcs = 2.0 * (1.0 - math.cos(limit)) / CURVATURE
+    expected = 2.0 * limit / CURVATURE + (0.05 - arcs) / math.sin(limit)
+    assert least == pytest.approx(expected, rel=1e-12)
+
+
+def test_up_and_down_are_alike_and_needles_are_judged_one_by_one() -> None:
+    reduced = default_rng(2).uniform(-1, 1, (50, 3)) * [0.02, 1.2, 3.0]
+    whole = least_insertion(reduced, CURVATURE, tolerance=1e-3)
+    np.testing.assert_allclose(least_insertion(-reduced, CURVATURE, tolerance=1e-3), whole)
+    alone = [float(least_insertion(r, CURVATURE, tolerance=1e-3)) for r in reduced]
+    np.testing.assert_allclose(whole, alone, rtol=1e-14)
+    assert np.all(whole <= least_insertion(reduced, CURVATURE) + 1e-12)
+    assert np.isnan(least_insertion([np.nan, 0.0, 0.0], CURVATURE))
+
+
+def test_what_is_left_of_the_depth_decides() -> None:
+    reduced = [-0.003, 0.0, 0.3]
+    needed = float(least_insertion(reduced, CURVATURE))
+    for spare, expected in ((1e-6, True), (-1e-6, False)):
+        plane = reachability(reduced, CURVATURE, insertion=0.05, end=0.05 + needed + spare)
+        point = point_reachability(
+            [0.0, 0.0, 0.05], CURVATURE, insertion=0.05, end=0.1 + spare, tolerance=1e-9
+        )
+        assert (bool(plane.reachable), bool(point.reachable)) == (expected, expected)
+        assert float(plane.depth) == pytest.approx(0.05 + needed)
+        assert float(point.depth) == pytest.approx(0.1)
+
+
+def test_calls_that_make_no_sense_are_refused_with_what_and_why() -> None:
+    check_offset(0.028, CURVATURE, 0.12)
+    with pytest.raises(UserError, match=r"0\.03 m cannot be reached.*-0\.0289.* to 0\.0289"):
+        check_offset(0.03, CURVATURE, 0.12)
+    with pytest.raises(UserError, match="no plane"):
+        check_offset(0.0, CURVATURE, 0.01, pitch=0.5)
+    for curvature in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(UserError, match="curvature"):
+            least_insertion([0.0, 0.0, 0.0], curvature)
+    for limit in (0.0, 0.5 * math.pi):
+        with pytest.raises(UserError, match="pitch_limit"):
+            least_insertion([0.0, 0.0, 0.0], CURVATURE, pitch_limit=limit)
+    with pytest.raises(UserError, match="pitch"):
+        least_insertion([0.0, 1.6, 0.0], CURVATURE)
+    with pytest.raises(UserError, match="tolerance"):
+        least_insertion([0.0, 0.0, 0.0], CURVATURE, tolerance=-1.0)
+
+
+def path(curvatures: Array, length: float) -> Array:
+    """Return the end (x, 0, z) of a plane path from the origin along z, by small chords [m]."""
+    part = length / len(curvatures)
+    heading = np.cumsum(curvatures * part) - 0.5 * curvatures * part
+    return np.array([np.sum(np.sin(heading)), 0.0, np.sum(np.cos(heading))]) * part
+
+
+def test_the_soonest_way_to_a_point_is_an_arc_and_a_straight() -> None:
+    for bend_deg, straight in ((0.0, 0.05), (20.0, 0.03), (60.0, 0.0)):
+        arc, parts = np.deg2rad(bend_deg) / CURVATURE, 20_000
+        on_arc = round(parts * arc / (arc + straight))
+        end = path(np.where(np.arange(parts) < on_arc, CURVATURE, 0.0), arc + straight)
+        turned = np.array([end[0] * 0.6, -end[0] * 0.8, end[2]])
+        least = float(least_insertion_to_point(turned, CURVATURE))
+        assert least == pytest.approx(arc + straight, abs=1e-5)
+
+
+def test_no_path_ends_sooner_than_it_may_nor_beyond_the_widest_place() -> None:
+    rng = default_rng(3)
+    for _ in range(100):
+        length = rng.uniform(0.02, 0.15)
+        pieces = rng.uniform(-1.0, 1.0, rng.integers(1, 6))
+        extreme = np.where(rng.random(len(pieces)) < 0.5, np.sign(pieces), pieces)
+        end = path(np.repeat(extreme * CURVATURE, 1000), length)
+        assert float(least_insertion_to_point(end, CURVATURE)) <= length + 1e-6
+    for ahead in (0.03, 0.3):
+        widest = widest_at(ahead, CURVATURE)
+        assert not np.isnan(least_insertion_to_point([0.0, widest - 1e-6, ahead], CURVATURE))
+        assert np.isnan(least_insertion_to_point([0.0, widest + 1e-6, ahead], CURVATURE))
+    # Within the circle a tolerance may help; beside or behind it is there already.
+    radius = 1.0 / CURVATURE
+    inside = np.array([radius - np.sqrt((radius - 0.0005) ** 2 - 0.06**2), 0.0, 0.06])
+    assert least_insertion_to_point(inside, CURVATURE, tolerance=0.001) == pytest.approx(
+        radius * np.arcsin(0.06 / (radius - 0.0005)), rel=1e-6
+    )
+    assert np.all(np.isnan(least_insertion_to_point([[0.01, 0.0, 0.0], [0.0, 0.0, -0.01]], 8.0)))
+    there = point_reachability(
+        [0.0, 0.0005, -0.0005], CURVATURE, insertion=0.1, end=0.1, tolerance=0.001
+    )
+    assert bool(there.reachable)
+    assert there.depth == pytest.approx(0.1)
+
+
+def test_refusals_of_a_point_say_why_and_from_where_it_would_go() -> None:
+    check_point([0.01, 0.005, 0.09], CURVATURE, 0.12)
+    with pytest.raises(UserError, match="ahead of the entry"):
+        check_point([0.0, 0.0, 0.0], CURVATURE, 0.12)
+    with pytest.raises(UserError, match=r"takes 0\.1\d* m of insertion, depth is 0\.1 m"):
+        check_point([0.005, 0.0, 0.11], CURVATURE, 0.1)
+    aside = np.array([0.03, -0.04, 0.06])
+    with pytest.raises(UserError, match="in place of") as refusal:
+        check_point(aside, CURVATURE, 0.15)
+    # From that entry it can be reached, from a little less far not.
+    (place,) = re.findall(r"entering at \((.*?)\)", str(refusal.value))
+    entry = np.array([*(float(part) for part in place.split(",")), 0.0])
+    check_point(aside - 1.001 * entry, CURVATURE, 0.15)
+    with pytest.raises(UserError):
+        check_point(aside - 0.999 * entry, CURVATURE, 0.15)
+    np.testing.assert_array_equal(point_from_message("rig", [1.0, 2.0, 3.0]), [1.0, 2.0, 3.0])
+    with pytest.raises(UserError, match="'world'"):
+        point_from_message("world", [0.0, 0.0, 0.1])
+    with pytest.raises(UserError, match="not finite"):
+        point_from_message("rig", [0.0, float("nan"), 0.1])

@@ -1,0 +1,98 @@
+"""The next step from where the needle is, how sure that is, and what was heard until then."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from needle_controller.bank.filter_settings import FilterSettings
+from needle_controller.bank.hypothesis_filter import HypothesisFilter
+from needle_controller.laws.law import SteeringCommand
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.heard_messages import HeardMessages, heard_messages
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.next_step import next_step
+from needle_controller.protocol.trust import Trust, ends_elsewhere, trust_of
+
+SETTINGS = SteeringSettings(depth=0.12)
+
+
+def test_a_step_goes_on_by_its_length_or_ends_at_depth_or_point() -> None:
+    rows: list[tuple[float, float | None, float | None]] = [
+        (0.05, None, 0.051),
+        (0.05, 0.005, 0.051),
+        (0.05, 0.0004, 0.0504),
+        (0.05, 1.01e-4, 0.050101),
+        (0.05, 0.99e-4, None),
+        (0.05, 1e-4, None),
+        (0.05, -0.01, None),
+        # The depth ends it before the point; a last step may be longer by a thousandth.
+        (0.1195, 0.005, 0.12),
+        (0.12 - 1.0009e-3, None, 0.12),
+        (0.12 - 1.0011e-3, None, 0.12 - 1.1e-6),
+        (0.12 - 1.1e-6, None, 0.12),
+        (0.12 - 0.9e-6, None, None),
+        (0.13, None, None),
+    ]
+    for insertion, left, end in rows:
+        joints = JointSample(7, insertion, 1.0)
+        distance = None if left is None else np.asarray(left)
+        command = SteeringCommand(np.zeros(()), np.asarray(100.0), distance)
+        step = next_step(7, joints, command, SETTINGS, slowly=False)
+        assert (step is None) is (end is None), (insertion, left)
+        if step is None or end is None:
+            continue
+        length = end - insertion
+        assert step.stamp_ns == 7
+        assert step.insertion == pytest.approx(end, rel=0, abs=1e-12)
+        assert step.rotation == pytest.approx(1.0 + 100.0 * length, rel=0, abs=1e-9)
+        assert step.duration == pytest.approx(length / 0.002)
+        slow = next_step(7, joints, command, SETTINGS, slowly=True)
+        assert slow == dataclasses.replace(step, duration=2.0 * step.duration)
+
+
+def test_trust_is_the_interval_of_the_covariance_the_doubts_and_the_end() -> None:
+    estimator = HypothesisFilter(FilterSettings())
+    estimator.reset([0.002, 0.0, 0.0], np.zeros(2))
+    estimate = estimator.estimate()
+    trust = trust_of(estimate)
+    half = 1.96 * math.sqrt(estimate.covariance[0, 0])
+    assert trust.r1 == pytest.approx(0.002, rel=1e-12)
+    assert (trust.r1 - trust.low, trust.high - trust.r1) == pytest.approx((half, half), rel=1e-4)
+    assert (trust.verdict, trust.is_doubtful) == ("trusted", False)
+    there, elsewhere = trust_of(estimate, 0.00099), trust_of(estimate, -0.0072)
+    assert (there.verdict, there.is_doubtful) == ("trusted", False)
+    assert elsewhere.verdict == "doubtful: the needle ends -0.0072 m from its target"
+    assert elsewhere.is_doubtful
+    doubted = dataclasses.replace(estimate, doubtful=np.array(True), doubts=("a", "b"))
+    assert trust_of(doubted, 0.01).verdict.startswith("doubtful: a; b; the needle ends")
+    # An estimator that does not judge itself is not judged by its end either.
+    unjudged = trust_of(dataclasses.replace(estimate, doubtful=None, doubts=()), 0.0072)
+    assert (unjudged.verdict, unjudged.is_doubtful) == ("", False)
+    np.testing.assert_array_equal(ends_elsewhere(np.array([1e-3, -1.01e-3])), [False, True])
+
+
+def test_trust_in_a_line_says_the_distance_its_interval_and_the_verdict() -> None:
+    said = Trust("trusted", False, 0.001, -0.001, 0.003).summary
+    assert said == "r1 = 0.00100 m +- 0.00200 m (95 %), trusted"
+    assert Trust(r1=0.0, low=-1.0, high=1.0).summary.endswith("(95 %)")
+
+
+def test_what_was_heard_is_read_back_in_its_order_and_told_once() -> None:
+    heard = HeardMessages()
+    assert heard_messages(heard.take_text()) == []
+    messages = [("joint_states", 1_700_000_000_000_000_000), ("needle/tip", 5), ("joint_states", 7)]
+    for message in messages:
+        heard.add(*message)
+    assert heard_messages(heard.take_text()) == messages
+    assert heard.take_text() == ""
+    for number in range(100):
+        assert not heard.is_full
+        heard.add("joint_states", number)
+    assert heard.is_full
+    # What nobody sent so is no message.
+    found = heard_messages("joint_states soon, needle/tip -1, device/result 7, x 8 9")
+    assert found == [("device/result", 7)]

@@ -1,0 +1,243 @@
+"""plane_controller as a component: what its inputs, services and timer lead to."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+import pytest
+
+from needle_controller.model.kinematics import rotation_from_angles
+from needle_controller.plane_controller import COMMANDS, STATUS, PlaneController, tip_covariance
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.heard_messages import heard_messages
+from needle_core import messages as m
+from needle_core.component import Actions, Diagnose, Log, Moment, Peers, Publish, Reply
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.status_messages import ControllerStatus, DeviceStatus
+
+TICK = 20_000_000
+STRAIGHT = (0.0, 0.0, 0.0, 1.0)
+SETTINGS = SteeringSettings(target_offset=0.003, tip_covariance="configured")
+
+
+class Bench:
+    """The component, a scripted device and a scripted tracker."""
+
+    def __init__(self, settings: SteeringSettings = SETTINGS, receiver: str = "/device") -> None:
+        self.component = PlaneController(settings)
+        self.now, self.later = TICK, 0.0
+        self.place = {"rotation": 0.0, "insertion": 0.0}
+        self.published: defaultdict[str, list[Any]] = defaultdict(list)
+        self.health: dict[str, Diagnostic] = {}
+        self.logs: list[str] = []
+        self.replies: list[Reply] = []
+        self.do(self.component.on_peers(Peers(subscribers={COMMANDS: (receiver,)}), self.at))
+
+    @property
+    def at(self) -> Moment:
+        return Moment(self.now * 1e-9 + self.later, self.now, self.now)
+
+    @property
+    def status(self) -> ControllerStatus:
+        return self.published[STATUS][-1]  # type: ignore[no-any-return]
+
+    def do(self, actions: Actions) -> None:
+        for action in actions:
+            match action:
+                case Publish(topic, message):
+                    self.published[topic].append(message)
+                case Diagnose(part, diagnostic):
+                    self.health[part] = diagnostic
+                case Log(text=text):
+                    self.logs.append(text)
+                case Reply():
+                    self.replies.append(action)
+
+    def hear(self, topic: str, message: Any) -> None:
+        (row,) = (row for row in self.component.inputs if row.topic == topic)
+        assert isinstance(message, row.message)
+        self.do(row.handler(message, self.at))
+
+    def call(self, service: str) -> tuple[bool, str]:
+        (row,) = (row for row in self.component.services if row.name.endswith(service))
+        self.do(row.handler(None, 7, self.at))
+        assert self.replies[-1].request == 7
+        return self.replies[-1].success, self.replies[-1].text
+
+    def joints(self, **positions: float) -> None:
+        self.now += TICK
+        names = tuple(f"{name}_joint" for name in positions)
+        self.hear("joint_states", m.JointState(self.now, names, tuple(positions.values())))
+
+    def tip(self, x: float = 0.0, frame: str = "rig") -> None:
+        self.joints(**self.place)
+        z = self.place["insertion"]
+        self.hear("needle/tip", m.Point(self.now, frame, (x, 0.0, z)))
+
+    def started(self) -> Bench:
+        self.hear("device/status", DeviceStatus(state="HOLDING", homed=True, hold_owner="operator"))
+        self.joints(**self.place)
+        assert self.call("start") == (True, "steering")
+        return self
+
+    def step(self) -> m.Trajectory:
+        """Show a tip; carry out the command that it leads to, and answer."""
+        self.tip()
+        command: m.Trajectory = self.published[COMMANDS][-1]
+        assert command.stamp_ns == self.now
+        insertion, rotation = command.points[0].positions
+        self.place = {"rotation": rotation, "insertion": insertion}
+        self.joints(**self.place)
+        self.hear("device/result", m.CommandResult(command.stamp_ns, "succeeded"))
+        return command
+
+
+def test_it_steers_step_by_step_and_says_what_it_believes() -> None:
+    bench = Bench().started()
+    assert bench.status.state == "STEERING"
+    for number in (1, 2, 3):
+        command = bench.step()
+        assert command.joint_names == ("insertion_joint", "rotation_joint")
+        (point,) = command.points
+        assert (point.positions[0], point.time_from_start) == pytest.approx((number * 0.001, 0.5))
+        assert (bench.status.step, bench.status.tip_after_ns) == (number, bench.now)
+    for topic in ("estimate", "reduced_state", "linearized_state", "control_input"):
+        messages = bench.published[f"needle/{topic}"]
+        assert len(messages) == 3
+        assert messages[-1].stamp_ns == command.stamp_ns
+        assert messages[-1].frame_id == "target_plane"
+    pose, reduced = (bench.published[f"needle/{t}"][-1] for t in ("estimate", "reduced_state"))
+    assert pose.position[0] == reduced.values[0] == pytest.approx(-0.003, abs=2e-4)
+    x, y, z, w = pose.orientation
+    assert 2.0 * (x * z + w * y) == pytest.approx(np.sin(reduced.values[1]), abs=1e-12)
+    rate = bench.published["needle/control_input"][-1].values[1]
+    before = bench.published[COMMANDS][-2].points[0].positions[1]
+    assert point.positions[1] - before == pytest.approx(rate * 0.001)
+    heard = [one for s in bench.published[STATUS] for one in heard_messages(s.heard)]
+    assert [one.topic for one in heard[-2:]] == ["joint_states", "device/result"]
+    assert bench.call("stop") == (True, "stopped")
+    assert bench.status.state == "IDLE"
+
+
+def test_a_start_waits_for_a_device_that_listens_and_says_why_not() -> None:
+    assert Bench().call("start") == (False, "no device/status has come")
+    bench = Bench(receiver="/recorder")
+    assert bench.call("start") == (False, f"waiting for subscriber of {COMMANDS}")
+    assert bench.component.steering.state.value == "IDLE"
+
+
+def test_joints_that_cannot_be_used_are_named_and_counted() -> None:
+    bench = Bench()
+    bench.joints(insertion=0.0)
+    assert "without rotation_joint" in bench.health["joint_states"].message
+    bench.joints(insertion=0.0, rotation=float("nan"))
+    assert "not finite" in bench.health["joint_states"].message
+    health = bench.health["joint_states"]
+    assert (health.level, health.values["joint_states_refused"]) == (Level.WARN, "2")
+    assert bench.component.steering.intake.joints.latest is None
+    bench.joints(insertion=0.0, rotation=0.0)
+    assert bench.health["joint_states"].level is Level.OK
+
+
+def test_every_reason_to_refuse_a_tip_is_logged_once_in_two_seconds() -> None:
+    bench = Bench().started()
+    for again in (1, 2, 3):
+        for x, frame in ((float("nan"), "rig"), (0.0, "map"), (1.0, "rig")):
+            bench.tip(x, frame)
+        if again == 2:
+            bench.later += 2.0
+    assert bench.status.tips_rejected_for == "not_finite 3, frame 3, too_far 3"
+    assert (bench.status.tips_rejected, bench.status.level) == (9, Level.WARN)
+    for reason in ("not finite", "frame 'map'", "from the entry point"):
+        assert sum(reason in line for line in bench.logs) == 2
+    # Time is looked at by the timer.
+    for _ in range(2):
+        bench.do(bench.component.timers[0].handler(bench.at))
+        bench.later += 3.0
+    assert bench.status.state == "WAITING_FOR_TIP"
+
+
+def test_a_tip_pose_says_the_positions_covariance() -> None:
+    pose = m.PoseWithCovariance(5, "rig", (0.0, 0.0, 0.0), STRAIGHT, tuple(map(float, range(36))))
+    known = tip_covariance(pose)
+    np.testing.assert_array_equal(known.matrix, [[0, 1, 2], [6, 7, 8], [12, 13, 14]])
+    assert (known.stamp_ns, known.frame_id) == (5, "rig")
+    bench = Bench(dataclasses.replace(SETTINGS, tip_covariance="from_tip_pose")).started()
+    bench.tip()
+    assert not bench.published[COMMANDS]
+    noise = tuple(1e-8 * np.eye(6).ravel())
+    bench.hear("needle/tip_pose", dataclasses.replace(pose, stamp_ns=bench.now, covariance=noise))
+    assert len(bench.published[COMMANDS]) == 1
+
+
+def test_the_covariance_follows_the_messages_convention() -> None:
+    """Fixed axes of target_plane: a sample of small turns has the published covariance."""
+    bench = Bench().started()
+    bench.step()
+    estimate = bench.component.steering.control._estimator.estimate()
+    published = np.reshape(bench.published["needle/estimate"][-1].covariance, (6, 6))
+    scale = 1e-4
+    draws = np.random.default_rng(1).multivariate_normal(np.zeros(6), estimate.covariance, 20_000)
+    mean = rotation_from_angles(estimate.coordinates[3:])
+    turned = rotation_from_angles(estimate.coordinates[3:] + scale * draws[:, 3:]) @ mean.T
+    vectors = np.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], axis=-1)
+    sampled = np.cov(vectors.T / scale)
+    np.testing.assert_allclose(sampled, published[3:, 3:], atol=0.05 * np.max(published[3:, 3:]))
+
+
+def test_targets_are_taken_or_refused_and_the_last_stays() -> None:
+    bench = Bench()
+    plane = m.Pose(0, "rig", (0.005, 0.0, 0.0), STRAIGHT)
+    bench.hear("target_plane", plane)
+    assert bench.status.target_offset_m == 0.005
+    for bad, said in (((np.nan, 0.0, 0.0), "not finite"), ((0.5, 0.0, 0.0), "cannot be reached")):
+        bench.hear("target_plane", dataclasses.replace(plane, position=bad))
+        assert said in bench.health["target_plane"].message
+    assert "the last plane stays" in bench.component.complaints["target_plane"]
+    assert bench.status.target_offset_m == 0.005
+    for x, z in ((0.01, 0.1), (0.09, 0.1)):
+        bench.hear("target_point", m.Point(0, "rig", (x, 0.0, z)))
+        assert bench.status.target_point_m == (0.01, 0.0, 0.1)
+    assert "entering at" in bench.health["target_point"].message
+    # A plane takes the point's place.
+    bench.hear("target_plane", plane)
+    assert bench.status.target_point_m is None
+    assert bench.health["target_plane"].level is Level.OK
+    ball = m.Marker("rig", "bone", 1, 2, 0, (0.0, 0.0, 0.06), STRAIGHT, (0.004, 0.004, 0.004))
+    bench.hear("obstacles", m.Markers((ball,)))
+    bench.hear("obstacles", m.Markers((dataclasses.replace(ball, kind=1),)))
+    assert "the last obstacles stay" in bench.health["obstacles"].message
+    assert bench.status.obstacles == 1
+    bench.hear("obstacles", m.Markers(()))
+    assert bench.status.obstacles == 0
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_a_stamped_point_is_foretold_and_another_rests(stamped: bool) -> None:
+    bench, place = Bench(), np.array([0.004, 0.0, 0.09])
+    for k in range(41):
+        # It drifts along x.
+        x, y, z = place + np.array([0.25e-4 * k, 0.0, 0.0])
+        stamp = k * 250_000_000 + 5_000_000_000 if stamped else 0
+        bench.hear("target_point", m.Point(stamp, "rig", (x, y, z)))
+    points = bench.component.steering.control._points
+    assert points is not None
+    wanted = place + np.array([1.5e-3 if stamped else 1e-3, 0.0, 0.0])
+    np.testing.assert_allclose(points.motion.at(20.0), wanted, atol=1e-7)
+
+
+def test_parameters_change_on_the_way_and_a_path_has_several_points() -> None:
+    bench = Bench().started()
+    bench.do(
+        bench.component.on_settings(dataclasses.replace(SETTINGS, preset="open_loop"), bench.at)
+    )
+    assert bench.status.preset == "open_loop"
+    assert bench.step().points[0].positions[1] == 0.0
+    ahead = Bench(dataclasses.replace(SETTINGS, insertion="continuous")).started()
+    ahead.tip()
+    points = ahead.published[COMMANDS][-1].points
+    assert [point.positions[0] for point in points] == pytest.approx([0.0, 0.001, 0.002])
+    assert [point.time_from_start for point in points] == pytest.approx([0.0, 0.5, 1.0])
