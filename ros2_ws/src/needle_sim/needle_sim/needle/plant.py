@@ -53,9 +53,6 @@ class NeedlePlant:
         kappa, the curvature of the path under pure insertion [1/m]; may be set later on.
     torsion : Torsion, optional
         Torsion of the shaft; none by default.
-    tip_offset : float
-        l2, how far the tip is ahead of frame B, the rear wheel, along its axis [m]. 0 is the
-        unicycle: the tip is frame B's origin. The poses here are always the tip's.
 
     Raises
     ------
@@ -69,7 +66,6 @@ class NeedlePlant:
         *,
         curvature: ArrayLike,
         torsion: Torsion | None = None,
-        tip_offset: float = 0.0,
     ) -> None:
         pose = np.array(T_rig_tip, dtype=np.float64)
         if pose.shape[-2:] != (4, 4):
@@ -79,7 +75,6 @@ class NeedlePlant:
             raise ValueError(f"T_rig_tip and curvature must be finite, got {pose}, {curvature!r}")
         self._pose = pose
         self._torsion = Torsion() if torsion is None else torsion
-        self._tip_offset = tip_offset
         self._insertion: FloatArray = np.zeros(pose.shape[:-2])
         self._channel = Channel(pose, float(self._torsion.tip_angle)) if pose.ndim == 2 else None
 
@@ -190,8 +185,7 @@ class NeedlePlant:
         """Move the tip by V1 dl + V2 dtheta of [KC09] eq. (2), and return that twist."""
         shape = np.broadcast_shapes(self._insertion.shape, length.shape, tip_turned.shape)
         twist = np.zeros((*shape, 6))
-        # V1 = [0, 0, 1, kappa, 0, 0] of frame B, written at the tip, l2 e3 ahead of it.
-        twist[..., 1] = -self.curvature * self._tip_offset * length
+        # V1 = [0, 0, 1, kappa, 0, 0] of the unicycle, whose tip is frame B's origin (l2 = 0).
         twist[..., 2] = length
         twist[..., 3] = self.curvature * length
         twist[..., 5] = tip_turned

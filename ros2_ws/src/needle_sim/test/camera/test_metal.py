@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from needle_sim.camera.metal import mirrored, place_lamp
-from needle_sim.camera.paper import paper_lines
 from needle_sim.camera.projection import project
 from needle_sim.camera.renderer import StereoRenderer
-from needle_sim.camera.scenarios import GraphPaper, Metal
+from needle_sim.camera.scenarios import Metal
 from needle_sim.camera.stereo_rig import StereoRig
 
-from .scenes import STILL, needle, render, taken
+from .scenes import STILL, needle, render
 
 
 def test_a_shaft_mirrors_where_its_normal_halves_the_angle_and_is_dark_where_it_bends_away() -> (
@@ -58,24 +57,3 @@ def test_the_core_lies_on_the_lamp_s_side_in_the_image(rig: StereoRig) -> None:
                 assert np.sign(off) == towards
                 checked.add(towards)
     assert checked == {-1.0, 1.0}
-
-
-def test_paper_s_lines_are_where_its_floor_is(rig: StereoRig) -> None:
-    paper = GraphPaper(floor_depth=0.03, pitch=0.01)
-    lines = paper_lines(paper, rig.half_height, np.random.default_rng([2, 0, 5, 4]))
-    assert len(lines) > 20
-    assert all(line[:, 0] == pytest.approx(rig.half_height - 0.03) for line in lines)
-    ways = np.array([(line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0]) for line in lines])
-    # Two sets, across each other.
-    products = np.abs(ways @ ways[0])
-    assert np.all((products > 0.999) | (products < 0.001))
-    ruled, plain = (
-        StereoRenderer(rig, 2, scenario=dataclasses.replace(STILL, paper=on))
-        for on in (paper, None)
-    )
-    dark = taken(render(ruled, None, 0), render(plain, None, 0))[0]
-    for line in lines:
-        u, v = np.rint(project(line[len(line) // 2], rig.left)).astype(int)
-        if 150 < u < 1000 and 20 < v < 740:
-            assert dark[v - 1 : v + 2, u - 1 : u + 2].max() > 20.0
-    assert np.median(dark) == 0.0

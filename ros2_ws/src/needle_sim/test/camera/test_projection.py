@@ -43,23 +43,6 @@ def test_without_refraction_on_the_surface_and_above_it_is_opencv_s_camera(rig: 
             np.testing.assert_allclose(seen, expected.reshape(-1, 2), rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("index", [1.0, 1.3, 1.8])
-def test_snell_s_law_holds_in_the_plane_of_incidence(rig: StereoRig, index: float) -> None:
-    points = points_inside(300)
-    # Up to where the ray grazes the surface.
-    points[150:, 1:] *= 50.0
-    centre = rig.right.centre
-    points[0, 1:] = centre[1:]
-    crossing = refraction_point(points, centre, surface(index))
-    into, out = crossing - points, centre - crossing
-    into /= np.linalg.norm(into, axis=1)[:, np.newaxis]
-    out /= np.linalg.norm(out, axis=1)[:, np.newaxis]
-    np.testing.assert_array_equal(crossing[:, 0], HEIGHT)
-    np.testing.assert_array_equal(crossing[0, 1:], centre[1:])
-    # Both horizontal parts, as vectors: n sin(inside) = sin(outside).
-    np.testing.assert_allclose(index * into[:, 1:], out[:, 1:], rtol=0, atol=1e-11)
-
-
 def refracted(direction: np.ndarray, normal: np.ndarray, ratio: float) -> np.ndarray:
     """Snell's law for vectors, by angles: from a medium into one of another index."""
     cosine = -float(direction @ normal)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import random
-from collections.abc import Callable, Sequence
 from typing import Any
 
 from needle_core.can_frame import CAN, CanFrame
-from needle_core.component import Component, Output
 from needle_core.runners.faults import Arrival, Arrivals, Fault, Link
-from needle_core.status_messages import DeviceStatus
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.drive_emulator import DriveEmulator
@@ -20,13 +16,6 @@ from .person import VirtualBench
 
 _ALL = range(0x800)
 DRIVER, DRIVES = DeviceDriver.name, DriveEmulator.name
-
-
-class AnotherDevice(Component):
-    """Says that it is the device."""
-
-    name = "sim_rig"
-    outputs = (Output("device/status", DeviceStatus),)
 
 
 class ComponentBench(VirtualBench):
@@ -56,12 +45,6 @@ class ComponentBench(VirtualBench):
     @property
     def error_codes(self) -> set[int]:
         return {drive.error_code for drive in self.drives.bus.drives.values()}
-
-    @property
-    def ended(self) -> tuple[int, str] | None:
-        """The driver's exit code and last words."""
-        end = self.runner.exits.get(DRIVER)
-        return None if end is None else (end.code, end.text)
 
     def sent(self, *cob_ids: int, by: str = DRIVER) -> list[tuple[float, CanFrame]]:
         """Return frames of these COB-IDs since the mark, with their times."""
@@ -95,16 +78,13 @@ class ComponentBench(VirtualBench):
         self.person.pressed = True
         self.run(0.1)
 
-    def step(self, length: float = 0.002, rotation: float = 0.5, duration: float = 1.0) -> None:
-        self.command(length, rotation, duration)
-
     def moving(self) -> None:
         """Be in the middle of a step."""
         if not self.person.pressed:
             self.home()
             self.arm()
         begin = self.places[0]
-        self.step()
+        self.command(0.002, 0.5, 1.0)
         self.until(lambda: self.places[0] > begin + 0.0005)
 
     def release(self) -> None:
@@ -119,17 +99,12 @@ class ComponentBench(VirtualBench):
         return self.places == at
 
 
-def losing(
-    identifiers: Sequence[int],
-    begin: Callable[[], float],
-    end: Callable[[], float] = lambda: math.inf,
-) -> Fault:
-    """Return a fault that loses the drives' frames of some identifiers from a time to another."""
+def losing(identifier: int, until: list[float]) -> Fault:
+    """Return a fault that loses frames of an identifier shortly before a time that is set later."""
 
     def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
-        if link.topic != CAN or link.sender != DRIVES or not begin() <= now < end():
-            return (Arrival(0.0, message),)
-        kept = tuple(f for f in message if f.identifier not in identifiers)
-        return (Arrival(0.0, kept),)
+        if link.topic == CAN and until[0] - 0.3 <= now < until[0]:
+            message = tuple(frame for frame in message if frame.identifier != identifier)
+        return (Arrival(0.0, message),)
 
     return fault

@@ -7,23 +7,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from needle_core import component as c
 from needle_core import messages as m
-from needle_core.component import (
-    BEST_EFFORT,
-    LATCHED,
-    Action,
-    Actions,
-    Answer,
-    Call,
-    Component,
-    Input,
-    Moment,
-    Output,
-    Port,
-    Publish,
-    Send,
-    Timer,
-)
 from needle_core.runners.faults import Fault
 from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_core.status_messages import ControllerStatus, DeviceStatus
@@ -42,43 +27,43 @@ KINDS: dict[str, type[Any]] = {
 }
 
 
-class Person(Component):
+class Person(c.Component):
     """Plays operator and controller, and keeps what it hears."""
 
     name = "person"
 
     def __init__(self) -> None:
         self.heard: dict[str, list[Any]] = defaultdict(list)
-        self.answers: list[Answer] = []
+        self.answers: list[c.Answer] = []
         self.pressed, self.speaks = False, True
-        self.actions: list[Action] = []
+        self.actions: list[c.Action] = []
         self.inputs = (
-            *(Input(topic, kind, partial(self._keep, topic)) for topic, kind in KINDS.items()),
-            Input("device/status", DeviceStatus, partial(self._keep, "device/status"), LATCHED),
+            *(c.Input(topic, kind, partial(self._keep, topic)) for topic, kind in KINDS.items()),
+            c.Input("device/status", DeviceStatus, partial(self._keep, "device/status"), c.LATCHED),
         )
         self.outputs = (
-            Output("device/hold", m.HoldState, BEST_EFFORT),
-            Output("device/joint_trajectory", m.Trajectory),
-            Output("device/estop", m.EmergencyStop),
-            Output("sim/drive_positions", m.JointState),
-            Output("needle/controller_status", ControllerStatus, LATCHED),
+            c.Output("device/hold", m.HoldState, c.BEST_EFFORT),
+            c.Output("device/joint_trajectory", m.Trajectory),
+            c.Output("device/estop", m.EmergencyStop),
+            c.Output("sim/drive_positions", m.JointState),
+            c.Output("needle/controller_status", ControllerStatus, c.LATCHED),
         )
-        self.ports = (Port(COMMAND_LINES, lambda *_: ()),)
-        self.timers = (Timer(0.01, self._act),)
+        self.ports = (c.Port(COMMAND_LINES, lambda *_: ()),)
+        self.timers = (c.Timer(0.01, self._act),)
 
-    def on_answer(self, answer: Answer, at: Moment) -> Actions:
+    def on_answer(self, answer: c.Answer, at: c.Moment) -> c.Actions:
         self.answers.append(answer)
         return ()
 
-    def _keep(self, topic: str, message: Any, at: Moment) -> Actions:
+    def _keep(self, topic: str, message: Any, at: c.Moment) -> c.Actions:
         self.heard[topic].append(message)
         return ()
 
-    def _act(self, at: Moment) -> Actions:
+    def _act(self, at: c.Moment) -> c.Actions:
         if self.speaks:
             scale = 1.0 if self.pressed else 0.0
             hold = m.HoldState("person", "", at.stamp_ns, self.pressed, scale, 0.1)
-            yield Publish("device/hold", hold)
+            yield c.Publish("device/hold", hold)
         yield from self.actions
         self.actions = []
 
@@ -87,14 +72,14 @@ class VirtualBench:
     """Components and a person, on a virtual runner."""
 
     def __init__(
-        self, *components: Component, seed: int = 1, faults: tuple[Fault, ...] = ()
+        self, *components: c.Component, seed: int = 1, faults: tuple[Fault, ...] = ()
     ) -> None:
         self.person = Person()
         self.logs: list[str] = []
         taps = (self._tap,)
         self.runner = VirtualRunner([*components, self.person], seed, faults=faults, taps=taps)
 
-    def _tap(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
+    def _tap(self, stamp_ns: int, sender: str, message: Any, output: c.Output) -> None:
         if output.topic == LOG.topic:
             self.logs.append(message.text)
 
@@ -111,7 +96,7 @@ class VirtualBench:
         return [result.outcome for result in self.heard("device/result")]
 
     @property
-    def answers(self) -> dict[str, Answer]:
+    def answers(self) -> dict[str, c.Answer]:
         """The last answer of each service."""
         return {answer.service.removeprefix("device/"): answer for answer in self.person.answers}
 
@@ -129,27 +114,27 @@ class VirtualBench:
         return self.runner.now - begin
 
     def ask(self, service: str, request: bool | None = None) -> None:
-        self.person.actions.append(Call(f"device/{service}", request))
+        self.person.actions.append(c.Call(f"device/{service}", request))
 
-    def call(self, service: str, request: bool | None = None) -> Answer:
+    def call(self, service: str, request: bool | None = None) -> c.Answer:
         count = len(self.person.answers)
         self.ask(service, request)
         self.until(lambda: len(self.person.answers) > count)
         return self.person.answers[-1]
 
     def succeed(self, service: str, request: bool | None = None) -> None:
-        """Call a service until it is done: drives take a while to switch off."""
+        """c.Call a service until it is done: drives take a while to switch off."""
         self.until(lambda: self.call(service, request).success)
 
     def publish(self, topic: str, message: Any) -> None:
-        self.person.actions.append(Publish(topic, message))
+        self.person.actions.append(c.Publish(topic, message))
 
     def press_stop(self, pressed: bool = True) -> None:
         self.publish("device/estop", m.EmergencyStop(pressed))
 
     def say(self, *lines: str) -> None:
         """Type lines into the drives' terminal."""
-        self.person.actions.append(Send(COMMAND_LINES, lines))
+        self.person.actions.append(c.Send(COMMAND_LINES, lines))
         self.run(0.02)
 
     def command(self, length: float, rotation: float, duration: float, stamp_ns: int = 0) -> None:

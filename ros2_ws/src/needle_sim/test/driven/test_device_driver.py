@@ -5,19 +5,15 @@ from __future__ import annotations
 import itertools
 import math
 import random
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 
-from needle_core.can_frame import CAN
-from needle_core.runners.faults import delay, silence
-from needle_device_driver.cia402 import cia402_axis
-from needle_device_driver.device_driver import EXIT_BROKEN
+from needle_core.runners.faults import delay
 
-from .component_bench import DRIVER, DRIVES, ComponentBench
+from .component_bench import DRIVER, DRIVES, ComponentBench, losing
 
 HEARTBEAT_LOST = 0x8130
+LIMITS, HOMING_SPEEDS, DEVICE_TYPE = 0x607D, 0x6099, 0x1000
 UNITS = (0x608F, 0x60A8, 0x60A9, 0x60AA)
 
 
@@ -26,7 +22,7 @@ def test_it_sets_the_drives_up_homes_and_moves_them_in_even_cycles() -> None:
     bench.home()
     bench.arm()
     bench.mark()
-    bench.step(0.002, 0.5, 1.0)
+    bench.command(0.002, 0.5, 1.0)
     bench.until(lambda: bench.outcomes)
     assert bench.outcomes == ["succeeded"]
     assert bench.places[0] == pytest.approx(0.002, abs=1e-5)
@@ -82,7 +78,7 @@ def test_steps_that_are_broken_off_and_go_on_are_no_alarm(lag: float, late: floa
     bench.home()
     bench.arm()
     for _ in range(3):
-        bench.step(0.001, rng.uniform(-0.6, 0.6), rng.choice((0.2, 0.4, 1.0)))
+        bench.command(0.001, rng.uniform(-0.6, 0.6), rng.choice((0.2, 0.4, 1.0)))
         bench.run(rng.uniform(0.2, 0.8))
         bench.person.pressed = False
         bench.run(rng.uniform(0.05, 0.3))
@@ -150,102 +146,64 @@ def test_drives_stop_by_themselves_when_the_driver_stands_still() -> None:
     assert bench.places == stopped
 
 
-# ---- the end, and what is broken ---------------------------------------------------------------
-
-
-def test_an_end_brings_the_axes_to_rest_and_releases_the_drives_watchdogs() -> None:
+def test_lines_that_are_no_commands_are_named_and_do_nothing() -> None:
     bench = ComponentBench()
-    bench.moving()
-    bench.runner.stop(DRIVER)
-    bench.until(lambda: bench.ended, 2.0)
-    assert bench.ended == (0, "")
-    assert bench.rests()
+    bench.until(lambda: bench.status.state == "DISABLED")
+    bench.logs.clear()
+    bad = (
+        "explode",
+        "stall",
+        "stall both",
+        "stall insertion now",
+        "emcy insertion x",
+        "emcy rotation 0x10000",
+        "cut_bus now",
+    )
+    bench.say(*bad)
+    assert [text.split("'")[1] for text in bench.logs] == list(bad)
+    bench.run(0.5)
+    assert bench.status.state == "DISABLED"
     assert bench.error_codes == {0}
-    for drive in bench.drives.bus.drives.values():
-        assert drive.state.name == "SWITCH_ON_DISABLED"
 
 
-def test_drives_that_are_not_there_end_it_and_late_ones_are_set_up() -> None:
-    bench = ComponentBench(fault=silence(DRIVES, 0.0, math.inf), connect_timeout=1.0)
-    bench.until(lambda: bench.ended, 8.0)
-    code, text = bench.ended or (0, "")
-    assert code == 2
-    assert "node 1 does not answer" in text
-    late = ComponentBench(fault=silence(DRIVES, 0.0, 1.0), connect_timeout=3.0)
-    late.until(lambda: late.status.state == "DISABLED", 8.0)
+# ---- both drives -------------------------------------------------------------------------------
 
 
-def _breaks(*_: Any) -> Any:
-    raise ZeroDivisionError("planted")
-
-
-def _a_handler(bench: ComponentBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench.moving()
-    monkeypatch.setattr(bench.driver.supervisor, "submit", _breaks)
-    bench.step()
-
-
-def _an_order(bench: ComponentBench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_drives_are_asked_side_by_side_and_homing_begins_when_both_have_taken_limits() -> None:
+    lost = [math.inf]
+    bench = ComponentBench(drives={"insertion_start": 0.002}, fault=losing(0x582, lost))
     bench.set_up()
-    monkeypatch.setattr(cia402_axis, "write_homing", _breaks)
-    assert bench.call("home").text == "called off: internal error"
 
+    def times(cob_id: int) -> list[float]:
+        return [time for time, frame in bench.sent(cob_id) if bench.entry(frame)[0] != DEVICE_TYPE]
 
-@pytest.mark.parametrize("breaks", [_a_handler, _an_order])
-def test_a_handler_or_order_that_raises_stops_both_axes_until_a_reset(
-    breaks: Callable[[ComponentBench, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench = ComponentBench()
-    breaks(bench, monkeypatch)
-    bench.release()
-    assert "internal error: ZeroDivisionError: planted" in bench.status.fault
-    assert bench.ended is None
-    assert bench.rests()
-    assert bench.call("reset").success
-
-
-def test_a_cycle_that_raises_ends_the_driver_and_the_drives_stop(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    bench = ComponentBench()
-    bench.moving()
-    monkeypatch.setattr(bench.driver._drives, "collect", _breaks)
-    bench.until(lambda: bench.ended, 0.1)
-    assert bench.runner.exits[DRIVER].code == EXIT_BROKEN
-    bench.run(0.3)
-    assert bench.rests()
-    assert bench.error_codes == {HEARTBEAT_LOST}
-
-
-# ---- the port ----------------------------------------------------------------------------------
-
-
-def test_a_lost_port_stops_both_and_a_reset_opens_it_anew() -> None:
-    bench = ComponentBench()
-    bench.moving()
-    at = bench.places
-    bench.runner.lose_port(DRIVER, CAN, "unplugged")
-    # The driver needs no cycle of its own.
-    assert bench.until(lambda: bench.status.state == "FAULT") < 0.01
-    assert "link virtual can is lost: unplugged" in bench.status.fault
+    assert times(0x601)[0] < times(0x602)[-1]
+    assert times(0x602)[0] < times(0x601)[-1]
+    # The rotation drive's answers are lost for a while: it is asked again.
+    lost[0] = bench.runner.now + 0.3
     bench.mark()
-    bench.release()
-    assert bench.sent() == []
-    assert bench.places[0] - at[0] < 0.002 * 0.05
-    assert bench.error_codes == {HEARTBEAT_LOST}
-    assert "cannot open virtual can: unplugged" in bench.call("reset").text
-    bench.runner.open_port(DRIVER, CAN)
-    bench.run(0.02)
-    assert bench.call("reset").success
-    bench.moving()
-    bench.until(lambda: bench.outcomes[-1] == "succeeded")
+    assert bench.call("home").success
+    replied = bench.runner.now
+    bench.until(lambda: bench.status.homed)
+    first = min(time for time, frame in bench.sent(0x201, 0x202) if frame.data[0] & 0x10)
+    taken = {
+        (frame.identifier, *bench.entry(frame)): time
+        for time, frame in bench.sent(0x581, 0x582, by=DRIVES)
+        if frame.data[0] == 0x60
+    }
+    wanted = list(itertools.product((0x581, 0x582), (LIMITS, HOMING_SPEEDS), (1, 2)))
+    assert max(taken[key] for key in wanted) < min(first, replied)
+    assert replied > lost[0]
 
 
-def test_a_port_that_opens_in_time_is_waited_for() -> None:
+def test_an_emergency_stop_calls_a_set_up_off_until_it_is_released() -> None:
     bench = ComponentBench()
-    bench.runner.lose_port(DRIVER, CAN, "no such file")
-    bench.run(1.0)
-    assert bench.sent() == []
-    assert bench.status.state == "UNCONFIGURED"
-    bench.runner.open_port(DRIVER, CAN)
+    bench.until(lambda: len(bench.sent(0x601)) > 10)
+    bench.press_stop()
+    bench.until(lambda: bench.status.state == "ESTOPPED")
+    bench.mark()
+    bench.run(1.5)
+    # It looks whether they are still there, and no more.
+    assert {bench.entry(frame)[0] for _, frame in bench.sent(0x601, 0x602)} == {DEVICE_TYPE}
+    bench.press_stop(False)
     bench.until(lambda: bench.status.state == "DISABLED")

@@ -166,13 +166,3 @@ def test_a_lost_heartbeat_of_the_master_is_an_emergency_and_a_fault(master: Mast
     # 0x1029 is 0: it leaves OPERATIONAL. The other drive monitors nobody.
     assert master.bus.drives["insertion"].device.state == 0x7F
     assert master.bus.drives["rotation"].device.state == 0x05
-
-
-def test_errors_are_told_and_remembered(master: Master) -> None:
-    master.bus.emergency("insertion", 0x5530)
-    master.wait(0.001)
-    assert master.frames(0x81) == [bytes([0x30, 0x55, 0x21, 0, 0, 0, 0, 0])]
-    assert (master.read(0x1003), master.read(0x1003, 1)) == (1, 0x5530)
-    assert master.read(0x1001) == 0x21
-    master.write(0x1003, 0, 0, 1)
-    assert master.read(0x1003) == 0

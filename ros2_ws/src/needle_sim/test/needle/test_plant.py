@@ -186,15 +186,6 @@ def test_broadcasting_equals_looping() -> None:
         assert many.rotation[row, column] == pytest.approx(float(one.rotation))
 
 
-def test_a_bicycle_s_tip_rides_ahead_of_the_rear_wheel() -> None:
-    ahead = np.eye(4)
-    ahead[2, 3] = 0.01
-    tip = NeedlePlant(initial_pose(0.03, 0.2) @ ahead, curvature=CURVATURE, tip_offset=0.01)
-    for turned in TURNS:
-        tip.advance(0.001, turned)
-    np.testing.assert_allclose(tip.T_rig_tip, wandering().T_rig_tip @ ahead, rtol=0, atol=1e-13)
-
-
 def test_what_cannot_be_is_refused_and_changes_nothing() -> None:
     plant = NeedlePlant(np.eye(4), curvature=CURVATURE)
     for inputs in ((np.nan, 0.0), (0.001, np.inf)):

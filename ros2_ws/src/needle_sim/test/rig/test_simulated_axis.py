@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.procedure import run_at_once
-from needle_sim.rig.bench import SimulatedBench
 from needle_sim.rig.simulated_axis import SimulatedAxis
 
 PERIOD = 0.02
@@ -18,18 +16,6 @@ def powered(name: str = "insertion", position: float = 0.0) -> SimulatedAxis:
     run_at_once(axis.configure())
     axis.power(True)
     return axis
-
-
-def make_bench(tip_noise: float = 1e-3) -> SimulatedBench:
-    return SimulatedBench(
-        curvature=8.0,
-        pitch=0.03,
-        roll=0.2,
-        torsion_play=0.0,
-        torsion_lag=0.0,
-        tip_noise=tip_noise,
-        seed=3,
-    )
 
 
 def test_an_axis_reaches_its_target_exactly_and_in_time_both_ways() -> None:
@@ -79,24 +65,3 @@ def test_homing_goes_to_zero_and_is_not_homed_until_there() -> None:
         axis.advance(PERIOD)
     assert axis.position == 0.0
     assert (axis.poll(0.0).homed, axis.poll(0.0).moving) == (True, False)
-
-
-def test_the_needle_moves_by_what_the_axes_did() -> None:
-    bench = make_bench()
-    for share in (0.3, 1.0, 1.0):
-        bench.move_to(share * 0.001, share * 0.3)
-    assert bench.plant.insertion == pytest.approx(0.001)
-    assert bench.plant.rotation == pytest.approx(0.3)
-    assert (bench.insertion, bench.rotation) == (0.001, 0.3)
-
-
-def test_noise_is_keyed_by_seed_and_exposure_and_by_nothing_else() -> None:
-    first, second = make_bench(), make_bench()
-    first.measure_tip(0)
-    np.testing.assert_array_equal(first.measure_tip(5), second.measure_tip(5))
-    assert np.any(first.measure_tip(5) != first.measure_tip(6))
-    errors = np.array([first.measure_tip(n) - first.tip for n in range(200)])
-    assert np.abs(errors).max() <= 1e-3
-    assert np.abs(errors).max(axis=0) == pytest.approx(1e-3, rel=0.1)
-    quiet = make_bench(tip_noise=0.0)
-    np.testing.assert_array_equal(quiet.measure_tip(1), quiet.tip)

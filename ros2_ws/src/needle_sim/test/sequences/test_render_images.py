@@ -73,17 +73,6 @@ def test_without_a_needle_there_is_no_truth_and_the_first_frame_may_be_deep_in(
     assert (row["left_seen"], row["right_seen"]) == ("0.0", "0.0")
 
 
-def test_the_stage_rests_at_its_depth() -> None:
-    rig, clean = load_stereo_rig(CALIBRATION), SCENARIOS["clean"]
-    pairs = render_insertion(rig, clean, seed=1, frames=4, depth=0.0065, step=0.004)
-    seen = [(pair.insertion, pair.truth) for pair in pairs]
-    assert [insertion for insertion, _ in seen] == [0.0, 0.004, 0.0065, 0.0065]
-    third, fourth = seen[2][1], seen[3][1]
-    assert third is not None
-    assert fourth is not None
-    np.testing.assert_array_equal(third.tip, fourth.tip)
-
-
 def test_random_paths_stay_inside_differ_and_are_smooth() -> None:
     def path_and_tips(seed: int) -> tuple[np.ndarray, np.ndarray]:
         path = random_path(seed, 0.12, (0.0175, math.inf), 1.0 / 0.122)

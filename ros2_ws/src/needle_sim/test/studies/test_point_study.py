@@ -14,7 +14,7 @@ from needle_bringup.studies.study_controllers import (
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
 from needle_sim.studies.disturbances import Disturbances
-from needle_sim.studies.point_study import PointOutcomes, point_figures, run_point_study
+from needle_sim.studies.point_study import run_point_study
 from needle_sim.studies.point_targets import (
     BREATHING_RATE,
     CURVATURE_SHARE,
@@ -122,17 +122,6 @@ def test_each_needle_ends_at_its_own_point_with_a_short_last_step() -> None:
     shallow = dataclasses.replace(STRAIGHT, depth=0.0155)
     found = run_point_study(np.zeros((2, 3)), targets, Straight, shallow)
     assert found.error[1] == pytest.approx(np.hypot(0.002, 0.0048), abs=1e-6)
-
-
-def test_figures_of_known_ends() -> None:
-    unsaid = np.full(2, np.nan)
-    ends = PointOutcomes(np.array([0.0003, 0.0014]), np.array([1.0, 3.0]), unsaid, unsaid, unsaid)
-    seen = point_figures(ends)
-    assert seen["within_1_mm_point"] == 0.5
-    assert seen["rms_point_mm"] == pytest.approx(np.sqrt((0.09 + 1.96) / 2.0))
-    assert seen["max_point_mm"] == pytest.approx(1.4)
-    assert seen["rotation_mean_deg"] == pytest.approx(np.rad2deg(2.0))
-    assert seen["doubtful_at_end"] is None
 
 
 def test_best_comes_to_points_that_drift_and_breathe() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.rrt_replanning import DutyCycle, arc_to, is_clear, move, plan
+from needle_sim.studies.rrt_replanning import DutyCycle, is_clear, plan
 from needle_sim.studies.sliding_mode import sliding_mode_rate
 
 CURVATURE = 1.0 / 0.122
@@ -45,22 +45,6 @@ def test_sliding_mode_turns_the_bevel_the_shorter_way_and_comes_as_near_as_publi
         assert -plant.T_rig_tip[:2, 1] @ towards > np.array([0.0, -1.0]) @ towards
     # At 30 deg/mm and this curvature the bound is 0.41 mm, in steps far shorter than a turn.
     assert steered(sliding, 2e-4)[0] < 0.00041
-
-
-def test_an_arc_ends_where_it_is_to_and_is_the_needle_s_own_at_the_edge() -> None:
-    plant = NeedlePlant(initial_pose(0.1, 0.4), curvature=CURVATURE)
-    pose = plant.T_rig_tip
-    place, ahead = pose[:3, 3].copy(), pose[:3, 2].copy()
-    plant.advance(0.06, 0.0)
-    there, bend, end, heading = plant.T_rig_tip, np.empty(3), np.empty(3), np.empty(3)
-    goal = there[:3, 3].copy()
-    length = arc_to(place, ahead, goal, 1.001 * CURVATURE, bend)
-    assert length == pytest.approx(0.06)
-    np.testing.assert_allclose(bend, -CURVATURE * pose[:3, 1], atol=1e-9)
-    move(place, ahead, bend, length, end, heading)
-    np.testing.assert_allclose(end, goal, atol=1e-12)
-    np.testing.assert_allclose(heading, there[:3, 2], atol=1e-9)
-    assert np.isinf(arc_to(place, ahead, goal, 0.99 * CURVATURE, bend))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])

@@ -99,7 +99,7 @@ def test_curvature_and_slip_act_on_the_needle(
 
 
 def test_outcomes_follow_the_seed_and_not_the_chunks() -> None:
-    disturbed = settings(disturbances=TROUBLE, depth=0.022)
+    disturbed = settings(disturbances=TROUBLE, depth=0.021)
 
     def values(study: StudySettings = disturbed, chunk: int = 500) -> FloatArray:
         found = run_study(STARTS, controller_factory("best", 0.001), study, chunk=chunk)
