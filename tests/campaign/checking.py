@@ -4,31 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
+import multiprocessing
 import os
 import re
 import signal
 import subprocess
-import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
 
-from needle_bringup.descendants import processes_with, ran
+from needle_bringup.descendants import processes_with
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import ports_of
 from needle_core.process.shared_memory import dead_ports
 
+T = TypeVar("T")
 # Every process that a check starts carries this in its environment, so that none can hide.
 MARK = "NEEDLE_VERIFICATION"
-_DOMAIN = r"ROS_DOMAIN_ID (\d+)"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,10 +40,8 @@ class Finding:
         Short name, for `--json`.
     what : str
         What is looked at.
-    wanted : str
-        What it must be.
-    seen : str
-        What it is.
+    wanted, seen : str
+        What it must be, and what it is.
     passed : bool
         Whether that is good enough.
     """
@@ -61,7 +58,7 @@ Check = Callable[["Workbench"], Iterator[Finding]]
 
 @dataclasses.dataclass(frozen=True)
 class SimulateRun:
-    """A finished run of `scripts/simulate`.
+    """A finished run of `simulate`.
 
     Attributes
     ----------
@@ -74,7 +71,7 @@ class SimulateRun:
     bag : Path
         The folder that was asked for.
     left_over : list of str
-        Processes that outlived the command.
+        Processes and shared-memory ports that outlived the command.
     """
 
     code: int
@@ -89,17 +86,6 @@ class SimulateRun:
         path = self.bag / "summary.json"
         return dict(yaml.safe_load(path.read_text("utf-8"))) if path.is_file() else {}
 
-    def log(self, node: str) -> str:
-        """Return what a node wrote."""
-        path = self.bag / "logs" / f"{node}.log"
-        return path.read_text("utf-8", errors="replace") if path.is_file() else ""
-
-    @property
-    def left_in_memory(self) -> list[str]:
-        """Shared-memory ports that the nodes left behind; a domain may have new users by now."""
-        domain = re.search(_DOMAIN, self.output)
-        return dead_ports(ports_of(int(domain[1]))) if domain else []
-
     @property
     def last_line(self) -> str:
         """Last line of the output."""
@@ -113,7 +99,7 @@ def _heed_signals() -> None:
 
 
 class StartedRun:
-    """A run of `scripts/simulate` under way.
+    """A run of `simulate` under way.
 
     Parameters
     ----------
@@ -144,16 +130,6 @@ class StartedRun:
         """Text that it has written so far."""
         return self._output.read_text("utf-8", errors="replace")
 
-    def domain(self) -> int:
-        """Wait until the nodes start; return their ROS_DOMAIN_ID.
-
-        Raises
-        ------
-        UserError
-            If the run ends, or the time, before that.
-        """
-        return int(self.wait_until_said(_DOMAIN)[1])
-
     def wait_until_said(self, pattern: str, timeout: float = 60.0) -> re.Match[str]:
         """Wait until the run has written what this regular expression matches; return the match.
 
@@ -169,8 +145,7 @@ class StartedRun:
             if found := re.search(pattern, self.output):
                 return found
             if ended or time.monotonic() >= deadline:
-                how = "ended before it" if ended else f"has run {timeout:g} s and not yet"
-                raise UserError(f"{how} said {pattern!r}: {self.output.strip()[-500:]}")
+                raise UserError(f"it has not said {pattern!r}: {self.output.strip()[-500:]}")
             time.sleep(0.01)
 
     def interrupt(self, number: signal.Signals) -> None:
@@ -190,11 +165,14 @@ class StartedRun:
             self.process.kill()
             code = self.process.wait()
         wall = time.monotonic() - self._begin
-        left_over = self.running()
-        for pid, _ in left_over:
+        running = self.running()
+        for pid, _ in running:
             os.kill(pid, signal.SIGKILL)
-        names = [f"{pid} {name}" for pid, name in left_over]
-        return SimulateRun(code, wall, self.output, self._bag, names)
+        left_over = [f"{pid} {name}" for pid, name in running]
+        # A domain may have new users by now.
+        if domain := re.search(r"ROS_DOMAIN_ID (\d+)", self.output):
+            left_over += dead_ports(ports_of(int(domain[1])))
+        return SimulateRun(code, wall, self.output, self._bag, left_over)
 
 
 class Workbench:
@@ -225,23 +203,10 @@ class Workbench:
         return self._runs[name]
 
 
-def trial_outcomes(module: str, *words: object) -> list[dict[str, Any]]:
-    """Run trials in a process of their own; return what each came to.
-
-    Parameters
-    ----------
-    module : str
-        What runs them: it prints a JSON object for each.
-    *words : object
-        Its command line.
-
-    Raises
-    ------
-    UserError
-        If they do not end well.
-    """
-    command = [sys.executable, "-m", module, *map(str, words)]
-    return [json.loads(line) for line in ran(command).stdout.splitlines()]
+def in_own_process(function: Callable[..., T], *arguments: object) -> T:
+    """Call a function in a fresh process: it may start ROS, or move into another network."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
 
 
 def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:
@@ -257,19 +222,9 @@ def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:
     if not files:
         raise UserError(f"{bag}: there is no bag")
     with files[0].open("rb") as stream:
-        reader = make_reader(stream)
-        for _, channel, message in reader.iter_messages(topics=list(topics)):
+        for _, channel, message in make_reader(stream).iter_messages(topics=list(topics)):
             found[channel.topic].append(message.data)
     return found
-
-
-def diagnostics(bag: Path) -> Iterator[tuple[int, str, str]]:
-    """Yield (level, name, message) of every status on /diagnostics."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for data in payloads(bag, ["/diagnostics"])["/diagnostics"]:
-        array: Any = store.deserialize_cdr(data, "diagnostic_msgs/msg/DiagnosticArray")
-        for status in array.status:
-            yield int(status.level), str(status.name), str(status.message)
 
 
 def unreadable(bag: Path) -> str:

@@ -7,19 +7,15 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-from tqdm import tqdm
 
 from campaign.checking import Check, Finding, Workbench
 from campaign.checks import (
     check_bags,
-    check_computers,
     check_console_hold,
     check_continuous,
     check_control,
     check_driver,
-    check_hold_sources,
+    check_holds,
     check_simulation,
     check_traced,
     check_tracker,
@@ -36,8 +32,8 @@ STEPS: Mapping[str, tuple[Check, ...]] = {
     "C": (*check_tracker.CHECKS, *check_traced.CHECKS),
     "D": check_driver.CHECKS,
     "E": check_bags.CHECKS,
-    "I": (*check_continuous.CHECKS, *check_hold_sources.CHECKS, *check_console_hold.CHECKS),
-    "K": check_computers.CHECKS,
+    "I": (*check_continuous.CHECKS, *check_holds.HOLD_CHECKS, *check_console_hold.CHECKS),
+    "K": check_holds.COMPUTER_CHECKS,
 }
 
 DESCRIPTION = """\
@@ -73,21 +69,16 @@ def _verify(arguments: Sequence[str]) -> int:
         return EXIT_DONE
     begin = time.monotonic()
     findings: list[tuple[str, Finding]] = []
-    tqdm.monitor_interval = 0  # its thread would outlive the bar
     keep = given.keep and make_folder("--keep", given.keep, exist_ok=False)
     with (
         contextlib.nullcontext(keep) if keep else temporary_folder() as folder,
         ending_descendants(),
-        _progress(len(checks)) as bar,
     ):
         bench = Workbench([str(checkout() / "scripts" / "simulate")], folder)
         for step, check in checks:
-            bar.set_description(f"{step} {check.__name__}")
             for finding in _findings(check, bench):
                 findings.append((step, finding))
-                with bar.external_write_mode():
-                    _show(step, finding)
-            bar.update()
+                _show(step, finding)
     failed = sum(not finding.passed for _, finding in findings)
     print(f"{len(findings) - failed} of {len(findings)} as wanted")
     if given.json:
@@ -95,21 +86,11 @@ def _verify(arguments: Sequence[str]) -> int:
     return EXIT_MISSED if failed else EXIT_DONE
 
 
-def _progress(checks: int) -> Any:
-    """Return a bar over the checks, on a terminal; elsewhere the findings show how far it is."""
-    return tqdm(
-        total=checks,
-        leave=False,
-        disable=not sys.stderr.isatty(),
-        bar_format="{desc} {bar} {n_fmt} of {total_fmt} checks, {elapsed}",
-    )
-
-
 def _findings(check: Check, bench: Workbench) -> Iterator[Finding]:
     """Run a check; one that cannot be made has missed."""
     try:
         yield from check(bench)
-    except UserError as error:
+    except (UserError, ModuleNotFoundError) as error:
         what = (check.__doc__ or "").splitlines()[0]
         yield Finding(check.__name__, what, "can be checked", str(error), False)
 

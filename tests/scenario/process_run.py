@@ -16,14 +16,13 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState, Joy
 from trajectory_msgs.msg import JointTrajectory
 
-from campaign.trials.drives.drive_hand import JOINTS, DriveHand
-from campaign.trials.listening_node import ros
+from campaign.trials.rig_hand import RigHand, ros
 from campaign.trials.trial_processes import TrialProcesses, graph_in_real_time
 from needle_core.convert import from_ros
 from needle_core.errors import UserError
 from needle_core.messages import HoldState
 from needle_core.process.ros_domain import own_domain
-from needle_core.ros.conversions import JOINT_STATES, RELIABLE, to_qos, values_of
+from needle_core.ros.conversions import RELIABLE, to_qos, values_of
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.device import HOLDS
 from scenario.faults import Fault, Kind
@@ -44,7 +43,7 @@ _START, _DRAW_OUT, _STILL = 120.0, 60.0, 1.0
 _WITHOUT_SYNC = 0.1
 
 
-class Witness(DriveHand):
+class Witness(RigHand):
     """Hears holds, status and motors, and judges them; draws the needle out when it is asked to.
 
     Times are those at which a message was sent, so that a witness who is late judges no other. It
@@ -60,12 +59,10 @@ class Witness(DriveHand):
     def __init__(self) -> None:
         self.watch = Watch(bounds_of_the_rig(), _RELEASE_BOUND)
         self._begun = time.time()
-        self._moved_at = 0.0
         self._hears_person = False
-        super().__init__(steers=False)
+        super().__init__("sim/drive_positions")
         # Whose press it is that moves the needle.
         self._holder = PERSON
-        self.create_subscription(JointState, "sim/drive_positions", self._on_places, JOINT_STATES)
         self.create_subscription(Joy, "device/hold", self._on_hold, to_qos(HOLDS))
         self.create_subscription(
             JointTrajectory, "device/joint_trajectory", self._on_command, RELIABLE
@@ -86,22 +83,23 @@ class Witness(DriveHand):
         """
         self._holder = self.get_name()
         end = self.now + _DRAW_OUT
-        while self.motors[-1].insertion > OUT:
+        while self.insertion > OUT:
             state, activity = self.status.get("state"), self.status.get("activity")
             if self.now > end:
-                raise UserError(f"it is {self.motors[-1].insertion * 1e3:.2f} mm in; {self.status}")
+                raise UserError(f"it is {self.insertion * 1e3:.2f} mm in; {self.status}")
             if state in ("FAULT", "ESTOPPED"):
                 self.pressed = False
-                self.call("reset")
+                self.call("device/reset")
             elif state == "DISABLED":
-                self.call("enable", True)
+                self.call("device/enable", True)
             elif self.status.get("hold_owner") != self.get_name():
                 # A hold that does not count has to be let go of first.
                 self.pressed = not self.pressed
             elif activity != "retraction":
-                self.call("retract")
+                self.call("device/retract")
             self.pause(0.2)
-        self.release()
+        self.pressed = False
+        self.until(lambda: self.status.get("hold_owner", "") == "", "the hold is off")
 
     def _on_hold(self, message: Joy, info: dict[str, int]) -> None:
         hold = from_ros(HoldState, message)
@@ -116,12 +114,14 @@ class Witness(DriveHand):
         self.watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
 
     def _on_places(self, message: JointState, info: dict[str, int]) -> None:
-        before, self._moved_at = self._moved_at, self._sent_at(info)
-        if self._moved_at - before > _WITHOUT_SYNC:
-            self.watch.see_drives_go_on(self._moved_at)
+        before = self.places[-1].time if self.places else 0.0
+        super()._on_places(message, info)
+        at = self.places[-1]
+        moved_at = at.time - self._begun
+        if at.time - before > _WITHOUT_SYNC:
+            self.watch.see_drives_go_on(moved_at)
         if self._hears_person:
-            at = dict(zip(message.name, message.position, strict=True))
-            self.watch.see_motors(self._moved_at, *(at[joint] for joint in JOINTS))
+            self.watch.see_motors(moved_at, at.insertion, at.rotation)
 
     def _sent_at(self, info: dict[str, int]) -> float:
         return info["source_timestamp"] * 1e-9 - self._begun
@@ -159,7 +159,7 @@ def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResul
             yield result
 
 
-def run_processes(seed: int, folder: Path) -> RunResult:
+def run_processes(seed: int, folder: Path, faults: Sequence[Fault] | None = None) -> RunResult:
     """Run the rig in real time, in a ROS domain of its own.
 
     Parameters
@@ -168,33 +168,23 @@ def run_processes(seed: int, folder: Path) -> RunResult:
         Of the simulation and of what happens.
     folder : Path
         Takes the nodes' logs.
+    faults : sequence of Fault, optional
+        In place of those of the seed.
     """
-    faults = processes_schedule_of(seed)
+    happened = tuple(processes_schedule_of(seed) if faults is None else faults)
     with (
         own_domain() as domain,
         ros(domain),
         closing(Witness()) as witness,
         closing(TrialProcesses(folder, domain, graph_in_real_time(seed))) as graph,
     ):
-        _insert(witness, graph, faults)
+        _insert(witness, graph, happened)
         violations = tuple(witness.watch.violations)
-        happened = tuple(faults)
-        return RunResult(
-            seed,
-            happened,
-            violations,
-            happened,
-            witness.now,
-            of_processes=True,
-        )
+        return RunResult(seed, happened, violations, happened, witness.now, of_processes=True)
 
 
 def _insert(witness: Witness, graph: TrialProcesses, faults: Sequence[Fault]) -> None:
-    witness.until(
-        lambda: bool(witness.motors) and witness.motors[-1].insertion > _DEEP_ENOUGH,
-        "steering",
-        _START,
-    )
+    witness.until(lambda: witness.insertion > _DEEP_ENOUGH, "steering", _START)
     begun = witness.now
     events: list[tuple[float, Callable[[], None]]] = []
     for fault in faults:
@@ -213,7 +203,7 @@ def _insert(witness: Witness, graph: TrialProcesses, faults: Sequence[Fault]) ->
 
 
 def _begin(witness: Witness, graph: TrialProcesses, fault: Fault) -> None:
-    if graph.exit_code(fault.part) is not None:
+    if graph.nodes[fault.part].exit_code is not None:
         return
     if fault.part == "device_driver":
         witness.watch.see_driver(witness.now, speaks=False)
@@ -224,8 +214,8 @@ def _begin(witness: Witness, graph: TrialProcesses, fault: Fault) -> None:
 
 
 def _end(witness: Witness, graph: TrialProcesses, fault: Fault) -> None:
-    if graph.exit_code(fault.part) is not None:
-        graph.start(fault.part)
+    if graph.nodes[fault.part].exit_code is not None:
+        graph.begin(fault.part)
     else:
         graph.signal(fault.part, signal.SIGCONT)
     if fault.part == "device_driver":

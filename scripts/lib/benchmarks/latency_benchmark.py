@@ -7,7 +7,6 @@ insertion, in one process, says how the needle goes; the second goes the same wa
 
 from __future__ import annotations
 
-import math
 import os
 import socket
 import subprocess
@@ -16,32 +15,32 @@ import tempfile
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import latency_rig
 import needle_tracker
-from campaign.trials.steered_needle import Hand, SteeredNeedle
-from campaign.trials.trial_processes import Parameters, TrialProcesses
+from campaign.trials.steered_needle import FRAME_RATE, OFFSET, steer
+from campaign.trials.trial_processes import TrialProcesses
+from campaign.trials.virtual_rig import Held
 from needle_analysis.run.stage_timing import stage_timings
 from needle_bags.reading.bag_reader import read_run
 from needle_bringup.simulation.rig_configuration import GRAPH_WATCHDOG, can_adapter
-from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.component import Actions
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import own_domain
+from needle_core.settings.parameter_files import Parameters
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
-from needle_sim.rig.bench import SimulatedBench
+from needle_sim.sensors import TipSensor
 
 CALIBRATION = Path(needle_tracker.__file__).resolve().parents[1] / "config" / "calibration.yaml"
-FRAME = 1.0 / 30.0
+FRAME = 1.0 / FRAME_RATE
 SPEED, DEPTH = 0.002, 0.030
 # Images count from here: before, the tracker believes the insertion [m].
 FIRST = 0.006
 _SPACING = 6e-5
-_OFFSET = 0.003
-_LONGEST = 120.0
-_TIP_STD = 5e-5
 _LOOPBACK = "127.0.0.1"
 STAGES = ("tracker", "controller", "driver", "image to set-point")
 
@@ -56,7 +55,7 @@ def measure(depth: float = DEPTH) -> Mapping[str, tuple[float, float]]:
     """
     with tempfile.TemporaryDirectory(prefix="needle_bench_") as name:
         folder = Path(name)
-        draw(folder, depth + _OFFSET)
+        draw(folder, depth + OFFSET)
         _run(folder, depth)
         run = read_run(folder / "bag")
         timings = {timing.name: timing for timing in stage_timings(run)}
@@ -68,48 +67,37 @@ def measure(depth: float = DEPTH) -> Mapping[str, tuple[float, float]]:
     return figures
 
 
+class _DrawingSensor(TipSensor):
+    """Tells the tip, and draws the needle on its way."""
+
+    def __init__(self, *parts: Any) -> None:
+        super().__init__(*parts)
+        self._renderer = StereoRenderer(load_stereo_rig(CALIBRATION), 1)
+        self.insertions: list[float] = []
+        self.images: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def expose(self, number: int, stamp_ns: int) -> Actions:
+        bench = self._bench
+        if not self.insertions or bench.insertion - self.insertions[-1] > _SPACING:
+            self.insertions.append(bench.insertion)
+            plant = bench.plant
+            pose, line = plant.T_rig_tip, plant.centreline(1e-3)
+            self.images.append(self._renderer.render(pose, line, number))
+        return super().expose(number, stamp_ns)
+
+
 def draw(folder: Path, depth: float) -> None:
     """Steer a needle in this process, and leave images of it on its way in a folder."""
-    settings = SteeringSettings(
-        insertion="continuous",
-        target_offset=_OFFSET,
-        depth=depth,
-        nominal_speed=SPEED,
-        tip_covariance="configured",
-        tip_noise="normal",
-        measurement_std=_TIP_STD,
-    )
-    bench = SimulatedBench(
-        curvature=settings.curvature,
-        pitch=math.radians(2.0),
-        roll=math.radians(15.0),
-        torsion_play=0.0,
-        torsion_lag=0.0,
-        tip_noise=0.0,
-        seed=1,
-    )
-    renderer = StereoRenderer(load_stereo_rig(CALIBRATION), 1)
-    insertions: list[float] = []
-    images: list[tuple[np.ndarray, np.ndarray]] = []
+    sensors: list[_DrawingSensor] = []
 
-    def see(number: int) -> np.ndarray:
-        if not insertions or bench.insertion - insertions[-1] > _SPACING:
-            insertions.append(bench.insertion)
-            plant = bench.plant
-            images.append(renderer.render(plant.T_rig_tip, plant.centreline(1e-3), number))
-        return bench.tip
+    def see(*parts: Any) -> _DrawingSensor:
+        sensors.append(_DrawingSensor(*parts))
+        return sensors[0]
 
-    needle = SteeredNeedle(
-        settings,
-        bench,
-        lambda seconds: Hand(pressed=seconds > 0.2),
-        tip_period=FRAME,
-        latency=0.01,
-        measure=see,
-    )
-    needle.run(_LONGEST)
-    np.save(folder / latency_rig.IMAGES_FILE, np.array(images))
-    np.save(folder / latency_rig.INSERTIONS_FILE, np.array(insertions))
+    hold = lambda seconds: Held(pressed=seconds > 0.2)  # noqa: E731
+    steer(hold, 1, latency=0.01, see=see, depth=depth, nominal_speed=SPEED)
+    np.save(folder / latency_rig.IMAGES_FILE, np.array(sensors[0].images))
+    np.save(folder / latency_rig.INSERTIONS_FILE, np.array(sensors[0].insertions))
 
 
 def _run(folder: Path, depth: float) -> None:
@@ -125,8 +113,8 @@ def _run(folder: Path, depth: float) -> None:
         "stereo_tracker": {},
         "plane_controller": {
             "insertion": "continuous",
-            "target_offset": _OFFSET,
-            "depth": depth + _OFFSET,
+            "target_offset": OFFSET,
+            "depth": depth + OFFSET,
             "nominal_speed": SPEED,
         },
         "console": {"address": _LOOPBACK, **_free_ports()},

@@ -18,7 +18,7 @@ import rclpy
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_srvs.srv import Trigger
 
-from campaign.trials.drives.drive_hand import DriveHand
+from campaign.trials.rig_hand import CONTROLLER_START, RigHand
 from needle_core.convert import Converter
 from needle_core.errors import UserError
 from needle_core.message_types import NANOSECONDS, rclpy_types
@@ -37,7 +37,7 @@ _BEFORE = 30
 _PATIENCE = 60.0
 
 
-class LatencyRig(DriveHand):
+class LatencyRig(RigHand):
     """Shows, and holds.
 
     Parameters
@@ -49,7 +49,7 @@ class LatencyRig(DriveHand):
     """
 
     def __init__(self, folder: Path, calibration: Path) -> None:
-        super().__init__(steers=False)
+        super().__init__()
         self._images = np.load(folder / IMAGES_FILE)
         self._insertions = np.load(folder / INSERTIONS_FILE)
         self._converter = Converter(rclpy_types())
@@ -63,7 +63,6 @@ class LatencyRig(DriveHand):
             )
             for side, camera in (("left", rig.left), ("right", rig.right))
         ]
-        self._start = self.create_client(Trigger, "plane_controller/start")
         self._told: deque[tuple[int, float]] = deque([(0, 0.0)], maxlen=_JOINTS)
         self._random = random.Random(1)
         self._due = time.monotonic()
@@ -71,12 +70,11 @@ class LatencyRig(DriveHand):
 
     def insert(self, depth: float) -> None:
         """Prepare the rig, then hold until the needle is so deep [m]."""
-        self.until(self.ready, "the driver")
-        self.home()
-        self.insist("enable", True)
+        self.prepare()
         self._show_until(lambda: self.shown >= _BEFORE, "images")
-        self._show_until(self._start.service_is_ready, "the controller")
-        while not self._has_started():
+        start = self._clients_of[CONTROLLER_START]
+        self._show_until(start.service_is_ready, "the controller")
+        while not self._has_started(start):
             shown = self.shown
             self._show_until(lambda least=shown: self.shown > least, "another image")
         self.send_hold()
@@ -86,8 +84,8 @@ class LatencyRig(DriveHand):
         self.pressed = False
         self.send_hold()
 
-    def _has_started(self) -> bool:
-        future = self._start.call_async(Trigger.Request())
+    def _has_started(self, start: Any) -> bool:
+        future = start.call_async(Trigger.Request())
         self._show_until(future.done, "an answer of the controller")
         return bool(future.result().success)
 
@@ -95,7 +93,7 @@ class LatencyRig(DriveHand):
         end = time.monotonic() + _PATIENCE
         while not condition():
             if time.monotonic() > end:
-                raise UserError(f"waited {_PATIENCE:g} s in vain: {what}{self.state_now()}")
+                raise UserError(f"waited {_PATIENCE:g} s in vain: {what}; device: {self.status}")
             wait = self._due - time.monotonic()
             self.look(max(wait, 0.0))
             if time.monotonic() >= self._due:
@@ -115,8 +113,8 @@ class LatencyRig(DriveHand):
             image.publish(self._converter.to_ros(image_message(pixels, frame, exposed_ns)))
         self.shown += 1
 
-    def _on_joints(self, message: JointState) -> None:
-        super()._on_joints(message)
+    def _on_places(self, message: JointState, info: dict[str, int]) -> None:
+        super()._on_places(message, info)
         self._told.append((to_nanoseconds(message.header.stamp), message.position[0]))
 
 

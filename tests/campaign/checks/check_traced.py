@@ -32,25 +32,17 @@ def path_traced(_: Workbench) -> Iterator[Finding]:
     needles = [look for look in looks if look.truth is not None]
     for told, least in _LEAST.items():
         found = _found([look for look in needles if look.told is told])
-        yield Finding(
-            f"path_traced_found_{told.name.lower()}",
-            f"path-traced, {told.value} insertion, {_pairs(needles)} pairs: a tip",
-            f">= {least:.0%}",
-            f"{found:.1%}",
-            found >= least,
-        )
+        key = f"path_traced_found_{told.name.lower()}"
+        what = f"path-traced, {told.value} insertion, {_pairs(needles)} pairs: a tip"
+        yield Finding(key, what, f">= {least:.0%}", f"{found:.1%}", found >= least)
     yield from _kinds(needles)
     for rig in RIGS:
         yield from _errors(rig, [look for look in needles if look.scene.rig == rig])
     tips = [look for look in needles if look.tip is not None]
     inside = float(np.mean([look.normalised <= _CHI_SQUARED_95 for look in tips]))
-    yield Finding(
-        "path_traced_consistency",
-        f"path-traced: {len(tips)} tips within the 95 % ellipsoid that they claim",
-        "85 to 99.5 %",
-        f"{inside:.1%}",
-        0.85 <= inside <= 0.995,
-    )
+    what = f"path-traced: {len(tips)} tips within the 95 % ellipsoid that they claim"
+    passed = 0.85 <= inside <= 0.995
+    yield Finding("path_traced_consistency", what, "85 to 99.5 %", f"{inside:.1%}", passed)
     empty = [look for look in looks if look.truth is None]
     false = sum(look.tip is not None for look in empty)
     yield Finding(

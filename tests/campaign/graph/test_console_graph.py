@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
-import subprocess
 import sys
 import time
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import pytest
 
-from needle_core.process.ros_domain import own_domain
-
-LIMIT = 60.0
+from campaign.checking import Workbench
 
 
 def free_port() -> int:
@@ -35,26 +32,15 @@ def page(port: int) -> str:
         return ""
 
 
-def test_a_page_is_served_beside_nodes_until_a_signal_comes() -> None:
+def test_a_page_is_served_beside_nodes_until_a_signal_comes(tmp_path: Path) -> None:
     pytest.importorskip("nicegui", reason="the console's lock is not installed: scripts/console")
     port = free_port()
-    words = ["--graph", "--level", "tip", "--port", str(port)]
-    with own_domain() as domain:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "needle_bringup.simulation.console", *words],
-            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        try:
-            deadline = time.monotonic() + LIMIT
-            while "needle" not in page(port).lower():
-                assert process.poll() is None
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
-        finally:
-            process.send_signal(signal.SIGINT)
-            said, _ = process.communicate(timeout=LIMIT)
-    assert process.returncode == 130, said
-    assert said == f"http://127.0.0.1:{port}/   (Ctrl-C ends all)\n"
+    command = [sys.executable, "-m", "needle_bringup.simulation.console", "--graph"]
+    started = Workbench(command, tmp_path).start("bag", "--level", "tip", "--port", str(port))
+    deadline = time.monotonic() + 60.0
+    while "needle" not in page(port).lower():
+        assert started.process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.1)
+    started.interrupt(signal.SIGINT)
+    ended = started.wait(60.0)
+    assert (ended.code, ended.left_over) == (130, [])

@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -15,16 +14,16 @@ from pathlib import Path
 
 import pytest
 
+from campaign.trials.holds.computers import ADDRESSES, two_computers
 from needle_bringup.simulation.node_process import NodeProcess, stop
 from needle_core.files.installed import find_executable
 from needle_core.process.reach import DISCOVERY_RANGE, PROFILES
 from needle_core.process.ros_domain import own_domain, ports_of
 
 LIMIT = 30.0
-ADDRESS, STRANGER = "10.213.77.1", "10.213.77.2"
-
-# Asks the address of another namespace for a rig, and presses its emergency stop as long as it
-# must: until the one that is open has felt it, then for as long again and two seconds more.
+OPEN = {DISCOVERY_RANGE: "SUBNET"}
+# Asks the other computer for a rig, and presses its emergency stop as long as it must: until the
+# one that is open has felt it, then for as long again and two seconds more.
 ASK = """
 import json, time
 import rclpy
@@ -46,32 +45,20 @@ def press(end):
         for publisher in stops.values():
             publisher.publish(Bool(data=True))
         rclpy.spin_once(node, timeout_sec=0.1)
-press(lambda: heard["open"] == "ESTOPPED" or time.monotonic() > begin + %g)
+press(lambda: heard["open"] == "ESTOPPED" or time.monotonic() > begin + 30.0)
 end = time.monotonic() + (time.monotonic() - begin) + 2.0
 press(lambda: time.monotonic() > end)
 found = sorted(space for name, space in node.get_node_names_and_namespaces() if name != "stranger")
 print(json.dumps({"heard": heard, "found": found}))
 """
-
-Start = Callable[..., NodeProcess]
-
 # Package and parameters of each node.
-NODES: dict[str, tuple[str, tuple[str, ...]]] = {
+NODES = {
     "device_driver": ("needle_device_driver", ("channel:={}/none", "connect_timeout:=600.0")),
     "drive_emulator": ("needle_sim", ("pty:={}/can",)),
     "operator": ("needle_bringup", ("source:=joy", "key:=0")),
     "simulated_operator": ("needle_bringup", ()),
-    "plane_controller": ("needle_controller", ()),
 }
-
-
-def bare(domain: int, **more: str) -> dict[str, str]:
-    """Return an environment as plain ROS has it: nothing of scripts/env.sh about networks."""
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1", **more}
-    for name in (DISCOVERY_RANGE, PROFILES):
-        if name not in more:
-            environment.pop(name, None)
-    return environment
+Start = Callable[..., NodeProcess]
 
 
 @pytest.fixture
@@ -80,24 +67,29 @@ def domain() -> Iterator[int]:
         yield one
 
 
+def bare(domain: int, **more: str) -> dict[str, str]:
+    """Return an environment as plain ROS has it: nothing of scripts/env.sh about networks."""
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
+    for name in (DISCOVERY_RANGE, PROFILES):
+        environment.pop(name, None)
+    return environment | more
+
+
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
+def start(tmp_path: Path, domain: int) -> Iterator[Start]:
     processes: list[NodeProcess] = []
 
-    def begin(
-        name: str, environment: dict[str, str], *before: str, node: str = "device_driver"
-    ) -> NodeProcess:
+    def begin(name: str, *before: str, node: str = "device_driver", **more: str) -> NodeProcess:
         package, parameters = NODES[node]
-        command = [*before, find_executable(package, node), "--ros-args"]
+        command = [*before, find_executable(package, node), "--ros-args", "-r", f"__ns:=/{name}"]
         for parameter in parameters:
             command += ["-p", parameter.format(tmp_path)]
-        command += ["-r", f"__ns:=/{name}"]
-        process = NodeProcess(name, command, environment=environment, log=tmp_path / f"{name}.log")
+        log = tmp_path / f"{name}.log"
+        process = NodeProcess(name, command, environment=bare(domain, **more), log=log)
         processes.append(process)
         deadline = time.monotonic() + LIMIT
         while "ROS_DOMAIN_ID" not in process.log.read_text("utf-8"):
-            assert process.exit_code is None, process.tail(5)
-            assert time.monotonic() < deadline, process.tail(5)
+            assert process.exit_code is None and time.monotonic() < deadline, process.tail(5)
         return process
 
     yield begin
@@ -112,9 +104,9 @@ def listening(pid: int, domain: int) -> set[str]:
         with contextlib.suppress(FileNotFoundError):
             if match := re.fullmatch(r"socket:\[(\d+)\]", str(file.readlink())):
                 own.add(match[1])
-    lines = Path(f"/proc/{pid}/net/udp").read_text("ascii").splitlines()[1:]
     found = set()
-    for fields in map(str.split, lines):
+    for line in Path(f"/proc/{pid}/net/udp").read_text("ascii").splitlines()[1:]:
+        fields = line.split()
         address, port = fields[1].split(":")
         if fields[9] in own and int(port, 16) in ports_of(domain):
             found.add(".".join(str(byte) for byte in reversed(bytes.fromhex(address))))
@@ -124,94 +116,31 @@ def listening(pid: int, domain: int) -> set[str]:
 def test_a_node_listens_to_this_machine_only_unless_asked_otherwise(
     start: Start, domain: int
 ) -> None:
-    closed = start("closed", bare(domain))
-    assert listening(closed.pid, domain) == {"127.0.0.1"}
-    opened = start("open", bare(domain, **{DISCOVERY_RANGE: "SUBNET"}))
-    assert "0.0.0.0" in listening(opened.pid, domain)
+    assert listening(start("closed").pid, domain) == {"127.0.0.1"}
+    assert "0.0.0.0" in listening(start("open", **OPEN).pid, domain)
 
 
-def test_another_middleware_is_named_and_not_loaded(domain: int) -> None:
-    environment = bare(domain, RMW_IMPLEMENTATION="rmw_cyclonedds_cpp")
-    done = subprocess.run(
-        [find_executable("needle_sim", "drive_emulator"), "--help"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=LIMIT,
-        check=False,
-    )
-    assert done.returncode == 0
-    assert done.stderr == (
-        "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp ignored: the rig's nodes run on rmw_fastrtps_cpp\n"
-    )
-
-
-@pytest.mark.parametrize(
-    ("node", "asked"),
-    [
-        ("device_driver", "LOCALHOST"),
-        ("device_driver", "SUBNET"),
-        ("drive_emulator", "LOCALHOST"),
-        ("operator", "LOCALHOST"),
-        ("simulated_operator", "LOCALHOST"),
-    ],
-)
-def test_who_must_not_be_held_up_has_no_shared_memory(
-    start: Start, domain: int, node: str, asked: str
-) -> None:
-    process = start("rig", bare(domain, **{DISCOVERY_RANGE: asked}), node=node)
+@pytest.mark.parametrize("node", NODES)
+def test_who_must_not_be_held_up_has_no_shared_memory(start: Start, node: str) -> None:
+    asked = OPEN if node == "device_driver" else {DISCOVERY_RANGE: "LOCALHOST"}
+    process = start("rig", node=node, **asked)
     assert "/dev/shm/fastrtps" not in Path(f"/proc/{process.pid}/maps").read_text("utf-8")
 
 
-@pytest.fixture
-def namespaces() -> Iterator[tuple[str, str]]:
-    """Make two network namespaces with one cable between them."""
-    ip = shutil.which("ip")
-    if ip is None:
-        pytest.skip("no `ip` (iproute2) here: no other network to ask from")
-    rig, other = (f"needle_{os.getpid()}_{name}" for name in ("rig", "other"))
-
-    def run(words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run([ip, *words.split()], capture_output=True, text=True, check=False)
-
-    made = [run(f"netns add {name}") for name in (rig, other)]
-    try:
-        if any(one.returncode for one in made):
-            pytest.skip(f"no network namespaces can be made here: {made[0].stderr.strip()}")
-        for words in (
-            f"link add needle netns {rig} type veth peer name needle netns {other}",
-            f"-n {rig} addr add {ADDRESS}/30 dev needle",
-            f"-n {other} addr add {STRANGER}/30 dev needle",
-            *(
-                f"-n {name} link set {device} up"
-                for name in (rig, other)
-                for device in ("lo", "needle")
-            ),
-        ):
-            assert run(words).returncode == 0, words
-        yield rig, other
-    finally:
-        for name in (rig, other):
-            run(f"netns del {name}")
-
-
 def test_from_another_network_nothing_is_seen_and_nothing_is_moved(
-    start: Start, domain: int, namespaces: tuple[str, str]
+    start: Start, domain: int
 ) -> None:
-    rig, other = namespaces
-    inside = ("ip", "netns", "exec", rig)
-    closed = start("closed", bare(domain), *inside)
-    opened = bare(domain, **{DISCOVERY_RANGE: "SUBNET"})
-    start("open", opened, *inside)
-    asked = subprocess.run(
-        ["ip", "netns", "exec", other, sys.executable, "-c", ASK % LIMIT],
-        env=bare(domain, **{DISCOVERY_RANGE: "SUBNET", "ROS_STATIC_PEERS": ADDRESS}),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    with two_computers() as (rig, other, _):
+        closed = start("closed", *rig.inside)
+        start("open", *rig.inside, **OPEN)
+        asked = subprocess.run(
+            [*other.inside, sys.executable, "-c", ASK],
+            env=bare(domain, ROS_STATIC_PEERS=ADDRESSES[0], **OPEN),
+            capture_output=True,
+            text=True,
+            check=True,
+        )
     seen = json.loads(asked.stdout)
-    assert seen["heard"]["open"] == "ESTOPPED", "who asks for a network is reached"
-    assert seen["heard"]["closed"] == ""
+    assert seen["heard"] == {"open": "ESTOPPED", "closed": ""}
     assert set(seen["found"]) == {"/open"}
     assert "emergency stop" not in closed.log.read_text("utf-8")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import os
 import signal
@@ -12,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.rosbag2 import Reader
@@ -28,142 +28,120 @@ from needle_core.process.ros_domain import own_domain
 # message's number.
 _NUMBER = slice(8, 12)
 _START_UP = 30.0
-_LOAD = "recording_load"
-_MODULES = {
-    "recorder": "needle_bags.ros.recorder",
-    _LOAD: "campaign.trials.recording_load",
-}
-_SECOND = 1_000_000_000
+_LOAD = "campaign.trials.recording_load"
 
 
-@dataclasses.dataclass(frozen=True)
-class FullRate:
-    """Outcome of a recording at full rate.
+def record_full_rate(folder: Path, duration: float) -> dict[str, Any]:
+    """Record what a rig at full rate sends for so long [s], while two processes are busy.
 
-    Attributes
-    ----------
-    bag : Path
-        The bag.
-    sent, missing, counted : dict of str to int
-        For each topic: messages that were sent, that are not in the bag, and that the recorder
-        says it lost.
-    processor_share : float
-        Processor time of the recorder over the time, of one core.
-    memory_mb, growth_mb : float
-        The recorder's memory at the end, and by how much it grew in the second half [MB].
-    megabytes_per_s : float
-        Written to the disk.
-    exit_code : int
-        The recorder's.
+    Returns
+    -------
+    dict
+        By topic what was `sent`, is `missing` in the bag, and is `counted` as lost by the recorder;
+        its `share` of a core, its `memory` and how much that `grew` in the second half [MB], the
+        rate of writing, `MB_per_s`, and its exit `code`.
     """
-
-    bag: Path
-    sent: dict[str, int]
-    missing: dict[str, int]
-    counted: dict[str, int]
-    processor_share: float
-    memory_mb: float
-    growth_mb: float
-    megabytes_per_s: float
-    exit_code: int
-
-
-@dataclasses.dataclass(frozen=True)
-class Killed:
-    """Outcome of `recover` on a killed recording.
-
-    Attributes
-    ----------
-    messages : int
-        Messages in it.
-    age_s : float
-        From its last message to the kill [s].
-    gaps : int
-        Messages missing between others of their topic.
-    unreadable : str
-        Why rosbags or mcap do not open it; empty if they do.
-    """
-
-    messages: int
-    age_s: float
-    gaps: int
-    unreadable: str
-
-
-def record_full_rate(folder: Path, duration: float, *, burners: int = 2) -> FullRate:
-    """Record what a rig at full rate sends, while `burners` processes keep the cores busy."""
     bag = folder / "full_rate"
     with (
         own_domain() as domain,
-        _process(domain, "recorder", bag=str(bag)) as recorder,
-        busy(burners),
-        _process(domain, _LOAD, duration=duration) as load,
+        recorder(domain, bag) as recording,
+        busy(2),
+        _process(domain, _LOAD, str(duration)) as load,
     ):
-        begin, before = time.monotonic(), _processor_time(recorder.pid)
+        begin, before = time.monotonic(), _processor_time(recording.pid)
         memory: list[float] = []
-        while load.poll() is None and recorder.poll() is None:
+        while load.poll() is None and recording.poll() is None:
             time.sleep(0.5)
-            memory.append(_memory(recorder.pid))
-        share = (_processor_time(recorder.pid) - before) / (time.monotonic() - begin)
+            memory.append(_memory(recording.pid))
+        share = (_processor_time(recording.pid) - before) / (time.monotonic() - begin)
         output, _ = load.communicate()
-        recorder.send_signal(signal.SIGINT)
-        code = recorder.wait(60.0)
+        recording.send_signal(signal.SIGINT)
+        code = recording.wait(60.0)
     if load.returncode or not output.strip():
         raise UserError(f"the load did not run: exit code {load.returncode}")
     sent = dict(json.loads(output.strip().splitlines()[-1]))
     kept = {topic: len(set(found)) for topic, found in _numbers(bag).items()}
+    missing = {topic: count - kept.get(topic, 0) for topic, count in sent.items()}
+    lost = json.loads(read_contents(bag).custom_data.get(MESSAGES_LOST, "{}"))
     half, quarter = len(memory) // 2, max(1, len(memory) // 8)
-    growth = np.mean(memory[-quarter:]) - np.mean(memory[half : half + quarter])
     size = sum(file.stat().st_size for file in bag.glob("*.mcap"))
-    return FullRate(
-        bag,
-        sent,
-        {topic: count - kept.get(topic, 0) for topic, count in sent.items()},
-        json.loads(read_contents(bag).custom_data.get(MESSAGES_LOST, "{}")),
-        share,
-        memory[-1],
-        float(growth),
-        size / duration / 1e6,
-        code,
-    )
+    return {
+        "sent": sum(sent.values()),
+        "missing": {topic: count for topic, count in missing.items() if count},
+        "counted": {topic: lost[topic] for topic in sent if topic in lost},
+        "share": share,
+        "memory": memory[-1],
+        "grew": float(np.mean(memory[-quarter:]) - np.mean(memory[half : half + quarter])),
+        "MB_per_s": size / duration / 1e6,
+        "code": code,
+    }
 
 
-def record_and_kill(
-    folder: Path, moments: int, seed: int, *, images: bool = True
-) -> Iterator[Killed]:
-    """Kill a recorder at random moments, recover each time what it leaves."""
-    rng = np.random.default_rng(seed)
+def record_and_kill(folder: Path, moments: int, *words: str) -> Iterator[tuple[str, float, int]]:
+    """Kill a recorder at random moments, recover each time what it leaves.
+
+    Yields
+    ------
+    str, float, int
+        Why the bag cannot be read; from its last message to the kill [s]; messages missing between
+        others of their topic.
+    """
+    rng = np.random.default_rng(5)
     for number in range(moments):
-        bag = folder / f"killed_{'images' if images else 'small'}_{number}"
+        bag = folder / f"killed_{number}"
         # A domain for each: what a killed process leaves in shared memory may keep the next one
         # from hearing the same partners.
         with (
             own_domain() as domain,
-            _process(domain, "recorder", bag=str(bag)) as recorder,
-            _process(domain, _LOAD, duration=3600.0, images=images),
+            recorder(domain, bag) as recording,
+            _process(domain, _LOAD, "3600", *words),
         ):
-            _wait_until_recording(bag, recorder)
+            deadline = time.monotonic() + _START_UP
+            # The first chunk of data is on the disk.
+            while sum(file.stat().st_size for file in bag.glob("*.mcap")) < 50_000:
+                if time.monotonic() > deadline or recording.poll() is not None:
+                    raise UserError(f"the recorder does not record into {bag}")
+                time.sleep(0.01)
             time.sleep(float(rng.uniform(0.0, 2.0)))
             killed_at = time.time_ns()
-            recorder.kill()
-            recorder.wait(10.0)
-        yield _recovered(bag, killed_at)
-
-
-def _recovered(bag: Path, killed_at: int) -> Killed:
-    messages = recover_bag(bag).messages
-    why = unreadable(bag)
-    if why:
-        return Killed(messages, 0.0, 0, why)
-    gaps = 0
-    for topic, found in _numbers(bag).items():
+            recording.kill()
+            recording.wait(10.0)
+        recover_bag(bag)
+        if why := unreadable(bag):
+            yield why, 0.0, 0
+            continue
         # A best-effort topic may lose what is sent before the recorder is known to it, no more.
-        span = max(found) - min(found) + 1
-        if topic != "/device/hold":
-            gaps += span - len(set(found))
-    with Reader(bag) as reader:
-        age = (killed_at - (reader.end_time - 1)) / _SECOND
-    return Killed(messages, age, gaps, "")
+        gaps = sum(
+            max(found) - min(found) + 1 - len(set(found))
+            for topic, found in _numbers(bag).items()
+            if topic != "/device/hold"
+        )
+        with Reader(bag) as reader:
+            yield "", (killed_at - (reader.end_time - 1)) * 1e-9, gaps
+
+
+def recorder(
+    domain: int, bag: Path, name: str = "recorder"
+) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
+    """Start a recorder of this node name; it is killed in the end."""
+    words = ["--ros-args", "-r", f"__node:={name}", "-p", f"bag:={bag}"]
+    return _process(domain, "needle_bags.ros.recorder", *words)
+
+
+@contextlib.contextmanager
+def _process(domain: int, module: str, *words: str) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [sys.executable, "-m", module, *words],
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def _numbers(bag: Path) -> dict[str, list[int]]:
@@ -177,37 +155,6 @@ def _numbers(bag: Path) -> dict[str, list[int]]:
     return found
 
 
-def _wait_until_recording(bag: Path, recorder: subprocess.Popen[str]) -> None:
-    """Wait until the first chunk of data is on the disk."""
-    end = time.monotonic() + _START_UP
-    while time.monotonic() < end and recorder.poll() is None:
-        if sum(file.stat().st_size for file in bag.glob("*.mcap")) > 50_000:
-            return
-        time.sleep(0.01)
-    raise UserError(f"the recorder does not record into {bag}")
-
-
-@contextlib.contextmanager
-def _process(
-    domain: int, node: str, **parameters: str | float | bool
-) -> Iterator[subprocess.Popen[str]]:
-    words = [sys.executable, "-m", _MODULES[node], "--ros-args"]
-    for name, value in parameters.items():
-        words += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
-    with subprocess.Popen(
-        words,
-        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 def _processor_time(pid: int) -> float:
     """Return the processor time that a process has taken [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
@@ -216,8 +163,5 @@ def _processor_time(pid: int) -> float:
 
 def _memory(pid: int) -> float:
     """Return the memory of a process that is its own [MB]: without what it shares."""
-    try:
-        fields = Path(f"/proc/{pid}/statm").read_text("utf-8").split()
-    except OSError:
-        return 0.0
+    fields = Path(f"/proc/{pid}/statm").read_text("utf-8").split()
     return (int(fields[1]) - int(fields[2])) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -19,20 +19,10 @@ from typing import Any
 
 from needle_core.errors import UserError
 
-_FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--no-first-run",
-    "--disable-gpu",
-    "--disable-quic",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--disable-extensions",
-    "--disable-breakpad",
-    "--disable-dev-shm-usage",
-    "--remote-debugging-port=0",
-)
+_FLAGS = """\
+--headless=new --no-sandbox --no-first-run --disable-gpu --disable-quic --disable-sync
+--disable-background-networking --disable-component-update --disable-extensions
+--disable-breakpad --disable-dev-shm-usage --remote-debugging-port=0"""
 _PATIENCE = 60.0
 _POLL = 0.02
 _KEY = {"key": " ", "code": "Space", "windowsVirtualKeyCode": 32}
@@ -66,7 +56,7 @@ class Chromium:
             raise UserError("there is no chromium: apt-get install chromium")
         folder.mkdir()
         self._process = subprocess.Popen(
-            [path, *_FLAGS, f"--user-data-dir={folder}", "about:blank"],
+            [path, *_FLAGS.split(), f"--user-data-dir={folder}", "about:blank"],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -84,9 +74,9 @@ class Chromium:
             raise
         self._numbers = itertools.count(1)
 
-    def open(self, url: str, *, window: bool = False) -> Tab:
-        """Open a page in front, in a new tab or a window of its own."""
-        target = str(self.call("Target.createTarget", url=url, newWindow=window)["targetId"])
+    def open(self, url: str) -> Tab:
+        """Open a page in front, in a new tab."""
+        target = str(self.call("Target.createTarget", url=url)["targetId"])
         session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         tab = Tab(self, target, str(session))
         tab.show()
@@ -212,39 +202,28 @@ class Tab:
     def touch(self, *places: tuple[float, float]) -> None:
         """Have fingers at these places [px]; nowhere: lift them."""
         points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(places)]
-        kind = "touchStart" if points else "touchEnd"
-        self._browser.post("Input.dispatchTouchEvent", self._session, type=kind, touchPoints=points)
+        self._input("Touch", type="touchStart" if points else "touchEnd", touchPoints=points)
 
     def cancel_touch(self) -> None:
         """Take the fingers away as a system does that has use for them."""
-        self._browser.post(
-            "Input.dispatchTouchEvent", self._session, type="touchCancel", touchPoints=[]
-        )
+        self._input("Touch", type="touchCancel", touchPoints=[])
 
     def press_key(self, key: str) -> None:
         """Press a key that is called as it is."""
-        self._browser.post(
-            "Input.dispatchKeyEvent", self._session, type="keyDown", key=key, code=key
-        )
+        self._input("Key", type="keyDown", key=key, code=key)
 
     def press_space(self, *, repeat: bool = False) -> None:
         """Press the space bar, or say that it still is."""
-        self._browser.post(
-            "Input.dispatchKeyEvent", self._session, type="keyDown", autoRepeat=repeat, **_KEY
-        )
+        self._input("Key", type="keyDown", autoRepeat=repeat, **_KEY)
 
     def release_space(self) -> None:
         """Release it."""
-        self._browser.post("Input.dispatchKeyEvent", self._session, type="keyUp", **_KEY)
+        self._input("Key", type="keyUp", **_KEY)
 
     def _mouse(self, kind: str, x: float, y: float, buttons: int, button: str = "left") -> None:
-        self._browser.post(
-            "Input.dispatchMouseEvent",
-            self._session,
-            type=kind,
-            x=x,
-            y=y,
-            button="none" if kind == "mouseMoved" else button,
-            buttons=buttons,
-            clickCount=1,
-        )
+        button = "none" if kind == "mouseMoved" else button
+        at = {"x": x, "y": y, "clickCount": 1}
+        self._input("Mouse", type=kind, button=button, buttons=buttons, **at)
+
+    def _input(self, device: str, **parameters: object) -> None:
+        self._browser.post(f"Input.dispatch{device}Event", self._session, **parameters)

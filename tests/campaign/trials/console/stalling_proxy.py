@@ -6,8 +6,6 @@ import contextlib
 import socket
 import threading
 
-_AT_ONCE = 65536
-
 
 class StallingProxy:
     """Hands on bytes between a port of its own and another one, both ways.
@@ -23,33 +21,16 @@ class StallingProxy:
         self._flows = threading.Event()
         self._flows.set()
         self._listener = socket.create_server(("127.0.0.1", 0))
-        self._sockets: list[socket.socket] = []
-        self._threads = [threading.Thread(target=self._accept)]
-        self._threads[0].start()
-
-    @property
-    def port(self) -> int:
-        """Port that leads there."""
-        return int(self._listener.getsockname()[1])
-
-    def stall(self) -> None:
-        """Let nothing through."""
-        self._flows.clear()
-
-    def flow(self) -> None:
-        """Let through what has come meanwhile, and all that follows."""
-        self._flows.set()
+        self._sockets = [self._listener]
+        self.port = int(self._listener.getsockname()[1])
+        self.stall, self.flow = self._flows.clear, self._flows.set
+        threading.Thread(target=self._accept, daemon=True).start()
 
     def close(self) -> None:
         """End all connections."""
         self._flows.set()
-        for one in (self._listener, *self._sockets):
-            with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
-        for thread in self._threads:
-            thread.join()
-        for one in (self._listener, *self._sockets):
-            one.close()
+        for one in self._sockets:
+            _shut(one)
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):
@@ -59,14 +40,17 @@ class StallingProxy:
                 self._sockets += (near, far)
                 for ends in ((near, far), (far, near)):
                     ends[1].setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    self._threads.append(threading.Thread(target=self._pass, args=ends))
-                    self._threads[-1].start()
+                    threading.Thread(target=self._pass, args=ends, daemon=True).start()
 
     def _pass(self, source: socket.socket, sink: socket.socket) -> None:
         with contextlib.suppress(OSError):
-            while data := source.recv(_AT_ONCE):
+            while data := source.recv(65536):
                 self._flows.wait()
                 sink.sendall(data)
-        for one in (source, sink):
-            with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
+        _shut(source)
+        _shut(sink)
+
+
+def _shut(one: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        one.shutdown(socket.SHUT_RDWR)

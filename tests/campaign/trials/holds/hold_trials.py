@@ -1,104 +1,194 @@
-"""Trials of what a person holds, each printed as one JSON object: when the needle moves last.
-
-`python -m campaign.trials.holds.hold_trials 50 pedal_unplugged joy_silent operator_frozen`
-"""
+"""What a person holds is lost at random moments while a needle goes in at 5 mm/s, all the time."""
 
 from __future__ import annotations
 
-import math
+import os
 import random
-import sys
+import signal
+import tempfile
 import time
-from collections import deque
-from collections.abc import Iterable
-from contextlib import closing
-from itertools import groupby
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from campaign.trials.holds.hands import (
-    HANDS,
-    LATEST,
-    READY,
-    RECENT,
-    HeldSource,
-    fast_insertion,
-    hold_anew,
-    until_deep,
-)
-from campaign.trials.holds.hold_witness import HoldWitness
-from campaign.trials.listening_node import ros
-from campaign.trials.trial_processes import TrialProcesses
-from campaign.trials.trial_runner import Outcomes, Trial, run_trials, trials_of
-from needle_core.commands.options import CommandParser
+from sensor_msgs.msg import Joy
 
-KINDS = tuple(HANDS)
-# How long a loss is watched, and how long what comes back is [s].
-_LOST, _BACK = 0.6, 1.2
+from campaign.trials.holds.computers import enter_network, two_computers
+from campaign.trials.holds.piped_pedal import KEY, PipedPedal
+from campaign.trials.rig_hand import CONTROLLER_START, RigHand, ros
+from campaign.trials.trial_processes import TrialProcesses, without_recorder
+from needle_bringup.simulation.simulate_options import SimulateOptions
+from needle_core.errors import UserError
+from needle_core.process.reach import DISCOVERY_RANGE, PROFILES, keep_to_this_machine
+from needle_core.process.ros_domain import own_domain
+from needle_core.ros.base_node import STEADY_CLOCK
+from needle_core.ros.conversions import RELIABLE
+from needle_core.settings.parameter_files import Parameters
+
+CABLE = "cable_cut"
+KINDS = ("pedal_unplugged", "joy_silent", "operator_frozen", CABLE)
+DELAY, LOSS = 0.005, 0.01
+"""Of all that passes the cable."""
+OPERATOR = "operator"
+_OPERATOR_MODULE = "campaign.trials.holds.piped_operator"
+_SPEED, _DEPTH_MM = 0.005, 190.0
+_DEEP = 0.17  # from here on the next trial has a rig of its own [m]
+_JOY_PERIOD = 0.02
+# Latest moment of a loss after the needle has begun to move, and how long what comes back is
+# watched [s]; a needle that moved so shortly before moves now.
+_LATEST, _BACK, RECENT = 0.4, 2.0, 0.05
+# A loss lasts so long [s].
+_LASTS = {CABLE: (0.3, 5.0)}
+_LASTS_ELSE = (0.6, 0.6)
+_NEUTRAL, _AGAIN, _GIVE_UP = 0.2, 2.0, 60.0
+# A needle that goes farther than a late stop would take it moves [m].
+_UNDER_WAY = 0.2e-3
 
 
-def hold_trials(folder: Path, domain: int, trials: Iterable[Trial]) -> Outcomes:
-    """Yield what came of each trial: a level tip in real time, a source that is lost.
+class Source(NamedTuple):
+    """What is held: pressed or let go of, lost, and got back as it was."""
+
+    press: Callable[[bool], None]
+    lose: Callable[[], None]
+    come_back: Callable[[], None]
+
+
+def hold_trials(kind: str, count: int, seed: int = 1) -> list[dict[str, Any]]:
+    """Return what came of each loss; this process may be in another network from now on.
 
     Parameters
     ----------
-    folder : Path
-        Takes the logs.
-    domain : int
-        ROS_DOMAIN_ID.
-    trials : iterable of Trial
-        Their kinds are of `KINDS`.
+    kind : str
+        One of `KINDS`.
+    count : int
+        Losses.
+    seed : int
+        Of all that is drawn.
     """
-    left = deque(trials)
-    with ros(domain):
-        while left:
-            place = left[0].make_folder(folder)
-            parameters = fast_insertion(left[0].rng.randrange(1000))
+    rng = random.Random(f"{seed} {kind}")
+    outcomes: list[dict[str, Any]] = []
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="needle_trial_")))
+        domain = stack.enter_context(own_domain())
+        cable: tuple[Callable[[], None], ...] = ()
+        persons: Sequence[str] = ()
+        if kind == CABLE:
+            # Controller and person are on one computer, the rig and who sees it on the other.
+            one, other, wire = stack.enter_context(two_computers(delay=DELAY, loss=LOSS))
+            enter_network(other.pid)
+            # What a person sets on both computers; the rest follows from it.
+            os.environ[DISCOVERY_RANGE] = "SUBNET"
+            os.environ.pop(PROFILES, None)
+            keep_to_this_machine()
+            persons, cable = one.inside, (wire.cut, wire.mend)
+        stack.enter_context(ros(domain))
+        while len(outcomes) < count:
+            place = folder / str(len(outcomes))
+            place.mkdir()
+            before = dict.fromkeys((OPERATOR, "plane_controller"), persons)
+            parameters = _parameters(rng.randrange(1000))
             with (
-                closing(HoldWitness()) as witness,
-                closing(TrialProcesses(place, domain, parameters)) as graph,
+                closing(RigHand(holds=False)) as hand,
+                closing(TrialProcesses(place, domain, parameters, before)) as graph,
+                _held(kind, place, graph, hand, cable) as source,
             ):
-                ready = False
-                for kind, alike in groupby(until_deep(left, witness), lambda trial: trial.kind):
-                    with closing(HANDS[kind](place, graph, witness)) as hand:
-                        # A simulated rig waits for an operator, whichever.
-                        if not ready:
-                            witness.prepare(READY)
-                            ready = True
-                        for trial in alike:
-                            yield trial.outcome(_lose(hand, witness, trial.rng))
-                            graph.check()
+                hand.prepare()
+                hand.insist(CONTROLLER_START)
+                while len(outcomes) < count and hand.insertion < _DEEP:
+                    outcomes.append(_lose(hand, source, rng, *_LASTS.get(kind, _LASTS_ELSE)))
+                    graph.check()
+    return outcomes
 
 
-def _lose(hand: HeldSource, witness: HoldWitness, rng: random.Random) -> dict[str, Any]:
+@contextmanager
+def _held(
+    kind: str,
+    folder: Path,
+    graph: TrialProcesses,
+    hand: RigHand,
+    cable: tuple[Callable[[], None], ...],
+) -> Iterator[Source]:
+    """Start an operator, and give what its person holds."""
+    if kind == "joy_silent":
+        joy = hand.create_publisher(Joy, "joy", RELIABLE)
+        pressed = [False]
+        send = lambda: joy.publish(Joy(buttons=[int(pressed[0])]))  # noqa: E731
+        timer = hand.create_timer(_JOY_PERIOD, send, clock=STEADY_CLOCK)
+        graph.begin_module(OPERATOR, _OPERATOR_MODULE, {"source": "joy", "key": 0})
+        yield Source(partial(pressed.__setitem__, 0), timer.cancel, timer.reset)
+        return
+    pedal = PipedPedal(folder / "pedal")
+    values = {"source": "pedal", "device": str(folder / "pedal"), "key": KEY}
+    graph.begin_module(OPERATOR, _OPERATOR_MODULE, values)
+    ways: dict[str, tuple[Callable[[], None], ...]] = {
+        "pedal_unplugged": (pedal.unplug, pedal.plug),
+        "operator_frozen": (
+            partial(graph.signal, OPERATOR, signal.SIGSTOP),
+            partial(graph.signal, OPERATOR, signal.SIGCONT),
+        ),
+        CABLE: cable,
+    }
+    yield Source(pedal.press, *ways[kind])
+    pedal.unplug()
+
+
+def _lose(
+    hand: RigHand, source: Source, rng: random.Random, shortest: float, longest: float
+) -> dict[str, Any]:
     """Hold, lose the source at a random moment, get it back as it was, and watch."""
-    hold_anew(hand, witness)
-    witness.pause(rng.uniform(0.0, LATEST))
+    again = _hold_anew(hand, source)
+    hand.pause(rng.uniform(0.0, _LATEST))
     lost = time.time()
-    hand.lose()
-    witness.pause(_LOST)
+    source.lose()
+    hand.pause(rng.uniform(shortest, longest))
     back = time.time()
-    hand.come_back()
-    witness.pause(_BACK)
-    last = witness.last_motion(lost, back)
+    source.come_back()
+    hand.pause(_BACK)
     return {
-        "moving": witness.way(lost - RECENT, lost) > 0.0,
-        "last_motion_ms": (last - lost) * 1e3,
-        "distance_mm": witness.way(lost, back) * 1e3,
-        "resumed_mm": witness.way(back, math.inf) * 1e3,
-        "silent_ms": witness.longest_silence(lost - RECENT, math.inf) * 1e3,
+        "moving": hand.way(lost - RECENT, lost) > 0.0,
+        "last_motion_ms": (hand.last_motion(lost, back) - lost) * 1e3,
+        "distance_mm": hand.way(lost, back) * 1e3,
+        "resumed_mm": hand.way(back) * 1e3,
+        "again_s": again,
     }
 
 
-def main() -> int:
-    """Run trials; returns the exit code."""
-    return run_trials(
-        CommandParser("hold_trials", __doc__ or "", ""),
-        lambda given, folder, domain: hold_trials(
-            folder, domain, trials_of(KINDS, given.kinds, given.count, given.seed)
-        ),
+def _hold_anew(hand: RigHand, source: Source) -> float:
+    """Press anew until the needle moves, and return how long that took [s].
+
+    What was lost must be there and neutral first; raises UserError if it never moves.
+    """
+    begin = time.monotonic()
+    while time.monotonic() < begin + _GIVE_UP:
+        source.press(False)
+        hand.pause(_NEUTRAL)
+        at = hand.insertion
+        source.press(True)
+        again = time.monotonic() + _AGAIN
+        while time.monotonic() < again:
+            hand.look(0.005)
+            if hand.insertion > at + _UNDER_WAY:
+                return time.monotonic() - begin
+    raise UserError(f"the held needle does not move; device: {hand.status}")
+
+
+def _parameters(seed: int) -> Parameters:
+    """Return the parameters of a level tip whose needle moves as long as it is held.
+
+    One that rests after each step would be at rest at many losses.
+    """
+    parameters = without_recorder(
+        SimulateOptions(
+            level="tip",
+            controller="paper",
+            insertion="continuous",
+            depth_mm=_DEPTH_MM,
+            graph=True,
+            seed=seed,
+        )
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    del parameters["simulated_operator"]
+    parameters["plane_controller"]["nominal_speed"] = _SPEED
+    return parameters

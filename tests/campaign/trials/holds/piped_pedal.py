@@ -8,29 +8,24 @@ import os
 import struct
 from pathlib import Path
 
+KEY = 48
 # struct input_event of a 64-bit kernel.
 _EVENT = struct.Struct("@llHHi")
 _SYN, _KEY = 0, 1
-_LAST_KEY = 0x2FF
 _LONGEST_READ = 65536
 
 
 class PipedPedal:
-    """The pedal: what a foot does to it, and its plug.
-
-    It is plugged in at first. Held down it repeats nothing, as a pedal does.
+    """The pedal: what a foot does to it, and its plug. It is plugged in at first.
 
     Parameters
     ----------
     path : Path
         Where its device file appears.
-    key : int
-        Code of its key.
     """
 
-    def __init__(self, path: Path, key: int) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
-        self._key = key
         self._down = False
         self._pipe: int | None = None
         self.plug()
@@ -40,8 +35,7 @@ class PipedPedal:
         os.mkfifo(self._path)
         # For both ways: one that writes alone would wait for a reader.
         self._pipe = os.open(self._path, os.O_RDWR | os.O_NONBLOCK)
-        if self._down:
-            self._send(1)
+        self.press(self._down)
 
     def unplug(self) -> None:
         """Pull its plug."""
@@ -50,19 +44,11 @@ class PipedPedal:
             self._path.unlink()
         self._pipe = None
 
-    def press(self) -> None:
-        """Press it, also while it is unplugged."""
-        self._down = True
-        self._send(1)
-
-    def release(self) -> None:
-        """Let go of it."""
-        self._down = False
-        self._send(0)
-
-    def _send(self, value: int) -> None:
+    def press(self, down: bool) -> None:
+        """Press it, or let go of it, also while it is unplugged."""
+        self._down = down
         if self._pipe is not None:
-            events = _EVENT.pack(0, 0, _KEY, self._key, value) + _EVENT.pack(0, 0, _SYN, 0, 0)
+            events = _EVENT.pack(0, 0, _KEY, KEY, down) + _EVENT.pack(0, 0, _SYN, 0, 0)
             os.write(self._pipe, events)
 
 
@@ -74,17 +60,13 @@ class PipeDevice:
     Parameters
     ----------
     path : str
-        The pipe.
-
-    Raises
-    ------
-    OSError
-        If it is not there.
+        The pipe; raises OSError if it is not there.
     """
 
+    keys = frozenset((KEY,))
+
     def __init__(self, path: str) -> None:
-        self.keys = frozenset(range(_LAST_KEY + 1))
-        self._down: set[int] = set()
+        self._is_down = False
         self._pipe = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         with contextlib.suppress(OSError):
             self.read()
@@ -97,14 +79,13 @@ class PipeDevice:
             return b""
         if not data:
             raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
-        for _, _, kind, code, value in _EVENT.iter_unpack(data):
-            if kind == _KEY:
-                (self._down.add if value else self._down.discard)(code)
+        for _, _, kind, _, value in _EVENT.iter_unpack(data):
+            self._is_down = bool(value) if kind == _KEY else self._is_down
         return data
 
     def keys_down(self) -> frozenset[int]:
         """Return the codes of the keys that are down."""
-        return frozenset(self._down)
+        return self.keys if self._is_down else frozenset()
 
     def axis(self, code: int) -> float:
         """Refuse: a pedal has no axes."""

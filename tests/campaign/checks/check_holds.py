@@ -1,0 +1,53 @@
+"""Steps I and K: whatever a person holds, its hold ends with it, and nothing moves by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from campaign.checking import Check, Finding, Workbench, in_own_process
+from campaign.trials.holds.hold_trials import CABLE, hold_trials
+
+MOMENTS = 50
+WHAT = {
+    "pedal_unplugged": "pedal unplugged, and plugged in again still pressed",
+    "joy_silent": "joy node silent, and talking again with its button still pressed",
+    "operator_frozen": "operator stopped by SIGSTOP, and going on with the pedal still pressed",
+    CABLE: "cable between two computers cut for 0.3 to 5 s, 5 ms late and 1 % lost at all times",
+}
+# From a loss to the last motion, and between two samples of the joints that can show it [ms].
+BOUND, SAMPLING = 150.0, 20.0
+
+
+def hold_sources(_: Workbench) -> Iterator[Finding]:
+    """End every motion soon after its pedal or joystick is lost, and never resume it."""
+    for kind in WHAT:
+        if kind != CABLE:
+            yield _finding(kind)
+
+
+def two_computers(_: Workbench) -> Iterator[Finding]:
+    """End every motion soon after the cable is cut, go on only when a person presses anew."""
+    yield _finding(CABLE)
+
+
+def _finding(kind: str) -> Finding:
+    outcomes = in_own_process(hold_trials, kind, MOMENTS)
+    latest, way, again = (
+        max(float(one[key]) for one in outcomes)
+        for key in ("last_motion_ms", "distance_mm", "again_s")
+    )
+    moving = sum(bool(one["moving"]) for one in outcomes)
+    resumed = [f"{one['resumed_mm']:.2f} mm" for one in outcomes if one["resumed_mm"] > 0.0]
+    return Finding(
+        kind,
+        f"{WHAT[kind]}, at {MOMENTS} random moments at 5 mm/s: last motion; then by "
+        "itself; pressed anew it goes on",
+        f"at most {BOUND:g} ms (and {SAMPLING:g} ms between samples) after the loss; none",
+        f"at most {latest:.0f} ms, {way:.2f} mm (moving at {moving} losses); {len(resumed)} "
+        f"{resumed[:3]}; within {again:.1f} s",
+        latest <= BOUND + SAMPLING and not resumed,
+    )
+
+
+HOLD_CHECKS: tuple[Check, ...] = (hold_sources,)
+COMPUTER_CHECKS: tuple[Check, ...] = (two_computers,)

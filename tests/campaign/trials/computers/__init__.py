@@ -1,1 +1,0 @@
-"""Computers of a trial that are one machine: networks, a cable, light."""

@@ -1,1 +1,0 @@
-"""Faults and steps of drives and driver."""
