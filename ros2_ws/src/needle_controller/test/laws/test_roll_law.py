@@ -52,16 +52,15 @@ def test_turns_to_where_the_needle_bends_towards_the_plane_within_the_limit() ->
     assert abs(unsure.virtual_input) < abs(sure.virtual_input)
 
 
-@pytest.mark.parametrize("roll", [-0.5, 0.9])
-@pytest.mark.parametrize("before", [1.0, -1.0])
-def test_a_flip_is_mirrored(roll: float, before: float) -> None:
+def test_a_flip_is_mirrored() -> None:
     """With the wanted sine of the roll there already, a change of sign is a turn by pi - 2 roll."""
-    start = roll if before > 0.0 else np.pi - roll
-    assert nearest_turn(start, np.sin(roll), before, 0.0, 20.0) == pytest.approx(0.0, abs=1e-9)
-    turn = nearest_turn(start, np.sin(roll), -before, 0.0, 20.0)
-    assert np.sin(start + turn) == pytest.approx(np.sin(roll))
-    assert np.cos(start + turn) == pytest.approx(-np.cos(start))
-    assert abs(turn) <= np.pi
+    for roll, before in ((-0.5, 1.0), (0.9, 1.0), (-0.5, -1.0), (0.9, -1.0)):
+        start = roll if before > 0.0 else np.pi - roll
+        assert nearest_turn(start, np.sin(roll), before, 0.0, 20.0) == pytest.approx(0.0, abs=1e-9)
+        turn = nearest_turn(start, np.sin(roll), -before, 0.0, 20.0)
+        assert np.sin(start + turn) == pytest.approx(np.sin(roll))
+        assert np.cos(start + turn) == pytest.approx(-np.cos(start))
+        assert abs(turn) <= np.pi
 
 
 def test_flips_are_planned_at_depths_that_increase() -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import pytest
-
 from needle_controller.protocol.joint_history import (
     CONFIRMED_BY,
     LARGEST_GAP_NS,
@@ -96,23 +94,20 @@ def test_a_sample_counts_that_follows_from_the_one_before() -> None:
 SPIKES = [(TICK, 0.0, 0.0), (TICK, 0.05, 3.0), (HOUR, 0.05, 0.0), (-HOUR, 0.05, 0.0)]
 
 
-@pytest.mark.parametrize("spike", SPIKES)
-def test_a_spike_is_dropped_and_what_stays_is_the_new_truth(
-    spike: tuple[int, float, float],
-) -> None:
-    stamp, insertion, rotation = spike
-    made = history((START, 0.05, 0.0))
-    made.add(JointSample(START + stamp, insertion, rotation))
-    assert "do not follow from the last" in made.complaint
-    # One that does not follow from the spike either begins the count anew.
-    assert made.add(JointSample(START + 5 * HOUR, 1.0, 0.0)) is Heard.DOUBTED
-    heard = [
-        made.add(JointSample(START + stamp + tick * TICK, insertion, rotation))
-        for tick in range(CONFIRMED_BY)
-    ]
-    assert heard == [Heard.DOUBTED] * (CONFIRMED_BY - 1) + [Heard.JUMPED]
-    assert made.oldest == JointSample(START + stamp, insertion, rotation)
-    assert (made.complaint, made.doubted) == ("", CONFIRMED_BY + 2)
+def test_a_spike_is_dropped_and_what_stays_is_the_new_truth() -> None:
+    for stamp, insertion, rotation in SPIKES:
+        made = history((START, 0.05, 0.0))
+        made.add(JointSample(START + stamp, insertion, rotation))
+        assert "do not follow from the last" in made.complaint
+        # One that does not follow from the spike either begins the count anew.
+        assert made.add(JointSample(START + 5 * HOUR, 1.0, 0.0)) is Heard.DOUBTED
+        heard = [
+            made.add(JointSample(START + stamp + tick * TICK, insertion, rotation))
+            for tick in range(CONFIRMED_BY)
+        ]
+        assert heard == [Heard.DOUBTED] * (CONFIRMED_BY - 1) + [Heard.JUMPED]
+        assert made.oldest == JointSample(START + stamp, insertion, rotation)
+        assert (made.complaint, made.doubted) == ("", CONFIRMED_BY + 2)
 
 
 def test_two_truths_in_turn_leave_the_first() -> None:

@@ -12,7 +12,7 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import Awaiting, SteeringState
 
-from .rig import HELD, MOVING, Rig, device, sent, where
+from .rig import HELD, MOVING, TICK, Rig, device, none_sent, sent, where
 
 SETTINGS = SteeringSettings(target_offset=0.003)
 HOLDING = dataclasses.replace(HELD, insertion_m=0.0, rotation_rad=0.0)
@@ -74,11 +74,11 @@ def test_start_refuses_a_needle_that_is_in_or_at_the_depth_or_turned_too_far() -
         assert ("roll in target_plane" not in said) is started, degrees
 
 
-@pytest.mark.parametrize("turned", [2.0, -8.0])
-def test_best_starts_with_its_base_turned_however_the_last_run_left_it(turned: float) -> None:
-    rig = Rig(started=False, rotation=turned)
-    assert rig.start() == "steering"
-    assert sent(rig.expose()).rotation == pytest.approx(turned, abs=0.53)
+def test_best_starts_with_its_base_turned_however_the_last_run_left_it() -> None:
+    for turned in (2.0, -8.0):
+        rig = Rig(started=False, rotation=turned)
+        assert rig.start() == "steering"
+        assert sent(rig.expose()).rotation == pytest.approx(turned, abs=0.53)
 
 
 def test_start_and_stop_count_only_where_they_change_something() -> None:
@@ -97,8 +97,15 @@ def test_start_and_stop_count_only_where_they_change_something() -> None:
     # It goes on with what is known.
     assert rig.start() == "steering"
     assert rig.steering.reason == ""
-    assert sent(rig.expose()).insertion == pytest.approx(0.006)
+    step = sent(rig.expose())
+    assert step.insertion == pytest.approx(0.006)
     assert (rig.steering.step, rig.steering.starts) == (5, 2)
+    # A tip that waited for its joints when it was stopped is gone.
+    rig.run(step)
+    rig.steering.on_tip(rig.measured(ahead=TICK))
+    rig.steering.on_stop()
+    assert rig.start() == "steering"
+    assert none_sent(rig.settle(1))
 
 
 def test_a_needle_that_is_out_is_another_one() -> None:

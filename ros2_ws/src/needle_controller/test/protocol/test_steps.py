@@ -5,14 +5,9 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from needle_controller.observers.luenberger import LuenbergerObserver
-from needle_controller.presets.own_estimator import OwnEstimator
-from needle_controller.presets.own_parts import OwnPart
-from needle_controller.presets.presets import observer_settings
-from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.presets.own_parts import OwnPartError
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import (
     Action,
@@ -103,23 +98,14 @@ def test_an_aborted_step_resumes_from_where_the_joints_are() -> None:
     assert sent(rig.expose()).insertion == pytest.approx(0.0003 + 0.001)
 
 
-def test_joints_that_are_heard_late_do_not_show_a_standstill() -> None:
+def test_joints_that_were_sent_before_the_answer_do_not_show_a_standstill() -> None:
     rig = Rig()
     step = sent(rig.expose())
-    answered = 10**18
-    for _ in range(10):
-        rig.now += TICK
-        rig.steering.on_joints(JointSample(rig.now, 0.0, 0.0, sent_ns=answered - 1))
-    rig.steering.on_result(step.stamp_ns, "succeeded", answered)
-    for _ in range(10):
-        rig.now += TICK
-        sample = JointSample(rig.now, 0.0, 0.0, sent_ns=answered - 1)
-        assert rig.steering.on_joints(sample) == []
+    rig.steering.on_result(step.stamp_ns, "succeeded", 10**18)
+    assert rig.settle(10) == []
     assert none_sent(rig.steering.on_tip(rig.measured()))
-    for share in (0.5, 1.0):
-        rig.now += TICK
-        place = share * step.insertion, share * step.rotation
-        rig.steering.on_joints(JointSample(rig.now, *place, sent_ns=answered))
+    rig.insertion, rig.rotation = step.insertion, step.rotation
+    rig.settle(1)
     assert (rig.steering.step, rig.steering.intake.after_ns) == (1, rig.now)
 
 
@@ -156,33 +142,33 @@ def test_the_command_follows_from_stamps_whatever_order_the_topics_come_in() -> 
     assert command.stamp_ns == tips[5].stamp_ns
 
 
-@pytest.mark.parametrize(
-    ("moved", "turned", "looked_at_anew"),
-    [(1.01e-4, 0.0, True), (0.99e-4, 0.0, False), (0.0, 2.1e-2, True), (0.0, -1.9e-2, False)],
-)
-def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew(
-    moved: float, turned: float, looked_at_anew: bool
-) -> None:
-    for waiting in ("for the tip", "for the device"):
-        rig = Rig()
-        rig.steps(3)
-        if waiting == "for the device":
-            rig.steering.on_device(MOVING)
-            rig.expose()
-        else:
-            early = rig.measured(ahead=TICK)
+def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew() -> None:
+    for moved, turned, looked_at_anew in (
+        (1.01e-4, 0.0, True),
+        (0.99e-4, 0.0, False),
+        (0.0, 2.1e-2, True),
+        (0.0, -1.9e-2, False),
+    ):
+        for waiting in ("for the tip", "for the device"):
+            rig = Rig()
+            rig.steps(3)
+            if waiting == "for the device":
+                rig.steering.on_device(MOVING)
+                rig.expose()
+            else:
+                early = rig.measured(ahead=TICK)
+                rig.settle(1)
+            rig.insertion += moved
+            rig.rotation += turned
             rig.settle(1)
-        rig.insertion += moved
-        rig.rotation += turned
-        rig.settle(1)
-        if waiting == "for the device":
-            actions = rig.steering.on_device(HELD)
-        else:
-            actions = rig.steering.on_tip(early)
-        assert none_sent(actions) is looked_at_anew, waiting
-        if looked_at_anew:
-            assert where(rig) == (STEERING, Awaiting.TIP)
-            assert sent(rig.expose()).insertion == pytest.approx(rig.insertion + 0.001)
+            if waiting == "for the device":
+                actions = rig.steering.on_device(HELD)
+            else:
+                actions = rig.steering.on_tip(early)
+            assert none_sent(actions) is looked_at_anew, waiting
+            if looked_at_anew:
+                assert where(rig) == (STEERING, Awaiting.TIP)
+                assert sent(rig.expose()).insertion == pytest.approx(rig.insertion + 0.001)
 
 
 def test_the_last_step_ends_at_the_depth_and_then_it_is_done() -> None:
@@ -226,30 +212,20 @@ def test_a_recorded_device_may_have_made_another_step() -> None:
     assert (rig.steering.step, rig.steering.intake.after_ns) == (1, rig.now)
 
 
-def test_an_own_estimator_that_fails_on_the_way_stops_the_needle() -> None:
-    class Broken(LuenbergerObserver):
-        is_mended = False
-
-        def __init__(self, settings: SteeringSettings, *_: object) -> None:
-            super().__init__(observer_settings(settings, settings.gains()))
-
-        def advance(self, d_insertion: npt.ArrayLike, d_rotation: npt.ArrayLike) -> None:
-            if not self.is_mended:
-                raise RuntimeError("no")
+def test_an_own_part_that_fails_on_the_way_stops_the_needle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object) -> None:
+        raise OwnPartError("advance() raised RuntimeError")
 
     rig = Rig()
-    part = OwnPart("estimator", "broken", "package 1.0, module:Broken", Broken)
-    rig.steering.control._estimator = OwnEstimator(
-        part, rig.steering.settings, np.eye(3), np.zeros(3), np.random.default_rng(0)
-    )
-    rig.run(sent(rig.expose()))
-    actions = rig.expose()
-    assert none_sent(actions)
+    rig.steps(1)
+    with monkeypatch.context() as broken:
+        broken.setattr(rig.steering.control, "update", fail)
+        (log,) = rig.expose()
+    assert logged([log]) == "FAULT: advance() raised RuntimeError"
     assert where(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
-    assert "estimator 'broken' (package 1.0, module:Broken): advance(" in logged(actions)
-    assert "raised RuntimeError: no at test_steps.py:" in rig.steering.reason
     # A tip that comes later moves nothing either.
-    Broken.is_mended = True
     assert none_sent(rig.expose())
     assert rig.start() == "steering"
     sent(rig.expose())
