@@ -40,9 +40,24 @@ class PtyCan:
         return self._pty.path
 
     def open(self, arrive: Callable[[Any], None]) -> None:
-        """Hand on what the computer sends."""
-        self._thread = threading.Thread(target=self._read, args=(arrive,), daemon=True)
+        """Begin to read."""
+        self._thread = threading.Thread(target=self.read, args=(arrive,), daemon=True)
         self._thread.start()
+
+    def read(self, arrive: Callable[[Any], None]) -> None:
+        """Hand on what the computer sends, until the adapter is closed."""
+        while not self._is_closed:
+            with self._lock:
+                waited_for = self._pty.filenos
+            try:
+                select.select(waited_for, [], [], _LOOK)
+            except OSError:
+                # Unplugged meanwhile.
+                continue
+            with self._lock:
+                frames = self._pty.receive()
+            if frames:
+                arrive(frames)
 
     def send(self, batch: tuple[CanFrame, ...]) -> None:
         """Hand frames to the computer."""
@@ -63,17 +78,3 @@ class PtyCan:
         if self._thread is not None:
             self._thread.join()
         self._pty.unplug()
-
-    def _read(self, arrive: Callable[[Any], None]) -> None:
-        while not self._is_closed:
-            with self._lock:
-                waited_for = self._pty.filenos
-            try:
-                select.select(waited_for, [], [], _LOOK)
-            except OSError:
-                # Unplugged meanwhile.
-                continue
-            with self._lock:
-                frames = self._pty.receive()
-            if frames:
-                arrive(frames)

@@ -43,8 +43,6 @@ class EmulatedBus:
         rotation: EmulatedDriveSettings,
         now: float,
     ) -> None:
-        if insertion.node_id == rotation.node_id:
-            raise ValueError(f"both drives have node id {insertion.node_id}")
         self.drives = {"insertion": EmulatedDrive(insertion), "rotation": EmulatedDrive(rotation)}
         self._moved_until = now
         self.syncs = 0

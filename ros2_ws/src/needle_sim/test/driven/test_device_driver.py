@@ -8,6 +8,7 @@ import random
 
 import pytest
 
+from needle_core.errors import UserError
 from needle_core.runners.faults import delay
 
 from .component_bench import DRIVER, DRIVES, ComponentBench, losing
@@ -164,6 +165,12 @@ def test_lines_that_are_no_commands_are_named_and_do_nothing() -> None:
     bench.run(0.5)
     assert bench.status.state == "DISABLED"
     assert bench.error_codes == {0}
+
+
+def test_drives_that_cannot_be_are_refused() -> None:
+    for bad in ({"insertion_node_id": 2}, {"limit_action": "ignore"}, {"insertion_start": 0.3}):
+        with pytest.raises(UserError, match=r"node id|one of|beyond"):
+            ComponentBench(drives=bad)
 
 
 # ---- both drives -------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import pytest
 
 from needle_core.can_frame import CanFrame
 from needle_core.errors import UserError
+from needle_sim.bus.pty_can import PtyCan
 from needle_sim.bus.pty_port import PtyPort
 
 
@@ -23,7 +24,7 @@ def port(tmp_path: Path) -> Iterator[PtyPort]:
     assert not (tmp_path / "can").is_symlink()
 
 
-def computer(port: PtyPort) -> Any:
+def computer(port: PtyPort | PtyCan) -> Any:
     return can.Bus(interface="slcan", channel=port.path, bitrate=500_000, sleep_after_open=0)
 
 
@@ -64,6 +65,30 @@ def test_an_unplugged_adapter_is_an_error_and_comes_back(port: PtyPort) -> None:
     with computer(port) as bus:
         bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         assert received(port) == (CanFrame(0x80),)
+
+
+def test_a_bus_reads_the_port_until_it_is_closed_and_can_be_plugged(tmp_path: Path) -> None:
+    adapter = PtyCan(tmp_path / "can")
+    heard: list[CanFrame] = []
+    adapter.plug(plugged_in=False)
+    assert not (tmp_path / "can").is_symlink()
+    adapter.plug(plugged_in=True)
+
+    def arrive(frames: tuple[CanFrame, ...]) -> None:
+        heard.extend(frames)
+        adapter.send((CanFrame(0x181, b"\1"),))
+        message = bus.recv(1.0)
+        assert message is not None
+        heard.append(CanFrame(message.arbitration_id, bytes(message.data)))
+        adapter.close()
+
+    bus = computer(adapter)
+    bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+    adapter.read(arrive)
+    assert heard == [CanFrame(0x80), CanFrame(0x181, b"\1")]
+    assert list(tmp_path.iterdir()) == []
+    bus.serialPortOrig.close()
+    bus._is_shutdown = True
 
 
 def read(terminal: int, count: int) -> bytes:

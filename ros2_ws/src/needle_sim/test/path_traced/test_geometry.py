@@ -10,6 +10,10 @@ import pytest
 
 from needle_sim.camera.projection import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
+from needle_sim.path_traced.appearance import LAMPS, RANDOM, draw_appearance
+from needle_sim.path_traced.block import backdrop, refractive_index
+from needle_sim.path_traced.floors import FloorPicture
+from needle_sim.path_traced.lamps import MIDDLE, apparent_centre, place_lamps
 from needle_sim.path_traced.needle_mesh import NeedleEnd, needle_mesh
 from needle_sim.path_traced.refracted_rays import refracted_rays
 from needle_sim.sequences.boxes import draw_box
@@ -107,3 +111,33 @@ def test_the_mesh_is_as_thick_as_it_says_and_ends_where_it_says(hollow: bool) ->
     corners = shaft.points[shaft.faces]
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.einsum("ij,ij->i", outward, shaft.normals[shaft.faces[:, 0]]) > -1e-14).all()
+
+
+def test_a_box_stands_before_what_is_behind_it(boxes: list[StereoRig]) -> None:
+    look, picture = draw_appearance(RANDOM, 3), FloorPicture(np.zeros((2, 2), dtype=np.float32))
+    for rig, camera in cameras(boxes):
+        behind = backdrop(camera, rig, look, picture)
+        assert behind.depth == pytest.approx(camera.window.inner + look.behind)
+        rays = refracted_rays(camera.camera_matrix[:2, 2], camera, rig)
+        place = behind.met_by(rays.origin, rays.direction)
+        assert place @ camera.window.normal == pytest.approx(-behind.depth, abs=0.003)
+        aside = behind.points(place @ behind.sideways, place[2])
+        np.testing.assert_allclose(aside, place, atol=1e-12)
+    for rig, camera in cameras([RIG]):
+        behind = backdrop(camera, rig, look, picture)
+        np.testing.assert_array_equal(behind.normal, [1.0, 0.0, 0.0])
+        assert behind.depth == -look.floor_height
+
+
+def test_lamps_stand_above_and_seem_higher() -> None:
+    for kind in LAMPS:
+        for seed in range(5):
+            for lamp in place_lamps(kind, np.random.default_rng(seed)):
+                there = apparent_centre(lamp, RIG)
+                assert lamp.centre[0] >= 0.15
+                # Snell: the sines of the angles from the middle and from the surface over it.
+                inside = there - MIDDLE
+                sine = np.linalg.norm(inside[1:]) / np.linalg.norm(inside)
+                assert sine < 1.0 / refractive_index(RIG)
+                assert there[0] > lamp.centre[0]
+                np.testing.assert_array_equal(there[1:], lamp.centre[1:])

@@ -14,7 +14,7 @@ from needle_bringup.studies.study_controllers import (
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
 from needle_sim.studies.disturbances import Disturbances
-from needle_sim.studies.point_study import run_point_study
+from needle_sim.studies.point_study import point_figures, run_point_study
 from needle_sim.studies.point_targets import (
     BREATHING_RATE,
     CURVATURE_SHARE,
@@ -116,6 +116,9 @@ def test_each_needle_ends_at_its_own_point_with_a_short_last_step() -> None:
     # 10 rad/m from the second step on.
     np.testing.assert_allclose(found.rotation, 10.0 * np.array([0.0095, 0.0193]))
     np.testing.assert_array_equal(found.reached, [True, False])
+    seen = point_figures(found)
+    assert (seen["within_1_mm_point"], seen["doubtful_at_end"]) == (0.5, None)
+    assert seen["max_point_mm"] == pytest.approx(2.0, abs=1e-3)
     apart = run_point_study(np.zeros((2, 3)), targets, Straight, STRAIGHT, chunk=1)
     np.testing.assert_allclose(apart.error, found.error, atol=1e-9)
     # None goes beyond the depth.
