@@ -83,12 +83,14 @@ def test_what_fails_is_bad_input_an_internal_error_or_missed_after_a_signal(
     middleware: Middleware, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad, odd = UserError("rate = 0 Hz, must be > 0"), RuntimeError("a fault of its own")
+    lost = rclpy_implementation.RCLError("bad name")
     for create, spin, code, said in (
         (fail(bad), None, 2, "error: rate = 0 Hz, must be > 0\n"),
         (fail(bad, signalled=True), None, 0, "error: rate = 0 Hz, must be > 0\n"),
-        (fail(rclpy_implementation.RCLError("bad name")), None, 2, "error: bad name\n"),
+        (fail(lost), None, 2, "error: bad name\n"),
         (fail(odd), None, 3, "error: internal error, "),
         (middleware.make, fail(odd), 3, "error: internal error, "),
+        (middleware.make, fail(lost), 3, "error: internal error, "),
         (middleware.make, fail(bad), 2, "error: rate = 0 Hz, must be > 0\n"),
     ):
         middleware.done.clear()

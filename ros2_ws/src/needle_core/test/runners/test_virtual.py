@@ -221,12 +221,13 @@ def test_what_waits_at_a_port_is_one_batch() -> None:
         return other._take(batch, at)
 
     other.ports = (Port("wire", take),)
-    runner = VirtualRunner([one, other])
+    runner, told = run([one, other], seconds=0.0)
     runner.run(0.1)
     assert max(batches) <= 6
     runner.freeze("other", 0.1)
     runner.run(0.2)
     assert max(batches) > 100
+    assert told == []
     numbers = [number for _, number in other.arrived]
     assert numbers == list(range(1, len(numbers) + 1))
 
@@ -258,6 +259,12 @@ def test_a_port_is_lost_and_opened_also_for_who_starts_meanwhile() -> None:
     runner.run(0.1)
     assert anew.arrived
     assert changes == ["unplugged", "unplugged", ""]
+    # Nor does anything pass a lost port outwards.
+    runner.lose_port("one", "wire", "full")
+    runner.run(0.001)
+    arrived = len(anew.arrived)
+    runner.run(0.1)
+    assert len(anew.arrived) == arrived
 
 
 # ---- what befalls components --------------------------------------------------------------------

@@ -58,9 +58,10 @@ def test_a_number_that_is_none_is_refused_and_infinity_where_it_is_no_value() ->
 
 @dataclasses.dataclass(frozen=True)
 class Parameters:
-    """A number, a list and a text, as a node has them."""
+    """Numbers, a list and a text, as a node has them."""
 
     rate: float = parameter(30.0, unit="Hz", lower=1.0, upper=100.0, description="A rate.")
+    count: int = parameter(3, unit="-", lower=1, upper=9, description="A count.")
     gains: tuple[float, ...] = fixed_parameter((1.0,), "-", "Gains.", 0.0, 9.0)
     law: str = parameter("mpc", unit="-", description="A law.", choices=("mpc", "pid"))
 
@@ -69,21 +70,21 @@ class Parameters:
 
 
 def test_parameters_are_taken_whole_and_typed_or_named_with_their_node() -> None:
-    values = {"rate": 100.0, "gains": [0.0, 9.0], "law": "pid"}
-    assert from_values(Parameters, values, "/rig") == Parameters(100.0, (0.0, 9.0), "pid")
+    values = {"rate": 100.0, "count": 1, "gains": [0.0, 9.0], "law": "pid"}
+    assert from_values(Parameters, values, "/rig") == Parameters(100.0, 1, (0.0, 9.0), "pid")
     for wrong, said in (
         ({"rate": 100.1}, "rate = 100.1 Hz is outside [1, 100] Hz"),
         ({"rate": 50}, "rate = 50 is not of type float (write 50.0)"),
-        ({"rate": True}, "rate = True is of type bool, wants float"),
+        ({"count": True}, "count = True is of type bool, wants int"),
         ({"gains": [1.0, -0.1]}, "gains = -0.1 is outside [0, 9]"),
         ({"law": "pdi"}, "law = 'pdi' is not one of mpc, pid"),
         ({"raet": 20.0}, "unknown parameter 'raet' (did you mean 'rate'?)"),
-        ({"x": 20.0}, "unknown parameter 'x' (known: rate, gains, law)"),
+        ({"x": 20.0}, "unknown parameter 'x' (known: rate, count, gains, law)"),
     ):
         with pytest.raises(UserError) as caught:
             from_values(Parameters, wrong, "/rig")
         assert str(caught.value) == f"/rig: {said}"
-    rate, _, gains, _, law, _ = describe(Parameters).splitlines()
+    rate, _, _, _, gains, _, law, _ = describe(Parameters).splitlines()
     assert rate == "  rate: 30.0 Hz [1, 100]"
     assert gains == "  gains: [1.0] [0, 9] (fixed at start)"
     assert law == "  law: 'mpc' [mpc, pid]"
