@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -26,10 +28,10 @@ def test_the_last_set_point_is_the_target_to_the_last_bit(
 def test_a_period_at_half_speed_goes_half_as_far_and_one_may_end_a_leg() -> None:
     motion = CoordinatedMotion((0.0, 0.0), [Leg(1.0, -2.0, 1.0), Leg(2.0, -2.0, 0.5)])
     assert motion.advance(0.2, 1.0) == SetPoint(0.2, -0.4, 1.0, 2.0)
-    assert motion.advance(0.2, 0.5) == SetPoint(pytest.approx(0.3), pytest.approx(-0.6), 0.5, 1.0)
+    at = motion.advance(0.2, 0.5)
+    assert dataclasses.astuple(at) == pytest.approx((0.3, -0.6, 0.5, 1.0))
     at = motion.advance(0.8, 1.0)
-    assert (at.insertion, at.rotation) == (pytest.approx(1.2), -2.0)
-    assert (at.insertion_speed, at.rotation_speed) == pytest.approx((0.9 / 0.8, 1.4 / 0.8))
+    assert dataclasses.astuple(at) == pytest.approx((1.2, -2.0, 0.9 / 0.8, 1.4 / 0.8))
     assert not motion.complete
     motion.advance(0.4, 1.0)
     assert motion.complete
@@ -50,8 +52,5 @@ def test_legs_are_slowed_to_both_bounds() -> None:
     legs = [Leg(1.0, 1.0, 1.0), Leg(1.5, -3.0, 1.0), Leg(1.6, -3.0, 9.0)]
     slowed = slowed_legs((0.0, 0.0), legs, max_speed=0.25, max_rotation_rate=2.0)
     assert [leg.duration for leg in slowed] == [4.0, 2.0, 9.0]
-    assert [leg.duration for leg in slowed_legs((0.0, 0.0), legs, max_speed=0.25)] == [
-        4.0,
-        2.0,
-        9.0,
-    ]
+    slowed = slowed_legs((0.0, 0.0), legs[1:], max_speed=0.25)
+    assert [leg.duration for leg in slowed] == [6.0, 9.0]

@@ -10,6 +10,7 @@ import select
 import socket
 import tty
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import can
 import pytest
@@ -28,7 +29,7 @@ CONNECT = socket.create_connection
 class Port:
     """A port, and what has come through it."""
 
-    def __init__(self, kind: str, channel: str = "can0", **settings: int) -> None:
+    def __init__(self, kind: str, channel: str = "can0", **settings: Any) -> None:
         self.now = 0.0
         self.frames: list[bytes] = []
         self.changes: list[str] = []
@@ -221,8 +222,10 @@ class Daemon:
         self, monkeypatch: pytest.MonkeyPatch, said: bytes = b"< hi >< ok >< ok >"
     ) -> None:
         with socket.create_server(("localhost", 0)) as server:
+            server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             self.client = CONNECT(server.getsockname())
             self.peer, _ = server.accept()
+        self.client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
         self.peer.sendall(said)
         self.peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         monkeypatch.setattr(socket, "create_connection", lambda *_: self.client)

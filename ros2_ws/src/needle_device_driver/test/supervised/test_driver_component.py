@@ -98,7 +98,7 @@ class DriverBench:
         return self.answer(number)
 
     def answer(self, number: int) -> Reply:
-        (reply,) = [action for action in self.of(Reply) if action.request == number]
+        (reply,) = [a for a in self.said if isinstance(a, Reply) and a.request == number]
         return reply
 
     def set_up(self) -> DriverBench:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import pytest
 
@@ -45,7 +46,8 @@ HARD = {
 def test_bounds_of_the_driver_are_those_of_the_document_and_parameters_of_their_name() -> None:
     assert dataclasses.asdict(DeviceDriverParameters().limits) == BOUNDS
     for name, bound in BOUNDS.items():
-        given = DeviceDriverParameters(**{name: 0.9 * bound}).limits
+        changed: dict[str, Any] = {name: 0.9 * bound}
+        given = DeviceDriverParameters(**changed).limits
         assert dataclasses.asdict(given) == BOUNDS | {name: 0.9 * bound}
     # Ideal axes come nearer to their targets.
     ideal = BOUNDS | {"insertion_tolerance": 1e-6, "rotation_tolerance": 1e-4}

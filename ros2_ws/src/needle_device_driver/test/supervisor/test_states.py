@@ -12,35 +12,27 @@ from needle_device_driver.supervisor.states import (
     next_state,
 )
 
+# By trigger: from where to where.
 WAYS = {
-    "UNCONFIGURED configure DISABLED",
-    "DISABLED deconfigure UNCONFIGURED",
-    "DISABLED enable HOLDING",
-    "HOLDING disable DISABLED",
-    "MOVING disable DISABLED",
-    "HOLDING motion start MOVING",
-    "MOVING motion end HOLDING",
-    "DISABLED homing start MOVING",
-    "MOVING homing end DISABLED",
-    "UNCONFIGURED fail FAULT",
-    "DISABLED fail FAULT",
-    "HOLDING fail FAULT",
-    "MOVING fail FAULT",
-    "UNCONFIGURED estop ESTOPPED",
-    "DISABLED estop ESTOPPED",
-    "HOLDING estop ESTOPPED",
-    "MOVING estop ESTOPPED",
-    "FAULT estop ESTOPPED",
-    "FAULT reset DISABLED",
-    "ESTOPPED reset DISABLED",
-    "FAULT reset before configuration UNCONFIGURED",
-    "ESTOPPED reset before configuration UNCONFIGURED",
+    "configure": "UNCONFIGURED-DISABLED",
+    "deconfigure": "DISABLED-UNCONFIGURED",
+    "enable": "DISABLED-HOLDING",
+    "disable": "HOLDING-DISABLED MOVING-DISABLED",
+    "motion start": "HOLDING-MOVING",
+    "motion end": "MOVING-HOLDING",
+    "homing start": "DISABLED-MOVING",
+    "homing end": "MOVING-DISABLED",
+    "fail": "UNCONFIGURED-FAULT DISABLED-FAULT HOLDING-FAULT MOVING-FAULT",
+    "estop": "UNCONFIGURED-ESTOPPED DISABLED-ESTOPPED HOLDING-ESTOPPED MOVING-ESTOPPED "
+    "FAULT-ESTOPPED",
+    "reset": "FAULT-DISABLED ESTOPPED-DISABLED",
+    "reset before configuration": "FAULT-UNCONFIGURED ESTOPPED-UNCONFIGURED",
 }
 
 
 def test_each_pair_leads_where_it_should_or_nowhere() -> None:
-    found = {f"{a.value} {trigger.value} {b.value}" for (a, trigger), b in TRANSITIONS.items()}
-    assert found == WAYS
+    found = {f"{t.value}: {a.value}-{b.value}" for (a, t), b in TRANSITIONS.items()}
+    assert found == {f"{t}: {way}" for t, ways in WAYS.items() for way in ways.split()}
     assert next_state(State.HOLDING, Trigger.MOTION_START) is State.MOVING
     with pytest.raises(ForbiddenTransitionError, match="no transition from FAULT by motion start"):
         next_state(State.FAULT, Trigger.MOTION_START)

@@ -144,20 +144,6 @@ def test_reply_age_joints_are_no_older_than_answers_are_late(
     assert rule or bench.drives.unanswered == cycles
 
 
-@pytest.mark.parametrize("which", ["insertion", "rotation"])
-def test_reply_age_an_axis_that_answers_late_is_not_sent_on_meanwhile(which: str) -> None:
-    for late in (2, 4):
-        bench = DriveBench().moving()
-        getattr(bench, which).answers_late = late
-        for _ in range(20):
-            bench.go()
-            joints = bench.supervisor.joints(bench.now)
-            assert joints is not None
-            # Three cycles' way at 2 mm/s; answers to SYNCs of long ago would be off by more.
-            assert abs(joints.insertion.position - bench.insertion.position / 20e6) <= 0.0001201
-        assert bench.drives.unanswered > 5
-
-
 def test_reply_age_lost_answers_are_counted_and_given_up_after_a_pause() -> None:
     bench = DriveBench().moving()
     for _ in range(3):

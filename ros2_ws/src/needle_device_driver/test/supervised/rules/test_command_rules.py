@@ -7,11 +7,11 @@ import math
 import pytest
 
 from needle_core.errors import OutOfBoundsError
-from needle_device_driver.supervisor.command import Command, CommandPoint, Refusal, check_form
+from needle_device_driver.supervisor.command import Command, CommandPoint, check_form
 from needle_device_driver.supervisor.limits import SafetyLimits
 
 from ..ideal_axes import Bench
-from ..supervisor_bench import NAMES, command
+from ..supervisor_bench import NAMES
 
 MS = 1_000_000
 Point = tuple[float, float, float]
@@ -40,6 +40,7 @@ def test_command_state_a_second_command_leaves_the_running_step_alone() -> None:
     other = bench.step(0.002, 1.0)
     # Its own stamp would tell its sender that the running one has ended.
     bench.step(0.002, 1.0, stamp_ns=stamp)
+    assert bench.reset().message == "a step is under way"
     bench.go(20)
     refusal = "aborted: the device is MOVING, not HOLDING"
     assert bench.results == [(other, refusal), (stamp, "succeeded")]
@@ -57,11 +58,16 @@ def test_reply_age_no_step_begins_where_an_axis_is_silent(which: str) -> None:
     assert bench.state == "MOVING"
 
 
-def test_inner_limit_switch_no_step_begins_there() -> None:
+def test_inner_limit_switch_ends_a_step_and_none_begins_there() -> None:
     bench = Bench().ready()
     bench.insertion.inner_switch = True
     bench.step()
     assert (bench.rule, bench.state) == ("inner_limit_switch", "HOLDING")
+    bench = Bench().moving()
+    bench.insertion.inner_switch = True
+    at = bench.positions
+    bench.go()
+    assert (bench.rule, bench.state, bench.positions) == ("inner_limit_switch", "FAULT", at)
 
 
 def test_command_one_publisher() -> None:
@@ -236,6 +242,8 @@ def test_max_depth() -> None:
 def test_max_step_length_also_in_the_wrong_unit() -> None:
     bounded("max_step_length", (0.002001, 0.0, 0.5), (0.00200101, 0.0, 0.5))
     bench = Bench().ready()
+    bench.step(0.00201)
+    assert bench.outcomes == ["aborted: step 2.01 mm is beyond 2 mm"]
     bench.step(1.0)
     bench.refused("max_depth")
 
@@ -269,10 +277,3 @@ def test_max_turns() -> None:
     for sign in (1, -1):
         turn = sign * 0.1 * 2.0 * math.pi
         bounded("max_turns", (0.001, turn, 0.5), (0.001, turn * 1.000001, 0.5), max_turns=0.1)
-
-
-def test_a_refusal_names_value_and_bound() -> None:
-    bench = Bench().ready()
-    bench.step(0.00201)
-    assert bench.outcomes == ["aborted: step 2.01 mm is beyond 2 mm"]
-    assert isinstance(check_form(command(1)), Refusal)

@@ -118,18 +118,6 @@ def test_max_step_length_bounds_how_far_ahead_a_path_ends() -> None:
     assert bench.state == "MOVING"
 
 
-def test_max_step_length_no_path_outlives_its_commands_by_more() -> None:
-    bench = Bench().ready()
-    for _ in range(20):
-        here = bench.positions[0] * 1e3
-        path(bench, (here, 0.0), (here + 1.0, 0.0), (here + 2.0, 0.0))
-        bench.go(2)
-    last = bench.positions[0]
-    bench.go(40)
-    assert bench.positions[0] - last <= 0.002
-    assert (bench.outcomes[-1], bench.state) == ("succeeded", "HOLDING")
-
-
 def test_tip_age_a_slow_path_ends_when_its_tip_is_too_old() -> None:
     bench = Bench().ready()
     straight(bench)
@@ -185,39 +173,6 @@ def test_command_form_a_path_that_begins_ahead_of_the_needle_is_refused() -> Non
     path(bench, (0.5, 0.1), (1.0, 0.3), (2.2, 0.3))
     bench.go(20)
     assert (bench.rule, bench.positions) == ("command_form", (0.002, 0.3))
-
-
-def test_hold_to_run_a_release_ends_a_path_at_once() -> None:
-    bench = Bench().ready()
-    straight(bench)
-    bench.go(3)
-    at = bench.positions
-    bench.hold(False)
-    bench.wait(20)
-    assert bench.outcomes[-1] == "aborted: hold released"
-    straight(bench)
-    bench.wait(3)
-    assert (bench.rule, bench.positions) == ("hold_to_run", at)
-
-
-def test_coordinated_random_paths_replaced_at_random_keep_every_bound() -> None:
-    rng = np.random.default_rng(7)
-    bench = Bench().ready()
-    places = [bench.positions]
-    for _ in range(100):
-        insertion, rotation = bench.positions
-        here, turn = insertion * 1e3, rotation + rng.uniform(-0.5, 0.5)
-        knots = (here - 0.1, rotation), (here + rng.uniform(0.2, 0.9), turn), (here + 2.0, turn)
-        path(bench, *knots, speed=1e-3)
-        scale = rng.uniform(0.0, 1.0)
-        for _ in range(rng.integers(1, 4)):
-            bench.go(scale=scale)
-            places.append(bench.positions)
-    insertion_ways, rotation_ways = np.diff(np.array(places).T)
-    assert insertion_ways.min() >= 0.0
-    assert insertion_ways.max() <= SPEED * PERIOD * (1 + 1e-9)
-    assert np.abs(rotation_ways).max() <= np.pi * PERIOD * (1 + 1e-9)
-    assert not [outcome for outcome in bench.outcomes if "abort" in outcome]
 
 
 # ---- an insertion axis that a hand pushes -------------------------------------------------------

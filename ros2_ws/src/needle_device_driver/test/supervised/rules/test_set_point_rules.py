@@ -19,16 +19,6 @@ def refused(bench: DriveBench, target: float, rule: Rule, axis: int = 0) -> str:
     return str(caught.value)
 
 
-def test_look_ahead_is_one_cycle_at_every_moment() -> None:
-    bench = DriveBench().ready()
-    bench.step(0.002, 1.2, 0.4)
-    for _ in range(25):
-        before = bench.insertion.position
-        bench.go()
-        assert bench.insertion.next_target - before <= 2000
-    assert bench.outcomes == ["succeeded"]
-
-
 def test_look_ahead_refuses_a_set_point_that_is_further() -> None:
     bench = DriveBench().moving()
     # A cycle's way at 5 mm/s, 1 % and a count.
@@ -139,19 +129,6 @@ def test_following_error_that_a_drive_reports() -> None:
     bench.rotation.STATES = {**bench.rotation.STATES, "enabled": 0x2237}
     bench.go()
     bench.failed("following_error", "the drive reports a following error")
-
-
-def test_settling_time_names_an_axis_that_does_not_arrive() -> None:
-    bench = DriveBench().moving()
-    bench.go(30)
-    # 0.1 mm before the target, within the following error.
-    bench.insertion.blocked = True
-    bench.go(12)
-    bench.insertion.position = 38_000
-    bench.go(45)
-    assert bench.state == "MOVING"
-    bench.go(20)
-    bench.failed("settling_time", "insertion 0.1000 mm")
 
 
 # ---- software limits ----------------------------------------------------------------------------
