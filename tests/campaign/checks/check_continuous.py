@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from campaign.checking import Check, Finding, Workbench
+from campaign.checks.control_studies import Study, run
 from campaign.trials.steered_needle import Hand, changing, constant, pushing, rms_at_end, steer
 from campaign.trials.virtual_rig import FASTEST
-from needle_bringup.descendants import ran
-from needle_core.files.installed import find_executable
 
 SEED, NEEDLES = 1400, 12
 HANDS: dict[str, tuple[float, Callable[[np.random.Generator], Hand]]] = {
@@ -45,20 +43,17 @@ def hands(_: Workbench) -> Iterator[Finding]:
 
 def frame_rates(bench: Workbench) -> Iterator[Finding]:
     """Study preset best at 5 mm/s beside stepwise; tips a second make no difference."""
-    command = find_executable("needle_sim", "monte_carlo")
-    figures = {}
     # 5 mm/s times 10, 33 and 100 ms; of tips between two uses nothing is taken but that they came.
-    for delay in ("0", "0.05", "0.17", "0.5"):
-        file = bench.folder / f"turn_delay_{delay}.json"
-        options = ["--draws", "10", "--seed", str(SEED), "--turn-delay-mm", delay]
-        ran([command, *options, "--json", str(file)])
-        figures[delay] = json.loads(file.read_text("utf-8"))
+    figures = {
+        delay: run(Study(f"delay_{delay}", "best", ("--turn-delay-mm", delay)), bench.folder)
+        for delay in ("0", "0.05", "0.17", "0.5")
+    }
     stepwise = figures.pop("0")["rms_last_20_mm"]
     for delay, seen in figures.items():
         rms, there = seen["rms_last_20_mm"], seen["converged_at_end"]
         yield Finding(
             f"continuous_turn_delay_{delay}",
-            f"{seen['runs']} needles, turned {delay} mm after each used tip",
+            f"10,000 needles, turned {delay} mm after each used tip",
             f"RMS within 10 % of stepwise ({stepwise:.4f} mm), >= 99.95 % within 1 mm",
             f"{rms:.4f} mm, {there:.2%}",
             rms <= 1.1 * stepwise and there >= 0.9995,

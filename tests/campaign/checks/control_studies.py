@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from campaign.checking import Finding
 from needle_bringup.descendants import ran
@@ -29,7 +30,7 @@ MIXED = (
 # A study runs in one thread; numpy's others only wait, which counts as processor time too.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
-Figures = Mapping[str, float | None]
+Figures = Mapping[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -39,19 +39,6 @@ def test_an_orderly_node_ends_on_sigint(tmp_path: Path) -> None:
     assert process.exit_code == 0
 
 
-def test_what_is_said_to_a_node_reaches_it(tmp_path: Path) -> None:
-    process = NodeProcess(
-        "node",
-        [sys.executable, "-c", "print(input()[::-1])"],
-        environment=os.environ,
-        log=tmp_path / "node.log",
-        takes_input=True,
-    )
-    process.say("tuc")
-    assert wait_for([process], 20.0) == []
-    assert (process.exit_code, process.last_line) == (0, "cut")
-
-
 def test_a_stubborn_node_is_killed_and_named(tmp_path: Path) -> None:
     process = start(
         tmp_path,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import http.server
+import shutil
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from http import HTTPStatus
+from functools import partial
 from pathlib import Path
 
 import needle_console
@@ -50,7 +52,12 @@ def serving_button(
     on_state, on_notice : callable
         As `HoldServer` takes them.
     """
-    with http.server.ThreadingHTTPServer((_ADDRESS, 0), _Page) as pages:
+    with (
+        tempfile.TemporaryDirectory(prefix="needle_page_") as folder,
+        http.server.ThreadingHTTPServer((_ADDRESS, 0), partial(_Page, directory=folder)) as pages,
+    ):
+        Path(folder, "index.html").write_text(_PAGE, "utf-8")
+        shutil.copy(Path(needle_console.__path__[0]) / "static" / "hold.js", folder)
         serving = threading.Thread(target=pages.serve_forever)
         serving.start()
         access = Access(_ADDRESS, pages.server_port)
@@ -64,22 +71,6 @@ def serving_button(
             serving.join()
 
 
-class _Page(http.server.BaseHTTPRequestHandler):
-    def do_GET(self) -> None:
-        path = self.path.partition("?")[0]
-        if path == "/":
-            self._answer("text/html", _PAGE)
-        elif path == "/hold.js":
-            script = Path(needle_console.__path__[0]) / "static" / "hold.js"
-            self._answer("text/javascript", script.read_text("utf-8"))
-        else:
-            self.send_error(HTTPStatus.NOT_FOUND)
-
+class _Page(http.server.SimpleHTTPRequestHandler):
     def log_message(self, *_: object) -> None:
         """Say nothing of requests."""
-
-    def _answer(self, kind: str, text: str) -> None:
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", f"{kind}; charset=utf-8")
-        self.end_headers()
-        self.wfile.write(text.encode())

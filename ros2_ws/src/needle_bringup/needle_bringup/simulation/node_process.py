@@ -36,8 +36,6 @@ class NodeProcess:
         File that takes its output.
     pass_fds : sequence of int
         Open files that it keeps.
-    takes_input : bool
-        Whether `say` reaches it; else its input is empty.
     """
 
     def __init__(
@@ -48,7 +46,6 @@ class NodeProcess:
         environment: Mapping[str, str],
         log: Path,
         pass_fds: Sequence[int] = (),
-        takes_input: bool = False,
     ) -> None:
         self.name = name
         self.log = log
@@ -63,7 +60,7 @@ class NodeProcess:
             self._process = subprocess.Popen(
                 list(command),
                 env=dict(environment),
-                stdin=subprocess.PIPE if takes_input else subprocess.DEVNULL,
+                stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 pass_fds=pass_fds,
@@ -76,19 +73,10 @@ class NodeProcess:
         """Process id."""
         return self._process.pid
 
-    def say(self, line: str) -> None:
-        """Write a line to its input."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{line}\n".encode())
-        self._process.stdin.flush()
-
     @property
     def exit_code(self) -> int | None:
         """Exit code, negative for a signal; None while it runs."""
-        code = self._process.poll()
-        if code is not None and self._process.stdin is not None:
-            self._process.stdin.close()
-        return code
+        return self._process.poll()
 
     @property
     def last_line(self) -> str:
