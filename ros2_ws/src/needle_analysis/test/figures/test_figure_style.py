@@ -16,34 +16,12 @@ LINES = {
 # Machado, Oliveira, Fernandes 2009, severity 1: linear RGB as who lacks one kind of cones sees it.
 VISION = {
     "full": np.eye(3),
-    "no red": np.array(
-        [
-            [0.152286, 1.052583, -0.204868],
-            [0.114503, 0.786281, 0.099216],
-            [-0.003882, -0.048116, 1.051998],
-        ]
-    ),
-    "no green": np.array(
-        [
-            [0.367322, 0.860646, -0.227968],
-            [0.280085, 0.672501, 0.047413],
-            [-0.011820, 0.042940, 0.968881],
-        ]
-    ),
-    "no blue": np.array(
-        [
-            [1.255528, -0.076749, -0.178779],
-            [-0.078411, 0.930809, 0.147602],
-            [0.004733, 0.691367, 0.303900],
-        ]
-    ),
+    "no red": [[0.1523, 1.0526, -0.2049], [0.1145, 0.7863, 0.0992], [-0.0039, -0.0481, 1.0520]],
+    "no green": [[0.3673, 0.8606, -0.2280], [0.2801, 0.6725, 0.0474], [-0.0118, 0.0429, 0.9689]],
+    "no blue": [[1.2555, -0.0767, -0.1788], [-0.0784, 0.9308, 0.1476], [0.0047, 0.6914, 0.3039]],
 }
 TO_XYZ = np.array(
-    [
-        [0.4124564, 0.3575761, 0.1804375],
-        [0.2126729, 0.7151522, 0.0721750],
-        [0.0193339, 0.1191920, 0.9503041],
-    ]
+    [[0.41246, 0.35758, 0.18044], [0.21267, 0.71515, 0.07218], [0.01933, 0.11919, 0.95030]]
 )
 
 
@@ -73,16 +51,17 @@ def lab(rgb: np.ndarray) -> np.ndarray:
     return np.array([116.0 * f[1] - 16.0, 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])])
 
 
-@pytest.mark.parametrize("name", LINES)
-def test_every_line_stands_out_from_its_ground(name: str) -> None:
-    color, white = srgb(LINES[name]), np.ones(3)
-    assert contrast(color, white) >= 3.0
-    assert contrast(in_the_dark(color), in_the_dark(white)) >= 3.0
+def test_every_line_stands_out_from_its_ground() -> None:
+    for name, line in LINES.items():
+        color, white = srgb(line), np.ones(3)
+        assert contrast(color, white) >= 3.0, name
+        assert contrast(in_the_dark(color), in_the_dark(white)) >= 3.0, name
 
 
 @pytest.mark.parametrize("vision", VISION)
 def test_any_two_lines_can_be_told_apart(vision: str) -> None:
+    matrix = np.array(VISION[vision])
     for one, other in itertools.combinations(LINES, 2):
         for mode in (lambda color: color, in_the_dark):
-            seen = [lab(VISION[vision] @ linear(mode(srgb(LINES[name])))) for name in (one, other)]
+            seen = [lab(matrix @ linear(mode(srgb(LINES[name])))) for name in (one, other)]
             assert np.linalg.norm(seen[0] - seen[1]) >= 10.0, (one, other)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -15,41 +17,25 @@ from needle_analysis.live.spread import SIGMAS, ellipsoid
 from needle_analysis.run.shaft_trail import ShaftTrail
 from needle_controller.model.target_plane import TargetPlane
 
-Array = NDArray[np.float64]
 RADIUS = 0.1
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 
 
-def arc(insertion: float) -> Array:
+def arc(insertion: float) -> NDArray[np.float64]:
     """Where the tip of a needle on a circle is."""
     angle = insertion / RADIUS
     return RADIUS * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)])
 
 
-# What mypy takes for the same after a call may have changed.
-
-
-def believed(needle: LiveNeedle) -> Belief | None:
-    return needle.belief
-
-
-def wanted(needle: LiveNeedle) -> TargetPlane | None:
-    return needle.plane
-
-
-def drawn_shaft(needle: LiveNeedle) -> Array | None:
-    return needle.shaft
-
-
-def inserted(*insertions: float) -> ShaftTrail:
+def inserted() -> ShaftTrail:
     trail = ShaftTrail()
-    for insertion in insertions:
+    for insertion in np.arange(0.0, 0.0801, 1e-4):
         trail.add(insertion, arc(insertion))
     return trail
 
 
 def test_the_shaft_lies_where_the_tip_went() -> None:
-    trail = inserted(*np.arange(0.0, 0.0801, 1e-4))
-    shaft = trail.shaft(0.08, arc(0.08))
+    shaft = inserted().shaft(0.08, arc(0.08))
     assert shaft[0] == pytest.approx(np.zeros(3))
     assert shaft[-1] == pytest.approx(arc(0.08))
     assert np.linalg.norm(shaft - [RADIUS, 0.0, 0.0], axis=1) == pytest.approx(RADIUS)
@@ -58,7 +44,7 @@ def test_the_shaft_lies_where_the_tip_went() -> None:
 
 
 def test_a_needle_drawn_back_lies_in_its_way_which_stays_until_it_is_out() -> None:
-    trail = inserted(*np.arange(0.0, 0.0801, 1e-4))
+    trail = inserted()
     way = trail.path
     trail.add(0.03, arc(0.03))
     assert np.array_equal(trail.path, way)
@@ -73,7 +59,7 @@ def test_a_needle_drawn_back_lies_in_its_way_which_stays_until_it_is_out() -> No
 
 def test_the_ellipsoid_holds_as_many_as_it_says() -> None:
     rng = np.random.default_rng(5)
-    for turned in Rotation.random(8, random_state=5).as_matrix():
+    for turned in Rotation.random(4, random_state=5).as_matrix():
         covariance = turned @ np.diag([1e-8, 4e-8, 9e-6]) @ turned.T
         axes, lengths = ellipsoid(covariance)
         # Else no quaternion would turn them.
@@ -89,96 +75,85 @@ def test_what_is_believed_in_the_plane_is_shown_in_the_rig() -> None:
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = turned, [0.003, 0.001, 0.0]
     plane = TargetPlane(transform)
-    needle = LiveNeedle()
+    needle: Any = LiveNeedle()
     heading = Rotation.from_euler("y", 0.1).as_matrix()
     covariance = np.diag([1.0, 2.0, 3.0]) * 1e-6
     needle.take_belief(Belief(np.array([0.001, 0.0, 0.05]), heading, covariance))
-    assert believed(needle) is None
+    assert [needle.belief] == [None]
     needle.take_plane(plane)
     needle.take_targets(plane.offset, None)
-    belief = believed(needle)
-    assert belief is not None
+    belief = needle.belief
     assert plane.from_rig(belief.place) == pytest.approx(np.array([0.001, 0.0, 0.05]))
     assert belief.rotation == pytest.approx(turned @ heading)
     assert turned.T @ belief.covariance @ turned == pytest.approx(covariance)
 
 
 def test_the_plane_that_is_in_force_counts_not_one_that_was_refused() -> None:
-    needle = LiveNeedle()
-    assert wanted(needle) is None
+    needle: Any = LiveNeedle()
+    assert [needle.plane] == [None]
     asked = np.eye(4)
     asked[0, 3] = 0.05
     needle.take_plane(TargetPlane(asked))
     needle.take_targets(0.003, np.array([0.01, 0.0, 0.1]))
-    plane = wanted(needle)
-    assert plane is not None
-    assert plane.offset == pytest.approx(0.003)
+    assert needle.plane.offset == pytest.approx(0.003)
     needle.take_targets(0.05, None)
-    plane = wanted(needle)
-    assert plane is not None
-    assert plane.T_rig_plane[0, 3] == pytest.approx(0.05)
+    assert needle.plane.T_rig_plane[0, 3] == pytest.approx(0.05)
     assert needle.target_point is None
 
 
 def test_a_tip_that_is_not_found_leaves_the_last_one_and_says_so() -> None:
-    needle = LiveNeedle()
-    assert drawn_shaft(needle) is None
+    needle: Any = LiveNeedle()
+    assert [needle.shaft] == [None]
     needle.take_insertion(0.02)
-    upright = np.array([0.0, 0.0, 0.0, 1.0])
-    needle.take_tip(SeenTip(100, arc(0.02), upright, np.eye(3)))
+    needle.take_tip(SeenTip(100, arc(0.02), UPRIGHT, np.eye(3)))
     needle.take_no_tip(200)
     assert (needle.answered_ns, needle.is_seen) == (200, False)
-    shaft = drawn_shaft(needle)
-    assert shaft is not None
-    assert shaft[-1] == pytest.approx(arc(0.02))
+    assert needle.shaft[-1] == pytest.approx(arc(0.02))
 
 
 def blank(value: int = 0) -> NDArray[np.uint8]:
     return np.full((120, 160), value, np.uint8)
 
 
-def decoded(data: bytes) -> NDArray[np.uint8]:
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert picture is not None
-    return np.asarray(picture, np.uint8)
-
-
-def test_an_image_is_drawn_once_with_its_own_answer() -> None:
+def test_an_image_is_drawn_once_with_its_own_answer_or_late_without() -> None:
     images = LatestImages()
+
+    def drawn(answered: int | None, now: float) -> tuple[int, bool] | None:
+        found = images.next(answered, now)
+        assert found is None or found[2][0, 0] == found[0]
+        return None if found is None else found[:2]
+
     for stamp in (10, 20, 30):
         images.add(stamp, blank(stamp))
-    assert images.next(None, 0.0) is None
-    drawn = images.next(20, 0.1)
-    assert drawn is not None
-    assert (drawn[0], drawn[1], drawn[2][0, 0]) == (20, True, 20)
-    assert images.next(20, 0.2) is None
-    assert images.next(10, 0.2) is None
-    assert images.next(30, 0.3) is not None
+    assert drawn(None, 0.0) is None
+    assert drawn(20, 0.1) == (20, True)
+    assert drawn(20, 0.2) is None
+    assert drawn(10, 0.2) is None
+    assert drawn(30, 0.3) == (30, True)
     # One that waits for its answer is not drawn without, so soon after the last.
     images.add(40, blank(40))
-    assert images.next(30, 0.7) is None
-    late = images.next(30, 0.9)
-    assert late is not None
-    assert late[:2] == (40, False)
-
-
-def test_without_answers_the_newest_image_is_drawn_as_it_is() -> None:
+    assert drawn(30, 0.7) is None
+    assert drawn(30, 0.9) == (40, False)
+    # Without answers the newest is drawn as it is.
     images = LatestImages()
-    images.add(10, blank())
-    assert images.next(None, 5.0) is None
-    images.add(20, blank())
-    drawn = images.next(None, 5.6)
-    assert drawn is not None
-    assert drawn[:2] == (20, False)
-    assert images.next(None, 5.7) is None
+    images.add(10, blank(10))
+    assert drawn(None, 5.0) is None
+    images.add(20, blank(20))
+    assert drawn(None, 5.6) == (20, False)
+    assert drawn(None, 5.7) is None
 
 
 def test_shaft_and_tip_are_drawn_where_they_are() -> None:
+    def coloured(shaft: NDArray[np.float64]) -> NDArray[np.bool_]:
+        data = np.frombuffer(marked_image(blank(), shaft, ""), np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        assert picture is not None
+        assert picture.shape == (120, 160, 3)
+        return np.asarray(picture.max(axis=2) > 60)
+
     shaft = np.array([[20.0, 30.0], [100.0, 30.0], [np.nan, np.nan], [130.0, 60.0]])
-    picture = decoded(marked_image(blank(), shaft, ""))
-    assert picture.shape == (120, 160, 3)
-    coloured = picture.max(axis=2) > 60
-    assert coloured[29:32, 60].any()
-    assert coloured[60, 119:123].any()
-    assert not coloured[80:, :].any()
-    assert not (decoded(marked_image(blank(), np.empty((0, 2)), "")) > 60).any()
+    seen = coloured(shaft)
+    assert seen[29:32, 60].any()
+    assert seen[60, 119:123].any()
+    assert not seen[80:, :].any()
+    assert not coloured(np.empty((0, 2))).any()

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from needle_analysis.figures.film_views import Projection
 from needle_analysis.live import live_view
 from needle_analysis.live.live_messages import ADD
 from needle_analysis.live.live_view import LiveView, LiveViewParameters
@@ -126,34 +127,29 @@ def shown(markers: m.Markers) -> dict[str, m.Marker]:
 
 def test_what_is_known_is_drawn_and_the_rest_is_taken_away() -> None:
     scene = Scene()
-    markers = scene.look_at(live_view.MARKERS).seen[live_view.MARKERS]
+    seen = scene.look_at(live_view.MARKERS, live_view.TIP, live_view.PATH).seen
+    markers = seen[live_view.MARKERS]
     status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
     scene.say("needle/controller_status", status)
     assert set(shown(markers[-1])) == {"plane", "target_point"}
     assert len(markers[-1].markers) == 6
     scene.say("joint_states", inserted(0.04))
     scene.say("needle/tip_pose", pose("rig", 1e-4))
-    seen = shown(markers[-1])
-    assert seen["shaft"].points[-1] == TIP
-    assert seen["uncertainty"].scale == pytest.approx((2 * 2.7955e-4,) * 3)
-    assert seen["plane"].position[0] == pytest.approx(0.003)
-    assert seen["plane"].frame_id == "rig"
-    assert seen["plane"].stamp_ns == pytest.approx(scene.runner.timeline.stamp_ns, abs=2e8)
+    there = shown(markers[-1])
+    assert there["shaft"].points[-1] == TIP
+    assert there["uncertainty"].scale == pytest.approx((2 * 2.7955e-4,) * 3)
+    assert there["plane"].position[0] == pytest.approx(0.003)
+    assert there["plane"].frame_id == "rig"
+    assert there["plane"].stamp_ns == pytest.approx(scene.runner.timeline.stamp_ns, abs=2e8)
+    assert seen[live_view.TIP][-1] == m.Pose(EXPOSED, "rig", TIP, UPRIGHT)
+    assert seen[live_view.PATH][-1].positions[-1] == TIP
     scene.say("needle/estimate", pose("target_plane", 2e-4))
-    seen = shown(markers[-1])
-    assert seen["estimate"].points[0] == pytest.approx((TIP[0] + 0.003, *TIP[1:]))
-    assert seen["uncertainty"].scale == pytest.approx((4 * 2.7955e-4,) * 3)
+    there = shown(markers[-1])
+    assert there["estimate"].points[0] == pytest.approx((TIP[0] + 0.003, *TIP[1:]))
+    assert there["uncertainty"].scale == pytest.approx((4 * 2.7955e-4,) * 3)
     # What is not found is grey.
     scene.say("needle/tip_pose", pose("rig", np.inf, 2 * EXPOSED))
     assert shown(markers[-1])["tip"].colour == (0.7, 0.7, 0.7, 1.0)
-
-
-def test_tip_and_way_are_sent() -> None:
-    scene = steered()
-    seen = scene.look_at(live_view.TIP, live_view.PATH).seen
-    assert seen[live_view.TIP][-1] == m.Pose(EXPOSED, "rig", TIP, UPRIGHT)
-    assert seen[live_view.PATH][-1].positions[-1] == TIP
-    assert len(seen[live_view.PATH][-1].positions) == 2
 
 
 def test_nothing_is_sent_that_nobody_looks_at() -> None:
@@ -168,9 +164,11 @@ def test_nothing_is_sent_that_nobody_looks_at() -> None:
     assert scene.published == []
 
 
-@pytest.mark.parametrize(
-    ("topic", "message"),
-    [
+def test_what_cannot_be_is_refused_by_name_and_changes_nothing() -> None:
+    scene = steered()
+    markers = scene.look_at(live_view.MARKERS).seen[live_view.MARKERS]
+    before = shown(markers[-1])
+    for topic, message in (
         ("joint_states", inserted(1e300)),
         ("joint_states", m.JointState(1, ("other_joint",), (0.0,))),
         ("needle/estimate", pose("target_plane", np.nan)),
@@ -179,30 +177,28 @@ def test_nothing_is_sent_that_nobody_looks_at() -> None:
         ("needle/controller_status", ControllerStatus(target_point_m=(0.0, 0.0, 20.0))),
         ("target_plane", m.Pose(1, "elsewhere", (0.0, 0.0, 0.0), UPRIGHT)),
         ("stereo_tracker/calibration", m.Text("none")),
-    ],
-)
-def test_what_cannot_be_is_refused_by_name_and_changes_nothing(topic: str, message: Any) -> None:
-    scene = steered()
-    markers = scene.look_at(live_view.MARKERS).seen[live_view.MARKERS]
-    before = shown(markers[-1])
-    scene.say(topic, message)
-    assert scene.health[topic].startswith("refused: ")
-    assert "handlers" not in scene.health
-    after = shown(markers[-1])
-    assert after["estimate"].points == before["estimate"].points
-    assert after["shaft"].points == before["shaft"].points
-    assert after.keys() == before.keys()
-
-
-def test_health_is_told_again_after_a_good_message() -> None:
-    scene = Scene()
-    scene.say("joint_states", inserted(np.nan))
-    assert scene.health["joint_states"].startswith("refused: ")
+    ):
+        scene.say(topic, message)
+        assert scene.health[topic].startswith("refused: ")
+        assert "handlers" not in scene.health
+        after = shown(markers[-1])
+        assert after["estimate"].points == before["estimate"].points
+        assert after["shaft"].points == before["shaft"].points
+        assert after.keys() == before.keys()
+    # Health is told again after a good message.
     scene.say("joint_states", inserted(0.04))
     assert scene.health["joint_states"] == "ok"
 
 
 # ---- images
+
+
+@pytest.fixture(scope="module")
+def left_view() -> Projection:
+    """What the left camera sees; compiled."""
+    project = stereo_views(load_calibration(CALIBRATION))[0].project
+    project(np.array(TIP))
+    return project
 
 
 def black(stamp_ns: int) -> m.Image:
@@ -211,7 +207,7 @@ def black(stamp_ns: int) -> m.Image:
     return m.Image(stamp_ns, "", camera.height, camera.width, "mono8", camera.width, bytes(size))
 
 
-def test_an_image_is_drawn_with_its_answer() -> None:
+def test_an_image_is_drawn_with_its_answer(left_view: Projection) -> None:
     scene = steered()
     scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
     pictures = scene.look_at(LEFT).seen[LEFT]
@@ -224,23 +220,13 @@ def test_an_image_is_drawn_with_its_answer() -> None:
     assert picture is not None
     camera = load_calibration(CALIBRATION).left
     assert picture.shape == (camera.height, camera.width, 3)
-    u, v = np.round(stereo_views(load_calibration(CALIBRATION))[0].project(np.array(TIP)))
+    u, v = np.round(left_view(np.array(TIP)))
     ring = picture[int(v) - 12 : int(v) + 13, int(u) - 12 : int(u) + 13]
     # Orange: red over green over blue.
     assert (ring[..., 2].astype(int) - ring[..., 0] > 100).sum() > 20
 
 
-def test_an_image_of_another_camera_is_refused_by_name() -> None:
-    scene = Scene()
-    scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
-    pictures = scene.look_at(LEFT).seen[LEFT]
-    scene.say("stereo/left/image_raw", m.Image(1, "", 2, 3, "mono8", 3, bytes(6)))
-    assert "the calibration is for" in scene.health["stereo/left/image_raw"]
-    scene.runner.run(1.0)
-    assert pictures == []
-
-
-def test_images_that_came_while_nobody_looked_are_not_shown_later() -> None:
+def test_images_of_another_camera_or_from_before_anybody_looked_are_not_shown() -> None:
     scene = Scene()
     scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
     scene.say("stereo/left/image_raw", black(1))
@@ -255,6 +241,8 @@ def test_images_that_came_while_nobody_looked_are_not_shown_later() -> None:
     pictures = scene.look_at(LEFT).seen[LEFT]
     scene.runner.run(1.0)
     assert pictures == []
+    scene.say("stereo/left/image_raw", m.Image(1, "", 2, 3, "mono8", 3, bytes(6)))
+    assert "the calibration is for" in scene.health["stereo/left/image_raw"]
     scene.say("stereo/left/image_raw", black(4))
     scene.runner.run(1.0)
     assert [picture.stamp_ns for picture in pictures] == [4]
@@ -269,6 +257,10 @@ def test_images_are_received_only_while_their_view_is_looked_at() -> None:
     assert list(view.on_peers(peers, at)) == [Listen(left, True), Listen(right, False)]
     assert list(view.on_peers(Peers(), at)) == [Listen(left, False), Listen(right, False)]
     assert {row.topic for row in view.inputs if row.lazy} == {left, right}
+    # Without a message for transforms there is no topic of them.
+    pictures = live_view.PICTURES.values()
+    topics = {row.topic for row in view.outputs}
+    assert topics == {live_view.TIP, live_view.PATH, live_view.MARKERS, *pictures}
 
 
 # ---- transforms
@@ -295,13 +287,3 @@ def test_transforms_are_sent_where_there_is_a_message_for_them() -> None:
     plane, tip = seen[live_view.TF][-1].transforms
     assert (plane.child_frame_id, plane.translation) == ("target_plane", (0.003, 0.0, 0.0))
     assert tip == m.Transform(EXPOSED, "rig", "needle_tip", TIP, UPRIGHT)
-
-
-def test_without_a_message_for_transforms_there_is_no_topic_of_them() -> None:
-    topics = {row.topic for row in LiveView(LiveViewParameters(), transforms=False).outputs}
-    assert topics == {
-        live_view.TIP,
-        live_view.PATH,
-        live_view.MARKERS,
-        *live_view.PICTURES.values(),
-    }

@@ -1,10 +1,12 @@
-"""`rerun` on the committed bag: unchanged as it is, red with a gain or a sign changed."""
+"""`rerun`: unchanged where nothing changed, red with a gain or a sign that did, one line if bad."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +23,11 @@ from needle_bags.reading.bag_files import read_contents
 from needle_bags.reading.bag_order import raw_as_sent
 from needle_bags.reading.bag_reader import read_run
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.errors import UserError
 from needle_tracker.optics.calibration import StereoCalibration, parse_calibration
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 EVENT = "rcl_interfaces/msg/ParameterEvent"
-BAG = Path(__file__).resolve().parents[5] / "bags" / "regression"
 
 Capture = pytest.CaptureFixture[str]
 
@@ -34,28 +36,68 @@ def rerun(*arguments: object) -> int:
     return rerun_node.main([str(argument) for argument in arguments])
 
 
-@pytest.fixture(scope="module")
-def paper_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The committed bag as preset paper would have it."""
-    bag = tmp_path_factory.mktemp("rerun") / "paper"
-    assert rerun(BAG, "--preset", "paper", "--output", bag) == 1
-    return bag
+def printed(*arguments: object) -> tuple[int, str]:
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        code = rerun(*arguments)
+    return code, out.getvalue()
 
 
 def changed_fields(result: Path) -> set[str]:
     values: dict[str, Any] = json.loads(result.read_text())
-    return {
-        key.removesuffix("_differing")
-        for key, v in values.items()
-        if key.endswith("_differing") and v
-    }
+    ending = "_differing"
+    return {key.removesuffix(ending) for key, v in values.items() if key.endswith(ending) and v}
 
 
-def test_todays_code_does_what_it_did(capsys: Capture) -> None:
-    assert rerun(BAG) == 0, f"{capsys.readouterr().out}\nmeant? scripts/renew_regression_bag"
-    printed = capsys.readouterr().out
-    assert "6 image pairs through stereo_tracker, 121 tips through plane_controller" in printed
-    assert "UNCHANGED" in printed
+def given(folder: Path, text: str, node: str = "plane_controller") -> Path:
+    file = folder / "given.yaml"
+    file.write_text(f"{node}: {{ros__parameters: {{{text}}}}}")
+    return file
+
+
+@pytest.fixture(scope="module")
+def untouched(regression: Path) -> tuple[int, str]:
+    """The whole of the committed bag, run again."""
+    return printed(regression)
+
+
+@pytest.fixture(scope="module")
+def mirrored(first_pictures: Path) -> tuple[int, str]:
+    """The bag up to its first pictures, run again by code that has a sign turned."""
+
+    def mirror(document: Any) -> StereoCalibration:
+        calibration = parse_calibration(document)
+        matrix = calibration.left.camera_matrix * np.array([[1, 1, 1], [1, -1, 1], [1, 1, 1]])
+        left = dataclasses.replace(calibration.left, camera_matrix=matrix)
+        return dataclasses.replace(calibration, left=left)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rerun_node, "parse_calibration", mirror)
+        return printed(first_pictures)
+
+
+@pytest.fixture(scope="module")
+def paper_bag(tmp_path_factory: pytest.TempPathFactory, eight_steps: Path) -> Path:
+    """The first steps as preset paper would have them."""
+    bag = tmp_path_factory.mktemp("rerun") / "paper"
+    assert rerun(eight_steps, "--preset", "paper", "--output", bag) == 1
+    return bag
+
+
+def test_todays_code_does_what_it_did(untouched: tuple[int, str], regression: Path) -> None:
+    code, said = untouched
+    assert code == 0, f"{said}\nmeant? scripts/renew_regression_bag"
+    assert "6 image pairs through stereo_tracker, 121 tips through plane_controller" in said
+    assert "UNCHANGED" in said
+    # The table that people read in a diff belongs to the bag beside it.
+    rows = (regression / TABLE).read_text().splitlines()[1:]
+    assert len(rows) == read_contents(regression).counts["/needle/estimate"]
+
+
+def test_a_sign_in_the_projection_is_seen(mirrored: tuple[int, str]) -> None:
+    code, said = mirrored
+    assert code == 1
+    assert "needle/tip: 1 recorded but not today (at 30.0 mm" in said
 
 
 @pytest.mark.parametrize(
@@ -66,62 +108,13 @@ def test_todays_code_does_what_it_did(capsys: Capture) -> None:
         ("step_length", "device_joint_trajectory_insertion"),
     ],
 )
-def test_a_hundredth_is_seen(tmp_path: Path, parameter: str, field: str) -> None:
-    file, result = tmp_path / "changed.yaml", tmp_path / "result.json"
-    value = 1.01 * read_run(BAG).parameter("plane_controller", parameter)
-    file.write_text(f"plane_controller: {{ros__parameters: {{{parameter}: {value}}}}}")
-    assert rerun(BAG, "--params", file, "--json", result) == 1
+def test_a_hundredth_of_a_parameter_is_seen(
+    eight_steps: Path, tmp_path: Path, parameter: str, field: str
+) -> None:
+    value = 1.01 * read_run(eight_steps).parameter("plane_controller", parameter)
+    file, result = given(tmp_path, f"{parameter}: {value}"), tmp_path / "result.json"
+    assert rerun(eight_steps, "--params", file, "--json", result) == 1
     assert field in changed_fields(result)
-
-
-def test_a_sign_in_the_projection_is_seen(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
-    def mirrored(document: Any) -> StereoCalibration:
-        calibration = parse_calibration(document)
-        matrix = calibration.left.camera_matrix * np.array([[1, 1, 1], [1, -1, 1], [1, 1, 1]])
-        left = dataclasses.replace(calibration.left, camera_matrix=matrix)
-        return dataclasses.replace(calibration, left=left)
-
-    monkeypatch.setattr("needle_analysis.ros.rerun.parse_calibration", mirrored)
-    assert rerun(BAG) == 1
-    assert "needle/tip: 6 recorded but not today (at 30.0 mm" in capsys.readouterr().out
-
-
-def test_code_that_breaks_is_told_from_code_that_changed(
-    monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
-    def mistaken(*_: object) -> None:
-        raise ValueError("behind the camera")
-
-    monkeypatch.setattr("needle_analysis.ros.tracker_rerun.TrackerStage.take", mistaken)
-    assert rerun(BAG) == 3
-    assert "internal error, please report it: ValueError: behind" in capsys.readouterr().err
-
-
-def test_another_preset_is_a_run_of_its_own(
-    paper_bag: Path, tmp_path: Path, capsys: Capture
-) -> None:
-    assert rerun(paper_bag) == 0
-    assert "(paper)" in capsys.readouterr().out
-    result = tmp_path / "result.json"
-    assert rerun(BAG, "--preset", "paper", "--json", result) == 1
-    changed = changed_fields(result)
-    assert "needle_estimate_position" in changed
-    # Tips are measured anew: the same but for rounding, which is the processor's.
-    assert not {name for name in changed if name.startswith("needle_tip")}
-    # Beyond the outputs it is the same bag.
-    before, after = read_contents(BAG), read_contents(paper_bag)
-    assert before.counts == after.counts
-    for topic in ("/joint_states", "/device/status", "/sim/tip_pose"):
-        kept = [
-            [(m.log_time, m.data) for m in raw_as_sent(bag, topic.__eq__, lambda _: False)]
-            for bag in (BAG, paper_bag)
-        ]
-        assert kept[0] == kept[1]
-    lines = (paper_bag / TABLE).read_text().splitlines()
-    assert len(lines) == 122
-    assert lines[0].split()[:3] == ["insertion_mm", "tip_x_mm", "tip_y_mm"]
 
 
 def test_a_gain_that_is_off_by_a_hundredth_is_seen(
@@ -141,47 +134,56 @@ def test_a_gain_that_is_off_by_a_hundredth_is_seen(
     assert "needle_control_input_v" in changed_fields(result)
 
 
-def test_the_committed_table_is_the_committed_bags() -> None:
-    """The table that people read in a diff belongs to the bag beside it."""
-    rows = (BAG / TABLE).read_text().splitlines()[1:]
-    assert len(rows) == read_contents(BAG).counts["/needle/estimate"]
+def test_code_that_breaks_is_told_from_code_that_changed(
+    eight_steps: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    def mistaken(*_: object) -> None:
+        raise ValueError("behind the camera")
+
+    monkeypatch.setattr("needle_analysis.ros.controller_rerun.ControllerStage.take", mistaken)
+    assert rerun(eight_steps) == 3
+    assert "internal error, please report it: ValueError: behind" in capsys.readouterr().err
 
 
-def test_parameters_as_nodes_announced_them_do_as_well(tmp_path: Path) -> None:
+def test_another_preset_is_a_run_of_its_own(eight_steps: Path, paper_bag: Path) -> None:
+    code, said = printed(paper_bag)
+    assert code == 0
+    assert "(paper)" in said
+    # Beyond the outputs it is the same bag.
+    before, after = read_contents(eight_steps), read_contents(paper_bag)
+    assert before.counts == after.counts
+    for topic in ("/joint_states", "/device/status", "/sim/tip_pose"):
+        kept = [
+            [(m.log_time, m.data) for m in raw_as_sent(bag, topic.__eq__, lambda _: False)]
+            for bag in (eight_steps, paper_bag)
+        ]
+        assert kept[0] == kept[1]
+    lines = (paper_bag / TABLE).read_text().splitlines()
+    assert len(lines) == 1 + before.counts["/needle/estimate"]
+    assert lines[0].split()[:3] == ["insertion_mm", "tip_x_mm", "tip_y_mm"]
+
+
+def copied(bag: Path, target: Path, custom: dict[str, str], topic: str, kind: str) -> Any:
+    """Begin a copy of a bag with other texts; return what puts a message of a new topic first."""
+    contents = read_contents(bag)
+    copy, new = BagCopy(target, "jazzy", custom), standard_topic(topic, kind)
+
+    @contextlib.contextmanager
+    def writing() -> Iterator[Callable[[bytes], None]]:
+        yield lambda data: copy.put(new, data, contents.start, contents.start)
+        for m in raw_as_sent(bag, lambda _: True, lambda _: False):
+            copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
+        copy.close()
+
+    return writing()
+
+
+def test_parameters_as_nodes_announced_them_do_as_well(eight_steps: Path, tmp_path: Path) -> None:
     """What ROS 2's own recorder leaves: no custom data, but /parameter_events."""
-    contents, values = read_contents(BAG), read_run(BAG).parameters
-    copy = BagCopy(tmp_path / "bag", "jazzy", {"calibration": contents.custom_data["calibration"]})
-    topic = standard_topic("/parameter_events", EVENT)
-    for node, parameters in values.items():
-        copy.put(topic, event(node, parameters), contents.start, contents.start)
-    for m in raw_as_sent(BAG, lambda _: True, lambda _: False):
-        copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
-    copy.close()
+    with copied(eight_steps, tmp_path / "bag", {}, "/parameter_events", EVENT) as put:
+        node = "/plane_controller"
+        put(event(node, read_run(eight_steps).parameters[node]))
     assert rerun(tmp_path / "bag") == 0
-
-
-def test_the_calibration_that_the_tracker_told_is_used(tmp_path: Path, capsys: Capture) -> None:
-    """It says it on a topic of its own: nobody has to tell the recorder."""
-    contents, text = read_contents(BAG), read_run(BAG).calibration
-    custom = {"parameters": contents.custom_data["parameters"], "calibration": "left: {}"}
-    copy = BagCopy(tmp_path / "bag", "jazzy", custom)
-    topic = standard_topic("/stereo_tracker/calibration", "std_msgs/msg/String")
-    copy.put(topic, standard_text(text), contents.start, contents.start)
-    for m in raw_as_sent(BAG, lambda _: True, lambda _: False):
-        copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
-    copy.close()
-    assert rerun(tmp_path / "bag") == 0
-    other = yaml.safe_load(text)
-    other["phantom"]["refractive_index"] += 0.01
-    (tmp_path / "other.yaml").write_text(yaml.safe_dump(other))
-    values = f"{{ros__parameters: {{calibration_file: {tmp_path}/other.yaml}}}}"
-    (tmp_path / "given.yaml").write_text(f"stereo_tracker: {values}")
-    again = tmp_path / "again"
-    given = ("--params", tmp_path / "given.yaml", "--output", again)
-    assert rerun(tmp_path / "bag", *given) == 1
-    # What was used is in the copy, which runs again unchanged.
-    assert yaml.safe_load(read_run(again).calibration) == other
-    capsys.readouterr()
 
 
 def event(node: str, parameters: dict[str, Any]) -> bytes:
@@ -204,66 +206,71 @@ def event(node: str, parameters: dict[str, Any]) -> bytes:
     return bytes(STORE.serialize_cdr(types[EVENT](stamp, node, new, [], []), EVENT))
 
 
-BAD: list[tuple[list[str], str]] = [
-    (["--preset", "bset"], "--preset 'bset' is not one of"),
-    (["--json", "/nowhere/at/all.json"], "its folder must exist"),
-    (["--params", "/nowhere.yaml"], "/nowhere.yaml"),
-    (["--output", str(BAG)], "holds a bag already"),
-    (["--presets", "best"], "see --help"),
-]
+def test_the_calibration_that_the_tracker_told_or_that_is_given_is_used(
+    eight_steps: Path, first_pictures: Path, tmp_path: Path
+) -> None:
+    """The tracker says it on a topic of its own: nobody has to tell the recorder."""
+    text = read_run(eight_steps).calibration
+    bag, kind = tmp_path / "bag", "std_msgs/msg/String"
+    with copied(
+        eight_steps, bag, {"calibration": "left: {}"}, "/stereo_tracker/calibration", kind
+    ) as put:
+        put(standard_text(text))
+    run = read_run(bag)
+    assert run.calibration == text
+    other = tmp_path / "other.yaml"
+    changed = yaml.safe_load(text)
+    changed["phantom"]["refractive_index"] += 0.01
+    other.write_text(yaml.safe_dump(changed))
+    file = given(tmp_path, f"calibration_file: {other}", "stereo_tracker")
+    seen: list[str] = []
+
+    def stop(_: object, __: object, used: str) -> None:
+        seen.append(used)
+        raise UserError("seen")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rerun_node, "_tracker", stop)
+        for arguments in ((), ("--params", file)):
+            assert rerun(first_pictures, *arguments) == 2
+    assert seen == [text, other.read_text()]
 
 
-@pytest.mark.parametrize(("arguments", "words"), BAD)
-def test_bad_input_is_one_line(arguments: list[str], words: str, capsys: Capture) -> None:
-    assert rerun(BAG, *arguments) == 2
-    printed = capsys.readouterr().err
-    assert words in printed
-    assert printed.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
+def test_bad_input_is_one_line(
+    eight_steps: Path, make_run: Callable[..., Path], tmp_path: Path, capsys: Capture
+) -> None:
+    table: dict[tuple[object, ...], str] = {
+        (eight_steps, "--preset", "bset"): "--preset 'bset' is not one of",
+        (eight_steps, "--json", "/nowhere/at/all.json"): "its folder must exist",
+        (eight_steps, "--params", "/nowhere.yaml"): "/nowhere.yaml",
+        (eight_steps, "--output", eight_steps): "holds a bag already",
+        (eight_steps, "--presets", "best"): "see --help",
+        (make_run(steps=3),): "give them with --params",
+    }
+    for arguments, words in table.items():
+        assert rerun(*arguments) == 2
+        said = capsys.readouterr().err
+        assert words in said
+        assert said.count("\n") == 1
+    for text, words in (
         ("curvatur: 8.0", "has no parameter curvatur"),
         ("curvature: -8.0", "curvature = -8"),
         ("curvature: high", "curvature"),
-    ],
-)
-def test_bad_parameters_are_one_line(
-    tmp_path: Path, text: str, words: str, capsys: Capture
+    ):
+        assert rerun(eight_steps, "--params", given(tmp_path, text)) == 2
+        # Of what the bag's nodes had and today's do not have it warns first.
+        lines = capsys.readouterr().err.splitlines()
+        (line,) = [line for line in lines if "no longer has" not in line]
+        assert words in line
+
+
+def test_parameters_reach_the_node_or_that_is_said(
+    eight_steps: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    file = tmp_path / "bad.yaml"
-    file.write_text(f"plane_controller: {{ros__parameters: {{{text}}}}}")
-    assert rerun(BAG, "--params", file) == 2
-    printed = capsys.readouterr().err.splitlines()
-    # Of what the bag's nodes had and today's do not have it warns first.
-    said = [line for line in printed if "no longer has" not in line]
-    assert len(said) == 1
-    assert words in said[0]
-
-
-def test_parameters_reach_the_node_or_that_is_said(tmp_path: Path, capsys: Capture) -> None:
-    file = tmp_path / "rig.yaml"
-    file.write_text("/rig1/plane_controller: {ros__parameters: {curvature: 8.0}}")
-    assert rerun(BAG, "--params", file) == 2
+    file = given(tmp_path, "curvature: 8.0", "/rig1/plane_controller")
+    assert rerun(eight_steps, "--params", file) == 2
     assert "this node is /plane_controller: write '/plane_controller'" in capsys.readouterr().err
-    file.write_text("device_driver: {ros__parameters: {max_depth: 0.1}}")
-    assert rerun(BAG, "--params", file) == 0
+    file = given(tmp_path, "max_depth: 0.1", "device_driver")
+    assert rerun(eight_steps, "--params", file) == 0
     warning = f"warning: {file}: no section for /plane_controller: it has device_driver"
     assert capsys.readouterr().err.splitlines()[0] == warning
-
-
-def test_a_bag_without_parameters_says_what_to_do(
-    make_run: Callable[..., Path], capsys: Capture
-) -> None:
-    assert rerun(make_run()) == 2
-    assert "give them with --params" in capsys.readouterr().err
-
-
-def test_help_teaches(capsys: Capture) -> None:
-    with pytest.raises(SystemExit) as ended:
-        rerun("--help")
-    assert ended.value.code == 0
-    printed = capsys.readouterr().out
-    assert "exit codes" in printed
-    assert "tolerances" in printed

@@ -25,7 +25,7 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.heard_messages import HeardMessages
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
-BAG = Path(__file__).resolve().parents[5] / "bags" / "regression"
+BAG = Path(__file__).resolve().parents[2] / "bags" / "regression"
 TYPE = "diagnostic_msgs/msg/DiagnosticStatus"
 PAIR = STORE.types["diagnostic_msgs/msg/KeyValue"]
 STATUS = "/needle/controller_status"

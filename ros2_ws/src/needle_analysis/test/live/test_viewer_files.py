@@ -1,86 +1,23 @@
-"""live_view on a real graph, and the viewers' files that show it."""
+"""The files by which viewers show what live_view sends."""
 
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import yaml
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CompressedImage, Image
-from visualization_msgs.msg import MarkerArray
 
 from needle_analysis.live.live_view import LiveView, LiveViewParameters
 from needle_analysis.ros import live_view as executable
 from needle_bags.format.message_definitions import message_class
 from needle_core import messages as m
 from needle_core.convert import ros_type
-from needle_core.ros.component_node import ComponentNode
-from needle_core.ros.conversions import IMAGES, RELIABLE, to_stamp
-from own_context import own_context
 
 ROOT = Path(__file__).parents[5]
 CONFIG = ROOT / "ros2_ws/src/needle_analysis/config"
-LIMIT = 20.0
-
-
-def make(settings: LiveViewParameters, _: str = "") -> LiveView:
-    return LiveView(settings, transforms=False)
-
-
-OUTPUTS = {f"/{row.topic}": ros_type(row.message) for row in make(LiveViewParameters()).outputs}
-
-
-def test_a_viewer_of_a_replay_finds_its_topics_stamped_by_the_players_clock() -> None:
-    with own_context() as context:
-        view = ComponentNode(
-            "live_view",
-            LiveViewParameters,
-            make,
-            context=context,
-            parameter_overrides=[Parameter("use_sim_time", value=True)],
-        )
-        viewer = Node("viewer", context=context)
-        clock = viewer.create_publisher(Clock, "/clock", RELIABLE)
-        images = viewer.create_publisher(Image, "stereo/left/image_raw", IMAGES)
-        seconds: list[int] = []
-        viewer.create_subscription(
-            MarkerArray,
-            "/live_view/markers",
-            lambda message: seconds.append(message.markers[0].header.stamp.sec),
-            RELIABLE,
-        )
-        looks = viewer.create_subscription(
-            CompressedImage, "/live_view/left/compressed", lambda _: None, RELIABLE
-        )
-        executor = SingleThreadedExecutor(context=context)
-        for node in (view, viewer):
-            executor.add_node(node)
-
-        def until(condition: Callable[[], object]) -> None:
-            deadline = time.monotonic() + LIMIT
-            while not condition():
-                assert time.monotonic() < deadline
-                clock.publish(Clock(clock=to_stamp(42_500_000_000)))
-                executor.spin_once(timeout_sec=0.02)
-
-        until(lambda: seconds[-1:] == [42])
-        until(lambda: images.get_subscription_count() == 1)
-        viewer.destroy_subscription(looks)
-        until(lambda: images.get_subscription_count() == 0)
-        executor.shutdown()
-        for node in (view, viewer):
-            node.destroy_node()
-
-
-# ---- the viewers' files
-
+VIEW = LiveView(LiveViewParameters(), transforms=False)
+OUTPUTS = {f"/{row.topic}": ros_type(row.message) for row in VIEW.outputs}
 BAG = ROOT / "bags/regression/metadata.yaml"
 RVIZ_TYPES = {
     "MarkerArray": "visualization_msgs/msg/MarkerArray",
