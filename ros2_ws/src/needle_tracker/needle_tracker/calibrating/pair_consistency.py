@@ -99,10 +99,9 @@ def _apart(views: list[BoardView], cameras: StereoCalibration) -> tuple[list[str
     kept = [view for view in views if view.name not in apart]
     if cameras.surface is not None and anchor_view(kept, cameras.surface) is not None:
         calibration, _ = first_calibration(kept, _posed(cameras, pose))
-        for view in both:
+        for view in (view for view in both if view.under_surface):
             alike = [dataclasses.replace(view, place=Place(np.eye(4), True, np.inf))]
-            limit = 2.0 * _alone(calibration, alike) + _SLACK_UNDER_PX
-            if view.under_surface and _misses(calibration, alike) > limit:
+            if _misses(calibration, alike) > 2.0 * _alone(calibration, alike) + _SLACK_UNDER_PX:
                 apart.append(view.name)
     return apart, pose
 

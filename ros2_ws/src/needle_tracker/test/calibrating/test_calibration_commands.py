@@ -1,44 +1,57 @@
-"""calibrate_stereo and check_calibration, from drawn images to files and exit codes."""
+"""calibrate_stereo and check_calibration: from what was seen to files, words and exit codes."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
-import shutil
-from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import yaml
+from matplotlib.figure import Figure
 
+from needle_core.errors import UserError
+from needle_tracker.calibrating import calibrate_stereo as calibrating
 from needle_tracker.calibrating.calibrate_stereo import main as calibrate_stereo
-from needle_tracker.optics.calibration import load_calibration
+from needle_tracker.calibrating.calibration_figures import residual_figure, rig_figure, save_figure
+from needle_tracker.calibrating.pair_consistency import PairsApartError
+from needle_tracker.calibrating.rig_calibration import RigCalibration
+from needle_tracker.calibrating.rig_model import BoardView
+from needle_tracker.optics.calibration import SIDES, load_calibration
+from needle_tracker.ros import check_calibration as checking
 from needle_tracker.ros.check_calibration import main as check_calibration
 
-from .session import record
-from .synthetic_rig import TrueRig, flat_pose, surface_places, under_places
+from .synthetic_rig import SIZES, session_content
 
 Out = pytest.CaptureFixture[str]
-
-
-@pytest.fixture(scope="module")
-def recorded(calibration_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("session")
-    rig = TrueRig.read(calibration_path)
-    record(folder, rig, {**surface_places(0.0175), **under_places(0.0175)}, free=7)
-    return folder
+Patch = pytest.MonkeyPatch
 
 
 @pytest.fixture
-def session(recorded: Path, tmp_path: Path) -> Path:
-    """A copy that a test may spoil."""
-    return Path(shutil.copytree(recorded, tmp_path / "session"))
+def arguments(tmp_path: Path) -> list[str]:
+    session = tmp_path / "session.yaml"
+    session.write_text(yaml.safe_dump(session_content()))
+    return ["--left", "left", "--right", "right", "--session", str(session)]
 
 
-def arguments(folder: Path, *more: str) -> list[str]:
-    images = ["--left", str(folder / "left"), "--right", str(folder / "right")]
-    return [*images, "--session", str(folder / "session.yaml"), *more]
+@pytest.fixture
+def seen(
+    views: list[BoardView], result: RigCalibration, monkeypatch: Patch
+) -> dict[str, list[BoardView]]:
+    """What both commands find in the images; the views with which is calibrated."""
+    nothing = dataclasses.replace(views[0].without("left").without("right"), name="blurred")
+    found = {"views": [*views, nothing], "used": list[BoardView]()}
+
+    def calibrate(used: list[BoardView], *_: object) -> RigCalibration:
+        found["used"] += used
+        return result
+
+    for module in (calibrating, checking):
+        monkeypatch.setattr(module, "views_in_folders", lambda *_, **__: (found["views"], SIZES))
+    monkeypatch.setattr(calibrating, "calibrate", calibrate)
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(b"png"))
+    return found
 
 
 def one_line(out: Out) -> str:
@@ -48,158 +61,127 @@ def one_line(out: Out) -> str:
     return captured.err
 
 
-def test_from_images_to_a_calibration_that_its_check_accepts(
-    recorded: Path, tmp_path: Path, capsys: Out
+def test_a_calibration_is_written_that_its_check_accepts(
+    seen: dict[str, list[BoardView]], arguments: list[str], tmp_path: Path, capsys: Out
 ) -> None:
     output, figures = tmp_path / "rig.yaml", tmp_path / "figures.json"
-    words = arguments(recorded, "--output", str(output), "--json", str(figures))
-    assert calibrate_stereo(words) == 0
+    assert calibrate_stereo([*arguments, "--output", str(output), "--json", str(figures)]) == 0
     text = capsys.readouterr().out
     for line in ("left camera, under boards", "surface_height: 17.", "left.k3: NOT DETERMINED"):
         assert line in text
-    calibration = load_calibration(output)
-    assert calibration.left.window.inside == pytest.approx(1.3, abs=0.003)
-    for picture in ("rig.rig.png", "rig.residuals.png"):
-        image = cv2.imread(str(tmp_path / picture))
-        assert image is not None
-        assert np.ptp(image) > 200
+    # Where neither camera sees the board there is nothing to calibrate from.
+    assert "left out, no board found: blurred" in text
+    assert [view.name for view in seen["used"]] == [view.name for view in seen["views"][:-1]]
+    assert load_calibration(output).left.window.inside == pytest.approx(1.3, abs=0.003)
+    assert output.read_text().startswith("# views: 6 free, 2 surface, 3 under")
+    assert all((tmp_path / f"rig.{name}.png").exists() for name in ("rig", "residuals"))
     values = json.loads(figures.read_text())
     assert values["tip_error_p95_mm"] < 0.06
     assert values["reprojection_left_under_px"] < 0.1
-    assert values["determined_refractive_index"] is True
-    assert values["determined_left_k3"] is False
+    assert (values["determined_refractive_index"], values["determined_left_k3"]) == (True, False)
+    assert values["surface_height_mm"] == pytest.approx(17.5, abs=0.3)
     assert values["problem"] is None
 
-    words = arguments(recorded, "--calibration", str(output), "--json", str(figures))
+    seen["views"] = [view for view in seen["views"] if view.name in ("surface_a", "under_wedge")]
+    words = [*arguments, "--calibration", str(output), "--json", str(figures)]
     assert check_calibration(words) == 0
     assert capsys.readouterr().out.endswith("OK\n")
     assert json.loads(figures.read_text())["ok"] is True
 
-    content = yaml.safe_load(output.read_text())
-    content["phantom"]["refractive_index"] += 0.01
-    output.write_text(yaml.safe_dump(content))
+    said = yaml.safe_load(output.read_text())
+    said["phantom"]["refractive_index"] += 0.01
+    output.write_text(yaml.safe_dump(said))
     assert check_calibration(words) == 1
-    assert "refractive index is -0.0" in capsys.readouterr().out
     values = json.loads(figures.read_text())
     assert values["ok"] is False
     assert values["refractive_index_error"] == pytest.approx(-0.01, abs=0.003)
     assert values["left_camera_turned_deg"] is None
 
 
-def drop(name: str, side: str) -> Callable[[Path], None]:
-    return lambda folder: (folder / side / f"{name}.png").unlink()
-
-
-def smaller(folder: Path) -> None:
-    cv2.imwrite(str(folder / "right" / "free_3.png"), np.zeros((480, 640), np.uint8))
-
-
-def broken(folder: Path) -> None:
-    (folder / "right" / "free_3.png").write_bytes(b"not an image")
-
-
-def empty(folder: Path) -> None:
-    shutil.rmtree(folder / "left")
-    (folder / "left").mkdir()
-
-
-def missing(folder: Path) -> None:
-    shutil.rmtree(folder / "left")
-
-
-def blind(folder: Path) -> None:
-    cv2.imwrite(str(folder / "right" / "free_3.png"), np.full((768, 1024), 90, np.uint8))
-
-
-def another_board(folder: Path) -> None:
-    path = folder / "session.yaml"
-    path.write_text(path.read_text().replace("columns: 12", "columns: 11"))
-
-
-def bad_session(folder: Path) -> None:
-    (folder / "session.yaml").write_text("board: {}\n")
-
-
-def no_image_of_a_place(folder: Path) -> None:
-    for side in ("left", "right"):
-        (folder / side / "under_deep.png").unlink()
-
-
-@pytest.mark.parametrize(
-    ("spoil", "says"),
-    [
-        (drop("free_2", "left"), "without a partner (1): right free_2.png"),
-        (smaller, "free_3.png is 640x480"),
-        (broken, "cannot read"),
-        (empty, "no images"),
-        (missing, "does not exist"),
-        (blind, "free_3: the right camera sees 0 corners"),
-        (another_board, "shows the session's board (11 x 9 squares of 10 mm"),
-        (bad_session, "phantom is missing"),
-        (no_image_of_a_place, "places.under_deep has no image"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_2(
-    session: Path, tmp_path: Path, capsys: Out, spoil: Callable[[Path], None], says: str
+def test_what_is_doubted_is_told_in_words_figures_and_exit_code(
+    seen: dict[str, list[BoardView]],
+    arguments: list[str],
+    tmp_path: Path,
+    capsys: Out,
+    monkeypatch: Patch,
 ) -> None:
-    spoil(session)
-    output = tmp_path / "rig.yaml"
-    assert calibrate_stereo(arguments(session, "--output", str(output))) == 2
-    assert says in one_line(capsys)
+    output, figures = tmp_path / "rig.yaml", tmp_path / "figures.json"
+    words = [*arguments, "--output", str(output), "--json", str(figures)]
+    assert calibrate_stereo(["--board", str(tmp_path / "board.pdf")]) == 0
+    assert "100 %" in capsys.readouterr().out
+    assert calibrate_stereo([*words, "--goal-mm", "0.001"]) == 1
+    assert "NOT within 0.001 mm" in capsys.readouterr().out
+    monkeypatch.setattr(calibrating, "doubts", lambda *_: ["does its place hold"])
+    assert calibrate_stereo(words) == 1
+    assert "NOT OK: does its place hold" in capsys.readouterr().out
+    assert json.loads(figures.read_text())["problem"] == "does its place hold"
+    output.unlink()
+
+    def apart(*_: object) -> None:
+        raise PairsApartError("free_1, not captured simultaneously")
+
+    monkeypatch.setattr(calibrating, "calibrate", apart)
+    assert calibrate_stereo(words) == 1
+    assert "free_1, not captured simultaneously; nothing is written" in capsys.readouterr().out
+    assert json.loads(figures.read_text())["problem"] == "free_1, not captured simultaneously"
     assert not output.exists()
 
 
 def test_bad_arguments_are_one_line_and_exit_2(
-    recorded: Path, tmp_path: Path, calibration_path: Path, capsys: Out
+    seen: dict[str, list[BoardView]],
+    arguments: list[str],
+    tmp_path: Path,
+    calibration_path: Path,
+    capsys: Out,
 ) -> None:
-    nowhere = str(tmp_path / "none" / "rig.yaml")
+    nowhere, known = str(tmp_path / "none" / "rig.yaml"), ["--calibration", str(calibration_path)]
     for words in (
         [],
         ["--wrong"],
         ["--board", str(tmp_path / "board.gif")],
-        arguments(recorded),
-        arguments(recorded, "--output", nowhere),
-        arguments(recorded, "--output", str(tmp_path / "rig.yaml"), "--goal-mm", "nan"),
+        arguments,
+        [*arguments, "--output", nowhere],
+        [*arguments, "--output", str(tmp_path / "rig.yaml"), "--goal-mm", "nan"],
     ):
         assert calibrate_stereo(words) == 2, words
         one_line(capsys)
-    known = ["--calibration", str(calibration_path)]
+    session = arguments[-2:]
     for words in (
         [],
         known,
-        arguments(recorded, "--calibration", nowhere),
-        arguments(recorded, *known, "--live", "surface_a"),
-        arguments(recorded, *known, "--limit-mm", "0"),
-        [*known, "--session", str(recorded / "session.yaml"), "--live", "nowhere"],
+        [*arguments, "--calibration", nowhere],
+        [*arguments, *known, "--live", "surface_a"],
+        [*known, *session, "--left", "l", "--live", "surface_a"],
+        [*arguments, *known, "--limit-mm", "0"],
+        [*known, *session, "--live", "nowhere"],
     ):
         assert check_calibration(words) == 2, words
         one_line(capsys)
+    other = tmp_path / "other.yaml"
+    text = calibration_path.read_text()
+    other.write_text(text.replace("image_width: 1024", "image_width: 1280"))
+    assert check_calibration([*arguments, "--calibration", str(other)]) == 2
+    assert "left images are 1024x768" in one_line(capsys)
 
 
-def test_a_calibration_for_another_resolution(
-    recorded: Path, tmp_path: Path, calibration_path: Path, capsys: Out
+@pytest.mark.parametrize("found", ["result", "box_result"])
+def test_pictures_show_cameras_boards_and_what_corners_miss_by(
+    request: pytest.FixtureRequest, found: str, tmp_path: Path
 ) -> None:
-    content = yaml.safe_load(calibration_path.read_text())
-    content["right"]["image_width"] = 1280
-    path = tmp_path / "other.yaml"
-    path.write_text(yaml.safe_dump(content))
-    assert check_calibration(arguments(recorded, "--calibration", str(path))) == 2
-    assert "right images are 1024x768" in one_line(capsys)
-
-
-def test_a_place_given_wrong_is_pointed_at(session: Path, tmp_path: Path, capsys: Out) -> None:
-    content = yaml.safe_load((session / "session.yaml").read_text())
-    content["places"]["surface_b"]["origin"] = flat_pose([0.0185, -0.040, 0.0025])[:3, 3].tolist()
-    (session / "session.yaml").write_text(yaml.safe_dump(content))
-    figures = tmp_path / "figures.json"
-    words = arguments(session, "--output", str(tmp_path / "rig.yaml"), "--json", str(figures))
-    assert calibrate_stereo(words) == 1
-    text = capsys.readouterr().out
-    assert "NOT OK: surface_" in text
-    assert "does its place hold" in json.loads(figures.read_text())["problem"]
-
-
-def test_the_board_command_writes_a_board(tmp_path: Path, capsys: Out) -> None:
-    assert calibrate_stereo(["--board", str(tmp_path / "board.pdf")]) == 0
-    assert (tmp_path / "board.pdf").stat().st_size > 5000
-    assert "100 %" in capsys.readouterr().out
+    result: RigCalibration = request.getfixturevalue(found)
+    side_view, along = rig_figure(result).axes
+    for axes, axis in ((side_view, 2), (along, 1)):
+        lines = [np.asarray(line.get_xydata()) for line in axes.get_lines()]
+        for camera in (result.calibration.left, result.calibration.right):
+            place = 1e3 * camera.centre[[axis, 0]]
+            assert any(len(xy) == 1 and np.allclose(xy, place) for xy in lines)
+        assert sum(len(xy) == 5 for xy in lines) == len(result.model.views)
+    left, right, errors = residual_figure(result).axes
+    for axes, side in ((left, "left"), (right, "right")):
+        (arrows,) = axes.collections
+        np.testing.assert_allclose(np.asarray(arrows.get_offsets()), result.model.pixels[side])
+    heights = [bar.get_height() for bar in errors.patches]  # type: ignore[attr-defined]
+    assert len(heights) == len(SIDES) * len(result.model.views)
+    assert heights[0] == pytest.approx(result.reprojection_rms_px("left", 0))
+    with pytest.raises(UserError, match="cannot write"):
+        save_figure(Figure(), tmp_path / "none" / "rig.png")

@@ -1,25 +1,48 @@
+"""What a session file says, and what it may not say."""
+
 from __future__ import annotations
 
+import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from needle_core.errors import UserError
-from needle_tracker.calibrating.calibration_session import load_session, parse_session
+from needle_tracker.calibrating.calibration_session import Place, load_session, parse_session
+from needle_tracker.optics.calibration import SIDES
 
-from .session import session_content
-from .synthetic_rig import flat_pose, surface_places, under_places
+from .synthetic_rig import BOARD, GIVEN_BOX, PLACES, STANDS, flat_pose, session_content
 
-
-def content(**places: Any) -> dict[str, Any]:
-    return session_content({}) | {"places": places}
+FLAT = {"origin": [0.018, -0.04, 0.01]}
 
 
-def test_a_place_written_is_the_place_read() -> None:
-    places = {**surface_places(0.0175), **under_places(0.0175)}
-    read = parse_session(session_content(places))
-    for name, place in places.items():
+def entry(place: Place) -> dict[str, Any]:
+    T = place.T_rig_board
+    said = {"origin": T[:3, 3].tolist(), "columns": T[:3, 0].tolist(), "rows": T[:3, 1].tolist()}
+    return said | {"under_surface": place.under_surface, "sigma": place.sigma}
+
+
+def box_content(**places: Any) -> dict[str, Any]:
+    """A session file with a window for each camera in place of the phantom."""
+    said = session_content(**places)
+    del said["phantom"]
+    for side, window in zip(SIDES, GIVEN_BOX, strict=True):
+        values = {"point": window.point.tolist(), "normal": window.normal.tolist()}
+        layers = [dataclasses.asdict(layer) for layer in window.layers]
+        said[side] = {"window": values | {"layers": layers, "inside": window.inside}}
+    return said
+
+
+def test_a_session_written_is_the_session_read(tmp_path: Path) -> None:
+    path = tmp_path / "session.yaml"
+    path.write_text(yaml.safe_dump(session_content(**{n: entry(p) for n, p in PLACES.items()})))
+    read = load_session(path)
+    assert read.board == BOARD
+    assert [w.inside for w in read.windows] == [1.33, 1.33]
+    for name, place in PLACES.items():
         found = read.place_of(name)
         assert found is not None
         np.testing.assert_allclose(found.T_rig_board, place.T_rig_board, atol=1e-12)
@@ -27,17 +50,24 @@ def test_a_place_written_is_the_place_read() -> None:
     assert read.place_of("free_1") is None
 
 
-def test_by_default_a_board_lies_flat_along_the_insertion() -> None:
-    session = parse_session(content(**{"on_*": {"origin": [0.018, -0.04, 0.01]}}))
-    place = session.place_of("on_top_3")
-    assert place is not None
+def test_a_session_says_windows_and_what_is_held_in_the_box() -> None:
+    places = {"stand": entry(STANDS), "box_*": {"under_surface": True}}
+    session = parse_session(box_content(**places))
+    for window, given in zip(session.windows, GIVEN_BOX, strict=True):
+        assert window.normal.tolist() == given.normal.tolist()
+        assert (window.layers, window.inside) == (given.layers, given.inside)
+    held, stands = session.place_of("box_07"), session.place_of("stand")
+    assert held is not None
+    assert stands is not None
+    assert (held.under_surface, held.is_known) == (True, False)
+    assert (stands.under_surface, stands.is_known, stands.sigma) == (True, True, 0.0)
+
+
+def test_places_are_found_by_name_or_pattern_and_lie_flat_by_default() -> None:
+    session = parse_session(session_content(**{"on_17.5": FLAT, "on_18.*": FLAT}))
+    place = session.place_of("on_17.5")
+    assert place is session.places["on_17.5"]
     np.testing.assert_allclose(place.T_rig_board, flat_pose([0.018, -0.04, 0.01]), atol=1e-12)
-
-
-def test_a_name_may_have_dots() -> None:
-    flat = {"origin": [0.018, -0.04, 0.01]}
-    session = parse_session(content(**{"on_17.5": flat, "on_18.*": flat}))
-    assert session.place_of("on_17.5") is session.places["on_17.5"]
     assert session.place_of("on_18.25") is session.places["on_18.*"]
     assert session.place_of("on_17") is None
 
@@ -48,31 +78,42 @@ def test_a_name_may_have_dots() -> None:
         ({}, "places.a.origin"),
         ({"origin": [0, 0]}, "places.a.origin wants 3 numbers, has 2"),
         ({"origin": [0.018, 0, float("nan")]}, "places.a.origin .* not a finite number"),
-        ({"origin": [0.018, 0, 0], "colums": [0, 0, 1]}, "unknown key 'colums'"),
-        ({"origin": [0.018, 0, 0], "columns": [0, 1, 1]}, "right angles"),
-        ({"origin": [0.018, 0, 0], "columns": [0, 0, 0]}, "right angles"),
-        ({"origin": [0.018, 0, 0], "rows": [0, -1, 0]}, "faces downwards"),
-        ({"origin": [0.018, 0, 0], "sigma": -1.0}, "places.a.sigma"),
-        ({"origin": [0.018, 0, 0], "under_surface": True}, "above the surface"),
+        (FLAT | {"colums": [0, 0, 1]}, "unknown key 'colums'"),
+        (FLAT | {"columns": [0, 1, 1]}, "right angles"),
+        (FLAT | {"rows": [0, -1, 0]}, "faces downwards"),
+        (FLAT | {"sigma": -1.0}, "places.a.sigma"),
+        (FLAT | {"under_surface": True}, "above the surface"),
         ({"origin": [0.0, 0, 0]}, "below the surface"),
         ({"origin": [0.0, 0, 0], "under_surface": "yes"}, "not true or false"),
+        ({"under_surface": True, "sigma": 1e-4}, "places.a.origin"),
     ],
 )
 def test_a_wrong_place_is_named(place: dict[str, Any], says: str) -> None:
     with pytest.raises(UserError, match=says):
-        parse_session(content(a=place))
+        parse_session(session_content(a=place))
 
 
-def test_a_file_that_is_no_session(tmp_path: Any) -> None:
+@pytest.mark.parametrize(
+    ("place", "says"),
+    [
+        # Level, its print up: the camera beside sees its edge.
+        ({"origin": [0.0, -0.04, 0.01]}, "away from the camera"),
+        ({"origin": [0.03, -0.01, 0.01], "rows": [-1, 1, 0]}, "above the surface"),
+    ],
+)
+def test_a_wrong_place_in_a_box_is_named(place: dict[str, Any], says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        parse_session(box_content(a=place | {"under_surface": True}))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [(b"\xff\xfe\x00", "not a text file"), (b"a: [", "not YAML"), (b"[]", "not a mapping")],
+)
+def test_a_file_that_is_no_session_is_refused(tmp_path: Path, text: bytes, says: str) -> None:
     path = tmp_path / "session.yaml"
     with pytest.raises(UserError, match="cannot be read: No such file"):
         load_session(path)
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UserError, match="not a text file"):
-        load_session(path)
-    path.write_text("a: [")
-    with pytest.raises(UserError, match="not YAML"):
-        load_session(path)
-    path.write_text("[]")
-    with pytest.raises(UserError, match="not a mapping"):
+    path.write_bytes(text)
+    with pytest.raises(UserError, match=says):
         load_session(path)

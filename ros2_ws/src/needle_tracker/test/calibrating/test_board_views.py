@@ -1,0 +1,103 @@
+"""From images in folders, or of several exposures, to what both cameras saw of the board."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from needle_core.errors import UserError
+from needle_tracker.calibrating.board_views import averaged_view, views_in_folders
+from needle_tracker.calibrating.calibration_session import Place, Session
+from needle_tracker.calibrating.charuco import CharucoBoard
+from needle_tracker.optics.calibration import SIDES
+
+from .drawn_boards import SMALL, board_image
+from .synthetic_rig import GIVEN, flat_pose
+
+SESSION = Session(SMALL, GIVEN, {"top": Place(flat_pose([0.018, 0.0, 0.0]))})
+IMAGE = board_image(SMALL, 24, 24)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for side in SIDES:
+        (tmp_path / side).mkdir()
+        for name in ("top", "free_1"):
+            cv2.imwrite(str(tmp_path / side / f"{name}.png"), IMAGE)
+    return tmp_path
+
+
+def test_each_pair_of_images_is_a_view(folder: Path) -> None:
+    cv2.imwrite(str(folder / "right" / "free_1.png"), np.full_like(IMAGE, 90))
+    views, sizes = views_in_folders(folder / "left", folder / "right", SESSION)
+    assert sizes == dict.fromkeys(SIDES, IMAGE.shape[::-1])
+    assert [view.name for view in views] == ["free_1", "top"]
+    free, top = views
+    assert (free.place, top.place) == (None, SESSION.places["top"])
+    assert len(free.right.points) == 0
+    for corners in (top.left, top.right, free.left):
+        np.testing.assert_allclose(corners.points, SMALL.corners)
+        expected = 24 * SMALL.corners[:, :2] / SMALL.square + 24 - 0.5
+        np.testing.assert_allclose(corners.pixels, expected, atol=0.5)
+
+
+def drop(name: str) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).unlink()
+
+
+def write(name: str, image: np.ndarray) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+def broken(folder: Path) -> None:
+    (folder / "right" / "top.png").write_bytes(b"not an image")
+
+
+def no_image_of_the_place(folder: Path) -> None:
+    for side in SIDES:
+        (folder / side / "top.png").rename(folder / side / "other.png")
+
+
+def another_board(folder: Path) -> None:
+    other = board_image(CharucoBoard(6, 4, dictionary="DICT_4X4_50"), 24, 24)
+    for side in SIDES:
+        for name in ("top", "free_1"):
+            cv2.imwrite(str(folder / side / f"{name}.png"), other)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (drop("left/free_1.png"), r"without a partner \(1\): right free_1.png"),
+        (write("right/top.png", np.zeros((48, 64), np.uint8)), "top.png is 64x48"),
+        (broken, "cannot read .*top.png"),
+        (no_image_of_the_place, "places.top has no image"),
+        (another_board, "give `columns: 6` as its board"),
+    ],
+)
+def test_folders_that_are_no_session_are_refused(
+    folder: Path, spoil: Callable[[Path], object], says: str
+) -> None:
+    spoil(folder)
+    with pytest.raises(UserError, match=says):
+        views_in_folders(folder / "left", folder / "right", SESSION)
+
+
+def test_a_board_that_stood_still_is_the_mean_of_its_exposures() -> None:
+    moved = np.roll(IMAGE, 1, axis=1)
+    hidden = IMAGE.copy()
+    hidden[:, 84:] = 255
+    pairs = [dict(zip(SIDES, pair, strict=True)) for pair in ((IMAGE, IMAGE), (moved, hidden))]
+    view = averaged_view("top", SESSION, pairs)
+    assert view.place is SESSION.places["top"]
+    numbers, pixels = SMALL.find(IMAGE)
+    np.testing.assert_allclose(view.left.pixels, pixels + np.array([0.5, 0.0]), atol=0.02)
+    # A corner that half of the exposures show is not kept.
+    assert 0 < len(view.right.points) < len(numbers)
+    blank = np.full_like(IMAGE, 90)
+    with pytest.raises(UserError, match="no image shows the session's board"):
+        averaged_view("top", SESSION, [dict.fromkeys(SIDES, blank)])

@@ -1,0 +1,155 @@
+"""Squares and places given wrong, and pairs not taken at once: they hardly show in the errors."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from needle_sim.camera.stereo_rig import StereoRig
+from needle_tracker.calibrating.calibrate_stereo import report
+from needle_tracker.calibrating.calibration_outliers import doubts, ring_patterns, square_error
+from needle_tracker.calibrating.pair_consistency import PairsApartError, consistent_views
+from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
+from needle_tracker.calibrating.rig_model import BoardView, Corners
+from needle_tracker.optics.calibration import StereoCalibration
+
+from .synthetic_rig import GIVEN, PLACES, SIZES, free_pose, lenses_of, take, view_of
+
+
+def said_larger(views: list[BoardView], share: float) -> list[BoardView]:
+    """Views of a board whose squares are said to be larger than they are."""
+    return [
+        dataclasses.replace(
+            view,
+            left=Corners((1.0 + share) * view.left.points, view.left.pixels),
+            right=Corners((1.0 + share) * view.right.points, view.right.pixels),
+        )
+        for view in views
+    ]
+
+
+def test_wrong_squares_are_found_by_their_size(
+    views: list[BoardView], calibration: StereoCalibration
+) -> None:
+    """0.3 % is 0.4 mm at the tip, and 0.01 px more reprojection error."""
+    result = calibrate(said_larger(views[4:], 0.003), SIZES, GIVEN, lenses_of(calibration))
+    error, sigma = square_error(result)
+    assert error == pytest.approx(-0.003, abs=max(4.0 * sigma, 3e-4))
+    assert "smaller than the session says" in doubts(result, (error, sigma))[0]
+
+
+def test_one_place_does_not_tell_the_size_of_the_squares(
+    views: list[BoardView], calibration: StereoCalibration
+) -> None:
+    found = said_larger(views[2:7], 0.01)
+    result = calibrate(found, SIZES, GIVEN, lenses_of(calibration))
+    size = square_error(result)
+    assert not size[1] < 0.1
+    assert doubts(result, size) == []
+    assert "size of the squares: not told by these views" in report(result, size, 0.06)
+
+
+@pytest.mark.parametrize(
+    ("name", "shift", "says"),
+    [
+        # Index and surface take most of it, and tips are as wrong.
+        ("under_deep", [1e-3, 0.0, 0.0], "under_deep comes out 0."),
+        ("surface_b", [0.0, 0.0, 2e-3], "does its place hold"),
+    ],
+)
+def test_a_wrong_place_is_found(
+    views: list[BoardView], calibration: StereoCalibration, name: str, shift: list[float], says: str
+) -> None:
+    number = next(i for i, view in enumerate(views) if view.name == name)
+    place = views[number].place
+    assert place is not None
+    pose = place.T_rig_board.copy()
+    pose[:3, 3] += shift
+    wrong = dataclasses.replace(views[number], place=dataclasses.replace(place, T_rig_board=pose))
+    found = [*views[5:number], wrong, *views[number + 1 :]]
+    result = calibrate(found, SIZES, GIVEN, lenses_of(calibration))
+    assert any(says in one for one in doubts(result, square_error(result)))
+
+
+def test_a_lens_that_plumb_bob_does_not_describe_is_not_ok(result: RigCalibration) -> None:
+    residuals = result.fit.residuals.copy()
+    out = result.model.pixels["right"] - result.calibration.right.camera_matrix[:2, 2]
+    away = np.linalg.norm(out, axis=1)[:, None]
+    residuals[-out.size :] += (0.05 * np.sin(away / 50.0) * out / away).ravel()
+    bent = dataclasses.replace(result, fit=dataclasses.replace(result.fit, residuals=residuals))
+    assert 0.03 < ring_patterns(bent)["right"] < 0.06
+    (said,) = doubts(bent, (0.0, np.inf))
+    assert "right camera: corners miss by up to 0.0" in said
+    assert "in a pattern of rings: its lens has more" in said
+
+
+FREE = 6
+
+
+@pytest.fixture(scope="module")
+def many(rig: StereoRig) -> list[BoardView]:
+    places = {name: PLACES[name] for name in ("surface_a", "under_deep", "under_wedge")}
+    return take(rig, free=FREE, places=places)
+
+
+def swapped(views: list[BoardView], partner: dict[int, int]) -> list[BoardView]:
+    """Views whose right images are those of others."""
+    return [
+        dataclasses.replace(view, right=views[partner.get(number, number)].right)
+        for number, view in enumerate(views)
+    ]
+
+
+def moved(rig: StereoRig, views: list[BoardView], numbers: set[int]) -> list[BoardView]:
+    """Views whose board moved by 0.3 mm between the left image and the right one."""
+    rng, result = np.random.default_rng(0), list(views)
+    for number in range(FREE):
+        pose, step = free_pose(rng), np.random.default_rng(number).normal(size=3)
+        pose[:3, 3] += 0.3e-3 * step / np.linalg.norm(step)
+        if number in numbers:
+            right = view_of(rig, "", pose, None, np.random.default_rng(number)).right
+            result[number] = dataclasses.replace(views[number], right=right)
+    return result
+
+
+@pytest.mark.parametrize(
+    ("partner", "moves", "apart"),
+    [
+        ({}, set(), []),
+        ({3: 5}, set(), ["free_03"]),
+        ({}, {1, 5}, ["free_01", "free_05"]),
+        ({7: 8}, set(), ["under_deep"]),
+    ],
+)
+def test_few_pairs_not_taken_at_once_are_left_out(
+    rig: StereoRig,
+    many: list[BoardView],
+    calibration: StereoCalibration,
+    partner: dict[int, int],
+    moves: set[int],
+    apart: list[str],
+) -> None:
+    found = swapped(moved(rig, many, moves), partner)
+    kept, left_out, pose = consistent_views(found, calibration, 4)
+    assert [view.name for view in left_out] == apart
+    assert len(kept) + len(left_out) == len(many)
+    assert pose is not None
+    expected = calibration.right.T_optical_rig @ np.linalg.inv(calibration.left.T_optical_rig)
+    np.testing.assert_allclose(pose, expected, atol=1e-3)
+
+
+def test_many_pairs_not_taken_at_once_are_the_reason_told(
+    rig: StereoRig, many: list[BoardView], calibration: StereoCalibration
+) -> None:
+    views = moved(rig, many, set(range(FREE)))[: FREE + 1]
+    with pytest.raises(PairsApartError, match=r"free_00, .*not captured simultaneously"):
+        consistent_views(views, calibration, 4)
+
+
+def test_a_place_that_only_one_image_shows_is_not_ok(result: RigCalibration) -> None:
+    place = next(view for view in result.model.views if view.name == "surface_a")
+    apart = dataclasses.replace(result, apart=[place])
+    assert "in surface_a, though" in doubts(apart, (0.0, np.inf))[0]
+    assert "WARNING: left and right do not show" in report(apart, (0.0, np.inf), 0.06)
