@@ -12,7 +12,7 @@ from needle_core import messages as m
 from needle_core.runners.faults import Fault
 from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_core.status_messages import ControllerStatus, DeviceStatus
-from needle_sim.drive_emulator import COMMAND_LINES
+from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES
 
 SIDES = ("left", "right")
 KINDS: dict[str, type[Any]] = {
@@ -48,7 +48,10 @@ class Person(c.Component):
             c.Output("sim/drive_positions", m.JointState),
             c.Output("needle/controller_status", ControllerStatus, c.LATCHED),
         )
-        self.ports = (c.Port(COMMAND_LINES, lambda *_: ()),)
+        self.ports = (
+            c.Port(COMMAND_LINES, lambda *_: ()),
+            c.Port(ADAPTER, partial(self._keep, ADAPTER)),
+        )
         self.timers = (c.Timer(0.01, self._act),)
 
     def on_answer(self, answer: c.Answer, at: c.Moment) -> c.Actions:

@@ -10,6 +10,8 @@ import pytest
 
 from needle_core.errors import UserError
 from needle_core.runners.faults import delay
+from needle_sim.drive_emulator import ADAPTER
+from needle_sim.drives.fault_commands import PlugOrder
 
 from .component_bench import DRIVER, DRIVES, ComponentBench, losing
 
@@ -162,6 +164,8 @@ def test_lines_that_are_no_commands_are_named_and_do_nothing() -> None:
     )
     bench.say(*bad)
     assert [text.split("'")[1] for text in bench.logs] == list(bad)
+    bench.say("unplug", "restore")
+    assert [*itertools.chain(*bench.heard(ADAPTER))] == [PlugOrder.OUT, PlugOrder.IN]
     bench.run(0.5)
     assert bench.status.state == "DISABLED"
     assert bench.error_codes == {0}

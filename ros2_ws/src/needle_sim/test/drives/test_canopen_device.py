@@ -113,14 +113,14 @@ def test_a_pdo_goes_on_change_by_the_event_timer_and_on_request(master: Master) 
 
 def test_a_synchronous_pdo_is_applied_with_the_sync_only(master: Master) -> None:
     remap(master, 1, [0x607A0020], 1, base=0x1400)
-    remap(master, 2, [0x60810020], 255, base=0x1400)
+    remap(master, 2, [0x60810020, 0x60830020], 255, base=0x1400)
     master.network.send_message(0x301, (77).to_bytes(4, "little"))
-    master.network.send_message(0x401, (88).to_bytes(4, "little"))
+    master.network.send_message(0x401, (88).to_bytes(4, "little") + bytes(4))
     assert (master.read(0x607A), master.read(0x6081)) == (0, 88)
     master.sync()
     assert master.read(0x607A) == 77
     # Too short to hold all that is mapped: not taken at all.
-    master.network.send_message(0x401, b"\1\0")
+    master.network.send_message(0x401, (99).to_bytes(4, "little"))
     assert master.read(0x6081) == 88
 
 
