@@ -1,17 +1,34 @@
+"""The paper's numbers from runs that are known, its page, figures, --json and command line."""
+
 from __future__ import annotations
 
+import functools
 import json
-import sys
+import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from needle_bags.reading.bag_reader import Run, read_run
+from needle_bringup.paper import paper_results, paper_runs
 from needle_bringup.paper.paper import main
 from needle_bringup.paper.paper_figures import common_r1, converged_share
 from needle_bringup.paper.paper_results import Floats, SteeringTrial, missed_later, settled_mm
-from needle_bringup.paper.paper_runs import Laboratory
+from needle_bringup.paper.paper_runs import Columns, Laboratory
+from needle_bringup.studies.limit_study import LimitRow, Reached
+from needle_bringup.workplace import checkout
+from needle_core.commands.cli import JsonValue
 from needle_core.errors import UserError
+
+COUNT = 400
+FIGURES: dict[str, JsonValue] = {
+    "runs": COUNT,
+    "converged_at_end": 0.99,
+    "converged_last_20": 0.985,
+    "settle_median_mm": 41.0,
+}
 
 
 def trial(insertion_mm: Floats, r1_mm: Floats) -> SteeringTrial:
@@ -34,15 +51,12 @@ def test_runs_that_missed_are_looked_at_again_farther_in() -> None:
     assert missed_later({"r1_final_mm": np.zeros(2)}, {"r1_final_mm": np.zeros(2)}) == (0, 0, 0.0)
 
 
-def test_trials_are_averaged_where_all_of_them_are() -> None:
+def test_trials_are_averaged_where_all_are_and_cells_hold_their_own_share() -> None:
     one = trial(np.arange(11.0), np.arange(11.0))
     other = trial(np.arange(0.0, 9.0, 2.0), np.zeros(5))
     insertion, r1 = common_r1([one, other])
     np.testing.assert_allclose(insertion, np.arange(9.0))
     np.testing.assert_allclose(r1.mean(axis=0), np.arange(9.0) / 2.0)
-
-
-def test_the_domain_s_cells_hold_their_own_share() -> None:
     runs = {
         "x_mm": np.array([-15.0, -15.0, 15.0]),
         "roll_deg": np.array([-45.0, -45.0, 45.0]),
@@ -52,50 +66,111 @@ def test_the_domain_s_cells_hold_their_own_share() -> None:
     np.testing.assert_allclose(shares, [[0.5, np.nan], [np.nan, 1.0]])
 
 
-def test_a_study_that_is_there_is_not_run_again(tmp_path: Path) -> None:
+def test_what_is_there_is_not_run_again_and_words_and_empty_cells_are_no_numbers(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "one.json").write_text(json.dumps({"runs": 2}), "utf-8")
-    (tmp_path / "one.csv").write_text("x_mm,settle_mm\n1,2\n3,\n", "utf-8")
-    figures, runs = Laboratory(["/nowhere"], tmp_path).study("one", "--frobnicate")
-    assert figures == {"runs": 2}
+    (tmp_path / "one.csv").write_text("x_mm,controller,settle_mm\n1,best,2\n3,best,\n", "utf-8")
+    laboratory = Laboratory(["/nowhere"], tmp_path)
+    figures, runs = laboratory.study("one", "--frobnicate")
+    assert figures == laboratory.identify("one", "bag") == {"runs": 2}
     np.testing.assert_array_equal(runs["x_mm"], [1.0, 3.0])
     np.testing.assert_array_equal(runs["settle_mm"], [2.0, np.nan])
+    assert set(runs) == {"x_mm", "settle_mm"}
 
 
-def test_the_numbers_of_a_study_are_read_whatever_else_it_writes(tmp_path: Path) -> None:
-    options = ("--controller", "paper", "--depth-mm", "3")
-    figures, runs = Laboratory(["/nowhere"], tmp_path).study("few", *options)
-    assert len(runs["r1_final_mm"]) == figures["runs"]
-    assert np.all(np.isfinite(runs["r1_final_mm"]))
-    assert "controller" not in runs
+def test_what_runs_is_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[list[str]] = []
+    monkeypatch.setattr(paper_runs, "_run", lambda name, command, good: asked.append(command))
+    laboratory = Laboratory(["simulate", "-q"], tmp_path)
+    for work, words in (
+        (laboratory.trial, ("one", "--level", "tip")),
+        (laboratory.study, ("two", "--draws", "1")),
+        (laboratory.identify, ("three", "one", "--from-mm", "5")),
+    ):
+        # Nothing has run, so nothing is there to be read.
+        with pytest.raises((FileNotFoundError, UserError)):
+            work(*words)
+    bag = str(tmp_path / "one")
+    assert asked[0] == ["simulate", "-q", "--level", "tip", "--bag", bag]
+    assert [Path(command[0]).name for command in asked[1:]] == ["monte_carlo", "identify_curvature"]
+    assert (asked[1][1:3], asked[2][1:4]) == (["--draws", "1"], [bag, "--from-mm", "5"])
 
 
-def test_a_trial_that_does_not_run_is_one_line(tmp_path: Path) -> None:
-    simulate = [sys.executable, "-c", "import sys; print('no rig', file=sys.stderr); sys.exit(2)"]
-    with pytest.raises(UserError, match=r"trial_1: .*code 2: no rig"):
-        Laboratory(simulate, tmp_path).trial("trial_1")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--seed", "x"], "'x'"),
-        (["--seed", "-1"], "--seed"),
-        (["--json", "/nowhere/f.json"], "/nowhere/f.json"),
-        (["--frobnicate"], "--frobnicate"),
-    ],
-)
 def test_bad_arguments_are_one_line_and_exit_2(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(arguments) == 2
-    captured = capsys.readouterr()
-    assert len(captured.err.strip().splitlines()) == 1
-    assert said in captured.err
-
-
-def test_an_out_that_is_a_file_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("", "utf-8")
-    assert main(["--out", str(tmp_path / "file")]) == 2
-    assert "--out" in capsys.readouterr().err
+    for words, said in (
+        (["--seed", "x"], "'x'"),
+        (["--seed", "-1"], "--seed"),
+        (["--json", "/nowhere/f.json"], "/nowhere/f.json"),
+        (["--out", str(tmp_path / "file")], "--out"),
+        (["--frobnicate"], "--frobnicate"),
+    ):
+        assert main(words) == 2
+        captured = capsys.readouterr()
+        assert len(captured.err.strip().splitlines()) == 1
+        assert said in captured.err
+
+
+@functools.cache
+def a_run() -> Run:
+    return read_run(checkout() / "bags" / "regression")
+
+
+class MadeUpLaboratory(Laboratory):
+    """Every trial is one bag, and every study the same runs: four miss, and farther in one."""
+
+    def trial(self, name: str, *arguments: str) -> Run:
+        return a_run()
+
+    def study(self, name: str, *arguments: str) -> tuple[dict[str, JsonValue], Columns]:
+        rng = np.random.default_rng(0)
+        columns = {
+            "x_mm": rng.uniform(-20.0, 20.0, COUNT),
+            "pitch_deg": rng.uniform(-40.0, 40.0, COUNT),
+            "roll_deg": rng.uniform(-90.0, 90.0, COUNT),
+            "r1_final_mm": rng.uniform(-0.9, 0.9, COUNT),
+        }
+        columns["r1_final_mm"][:4] = 0.5 if "240" in arguments else 1.5
+        columns["r1_final_mm"][0] = -2.0
+        return FIGURES, columns
+
+    def identify(self, name: str, bag: str, *arguments: str) -> dict[str, JsonValue]:
+        return {"radius_mm": 121.0, "radius_low_mm": 118.5, "radius_high_mm": 124.5}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder with all that `paper` writes of made-up runs."""
+    folder = tmp_path_factory.mktemp("paper")
+    row = LimitRow(Reached(0.14, 0.2, 0.999), Reached(0.11, 0.15, 1.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper_runs, "Laboratory", MadeUpLaboratory)
+        patch.setattr(paper_results, "limits", lambda *_: {"noise ±1 mm": row})
+        words = ["--quick", "--out", str(folder / "out"), "--json", str(folder / "figures.json")]
+        assert main(words) == 0
+    return folder
+
+
+def test_the_page_has_the_paper_s_values_beside_those_of_the_runs(written: Path) -> None:
+    page = (written / "out" / "paper.md").read_text("utf-8")
+    for cells in (
+        "endpoint grid: within ±1 mm at 120 mm",
+        "| 98.56 % | 99.00 % / 98.50 % |",
+        "| 144 of 10,000; none diverged | 4 of 400; 3 of them within ±1 mm at 240 mm, the worst 2",
+        "| 12.2 cm | 12.10 cm (95 %: 118.5 to 124.5 mm) |",
+        "0.14 mm, 0.20 mm, 99.9 %; limit 0.11 mm, 0.15 mm, 100.0 %",
+    ):
+        assert cells in page
+    images = sorted((written / "out" / "images").glob("*.png"))
+    assert [f"images/{image.name}" in page for image in images] == [True] * 4
+    for path in images:
+        image = cv2.imread(str(path))
+        assert image is not None
+        assert np.ptp(image) > 200
+    values = json.loads((written / "figures.json").read_text())
+    assert (values["endpoint_missed"], values["endpoint_missed_also_later"]) == (4, 1)
+    assert values["limit_noise_1_mm_point_rms_mm"] == 0.15
+    assert all(math.isfinite(value) for value in values.values())

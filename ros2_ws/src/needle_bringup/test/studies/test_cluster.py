@@ -1,147 +1,150 @@
-"""Studies on a real scheduler and real workers, each a process: the same bits, whoever dies."""
+"""Studies on a cluster that the test plays: the same bits, in order, whoever is lost."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import socket
 import sys
-from collections.abc import Iterator
+import types
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dask_cluster import NEEDED, Cluster
-from dying_part import end_every, end_process, end_the_first
 from needle_bringup.studies import cluster, cluster_study
 from needle_bringup.studies.cluster import on_cluster
-from needle_bringup.studies.cluster_study import ClusterPart, digest, run_part, run_parts
 from needle_bringup.studies.monte_carlo import main
-from needle_bringup.studies.monte_carlo_options import parse
-from needle_bringup.studies.study_parts import parts_of
 from needle_core.errors import UserError
 
-STUDY = ("--draws", "3", "--depth-mm", "4", "--seed", "5")
-PARTS = parts_of(parse(STUDY))
+ADDRESS = "tcp://10.0.0.5:8786"
 
 
-@pytest.fixture(scope="module")
-def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    started = Cluster(tmp_path_factory.mktemp("cluster"), 2)
-    yield started
-    started.end()
+class LostConnection(Exception):
+    pass
 
 
-def figures_of(folder: Path, *words: str) -> tuple[dict[str, object], str]:
-    files = ["--json", str(folder / "f.json"), "--csv", str(folder / "f.csv")]
-    assert main([*STUDY, *words, *files]) == 0
+class KilledWorker(Exception):
+    pass
+
+
+class Future:
+    """A part that is done when its result is asked for."""
+
+    def __init__(self, key: str, work: Callable[[], Any]) -> None:
+        self.key, self.result = key, work
+
+    def release(self) -> None:
+        pass
+
+
+class Dask(types.ModuleType):
+    """Stands for `distributed`: does parts here, the last first, as long as nothing is lost."""
+
+    KilledWorker, CancelledError = KilledWorker, LostConnection
+
+    def __init__(self) -> None:
+        super().__init__("distributed")
+        self.answers = True
+        self.lost_after: list[int] = []
+        """Of each connection, the parts after which it is lost."""
+        self.asked: list[int] = []
+
+    def Client(self, address: str, timeout: float) -> Dask:
+        assert address == ADDRESS
+        if not self.answers:
+            raise OSError("Timed out\nafter 30 s")
+        return self
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def as_completed(self, futures: Sequence[Future]) -> Iterator[Future]:
+        self.asked.append(len(futures))
+        left = self.lost_after.pop(0) if self.lost_after else len(futures)
+        return self._done(list(reversed(futures)), left)
+
+    def _done(self, ready: Sequence[Future], left: int) -> Iterator[Future]:
+        yield from ready[:left]
+        if left < len(ready):
+            raise LostConnection
+
+
+@pytest.fixture
+def dask(monkeypatch: pytest.MonkeyPatch) -> Dask:
+    module = Dask()
+
+    def submit(
+        _: Dask, run: Callable[[Any], Any], parts: Sequence[Any], **__: object
+    ) -> list[Future]:
+        return [Future(f"{n}", partial(run, part)) for n, part in enumerate(parts)]
+
+    monkeypatch.setattr(Dask, "map", submit, raising=False)
+    monkeypatch.setitem(sys.modules, "distributed", module)
+    return module
+
+
+def square(number: int) -> int:
+    if number < 0:
+        raise KilledWorker("killed 3 times")
+    return number**2
+
+
+def test_results_come_in_the_order_of_the_parts_also_over_a_lost_connection(dask: Dask) -> None:
+    assert list(on_cluster(ADDRESS, square, range(5))) == [0, 1, 4, 9, 16]
+    dask.lost_after = [2, 1]
+    assert list(on_cluster(ADDRESS, square, range(5))) == [0, 1, 4, 9, 16]
+    assert dask.asked == [5, 5, 3, 2]
+
+
+def test_what_cannot_go_on_is_one_line(dask: Dask, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refusal(*parts: int, address: str = ADDRESS) -> str:
+        with pytest.raises(UserError) as error:
+            list(on_cluster(address, square, parts))
+        return str(error.value)
+
+    assert "(out of memory? their logs say more)" in refusal(-1)
+    dask.lost_after = [0]
+    assert refusal(1, 2).endswith("lost, with 0 of 2 parts done")
+    dask.answers = False
+    assert refusal(1) == f"--scheduler {ADDRESS}: Timed out after 30 s"
+    for address in ("somewhere", "gopher://a:1", "tcp://a", "tcp://a:b"):
+        assert "is not tcp://HOST:PORT" in refusal(address=address)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert "scripts/dask --version installs it" in refusal(1)
+
+
+def test_a_worker_with_other_code_is_refused(dask: Dask, monkeypatch: pytest.MonkeyPatch) -> None:
+    here = cluster.identity()
+    known = iter([{**here, "numpy": "1.0.0"}, here])
+    monkeypatch.setattr(cluster, "identity", lambda: next(known))
+    with pytest.raises(UserError, match=r"has numpy \S+ in place of 1\.0\.0; all machines"):
+        list(on_cluster(ADDRESS, square, [1]))
+
+
+def figures_of(folder: Path, *words: str) -> tuple[Mapping[str, object], str]:
+    study = ["--targets", "3", "--depth-mm", "2", "--json", str(folder / "f.json")]
+    assert main([*study, "--csv", str(folder / "f.csv"), *words]) == 0
     figures = json.loads((folder / "f.json").read_text("utf-8"))
     for key in ("wall_s", "cpu_s"):
         assert figures.pop(key) > 0.0
     return figures, (folder / "f.csv").read_text("utf-8")
 
 
-@NEEDED
-def test_a_cluster_gives_the_figures_of_one_machine(
-    two_workers: Cluster, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+def test_a_cluster_gives_the_figures_of_one_machine_and_one_that_rounds_otherwise_is_named(
+    dask: Dask,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    alone = figures_of(tmp_path)
-    assert figures_of(tmp_path, "--scheduler", two_workers.address) == alone
-    assert "warning" not in capfd.readouterr().err
-    points = ("--targets", "30", "--controller", "sliding_mode")
-    assert figures_of(tmp_path, *points, "--scheduler", two_workers.address) == figures_of(
-        tmp_path, *points
-    )
-
-
-@NEEDED
-def test_a_killed_worker_costs_only_time(two_workers: Cluster, tmp_path: Path) -> None:
-    asked = [(tmp_path / "killed", ClusterPart(part, PARTS[0].of_first(2))) for part in PARTS]
-    done = on_cluster(two_workers.address, end_the_first, asked)
-    assert [digest(part.outcomes) for part in done] == [digest(part.run()) for part in PARTS]
-    assert (tmp_path / "killed").exists()
-
-
-@NEEDED
-def test_a_part_that_ends_every_worker_is_given_up(two_workers: Cluster) -> None:
-    with pytest.raises(UserError, match=r"workers died while running it.*out of memory"):
-        list(on_cluster(two_workers.address, end_every, [None]))
-
-
-@NEEDED
-def test_a_worker_with_other_code_is_refused(
-    two_workers: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here = {**cluster.identity(), "numpy": "1.0.0"}
-    monkeypatch.setattr(cluster, "identity", lambda: here)
-    with pytest.raises(UserError, match=r"has numpy \S+ in place of 1\.0\.0; all machines"):
-        run_parts(two_workers.address, PARTS, PARTS[0].of_first(2), lambda _: None)
-
-
-@NEEDED
-def test_a_machine_that_rounds_otherwise_is_named(
-    two_workers: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # What the workers say stays what it was.
-    monkeypatch.setattr(cluster_study, "digest", lambda _: "other bits")
-    done = run_parts(two_workers.address, PARTS[:2], PARTS[0].of_first(2), lambda _: None)
-    assert done.differing == (socket.gethostname(),)
-
-
-@NEEDED
-def test_a_lost_connection_is_made_again(
-    two_workers: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import distributed  # noqa: PLC0415
-
-    whole = distributed.as_completed
-
-    def cut(done: Iterator[Any]) -> Iterator[Any]:
-        monkeypatch.setattr(distributed, "as_completed", whole)
-        yield next(done)
-        raise distributed.CancelledError
-
-    monkeypatch.setattr(distributed, "as_completed", lambda futures: cut(whole(futures)))
-    asked = [ClusterPart(part, PARTS[0].of_first(2)) for part in PARTS]
-    done = on_cluster(two_workers.address, run_part, asked)
-    assert [digest(part.outcomes) for part in done] == [digest(part.run()) for part in PARTS]
-
-
-@NEEDED
-def test_a_lost_scheduler_ends_the_study_in_one_line(tmp_path: Path) -> None:
-    started = Cluster(tmp_path, 1, "--no-nanny")
-    with pytest.raises(UserError, match="lost, with 0 of 1 parts done"):
-        list(on_cluster(started.address, end_process, [started.scheduler.pid]))
-    started.end()
-
-
-@NEEDED
-def test_a_scheduler_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "CONNECTS_WITHIN", 0.5)
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-    with pytest.raises(UserError, match=f"tcp://127.0.0.1:{port}: Timed out"):
-        list(on_cluster(f"tcp://127.0.0.1:{port}", end_every, [None]))
-
-
-def test_without_dask_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UserError, match="scripts/dask --version installs it"):
-        list(on_cluster("tcp://127.0.0.1:1", run_part, []))
-
-
-@pytest.mark.parametrize("address", ["somewhere", "gopher://a:1", "tcp://a", "tcp://a:b"])
-def test_what_is_no_address_is_refused(address: str) -> None:
-    with pytest.raises(UserError, match=f"--scheduler '{address}' is not tcp://HOST:PORT"):
-        list(on_cluster(address, run_part, []))
-
-
-def test_each_run_says_what_it_was_run_with(tmp_path: Path) -> None:
-    _, text = figures_of(tmp_path, "--slip", "0.02", "--draws", "1")
-    rows = list(csv.DictReader(io.StringIO(text)))
-    assert [row["run"] for row in rows] == [str(number) for number in range(1000)]
-    for name, value in {"slip": "0.02", "seed": "5", "controller": "best", "x_mm": "-3"}.items():
-        assert rows[0][name] == value
-    assert rows[0]["rotation_deg"] != rows[0]["most_rotation_deg"] == "1e6"
+    figures, runs = figures_of(tmp_path)
+    there = figures_of(tmp_path, "--scheduler", ADDRESS)
+    assert there == (figures, runs)
+    assert "warning" not in capsys.readouterr().err
+    monkeypatch.setattr(cluster_study, "_witness_digest", lambda _: "other bits")
+    figures_of(tmp_path, "--scheduler", ADDRESS)
+    assert f"warning: {socket.gethostname()} rounds otherwise" in capsys.readouterr().err

@@ -7,74 +7,87 @@ import math
 import numpy as np
 import pytest
 
+from needle_bringup.studies import limit_study
 from needle_bringup.studies.limit_study import BOUNDS, ROWS, limits
 from needle_bringup.studies.particle_filter import ParticleFilter
 from needle_controller.model.arrays import Array
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.tissue import Torsion
 from needle_sim.studies.disturbances import Disturbances
-from needle_sim.studies.start_grids import StartBounds
 
+pytestmark = pytest.mark.usefixtures("compiled")
 CURVATURE, STEP, NOISE = 1.0 / 0.122, 0.001, 0.001
 
 
-def particle_filter(wrong: Disturbances, bounds: StartBounds = BOUNDS) -> ParticleFilter:
-    return ParticleFilter(CURVATURE, wrong, bounds, 3000, seed=7)
+def particle_filter(wrong: Disturbances, particles: int = 1500) -> ParticleFilter:
+    return ParticleFilter(CURVATURE, wrong, BOUNDS, particles, seed=7)
 
 
-def followed(
-    filter_: ParticleFilter, wrong: Disturbances, *, late: int = 0
-) -> tuple[Array, list[float]]:
-    """Insert a needle by 60 mm with two turns; return its pose and how far off x was, in sigmas."""
+def followed(filter_: ParticleFilter, wrong: Disturbances, late: int = 0) -> tuple[Array, float]:
+    """Insert a needle by 60 mm with two turns; return its pose and how often x was within 3 sigma.
+
+    A tip of ten is far off where there are outliers.
+    """
     torsion = Torsion(wrong.play, wrong.lag_length)
     plant = NeedlePlant(initial_pose(0.1, -0.3), curvature=CURVATURE)
-    rng, tips, off = np.random.default_rng(3), [], []
+    rng, tips, within = np.random.default_rng(3), [], []
     for k in range(61):
         if k:
             turn = 0.5 if 10 < k < 15 or 30 < k < 33 else 0.0
             plant.advance(STEP, float(torsion.advance(STEP, turn)))
             filter_.advance(STEP, turn)
-        tips.append(np.array(plant.T_rig_tip[:3, 3]) + rng.uniform(-NOISE, NOISE, 3))
+        off = rng.uniform(-NOISE, NOISE, 3)
+        if wrong.noise_shape == "normal":
+            off = rng.normal(0.0, NOISE, 3)
+        if wrong.outliers and k % 10 == 5:
+            off = np.array([0.003, 0.0, 0.0])
+        tips.append(np.array(plant.T_rig_tip[:3, 3]) + off)
         if k == 0:
             filter_.reset(tips[0], [0.0, 0.0])
         elif k >= late:
             filter_.correct(tips[k - late], None, late * STEP)
         known = filter_.estimate()
         std = math.sqrt(float(known.covariance[0, 0]))
-        off.append(abs(float(known.position[0] - plant.T_rig_tip[0, 3])) / std)
-    return np.array(plant.T_rig_tip), off
+        within.append(abs(float(known.position[0] - plant.T_rig_tip[0, 3])) < 3.0 * std)
+    return np.array(plant.T_rig_tip), float(np.mean(within))
 
 
-@pytest.mark.parametrize("late", [0, 3])
-@pytest.mark.parametrize(("play", "lag"), [(0.0, 0.0), (0.7, 0.0), (0.0, 0.008)])
-def test_it_knows_where_the_needle_is_and_how_well(late: int, play: float, lag: float) -> None:
-    wrong = Disturbances(noise=NOISE, play=play, lag_length=lag)
+@pytest.mark.parametrize(
+    ("late", "wrong"),
+    [
+        (0, Disturbances(noise=NOISE, play=0.7)),
+        (3, Disturbances(noise=NOISE, lag_length=0.008)),
+        (0, Disturbances(noise=NOISE, noise_shape="normal")),
+        (0, Disturbances(noise=NOISE, outliers=0.1, outlier_size=(0.002, 0.0035))),
+    ],
+    ids=["play", "lag, late tips", "normal noise", "outliers"],
+)
+def test_it_knows_where_the_needle_is_and_how_well(late: int, wrong: Disturbances) -> None:
     filter_ = particle_filter(wrong)
-    pose, off = followed(filter_, wrong, late=late)
+    pose, within = followed(filter_, wrong, late)
     known = filter_.estimate()
-    assert np.linalg.norm(known.position - pose[:3, 3]) < 0.0004
+    assert np.linalg.norm(known.position - pose[:3, 3]) < 0.0006
     assert np.arccos(known.rotation[:, 2] @ pose[:3, 2]) < math.radians(1.0)
-    assert np.mean(np.array(off) < 3.0) > 0.97
+    assert within > 0.97
     assert float(known.hypotheses.uncertainty[0]) == pytest.approx(known.covariance[0, 0])
 
 
 def test_another_frame_changes_nothing_but_the_coordinates() -> None:
     wrong = Disturbances(noise=NOISE)
-    filter_ = particle_filter(wrong)
+    filter_ = particle_filter(wrong, 500)
     followed(filter_, wrong)
     before = filter_.estimate()
     moved = np.array(NeedlePlant(initial_pose(0.2, 0.5), curvature=0.0).T_rig_tip)
     moved[:3, 3] = [0.003, -0.001, 0.0]
     filter_.change_frame(moved)
     after = filter_.estimate()
-    np.testing.assert_allclose(
-        after.position, moved[:3, :3] @ before.position + moved[:3, 3], atol=1e-12
-    )
+    place = moved[:3, :3] @ before.position + moved[:3, 3]
+    np.testing.assert_allclose(after.position, place, atol=1e-12)
     np.testing.assert_allclose(after.rotation, moved[:3, :3] @ before.rotation, atol=1e-9)
 
 
 def test_a_tip_that_was_not_found_changes_nothing() -> None:
-    filter_ = particle_filter(Disturbances(noise=NOISE))
+    filter_ = particle_filter(Disturbances(noise=NOISE), 500)
     filter_.reset(np.zeros((2, 3)), np.zeros((2, 2)))
     filter_.advance(STEP, np.zeros(2))
     before = filter_.estimate()
@@ -84,10 +97,20 @@ def test_a_tip_that_was_not_found_changes_nothing() -> None:
         filter_.advance(-STEP, 0.0)
 
 
-def test_the_limit_is_nearer_than_what_knows_less() -> None:
-    rows = limits(20, 500, seed=11, only=("noise as claimed",))
-    assert list(rows) == ["noise as claimed"]
-    row = rows["noise as claimed"]
-    assert row.limit.rms_mm < row.best.rms_mm
-    assert row.limit.point_rms_mm < row.best.point_rms_mm
-    assert set(rows) <= set(ROWS)
+@pytest.fixture(scope="module")
+def reached() -> limit_study.LimitRow:
+    (row,) = limits(20, 500, seed=11, only=("noise as claimed",)).values()
+    return row
+
+
+def test_the_limit_is_nearer_than_what_knows_less(
+    reached: limit_study.LimitRow,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert reached.limit.rms_mm < reached.best.rms_mm
+    assert reached.limit.point_rms_mm < reached.best.point_rms_mm
+    monkeypatch.setattr(limit_study, "limits", lambda *given: {given[3][0]: reached})
+    assert limit_study.main() == 0
+    said = capsys.readouterr().out
+    assert all(label in said for label in ROWS)

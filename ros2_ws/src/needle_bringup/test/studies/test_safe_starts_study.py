@@ -1,3 +1,5 @@
+"""The study of safe starts, on a coarse grid."""
+
 from __future__ import annotations
 
 import json
@@ -27,19 +29,12 @@ def test_it_writes_figures_and_a_picture(tmp_path: Path) -> None:
 
 
 def test_an_entry_that_is_not_safe_is_exit_code_1(tmp_path: Path) -> None:
-    path = tmp_path / "o.yaml"
-    path.write_text(
-        "frame: rig\nspheres: [{center: [0.0, 0.0, 0.005], radius: 0.004}]\n", encoding="utf-8"
-    )
-    assert main(["--target", "0,0,90", "--obstacles", str(path)]) == 1
+    file = tmp_path / "o.yaml"
+    file.write_text("frame: rig\nspheres: [{center: [0.0, 0.0, 0.005], radius: 0.004}]\n", "utf-8")
+    assert main(["--target", "0,0,90", "--obstacles", str(file)]) == 1
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [([], "is missing"), (["--target", "1,2"], "X_MM,Y_MM,Z_MM"), (["--target", "a,2,3"], "'a'")],
-)
-def test_bad_targets_are_told(
-    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(words) == 2
-    assert said in capsys.readouterr().err
+def test_bad_targets_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, said in (([], "is missing"), (["1,2"], "X_MM,Y_MM,Z_MM"), (["a,2,3"], "'a'")):
+        assert main([*(["--target"] if words else []), *words]) == 2
+        assert said in capsys.readouterr().err

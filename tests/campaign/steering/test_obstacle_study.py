@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_bringup.studies.obstacle_scenes import ObstacleScene, clearance, make_scene
-from needle_bringup.studies.obstacle_study import (
+from campaign.steering.obstacle_scenes import ObstacleScene, clearance, make_scene
+from campaign.steering.obstacle_study import (
     CURVATURE,
     DEPTH,
     NEEDLE_RADIUS,

@@ -7,7 +7,6 @@ every needle the target is driven to. With thousands of points it misses few way
 """
 
 # Compiled code takes keywords slowly or not at all.
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math

@@ -1,6 +1,6 @@
 """Generated scenes with obstacles: which can be solved, which are taken on, and how they end.
 
-python -m needle_bringup.studies.obstacle_study --scenes 1000 --seed 1
+python -m campaign.steering.obstacle_study --scenes 1000 --seed 1
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from needle_bringup.studies.obstacle_scenes import ObstacleScene, clearance, make_scene
-from needle_bringup.studies.path_judge import way_after
+from campaign.steering.obstacle_scenes import ObstacleScene, clearance, make_scene
+from campaign.steering.path_judge import way_after
 from needle_bringup.studies.study_controllers import NeedlesToPoints, rrt_law
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.target_plane import offset_plane

@@ -1,0 +1,1 @@
+"""Studies of steering: past obstacles, and on the workers of a cluster."""

@@ -1,0 +1,103 @@
+"""Studies on a real scheduler and real workers, each a process: the same bits, whoever dies."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dask_cluster import NEEDED, Cluster
+from dying_part import end_every, end_process, end_the_first
+from needle_bringup.studies import cluster
+from needle_bringup.studies.cluster import on_cluster
+from needle_bringup.studies.cluster_study import ClusterPart, digest, run_part, run_parts
+from needle_bringup.studies.monte_carlo import main
+from needle_bringup.studies.monte_carlo_options import parse
+from needle_bringup.studies.study_parts import parts_of
+from needle_core.errors import UserError
+
+STUDY = ("--draws", "3", "--depth-mm", "4", "--seed", "5")
+PARTS = parts_of(parse(STUDY))
+
+
+@pytest.fixture(scope="module")
+def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    started = Cluster(tmp_path_factory.mktemp("cluster"), 2)
+    yield started
+    started.end()
+
+
+def figures_of(folder: Path, *words: str) -> tuple[dict[str, object], str]:
+    files = ["--json", str(folder / "f.json"), "--csv", str(folder / "f.csv")]
+    assert main([*STUDY, *words, *files]) == 0
+    figures = json.loads((folder / "f.json").read_text("utf-8"))
+    for key in ("wall_s", "cpu_s"):
+        assert figures.pop(key) > 0.0
+    return figures, (folder / "f.csv").read_text("utf-8")
+
+
+@NEEDED
+def test_a_cluster_gives_the_figures_of_one_machine(
+    two_workers: Cluster, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    alone = figures_of(tmp_path)
+    assert figures_of(tmp_path, "--scheduler", two_workers.address) == alone
+    assert "warning" not in capfd.readouterr().err
+    points = ("--targets", "30", "--controller", "sliding_mode")
+    assert figures_of(tmp_path, *points, "--scheduler", two_workers.address) == figures_of(
+        tmp_path, *points
+    )
+
+
+@NEEDED
+def test_a_killed_worker_costs_only_time(two_workers: Cluster, tmp_path: Path) -> None:
+    asked = [(tmp_path / "killed", ClusterPart(part, PARTS[0].of_first(2))) for part in PARTS]
+    done = on_cluster(two_workers.address, end_the_first, asked)
+    assert [digest(part.outcomes) for part in done] == [digest(part.run()) for part in PARTS]
+    assert (tmp_path / "killed").exists()
+
+
+@NEEDED
+def test_a_part_that_ends_every_worker_is_given_up(two_workers: Cluster) -> None:
+    with pytest.raises(UserError, match=r"workers died while running it.*out of memory"):
+        list(on_cluster(two_workers.address, end_every, [None]))
+
+
+@NEEDED
+def test_a_worker_with_other_code_is_refused(
+    two_workers: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = {**cluster.identity(), "numpy": "1.0.0"}
+    monkeypatch.setattr(cluster, "identity", lambda: here)
+    with pytest.raises(UserError, match=r"has numpy \S+ in place of 1\.0\.0; all machines"):
+        run_parts(two_workers.address, PARTS, PARTS[0].of_first(2), lambda _: None)
+
+
+@NEEDED
+def test_a_lost_connection_is_made_again(
+    two_workers: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import distributed  # noqa: PLC0415
+
+    whole = distributed.as_completed
+
+    def cut(done: Iterator[Any]) -> Iterator[Any]:
+        monkeypatch.setattr(distributed, "as_completed", whole)
+        yield next(done)
+        raise distributed.CancelledError
+
+    monkeypatch.setattr(distributed, "as_completed", lambda futures: cut(whole(futures)))
+    asked = [ClusterPart(part, PARTS[0].of_first(2)) for part in PARTS]
+    done = on_cluster(two_workers.address, run_part, asked)
+    assert [digest(part.outcomes) for part in done] == [digest(part.run()) for part in PARTS]
+
+
+@NEEDED
+def test_a_lost_scheduler_ends_the_study_in_one_line(tmp_path: Path) -> None:
+    started = Cluster(tmp_path, 1, "--no-nanny")
+    with pytest.raises(UserError, match="lost, with 0 of 1 parts done"):
+        list(on_cluster(started.address, end_process, [started.scheduler.pid]))
+    started.end()
