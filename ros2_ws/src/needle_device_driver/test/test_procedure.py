@@ -95,16 +95,6 @@ def test_side_by_side_each_goes_on_by_itself() -> None:
     assert one.steps == ["first", "second", "end"]
 
 
-def test_side_by_side_a_wait_ends_in_the_cycle_in_which_one_alone_would() -> None:
-    for begin in (0.0, 1000.0, 86400.0 / 7.0):
-        alone, both = Running(Script().procedure()), Running(side_by_side(Script().procedure()))
-        now = begin
-        while not alone.result:
-            assert alone.advance(now) == both.advance(now)
-            now += 0.02
-        assert now < begin + 0.7
-
-
 def test_side_by_side_the_others_end_where_one_raises() -> None:
     def refused() -> Procedure[None]:
         yield Wait(lambda: False, 0.1)
@@ -116,9 +106,7 @@ def test_side_by_side_the_others_end_where_one_raises() -> None:
     with pytest.raises(ValueError, match="refused"):
         running.advance(0.1)
     assert one.steps == ["first", "end"]
-
-
-def test_side_by_side_cancelled_ends_all() -> None:
+    # So does a cancellation end all.
     scripts = Script(), Script()
     running = Running(side_by_side(*(script.procedure() for script in scripts)))
     running.advance(0.0)

@@ -41,23 +41,6 @@ def enabled(machine: DriveMachine, position: int = 0) -> None:
     assert not machine.switching
 
 
-def test_switching_on_takes_a_step_for_each_statusword_and_begins_where_the_axis_stands(
-    machine: DriveMachine,
-) -> None:
-    machine.want(Goal.ON)
-    for word, position, target, order in (
-        (DISABLED, 5, 5, DriveCommand.SHUTDOWN),
-        (DISABLED, 70, 70, DriveCommand.SHUTDOWN),
-        (READY, 900, 900, DriveCommand.SWITCH_ON),
-        (ON, 900, 900, DriveCommand.ENABLE_OPERATION),
-        (ENABLED, 901, 900, DriveCommand.ENABLE_OPERATION),
-    ):
-        assert not machine.ready
-        assert orders(machine, said(word, position)) == [order]
-        assert machine.target == target
-    assert machine.ready
-
-
 @pytest.mark.parametrize("goal", [Goal.OFF, Goal.ON])
 def test_after_a_quick_stop_nothing_is_ordered_before_the_axis_stands(
     machine: DriveMachine, goal: Goal

@@ -45,10 +45,8 @@ class Port:
             return
         for item in batch:
             if isinstance(item, CanErrors):
-                self.errors, self.refusals = (
-                    self.errors + item.frames,
-                    self.refusals + item.refusals,
-                )
+                self.errors += item.frames
+                self.refusals += item.refusals
             else:
                 assert (item.identifier, item.time) == (0x181, self.now)
                 self.frames.append(item.data)

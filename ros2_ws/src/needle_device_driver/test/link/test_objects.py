@@ -95,6 +95,9 @@ def test_the_drives_bounds_follow_the_supervisors_and_the_example_is_a_configura
     file = Path(__file__).resolve().parents[2] / "config" / "drives.yaml"
     values = yaml.safe_load(file.read_text("utf-8"))["device_driver"]["ros__parameters"]
     example = DeviceDriverParameters(**values).drive("rotation")
+    link = DeviceDriverParameters(link="socketcand", channel="can0").link_settings
+    assert str(link) == "socketcand localhost:29536 can0"
+    assert link.write_timeout == 0.05
     assert (example.max_torque, example.counts(2 * math.pi)) == (0.5, 65536)
 
 

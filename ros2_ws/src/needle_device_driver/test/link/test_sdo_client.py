@@ -11,7 +11,6 @@ from canopen.objectdictionary import ODVariable, datatypes
 from canopen.sdo import client as canopen_client
 
 from needle_core.can_frame import CanErrors, CanFrame
-from needle_core.errors import UserError
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
@@ -167,14 +166,3 @@ def test_the_link_counts_errors_hands_on_frames_and_names_refusals_where_nobody_
     assert (link.error_frames, link.frames_received) == (3, 3)
     with pytest.raises(DriveError, match=r"does not answer.*the adapter refuses"):
         at_once(ObjectAccess(link, 1).read(DEVICE_TYPE))
-
-
-def test_link_settings_without_a_channel_or_of_no_kind_are_refused() -> None:
-    for kind, channel, bitrate, why in (
-        ("socketcan", "", 500_000, "channel"),
-        ("bluetooth", "x", 500_000, "link"),
-        ("slcan", "/dev/ttyACM0", 123, "bitrate"),
-    ):
-        with pytest.raises(UserError, match=why):
-            LinkSettings(kind, channel, bitrate)
-    assert str(LinkSettings("socketcand", "can0")) == "socketcand localhost:29536 can0"

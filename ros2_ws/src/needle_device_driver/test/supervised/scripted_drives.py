@@ -63,8 +63,6 @@ class ScriptedDrive:
         self.drift: dict[str, int] = {}
         self.search: Iterator[int] = iter(())
         self.inputs = 0
-        self.status_size = 7
-        self.place_size = 8
         self.position = 0
         self.target = 0
         self.next_target = 0
@@ -134,7 +132,10 @@ class ScriptedDrive:
         status += self.inputs.to_bytes(4, "little")
         place = self.position.to_bytes(4, "little", signed=True)
         place += (self.demand - self.position).to_bytes(4, "little", signed=True)
-        now = [(0x180, status[: self.status_size]), (0x280, place[: self.place_size])]
+        # As long as they are mapped.
+        status = status if self.objects[0x1A00, 0] == b"\x03" else status[:3]
+        place = place if self.objects[0x1A01, 0] == b"\x02" else place[:4]
+        now = [(0x180, status), (0x280, place)]
         if self.loses:
             self.loses -= 1
         else:

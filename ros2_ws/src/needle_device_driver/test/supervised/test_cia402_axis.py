@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from needle_device_driver.axes.axis import AxisError
-
 from .drive_bench import RAD, DriveBench
 
 
@@ -34,18 +32,6 @@ def test_measured_velocity_is_that_of_the_last_cycle() -> None:
     assert joints.rotation.velocity == pytest.approx(0.2, rel=2e-2)
 
 
-def test_a_step_right_after_a_release_and_press_waits_for_the_axes() -> None:
-    bench = DriveBench().moving()
-    # All between two cycles.
-    bench.press()
-    bench.step()
-    at = bench.positions
-    bench.go(2)
-    assert (bench.state, bench.positions) == ("MOVING", at)
-    bench.go(40)
-    assert bench.outcomes == ["aborted: hold released", "succeeded"]
-
-
 def test_a_drive_without_transition_16_is_switched_off_and_on_again() -> None:
     bench = DriveBench().moving()
     bench.insertion.keeps_quick_stop = True
@@ -64,19 +50,6 @@ def test_enable_and_home_wait_until_the_axes_are_off() -> None:
         assert reply.message == "waiting for the axes to switch off"
     bench.wait(10)
     assert bench.enable().success
-
-
-def test_a_drive_that_does_not_switch_on_is_a_fault_with_its_state() -> None:
-    bench = DriveBench().configured()
-    bench.rotation.deaf_to = {"all"}
-    assert bench.enable().success
-    bench.wait(100)
-    assert bench.state == "HOLDING"
-    bench.wait()
-    assert bench.state == "FAULT"
-    assert "is not on after 2 s: SWITCH_ON_DISABLED" in bench.status.fault
-    with pytest.raises(AxisError, match="is not on after"):
-        bench.axes[1].start_move(0.0, 0.001)
 
 
 def test_the_outer_end_is_the_negative_limit_switch_or_the_home_switch() -> None:
@@ -101,16 +74,6 @@ def again(bench: DriveBench, position: int, home_after: int) -> DriveBench:
     drive.more_status = 0x1400
     assert bench.home().success
     return bench
-
-
-def test_a_homing_from_before_does_not_count() -> None:
-    bench = again(DriveBench(), 3000, 40)
-    bench.wait(30)
-    assert not bench.is_homed()
-    bench.insertion.stale_homing, bench.insertion.more_status = False, 0
-    bench.wait(30)
-    assert bench.is_homed()
-    assert bench.insertion.position == 0
 
 
 def test_a_homing_ends_by_its_second_bit_where_the_first_stays_for_good() -> None:
@@ -179,19 +142,3 @@ def test_a_pushed_axis_is_told_nothing_that_moves_and_depends_on_no_computer() -
     assert bench.reset().success
     assert bench.insertion.state == "disabled"
     assert bench.run(bench.supervisor.deconfigure()).success
-
-
-def test_with_a_pushed_axis_rotation_follows_the_push_and_never_goes_back() -> None:
-    bench = pushed()
-    bench.step(0.001, 0.2)
-    bench.go(10)
-    assert bench.rotation.next_target == 0
-    for reached, wanted in ((4000, 0.2), (9000, 0.45), (6000, 0.45), (12_000, 0.6)):
-        bench.insertion.position = 777 + reached
-        bench.go(3)
-        assert bench.rotation.next_target == pytest.approx(wanted * 0.2 * RAD, abs=1)
-    assert bench.outcomes == []
-    bench.insertion.position = 777 + 21_000
-    bench.go(7)
-    assert bench.outcomes == ["succeeded"]
-    assert bench.rotation.position == round(0.2 * RAD)

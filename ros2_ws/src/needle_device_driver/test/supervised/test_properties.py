@@ -9,10 +9,9 @@ from typing import Any, TypeAlias
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from .drive_bench import RAD, DriveBench
 from .ideal_axes import Bench, IdealAxis
 
-Event: TypeAlias = Callable[[Any], object]
+Event: TypeAlias = Callable[[Bench], object]
 
 _LIMITS = {"max_depth": 0.006, "max_turns": 0.3}
 
@@ -28,10 +27,12 @@ def _homeless(bench: Bench) -> None:
     bench.supervisor.observe(bench.now)
 
 
-# What people do to either device.
-_PEOPLE: dict[str, Event] = {
+_EVENTS: dict[str, Event] = {
     "press": lambda bench: bench.hold(),
     "release": lambda bench: bench.hold(False),
+    "press b": lambda bench: bench.hold(sender="b"),
+    "release b": lambda bench: bench.hold(False, sender="b"),
+    "old press": lambda bench: bench.hold(count=-1),
     "silence": lambda bench: setattr(bench, "now", bench.now + 0.3),
     "enable": lambda bench: bench.enable(),
     "disable": lambda bench: bench.enable(False),
@@ -41,11 +42,6 @@ _PEOPLE: dict[str, Event] = {
     "retract": lambda bench: bench.retract(),
     "reset": lambda bench: bench.reset(),
     "home": lambda bench: bench.home(),
-}
-_IDEAL = _PEOPLE | {
-    "press b": lambda bench: bench.hold(sender="b"),
-    "release b": lambda bench: bench.hold(False, sender="b"),
-    "old press": lambda bench: bench.hold(count=-1),
     "fault": lambda bench: setattr(bench.rotation, "fault", "stalled"),
     "forget home": _homeless,
 }
@@ -64,7 +60,7 @@ _commands = st.builds(
     st.sampled_from([0.5, 1.0, 0.01, -1.0]),
     st.sampled_from([1, 1, 1, 2]),
 )
-_others = st.sampled_from([_named(name, event) for name, event in _IDEAL.items()])
+_others = st.sampled_from([_named(name, event) for name, event in _EVENTS.items()])
 
 
 class Witness(Bench):
@@ -119,53 +115,3 @@ def test_never_without_hold_never_beyond_limits(is_ready: bool, events: list[Eve
         event(bench)
         assert (bench.state == "MOVING") is (bench.activity != "none")
     assert all(o == "succeeded" or o.startswith("aborted: ") for o in bench.outcomes)
-
-
-_FURTHEST = {0x301: 0.005 * 0.02 * 20e6 * 1.02 + 2, 0x302: math.pi * 0.02 * RAD * 1.02 + 2}
-_DRIVES = _PEOPLE | {
-    "step": lambda bench: bench.supervisor.joints(bench.now) and bench.step(0.001, 0.3, 0.25),
-    "reboot": lambda bench: bench.after(bench.rotation.reboot),
-    "fail": lambda bench: bench.after(lambda: bench.insertion.fail(0x7121)),
-    "lose": lambda bench: setattr(bench, "broken", "gone"),
-    "switch off": lambda bench: setattr(bench.rotation, "state", "disabled"),
-}
-
-
-def _cycle(bench: DriveBench) -> None:
-    """Run a cycle and check what must hold of each."""
-    before, activity = bench.positions, bench.activity
-    bench.bus.sent.clear()
-    bench.wait()
-    if activity == "homing" or max(bench.insertion.homing_for, bench.rotation.homing_for) >= 0:
-        return
-    assert activity != "none" or bench.positions == before
-    for cob, data in bench.bus.sent:
-        drive, at = (bench.insertion, bench.rotation)[cob & 3 == 2], before[cob & 3 == 2]
-        # Only a drive that is on follows.
-        if cob in _FURTHEST and drive.state == "enabled":
-            target = int.from_bytes(data, "little", signed=True)
-            assert abs(target - at) <= _FURTHEST[cob]
-    if bench.state in ("FAULT", "ESTOPPED", "DISABLED"):
-        assert bench.activity == "none"
-
-
-@settings(max_examples=15, deadline=None, derandomize=True)
-@given(
-    under_way=st.booleans(),
-    names=st.lists(st.sampled_from(sorted(_DRIVES)), min_size=1, max_size=10),
-)
-def test_no_drive_moves_that_was_not_let_go(under_way: bool, names: list[str]) -> None:
-    bench = DriveBench()
-    # In the middle of things, so that faults do not only meet a device at rest.
-    if under_way:
-        bench.moving()
-    else:
-        bench.configured()
-    for name in names:
-        bench.bus.sent.clear()
-        _DRIVES[name](bench)
-        if name != "reset":
-            # Nothing but a reset acknowledges a fault.
-            assert not [d for c, d in bench.bus.sent if c in (0x201, 0x202) and d[0] & 0x80]
-        for _ in range(4):
-            _cycle(bench)

@@ -15,7 +15,7 @@ Change = Callable[[ScriptedDrive], None]
 Values = dict[tuple[int, int], int]
 
 READ_ONLY, TOO_LONG, NOT_MAPPABLE = 0x0601_0002, 0x0607_0012, 0x0604_0041
-RANGE, OTHER_STATE = 0x0609_0030, 0x0800_0022
+RANGE = 0x0609_0030
 COUNTS, COUNTS_2, RPM, RPM_S = 0x00B5_0300, 0x00B5_5700, 0x00B4_4700, 0x00C0_0300
 TURN = {(0x608F, 1): 20_000, (0x608F, 2): 1}
 IN_RPM = {(0x60A9, 0): RPM, (0x60AA, 0): RPM_S, **TURN}
@@ -189,31 +189,6 @@ def no_types(types: bytes) -> Change:
     )
 
 
-def while_powered(drive: ScriptedDrive) -> None:
-    """Refuse settings while the drive is on."""
-    drive.refuses = lambda index, sub, value: (
-        OTHER_STATE * (index == 0x607D and drive.state in ("enabled", "quick stop"))
-    )
-
-
-def strict_process_data(drive: ScriptedDrive) -> None:
-    """Take another address or mapping of process data only while it is off."""
-    drive.tells({(0x1801, 1): 0x4000_0291})
-
-    def refuses(index: int, sub: int, value: bytes) -> int:
-        if not 0x1400 <= index <= 0x1BFF:
-            return 0
-        cob_id = drive.holds(index & ~0x200, 1)
-        on, new = not cob_id >> 31, int.from_bytes(value, "little")
-        if sub != 1 or index & 0x200:
-            return OTHER_STATE * on
-        if index >= 0x1800 and not new & 1 << 30:
-            return RANGE
-        return OTHER_STATE * (on and bool((new ^ cob_id) & 0x7FF))
-
-    drive.refuses = refuses
-
-
 Row = tuple[Change, Values, str]
 
 
@@ -276,20 +251,15 @@ TAKEN: list[Row] = [
     (no_types(b"\x01\xff"), {(0x1400, 2): 0xFE, (0x1401, 2): 0xFE}, ""),
     # Process data that nobody asked for.
     (tells({(0x1802, 1): 0x4000_0381}), {(0x1802, 1): 0xC000_0381, (0x1800, 3): 0}, ""),
-    (all_of(lacks(0x60FD), has(status_size=3)), {(0x1A00, 0): 2}, "has no digital inputs to map"),
+    (lacks(0x60FD), {(0x1A00, 0): 2}, "has no digital inputs to map"),
     (
-        has(
-            refuses=lambda i, s, v: NOT_MAPPABLE * ((i, v) == (0x1A00, b"\x20\x00\xfd\x60")),
-            status_size=3,
-        ),
+        has(refuses=lambda i, s, v: NOT_MAPPABLE * ((i, v) == (0x1A00, b"\x20\x00\xfd\x60"))),
         {(0x1A00, 0): 2},
         "has no digital inputs to map",
     ),
-    (all_of(lacks(0x60F4), has(place_size=4)), {(0x1A01, 0): 1}, "has no following error to map"),
+    (lacks(0x60F4), {(0x1A01, 0): 1}, "has no following error to map"),
     # A node that another program stopped.
     (has(nmt=0x04), {}, ""),
-    (while_powered, {(0x607D, 1): -20_000}, ""),
-    (strict_process_data, {(0x1801, 1): 0x4000_0281}, ""),
 ]
 
 

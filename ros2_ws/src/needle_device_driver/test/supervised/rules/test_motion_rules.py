@@ -10,46 +10,36 @@ from ..ideal_axes import Bench
 from ..supervisor_bench import PERIOD
 
 
-def test_a_step_goes_exactly_to_its_target_and_answers_with_its_stamp() -> None:
+def test_coordinated_in_proportion_to_the_exact_target_whatever_the_speed() -> None:
     bench = Bench().ready()
-    stamp = bench.step(0.001, -0.3)
-    bench.go(24)
-    assert (bench.results, bench.state) == ([], "MOVING")
-    assert bench.status.command_ns == stamp
-    bench.go()
-    assert bench.positions == (0.001, -0.3)
-    assert (bench.results, bench.state) == ([(stamp, "succeeded")], "HOLDING")
-    assert (bench.status.text, bench.status.level, bench.status.activity) == ("HOLDING", 0, "none")
-
-
-def test_coordinated_in_proportion_whatever_the_speed() -> None:
-    bench = Bench().ready()
-    bench.step(0.001, -0.5)
+    stamp = bench.step(0.001, -0.5)
     for scale in (1.0, 0.2, 0.7, 0.0, 0.05, 1.0, 0.5):
         bench.go(3, scale)
         insertion, rotation = bench.positions
         assert rotation == pytest.approx(insertion / 0.001 * -0.5, rel=1e-12)
-    bench.go(25)
+    # 25 periods are the whole step: 14.65 are left.
+    bench.go(14)
+    assert (bench.results, bench.state) == ([], "MOVING")
+    assert bench.status.command_ns == stamp
+    bench.go()
     assert bench.positions == (0.001, -0.5)
+    assert (bench.status.insertion_m, bench.status.rotation_rad) == bench.positions
+    assert (bench.results, bench.state) == ([(stamp, "succeeded")], "HOLDING")
+    assert (bench.status.text, bench.status.level, bench.status.activity) == ("HOLDING", 0, "none")
 
 
 @pytest.mark.parametrize(("which", "bound"), [("insertion", 0.0005), ("rotation", 0.1)])
 def test_following_error_counts_from_its_bound_on_and_stops_both(which: str, bound: float) -> None:
     for share, state in ((0.999, "MOVING"), (1.001, "FAULT")):
-        bench = Bench().ready()
-        bench.step()
-        bench.go(5)
+        bench = Bench().moving()
         bench.axis(which).position -= share * bound
-        bench.now += PERIOD
-        bench.hold()
         bench.supervisor.drive(PERIOD, bench.now)
         assert bench.state == state, bench.status.fault
     assert bench.rule == "following_error"
+    limit = {"insertion": "limit 0.5 mm", "rotation": "limit 0.1 rad"}[which]
     assert f"the {which} axis is" in bench.status.fault
-    assert f"limit {bound * 1e3:g} mm" in bench.status.fault or which == "rotation"
-    assert bench.insertion.stops == bench.rotation.stops == 1
-    assert not bench.insertion.powered
-    assert not bench.rotation.powered
+    assert bench.status.fault.endswith(limit)
+    assert bench.insertion.orders[-2:] == bench.rotation.orders[-2:] == ["stop", "off"]
 
 
 @pytest.mark.parametrize(("which", "tolerance"), [("insertion", 1e-6), ("rotation", 1e-4)])
@@ -72,13 +62,17 @@ def test_settling_time_is_a_second_beside_the_target(which: str, tolerance: floa
 # ---- retraction ---------------------------------------------------------------------------------
 
 
-def inserted() -> Bench:
-    """Return a device 3 mm deep."""
+def inserted(*, homed: bool = True) -> Bench:
+    """Return a device 3 mm deep; or one that lost its home there, and counts from 0 again."""
     bench = Bench().ready()
     for _ in range(3):
         bench.go()
         bench.step(0.001, 0.2)
         bench.go(25)
+    if not homed:
+        bench.insertion.homed = bench.insertion.switch = False
+        bench.insertion.position, bench.insertion.target = 0.0, math.nan
+        bench.go(2)
     return bench
 
 
@@ -88,12 +82,12 @@ def test_retraction_moves_insertion_only_slowly_and_with_the_hold() -> None:
     assert bench.retract().message == "the axes are not powered yet"
     bench.insertion.powered = True
     bench.hold(False)
-    assert not bench.retract().success
+    assert bench.retract().message == "press and keep the hold first"
     bench.hold()
     rotation = bench.rotation.position
     bench.rotation.orders.clear()
     assert bench.retract().message == "retracting 3.0 mm while the hold lasts"
-    assert not bench.retract().success
+    assert bench.retract().message == "the device is MOVING, not HOLDING"
     bench.go(10)
     assert bench.insertion.position == pytest.approx(0.003 - 10 * 0.002 * PERIOD)
     bench.hold(False)
@@ -103,9 +97,8 @@ def test_retraction_moves_insertion_only_slowly_and_with_the_hold() -> None:
     bench.hold()
     assert bench.retract().success
     bench.go(100)
-    assert bench.positions == (0.0, rotation)
+    assert (bench.positions, bench.state) == ((0.0, rotation), "HOLDING")
     assert "move" not in bench.rotation.orders
-    assert bench.state == "HOLDING"
     assert bench.outcomes == ["succeeded"] * 3
     assert bench.retract().message == "the needle is out"
 
@@ -122,26 +115,14 @@ def test_retraction_goes_on_at_the_inner_switch_and_whatever_the_rotation_does()
     assert (bench.state, bench.rule) == ("FAULT", "following_error")
 
 
-def rebooted() -> Bench:
-    """Return a device whose insertion drive lost its home at 3 mm depth; it counts from 0 again."""
-    bench = inserted()
-    bench.insertion.homed = bench.insertion.switch = False
-    bench.insertion.position, bench.insertion.target = 0.0, math.nan
-    bench.go()
-    return bench
-
-
 def test_unhomed_outward_only_by_the_last_known_depth() -> None:
-    bench = rebooted()
-    assert not bench.is_homed()
-    bench.go()
+    bench = inserted(homed=False)
     bench.step()
     assert bench.rule == "homed_first"
     assert bench.retract().success
     bench.go(40)
-    bench.hold(False)
     # Counted where it stands now, what was drawn out is out.
-    bench.hold()
+    bench.press()
     assert bench.retract().message == "retracting 1.4 mm while the hold lasts"
     bench.go(100)
     assert bench.insertion.position == pytest.approx(-0.003)
@@ -150,7 +131,7 @@ def test_unhomed_outward_only_by_the_last_known_depth() -> None:
 
 
 def test_unhomed_outward_only_to_the_switch_and_by_all_the_depth_where_none_was_known() -> None:
-    bench = rebooted()
+    bench = inserted(homed=False)
     assert bench.retract().success
     bench.go(10)
     bench.insertion.switch = True
@@ -178,12 +159,11 @@ def test_homing_needle_out_must_be_confirmed_and_a_step_ends_that() -> None:
     assert bench.run(bench.supervisor.home(bench.now)).message == confirm
     assert bench.home().success
     assert bench.enable().success
-    assert not bench.home().success, "only while disabled"
+    assert bench.home().message == "the device is HOLDING, not DISABLED"
     bench.hold()
-    bench.step(-1.0)
-    assert str(bench.status.needle_out_confirmed) == "True", "it was refused"
-    bench.step()
-    assert str(bench.status.needle_out_confirmed) == "False"
+    for length, is_out in ((-1.0, True), (0.001, False)):
+        bench.step(length)
+        assert bench.status.needle_out_confirmed is is_out, "one that is refused ends nothing"
     bench.go(25)
     bench.enable(False)
     assert bench.run(bench.supervisor.home(bench.now)).message == confirm
@@ -208,9 +188,8 @@ def test_homing_needle_out_can_be_stopped_and_ends_without_power() -> None:
     assert (bench.positions, bench.state) == (at, "DISABLED")
     assert not bench.insertion.powered
     assert bench.home().success
-    bench.wait(500)
-    assert (bench.positions, bench.state) == ((0.0, 0.0), "DISABLED")
-    assert bench.is_homed()
+    bench.wait(300)
+    assert (bench.positions, bench.state, bench.is_homed()) == ((0.0, 0.0), "DISABLED", True)
     assert bench.rotation.orders[-1] == "off"
     assert bench.supervisor.stop().message == "nothing moves"
 

@@ -95,6 +95,24 @@ def test_max_rotation_rate_where_rotation_cannot_follow_insertion_waits() -> Non
     assert bench.outcomes[-1] == "replaced"
 
 
+@pytest.mark.parametrize(
+    ("rule", "points"),
+    [
+        ("max_speed", [(0.0005, 0.0, 0.09), (0.001, 0.0, 0.3), (0.0015, 0.0, 0.5)]),
+        ("max_rotation_step", [(0.0005, 0.7, 0.3), (0.001, 1.3, 0.6), (0.0015, 0.7, 0.9)]),
+        ("max_rotation_rate", [(0.0005, 0.0, 0.1), (0.001, -0.7, 0.3), (0.0015, -0.7, 0.5)]),
+        ("max_turns", [(0.0005, 0.4, 0.3), (0.001, 0.7, 0.6), (0.0015, 0.4, 0.9)]),
+        ("max_depth", [(0.001, 0.0, 0.3), (0.0017, 0.0, 0.6)]),
+    ],
+)
+def test_each_piece_of_a_path_is_bounded(
+    rule: str, points: list[tuple[float, float, float]]
+) -> None:
+    bench = Bench(max_turns=0.1 if rule == "max_turns" else 10.0, max_depth=0.0016).ready()
+    bench.submit(*points)
+    bench.refused(rule)
+
+
 def test_command_state_a_step_never_takes_the_place_of_a_path_nor_a_path_of_a_step() -> None:
     bench = Bench().ready()
     bench.step()

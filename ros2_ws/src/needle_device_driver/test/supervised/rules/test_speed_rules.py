@@ -220,7 +220,7 @@ def test_homing_time_a_drive_that_goes_away_from_its_switch_is_stopped(
     for tells in (True, False):
         bench = DriveBench(insertion_homing_method=method)
         if not tells:
-            bench.insertion.missing_objects, bench.insertion.status_size = {0x60FD}, 3
+            bench.insertion.missing_objects = {0x60FD}
         bench.insertion.inputs = switch * tells
         bench.insertion.searches(forever=away * MM_S)
         bench.homing()
