@@ -128,9 +128,9 @@ def test_a_turned_base_is_refused_but_for_the_part_before(
     assert "81 tips over 80.0 mm" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "tips.csv"
+    for text, message in (
         ("", "there is no row in it"),
         ("x_m,y_m,z_m\n", "there is no row in it"),
         ("a,b\n1,2\n", "x_m is missing"),
@@ -141,22 +141,21 @@ def test_a_turned_base_is_refused_but_for_the_part_before(
         ("x_m,y_m,z_m\n0,0,12.5\n", r"z_m = 12.5 m is outside"),
         ("x_m,y_m,z_m\n0,0,1,2\n", "more fields than columns"),
         ("x_m,y_m,z_m,insertion_m\n0,0,0.01,inf\n", "insertion_m = inf is not finite"),
-    ],
-)
-def test_bad_files_are_one_line(
-    tmp_path: Path, text: str, message: str, capsys: pytest.CaptureFixture[str]
+    ):
+        path.write_text(text)
+        assert command(path) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+
+
+def test_bad_arguments_are_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    path = tmp_path / "tips.csv"
-    path.write_text(text)
-    assert command(path) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
+    monkeypatch.chdir(tmp_path)
+    rows: list[list[str]] = [
         ["missing.csv"],
         ["."],
         [],
@@ -164,19 +163,12 @@ def test_bad_files_are_one_line(
         ["x.csv", "--from-mm", "-1"],
         ["x.csv", "--entry-std-mm", "nan"],
         ["x.csv", "--json", "/no/such/folder/x.json"],
-    ],
-)
-def test_bad_arguments_are_one_line(
-    arguments: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert command(*arguments) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert error.count("\n") == 1
+    ]
+    for arguments in rows:
+        assert command(*arguments) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ")
+        assert error.count("\n") == 1
 
 
 def test_a_straight_path_is_a_miss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

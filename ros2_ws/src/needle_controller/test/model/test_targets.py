@@ -89,8 +89,9 @@ def test_what_rests_or_hardly_was_seen_is_where_it_was_seen_to_the_bit() -> None
         np.testing.assert_array_equal(motion.at(60.0), motion.last)
     # Time that goes back begins anew.
     motion = seen(sine(0.2), 25.0)
-    motion.see(3.0, PLACE)
-    np.testing.assert_array_equal(motion.at(30.0), PLACE)
+    for time in np.arange(3.0, 13.0, 0.25):
+        motion.see(float(time), drift(float(time)))
+    np.testing.assert_allclose(motion.at(15.0), drift(15.0), atol=1e-9)
 
 
 def test_a_motion_is_foretold_whatever_its_shape_and_clock() -> None:

@@ -54,6 +54,7 @@ def test_a_leg_leads_to_its_aim() -> None:
         assert leg.miss == leg.scarce == 0.0
         assert leg.turning in (0.0, pytest.approx(abs(leg.turn) / RATE))
         assert leg.curvature <= CURVATURE
+        assert abs(leg.turn) <= 1.31 * math.pi
         np.testing.assert_allclose(end[:, 3], aim, atol=1e-4)
         np.testing.assert_allclose(points[count - 1, :3], end[:, 3])
         assert points[0, 3] == 0.01

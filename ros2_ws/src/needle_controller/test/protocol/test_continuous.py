@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from needle_controller.protocol import steering
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import (
     Action,
@@ -16,6 +17,7 @@ from needle_controller.protocol.steering_types import (
     SteeringState,
 )
 from needle_controller.protocol.step_watch import MOST_REFUSALS
+from needle_controller.protocol.trust import Trust
 
 from .rig import FREE, HELD, MOVING, TICK, Rig, logged, sent, spied, where
 
@@ -70,7 +72,9 @@ class ContinuousRig(Rig):
             self.steering.on_result(path_in(self.see()).stamp_ns, "aborted: no")
 
 
-def test_a_tip_leads_to_the_turn_of_a_step_and_a_path_beyond() -> None:
+def test_a_tip_leads_to_the_turn_of_a_step_and_a_path_beyond(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     stepwise, rig = Rig(), ContinuousRig()
     step, path = sent(stepwise.expose()), path_in(rig.see())
     (start, knot, end) = path.points
@@ -79,6 +83,10 @@ def test_a_tip_leads_to_the_turn_of_a_step_and_a_path_beyond() -> None:
     assert end == pytest.approx((2 * MM, step.rotation, 2 * step.duration))
     assert path.stamp_ns == rig.steering.command_ns == rig.now
     assert where(rig) == AT_WORK
+    # In doubt it goes at half the speed.
+    doubtful = ContinuousRig()
+    monkeypatch.setattr(steering, "trust_of", lambda *_: Trust("doubtful", is_doubtful=True))
+    assert path_in(doubtful.see()).points[1][2] == pytest.approx(2.0 * step.duration)
 
 
 def test_a_tip_within_a_step_length_only_renews_the_path() -> None:

@@ -5,16 +5,18 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 
 from needle_controller.model.target_plane import offset_plane
+from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import Awaiting, SteeringState
 
-from .rig import HELD, MOVING, TICK, Rig, device, none_sent, sent, where
+from .rig import HELD, MOVING, TICK, Rig, device, logged, none_sent, sent, where
 
-SETTINGS = SteeringSettings(target_offset=0.003)
+SETTINGS = SteeringSettings(target_offset=0.003, tip_covariance="configured")
 HOLDING = dataclasses.replace(HELD, insertion_m=0.0, rotation_rad=0.0)
 
 
@@ -143,3 +145,15 @@ def test_start_says_where_no_path_leads_past_obstacles() -> None:
     steering.on_device(HELD)
     rig.joints()
     assert "the target point is" in rig.start()
+    # One that comes on the way stops the needle.
+    steering.control.obstacles = Obstacles([Obstacle((0.05, 0.0, 0.02), (0.05, 0.0, 0.02), 0.001)])
+    assert rig.start() == "steering"
+    rig.steps(2)
+    wall = [Obstacle((-0.06, y, 0.03), (0.06, y, 0.03), 0.011) for y in np.linspace(-0.06, 0.06, 7)]
+    steering.control.obstacles = Obstacles(wall)
+    while not none_sent(actions := rig.expose()):
+        rig.run(sent(actions))
+    assert "IDLE: no way on from insertion 0.0" in logged(actions)
+    assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
+    said = steering.control.path_obstacle(0.0)
+    assert "no path to the target point is clear of the 7 obstacles, nor is one from" in said
