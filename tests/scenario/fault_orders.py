@@ -134,32 +134,31 @@ class FaultOrders:
         return partial(self._rig.faults.end, fault.part)
 
     def _spoil_drive(self, fault: Fault) -> Undo:
-        axis, kind = fault.part.partition(" ")[0], fault.kind
+        axis, now = fault.part.partition(" ")[0], self._timeline.now
         bus = self._rig.drives.bus
         drive = bus.drives[axis]
-        if kind is Kind.OFF:
-            bus.reboot(axis, self._timeline.now)
-            return _nothing
-        if kind is Kind.GARBAGE:
-            bus.emergency(axis, _MOTION_ERROR)
-            return _nothing
-        if kind is Kind.STUCK:
-            bus.stall(axis)
-            return partial(setattr, drive.motor, "stalled", False)
-        bus.hang(axis)
+        match fault.kind:
+            case Kind.OFF:
+                bus.reboot(axis, now)
+            case Kind.GARBAGE:
+                bus.emergency(axis, _MOTION_ERROR)
+            case Kind.STUCK:
+                bus.stall(axis)
+                return partial(setattr, drive.motor, "stalled", False)
+            case _:
+                bus.hang(axis)
 
-        def go_on() -> None:
-            drive.hung = False
-            drive.tick(self._timeline.now)
+                def go_on() -> None:
+                    drive.hung = False
+                    drive.tick(self._timeline.now)
 
-        return go_on
+                return go_on
+        return _nothing
 
     def _spoil_cameras(self, fault: Fault) -> Undo:
-        def see(sight: Sight) -> None:
-            self._rig.tracker.sight = sight
-
-        see(_SIGHTS[fault.kind])
-        return partial(see, Sight.CLEAR)
+        self._rig.tracker.sight = _SIGHTS[fault.kind]
+        # The tracker may be another by then.
+        return lambda: setattr(self._rig.tracker, "sight", Sight.CLEAR)
 
     def _spoil_clock(self, fault: Fault) -> Undo:
         timeline = self._timeline
@@ -240,10 +239,9 @@ class FaultOrders:
         garbage = {"curvature": math.nan, "step_length": -1.0, "curvatur": 1.0, "depth": "deep"}
         choice: dict[str, Any] = wrong if fault.kind is Kind.WRONG else garbage
         name = self._chance_of(fault).choice(tuple(choice))
+        named = {**values, name: choice[name]}
         try:
-            changed = from_values(
-                SteeringSettings, {**values, name: choice[name]}, "plane_controller"
-            )
+            changed = from_values(SteeringSettings, named, "plane_controller")
         except UserError:
             return _nothing
 

@@ -45,32 +45,15 @@ class Moment(enum.Enum):
 _LINK_KINDS = (Kind.OFF, Kind.SLOW, Kind.INTERMITTENT, Kind.REORDERED, Kind.DUPLICATED)
 PROCESSES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node")
 TOPICS = (
-    "/joy",
-    "/device/hold",
-    "/device/joint_trajectory",
-    "/device/result",
-    "/device/status",
-    "/joint_states",
-    "/needle/tip",
-    "/needle/tip_pose",
-    "/needle/controller_status",
-)
+    "/joy", "/device/hold", "/device/joint_trajectory", "/device/result", "/device/status",
+    "/joint_states", "/needle/tip", "/needle/tip_pose", "/needle/controller_status",
+)  # fmt: skip
 SERVICES = (
-    "/device/home",
-    "/device/enable",
-    "/device/reset",
-    "/device/confirm_needle_out",
-    "/device/retract",
-    "/plane_controller/start",
-)
-BUS, ADAPTER, CAMERAS, CLOCK, PERSON, PARAMETERS = (
-    "bus",
-    "adapter",
-    "cameras",
-    "system clock",
-    "person",
-    "parameters",
-)
+    "/device/home", "/device/enable", "/device/reset", "/device/confirm_needle_out",
+    "/device/retract", "/plane_controller/start",
+)  # fmt: skip
+BUS, ADAPTER, CAMERAS, CLOCK = "bus", "adapter", "cameras", "system clock"
+PERSON, PARAMETERS = "person", "parameters"
 SECOND_PERSON = "second person"
 """At a joystick and an operator of their own: keeps it pressed, draws out, presses and lets go at
 random, loses the joystick while pressing."""
@@ -82,13 +65,9 @@ DRIVES = ("insertion drive", "rotation drive")
 STRANGER = "stranger on "
 """Begins the name of a part where a foreign node publishes or calls what is not its own."""
 STRANGE_TOPICS = (
-    "/device/hold",
-    "/device/joint_trajectory",
-    "/device/estop",
-    "/joint_states",
-    "/needle/tip",
+    "/device/hold", "/device/joint_trajectory", "/device/estop", "/joint_states", "/needle/tip",
     "/target_plane",
-)
+)  # fmt: skip
 FLOOD = "flood"
 """A stranger that publishes 5,000 times a second what is not its own; `size` draws the topic."""
 _STRANGE_SERVICES = (*SERVICES, "/device/stop", "/plane_controller/stop", "/device/enable off")
@@ -214,14 +193,11 @@ def _as_often_short_as_long(generator: random.Random, shortest: float, longest: 
 
 def write_schedule(path: Path, seed: int, faults: Sequence[Fault], why: str) -> None:
     """Write a seed and its faults as a file that `read_schedule` reads."""
-    content: dict[str, Any] = {
-        "seed": seed,
-        "why": why,
-        "faults": [
-            {**dataclasses.asdict(one), "kind": one.kind.value, "after": one.after.value}
-            for one in faults
-        ],
-    }
+    listed = [
+        {**dataclasses.asdict(one), "kind": one.kind.value, "after": one.after.value}
+        for one in faults
+    ]
+    content: dict[str, Any] = {"seed": seed, "why": why, "faults": listed}
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 

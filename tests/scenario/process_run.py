@@ -25,10 +25,11 @@ from needle_core.process.ros_domain import own_domain
 from needle_core.ros.conversions import RELIABLE, to_qos, values_of
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.device import HOLDS
+from needle_device_driver.supervisor.limits import SafetyLimits
 from scenario.faults import Fault, Kind
 from scenario.judging.invariants import RELEASE_BOUND, Watch
 from scenario.parts.person import OUT
-from scenario.rig_run import RunResult, bounds_of_the_rig
+from scenario.rig_run import RunResult
 
 PERSON = "simulated_operator"
 PARTS = ("device_driver", "plane_controller", "stereo_tracker", PERSON)
@@ -57,7 +58,7 @@ class Witness(RigHand):
     """
 
     def __init__(self) -> None:
-        self.watch = Watch(bounds_of_the_rig(), _RELEASE_BOUND)
+        self.watch = Watch(SafetyLimits(), _RELEASE_BOUND)
         self._begun = time.time()
         self._hears_person = False
         super().__init__("sim/drive_positions")
@@ -134,19 +135,12 @@ class Witness(RigHand):
 def processes_schedule_of(seed: int) -> list[Fault]:
     """Draw what happens to the processes, from the moment in which the needle is steered [s]."""
     draw = random.Random(f"faults of processes {seed}")
-    return sorted(
-        (
-            Fault(
-                draw.choice(PARTS),
-                draw.choice((Kind.OFF, Kind.STUCK)),
-                draw.uniform(0.0, _LATEST),
-                _SHORTEST * (_LONGEST / _SHORTEST) ** draw.random(),
-                0.0,
-            )
-            for _ in range(draw.randint(1, _MOST))
-        ),
-        key=lambda fault: fault.at,
-    )
+    faults = []
+    for _ in range(draw.randint(1, _MOST)):
+        part, kind = draw.choice(PARTS), draw.choice((Kind.OFF, Kind.STUCK))
+        at, share = draw.uniform(0.0, _LATEST), draw.random()
+        faults.append(Fault(part, kind, at, _SHORTEST * (_LONGEST / _SHORTEST) ** share, 0.0))
+    return sorted(faults, key=lambda fault: fault.at)
 
 
 def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResult]:
@@ -188,11 +182,11 @@ def _insert(witness: Witness, graph: TrialProcesses, faults: Sequence[Fault]) ->
     begun = witness.now
     events: list[tuple[float, Callable[[], None]]] = []
     for fault in faults:
-        events.append((begun + fault.at, partial(_begin, witness, graph, fault)))
-        events.append((begun + fault.at + fault.lasts, partial(_end, witness, graph, fault)))
-    for at, happen in sorted(events, key=lambda event: event[0]):
+        for at, happen in ((fault.at, _begin), (fault.at + fault.lasts, _end)):
+            events.append((begun + at, partial(happen, witness, graph, fault)))
+    for at, act in sorted(events, key=lambda event: event[0]):
         witness.pause(max(at - witness.now, 0.0))
-        happen()
+        act()
     witness.pause(_STILL)
     # From here on there is one person, and it wants the needle out.
     graph.end(PERSON)

@@ -8,22 +8,11 @@ from typing import Any
 
 from needle_core import messages as m
 from needle_device_driver.supervisor.limits import SafetyLimits
+from scenario import faults as of
 from scenario.course import Course, told_by_moments
 from scenario.fault_orders import LATEST_MESSAGE, SLOWEST_HANDLER, FaultOrders
-from scenario.faults import (
-    CONSOLE,
-    DISK,
-    PAGE,
-    PAGE_LINE,
-    RECORDER,
-    SECOND_PERSON,
-    Fault,
-    Kind,
-    draw_schedule,
-    strange_topic,
-)
+from scenario.faults import Fault, Kind, draw_schedule, strange_topic
 from scenario.judging.invariants import RELEASE_BOUND, Violation, Watch
-from scenario.judging.limit_witness import Bounds
 from scenario.judging.set_point_frames import SetPointFrames
 from scenario.moments import watch_moments
 from scenario.parts.bench import Motors
@@ -43,7 +32,7 @@ _HOLD, _JOINTS = "/device/hold", "/joint_states"
 # The way of a press to the driver.
 _HOLD_LINKS = ("/joy", _HOLD)
 # Where one of them goes wrong the person holds by a page.
-_AT_PAGE = (CONSOLE, PAGE, PAGE_LINE)
+_AT_PAGE = (of.CONSOLE, of.PAGE, of.PAGE_LINE)
 _LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
 # The device's faults that take the joints from the controller.
 _TAKE_JOINTS = (_JOINTS, "device_driver", "plane_controller")
@@ -93,19 +82,6 @@ def schedule_of(seed: int) -> list[Fault]:
     return draw_schedule(seed) if seed % 100 else []
 
 
-def bounds_of_the_rig() -> Bounds:
-    """Return the limits that the driver has unless it is told others."""
-    limits = SafetyLimits()
-    return Bounds(
-        limits.max_depth,
-        limits.max_speed,
-        limits.max_rotation,
-        limits.max_rotation_rate,
-        limits.insertion_following_error,
-        limits.rotation_following_error,
-    )
-
-
 def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     """Run the rig once.
 
@@ -118,11 +94,11 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     """
     at_page = any(fault.part in _AT_PAGE for fault in faults)
     rig = SoakRig(seed, None if faults else UNDISTURBED_DEPTH, at_page=at_page)
-    if any(fault.part == SECOND_PERSON for fault in faults):
+    if any(fault.part == of.SECOND_PERSON for fault in faults):
         # Their hand must be seen neutral before it counts.
         for name in SECOND:
             rig.start(name)
-    of_recording = [fault for fault in faults if fault.part in (RECORDER, DISK)]
+    of_recording = [fault for fault in faults if fault.part in (of.RECORDER, of.DISK)]
     if of_recording:
         rig.record()
     watch = _watched(rig, faults)
@@ -148,15 +124,9 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
         off = f"the tip went to {rig.bench.deepest_tip[0] * 1e3:.2f} mm from the plane"
         watch.violate("undisturbed_converges", rig.now, f"{off}; {_state_of(rig)}")
     return RunResult(
-        seed,
-        tuple(faults),
-        tuple(watch.violations),
-        tuple(told_by_moments(course)),
-        rig.now,
-        digest=rig.digest.hexdigest(),
-        inserted=rig.person.done,
-        log=tuple(rig.log),
-    )
+        seed, tuple(faults), tuple(watch.violations), tuple(told_by_moments(course)), rig.now,
+        digest=rig.digest.hexdigest(), inserted=rig.person.done, log=tuple(rig.log),
+    )  # fmt: skip
 
 
 def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
@@ -168,10 +138,10 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
         if fault.part in _HOLD_LINKS and fault.kind in _LATE
     )
     # A page may be silent for 0.25 s, a joystick for 0.1 s.
-    late += 0.15 if rig.hand_node == CONSOLE else 0.0
+    late += 0.15 if rig.hand_node == of.CONSOLE else 0.0
     slow = (f.size for f in faults if f.part == "device_driver" and f.kind is Kind.SLOW)
     slowness = max(slow, default=0.0) * SLOWEST_HANDLER
-    watch = Watch(bounds_of_the_rig(), RELEASE_BOUND + late, slowness)
+    watch = Watch(SafetyLimits(), RELEASE_BOUND + late, slowness)
     strange = {strange_topic(fault) for fault in faults}
     joints_spoilt = _JOINTS in strange or any(fault.part in _TAKE_JOINTS for fault in faults)
 
@@ -189,7 +159,7 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
         watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
 
     def see_hold(node: str, message: m.HoldState) -> None:
-        if node == CONSOLE:
+        if node == of.CONSOLE:
             # It may have been pressed since the last tick.
             watch.see_hand(rig.now, holds=rig.hand_presses)
             watch.see_page_hold(rig.now, pressed=message.pressed)
@@ -210,7 +180,7 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
     rig.watch("device/joint_trajectory", see_command)
     rig.watch("device/estop", lambda _, said: watch.see_estop(rig.now, pressed=said.pressed))
     rig.watch("device/hold", see_hold)
-    if _HOLD in strange or any(fault.part == SECOND_PERSON for fault in faults):
+    if _HOLD in strange or any(fault.part == of.SECOND_PERSON for fault in faults):
         rig.hears_hold = hear
     return watch
 

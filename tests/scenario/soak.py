@@ -1,4 +1,14 @@
-"""The soak: many runs of the virtual rig under faults, and the shortest way to each violation."""
+"""Run the whole rig many times in simulated time, under random faults, and check its invariants.
+
+Each run has all nodes of the rig in one process, on one clock and one seed: driver with emulated
+drives, controller, operator, a person, and up to six faults (nodes killed, stopped, slow; topics,
+services and bus lossy, late, silent; drives, cameras, clocks and people that fail). The same seed
+gives the same run. The schedule of a run that violates an invariant is shortened, and kept as a
+file with --failures. What is interrupted says how far it came.
+
+With --processes, runs of real processes follow, in real time, one after the other: nodes are killed
+and stopped while a simulated needle is inserted. They need an otherwise idle machine.
+"""
 
 from __future__ import annotations
 
@@ -25,18 +35,6 @@ from scenario.rig_run import RunResult, run
 from scenario.shrinking import shrink
 from scenario.tally import Tally
 
-HELP = """\
-Run the whole rig many times in simulated time, under random faults, and check its invariants.
-
-Each run has all nodes of the rig in one process, on one clock and one seed: driver with emulated
-drives, controller, operator, a person, and up to six faults (nodes killed, stopped, slow; topics,
-services and bus lossy, late, silent; drives, cameras, clocks and people that fail). The same seed
-gives the same run. The schedule of a run that violates an invariant is shortened, and kept as a
-file with --failures. What is interrupted says how far it came.
-
-With --processes, runs of real processes follow, in real time, one after the other: nodes are killed
-and stopped while a simulated needle is inserted. They need an otherwise idle machine.
-"""
 EXAMPLES = """\
 examples:
   scripts/soak --runs 300                300 runs
@@ -57,31 +55,24 @@ def main(arguments: list[str] | None = None) -> int:
 def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="scripts/soak",
-        description=HELP,
+        description=__doc__,
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--runs", type=int, default=300, metavar="N", help="number of runs (300)")
-    parser.add_argument(
-        "--processes", type=int, default=0, metavar="N", help="number of runs of real processes (0)"
+    cluster = (
+        "do the runs on the Dask cluster of this scheduler, such as tcp://10.0.0.5:8786, to the "
+        "same results (docs/cluster.md)"
     )
-    parser.add_argument(
-        "--seed", type=int, default=1, metavar="S", help="seed of the first run (1)"
-    )
-    parser.add_argument(
-        "--schedule", type=Path, metavar="FILE", help="replay the seed and faults in this file"
-    )
-    parser.add_argument(
-        "--failures", type=Path, metavar="DIR", help="keep schedules that violate here"
-    )
-    parser.add_argument(
-        "--scheduler",
-        default="",
-        metavar="ADDRESS",
-        help="do the runs on the Dask cluster of this scheduler, such as tcp://10.0.0.5:8786, to "
-        "the same results (docs/cluster.md)",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON")
+    for name, kind, default, metavar, told in (
+        ("--runs", int, 300, "N", "number of runs (300)"),
+        ("--processes", int, 0, "N", "number of runs of real processes (0)"),
+        ("--seed", int, 1, "S", "seed of the first run (1)"),
+        ("--schedule", Path, None, "FILE", "replay the seed and faults in this file"),
+        ("--failures", Path, None, "DIR", "keep schedules that violate here"),
+        ("--scheduler", str, "", "ADDRESS", cluster),
+        ("--json", Path, None, "FILE", "write the figures as JSON"),
+    ):
+        parser.add_argument(name, type=kind, default=default, metavar=metavar, help=told)
     return parser.parse_args(arguments)
 
 
@@ -108,12 +99,7 @@ def _soak(options: argparse.Namespace) -> int:
     interrupted = False
     try:
         for result in results:
-            tally.add(
-                of_processes=result.of_processes,
-                faults=len(result.told_by_moments),
-                simulated=result.simulated,
-                violates=bool(result.violations),
-            )
+            tally.add(result)
             if result.violations:
                 _tell(result, options.failures)
             if sys.stderr.isatty():

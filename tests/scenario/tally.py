@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 
+from scenario.rig_run import RunResult
+
 
 class Tally:
     """Counts runs as they end.
@@ -26,25 +28,13 @@ class Tally:
         self._simulated = 0.0
         self.violations = 0
 
-    def add(self, *, of_processes: bool, faults: int, simulated: float, violates: bool) -> None:
-        """Count a run.
-
-        Parameters
-        ----------
-        of_processes : bool
-            Whether it was one of real processes.
-        faults : int
-            Faults that happened to it.
-        simulated : float
-            How long it took in its own time [s].
-        violates : bool
-            Whether it violated an invariant.
-        """
-        self._runs += not of_processes
-        self._processes += of_processes
-        self._faults += faults
-        self._simulated += simulated
-        self.violations += violates
+    def add(self, result: RunResult) -> None:
+        """Count a run."""
+        self._runs += not result.of_processes
+        self._processes += result.of_processes
+        self._faults += len(result.told_by_moments)
+        self._simulated += result.simulated
+        self.violations += bool(result.violations)
 
     @property
     def progress(self) -> str:

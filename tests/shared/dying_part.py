@@ -8,28 +8,15 @@ import signal
 from pathlib import Path
 
 from needle_bringup.studies.cluster_study import ClusterPart, PartDone, run_part
-from scenario.many_runs import run_part as run_seeds
-from scenario.rig_run import RunResult
 
 
 def end_the_first(asked: tuple[Path, ClusterPart]) -> PartDone:
     """Do a part; the first worker that would is killed in the midst of it."""
     mark, part = asked
-    _end_once(mark)
-    return run_part(part)
-
-
-def end_the_first_soak(asked: tuple[Path, range]) -> list[RunResult]:
-    """Do some runs of the soak, likewise."""
-    mark, seeds = asked
-    _end_once(mark)
-    return run_seeds(seeds)
-
-
-def _end_once(mark: Path) -> None:
     with contextlib.suppress(FileExistsError):
         mark.touch(exist_ok=False)
         os.kill(os.getpid(), signal.SIGKILL)
+    return run_part(part)
 
 
 def end_every(_: object) -> None:

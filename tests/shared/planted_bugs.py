@@ -26,6 +26,7 @@ from needle_device_driver.device import DeviceRows
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold
+from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
@@ -301,9 +302,9 @@ def _judge_forgets(**values: float) -> Plant:
 
 def _judge_of_drives_never_behind(patch: pytest.MonkeyPatch) -> None:
     bounds = dataclasses.replace(
-        rig_run.bounds_of_the_rig(), insertion_following_error=0.0, rotation_following_error=0.0
+        SafetyLimits(), insertion_following_error=1e-6, rotation_following_error=1e-6
     )
-    patch.setattr(rig_run, "bounds_of_the_rig", lambda: bounds)
+    patch.setattr(rig_run, "SafetyLimits", lambda: bounds)
     patch.setattr(limit_witness, "_SET_POINTS_BEHIND", 1)
 
 

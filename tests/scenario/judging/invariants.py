@@ -7,9 +7,10 @@ from collections import deque
 from collections.abc import Sequence
 
 from needle_core.status_messages import ControllerStatus, DeviceStatus
+from needle_device_driver.supervisor.limits import SafetyLimits
 from scenario.judging.bag_witness import WAITING_LIMIT
 from scenario.judging.hold_witness import HoldWitness
-from scenario.judging.limit_witness import Bounds, LimitWitness
+from scenario.judging.limit_witness import LimitWitness
 
 # A motor that goes no farther in a tick rests [m], [rad].
 _REST_INSERTION, _REST_ROTATION = 2e-7, 5e-4
@@ -66,7 +67,7 @@ class Watch:
 
     Parameters
     ----------
-    bounds : Bounds
+    bounds : SafetyLimits
         Of the rig.
     release_bound : float
         From a release, or a loss, to the last motion [s].
@@ -82,7 +83,7 @@ class Watch:
     """
 
     def __init__(
-        self, bounds: Bounds, release_bound: float = RELEASE_BOUND, late: float = 0.0
+        self, bounds: SafetyLimits, release_bound: float = RELEASE_BOUND, late: float = 0.0
     ) -> None:
         self._release_bound = release_bound
         self.violations: list[Violation] = []
@@ -129,17 +130,13 @@ class Watch:
         """Take whether the console says that the hand, at its page, presses."""
         idle = at - self._pressed_until
         if pressed and idle > PAGE_LIFETIME:
-            self.violate(
-                "hold_is_of_now", at, f"said to be held {idle:.3f} s after the finger was off"
-            )
+            said = f"said to be held {idle:.3f} s after the finger was off"
+            self.violate("hold_is_of_now", at, said)
         begins = pressed and not self._page_holds
         if begins and self._pressed_since < self._page_ended - PAGE_LIFETIME:
-            self.violate(
-                "hold_is_of_now",
-                at,
-                f"held again by a press of {self._pressed_since:.3f} s, from before "
-                f"{self._page_ended:.3f} s, when its hold had ended",
-            )
+            since, ended = self._pressed_since, self._page_ended
+            said = f"held again by a press of {since:.3f} s; its hold had ended at {ended:.3f} s"
+            self.violate("hold_is_of_now", at, said)
         if self._page_holds and not pressed:
             self._page_ended = at
         self._page_holds = pressed
@@ -155,11 +152,7 @@ class Watch:
         state, before = status.state, self._status.state
         if state in ("FAULT", "ESTOPPED") and not status.fault:
             self.violate("faults_are_named", at, f"{state} without a word why")
-        if (
-            state != before
-            and state in ("HOLDING", "DISABLED")
-            and before not in ("MOVING", "HOLDING")
-        ):
+        if state in ("HOLDING", "DISABLED") and before not in ("MOVING", "HOLDING", state):
             # Enabled, or reset: a press from before may not count.
             self._must_press_after = at
         if self._is_homing:
@@ -242,12 +235,9 @@ class Watch:
             return
         off = self._before[1] - status.insertion_m
         if not -0.0005 <= off <= _BELIEF:
-            self.violate(
-                "belief_equals_joints",
-                at,
-                f"the controller says {status.insertion_m * 1e3:.2f} mm, the needle is "
-                f"{self._before[1] * 1e3:.2f} mm in",
-            )
+            seen = f"the needle is {self._before[1] * 1e3:.2f} mm in"
+            said = f"the controller says {status.insertion_m * 1e3:.2f} mm, {seen}"
+            self.violate("belief_equals_joints", at, said)
 
     # ---- judgement ------------------------------------------------------------------------------
 
@@ -256,33 +246,22 @@ class Watch:
         return self._status.activity == "homing"
 
     def _judge_hold(self, at: float, *, begins: bool) -> None:
-        if self._estop_since is not None and at - self._estop_since > self._release_bound:
-            self.violate(
-                "estop_stops", at, f"motion {at - self._estop_since:.3f} s after an emergency stop"
-            )
+        estop = self._estop_since
+        if estop is not None and at - estop > self._release_bound:
+            self.violate("estop_stops", at, f"motion {at - estop:.3f} s after an emergency stop")
         # The hand's hold lasts as long as it presses and its node says so.
         idle = at - max(min(self._pressed_until, self._told_until), self._other_until)
         if idle > self._release_bound and at > self._ends_until:
-            self.violate(
-                "no_motion_without_hold",
-                at,
-                f"motion {idle:.3f} s after the last moment in which anybody held and said so",
-            )
+            said = f"motion {idle:.3f} s after the last moment in which anybody held and said so"
+            self.violate("no_motion_without_hold", at, said)
         by_others = self.witness.idle(at) if self.witness.hears else 0.0
         if by_others > RELEASE_BOUND and at > self._ends_until:
-            self.violate(
-                "no_motion_by_another",
-                at,
-                f"motion {by_others:.3f} s after the last press of an owner reached the device",
-            )
-        since = max(self._pressed_since, self._other_since)
-        if begins and since < self._must_press_after:
-            self.violate(
-                "no_motion_by_itself",
-                at,
-                f"motion by a press of {since:.3f} s, from before "
-                f"{self._must_press_after:.3f} s, when the device became ready",
-            )
+            said = f"motion {by_others:.3f} s after the last press of an owner reached the device"
+            self.violate("no_motion_by_another", at, said)
+        since, ready = max(self._pressed_since, self._other_since), self._must_press_after
+        if begins and since < ready:
+            said = f"motion by a press of {since:.3f} s; the device became ready at {ready:.3f} s"
+            self.violate("no_motion_by_itself", at, said)
 
     def _judge_way(self, at: float, insertion: float, rotation: float) -> None:
         """Judge a motion inwards: nobody but a command moves the needle there, and as it says."""
@@ -291,18 +270,13 @@ class Watch:
             for command in self._commands
             if insertion <= max(place[0] for place in command) + _BEYOND_COMMAND
         ]
+        where = f"at {insertion * 1e3:.2f} mm"
         if not off:
-            self.violate(
-                "turns_as_commanded",
-                at,
-                f"it goes in to {insertion * 1e3:.2f} mm, which none of the last commands wants",
-            )
+            said = f"{where} it goes in, which none of the last commands wants"
+            self.violate("turns_as_commanded", at, said)
         elif min(off) > _OUT_OF_PROPORTION:
-            self.violate(
-                "turns_as_commanded",
-                at,
-                f"at {insertion * 1e3:.2f} mm it is {min(off):.2f} rad from the nearest command",
-            )
+            said = f"{where} it is {min(off):.2f} rad from the nearest command"
+            self.violate("turns_as_commanded", at, said)
 
     def _judge_status(self, at: float) -> None:
         state = self._status.state
@@ -310,9 +284,8 @@ class Watch:
             return
         lag = at - max(self._status_at, self._moving_since or at)
         if lag > _STATUS_LAG:
-            self.violate(
-                "status_is_true", at, f"it moves {lag:.3f} s after device/status said {state}"
-            )
+            said = f"it moves {lag:.3f} s after device/status said {state}"
+            self.violate("status_is_true", at, said)
 
 
 def _rotation_at(insertion: float, command: Sequence[tuple[float, float]]) -> float:

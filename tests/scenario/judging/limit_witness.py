@@ -6,6 +6,8 @@ import dataclasses
 import math
 from collections.abc import Iterator
 
+from needle_device_driver.supervisor.limits import SafetyLimits
+
 # From one set-point to the next [s].
 _SET_POINT_PERIOD = 0.02
 # A drive may be behind by its following error, which is judged by a position of a cycle ago, one
@@ -13,32 +15,6 @@ _SET_POINT_PERIOD = 0.02
 _SET_POINTS_BEHIND = 3
 # What drives of such a rig swing over beyond its limits [m], [rad].
 _PLACE_ROOM, _TURN_ROOM = 0.0011, 0.3
-
-
-@dataclasses.dataclass(frozen=True)
-class Bounds:
-    """The rig's own limits.
-
-    Attributes
-    ----------
-    max_depth : float
-        [m].
-    max_speed : float
-        [m/s].
-    max_rotation : float
-        Either way [rad].
-    max_rotation_rate : float
-        [rad/s].
-    insertion_following_error, rotation_following_error : float
-        [m], [rad].
-    """
-
-    max_depth: float
-    max_speed: float
-    max_rotation: float
-    max_rotation_rate: float
-    insertion_following_error: float
-    rotation_following_error: float
 
 
 class Pace:
@@ -90,19 +66,23 @@ class _Axis:
     set_points: Pace
     motor: Pace
 
+    def said(self, way: float, most: float) -> str:
+        """Return a way beside its bound."""
+        return f"{way * self.scale:.4g} {self.unit} (at most {most * self.scale:.4g})"
+
 
 class LimitWitness:
     """Says what is beyond the limits.
 
     Parameters
     ----------
-    bounds : Bounds
+    bounds : SafetyLimits
         Of the rig.
     late : float
         How late a set-point may be sent: the next one may then follow it so much sooner [s].
     """
 
-    def __init__(self, bounds: Bounds, late: float = 0.0) -> None:
+    def __init__(self, bounds: SafetyLimits, late: float = 0.0) -> None:
         self._bounds = bounds
         # One may be early by all of its period.
         self._early = _SET_POINT_PERIOD + late
@@ -139,10 +119,7 @@ class LimitWitness:
             return
         ahead, bound = its.set_points.ahead(at, place), its.speed * self._early
         if ahead > bound:
-            yield (
-                f"set-points of {its.name} are {ahead * its.scale:.4g} {its.unit} ahead of its "
-                f"speed limit, at most {bound * its.scale:.4g}"
-            )
+            yield f"set-points of {its.name} {its.said(ahead, bound)} ahead of its speed limit"
 
     def see_motors(self, at: float, insertion: float, rotation: float) -> Iterator[str]:
         """Take where the motors really are; yields what is beyond the limits.
@@ -164,7 +141,4 @@ class LimitWitness:
             # Who is behind goes on as fast as it can (docs/safety.md, following_error).
             ahead = its.motor.ahead(at, place)
             if ahead > its.behind:
-                yield (
-                    f"{its.name} went {ahead * its.scale:.4g} {its.unit} farther than its speed "
-                    f"limit allows, at most {its.behind * its.scale:.4g}"
-                )
+                yield f"{its.name} went {its.said(ahead, its.behind)} farther than its speed allows"

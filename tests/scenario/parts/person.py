@@ -6,20 +6,8 @@ import dataclasses
 import enum
 from collections.abc import Callable
 
+from needle_core import component as c
 from needle_core import messages as m
-from needle_core.component import (
-    BEST_EFFORT,
-    LATCHED,
-    Action,
-    Actions,
-    Call,
-    Component,
-    Input,
-    Moment,
-    Output,
-    Publish,
-    Timer,
-)
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 INSERT, RETRACT, STOP = 0, 1, 2
@@ -68,7 +56,7 @@ class Hand:
         return "insert" if self.insert else "retract"
 
 
-class Joystick(Component):
+class Joystick(c.Component):
     """Publishes what the hand does.
 
     Parameters
@@ -81,16 +69,16 @@ class Joystick(Component):
 
     def __init__(self, hand: Hand, name: str = "joy_node", topic: str = "joy") -> None:
         self.name = name
-        self.outputs = (Output(topic, m.Joystick, BEST_EFFORT),)
+        self.outputs = (c.Output(topic, m.Joystick, c.BEST_EFFORT),)
 
-        def tell(at: Moment) -> Actions:
+        def tell(at: c.Moment) -> c.Actions:
             buttons = (int(hand.insert), int(hand.retract), int(hand.stop))
-            yield Publish(topic, m.Joystick(at.stamp_ns, (), buttons))
+            yield c.Publish(topic, m.Joystick(at.stamp_ns, (), buttons))
 
-        self.timers = (Timer(1.0 / _JOY_RATE, tell),)
+        self.timers = (c.Timer(1.0 / _JOY_RATE, tell),)
 
 
-class Person(Component):
+class Person(c.Component):
     """Acts by what the rig says of itself, and by where the needle is seen to be.
 
     Parameters
@@ -129,26 +117,26 @@ class Person(Component):
         self.done = False
         self.absent = False
         self.sees_lost_press: Callable[[float], bool] = lambda _: False
-        self.asides: list[Action] = []
+        self.asides: list[c.Action] = []
         self._called: dict[str, float] = {}
         self._changed_at = 0.0
         self.inputs = (
-            Input("device/status", DeviceStatus, self._see_device, LATCHED),
-            Input("needle/controller_status", ControllerStatus, self._see_controller, LATCHED),
+            c.Input("device/status", DeviceStatus, self._see_device, c.LATCHED),
+            c.Input("needle/controller_status", ControllerStatus, self._see_controller, c.LATCHED),
         )
-        self.outputs = (Output("device/estop", m.EmergencyStop),)
-        self.timers = (Timer(_LOOK, self._look),)
+        self.outputs = (c.Output("device/estop", m.EmergencyStop),)
+        self.timers = (c.Timer(_LOOK, self._look),)
 
-    def _see_device(self, message: DeviceStatus, at: Moment) -> Actions:
+    def _see_device(self, message: DeviceStatus, at: c.Moment) -> c.Actions:
         self.device = message
         return ()
 
-    def _see_controller(self, message: ControllerStatus, at: Moment) -> Actions:
+    def _see_controller(self, message: ControllerStatus, at: c.Moment) -> c.Actions:
         self.controller = message
         self.done = self.done or message.state == "DONE"
         return ()
 
-    def _look(self, at: Moment) -> Actions:
+    def _look(self, at: c.Moment) -> c.Actions:
         yield from self.asides
         self.asides = []
         if self.absent:
@@ -157,7 +145,7 @@ class Person(Component):
         insert, retract = False, False
         if state in ("FAULT", "ESTOPPED"):
             if state == "ESTOPPED":
-                yield Publish("device/estop", m.EmergencyStop(False))
+                yield c.Publish("device/estop", m.EmergencyStop(False))
             yield from self._try("device/reset", at)
         elif state == "DISABLED":
             yield from self._prepare(at)
@@ -167,7 +155,7 @@ class Person(Component):
                 yield from self._try(call[0], at, call[1])
         self._press(at.steady, insert=insert, retract=retract)
 
-    def _prepare(self, at: Moment) -> Actions:
+    def _prepare(self, at: c.Moment) -> c.Actions:
         is_out = self._insertion() < OUT
         if self.device.homed or not is_out:
             if self.wish is not Wish.LEAVE:
@@ -217,7 +205,7 @@ class Person(Component):
         self._hand.insert = self._hand.retract = False
         self._changed_at = now
 
-    def _try(self, name: str, at: Moment, on: bool | None = None) -> Actions:
+    def _try(self, name: str, at: c.Moment, on: bool | None = None) -> c.Actions:
         if at.steady - self._called.get(name, -_CALL_AGAIN) >= _CALL_AGAIN:
             self._called[name] = at.steady
-            yield Call(name, on)
+            yield c.Call(name, on)

@@ -64,13 +64,11 @@ class Disk:
             self.stands_still = True
         elif fault.kind is Kind.SLOW:
             self.slowness = fault.size * _SLOWEST_JOB
-        elif fault.kind is Kind.GARBAGE:
-            self.error = errno.EIO
-        elif fault.size < 0.5:
+        elif fault.kind is Kind.OFF and fault.size < 0.5:
             # Others fill it, and it can be seen.
             self.room = 0
         else:
-            self.error = errno.ENOSPC
+            self.error = errno.EIO if fault.kind is Kind.GARBAGE else errno.ENOSPC
         return self._mend
 
     def _mend(self) -> None:

@@ -7,19 +7,8 @@ import random
 from collections.abc import Callable
 from typing import Any
 
+from needle_core import component as c
 from needle_core import messages as m
-from needle_core.component import (
-    BEST_EFFORT,
-    LATCHED,
-    RELIABLE,
-    Actions,
-    Component,
-    Exit,
-    Moment,
-    Output,
-    Publish,
-    Timer,
-)
 from scenario.faults import FLOOD, Fault, Kind, strange_topic
 from scenario.parts.bench import Bench
 
@@ -29,7 +18,7 @@ _FLOOD_PERIOD, _AT_ONCE = 0.001, 5
 _JOINTS = (m.INSERTION_JOINT, m.ROTATION_JOINT)
 
 
-class Stranger(Component):
+class Stranger(c.Component):
     """Publishes on one topic from its start on.
 
     Parameters
@@ -50,28 +39,28 @@ class Stranger(Component):
         self._bench, self._chance = bench, chance
         self._topic = strange_topic(fault).removeprefix("/")
         rows: dict[str, tuple[type[Any], Any, Callable[[int], Any]]] = {
-            "device/hold": (m.HoldState, BEST_EFFORT, self._hold),
-            "device/joint_trajectory": (m.Trajectory, RELIABLE, self._trajectory),
-            "device/estop": (m.EmergencyStop, RELIABLE, lambda _: m.EmergencyStop(True)),
-            "joint_states": (m.JointState, RELIABLE, self._joints),
-            "needle/tip": (m.Point, RELIABLE, self._tip),
-            "target_plane": (m.Pose, LATCHED, self._plane),
+            "device/hold": (m.HoldState, c.BEST_EFFORT, self._hold),
+            "device/joint_trajectory": (m.Trajectory, c.RELIABLE, self._trajectory),
+            "device/estop": (m.EmergencyStop, c.RELIABLE, lambda _: m.EmergencyStop(True)),
+            "joint_states": (m.JointState, c.RELIABLE, self._joints),
+            "needle/tip": (m.Point, c.RELIABLE, self._tip),
+            "target_plane": (m.Pose, c.LATCHED, self._plane),
         }
         kind, delivery, self._make = rows[self._topic]
-        self.outputs = (Output(self._topic, kind, delivery),)
+        self.outputs = (c.Output(self._topic, kind, delivery),)
         floods = fault.part == FLOOD
         self._at_once = _AT_ONCE if floods else 1
-        self.timers = (Timer(_FLOOD_PERIOD if floods else _PERIOD, self._act),)
+        self.timers = (c.Timer(_FLOOD_PERIOD if floods else _PERIOD, self._act),)
 
-    def on_stop(self, at: Moment) -> Actions:
+    def on_stop(self, at: c.Moment) -> c.Actions:
         """Take an emergency stop back, and exit."""
         if self._topic == "device/estop":
-            yield Publish(self._topic, m.EmergencyStop(False))
-        yield Exit(0)
+            yield c.Publish(self._topic, m.EmergencyStop(False))
+        yield c.Exit(0)
 
-    def _act(self, at: Moment) -> Actions:
+    def _act(self, at: c.Moment) -> c.Actions:
         for _ in range(self._at_once):
-            yield Publish(self._topic, self._make(at.stamp_ns))
+            yield c.Publish(self._topic, self._make(at.stamp_ns))
 
     def _number(self, value: float) -> float:
         return self._chance.choice((math.nan, math.inf, -1e300)) if self._garbage else value

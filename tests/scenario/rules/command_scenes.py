@@ -1,0 +1,277 @@
+"""Scenes for the rules of holds and commands, each called as its rule is."""
+
+from __future__ import annotations
+
+import math
+
+from needle_core import messages as m
+from needle_core.component import Call, Publish
+from needle_device_driver.rules import Rule
+from scenario.rules.scene import AT_REST, COMMANDS, HOLD, STATUS, Held, Scene
+
+
+def hold_to_run() -> None:
+    """A step without a hold is refused; one that has lost it stops."""
+    scene = Scene()
+    scene.home()
+    scene.step()
+    assert scene.refuses(Rule.HOLD_TO_RUN)
+    scene.moving()
+    scene.release()
+    assert scene.rests()
+
+
+def hold_age() -> None:
+    """A hand that hangs stops the needle, and does not hold when it is back."""
+    scene = Scene()
+    scene.moving()
+    scene.silence(0.5)
+    assert scene.named(Rule.HOLD_AGE)
+    assert scene.rests(0.5)
+
+
+def hold_new_press() -> None:
+    """What was pressed before the axes were enabled moves nothing."""
+    scene = Scene()
+    scene.home()
+    scene.hand.held = Held(True)
+    scene.runner.run(0.1)
+    scene.call("device/enable", False)
+    scene.call("device/enable", True)
+    scene.step()
+    assert scene.refuses(Rule.HOLD_NEW_PRESS)
+
+
+def hold_one_owner() -> None:
+    """A second hand does not count beside the first, nor when that lets go."""
+    scene = Scene()
+    scene.ready()
+    other = scene.let_in(HOLD)
+    for count, pressed in enumerate((False, True), 1):
+        scene.told(other, Publish(HOLD.topic, m.HoldState("other", "", count, pressed, 1.0, 0.1)))
+    assert scene.named(Rule.HOLD_ONE_OWNER)
+    assert scene.hand.status.hold_owner == "hand"
+
+
+def hold_in_order() -> None:
+    """An old press of the hand that comes again does not count."""
+    scene = Scene()
+    scene.ready()
+    other = scene.let_in(HOLD)
+    old = m.HoldState(scene.hand.name, scene.hand.session._session, 1, False, 0.0, 0.1)
+    scene.told(other, Publish(HOLD.topic, old))
+    assert scene.named(Rule.HOLD_IN_ORDER)
+    assert scene.hand.status.holds_ignored > 0
+    assert scene.hand.status.hold_owner == "hand"
+
+
+def speed_scale() -> None:
+    """A speed that is no number is a release."""
+    scene = Scene()
+    scene.moving()
+    scene.hand.held = Held(True, math.nan)
+    scene.runner.run(0.1)
+    assert scene.rests()
+    assert scene.hand.status.hold_owner == ""
+
+
+def one_device() -> None:
+    """Where another device speaks nothing moves."""
+    scene = Scene()
+    scene.moving()
+    scene.let_in(STATUS)
+    assert scene.fails(Rule.ONE_DEVICE)
+
+
+def no_motion_by_itself() -> None:
+    """Enabling moves nothing, whatever was under way before and is pressed still."""
+    scene = Scene()
+    scene.moving()
+    scene.call("device/enable", False)
+    assert scene.rests()
+    scene.call("device/enable", True)
+    assert scene.rests(1.0)
+
+
+def command_state() -> None:
+    """A second command does not end the running step."""
+    scene = Scene()
+    first = scene.moving()
+    second = scene.step(0.001, 0.1, 0.5)
+    assert scene.named(Rule.COMMAND_STATE)
+    scene.until(lambda: first in scene.hand.results, "the first step")
+    assert scene.hand.results[first] == "succeeded"
+    assert scene.hand.results[second].startswith("aborted")
+
+
+def command_one_publisher() -> None:
+    """With two who command nobody is obeyed."""
+    scene = Scene()
+    scene.ready()
+    scene.let_in(COMMANDS)
+    scene.step()
+    assert scene.refuses(Rule.COMMAND_ONE_PUBLISHER)
+
+
+def command_form() -> None:
+    """A command without a time is none."""
+    scene = Scene()
+    scene.ready()
+    scene.send(((0.001, 0.0), 0.0))
+    assert scene.refuses(Rule.COMMAND_FORM)
+
+
+def command_finite() -> None:
+    """A command that is no number is none."""
+    scene = Scene()
+    scene.ready()
+    scene.send(((math.nan, 0.0), 1.0))
+    assert scene.refuses(Rule.COMMAND_FINITE)
+
+
+def command_newer() -> None:
+    """A command that comes twice is obeyed once."""
+    scene = Scene()
+    scene.ready()
+    stamp = scene.send(((0.001, 0.0), 0.5))
+    scene.until(lambda: stamp in scene.hand.results, "the step")
+    scene.hand.actions.append(
+        Publish(
+            COMMANDS.topic,
+            m.Trajectory(stamp, scene.joints, (m.TrajectoryPoint((0.002, 0.0), 0.5),)),
+        )
+    )
+    scene.runner.run(0.1)
+    assert scene.refuses(Rule.COMMAND_NEWER)
+
+
+def tip_age() -> None:
+    """A command after a tip of 2.1 s ago is refused."""
+    scene = Scene()
+    scene.ready()
+    scene.runner.run(3.0)
+    scene.send(((0.001, 0.0), 0.5), age=2.1)
+    assert scene.refuses(Rule.TIP_AGE)
+
+
+def homed_first() -> None:
+    """Without a home position no step begins."""
+    scene = Scene()
+    scene.until(lambda: scene.state == "DISABLED", "the driver")
+    scene.call("device/enable", True)
+    scene.press()
+    scene.send(((0.001, 0.0), 0.5))
+    assert scene.refuses(Rule.HOMED_FIRST)
+
+
+def forward_only() -> None:
+    """A step does not draw the needle out."""
+    scene = Scene()
+    scene.ready()
+    scene.until_done(scene.step())
+    scene.step(-0.001)
+    assert scene.refuses(Rule.FORWARD_ONLY)
+
+
+def max_depth() -> None:
+    """No step ends deeper than it may."""
+    scene = Scene({"max_depth": 0.02})
+    scene.ready()
+    for _ in range(10):
+        scene.until_done(scene.step(0.00199, 0.0))
+    scene.step(0.0002, 0.0)
+    assert scene.refuses(Rule.MAX_DEPTH)
+
+
+def max_step_length() -> None:
+    """No step is longer than 2 mm."""
+    scene = Scene()
+    scene.ready()
+    scene.step(0.0021)
+    assert scene.refuses(Rule.MAX_STEP_LENGTH)
+
+
+def max_speed() -> None:
+    """No step is faster than 5 mm/s."""
+    scene = Scene()
+    scene.ready()
+    scene.step(0.002, 0.0, 0.39)
+    assert scene.refuses(Rule.MAX_SPEED)
+
+
+def max_rotation_step() -> None:
+    """No step turns by more than 1.2 rad."""
+    scene = Scene()
+    scene.ready()
+    scene.step(turn=1.21)
+    assert scene.refuses(Rule.MAX_ROTATION_STEP)
+
+
+def max_rotation_rate() -> None:
+    """No step turns faster than 3.14 rad/s."""
+    scene = Scene()
+    scene.ready()
+    scene.step(0.001, 1.1, 0.34)
+    assert scene.refuses(Rule.MAX_ROTATION_RATE)
+
+
+def max_turns() -> None:
+    """No step turns the needle farther than its cables go."""
+    scene = Scene({"max_turns": 0.25})
+    scene.ready()
+    scene.until_done(scene.step())
+    scene.step()
+    assert scene.refuses(Rule.MAX_TURNS)
+
+
+def coordinated() -> None:
+    """Rotation follows insertion, at a speed that a person changes."""
+    scene = Scene()
+    scene.ready()
+    scene.hand.places.clear()
+    stamp = scene.step()
+    scene.runner.run(0.2)
+    scene.hand.held = Held(True, 0.3)
+    scene.until_done(stamp)
+    begin, end = scene.hand.places[0], scene.hand.places[-1]
+    for at in scene.hand.places:
+        insertion, rotation = (
+            (now - first) / (last - first) for now, first, last in zip(at, begin, end, strict=True)
+        )
+        assert abs(insertion - rotation) < 0.005
+
+
+def retraction() -> None:
+    """The needle comes out while the hold lasts, without turning, and no farther than home."""
+    scene = Scene()
+    scene.ready()
+    scene.until_done(scene.step())
+    deep, turned = scene.place
+    scene.call("device/retract")
+    scene.runner.run(0.1)
+    scene.release()
+    assert scene.rests()
+    assert 0.0 < scene.place[0] < deep
+    scene.press()
+    scene.call("device/retract")
+    scene.until(lambda: scene.hand.status.activity == "none", "the retraction")
+    assert abs(scene.place[0]) < 1e-4
+    assert abs(scene.place[1] - turned) <= AT_REST
+
+
+def homing_needle_out() -> None:
+    """Nothing is homed before somebody has said that the needle is out."""
+    scene = Scene()
+    scene.until(lambda: scene.state == "DISABLED", "the driver")
+    scene.hand.answers.clear()
+    scene.hand.actions.append(Call("device/home"))
+    assert scene.rests(1.0)
+    assert [answer.success for answer in scene.hand.answers] == [False]
+
+
+SCENES = (
+    hold_to_run, hold_age, hold_new_press, hold_one_owner, hold_in_order, speed_scale, one_device,
+    no_motion_by_itself, command_state, command_one_publisher, command_form, command_finite,
+    command_newer, tip_age, homed_first, forward_only, max_depth, max_step_length, max_speed,
+    max_rotation_step, max_rotation_rate, max_turns, coordinated, retraction, homing_needle_out,
+)  # fmt: skip

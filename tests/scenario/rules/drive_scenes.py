@@ -1,0 +1,222 @@
+"""Scenes for the rules of axes, drives and bus, each called as its rule is."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from needle_core import messages as m
+from needle_core.can_frame import CAN, CanFrame
+from needle_core.component import Publish
+from needle_device_driver.rules import Rule
+from needle_sim.drives.power_state import PowerState
+from scenario.rules.scene import AXES, DRIVER, ESTOP, Scene
+
+ON = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
+SYNC = 0x080
+
+
+def states(scene: Scene) -> list[PowerState]:
+    """Return both drives' states."""
+    return [scene.bus.drives[axis].state for axis in AXES]
+
+
+def following_error() -> None:
+    """An axis that does not follow stops both."""
+    scene = Scene()
+    scene.moving()
+    scene.bus.stall("insertion")
+    scene.runner.run(1.0)
+    assert scene.fails(Rule.FOLLOWING_ERROR)
+
+
+def unhomed_outward_only() -> None:
+    """After a drive's reboot the needle goes out by as much as it was in, and never in."""
+    scene = Scene()
+    scene.ready()
+    scene.until_done(scene.step())
+    scene.bus.reboot("insertion", scene.runner.now)
+    scene.runner.run(1.0)
+    scene.release()
+    scene.call("device/reset")
+    scene.call("device/enable", True)
+    scene.press()
+    scene.send(((0.003, 0.0), 1.0))
+    assert scene.refuses(Rule.HOMED_FIRST)
+    deep = scene.place[0]
+    scene.call("device/retract")
+    scene.until(lambda: scene.hand.status.activity == "none", "the retraction")
+    assert -1e-4 < scene.place[0] < 0.1 * deep
+
+
+def homing_time() -> None:
+    """A homing that does not end is ended."""
+    scene = Scene()
+    scene.until(lambda: scene.state == "DISABLED", "the driver")
+    scene.call("device/confirm_needle_out", True)
+    scene.bus.stall("rotation")
+    scene.call("device/home")
+    for _ in range(200):
+        scene.runner.run(1.0)
+        if scene.state == "FAULT":
+            break
+    assert scene.fails(Rule.HOMING_TIME)
+
+
+def estop_latches() -> None:
+    """An emergency stop ends the motion; taking it back moves nothing."""
+    scene = Scene()
+    scene.moving()
+    other = scene.let_in(ESTOP)
+    scene.told(other, Publish(ESTOP.topic, m.EmergencyStop(True)))
+    assert scene.rests()
+    assert scene.named(Rule.ESTOP_LATCHES)
+    scene.told(other, Publish(ESTOP.topic, m.EmergencyStop(False)))
+    assert scene.rests()
+    assert scene.state == "ESTOPPED"
+
+
+def one_fault_stops_both() -> None:
+    """The fault of one drive switches the other off, too."""
+    scene = Scene()
+    scene.moving()
+    scene.bus.emergency("insertion", 0x2310)
+    scene.runner.run(0.5)
+    assert scene.state == "FAULT"
+    assert not set(states(scene)) & set(ON)
+
+
+def inner_limit_switch() -> None:
+    """A step ends at the inner end's switch."""
+    scene = Scene({"max_depth": 0.3})
+    scene.ready()
+    motor = scene.bus.drives["insertion"].motor
+    scene.until_done(scene.step(0.0005, 0.0))
+    motor._settings = dataclasses.replace(motor._settings, travel=motor.position + 10_000.0)
+    scene.step()
+    scene.runner.run(1.0)
+    assert scene.fails(Rule.INNER_LIMIT_SWITCH)
+
+
+def reply_age() -> None:
+    """A drive that says nothing more is a fault."""
+    scene = Scene()
+    scene.moving()
+    scene.bus.hang("rotation")
+    assert scene.fails(Rule.REPLY_AGE)
+
+
+def axis_speed() -> None:
+    """A drive whose speeds are in another unit is stopped within 8 mm."""
+    scene = Scene(drives={"rpm": True})
+    scene.until(lambda: scene.state == "DISABLED", "the driver")
+    scene.call("device/confirm_needle_out", True)
+    scene.call("device/home")
+    begin = scene.place[0]
+    assert scene.fails(Rule.AXIS_SPEED)
+    assert abs(scene.place[0] - begin) < 0.008
+
+
+def settling_time() -> None:
+    """A step that does not arrive ends as a fault."""
+    scene = Scene()
+    scene.moving()
+    scene.until(lambda: scene.place[0] > 0.0018, "the step's end")
+    scene.bus.stall("insertion")
+    scene.runner.run(1.5)
+    assert scene.fails(Rule.SETTLING_TIME)
+
+
+def link_loss() -> None:
+    """An adapter that is pulled out is named."""
+    scene = Scene()
+    scene.moving()
+    scene.runner.lose_port(DRIVER, CAN, "unplugged")
+    assert scene.fails(Rule.LINK_LOSS)
+
+
+def one_master() -> None:
+    """Somebody else's SYNC is a fault."""
+    scene = Scene()
+    scene.moving()
+    scene.bus_says = [CanFrame(SYNC)]
+    assert scene.fails(Rule.ONE_MASTER)
+
+
+def drive_watchdog() -> None:
+    """Drives without a driver end their motion, and have a fault."""
+    scene = Scene()
+    scene.moving()
+    scene.runner.freeze(DRIVER, 1.0)
+    scene.runner.run(0.5)
+    assert states(scene) == [PowerState.FAULT] * 2
+    scene.runner.run(0.7)
+    assert scene.fails(Rule.DRIVE_WATCHDOG)
+
+
+def drive_emergency() -> None:
+    """A drive's emergency message stops both."""
+    scene = Scene()
+    scene.moving()
+    scene.bus.emergency("rotation", 0x4210)
+    assert scene.fails(Rule.DRIVE_EMERGENCY)
+
+
+def drive_reboot() -> None:
+    """A drive that starts anew is a fault."""
+    scene = Scene()
+    scene.ready()
+    scene.bus.reboot("rotation", scene.runner.now)
+    scene.runner.run(1.0)
+    assert scene.fails(Rule.DRIVE_REBOOT)
+    assert not scene.hand.status.homed
+
+
+def quick_stop() -> None:
+    """A release stops the drives where they are, not at their next set-point."""
+    scene = Scene()
+    scene.moving()
+    scene.release()
+    assert states(scene) == [PowerState.QUICK_STOP_ACTIVE] * 2
+    assert scene.rests()
+
+
+def software_limits() -> None:
+    """The drive itself knows how far it may go."""
+    scene = Scene()
+    scene.home()
+    for axis in AXES:
+        objects = scene.bus.drives[axis].device.objects
+        lower, upper = (
+            int.from_bytes(objects.read(0x607D, sub), "little", signed=True) for sub in (1, 2)
+        )
+        assert -(2**31) < lower < 0 < upper < 2**31 - 1
+
+
+def look_ahead() -> None:
+    """A driver that dies leaves a tenth of a millimetre to go."""
+    scene = Scene()
+    scene.ready()
+    scene.step(duration=0.41)
+    scene.until(lambda: scene.place[0] > 0.0005, "a step under way")
+    assert scene.state == "MOVING"
+    scene.runner.kill(DRIVER)
+    begin = scene.place[0]
+    scene.runner.run(0.5)
+    assert scene.place[0] - begin < 0.00021
+
+
+def loop_heartbeat() -> None:
+    """Each cycle sends a heartbeat, and drives that stand still stay content."""
+    scene = Scene()
+    scene.ready()
+    before = scene.heartbeats
+    scene.runner.run(1.0)
+    assert 49 <= scene.heartbeats - before <= 51
+    assert scene.state == "HOLDING"
+
+
+SCENES = (
+    following_error, unhomed_outward_only, homing_time, estop_latches, one_fault_stops_both,
+    inner_limit_switch, reply_age, axis_speed, settling_time, link_loss, one_master, drive_watchdog,
+    drive_emergency, drive_reboot, quick_stop, software_limits, look_ahead, loop_heartbeat,
+)  # fmt: skip

@@ -1,0 +1,189 @@
+"""A scene for one safety rule: driver, emulated drives, a hand, and whoever is in its way."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from typing import Any
+
+from needle_core import messages as m
+from needle_core.can_frame import CAN, CanFrame
+from needle_core.component import (
+    BEST_EFFORT,
+    LATCHED,
+    Action,
+    Actions,
+    Component,
+    Input,
+    Moment,
+    Output,
+    Publish,
+    Timer,
+)
+from needle_core.runners.faults import Arrival, Arrivals, Link
+from needle_core.runners.virtual import LOG
+from needle_core.status_messages import DeviceStatus
+from needle_device_driver.rules import Rule
+from scenario.virtual_rig import DRIVER, Held, VirtualRig
+
+JOINTS = (m.INSERTION_JOINT, m.ROTATION_JOINT)
+AXES = ("insertion", "rotation")
+AT_REST = 1e-6
+"""What a motor at rest may still move [m], [rad]."""
+
+
+class Witness(Component):
+    """Keeps what is logged."""
+
+    name = "witness"
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.inputs = (Input(LOG.topic, m.LogLine, self._keep),)
+
+    def _keep(self, line: m.LogLine, at: Moment) -> Actions:
+        self.lines.append(line.text)
+        return ()
+
+
+class Other(Component):
+    """A second node that sends what is not its own.
+
+    Parameters
+    ----------
+    *outputs : Output
+        Where it publishes.
+    """
+
+    name = "other"
+
+    def __init__(self, *outputs: Output) -> None:
+        self.actions: list[Action] = []
+        self.outputs = outputs
+        self.timers = (Timer(0.01, self._act),)
+
+    def _act(self, at: Moment) -> Actions:
+        yield from self.actions
+        self.actions = []
+
+
+HOLD = Output("device/hold", m.HoldState, BEST_EFFORT)
+COMMANDS = Output("device/joint_trajectory", m.Trajectory)
+ESTOP = Output("device/estop", m.EmergencyStop)
+STATUS = Output("device/status", DeviceStatus, LATCHED)
+
+
+class Scene(VirtualRig):
+    """The rig, ready to be homed.
+
+    Parameters
+    ----------
+    driver, drives : mapping, optional
+        Parameters of driver and drives.
+
+    Attributes
+    ----------
+    bus_says : list of CanFrame
+        What somebody else puts on the bus, in the drives' next batch.
+    """
+
+    joints = JOINTS
+
+    def __init__(
+        self,
+        driver: Mapping[str, Any] | None = None,
+        drives: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.bus_says: list[CanFrame] = []
+        self.heartbeats = 0
+        super().__init__(1, driver=driver, drives=drives, faults=(self._see_frames,))
+        self._witness = Witness()
+        self.runner.start(self._witness)
+
+    def _see_frames(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
+        if link.topic == CAN:
+            if link.sender == DRIVER:
+                self.heartbeats += sum(frame.identifier == 0x77F for frame in message)
+            else:
+                message, self.bus_says = (*message, *self.bus_says), []
+        return (Arrival(0.0, message),)
+
+    # ---- what is done -------------------------------------------------------------------------
+
+    def ready(self) -> None:
+        """Home, enable, press."""
+        self.home()
+        self.press()
+
+    def step(self, length: float = 0.002, turn: float = 1.0, duration: float = 1.0) -> int:
+        """Send a step from where the joints are [m], [rad], [s]; return its stamp."""
+        at = self.hand.joints
+        stamp = self.command(at[0] + length, at[1] + turn, duration)
+        self.runner.run(0.1)
+        return stamp
+
+    def send(self, *points: tuple[tuple[float, ...], float], age: float = 0.0) -> int:
+        """Send a command with these points and times, its stamp so old [s]."""
+        stamp = self.runner.timeline.stamp_ns - round(age * 1e9)
+        way = tuple(m.TrajectoryPoint(place, time) for place, time in points)  # type: ignore[arg-type]
+        self.hand.actions.append(Publish(COMMANDS.topic, m.Trajectory(stamp, JOINTS, way)))
+        self.runner.run(0.1)
+        return stamp
+
+    def until_done(self, stamp: int) -> None:
+        """Let a step end."""
+        self.until(lambda: stamp in self.hand.results, "the result of a step")
+
+    def moving(self) -> int:
+        """Be in the middle of a step."""
+        self.ready()
+        begin = self.place[0]
+        stamp = self.step()
+        self.until(lambda: self.place[0] > begin + 0.0005, "a step under way")
+        return stamp
+
+    def let_in(self, *outputs: Output) -> Other:
+        """Start another node, and let the rest see it."""
+        other = Other(*outputs)
+        self.runner.start(other)
+        self.runner.run(0.3)
+        return other
+
+    def told(self, other: Other, *actions: Action) -> None:
+        """Let the other node act, and time go by."""
+        other.actions += actions
+        self.runner.run(0.1)
+
+    def silence(self, seconds: float) -> None:
+        """Let the hand stand still, as a process that hangs."""
+        self.runner.freeze(self.hand.name, seconds)
+        self.runner.run(seconds)
+
+    # ---- what is seen -------------------------------------------------------------------------
+
+    @property
+    def state(self) -> str:
+        """What the device says of itself."""
+        return self.hand.status.state
+
+    def named(self, rule: Rule) -> bool:
+        """Return whether a rule was named in the log."""
+        return any(f"[{rule.value}]" in line for line in self._witness.lines)
+
+    def rests(self, seconds: float = 0.3) -> bool:
+        """Return whether no motor moves for some time."""
+        before = self.place
+        self.runner.run(seconds)
+        return all(abs(a - b) <= AT_REST for a, b in zip(self.place, before, strict=True))
+
+    def refuses(self, rule: Rule) -> bool:
+        """Return whether the last command was refused for a rule, and nothing moves."""
+        return self.rests() and self.named(rule) and self.state != "MOVING"
+
+    def fails(self, rule: Rule) -> bool:
+        """Return whether the device is in FAULT for a rule, and nothing moves."""
+        self.runner.run(0.3)
+        return self.rests() and self.named(rule) and self.state == "FAULT"
+
+
+__all__ = ["AXES", "COMMANDS", "ESTOP", "HOLD", "STATUS", "Held", "Other", "Scene"]
