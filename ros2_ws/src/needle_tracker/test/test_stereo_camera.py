@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import queue
-import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -28,11 +28,11 @@ from needle_core.diagnostics import Level
 from needle_core.errors import UserError
 from needle_core.runners.virtual import VirtualRunner
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.sources import pair_port
 from needle_tracker.sources.pair_port import PairPort
 from needle_tracker.sources.stereo_source import EndOfRecording, StampedPair
 from needle_tracker.stereo_camera import PAIRS, StereoCamera, StereoCameraParameters
 
-LIMIT = 20.0
 ASK = Send(PAIRS, ("next",))
 
 
@@ -78,15 +78,12 @@ def test_a_pair_is_published_with_its_calibration(calibration: StereoCalibration
     assert (image.encoding, image.step, set(image.data)) == ("mono8", camera.width, {15})
     assert image.frame_id == info.frame_id == "right_camera_optical"
     assert image.stamp_ns == info.stamp_ns == 9
-    assert sent["stereo/left/image_raw"].stamp_ns == 7
+    left = sent["stereo/left/image_raw"]
+    assert left.stamp_ns == 7
+    # Not copied.
+    assert np.shares_memory(np.frombuffer(left.data, np.uint8), rig.pixels)
     np.testing.assert_allclose(np.reshape(info.k, (3, 3)), camera.camera_matrix)
     np.testing.assert_allclose(info.d, camera.distortion)
-
-
-def test_an_image_is_not_copied(calibration: StereoCalibration) -> None:
-    rig = Rig(calibration)
-    image = published(rig.gives(rig.pair()))["stereo/left/image_raw"]
-    assert np.shares_memory(np.frombuffer(image.data, np.uint8), rig.pixels)
 
 
 def test_stamps_lose_the_latency_and_are_one_of_a_triggered_pair(
@@ -180,40 +177,44 @@ def test_pairs_come_at_the_rate_until_the_camera_is_lost(calibration: StereoCali
     assert runner.exits == {camera.name: Exit(2, "unplugged?")}
 
 
-class Source:
-    """Gives, one after the other, what it is made of; what is an error it raises."""
+def test_a_thread_reads_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Callable[[], Any]] = []
 
-    def __init__(self, *events: Any) -> None:
-        self._events = list(events)
-        self.threads: list[int] = []
-        self.is_closed = False
+    class Thread:
+        """Does what it is asked when the test lets it."""
 
-    def next(self) -> Any:
-        self.threads.append(threading.get_ident())
-        event = self._events.pop(0)
-        if isinstance(event, Exception):
-            raise event
-        return event
+        def __init__(self, *_: object) -> None:
+            self.now: Future[Any] = Future()
 
-    def close(self) -> None:
-        self.is_closed = True
+        def submit(self, task: Callable[[], Any]) -> Future[Any]:
+            asked.append(task)
+            return self.now
 
+        def shutdown(self) -> None:
+            asked.clear()
 
-def test_a_thread_reads_the_source() -> None:
-    source = Source(EndOfRecording("all"), None, UserError("unplugged?"), ZeroDivisionError())
-    arrived: queue.Queue[Any] = queue.Queue()
-    port = PairPort(source)
-    port.open(arrived.put)
-    for _ in range(4):
+    monkeypatch.setattr(pair_port, "ThreadPoolExecutor", Thread)
+    source = mock.Mock()
+    port, arrived = PairPort(source), list[Any]()
+    port.open(arrived.append)
+    port.send(("next",))
+    # Nobody waits for the source.
+    assert (asked, arrived) == ([source.next], [])
+    thread: Any = port._reader
+    for given in (EndOfRecording("all"), None, UserError("unplugged?"), ZeroDivisionError()):
+        future: Future[Any] = Future()
+        thread.now = future
         port.send(("next",))
-    end, unreadable, lost, mistake = (arrived.get(timeout=LIMIT) for _ in range(4))
-    assert (end(), unreadable(), lost) == (
-        (EndOfRecording("all"),),
-        (None,),
-        PortChange("unplugged?"),
-    )
+        if isinstance(given, Exception):
+            future.set_exception(given)
+        else:
+            future.set_result(given)
+    end, unreadable, lost, mistake = arrived
+    assert (end(), unreadable()) == ((EndOfRecording("all"),), (None,))
+    assert lost == PortChange("unplugged?")
+    # A mistake of ours ends the node that takes it.
     with pytest.raises(ZeroDivisionError):
         mistake()
     port.close()
-    assert source.is_closed
-    assert threading.get_ident() not in source.threads
+    assert not asked
+    source.close.assert_called_once_with()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,104 +14,12 @@ from scipy.spatial.transform import Rotation
 from needle_core.errors import UserError
 from needle_tracker.optics.calibration import load_calibration, parse_calibration, rotation_matrix
 
+SIDES = ("left", "right")
+
 
 @pytest.fixture
 def content(calibration_path: Path) -> Any:
-    return copy.deepcopy(yaml.safe_load(calibration_path.read_text(encoding="utf-8")))
-
-
-def test_cameras_look_down_from_above_the_surface(calibration_path: Path) -> None:
-    calibration = load_calibration(calibration_path)
-    assert calibration.left.window.height(calibration.left.centre) > 0.0
-    viewing = calibration.left.T_optical_rig[2, :3]
-    assert viewing[0] < -0.9
-
-
-def test_rotation_agrees_with_scipy() -> None:
-    for seed in range(20):
-        rotation = Rotation.random(rng=np.random.default_rng(seed))
-        np.testing.assert_allclose(
-            rotation_matrix(rotation.as_quat()), rotation.as_matrix(), atol=1e-14
-        )
-
-
-def test_rotation_is_normalised(content: Any) -> None:
-    pose = content["left"]["T_optical_rig"]
-    pose["rotation"] = [1.005 * part for part in pose["rotation"]]
-    rotation = parse_calibration(content).left.T_optical_rig[:3, :3]
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
-
-
-def _drop_right(content: Any) -> None:
-    del content["right"]
-
-
-def _index_below_air(content: Any) -> None:
-    content["phantom"]["refractive_index"] = 0.9
-
-
-def _nan_height(content: Any) -> None:
-    content["phantom"]["surface_height"] = float("nan")
-
-
-def _short_distortion(content: Any) -> None:
-    content["left"]["distortion_coefficients"]["data"] = [0.0] * 4
-
-
-def _other_model(content: Any) -> None:
-    content["left"]["distortion_model"] = "equidistant"
-
-
-def _no_rotation(content: Any) -> None:
-    content["right"]["T_optical_rig"]["rotation"] = [0.0, 0.0, 0.0, 0.1]
-
-
-def _text_for_size(content: Any) -> None:
-    content["left"]["image_width"] = "wide"
-
-
-def _negative_focal_length(content: Any) -> None:
-    content["left"]["camera_matrix"]["data"][0] = -1.0
-
-
-def _skew(content: Any) -> None:
-    content["left"]["camera_matrix"]["data"][1] = 0.5
-
-
-def _surface_above_cameras(content: Any) -> None:
-    content["phantom"]["surface_height"] = 2.0
-
-
-def _one_place(content: Any) -> None:
-    content["right"]["T_optical_rig"] = content["left"]["T_optical_rig"]
-
-
-@pytest.mark.parametrize(
-    ("spoil", "named"),
-    [
-        (_drop_right, "right"),
-        (_index_below_air, "refractive_index"),
-        (_nan_height, "surface_height"),
-        (_short_distortion, "left.distortion_coefficients"),
-        (_other_model, "plumb_bob"),
-        (_no_rotation, "right.T_optical_rig.rotation"),
-        (_text_for_size, "left.image_width"),
-        (_negative_focal_length, "left.camera_matrix"),
-        (_skew, "left.camera_matrix"),
-        (_surface_above_cameras, "not above the surface"),
-        (_one_place, "same place"),
-    ],
-)
-def test_bad_content_is_named(
-    content: Any, spoil: Callable[[Any], None], named: str, tmp_path: Path
-) -> None:
-    spoil(content)
-    path = tmp_path / "rig.yaml"
-    path.write_text(yaml.safe_dump(content), encoding="utf-8")
-    with pytest.raises(UserError, match=named) as caught:
-        load_calibration(path)
-    assert "\n" not in str(caught.value)
-    assert str(path) in str(caught.value)
+    return yaml.safe_load(calibration_path.read_text(encoding="utf-8"))
 
 
 @pytest.fixture
@@ -121,17 +28,31 @@ def own_windows(calibration_path: Path) -> Any:
     return yaml.safe_load(path.read_text(encoding="utf-8"))
 
 
+def test_rotations_agree_with_scipy_and_are_normalised(content: Any) -> None:
+    for seed in range(5):
+        rotation = Rotation.random(rng=np.random.default_rng(seed))
+        found = rotation_matrix(rotation.as_quat())
+        np.testing.assert_allclose(found, rotation.as_matrix(), atol=1e-14)
+    pose = content["left"]["T_optical_rig"]
+    pose["rotation"] = [1.005 * part for part in pose["rotation"]]
+    found = parse_calibration(content).left.T_optical_rig[:3, :3]
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-14)
+
+
 def test_the_one_surface_is_both_windows(content: Any) -> None:
     calibration = parse_calibration(content)
     for camera in (calibration.left, calibration.right):
         assert camera.window.point.tolist() == [0.0175, 0.0, 0.0]
         assert camera.window.normal.tolist() == [1.0, 0.0, 0.0]
         assert (camera.window.layers, camera.window.inside) == ((), 1.3)
+        # Both look down from above it.
+        assert camera.window.height(camera.centre) > 0.0
+        assert camera.T_optical_rig[2, 0] < -0.9
     assert calibration.surface is calibration.left.window
     # Said of each camera, it is the same surface.
     del content["phantom"]
     window = {"point": [0.0175, 0.1, 0.2], "normal": [1, 0, 0], "layers": [], "inside": 1.3}
-    for side in ("left", "right"):
+    for side in SIDES:
         content[side]["window"] = window
     surface = parse_calibration(content).surface
     assert surface is not None
@@ -162,28 +83,59 @@ def put(*keys: Any) -> Callable[[Any], None]:
     return change
 
 
-def _no_window(content: Any) -> None:
-    for side in ("left", "right"):
+def one_place(content: Any) -> None:
+    content["right"]["T_optical_rig"] = content["left"]["T_optical_rig"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "named"),
+    [
+        (lambda content: content.pop("right"), "right"),
+        (put("phantom", "refractive_index", 0.9), "refractive_index"),
+        (put("phantom", "surface_height", float("nan")), "surface_height"),
+        (put("phantom", "surface_height", 2.0), "not above the surface"),
+        (put("left", "distortion_coefficients", "data", [0.0] * 4), "left.distortion_coeff"),
+        (put("left", "distortion_model", "equidistant"), "plumb_bob"),
+        (put("left", "image_width", "wide"), "left.image_width"),
+        (put("left", "camera_matrix", "data", 0, -1.0), "left.camera_matrix"),
+        (put("left", "camera_matrix", "data", 1, 0.5), "left.camera_matrix"),
+        (put("right", "T_optical_rig", "rotation", [0, 0, 0, 0.1]), "right.T_optical_rig.rotation"),
+        (one_place, "same place"),
+    ],
+)
+def test_bad_content_is_named(
+    content: Any, spoil: Callable[[Any], None], named: str, tmp_path: Path
+) -> None:
+    spoil(content)
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    with pytest.raises(UserError, match=named) as caught:
+        load_calibration(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def no_window(content: Any) -> None:
+    for side in SIDES:
         del content[side]["window"]
 
 
-def _one_window(content: Any) -> None:
-    del content["right"]["window"]
+LAYER = ("right", "window", "layers", 0, "thickness")
 
 
 @pytest.mark.parametrize(
     ("spoil", "named"),
     [
         (put("phantom", {"surface_height": 0.01, "refractive_index": 1.3}), "take phantom out"),
-        (_no_window, "phantom is missing.*give phantom .*or each camera its window"),
-        (_one_window, "right.window.point is missing"),
+        (no_window, "phantom is missing.*give phantom .*or each camera its window"),
+        (lambda content: content["right"].pop("window"), "right.window.point is missing"),
         (put("left", "window", "normal", [2.0, 0.0, 0.0]), "length of left.window.normal"),
         (put("left", "window", "normal", [0.0, 0.1, 0.995]), "needle's axis"),
         (put("left", "window", "normal", [-1.0, 0.0, 0.0]), "normal points to the camera"),
         (put("left", "window", "layers", None), "layers = None is not a list"),
         (put("left", "window", "layers", [{"thickness": 0.005}]), "layers.0..refractive_index"),
-        (put("right", "window", "layers", 0, "thickness", -1e-3), "layers.0..thickness"),
-        (put("right", "window", "layers", 0, "thickness", 5), "right.window.layers.0..thickness"),
+        (put(*LAYER, -1e-3), "layers.0..thickness"),
+        (put(*LAYER, 5), "right.window.layers.0..thickness"),
         (put("right", "window", "inside", 0.9), "right.window.inside"),
         (put("right", "window", "point", [0.0, 0.06]), "right.window.point wants 3 numbers"),
     ],
@@ -195,18 +147,20 @@ def test_bad_windows_are_named(own_windows: Any, spoil: Callable[[Any], None], n
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["", "[1, 2]", "{a: [", "phantom: 3"])
-def test_other_files_are_refused(text: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (None, "No such file"),
+        (b"\xff\xfe\x80\x81", "not a text file"),
+        (b"", "phantom"),
+        (b"[1, 2]", "rig.yaml"),
+        (b"{a: [", "YAML"),
+        (b"phantom: 3", "phantom"),
+    ],
+)
+def test_other_files_are_refused(data: bytes | None, says: str, tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(UserError):
+    if data is not None:
+        path.write_bytes(data)
+    with pytest.raises(UserError, match=says):
         load_calibration(path)
-
-
-def test_missing_and_binary_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="No such file"):
-        load_calibration(tmp_path / "none.yaml")
-    binary = tmp_path / "image.yaml"
-    binary.write_bytes(b"\xff\xfe\x80\x81")
-    with pytest.raises(UserError, match="not a text file"):
-        load_calibration(binary)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import pytest
+
 from needle_tracker.sources.insertion_history import InsertionHistory
 from needle_tracker.sources.pairing import PairMatcher
 
@@ -21,29 +23,20 @@ def test_equal_stamps_pair_in_any_order_of_arrival() -> None:
     assert (matcher.counts.pairs, matcher.counts.unpaired) == (2, 0)
 
 
-def test_latest_is_never_paired_with_latest() -> None:
+def test_latest_is_never_paired_with_latest_and_what_is_passed_over_is_counted() -> None:
     matcher: PairMatcher[str] = PairMatcher(0)
-    assert matcher.add("left", 10, "l10") is None
+    matcher.add("left", 10, "l10")
     assert matcher.add("right", 20, "r20") is None
     assert matcher.add("left", 21, "l21") is None
     assert matcher.counts.pairs == 0
-
-
-def test_an_image_passed_over_is_dropped_and_counted() -> None:
-    matcher: PairMatcher[str] = PairMatcher(0)
-    matcher.add("left", 10, "l10")
-    matcher.add("left", 20, "l20")
-    assert matcher.add("right", 20, "r20") is not None
-    assert matcher.counts.unpaired_left == 1
+    assert matcher.add("right", 21, "r21") is not None
+    assert (matcher.counts.unpaired_left, matcher.counts.unpaired_right) == (1, 1)
     assert matcher.add("right", 10, "r10") is None
-
-
-def test_one_camera_alone_does_not_pile_up() -> None:
-    matcher: PairMatcher[str] = PairMatcher(0)
-    for stamp in range(100):
+    # One camera alone does not pile up.
+    for stamp in range(100, 200):
         assert matcher.add("right", stamp, "r") is None
     assert len(matcher.waiting("right")) == 3
-    assert matcher.counts.unpaired_right == 97
+    assert matcher.counts.unpaired_right == 99
 
 
 def test_tolerance_is_kept_and_the_nearest_wins() -> None:
@@ -84,19 +77,12 @@ def test_insertion_is_interpolated_at_the_exposure() -> None:
     assert history.at(101) is None
     history.add(200, 0.020)
     assert history.is_bracketed(150)
-    assert math.isclose(history.at(130) or 0.0, 0.013)
-    assert history.at(200) == 0.020
-    assert history.at(100) == 0.010
-    assert history.at(99) is None
-
-
-def test_bad_and_backward_samples_are_counted() -> None:
-    history = InsertionHistory()
-    history.add(100, 0.01)
-    history.add(110, math.nan)
-    assert (history.refused, history.is_bracketed(105)) == (1, False)
+    for stamp, insertion in ((99, None), (100, 0.010), (130, 0.013), (200, 0.020)):
+        assert history.at(stamp) == (insertion and pytest.approx(insertion))
+    # Of two at one moment the later counts; one that is not finite does not.
+    history.add(200, 0.030)
+    history.add(210, math.nan)
+    assert (history.at(200), history.refused, history.is_bracketed(205)) == (0.030, 1, False)
     history.add(50, 0.002)
-    assert history.restarts == 1
-    assert history.at(100) is None
-    history.add(50, 0.003)
-    assert history.at(50) == 0.003
+    assert (history.restarts, history.at(100), history.at(50)) == (1, None, 0.002)
+    assert (history.time_before(49), history.time_before(50)) == (1, 0)

@@ -1,0 +1,83 @@
+"""Swapped images are suspected: when the other way round is looked at, and what is enough."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from needle_tracker.answers import swapped_images
+from needle_tracker.answers.swapped_images import SwapWatch
+from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.refusals import TrackState
+from needle_tracker.tracking.tracker_settings import TrackerSettings
+
+LEFT, RIGHT = np.zeros((2, 4, 4), np.uint8)
+MISSED = Measurement(None, TrackState.SEARCHING, "no needle")
+
+
+class Other:
+    """In place of the second tracker: what it finds, and what it was asked."""
+
+    def __init__(self, *_: Any) -> None:
+        self.finds, self.looks, self.resets = True, 0, 0
+
+    def reset(self) -> None:
+        self.resets += 1
+
+    def process(self, left: Any, right: Any, insertion: Any) -> Measurement:
+        assert left is RIGHT
+        assert right is LEFT
+        self.looks += 1
+        return Measurement(None, TrackState.TRACKING, "" if self.finds else "no needle")
+
+
+@pytest.fixture
+def other(monkeypatch: pytest.MonkeyPatch) -> Other:
+    other = Other()
+    monkeypatch.setattr(swapped_images, "StereoTracker", lambda *_: other)
+    monkeypatch.setattr(swapped_images, "is_sound", lambda *_: True)
+    return other
+
+
+@pytest.fixture
+def watch(calibration: StereoCalibration, settings: TrackerSettings) -> SwapWatch:
+    return SwapWatch(calibration, settings)
+
+
+def misses(watch: SwapWatch, pairs: int) -> None:
+    for _ in range(pairs):
+        watch.see(LEFT, RIGHT, None, MISSED)
+
+
+def test_four_in_a_row_after_five_missed_are_a_suspicion_until_a_tip(
+    watch: SwapWatch, other: Other
+) -> None:
+    entry: Any = Measurement(None, TrackState.ENTRY, "")
+    found: Any = dataclasses.replace(entry, tip=object(), state=TrackState.TRACKING)
+    looks = []
+    seen = ((MISSED, 8), (MISSED, 1), (MISSED, 5), (entry, 1), (found, 1), (MISSED, 5))
+    for measured, pairs in seen:
+        for _ in range(pairs):
+            watch.see(LEFT, RIGHT, None, measured)
+        looks.append((other.looks, watch.suspected))
+    assert looks == [(3, False), (4, True), (4, True), (4, True), (4, False), (4, False)]
+
+
+def test_where_the_other_way_round_shows_none_half_of_the_pairs_are_looked_at(
+    watch: SwapWatch, other: Other
+) -> None:
+    other.finds = False
+    misses(watch, 5 + 10)
+    assert (other.looks, other.resets) == (10, 1)
+    misses(watch, 10)
+    assert other.looks == 10
+    misses(watch, 1)
+    assert (other.looks, other.resets) == (11, 2)
+    for number in range(9):
+        other.finds = number % 4 != 3
+        misses(watch, 1)
+    assert not watch.suspected

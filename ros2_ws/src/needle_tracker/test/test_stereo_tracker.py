@@ -1,0 +1,368 @@
+"""The tracker's component, called directly: messages in; answers, health and logs out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from needle_core import messages as m
+from needle_core.component import Actions, Diagnose, Log, Moment, Peers, Publish
+from needle_core.diagnostics import Level
+from needle_core.errors import UserError
+from needle_tracker.answers.tracker_messages import camera_info_problem, image_geometry
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+from needle_tracker.optics.calibration import Camera, StereoCalibration
+from needle_tracker.stereo_tracker import StereoTipTracker, make_tracker
+from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.refusals import TrackState
+from needle_tracker.tracking.triangulation import SpatialTip
+
+PIXELS = np.zeros((768, 1024), np.uint8)
+FOUND = Measurement(
+    SpatialTip(
+        np.array([0.001, 0.002, 0.05]), 1e-8 * np.eye(3), np.eye(3)[2], np.zeros((3, 3)), 0.0, 0.0
+    ),
+    TrackState.TRACKING,
+    "",
+)
+NOT_FOUND = Measurement(None, TrackState.SEARCHING, "no needle")
+SECOND = 1_000_000_000
+
+
+class Bench:
+    """The component, what it is told, and the last that it said."""
+
+    def __init__(self, tracker: StereoTipTracker) -> None:
+        self.tracker, self.now = tracker, 0.0
+        self.handlers = {row.topic: row.handler for row in tracker.inputs}
+        self.sent: dict[str, list[Any]] = {output.topic: [] for output in tracker.outputs}
+        self.health: dict[str, Any] = {}
+        self.logs: list[str] = []
+        self.measured: Measurement | None = FOUND
+        process = tracker.answers.tracker.process
+        tracker.answers.tracker.process = (  # type: ignore[method-assign]
+            lambda *pair: self.measured or process(*pair)
+        )
+        tracker.answers.swap.see = lambda *_: None  # type: ignore[method-assign]
+
+    def do(self, actions: Actions) -> None:
+        for action in actions:
+            if isinstance(action, Publish):
+                self.sent[action.topic].append(action.message)
+            elif isinstance(action, Diagnose):
+                self.health[action.part] = action.diagnostic
+            elif isinstance(action, Log):
+                self.logs.append(action.text)
+
+    def hear(self, topic: str, message: Any) -> None:
+        self.do(self.handlers[topic](message, Moment(self.now, 0)))
+
+    def check(self, now: float = 0.0) -> None:
+        self.now = now
+        self.do(self.tracker.check(Moment(now, 0)))
+
+    def joints(self, stamp: int, insertion: float = 0.05, name: str = "insertion_joint") -> None:
+        self.hear("joint_states", m.JointState(stamp, (name,), (insertion,)))
+
+    def image(self, side: str, stamp: int, pixels: Any = PIXELS, **fields: Any) -> None:
+        height, width = pixels.shape
+        data = pixels.tobytes()
+        image = m.Image(stamp, "", height, width, "mono8", width, data)
+        self.hear(f"stereo/{side}/image_raw", dataclasses.replace(image, **fields))
+
+    def pair(self, stamp: int, left: Any = PIXELS, right: Any = PIXELS, **fields: Any) -> bool:
+        """Let a pair follow its joint state; return whether the answer is a tip."""
+        answers = len(self.sent["needle/tip_pose"])
+        self.joints(stamp)
+        self.image("left", stamp, left)
+        self.image("right", stamp, right, **fields)
+        (pose,) = self.sent["needle/tip_pose"][answers:]
+        diagonal = np.reshape(pose.covariance, (6, 6)).diagonal()
+        assert np.all(np.isfinite(diagonal)) or np.all(np.isinf(diagonal))
+        return bool(np.all(np.isfinite(diagonal)))
+
+    def said(self, part: str) -> tuple[Level, str]:
+        return self.health[part].level, self.health[part].message
+
+
+Make = Callable[..., Bench]
+
+
+@pytest.fixture
+def make(calibration: StereoCalibration, monkeypatch: pytest.MonkeyPatch) -> Make:
+    monkeypatch.setattr("needle_tracker.tracking.tip_tracker.TipTracker.warm_up", lambda _: None)
+
+    def make(**parameters: Any) -> Bench:
+        settings = StereoTrackerParameters(**parameters)
+        return Bench(StereoTipTracker(settings, calibration, "text of the file"))
+
+    return make
+
+
+@pytest.fixture
+def bench(make: Make) -> Bench:
+    return make()
+
+
+def test_a_pair_gives_tip_and_pose_with_the_exposures_stamp(
+    bench: Bench, draw_pair: Any, make_arc: Any
+) -> None:
+    bench.measured = None
+    path = make_arc(0.05, 5.0, 1.0)
+    assert bench.pair(SECOND + 20, *draw_pair(path))
+    (tip,), (pose,) = bench.sent["needle/tip"], bench.sent["needle/tip_pose"]
+    assert (tip.frame_id, pose.frame_id) == ("rig", "rig")
+    assert tip.stamp_ns == pose.stamp_ns == SECOND + 20
+    np.testing.assert_allclose(tip.position, path[-1], atol=0.3e-3)
+    assert tip.position == pose.position
+    covariance = np.reshape(pose.covariance, (6, 6))
+    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
+    assert np.all(np.linalg.eigvalsh(covariance) > -1e-15)
+    assert covariance[:3, :3].trace() < 1e-6
+    assert bench.said("track") == (Level.OK, "TRACKING")
+    assert bench.said("images") == (Level.OK, "pairs complete")
+    assert bench.said("joints") == (Level.OK, "insertion known")
+    assert not bench.logs
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"encoding": "rgb8"}, "right image has 786432 bytes in rows of 1024"),
+        ({"encoding": "mono16"}, "right image is 'mono16', wants 8 bits, such as mono8"),
+        ({"width": 640}, "right image is 640x768, the calibration is for 1024x768"),
+        ({"data": PIXELS.tobytes()[1:]}, "right image has 786431 bytes in rows of 1024"),
+    ],
+)
+def test_bad_images_are_answered_without_a_tip_and_named(
+    bench: Bench, fields: dict[str, Any], reason: str
+) -> None:
+    assert not bench.pair(10, **fields)
+    level, message = bench.said("images")
+    assert level is Level.ERROR
+    assert message.startswith(f"pair refused: {reason}")
+    assert bench.health["images"].values["pairs_refused"] == "1"
+    assert bench.logs.count(f"images: {message}") == 1
+    assert not bench.sent["needle/tip"]
+    assert bench.pair(20)
+    bench.check(6.0)
+    assert bench.said("images") == (Level.OK, "pairs complete")
+
+
+def test_reasons_without_end_are_told_in_a_report_of_bounded_length(bench: Bench) -> None:
+    for number in range(50):
+        assert not bench.pair(10 + number, encoding=f"{number} " + "x" * 3000)
+    for part, kind in (("images", "refused: "), ("track", "no tip: ")):
+        values = bench.health[part].values
+        told = {key: int(value) for key, value in values.items() if key.startswith(kind)}
+        assert sum(told.values()) == 50
+        assert told[f"{kind}other reasons"] == 30
+        assert list(told)[-2].startswith(f"{kind}right image is '49 x")
+        assert max(map(len, [*told, bench.health[part].message])) < 120
+
+
+def test_time_running_backwards_is_no_tip(bench: Bench) -> None:
+    assert bench.pair(5 * SECOND)
+    assert not bench.pair(5 * SECOND - 1000)
+    assert "ran backwards" in bench.said("images")[1]
+    assert not bench.pair(5 * SECOND)
+    assert "repeated" in bench.said("images")[1]
+    assert bench.pair(5 * SECOND + 1000)
+    # Far back a new recording has begun: its first pair is refused, the next is looked at.
+    assert not bench.pair(SECOND)
+    assert bench.pair(SECOND + 1000)
+
+
+def info(camera: Camera, fields: dict[str, Any]) -> m.CameraInfo:
+    """The message of a sensor, with an roi (x, y, width, height) and binning."""
+    x, y, width, height = fields.get("roi", (0, 0, 0, 0))
+    message = m.CameraInfo(0, "", camera.height, camera.width, "plumb_bob", (), (), (), ())
+    roi = m.RegionOfInterest(x, y, width, height)
+    bins = {key: value for key, value in fields.items() if key != "roi"}
+    k = tuple(camera.camera_matrix.ravel().tolist())
+    return dataclasses.replace(message, k=k, roi=roi, **bins)
+
+
+@pytest.mark.parametrize(
+    ("fields", "size"),
+    [
+        ({}, (2048, 1536)),
+        ({"binning_x": 1, "roi": (0, 0, 2048, 1536)}, (2048, 1536)),
+        ({"binning_x": 4, "binning_y": 2}, (512, 768)),
+        ({"binning_x": 3}, (682, 1536)),
+        ({"roi": (512, 384, 1024, 768), "binning_x": 2, "binning_y": 2}, (512, 384)),
+        ({"roi": (100, 0, 1900, 0), "binning_x": 2}, (950, 1536)),
+    ],
+)
+def test_a_ray_falls_where_a_part_of_the_sensor_shows_it(
+    calibration: StereoCalibration, fields: dict[str, Any], size: tuple[int, int]
+) -> None:
+    K = np.array([[4000.0, 3.0, 1030.0], [0.0, 4020.0, 765.0], [0.0, 0.0, 1.0]])
+    sensor = dataclasses.replace(calibration.left, width=2048, height=1536, camera_matrix=K)
+    message = info(sensor, fields)
+    width, height, matrix = image_geometry(message)
+    assert (width, height) == size
+    ray = np.array([0.05, -0.03, 1.0])
+    x, y, *_ = fields.get("roi", (0, 0, 0, 0))
+    bins = np.array([fields.get("binning_x") or 1, fields.get("binning_y") or 1])
+    np.testing.assert_allclose((matrix @ ray)[:2], ((K @ ray)[:2] - [x, y]) / bins)
+    shown = dataclasses.replace(sensor, width=width, height=height, camera_matrix=matrix)
+    assert camera_info_problem(message, "left", shown) == ("", False)
+    matrix[0, 2] += 0.6
+    wanted = "left camera_info differs from the calibration by 0.6 px"
+    assert camera_info_problem(message, "left", shown) == (wanted, False)
+
+
+def test_a_camera_that_runs_at_another_resolution_gives_no_tip(
+    bench: Bench, calibration: StereoCalibration
+) -> None:
+    topic, camera = "stereo/left/camera_info", calibration.left
+    sensor = dataclasses.replace(camera, width=2048, height=1536, camera_matrix=np.zeros((3, 3)))
+    bench.hear(topic, info(sensor, {"binning_x": 4, "binning_y": 2}))
+    bench.check()
+    reason = "left camera_info is for 512x768 (sensor 2048x1536, roi 0x0 at 0,0, binning 4x2)"
+    assert bench.said("images") == (Level.ERROR, f"{reason}, the calibration for 1024x768")
+    assert not bench.pair(10)
+    assert bench.said("images")[1].startswith(f"pair refused: {reason}")
+    # A sensor that is larger than its images, and a driver that knows nothing, contradict nothing.
+    unknown = dataclasses.replace(sensor, width=0, height=0)
+    for number, message in enumerate(
+        (info(sensor, {"binning_x": 2, "binning_y": 2}), info(unknown, {}))
+    ):
+        bench.hear(topic, message)
+        assert bench.pair(20 + number)
+
+
+def test_images_without_a_partner_are_told(bench: Bench) -> None:
+    bench.check()
+    assert bench.said("images") == (Level.WARN, "no images yet")
+    bench.image("left", 1)
+    bench.check(0.6)
+    assert bench.said("images") == (Level.WARN, "left images without right")
+    for stamp in range(2, 6):
+        bench.image("left", stamp)
+    bench.image("right", 99)
+    bench.check(0.7)
+    assert bench.said("images") == (Level.WARN, "images without a partner were dropped")
+    values = bench.health["images"].values
+    assert (values["left_without_right"], values["pairs"]) == ("2", "0")
+    assert not bench.sent["needle/tip_pose"]
+
+
+def test_joint_states_that_tell_nothing_are_counted_and_silence_is_warned_of(bench: Bench) -> None:
+    bench.joints(1, name="rotation_joint")
+    bench.joints(1, math.nan)
+    bench.check()
+    assert bench.said("joints") == (Level.OK, "no joint states yet")
+    bench.image("left", 5)
+    bench.image("right", 5)
+    assert not bench.sent["needle/tip_pose"]
+    bench.check(1.0)
+    assert len(bench.sent["needle/tip_pose"]) == 1
+    assert bench.said("joints")[0] is Level.WARN
+    values = bench.health["joints"].values
+    assert (values["without_insertion_joint"], values["not_finite"]) == ("1", "1")
+    bench.joints(10)
+    bench.check(1.0)
+    assert bench.said("joints") == (Level.OK, "insertion known")
+
+
+def test_images_stamped_by_another_clock_than_joint_states_are_warned_of(bench: Bench) -> None:
+    bench.joints(10 * SECOND)
+    for stamp, said in (
+        (9 * SECOND, (Level.OK, "insertion known")),
+        (9 * SECOND - 1, (Level.WARN, "no pair is answered: exposed 1.0 s before the first")),
+    ):
+        bench.image("left", stamp)
+        bench.image("right", stamp)
+        bench.check()
+        level, message = bench.said("joints")
+        assert (level, message[: len(said[1])]) == said
+    assert bench.health["joints"].values["pairs_before_joint_states"] == "2"
+    assert not bench.sent["needle/tip_pose"]
+    assert bench.pair(11 * SECOND)
+    assert bench.said("joints") == (Level.OK, "insertion known")
+
+
+def test_swapped_images_are_suspected_aloud(bench: Bench) -> None:
+    bench.measured = NOT_FOUND
+    bench.tracker.answers.swap.suspected = True
+    assert not bench.pair(10)
+    level, message = bench.said("images")
+    assert level is Level.WARN
+    assert "seem to be swapped" in message
+    assert "parameters left and right" in message
+    # What is still so is not logged again.
+    bench.check(0.1)
+    assert sum("seem to be swapped" in text for text in bench.logs) == 1
+
+
+def test_pictures_are_drawn_where_somebody_looks_and_not_for_every_pair(make: Make) -> None:
+    bench = make(annotated_rate=2.0)
+    bench.pair(1)
+    topic = "stereo_tracker/annotated_image"
+    list(bench.tracker.on_peers(Peers(subscribers={topic: ("viewer",)}), Moment(0.0, 0)))
+    for stamp, bench.now, pictures in ((2, 0.0, 1), (3, 0.4, 1), (4, 0.5, 2)):
+        bench.pair(stamp)
+        assert len(bench.sent[topic]) == pictures
+    bench.check()
+    bench.check()
+    assert bench.sent["stereo_tracker/calibration"] == [m.Text("text of the file")]
+
+
+def test_the_heading_is_told_where_the_estimate_knows_the_roll(make: Make) -> None:
+    bench = make(heading_from_estimate=True, lean=0.1)
+    half = math.sqrt(0.5)
+    bench.hear("target_plane", m.Pose(0, "rig", (0.0, 0.0, 0.0), (0.0, 0.0, half, half)))
+    estimate = m.PoseWithCovariance(
+        0, "target_plane", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1e-4,) * 36
+    )
+    for stamp, covariance, away in (
+        (1, 1e-4, -math.sin(0.1)),
+        # A roll that is hardly known, and one of long ago, take no lean off.
+        (2, 1.0, 0.0),
+        (6 * SECOND, 1e-4, 0.0),
+    ):
+        bench.hear(
+            "needle/estimate",
+            dataclasses.replace(estimate, covariance=tuple(covariance * np.eye(6).ravel())),
+        )
+        assert bench.pair(stamp)
+        x, y, z, w = bench.sent["needle/tip_pose"][-1].orientation
+        # The plane's y is -x of rig: the visible end is bent from the heading towards it.
+        assert 2.0 * (x * z + y * w) == pytest.approx(away, abs=1e-3)
+        assert 2.0 * (y * z - x * w) == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("calibration_file", "/nowhere/rig.yaml", "/nowhere/rig.yaml"),
+        ("calibration_file", __file__, "not YAML in line"),
+        ("pair_tolerance", -1.0, "pair_tolerance"),
+        ("needle_polarity", "grey", "needle_polarity"),
+        ("max_curvature", math.nan, "max_curvature"),
+        ("hole_clearance", 0.05, "hole_clearance = 0.05 m"),
+        ("lost_after", 31, "lost_after = 31 is above forget_after = 30"),
+    ],
+)
+def test_bad_parameters_are_refused(name: str, value: Any, said: str) -> None:
+    with pytest.raises(UserError, match=said) as caught:
+        make_tracker(StereoTrackerParameters(**{name: value}))
+    assert "\n" not in str(caught.value)
+
+
+def test_the_installed_calibration_is_the_default(
+    calibration_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("needle_tracker.tracking.tip_tracker.TipTracker.warm_up", lambda _: None)
+    bench = Bench(make_tracker(StereoTrackerParameters(), "left/stereo_tracker"))
+    bench.check()
+    assert bench.tracker.name == "left/stereo_tracker"
+    assert bench.sent["stereo_tracker/calibration"] == [m.Text(calibration_path.read_text())]
