@@ -9,12 +9,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from campaign.trials.virtual_rig import DRIVER, FASTEST, VirtualRig
 from needle_core.can_frame import CAN
 from needle_core.errors import UserError
 from needle_sim.drive_emulator import POSITIONS
 from needle_sim.drive_emulator_parameters import COUNTS_PER_RADIAN, DriveEmulatorParameters
 from needle_sim.drives.power_state import PowerState
+from scenario.virtual_rig import DRIVER, FASTEST, VirtualRig
 
 INSERTION_COUNTS = DriveEmulatorParameters().insertion_counts_per_unit
 _DEEPEST, _MOST_ROTATION = 0.19, 3.0
@@ -58,9 +58,11 @@ def random_steps(count: int, seed: int = 1) -> dict[str, Any]:
         turn = -turn if abs(rotation + turn) > _MOST_ROTATION else turn
         if insertion + length > _DEEPEST:
             rig.call("device/retract")
-            rig.until(lambda: rig.place[0] == 0.0, "the retraction")
+            rig.until(lambda: rig.hand.status.activity == "retraction", "a retraction")
+            rig.until(lambda: rig.hand.status.activity == "none", "its end")
             rig.press()
-            retractions, insertion = retractions + 1, 0.0
+            # It ends at the home switch, which may be a few counts before 0.
+            retractions, insertion = retractions + 1, rig.place[0]
         insertion, rotation = insertion + length, rotation + turn
         # A count's rounding of where it begins must not make the fastest step too fast.
         duration = max(length / FASTEST, abs(turn) / 3.0) * rng.uniform(1.01, 1.5)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from campaign.trials.virtual_rig import FASTEST, Held, VirtualRig
 from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.component import Actions, Moment
@@ -18,6 +17,7 @@ from needle_sim.rig.bench import SimulatedBench
 from needle_sim.sensors import Sensor, TipSensor
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
+from scenario.virtual_rig import FASTEST, Held, VirtualRig
 
 OFFSET = 0.003
 TIP_STD = 5e-5

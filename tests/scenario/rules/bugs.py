@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,8 @@ from needle_device_driver.axes.motion import CoordinatedMotion, Leg
 from needle_device_driver.cia402 import cia402_axis
 from needle_device_driver.cia402.axis_speed import SpeedWatch
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
+from needle_device_driver.cia402.drive_settings import DriveSettings
+from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.supervisor import command, command_desk
 from needle_device_driver.supervisor.command_desk import CommandDesk
@@ -22,7 +25,7 @@ from needle_device_driver.supervisor.hold import Hold
 from needle_device_driver.supervisor.homing_times import HomingTimes
 from needle_device_driver.supervisor.motion_run import MotionRun
 from needle_device_driver.supervisor.retraction_bound import RetractionBound
-from needle_device_driver.supervisor.states import Activity
+from needle_device_driver.supervisor.states import Activity, State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
 Plant = Callable[[pytest.MonkeyPatch], None]
@@ -86,7 +89,7 @@ def _scale_is_one(hold: Hold, message: HoldState) -> HoldState:
 
 
 def _enabling_moves(patch: pytest.MonkeyPatch) -> None:
-    enable, drive = MotionSupervisor.enable, DeviceCore.drive
+    may_move, enable = MotionSupervisor.may_move, MotionSupervisor.enable
 
     def enabled(supervisor: MotionSupervisor, on: bool, now: float) -> Any:
         reply = enable(supervisor, on, now)
@@ -97,8 +100,13 @@ def _enabling_moves(patch: pytest.MonkeyPatch) -> None:
         return reply
 
     patch.setattr(MotionSupervisor, "enable", enabled)
+    patch.setattr(
+        MotionSupervisor,
+        "may_move",
+        lambda supervisor, now: supervisor.state is State.MOVING or may_move(supervisor, now),
+    )
     patch.setattr(DeviceCore, "moves_with_hold", property(lambda _: False))
-    patch.setattr(DeviceCore, "drive", lambda core, period, _, now: drive(core, period, 1.0, now))
+    patch.setattr(Hold, "speed_scale", property(lambda _: 1.0))
 
 
 def _rotation_comes_late(patch: pytest.MonkeyPatch) -> None:
@@ -127,14 +135,14 @@ def _homing_needs_no_word(patch: pytest.MonkeyPatch) -> None:
 
 
 def _set_points_far_ahead(patch: pytest.MonkeyPatch) -> None:
-    advance, magnitude = CoordinatedMotion.advance, cia402_axis.DriveSettings.magnitude
+    advance, magnitude = CoordinatedMotion.advance, DriveSettings.magnitude
     patch.setattr(
         CoordinatedMotion,
         "advance",
         lambda motion, period, scale: advance(motion, 10.0 * period, scale),
     )
     patch.setattr(
-        cia402_axis.DriveSettings,
+        DriveSettings,
         "magnitude",
         lambda settings, value: 20 * magnitude(settings, value),
     )
@@ -144,6 +152,16 @@ def _set_points_far_ahead(patch: pytest.MonkeyPatch) -> None:
 _faults_unheard = _set(Cia402Axis, _fault=property(lambda _: None))
 _any_bounds = _set(command, _check_bounds=_unheard)
 _motion_unwatched = _set(MotionRun, problem=_unheard)
+
+
+def _homing_takes_for_ever(patch: pytest.MonkeyPatch) -> None:
+    _faults_unheard(patch)
+    patch.setattr(HomingTimes, "count", lambda *_: "")
+
+
+def _axes_part(patch: pytest.MonkeyPatch) -> None:
+    _motion_unwatched(patch)
+    _faults_unheard(patch)
 
 
 BUGS: dict[str, Plant] = {
@@ -158,7 +176,7 @@ BUGS: dict[str, Plant] = {
     "command_state": _set(CommandDesk, _ready_for=lambda desk, _, now: desk._core.poll(now)),
     "command_one_publisher": _of_context(publishers=1),
     "command_form": _set(command, check_form=_unheard),
-    "command_finite": _set(command.math, isfinite=lambda _: True),
+    "command_finite": _set(math, isfinite=lambda _: True),
     "command_newer": _of_context(not_new=""),
     "tip_age": _of_context(tip_age=0.0),
     "homed_first": _of_context(homed=True),
@@ -170,18 +188,18 @@ BUGS: dict[str, Plant] = {
     "max_rotation_rate": _any_bounds,
     "max_turns": _any_bounds,
     "coordinated": _rotation_comes_late,
-    "following_error": lambda patch: (_motion_unwatched(patch), _faults_unheard(patch))[0],
+    "following_error": _axes_part,
     "retraction": _set(DeviceCore, way_out=property(lambda _: 0.0)),
     "unhomed_outward_only": _set(RetractionBound, target=lambda _, at: at.position),
     "homing_needle_out": _homing_needs_no_word,
-    "homing_time": _set(HomingTimes, count=lambda *_: ""),
+    "homing_time": _homing_takes_for_ever,
     "estop_latches": _set(MotionSupervisor, receive_estop=_unheard),
     "one_fault_stops_both": _set(AxisPair, each=_only_insertion_is_told),
     "inner_limit_switch": _motion_unwatched,
     "reply_age": _set(PairSnapshot, age=lambda *_: 0.0),
     "axis_speed": _set(SpeedWatch, judge=lambda *_, **__: True),
     "settling_time": _motion_unwatched,
-    "link_loss": _faults_unheard,
+    "link_loss": _set(DeviceDriver, _on_port_change=_nothing_sent),
     "one_master": _faults_unheard,
     "drive_watchdog": _set(cia402_axis, arm_watchdog=_nothing_sent),
     "drive_emergency": _faults_unheard,

@@ -28,8 +28,8 @@ from scenario.virtual_rig import DRIVER, Held, VirtualRig
 
 JOINTS = (m.INSERTION_JOINT, m.ROTATION_JOINT)
 AXES = ("insertion", "rotation")
-AT_REST = 1e-6
-"""What a motor at rest may still move [m], [rad]."""
+AT_REST = (1e-6, 1e-4)
+"""What motors at rest may still move [m], [rad]: counts of their encoders."""
 
 
 class Witness(Component):
@@ -125,7 +125,7 @@ class Scene(VirtualRig):
     def send(self, *points: tuple[tuple[float, ...], float], age: float = 0.0) -> int:
         """Send a command with these points and times, its stamp so old [s]."""
         stamp = self.runner.timeline.stamp_ns - round(age * 1e9)
-        way = tuple(m.TrajectoryPoint(place, time) for place, time in points)  # type: ignore[arg-type]
+        way = tuple(m.TrajectoryPoint(place, time) for place, time in points)
         self.hand.actions.append(Publish(COMMANDS.topic, m.Trajectory(stamp, JOINTS, way)))
         self.runner.run(0.1)
         return stamp
@@ -174,7 +174,11 @@ class Scene(VirtualRig):
         """Return whether no motor moves for some time."""
         before = self.place
         self.runner.run(seconds)
-        return all(abs(a - b) <= AT_REST for a, b in zip(self.place, before, strict=True))
+        after = self.place
+        return all(
+            abs(there - here) <= most
+            for there, here, most in zip(after, before, AT_REST, strict=True)
+        )
 
     def refuses(self, rule: Rule) -> bool:
         """Return whether the last command was refused for a rule, and nothing moves."""
@@ -186,4 +190,4 @@ class Scene(VirtualRig):
         return self.rests() and self.named(rule) and self.state == "FAULT"
 
 
-__all__ = ["AXES", "COMMANDS", "ESTOP", "HOLD", "STATUS", "Held", "Other", "Scene"]
+__all__ = ["AXES", "COMMANDS", "DRIVER", "ESTOP", "HOLD", "STATUS", "Held", "Other", "Scene"]
