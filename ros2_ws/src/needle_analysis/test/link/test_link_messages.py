@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
-from types import ModuleType
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,13 +32,10 @@ Said = dict[str, tuple[Any, float]]
 
 
 class Played:
-    """A message of pyigtl's: its content, time and device name."""
+    """A message of pyigtl's: its content, time and device name; of points, their names, too."""
 
-    def __init__(
-        self, content: Any, *rest: Any, timestamp: float = 0.0, device_name: str = ""
-    ) -> None:
-        # String and transform messages have both after the content, points their names.
-        time, name = (timestamp, device_name) if device_name else rest
+    def __init__(self, content: Any, *rest: Any, **named: Any) -> None:
+        time, name = named.values() if named else rest
         self._said = [name, np.asarray(content).tolist(), time]
 
     def pack(self) -> bytes:
@@ -48,11 +45,9 @@ class Played:
 @pytest.fixture
 def component(monkeypatch: pytest.MonkeyPatch) -> OpenIGTLink:
     """The component, whom somebody listens to."""
-    played: Any = ModuleType("pyigtl.messages")
-    played.StringMessage = played.TransformMessage = played.PointMessage = Played
-    package: Any = ModuleType("pyigtl")
-    package.messages = played
-    monkeypatch.setitem(sys.modules, "pyigtl", package)
+    kinds = dict.fromkeys(("StringMessage", "TransformMessage", "PointMessage"), Played)
+    played: Any = SimpleNamespace(**kinds)
+    monkeypatch.setitem(sys.modules, "pyigtl", SimpleNamespace(messages=played))
     monkeypatch.setitem(sys.modules, "pyigtl.messages", played)
     one = OpenIGTLink(OpenIGTLinkParameters(port=0))
     list(one.ports[0].handler((Listeners(1, 0),), AT))
@@ -112,23 +107,19 @@ def test_slicer_hears_the_needle_in_mm(component: OpenIGTLink) -> None:
         assert not said.keys() & {"NeedleTipToRig", "NeedleShaft"}
 
 
-def test_nothing_is_packed_while_nobody_listens() -> None:
-    component = OpenIGTLink(OpenIGTLinkParameters())
-    (timer,), (port,) = component.timers, component.ports
+def test_the_port_tells_who_listens_and_nothing_is_packed_for_nobody() -> None:
+    component = OpenIGTLink(OpenIGTLinkParameters(port=0))
+    (timer,), (row,) = component.timers, component.ports
     assert list(timer.handler(AT)) == [Send(LINK, (b"",))]
     keys = {"listeners": "0", "turned away": "2"}
     told = Diagnose("listeners", Diagnostic(Level.OK, "nobody listens", keys))
-    assert list(port.handler((Listeners(0, 2),), AT)) == [told]
-
-
-def test_the_port_tells_where_it_is_and_who_listens() -> None:
+    assert list(row.handler((Listeners(0, 2),), AT)) == [told]
     arrived: list[Any] = []
-    port = LinkPort(OpenIGTLinkParameters(port=0))
-    with contextlib.closing(port):
+    with contextlib.closing(LinkPort(component.settings)) as port:
         port.open(arrived.append)
         port.send((b"needle",))
-        where = f"shows the needle at 127.0.0.1, port {port.server.port}"
-        assert arrived == [(Log("info", where),), (Listeners(0, 0),)]
+        log = Log("info", f"shows the needle at 127.0.0.1, port {port.server.port}")
+        assert arrived == [(log,), (Listeners(0, 0),)]
 
 
 def test_without_pyigtl_it_says_so(

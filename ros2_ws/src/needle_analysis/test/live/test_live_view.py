@@ -38,6 +38,7 @@ CALIBRATION = Path(__file__).parents[4] / "src/needle_tracker/config/calibration
 TIP = (0.001, 0.002, 0.04)
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 LEFT = live_view.PICTURES["left"]
+RAW, RAW_RIGHT = (f"stereo/{side}/image_raw" for side in ("left", "right"))
 EXPOSED = 5_000_000_000
 
 
@@ -49,11 +50,7 @@ class PlayedRig(Component):
     def __init__(self, view: LiveView) -> None:
         self.todo: deque[Publish] = deque()
         self.outputs = tuple(Output(row.topic, row.message, row.delivery) for row in view.inputs)
-        self.timers = (Timer(0.01, self._say),)
-
-    def _say(self, at: Moment) -> Actions:
-        while self.todo:
-            yield self.todo.popleft()
+        self.timers = (Timer(0.01, lambda _: [self.todo.popleft() for _ in tuple(self.todo)]),)
 
 
 class Viewer(Component):
@@ -63,10 +60,10 @@ class Viewer(Component):
 
     def __init__(self, view: LiveView, topics: Iterable[str]) -> None:
         self.seen: dict[str, list[Any]] = {topic: [] for topic in topics}
-        rows = {row.topic: row for row in view.outputs}
         self.inputs = tuple(
-            Input(topic, rows[topic].message, partial(self._keep, topic), rows[topic].delivery)
-            for topic in topics
+            Input(row.topic, row.message, partial(self._keep, row.topic), row.delivery)
+            for row in view.outputs
+            if row.topic in self.seen
         )
 
     def _keep(self, topic: str, message: Any, at: Moment) -> Actions:
@@ -162,6 +159,14 @@ def test_nothing_is_sent_that_nobody_looks_at() -> None:
     scene.published.clear()
     scene.runner.run(0.5)
     assert scene.published == []
+    # Nor are images received.
+    peers, at = Peers(subscribers={LEFT: ("viewer",)}), Moment(0.0, 0)
+    assert list(scene.view.on_peers(peers, at)) == [Listen(RAW, True), Listen(RAW_RIGHT, False)]
+    assert list(scene.view.on_peers(Peers(), at)) == [Listen(RAW, False), Listen(RAW_RIGHT, False)]
+    assert {row.topic for row in scene.view.inputs if row.lazy} == {RAW, RAW_RIGHT}
+    # Without a message for transforms there is no topic of them.
+    topics = {live_view.TIP, live_view.PATH, live_view.MARKERS, *live_view.PICTURES.values()}
+    assert {row.topic for row in scene.view.outputs} == topics
 
 
 def test_what_cannot_be_is_refused_by_name_and_changes_nothing() -> None:
@@ -211,7 +216,7 @@ def test_an_image_is_drawn_with_its_answer(left_view: Projection) -> None:
     scene = steered()
     scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
     pictures = scene.look_at(LEFT).seen[LEFT]
-    scene.rig.todo.append(Publish("stereo/left/image_raw", black(2 * EXPOSED)))
+    scene.rig.todo.append(Publish(RAW, black(2 * EXPOSED)))
     scene.say("needle/tip_pose", pose("rig", 1e-4, 2 * EXPOSED))
     (seen,) = pictures
     assert (seen.stamp_ns, seen.format) == (2 * EXPOSED, "jpeg")
@@ -229,38 +234,24 @@ def test_an_image_is_drawn_with_its_answer(left_view: Projection) -> None:
 def test_images_of_another_camera_or_from_before_anybody_looked_are_not_shown() -> None:
     scene = Scene()
     scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
-    scene.say("stereo/left/image_raw", black(1))
+    scene.say(RAW, black(1))
     first = Viewer(scene.view, [LEFT])
     scene.runner.start(first)
     scene.runner.run(0.25)
     # It waits for its answer, which takes longer than anybody looks.
-    scene.rig.todo.append(Publish("stereo/left/image_raw", black(2)))
+    scene.rig.todo.append(Publish(RAW, black(2)))
     scene.runner.run(0.05)
     scene.runner.stop("viewer")
-    scene.say("stereo/left/image_raw", black(3))
+    scene.say(RAW, black(3))
     pictures = scene.look_at(LEFT).seen[LEFT]
     scene.runner.run(1.0)
     assert pictures == []
-    scene.say("stereo/left/image_raw", m.Image(1, "", 2, 3, "mono8", 3, bytes(6)))
-    assert "the calibration is for" in scene.health["stereo/left/image_raw"]
-    scene.say("stereo/left/image_raw", black(4))
+    scene.say(RAW, m.Image(1, "", 2, 3, "mono8", 3, bytes(6)))
+    assert "the calibration is for" in scene.health[RAW]
+    scene.say(RAW, black(4))
     scene.runner.run(1.0)
     assert [picture.stamp_ns for picture in pictures] == [4]
     assert first.seen[LEFT] == []
-
-
-def test_images_are_received_only_while_their_view_is_looked_at() -> None:
-    view = LiveView(LiveViewParameters(), transforms=False)
-    at = Moment(0.0, 0)
-    peers = Peers(subscribers={LEFT: ("viewer",)})
-    left, right = "stereo/left/image_raw", "stereo/right/image_raw"
-    assert list(view.on_peers(peers, at)) == [Listen(left, True), Listen(right, False)]
-    assert list(view.on_peers(Peers(), at)) == [Listen(left, False), Listen(right, False)]
-    assert {row.topic for row in view.inputs if row.lazy} == {left, right}
-    # Without a message for transforms there is no topic of them.
-    pictures = live_view.PICTURES.values()
-    topics = {row.topic for row in view.outputs}
-    assert topics == {live_view.TIP, live_view.PATH, live_view.MARKERS, *pictures}
 
 
 # ---- transforms

@@ -18,84 +18,68 @@ ROOT = Path(__file__).parents[5]
 CONFIG = ROOT / "ros2_ws/src/needle_analysis/config"
 VIEW = LiveView(LiveViewParameters(), transforms=False)
 OUTPUTS = {f"/{row.topic}": ros_type(row.message) for row in VIEW.outputs}
-BAG = ROOT / "bags/regression/metadata.yaml"
-RVIZ_TYPES = {
+PICTURE = "sensor_msgs/msg/CompressedImage"
+RVIZ = {
     "MarkerArray": "visualization_msgs/msg/MarkerArray",
     "Path": "nav_msgs/msg/Path",
     "Pose": "geometry_msgs/msg/PoseStamped",
-    "Image": "sensor_msgs/msg/CompressedImage",
-}
-IN_3D = {
-    "visualization_msgs/msg/MarkerArray",
-    "nav_msgs/msg/Path",
-    "geometry_msgs/msg/PoseStamped",
+    "Image": PICTURE,
 }
 
 
 def published() -> dict[str, str]:
     """Return topic to type of all that live_view publishes, and of what a recorded graph did."""
-    metadata = yaml.safe_load(BAG.read_text("utf-8"))["rosbag2_bagfile_information"]
-    recorded = [one["topic_metadata"] for one in metadata["topics_with_message_count"]]
+    metadata = yaml.safe_load((ROOT / "bags/regression/metadata.yaml").read_text("utf-8"))
+    topics = metadata["rosbag2_bagfile_information"]["topics_with_message_count"]
+    recorded = [one["topic_metadata"] for one in topics]
     # Every node publishes its health; the committed bag leaves it out.
     health = {"/diagnostics": ros_type(m.Diagnostics)}
     return {one["name"]: one["type"] for one in recorded} | OUTPUTS | health
 
 
-def test_the_rviz_configuration_shows_what_is_there() -> None:
+def test_the_rviz_configuration_and_the_help_show_what_is_there() -> None:
     document = yaml.safe_load((CONFIG / "live_view.rviz").read_text("utf-8"))
-    displays = document["Visualization Manager"]["Displays"]
-    shown_topics = {}
-    for display in displays:
-        name = display["Class"].partition("/")[2]
-        if "Topic" in display:
-            shown_topics[display["Topic"]["Value"]] = RVIZ_TYPES[name]
-        else:
-            assert name in ("Grid", "TF")
-    there = published()
-    assert {topic: there.get(topic) for topic in shown_topics} == shown_topics
-    assert set(shown_topics) == set(OUTPUTS)
-    assert document["Visualization Manager"]["Global Options"]["Fixed Frame"] == "rig"
+    manager, there = document["Visualization Manager"], published()
+    kinds = {one["Class"].partition("/")[2]: one for one in manager["Displays"]}
+    assert {name for name, one in kinds.items() if "Topic" not in one} == {"Grid", "TF"}
+    shown = {
+        display["Topic"]["Value"]: RVIZ[display["Class"].partition("/")[2]]
+        for display in manager["Displays"]
+        if "Topic" in display
+    }
+    assert {topic: there.get(topic) for topic in shown} == shown
+    assert shown.keys() == OUTPUTS.keys()
+    assert manager["Global Options"]["Fixed Frame"] == "rig"
+    assert all(topic.replace("/live_view", "~") in executable.HELP for topic in OUTPUTS)
 
 
 def test_the_foxglove_layout_shows_what_is_there() -> None:
     layout = json.loads((CONFIG / "live_view.json").read_text("utf-8"))
     there = published()
-    shown_topics: set[str] = set()
-
-    def show(topic: str, *kinds: str) -> None:
-        assert topic in there
-        assert not kinds or there[topic] in kinds
-        shown_topics.add(topic)
-
+    shown: set[str] = set()
     for name, panel in layout["configById"].items():
-        kind = name.partition("!")[0]
-        if kind == "3D":
-            for topic in panel["topics"]:
-                show(topic, *IN_3D)
-        elif kind == "Image":
-            show(panel["imageMode"]["imageTopic"], "sensor_msgs/msg/CompressedImage")
-        elif kind == "Plot":
-            for path in panel["paths"]:
-                topic, *fields = path["value"].partition("[")[0].split(".")
-                show(topic)
-                message = message_class(there[topic])()
-                for field in fields:
-                    message = getattr(message, field)
-        elif kind == "RawMessages":
-            show(panel["topicPath"])
-        else:
-            assert kind == "DiagnosticSummary"
-            show(panel["topicToRender"], "diagnostic_msgs/msg/DiagnosticArray")
-    assert set(OUTPUTS) <= shown_topics
+        match name.partition("!")[0]:
+            case "3D":
+                wanted = {topic: set(RVIZ.values()) - {PICTURE} for topic in panel["topics"]}
+            case "Image":
+                wanted = {panel["imageMode"]["imageTopic"]: {PICTURE}}
+            case "Plot":
+                ways = [path["value"].partition("[")[0].split(".") for path in panel["paths"]]
+                wanted = {topic: {there[topic]} for topic, *_ in ways}
+                for topic, *fields in ways:
+                    message = message_class(there[topic])()
+                    for field in fields:
+                        message = getattr(message, field)
+            case "RawMessages":
+                wanted = {panel["topicPath"]: {there[panel["topicPath"]]}}
+            case kind:
+                assert kind == "DiagnosticSummary"
+                wanted = {panel["topicToRender"]: {"diagnostic_msgs/msg/DiagnosticArray"}}
+        assert all(there[topic] in kinds for topic, kinds in wanted.items())
+        shown |= wanted.keys()
+    assert OUTPUTS.keys() <= shown
 
     def panels(part: Any) -> list[str]:
-        if isinstance(part, str):
-            return [part]
-        return [*panels(part["first"]), *panels(part["second"])]
+        return [part] if isinstance(part, str) else panels(part["first"]) + panels(part["second"])
 
     assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
-
-
-def test_the_help_names_every_topic() -> None:
-    for topic in OUTPUTS:
-        assert topic.replace("/live_view", "~") in executable.HELP

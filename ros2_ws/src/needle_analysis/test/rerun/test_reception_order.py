@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from functools import partial
+
+import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from needle_analysis.rerun.reception_order import in_reception_order
@@ -28,71 +31,41 @@ def status(time: int, *heard: tuple[str, int]) -> SentMessage:
     return SentMessage(time, time, "/rig/needle/controller_status", STATUS, data)
 
 
-def order(*messages: SentMessage) -> list[tuple[str, int]]:
-    heard = in_reception_order(list(messages), "/rig/")
-    assert [time for time, _ in heard] == sorted(time for time, _ in heard)
-    assert all(time >= message.time for time, message in heard)
-    return [(message.topic.rsplit("/", maxsplit=1)[-1], message.time) for _, message in heard]
+J, X, S = "joints", "other", "controller_status"
+SENT = partial(map, lambda pair: sent(*pair))
 
 
-def test_the_order_is_that_of_hearing() -> None:
-    found = order(
-        sent(10, "joints"),
-        sent(11, "result"),
-        sent(12, "tip"),
-        sent(20, "joints"),
-        status(30, ("tip", 12), ("joints", 10)),
-        sent(40, "joints"),
-        status(50, ("joints", 20), ("result", 11), ("joints", 40)),
-    )
-    assert found == [
-        ("tip", 12),
-        ("joints", 10),
-        ("controller_status", 30),
-        ("joints", 20),
-        ("result", 11),
-        ("joints", 40),
-        ("controller_status", 50),
-    ]
-
-
-def test_what_the_last_status_does_not_tell_was_heard_after_it() -> None:
-    found = order(
-        sent(10, "joints"),
-        sent(15, "joints"),
-        sent(16, "other"),
-        status(20, ("joints", 10)),
-        sent(30, "joints"),
-    )
-    assert found == [
-        ("joints", 10),
-        ("other", 16),
-        ("controller_status", 20),
-        ("joints", 15),
-        ("joints", 30),
-    ]
-
-
-def test_of_bags_that_do_not_tell_the_order_is_that_of_sending() -> None:
-    assert [time for _, time in order(status(20), sent(10, "joints"))] == [10, 20]
-
-
-def test_what_was_sent_before_the_last_that_was_heard_and_is_not_told_was_never_heard() -> None:
-    found = order(
-        sent(10, "joints"),
-        sent(11, "other"),
-        sent(20, "joints"),
-        status(25, ("joints", 20)),
-        sent(30, "joints"),
-        sent(40, "joints"),
-        status(45, ("joints", 40)),
-        sent(50, "joints"),
-    )
-    assert found == [
-        ("other", 11),
-        ("joints", 20),
-        ("controller_status", 25),
-        ("joints", 40),
-        ("controller_status", 45),
-        ("joints", 50),
-    ]
+@pytest.mark.parametrize(
+    ("messages", "heard"),
+    [
+        (  # The order is that of hearing.
+            [
+                *SENT([(10, J), (11, "result"), (12, "tip"), (20, J)]),
+                *(status(30, ("tip", 12), (J, 10)), sent(40, J)),
+                status(50, (J, 20), ("result", 11), (J, 40)),
+            ],
+            [("tip", 12), (J, 10), (S, 30), (J, 20), ("result", 11), (J, 40), (S, 50)],
+        ),
+        (  # What the last status does not tell was heard after it.
+            [*SENT([(10, J), (15, J), (16, X)]), status(20, (J, 10)), sent(30, J)],
+            [(J, 10), (X, 16), (S, 20), (J, 15), (J, 30)],
+        ),
+        # Of bags that do not tell, the order is that of sending.
+        ([status(20), sent(10, J)], [(J, 10), (S, 20)]),
+        (  # What was sent before the last that was heard, and is not told, was never heard.
+            [
+                *SENT([(10, J), (11, X), (20, J)]),
+                *(status(25, (J, 20)), *SENT([(30, J), (40, J)])),
+                *(status(45, (J, 40)), sent(50, J)),
+            ],
+            [(X, 11), (J, 20), (S, 25), (J, 40), (S, 45), (J, 50)],
+        ),
+    ],
+)
+def test_the_order_is_that_of_hearing(
+    messages: list[SentMessage], heard: list[tuple[str, int]]
+) -> None:
+    found = in_reception_order(list(messages), "/rig/")
+    assert [time for time, _ in found] == sorted(time for time, _ in found)
+    assert all(time >= message.time for time, message in found)
+    assert [(one.topic.rsplit("/", maxsplit=1)[-1], one.time) for _, one in found] == heard

@@ -9,7 +9,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from needle_analysis.run.innovation import gate_room, innovations, missed_tips, refused_tips
+from needle_analysis.run.innovation import (
+    Innovations,
+    gate_room,
+    innovations,
+    missed_tips,
+    refused_tips,
+)
 from needle_bags.reading.bag_reader import Run, Series, Status
 
 KAPPA = 8.0
@@ -17,6 +23,7 @@ STEPS = 40
 OFFSET = 3e-3
 MILLIMETRE = 1e-3
 MICROSECOND = 1_000
+EMPTY = {"truth": 7, "reduced_state": 3, "control_input": 3, "commands": 2, "holds": 2}
 
 
 def series(values: np.ndarray) -> Series:
@@ -44,30 +51,26 @@ def make_run(**changes: Any) -> Run:
     joints = np.stack([np.arange(STEPS + 1) * MILLIMETRE, np.arange(STEPS + 1) * 0.1], axis=1)
     quaternions = Rotation.from_matrix(rotations).as_quat()
     exact = np.zeros((STEPS + 1, 36))
+    others: dict[str, Any] = {
+        **{name: series(np.empty((0, width))) for name, width in EMPTY.items()},
+        **{name: [] for name in ("controller_status", "device_status", "results", "health")},
+        **{name: {} for name in ("topics", "parameters", "run_info", "versions", "recording")},
+        **{"calibration": "", "commit": ""},
+    }
     run = Run(
         path=Path("made_up"),
+        namespace="/",
         tips=series(positions + np.array([OFFSET, 0.0, 0.0])),
         tip_covariances=series(np.tile(np.eye(3).ravel() * 1e-8, (STEPS + 1, 1))),
-        truth=series(np.empty((0, 7))),
         estimate=series(np.hstack([positions, quaternions])),
         estimate_covariances=series(exact),
-        reduced_state=series(np.empty((0, 3))),
         joints=series(joints),
-        control_input=series(np.empty((0, 3))),
-        commands=series(np.empty((0, 2))),
-        holds=series(np.empty((0, 2))),
+        **others,
+    )
+    run = dataclasses.replace(
+        run,
         controller_status=[Status(0, {"target_offset_m": str(OFFSET)})],
-        device_status=[],
-        results=[],
-        health=[],
-        topics={},
         parameters={"/plane_controller": {"curvature": KAPPA, "tip_margin": 4e-3}},
-        run_info={},
-        versions={},
-        calibration="",
-        commit="",
-        recording={},
-        namespace="/",
     )
     return dataclasses.replace(run, **changes)
 
@@ -78,42 +81,34 @@ def moved(run: Run, index: int, by: tuple[float, float, float]) -> Run:
     return dataclasses.replace(run, tips=dataclasses.replace(run.tips, values=values))
 
 
-def test_a_needle_that_does_what_is_expected_has_no_innovation() -> None:
-    found = innovations(make_run())
+def found_in(run: Run) -> Innovations:
+    found = innovations(run)
     assert found is not None
-    assert len(found.stamps) == STEPS
-    np.testing.assert_allclose(found.values, 0.0, atol=1e-9)
-    np.testing.assert_allclose(found.sigmas, 1e-4, rtol=1e-9)
+    return found
 
 
 def test_innovation_is_measured_minus_expected() -> None:
-    found = innovations(moved(make_run(), 20, (3e-4, -1e-4, 2e-4)))
-    assert found is not None
+    found = found_in(make_run())
+    assert len(found.stamps) == STEPS
+    np.testing.assert_allclose(found.values, 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.sigmas, 1e-4, rtol=1e-9)
+    found = found_in(moved(make_run(), 20, (3e-4, -1e-4, 2e-4)))
     np.testing.assert_allclose(found.values[19], [3e-4, -1e-4, 2e-4], atol=1e-9)
     assert found.squared[19] == pytest.approx(9.0 + 1.0 + 4.0, rel=1e-4)
     np.testing.assert_allclose(found.values[20], 0.0, atol=1e-9)
+    # A tip that is not finite is none, and without a curvature nothing is expected.
+    found = found_in(moved(make_run(), 20, (np.nan, 0.0, 0.0)))
+    assert len(found.stamps) == STEPS - 1
+    assert np.isfinite(found.squared).all()
+    assert innovations(make_run(parameters={})) is None
 
 
 def test_an_uncertain_heading_widens_what_is_expected_across_the_needle() -> None:
     covariance = np.zeros((STEPS + 1, 6, 6))
     covariance[:, 3:, 3:] = np.eye(3) * 0.2**2
-    run = make_run(estimate_covariances=series(covariance.reshape(-1, 36)))
-    found = innovations(run)
-    assert found is not None
-    across, along = found.sigmas[0, 0], found.sigmas[0, 2]
-    assert across == pytest.approx(np.hypot(1e-4, 0.2 * MILLIMETRE), rel=1e-3)
-    assert along == pytest.approx(1e-4, rel=1e-2)
-
-
-def test_a_tip_that_is_not_finite_is_no_innovation() -> None:
-    found = innovations(moved(make_run(), 20, (np.nan, 0.0, 0.0)))
-    assert found is not None
-    assert len(found.stamps) == STEPS - 1
-    assert np.isfinite(found.squared).all()
-
-
-def test_without_a_curvature_there_is_none() -> None:
-    assert innovations(make_run(parameters={})) is None
+    sigmas = found_in(make_run(estimate_covariances=series(covariance.reshape(-1, 36)))).sigmas
+    assert sigmas[0, 0] == pytest.approx(np.hypot(1e-4, 0.2 * MILLIMETRE), rel=1e-3)
+    assert sigmas[0, 2] == pytest.approx(1e-4, rel=1e-2)
 
 
 def test_room_to_the_gate() -> None:

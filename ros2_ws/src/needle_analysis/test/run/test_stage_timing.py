@@ -64,16 +64,14 @@ def write(directory: Path, exposure: str) -> Any:
 @pytest.mark.parametrize("exposure", [LEFT, "sim/tip_pose"])
 def test_stages_take_what_they_took(tmp_path: Path, exposure: str) -> None:
     timings = {timing.name: timing for timing in stage_timings(write(tmp_path / "bag", exposure))}
-    wait = PERIOD - TRACKER - CONTROLLER - DEVICE
-    wanted = {
+    for name, milliseconds in {
         "tracker": TRACKER,
         "controller": CONTROLLER,
         "driver": DRIVER,
         "image to set-point": TRACKER + CONTROLLER + DRIVER,
         "device": DEVICE,
-        "camera": wait,
-    }
-    for name, milliseconds in wanted.items():
+        "camera": PERIOD - TRACKER - CONTROLLER - DEVICE,
+    }.items():
         assert timings[name].seconds * 1e3 == pytest.approx(milliseconds)
         assert len(timings[name].stamps) == (STEPS - 1 if name == "camera" else STEPS)
 

@@ -7,21 +7,22 @@ import errno
 import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import QosDurability, QosHistory, QosReliability, QosTime
+from rosbags.interfaces import QosDurability, QosReliability, QosTime
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from needle_bags.format.bag_copy import standard_text, standard_topic
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition
+from needle_bags.reading.bag_files import read_contents
 from needle_bags.recording import recording as recording_module
 from needle_bags.recording.free_space import FreeSpace
 from needle_bags.recording.recorder_health import WARN_WAITING, RecorderHealth
@@ -29,62 +30,36 @@ from needle_bags.recording.recording import Received, Recording, open_recording
 from needle_bags.recording.worker import Do, Job
 from needle_core.diagnostics import Level
 from needle_core.errors import UserError
-from needle_core.files.bag_topic import BagTopic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
-TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TIME = 1_700_000_000_000_000_000
 RIG_TYPES = (
     *(f"sensor_msgs/msg/{name}" for name in ("Image", "CameraInfo", "JointState", "Joy")),
     *(f"geometry_msgs/msg/{name}Stamped" for name in ("Point", "Pose", "Vector3")),
     *(f"std_msgs/msg/{name}" for name in ("Bool", "Header", "String")),
     *(f"rcl_interfaces/msg/{name}" for name in ("ParameterEvent", "Log")),
-    *("trajectory_msgs/msg/JointTrajectory", "rosgraph_msgs/msg/Clock"),
-    *("diagnostic_msgs/msg/DiagnosticArray", TYPE),
+    *("trajectory_msgs/msg/JointTrajectory", "diagnostic_msgs/msg/DiagnosticArray"),
 )
-TOPIC = BagTopic("/t", TYPE, full_definition(TYPE))
-FULL = OSError(errno.ENOSPC, "No space left on device")
-
-
-def pose(number: int) -> bytes:
-    types = STORE.types
-    message = types[TYPE](
-        header=types["std_msgs/msg/Header"](
-            stamp=types["builtin_interfaces/msg/Time"](sec=number, nanosec=5), frame_id="rig"
-        ),
-        pose=types["geometry_msgs/msg/PoseWithCovariance"](
-            pose=types["geometry_msgs/msg/Pose"](
-                position=types["geometry_msgs/msg/Point"](x=0.001 * number, y=0.0, z=0.0),
-                orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
-            ),
-            covariance=np.arange(36.0),
-        ),
-    )
-    return bytes(STORE.serialize_cdr(message, TYPE))
+TYPE = "std_msgs/msg/String"
+TOPIC = standard_topic("/t", TYPE)
 
 
 def received(number: int = 1, topic: str = "/t") -> Received:
-    return Received(topic, pose(number), TIME, TIME)
+    return Received(topic, standard_text(str(number)), TIME, TIME)
 
 
 @pytest.fixture(scope="module")
-def poses(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag of 200 poses with all that a bag can carry."""
+def texts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag of 200 texts with all that a bag can carry."""
     directory = tmp_path_factory.mktemp("writer") / "bag"
     bag = BagWriter(directory, chunk_size=4096)
-    qos = (
-        USUAL_QOS._replace(history=QosHistory.KEEP_LAST, depth=10),
-        USUAL_QOS._replace(
-            reliability=QosReliability.BEST_EFFORT,
-            durability=QosDurability.TRANSIENT_LOCAL,
-            lifespan=QosTime(10, 7),
-        ),
-    )
-    channel = bag.add_topic(
-        dataclasses.replace(TOPIC, type_hash=STORE.hash_rihs01(TYPE), offered_qos=qos)
-    )
+    told: Any = {"reliability": QosReliability.BEST_EFFORT, "lifespan": QosTime(10, 7)}
+    latched = USUAL_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL, **told)
+    offers = (USUAL_QOS._replace(depth=10), latched)
+    channel = bag.add_topic(dataclasses.replace(TOPIC, offered_qos=offers))
     for number in range(200):
-        bag.write(channel, pose(number), TIME + number * 1000, TIME + number * 1000 - 10)
+        time = TIME + number * 1000
+        bag.write(channel, standard_text(str(number)), time, time - 10)
     bag.set_custom_data("run_info", "level: tip\nseed: 1\n")
     bag.add_attachment("calibration.yaml", "application/yaml", b"left: {}\n", TIME)
     bag.close()
@@ -100,57 +75,44 @@ def test_definitions_hash_as_rosbags_computes() -> None:
         full_definition("no_such_msgs/msg/Thing")
 
 
-def test_rosbags_reads_the_messages_and_what_is_said_of_their_topic(poses: Path) -> None:
-    with AnyReader([poses]) as reader:
+def test_rosbags_reads_the_messages_and_what_is_said_of_their_topic(texts: Path) -> None:
+    with Reader(texts) as reader:
         messages = list(reader.messages())
-        assert reader.message_count == 200
-        assert [time for _, time, _ in messages] == [TIME + n * 1000 for n in range(200)]
-        assert [bytes(data) for _, _, data in messages] == [pose(n) for n in range(200)]
-        connection, _, data = messages[-1]
-        last: Any = reader.deserialize(data, connection.msgtype)
-        assert last.header.stamp.sec == 199
-    with Reader(poses) as bag:
-        (connection,) = bag.connections
-        assert connection.digest == STORE.hash_rihs01(TYPE)
-        assert bag.ros_distro == "jazzy"
-        first, second = connection.ext.offered_qos_profiles  # type: ignore[union-attr]
-    assert (first.history, first.depth) == (QosHistory.KEEP_LAST, 10)
-    assert first.reliability is QosReliability.RELIABLE
+        (connection,) = reader.connections
+        assert (reader.message_count, reader.ros_distro) == (200, "jazzy")
+    assert [time for _, time, _ in messages] == [TIME + n * 1000 for n in range(200)]
+    assert [bytes(data) for _, _, data in messages] == [standard_text(str(n)) for n in range(200)]
+    assert connection.digest == STORE.hash_rihs01(TYPE)
+    first, second = connection.ext.offered_qos_profiles  # type: ignore[union-attr]
+    assert (first.depth, first.reliability) == (10, QosReliability.RELIABLE)
     assert second.reliability is QosReliability.BEST_EFFORT
     assert second.durability is QosDurability.TRANSIENT_LOCAL
     assert (second.lifespan.sec, second.lifespan.nsec) == (10, 7)
     assert (first.deadline.sec, first.deadline.nsec) == (9223372036, 854775807)
-
-
-def test_mcap_reads_the_file_alone(poses: Path) -> None:
-    with (poses / "bag_0.mcap").open("rb") as stream:
-        reader = make_reader(stream)
-        assert reader.get_header().profile == "ros2"
-        summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
-        assert summary.statistics.message_count == 200
-        messages = list(reader.iter_messages())
-        (attachment,) = reader.iter_attachments()
-    schema, channel, message = messages[7]
-    assert schema is not None
-    assert (schema.name, schema.encoding) == (TYPE, "ros2msg")
-    assert channel.metadata["topic_type_hash"] == STORE.hash_rihs01(TYPE)
-    assert (message.log_time, message.publish_time) == (TIME + 7000, TIME + 6990)
-    assert attachment.data == b"left: {}\n"
-
-
-def test_metadata_has_no_anchors_and_keeps_texts(poses: Path) -> None:
-    text = (poses / "metadata.yaml").read_text()
+    text = (texts / "metadata.yaml").read_text()
     assert "&id" not in text
     information = yaml.safe_load(text)["rosbag2_bagfile_information"]
     assert information["version"] == 9
     assert information["custom_data"] == {"run_info": "level: tip\nseed: 1\n"}
 
 
-def test_a_bag_is_begun_where_none_is_and_replaces_none(poses: Path, tmp_path: Path) -> None:
+def test_mcap_reads_the_file_alone(texts: Path) -> None:
+    with (texts / "bag_0.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().profile == "ros2"
+        messages = list(reader.iter_messages())
+        (attachment,) = reader.iter_attachments()
+    schema, channel, message = messages[7]
+    assert schema is not None
+    assert (len(messages), schema.name, schema.encoding) == (200, TYPE, "ros2msg")
+    assert channel.metadata["topic_type_hash"] == STORE.hash_rihs01(TYPE)
+    assert (message.log_time, message.publish_time) == (TIME + 7000, TIME + 6990)
+    assert attachment.data == b"left: {}\n"
+
+
+def test_a_bag_is_begun_where_none_is_and_replaces_none(texts: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds a bag already"):
-        BagWriter(poses)
+        BagWriter(texts)
     (tmp_path / "parameters.yaml").write_text("{}")
     with pytest.raises(UserError, match="it is a file"):
         BagWriter(tmp_path / "parameters.yaml")
@@ -186,7 +148,7 @@ def test_what_a_disk_that_fills_at_the_very_end_drops_is_named_in_the_bag(
 
     def full_once(writer: Writer) -> None:
         monkeypatch.setattr(Writer, "finish", finish)
-        raise FULL
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(BagWriter, "flush", lambda _: None)
     monkeypatch.setattr(Writer, "finish", full_once)
@@ -196,48 +158,47 @@ def test_what_a_disk_that_fills_at_the_very_end_drops_is_named_in_the_bag(
         recording.append(received(number))
     recording.close({"/t": 2, "/other": 1})
     assert recording.is_whole
-    assert recording.error is not None
-    assert recording.error.endswith("bag_0.mcap: No space left on device")
-    text = (tmp_path / "bag" / "metadata.yaml").read_text()
-    custom = yaml.safe_load(text)["rosbag2_bagfile_information"]["custom_data"]
-    assert json.loads(custom["messages_lost"]) == {"/t": 12, "/other": 1}
+    assert str(recording.error).endswith("bag_0.mcap: No space left on device")
+    lost = read_contents(tmp_path / "bag").custom_data["messages_lost"]
+    assert json.loads(lost) == {"/t": 12, "/other": 1}
 
 
-def test_a_recording_ends_in_order_before_its_disk_is_full(
+def test_a_recording_ends_in_order_before_its_disk_is_full_or_at_what_it_cannot_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recording = open_recording(tmp_path / "bag")
-    recording.add_topic(TOPIC)
-    recording.append(received())
+    """The thread that writes may not end in silence: all that comes after would wait for ever."""
+    strange = open_recording(tmp_path / "strange")
+    strange.add_topic(TOPIC)
+    for topic in ("/t", "/nobody_described_it", "/t"):
+        strange.append(received(1, topic))
+    strange.close()
+    assert strange.error == "KeyError: '/nobody_described_it'"
+    full = open_recording(tmp_path / "full")
+    full.add_topic(TOPIC)
     monkeypatch.setattr(FreeSpace, "usable", lambda _: -1)
     monkeypatch.setattr(recording_module, "_LOOK_EVERY", 1)
-    recording.append(received())
-    recording.close()
-    assert recording.is_whole
-    assert recording.error is not None
-    assert recording.error.startswith(f"the disk of {tmp_path / 'bag'} has only")
-    with Reader(tmp_path / "bag") as reader:
-        assert 1 <= reader.message_count <= 2
+    full.append(received())
+    full.close()
+    assert str(full.error).startswith(f"the disk of {tmp_path / 'full'} has only")
+    for recording, name in ((strange, "strange"), (full, "full")):
+        assert recording.is_whole
+        assert read_contents(tmp_path / name).counts["/t"] <= 1
 
 
-class HeldWorker:
+class HeldWorker(list[Job]):
     """A worker that does nothing before the end: its disk stands still."""
 
     def __init__(self, do: Do, end: Job) -> None:
         self._do, self._end = do, end
-        self._jobs: list[Job] = []
+        self.put = self.append
 
     @property
     def waiting(self) -> int:
-        return len(self._jobs)
-
-    def put(self, job: Job) -> None:
-        self._jobs.append(job)
+        return len(self)
 
     def finish(self) -> None:
-        for job in self._jobs:
+        for job in (*self, self._end):
             self._do(job)
-        self._end()
 
 
 def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(tmp_path: Path) -> None:
@@ -261,57 +222,22 @@ def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(tmp_p
     assert 800 < dropped["/command"] < 1000
     recording.close()
     assert recording.is_whole
-    with Reader(tmp_path / "bag") as reader:
-        counts = {c.topic: c.msgcount for c in reader.connections}
+    counts = read_contents(tmp_path / "bag").counts
     assert counts == {"/image": 12 - dropped["/image"], "/command": 1050 - dropped["/command"]}
 
 
-def test_a_message_that_cannot_be_written_ends_the_recording_in_order(tmp_path: Path) -> None:
-    """The thread that writes may not end in silence: all that comes after would wait for ever."""
-    recording = open_recording(tmp_path / "bag")
-    recording.add_topic(TOPIC)
-    recording.append(received(1))
-    recording.append(received(2, "/nobody_described_it"))
-    recording.append(received(3))
-    recording.close()
-    assert recording.error == "KeyError: '/nobody_described_it'"
-    assert recording.is_whole
-    with Reader(tmp_path / "bag") as reader:
-        assert reader.message_count == 1
-
-
-class _Told:
-    """A recording as its health looks at it."""
-
-    def __init__(self) -> None:
-        self.error: str | None = None
-        self.bytes_received = self.bytes_waiting = 0
-        self.space = self
-        self.reserve, self.left = 1_000_000, 10**9
-
-    def usable(self) -> int:
-        if self.left < 0:
-            raise OSError(errno.EIO, "Input/output error")
-        return self.left
-
-
 def test_health_tells_the_worst_first() -> None:
-    told: Any = _Told()
+    space = SimpleNamespace(reserve=1_000_000, usable=lambda: 10**9)
+    told: Any = SimpleNamespace(error=None, bytes_received=0, bytes_waiting=0, space=space)
     health = RecorderHealth(told, Path("bag"))
     assert health.look(0.5, {}, []) == (Level.OK, "recording")
     assert health.look(0.5, {}, ["/odd is not recorded"]) == (Level.WARN, "/odd is not recorded")
-    # 10 MB/s for a second: 120 s of it do not fit.
-    told.bytes_received = 10_000_000
-    for _ in range(2):
-        health.look(0.5, {}, [])
+    # 10 MB/s: 120 s of it do not fit.
+    for _ in range(4):
         told.bytes_received += 5_000_000
-    level, text = health.look(0.5, {}, [])
-    assert (level, text) == (
-        Level.WARN,
-        "the disk of bag is nearly full: recording ends at 1 MB free",
-    )
-    told.left = -1
-    assert health.look(0.5, {}, [])[1] == "cannot look at the disk of bag: Input/output error"
+        level, text = health.look(0.5, {}, [])
+    assert level is Level.WARN
+    assert text == "the disk of bag is nearly full: recording ends at 1 MB free"
     told.bytes_waiting = WARN_WAITING + 1
     assert "slower than the graph: 50 MB wait" in health.look(0.5, {}, [])[1]
     assert health.look(0.5, {"/t": 3}, []) == (Level.WARN, "messages lost on /t")

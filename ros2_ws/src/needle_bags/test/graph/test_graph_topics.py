@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from std_msgs.msg import Int32
 
 from needle_bags.format.topic_choice import TopicChoice
-from needle_bags.recording.recording import Received
 from needle_bags.ros import graph_topics
 from needle_bags.ros.graph_topics import OVERLAP, GraphTopics
 from needle_core.files.bag_topic import BagTopic
 
-from .played_graph import (
-    BEST_EFFORT,
-    LATCHED,
-    RELIABLE,
-    PlayedGraph,
-    PlayedSubscription,
-    sent,
-)
+from .played_graph import BEST_EFFORT, LATCHED, RELIABLE, PlayedGraph, PlayedSubscription, sent
 
 JOINTS = "/joints"
+ALL, SOME = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+KEPT, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
 
 
 class Graph(PlayedGraph):
@@ -32,12 +28,12 @@ class Graph(PlayedGraph):
         super().__init__(monkeypatch, graph_topics)
         self.numbers: list[int] = []
         self.described: list[BagTopic] = []
-
-        def take(message: Received) -> None:
-            self.numbers.append(int(message.data))
-
-        node = Node("recorder")
-        self.topics = GraphTopics(node, TopicChoice(), self.described.append, take)
+        self.topics = GraphTopics(
+            Node("recorder"),
+            TopicChoice(),
+            self.described.append,
+            lambda message: self.numbers.append(int(message.data)),
+        )
 
     def hear(self, subscription: PlayedSubscription, *numbers: int) -> None:
         for number in numbers:
@@ -54,6 +50,7 @@ class Graph(PlayedGraph):
         return before, following
 
     def asked(self) -> tuple[ReliabilityPolicy, DurabilityPolicy]:
+        self.topics.poll()
         qos = self.subscriptions[-1].qos_profile
         return qos.reliability, qos.durability
 
@@ -90,8 +87,7 @@ def test_the_one_before_gives_what_waits_at_its_end(graph: Graph) -> None:
     assert graph.subscriptions == [before, following]
     graph.now += 0.1
     graph.topics.poll()
-    assert graph.numbers == [1, 2]
-    assert graph.subscriptions == [following]
+    assert (graph.numbers, graph.subscriptions) == ([1, 2], [following])
     graph.hear(following, 2, 3)
     assert graph.numbers == [1, 2, 3]
 
@@ -108,56 +104,32 @@ def test_a_third_subscription_gives_what_the_first_two_got_first(graph: Graph) -
     graph.hear(third, 3, 4)
     graph.now += OVERLAP + 0.1
     graph.topics.poll()
-    assert graph.numbers == [1, 2, 3, 4]
-    assert graph.subscriptions == [third]
+    assert (graph.numbers, graph.subscriptions) == ([1, 2, 3, 4], [third])
 
 
-@pytest.mark.parametrize(
-    ("offers", "reliability", "durability"),
-    [
-        ((RELIABLE,), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
-        ((LATCHED, LATCHED), ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
-        ((LATCHED, BEST_EFFORT), ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
-    ],
-)
-def test_the_strictest_that_all_publishers_can_serve_is_asked_for(
+def test_the_strictest_that_all_can_serve_is_asked_for_also_before_anybody_serves(
     graph: Graph,
-    offers: tuple[QoSProfile, ...],
-    reliability: ReliabilityPolicy,
-    durability: DurabilityPolicy,
 ) -> None:
-    for offer in offers:
-        graph.offer(JOINTS, Int32, offer)
-    graph.topics.poll()
-    assert graph.asked() == (reliability, durability)
-
-
-def test_a_topic_is_listened_to_before_it_has_a_publisher(graph: Graph) -> None:
-    """Who says one thing and ends would be missed; who comes best effort is asked for no more."""
+    graph.offer("/latched", Int32, LATCHED)
+    assert graph.asked() == (ALL, KEPT)
+    graph.offer("/latched", Int32, RELIABLE)
+    assert graph.asked() == (ALL, VOLATILE)
+    graph.offer("/latched", Int32, BEST_EFFORT)
+    assert graph.asked() == (SOME, VOLATILE)
+    # Who says one thing and ends would be missed; who takes best effort will get no more.
     graph.request("/estop", Int32)
-    graph.topics.poll()
-    assert graph.asked()[0] is ReliabilityPolicy.RELIABLE
+    assert graph.asked()[0] is ALL
     graph.request("/hold", Int32, BEST_EFFORT)
-    graph.topics.poll()
-    assert graph.asked()[0] is ReliabilityPolicy.BEST_EFFORT
+    assert graph.asked()[0] is SOME
+    before = len(graph.subscriptions)
     graph.offer("/hold", Int32, BEST_EFFORT)
     graph.topics.poll()
-    assert len(graph.subscriptions) == 2
+    assert len(graph.subscriptions) == before
     graph.offer("/estop", Int32, LATCHED)
-    graph.topics.poll()
-    assert graph.asked()[1] is DurabilityPolicy.TRANSIENT_LOCAL
+    assert graph.asked()[1] is KEPT
 
 
-def test_what_was_lost_is_counted_for_each_topic(graph: Graph) -> None:
-    graph.offer(JOINTS, Int32)
-    graph.topics.poll()
-    graph.hear(graph.subscriptions[0], 1, 2, 5, *range(6, 20))
-    assert graph.topics.lost == {JOINTS: 2}
-    graph.subscriptions[0].lost(type("Event", (), {"total_count": 7}))
-    assert graph.topics.lost == {JOINTS: 7}
-
-
-def test_a_topic_that_cannot_be_recorded_is_told_once_and_holds_no_other_up(graph: Graph) -> None:
+def test_losses_and_topics_that_cannot_be_recorded_are_told(graph: Graph) -> None:
     graph.types["/odd"] = "no_msgs/msg/Such"
     graph.offer(JOINTS, Int32)
     for _ in range(2):
@@ -167,10 +139,11 @@ def test_a_topic_that_cannot_be_recorded_is_told_once_and_holds_no_other_up(grap
     assert list(graph.topics.refused) == ["/odd"]
     graph.topics.describe_all()
     (topic,) = graph.described
-    assert (topic.name, topic.type_name, len(topic.offered_qos)) == (
-        JOINTS,
-        "std_msgs/msg/Int32",
-        1,
-    )
+    assert (topic.name, topic.type_name) == (JOINTS, "std_msgs/msg/Int32")
+    (subscription,) = graph.subscriptions
+    graph.hear(subscription, 1, 2, 5, *range(6, 20))
+    assert graph.topics.lost == {JOINTS: 2}
+    subscription.lost(SimpleNamespace(total_count=7))
+    assert graph.topics.lost == {JOINTS: 7}
     graph.topics.leave()
     assert graph.subscriptions == []

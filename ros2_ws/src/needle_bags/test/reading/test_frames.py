@@ -82,42 +82,28 @@ def message(kind: str, **fields: Any) -> Any:
     return TYPES[kind](**fields)
 
 
-def header(sec: int = 3, nanosec: int = 500_000_000) -> Any:
-    stamp = message("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-    return message("std_msgs/msg/Header", stamp=stamp, frame_id="rig")
-
-
-def test_health_has_a_row_for_each_status() -> None:
+def test_health_has_a_row_for_each_status_and_points_have_their_joints_names() -> None:
+    stamp = message("builtin_interfaces/msg/Time", sec=3, nanosec=500_000_000)
+    header = message("std_msgs/msg/Header", stamp=stamp, frame_id="rig")
     pair = message("diagnostic_msgs/msg/KeyValue", key="rate_hz", value="30")
     fields = {"message": "well", "hardware_id": "", "values": [pair]}
-    parts = [
-        message("diagnostic_msgs/msg/DiagnosticStatus", level=k, name=f"part {k}", **fields)
-        for k in (0, 1)
-    ]
-    health = message("diagnostic_msgs/msg/DiagnosticArray", header=header(), status=parts)
+    kind = "diagnostic_msgs/msg/DiagnosticStatus"
+    parts = [message(kind, level=k, name=f"part {k}", **fields) for k in (0, 1)]
+    health = message("diagnostic_msgs/msg/DiagnosticArray", header=header, status=parts)
     first, second = frames._rows(health)
     assert first["stamp"] == second["stamp"] == 3.5
     assert (second["level"], second["name"], second["values.rate_hz"]) == (1, "part 1", "30")
-
-
-def test_points_have_numbers_and_their_joints_names() -> None:
     after = message("builtin_interfaces/msg/Duration", sec=1, nanosec=250_000_000)
     nothing = dict.fromkeys(("velocities", "accelerations", "effort"), np.array([]))
     kind = "trajectory_msgs/msg/JointTrajectoryPoint"
-    points = [
-        message(kind, positions=np.array([k, 10.0 * k]), time_from_start=after, **nothing)
-        for k in (1.0, 2.0)
-    ]
+    place = np.array([1.0, 10.0])
+    point = message(kind, positions=place, time_from_start=after, **nothing)
     names = ["insertion_joint", "rotation_joint"]
     kind = "trajectory_msgs/msg/JointTrajectory"
-    (row,) = frames._rows(message(kind, header=header(), joint_names=names, points=points))
+    (row,) = frames._rows(message(kind, header=header, joint_names=names, points=[point] * 2))
+    each = {"insertion_joint": 1.0, "rotation_joint": 10.0}
     assert row == {
-        "stamp": 3.5,
-        "header.frame_id": "rig",
-        "points.0.positions.insertion_joint": 1.0,
-        "points.0.positions.rotation_joint": 10.0,
-        "points.0.time_from_start": 1.25,
-        "points.1.positions.insertion_joint": 2.0,
-        "points.1.positions.rotation_joint": 20.0,
-        "points.1.time_from_start": 1.25,
+        **{"stamp": 3.5, "header.frame_id": "rig"},
+        **{f"points.{k}.positions.{name}": x for k in (0, 1) for name, x in each.items()},
+        **{f"points.{k}.time_from_start": 1.25 for k in (0, 1)},
     }

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from mcap.reader import make_reader
-from mcap.records import Message
+from mcap.records import ChunkIndex, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.interfaces import QosDurability
@@ -86,9 +86,8 @@ def write_unchunked(path: Path, count: int = 300) -> Path:
         mcap = Writer(stream, use_chunking=False)
         mcap.start("ros2")
         schema = mcap.register_schema(TYPE, "ros2msg", TOPICS[0].definition.encode())
-        channels = [
-            mcap.register_channel(t.name, "cdr", schema, channel_metadata(t)) for t in TOPICS
-        ]
+        told = [(t.name, "cdr", schema, channel_metadata(t)) for t in TOPICS]
+        channels = [mcap.register_channel(*one) for one in told]
         for number in range(count):
             time = START + number * STEP
             mcap.add_message(channels[number % 3], time, payload(number), time)
@@ -109,11 +108,10 @@ def kill(path: Path, share: float = 0.75) -> Path:
 
 def damage(file: Path, share: float = 0.5) -> int:
     """Change a byte of a message in a file; return the message's number."""
-    data = bytearray(file.read_bytes())
-    found = {data.find(payload(number)): number for number in range(900)}
+    data = file.read_bytes()
+    found = {data.find(payload(number)): number for number in range(300)}
     place = min(at for at in found if at > len(data) * share)
-    data[place + 50] ^= 1
-    file.write_bytes(data)
+    flip(file, place + 50)
     return found[place]
 
 
@@ -129,16 +127,28 @@ def numbers(path: Path) -> list[int]:
     files = [path]
     if path.is_dir():
         told = yaml.safe_load((path / "metadata.yaml").read_text())
-        names = told["rosbag2_bagfile_information"]["relative_file_paths"]
-        files = [path / name for name in names]
+        files = [path / n for n in told["rosbag2_bagfile_information"]["relative_file_paths"]]
     indexed: list[bytes] = []
     streamed: list[bytes] = []
     for file in files:
         with file.open("rb") as stream:
-            reader_of_index = make_reader(stream, validate_crcs=True)
-            indexed += [m.data for _, _, m in reader_of_index.iter_messages()]
+            indexed += [m.data for _, _, m in make_reader(stream, True).iter_messages()]
             stream.seek(0)
             records = StreamReader(stream, validate_crcs=True).records
             streamed += [record.data for record in records if isinstance(record, Message)]
     assert found == indexed == streamed
     return [number_of(data) for data in found]
+
+
+def chunks(file: Path) -> list[ChunkIndex]:
+    with file.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return summary.chunk_indexes
+
+
+def flip(file: Path, place: int, bits: int = 1) -> None:
+    """Change bits of a byte."""
+    data = bytearray(file.read_bytes())
+    data[place] ^= bits
+    file.write_bytes(data)

@@ -44,8 +44,7 @@ def test_two_recordings_in_one_folder_are_not_merged_but_each_is_read_alone(
     assert "two recordings in one folder (mon.day.mcap, tuesday.mcap)" in said
     assert "give each a folder of its own, or name one of the files" in said
     alone, whole = read_contents(folder / "tuesday.mcap"), read_contents(stranger)
-    assert alone.topics == whole.topics
-    assert alone.counts == +whole.counts
+    assert (alone.topics, alone.counts) == (whole.topics, +whole.counts)
     assert whole.custom_data.items() <= alone.custom_data.items()
     assert (alone.start, alone.end, alone.distribution) == (whole.start, whole.end, "jazzy")
     assert contents(folder) == before
@@ -58,6 +57,8 @@ def test_a_stranger_beside_a_bag_is_named_and_left(
     """Without metadata.yaml, the bag is the files that are called as its folder."""
     path = write(tmp_path / "bag", max_file_size=20_000)
     put(path, (stranger, "a_stranger.mcap"))
+    (path / "notes.mcap").write_bytes(b"no MCAP file")
+    (path / "._bag_0.mcap").write_bytes(b"another system's notes of bag_0.mcap")
     data = (path / "a_stranger.mcap").read_bytes()
     if harm == "metadata":
         (path / "metadata.yaml").unlink()
@@ -67,6 +68,8 @@ def test_a_stranger_beside_a_bag_is_named_and_left(
     said = capsys.readouterr().out
     assert "left out: a_stranger.mcap: not of this bag (it begins " in said
     assert "days after the bag, another commit, another run_info)" in said
+    assert "left out: notes.mcap: not of this bag (not whole)" in said
+    assert said.count("left out") == 2
     assert (path / "a_stranger.mcap").read_bytes() == data
     kept = numbers(path)
     assert kept == list(range(len(kept)))
@@ -74,45 +77,27 @@ def test_a_stranger_beside_a_bag_is_named_and_left(
     assert recover_bag(path).was_whole
 
 
-def test_a_stranger_that_is_not_whole_is_named_too(tmp_path: Path) -> None:
-    path = write(tmp_path / "bag", 30)
-    (path / "notes.mcap").write_bytes(b"no MCAP file")
-    (path / "._bag_0.mcap").write_bytes(b"another system's notes of bag_0.mcap")
-    recovery = recover_bag(path)
-    assert recovery.was_whole
-    assert recovery.left_out == ["notes.mcap: not of this bag (not whole)"]
-
-
-def test_a_killed_file_among_others_is_made_whole_alone(tmp_path: Path, stranger: Path) -> None:
+@pytest.mark.parametrize("beside_a_bag", [False, True])
+def test_a_killed_file_among_others_is_made_whole_alone(
+    tmp_path: Path, stranger: Path, beside_a_bag: bool
+) -> None:
+    """What metadata.yaml tells is of other files."""
     killed = kill(write(tmp_path / "killed"))
-    folder = put(tmp_path / "dl", (killed, "a.mcap"), (stranger, "b.mcap"))
+    folder = stranger if beside_a_bag else put(tmp_path / "dl", (stranger, "b.mcap"))
+    put(folder, (killed, "a.mcap"))
     before = contents(folder)
-    with pytest.raises(UserError, match=r"recover .*/dl/a\.mcap`$"):
+    with pytest.raises(UserError, match=rf"recover {folder / 'a.mcap'}`$"):
         read_contents(folder / "a.mcap")
     recovery = recover_bag(folder / "a.mcap")
     assert numbers(folder / "a.mcap") == list(range(recovery.messages))
+    assert recovery.lost.endswith("(the file ends within a record) on: at least 0.3 s follow")
     told = read_contents(folder / "a.mcap").custom_data
-    assert told["recovered"] == recovery.lost
-    assert told["commit"] == RUN["commit"]
+    assert (told["recovered"], told["commit"]) == (recovery.lost, RUN["commit"])
     after = contents(folder)
     assert after.pop("a.mcap.damaged") == before.pop("a.mcap")
     assert after.pop("a.mcap")
     assert after == before
     assert recover_bag(folder / "a.mcap").was_whole
-
-
-def test_a_killed_file_beside_a_bag_is_made_whole_alone(tmp_path: Path) -> None:
-    """What metadata.yaml tells is of other files."""
-    folder, killed = write(tmp_path / "bag", 900), kill(write(tmp_path / "killed"))
-    put(folder, (killed, "killed.mcap"))
-    before = contents(folder)
-    recovery = recover_bag(folder / "killed.mcap")
-    assert numbers(folder / "killed.mcap") == list(range(recovery.messages))
-    assert recovery.lost.endswith("(the file ends within a record) on: at least 0.3 s follow")
-    after = contents(folder)
-    assert {after.pop("killed.mcap.damaged")} == {before.pop("killed.mcap")}
-    assert after.pop("killed.mcap")
-    assert after == before
 
 
 def test_a_file_of_a_bag_is_recovered_with_its_bag(tmp_path: Path) -> None:
@@ -145,7 +130,7 @@ def test_one_stem_of_two_recordings_is_not_merged(
     assert contents(folder) == before
 
 
-def test_another_run_is_told_by_what_ends_its_file(tmp_path: Path) -> None:
+def test_another_run_is_told_by_what_ends_its_file_or_begins_it(tmp_path: Path) -> None:
     """The last file of a recording has no record of its own of the run, but all of the bag's."""
     one = write(tmp_path / "one")
     two = write(tmp_path / "two", first=300, run=OTHER, max_file_size=30_000)
@@ -153,23 +138,11 @@ def test_another_run_is_told_by_what_ends_its_file(tmp_path: Path) -> None:
     shutil.copyfile(max(two.glob("*.mcap")), folder / "x_1.mcap")
     with pytest.raises(UserError, match=r"x_1\.mcap has another commit, another run_info"):
         recover_bag(folder)
-
-
-def test_a_damaged_file_is_not_followed_by_another_recording(tmp_path: Path) -> None:
-    one, two = write(tmp_path / "one"), write(tmp_path / "two", first=400)
-    folder = put(tmp_path / "dl", (one, "x_0.mcap"), (two, "x_2.mcap"))
+    # A damaged file is not followed by another recording either.
+    folder = put(tmp_path / "other", (one, "x_0.mcap"), (two, "x_2.mcap"))
     damage(folder / "x_0.mcap")
     with pytest.raises(UserError, match=r"x_2\.mcap is the beginning of a recording"):
         recover_bag(folder)
-
-
-def test_metadata_that_name_none_of_the_files(tmp_path: Path) -> None:
-    path = write(tmp_path / "bag", 30)
-    (path / "bag_0.mcap").rename(path / "monday.mcap")
-    before = contents(path)
-    with pytest.raises(UserError, match=r"nothing comes before bag_0\.mcap \(it is missing\)"):
-        recover_bag(path)
-    assert contents(path) == before
 
 
 def test_files_of_a_recording(tmp_path: Path) -> None:
@@ -187,3 +160,8 @@ def test_files_of_a_recording(tmp_path: Path) -> None:
         for name in names.split():
             (folder / name).write_bytes(b"")
         assert [file.name for file in recording_files(folder)] == found
+    # Metadata that name none of the files.
+    path = write(tmp_path / "bag", 30)
+    (path / "bag_0.mcap").rename(path / "monday.mcap")
+    with pytest.raises(UserError, match=r"nothing comes before bag_0\.mcap \(it is missing\)"):
+        recover_bag(path)
