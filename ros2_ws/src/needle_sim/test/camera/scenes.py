@@ -54,5 +54,5 @@ def taken(with_it: Pair, without: Pair) -> np.ndarray:
 
 def darkness(renderer: StereoRenderer, plant: NeedlePlant) -> np.ndarray:
     """What the needle takes from each image, the mean of some exposures."""
-    pairs = [taken(render(renderer, plant, n), render(renderer, None, n)) for n in range(3)]
+    pairs = [taken(render(renderer, plant, n), render(renderer, None, n)) for n in range(2)]
     return np.asarray(np.mean(pairs, axis=0))

@@ -39,10 +39,10 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_the_folder_holds_what_was_rendered(tmp_path: Path) -> None:
     output, done = tmp_path / "new" / "images", tmp_path / "done.json"
-    words = ["--scenario", "steel", "--frames", "2", "--seed", "7", "--step-mm", "9"]
+    words = ["--scenario", "clean", "--frames", "2", "--seed", "7", "--step-mm", "9"]
     assert main(arguments(output, *words, "--json", str(done))) == 0
-    rig, steel = load_stereo_rig(CALIBRATION), SCENARIOS["steel"]
-    outside, inside = render_insertion(rig, steel, seed=7, frames=2, step=0.009)
+    rig, clean = load_stereo_rig(CALIBRATION), SCENARIOS["clean"]
+    outside, inside = render_insertion(rig, clean, seed=7, frames=2, step=0.009)
     insertions, truths = rows(output / "insertion.csv"), rows(output / "truth.csv")
     assert [row["name"] for row in insertions] == ["000000.png", "000001.png"]
     assert [float(row["insertion_m"]) for row in insertions] == [0.0, 0.009]
@@ -58,7 +58,7 @@ def test_the_folder_holds_what_was_rendered(tmp_path: Path) -> None:
     assert (float(truths[1]["left_seen"]), float(truths[1]["right_seen"])) == (1.0, 1.0)
     assert (output / "calibration.yaml").read_bytes() == CALIBRATION.read_bytes()
     told = json.loads(done.read_text())
-    assert (told["scenario"], told["frames"], told["seed"]) == ("steel", 2, 7)
+    assert (told["scenario"], told["frames"], told["seed"]) == ("clean", 2, 7)
 
 
 def test_without_a_needle_there_is_no_truth_and_the_first_frame_may_be_deep_in(
