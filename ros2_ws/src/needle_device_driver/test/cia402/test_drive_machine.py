@@ -57,6 +57,13 @@ def test_after_a_quick_stop_nothing_is_ordered_before_the_axis_stands(
     assert machine.target == 1009
 
 
+def test_a_stop_on_the_way_off_ends_off(machine: DriveMachine) -> None:
+    enabled(machine)
+    machine.want(Goal.OFF)
+    machine.stop()
+    assert orders(machine, *[said(QUICK_STOP)] * 4)[-1] is DriveCommand.DISABLE_VOLTAGE
+
+
 def test_a_stop_holds_until_the_drive_has_said_that_it_took_it(machine: DriveMachine) -> None:
     enabled(machine)
     machine.stop()

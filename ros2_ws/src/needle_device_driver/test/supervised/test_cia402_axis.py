@@ -126,8 +126,11 @@ def test_a_pushed_axis_is_told_nothing_that_moves_and_depends_on_no_computer() -
     bench = pushed()
     assert bench.status.insertion_m == pytest.approx(0.0)
     bench.step(0.001, 0.2)
-    bench.insertion.position += 5000
     bench.go()
+    bench.insertion.position += 5000
+    bench.go(3)
+    assert bench.status.insertion_m == pytest.approx(0.00025)
+    assert bench.rotation.next_target == pytest.approx(0.25 * 0.2 * RAD, abs=1)
     bench.hold(False)
     assert bench.rotation.state == "quick stop"
     assert bench.outcomes == ["aborted: hold released"]

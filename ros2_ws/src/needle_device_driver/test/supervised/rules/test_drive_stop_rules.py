@@ -205,6 +205,16 @@ def test_drive_emergency_that_stays_keeps_the_device_in_fault(lacking: set[int],
     assert bench.reset().success
 
 
+def test_drive_emergency_between_two_cycles_refuses_a_retraction() -> None:
+    bench = DriveBench().moving()
+    bench.press()
+    bench.insertion.fail(0x7305)
+    bench.bus.flush()
+    reply = bench.retract()
+    assert (reply.success, "encoder error" in reply.message) == (False, True)
+    assert (bench.state, bench.rule) == ("FAULT", "drive_emergency")
+
+
 def test_one_fault_stops_both_a_drive_that_switches_itself_off() -> None:
     bench = DriveBench().moving()
     bench.after(lambda: setattr(bench.rotation, "state", "disabled"))

@@ -180,6 +180,17 @@ def test_tip_age_a_step_outlives_its_tip() -> None:
     assert bench.outcomes == ["succeeded"]
 
 
+def test_settling_time_begins_anew_with_the_path_that_takes_the_place() -> None:
+    bench = Bench().ready()
+    for end in (1.0, 2.0):
+        path(bench, (0.0, 0.0), (0.5, 0.0), (end, 0.0))
+        bench.rotation.stuck, bench.rotation.position = True, 0.001
+        bench.go(40)
+        assert bench.state == "MOVING", bench.status.fault
+    bench.go(22)
+    assert (bench.state, bench.rule) == ("FAULT", "settling_time")
+
+
 def test_command_form_a_path_that_begins_ahead_of_the_needle_is_refused() -> None:
     bench = Bench().ready()
     for ahead in (0.0011, 1.0):
