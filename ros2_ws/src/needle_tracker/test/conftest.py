@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import functools
-import itertools
-import math
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from needle_tracker.image.search_grid import Reach
+from drawn_needles import arc, cover_line, draw_line, tracker_settings
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
 from needle_tracker.optics.refraction import RefractedCamera, stereo_views
-from needle_tracker.tracking.gates import GateSettings
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 CALIBRATION = Path(__file__).parents[1] / "config" / "calibration.yaml"
@@ -37,80 +34,7 @@ def views(calibration: StereoCalibration) -> tuple[RefractedCamera, RefractedCam
 
 @pytest.fixture
 def settings(calibration: StereoCalibration) -> TrackerSettings:
-    reach = Reach(curvature=9.0, entry_angle=math.radians(10), hole_tolerance=0.5e-3, length=0.15)
-    gates = GateSettings(
-        reach=reach,
-        windows=(calibration.left.window, calibration.right.window),
-        least_distance=4e-3,
-        tip_lean=math.radians(12),
-        insertion_margin=2e-3,
-        step_margin=1.5e-3,
-        free_step=5e-3,
-        max_disagreement=1.5e-3,
-        max_miss_px=1.0,
-        max_depth_sigma=2e-3,
-        confirm_pairs=3,
-        lost_after=3,
-        forget_after=30,
-    )
-    return TrackerSettings(
-        gates=gates,
-        needle_width=0.7e-3,
-        bevel_length=0.0,
-        bright=False,
-        min_contrast=10.0,
-        noise_factor=5.0,
-        entry_zone=5e-3,
-        hole_clearance=2e-3,
-    )
-
-
-def draw_line(
-    shape: tuple[int, int], points: np.ndarray, width: float, level: float, background: float
-) -> np.ndarray:
-    """Return a float image with an anti-aliased polyline with square ends, by distance."""
-    coverage = np.zeros(shape)
-    cover_line(coverage, points, width)
-    return background + (level - background) * coverage
-
-
-def cover_line(coverage: np.ndarray, points: np.ndarray, width: float) -> None:
-    """Raise the coverage of pixels, 0 to 1, to that of a polyline, about its pieces only."""
-    shape = coverage.shape
-    last = len(points) - 2
-    for i, (first, second) in enumerate(itertools.pairwise(points)):
-        low = np.maximum(np.floor(np.minimum(first, second) - width), 0).astype(int)
-        high = np.ceil(np.maximum(first, second) + width).astype(int) + 1
-        v, u = np.ogrid[low[1] : min(high[1], shape[0]), low[0] : min(high[0], shape[1])]
-        length = float(np.linalg.norm(second - first))
-        along_axis = (second - first) / length
-        along = (u - first[0]) * along_axis[0] + (v - first[1]) * along_axis[1]
-        across = np.abs((v - first[1]) * along_axis[0] - (u - first[0]) * along_axis[1])
-        cover = np.clip(0.5 * width + 0.5 - across, 0, 1)
-        # Square ends; inside, neighbouring pieces overlap.
-        cover = cover * np.clip(length + (0.5 if i == last else 1.0) - along, 0, 1)
-        cover = cover * np.clip(along + (0.5 if i == 0 else 1.0), 0, 1)
-        block = coverage[low[1] : high[1], low[0] : high[0]]
-        np.maximum(block, cover, out=block)
-
-
-def arc(length: float, curvature: float, roll: float, pitch: float = 0.0) -> np.ndarray:
-    """Return points of a needle path from the entry, (n, 3) in `rig`, and its tip last."""
-    s = np.linspace(0.0, length, 120)
-    if curvature == 0.0:
-        side, ahead = np.zeros_like(s), s
-    else:
-        side = (1 - np.cos(curvature * s)) / curvature
-        ahead = np.sin(curvature * s) / curvature
-    x, y = side * math.sin(roll), side * math.cos(roll)
-    return np.stack(
-        [
-            x * math.cos(pitch) + ahead * math.sin(pitch),
-            y,
-            ahead * math.cos(pitch) - x * math.sin(pitch),
-        ],
-        axis=-1,
-    )
+    return tracker_settings(calibration)
 
 
 def _light_and_dark(view: RefractedCamera) -> tuple[np.ndarray, np.ndarray]:

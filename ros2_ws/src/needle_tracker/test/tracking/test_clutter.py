@@ -41,13 +41,13 @@ def insertion(
 
 
 @pytest.mark.parametrize(
-    ("scenario", "bound", "least"), [("clutter", 0.5e-3, 23), ("heavy_clutter", 1.5e-3, 15)]
+    ("scenario", "bound", "least"), [("clutter", 0.5e-3, 13), ("heavy_clutter", 1.5e-3, 8)]
 )
 def test_what_is_believed_is_right(
     tracker: StereoTracker, calibration_path: Path, scenario: str, bound: float, least: int
 ) -> None:
     found = 0
-    for length, truth, left, right in insertion(calibration_path, scenario, 3, 40, 64):
+    for length, truth, left, right in insertion(calibration_path, scenario, 3, 44, 58):
         measured = tracker.process(left, right, length)
         assert measured.state is not TrackState.LOST
         if measured.tip is not None:
@@ -59,7 +59,7 @@ def test_what_is_believed_is_right(
 def test_clutter_without_a_needle_is_no_needle(
     tracker: StereoTracker, calibration_path: Path
 ) -> None:
-    for length, _, left, right in insertion(calibration_path, "absent", 2, 30, 50):
+    for length, _, left, right in insertion(calibration_path, "absent", 2, 35, 50):
         assert tracker.process(left, right, length).tip is None
 
 

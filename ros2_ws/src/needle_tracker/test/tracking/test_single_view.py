@@ -44,14 +44,14 @@ def tracker(settings: TrackerSettings, calibration: StereoCalibration) -> Stereo
 def test_one_view_keeps_up_with_a_needle_that_the_other_does_not_see(
     tracker: StereoTracker, draw_pair: Drawer, make_arc: Arc, blocked: int, cover: int
 ) -> None:
-    """For 15 mm one camera is black, or sees a hand, all of one grey.
+    """For 11 mm one camera is black, or sees a hand, all of one grey.
 
     A hand leaves a tip, as long as its place is known well; a black image never does.
     """
     tips = []
-    for mm in range(40, 53):
+    for mm in range(43, 53):
         assert tracker.process(*draw_pair(make_arc(mm * 1e-3, 6.0, 1.0)), mm * 1e-3).tip is not None
-    for mm in range(53, 68):
+    for mm in range(53, 64):
         path = make_arc(mm * 1e-3, 6.0, 1.0)
         pair = list(draw_pair(path))
         pair[blocked] = np.full_like(pair[blocked], cover)
@@ -79,8 +79,8 @@ def test_one_view_keeps_up_with_a_needle_that_the_other_does_not_see(
     assert tracker.track.state is TrackState.LOST
     assert tips == (list(range(53, 53 + len(tips))) if cover else [])
     assert not cover or 4 <= len(tips) <= 9
-    path = make_arc(0.068, 6.0, 1.0)
-    found = tracker.process(*draw_pair(path), 0.068)
+    path = make_arc(0.064, 6.0, 1.0)
+    found = tracker.process(*draw_pair(path), 0.064)
     assert found.tip is not None
     assert np.linalg.norm(found.tip.position - path[-1]) < 0.2e-3
 

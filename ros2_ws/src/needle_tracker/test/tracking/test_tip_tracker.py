@@ -6,15 +6,12 @@ import dataclasses
 import math
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 import pytest
 
-from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.image.detection import Image
 from needle_tracker.image.tip_fit import ImageTip
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.refusals import NoTip, TrackState
 from needle_tracker.tracking.tip_tracker import TipTracker
@@ -24,63 +21,7 @@ from needle_tracker.tracking.triangulation import SpatialTip
 
 Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
 MakeArc = Callable[..., np.ndarray]
-Views = tuple[RefractedCamera, RefractedCamera]
 NOTHING = np.zeros((768, 1024), np.uint8)
-
-
-def mirroring(
-    views: Views, make_line: Callable[..., np.ndarray], path: np.ndarray, seed: int
-) -> tuple[Image, Image]:
-    """Draw a shaft whose core mirrors a lamp and whose rims mirror the dark, on a grey floor."""
-    rng = np.random.default_rng(seed)
-    images = []
-    for view in views:
-        shape = (view.camera.height, view.camera.width)
-        image = np.full(shape, 140.0)
-        for level, width in ((75.0, 4.6), (235.0, 2.0)):
-            share = make_line(shape, view.project(path), width, 1.0, 0.0)
-            image += share * (level - image)
-        image = cv2.GaussianBlur(image, (0, 0), 0.6) + rng.normal(0.0, 4.0, shape)
-        images.append(np.clip(image, 0, 255).astype(np.uint8))
-    return images[0], images[1]
-
-
-def test_a_needle_that_mirrors_a_lamp_is_found_where_lines_show_none(
-    calibration: StereoCalibration,
-    views: Views,
-    make_arc: MakeArc,
-    make_line: Callable[..., np.ndarray],
-) -> None:
-    settings = default_settings(calibration)
-    lines, both = StereoTracker(calibration, settings), TipTracker(calibration, settings)
-    seen_by_lines = found = 0
-    for mm in range(60, 68):
-        path = make_arc(1e-3 * mm, 6.0, 0.7)
-        images = mirroring(views, make_line, path, mm)
-        seen_by_lines += lines.process(*images, 1e-3 * mm).tip is not None
-        tip = both.process(*images, 1e-3 * mm).tip
-        if tip is not None:
-            found += 1
-            assert np.linalg.norm(tip.position - path[-1]) < 0.5e-3
-    assert seen_by_lines == 0
-    assert found >= 6
-
-
-def test_without_the_insertion_a_needle_may_go_far_between_two_pairs(
-    calibration: StereoCalibration,
-    views: Views,
-    make_arc: MakeArc,
-    make_line: Callable[..., np.ndarray],
-) -> None:
-    settings = default_settings(calibration)
-    tracker = TipTracker(calibration, settings)
-    for mm in range(40, 100, 9):
-        assert settings.gates.free_step < 9e-3
-        path = make_arc(1e-3 * mm, 6.0, 0.7)
-        tip = tracker.process(*mirroring(views, make_line, path, mm), None).tip
-        if mm > 40:
-            assert tip is not None
-            assert np.linalg.norm(tip.position - path[-1]) < 0.5e-3
 
 
 def test_a_plain_needle_is_measured_by_its_lines(

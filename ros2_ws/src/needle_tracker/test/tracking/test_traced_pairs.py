@@ -91,10 +91,17 @@ def test_a_steel_needle_is_found_and_no_surer_than_it_is_known(
         assert off @ np.linalg.solve(tip.covariance, off) < _CHI_SQUARED_999
 
 
-def test_a_face_of_known_length_makes_its_end_surer(calibration: StereoCalibration) -> None:
+@pytest.fixture(scope="module")
+def of_unknown_face(calibration: StereoCalibration) -> list[tuple[SpatialTip | None, np.ndarray]]:
+    return tracked(calibration, "steel_on_dark", empty=False, insertion=False)
+
+
+def test_a_face_of_known_length_makes_its_end_surer(
+    calibration: StereoCalibration, of_unknown_face: list[tuple[SpatialTip | None, np.ndarray]]
+) -> None:
     surer = 0
     for (unknown, truth), (known, _) in zip(
-        tracked(calibration, "steel_on_dark", empty=False, insertion=False),
+        of_unknown_face,
         tracked(calibration, "steel_on_dark", empty=False, insertion=False, bevel_length=0.76e-3),
         strict=True,
     ):

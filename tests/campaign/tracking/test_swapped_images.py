@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_core.files.installed import find_shared
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import find_scenario
 from needle_sim.camera.stereo_rig import load_stereo_rig
@@ -18,7 +17,7 @@ from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_tracker.answers.pair_answers import Frame, PairAnswers, PairingSettings
 from needle_tracker.answers.swapped_images import SwapWatch
 from needle_tracker.answers.tracker_parameters import default_settings
-from needle_tracker.optics.calibration import StereoCalibration, load_calibration
+from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_tracker.tracking.tracker import StereoTracker
@@ -56,16 +55,6 @@ class Looks:
         self.watch.see(left, right, insertion, measured)
         self.ever = self.ever or self.watch.suspected
         return measured
-
-
-@pytest.fixture(scope="module")
-def calibration_path() -> Path:
-    return find_shared("needle_tracker", "config/calibration.yaml")
-
-
-@pytest.fixture(scope="module")
-def calibration(calibration_path: Path) -> StereoCalibration:
-    return load_calibration(calibration_path)
 
 
 @pytest.fixture
