@@ -26,6 +26,7 @@ STEERING = SteeringState.STEERING
 def test_a_tip_leads_to_one_step_and_its_end_to_the_wish_for_another() -> None:
     rig = Rig()
     assert where(rig) == (STEERING, Awaiting.TIP)
+    assert rig.steering.command_ns == 0
     actions = rig.expose()
     step = sent(actions)
     assert step.stamp_ns == rig.now
@@ -156,7 +157,7 @@ def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew() ->
                 rig.steering.on_device(MOVING)
                 rig.expose()
             else:
-                early = rig.measured(ahead=TICK)
+                early, last = rig.measured(ahead=TICK), rig.steering.intake.last
                 rig.settle(1)
             rig.insertion += moved
             rig.rotation += turned
@@ -165,6 +166,7 @@ def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew() ->
                 actions = rig.steering.on_device(HELD)
             else:
                 actions = rig.steering.on_tip(early)
+                assert (rig.steering.intake.last is last) is looked_at_anew
             assert none_sent(actions) is looked_at_anew, waiting
             if looked_at_anew:
                 assert where(rig) == (STEERING, Awaiting.TIP)

@@ -48,6 +48,7 @@ def test_a_message_is_refused_whatever_the_needle_did() -> None:
         # The first tip has none before it.
         first = None if wanted is Fault.NOT_NEWER else wanted
         assert fault(refuse_message(measured, None)) is first, measured
+    assert "(4e-08 s behind)" in str(refuse_message(tip(0.0, 0.0, 0.0, stamp_ns=10), LAST))
 
 
 def test_a_stamp_is_refused_where_its_joints_will_never_be_known() -> None:
@@ -61,6 +62,8 @@ def test_a_stamp_is_refused_where_its_joints_will_never_be_known() -> None:
         measured = tip(0.0, 0.0, 0.0, stamp_ns=stamp_ns)
         assert fault(refuse_stamp(measured, oldest, latest)) is wanted, stamp_ns
         assert refuse_stamp(measured, None, None) is None
+    late = tip(0.0, 0.0, 0.0, stamp_ns=60 + 5 * STAMP_AHEAD_NS // 2)
+    assert "2.5 s ahead" in str(refuse_stamp(late, oldest, latest))
 
 
 def test_a_place_is_refused_where_no_needle_can_be() -> None:

@@ -75,7 +75,7 @@ def watched(watch: RetractionWatch, *places: float) -> list[bool]:
 def test_a_needle_is_drawn_back_where_the_median_of_five_samples_is() -> None:
     watch = RetractionWatch()
     assert not any(watched(watch, *[0.01] * 3, *[0.02] * 5, 0.005, 0.005))
-    assert not any(watched(watch, *[0.02] * 5))
+    assert not any(watched(watch, *[0.02] * 3, 0.005, *[0.02] * 5))
     assert not any(watched(watch, *[0.02 - 1.99e-4] * 5))
     assert watch.obstacle == ""
     assert watched(watch, *[0.02 - 2.01e-4] * 3)[-1]
