@@ -13,7 +13,13 @@ import numpy as np
 import pytest
 
 from needle_analysis.figures.film import MOST_FRAMES, READINGS, film_of
-from needle_analysis.figures.film_views import MOST_BYTES, _small_jpeg, camera_views, plan_views
+from needle_analysis.figures.film_views import (
+    MOST_BYTES,
+    _small_jpeg,
+    camera_views,
+    plan_views,
+    projections,
+)
 from needle_bags.reading.bag_images import images_at
 from needle_bags.reading.bag_reader import Run, Series, read_run
 
@@ -111,11 +117,13 @@ def test_the_film_of_real_cameras_has_the_tip_where_it_is_seen(
     stamps = np.array([frame.stamp for frame in frames])
     assert len(film["readings"]) == len(frames) == len(set(stamps.tolist()))
     images = {(index, side): image for index, side, image in images_at(run, stamps)}
-    checked = 0
+    seen_by, checked = projections(run), 0
     for view, side in zip(film["views"], ("left", "right"), strict=False):
         assert decoded(base64.b64decode(view["pictures"][0])).size
         for index, line in enumerate(view["lines"]):
             u, v = (float(part) for part in line.split(" ")[-1].split(","))
+            measured = seen_by[side](frames[index].shaft)[-1]
+            assert (u, v) == pytest.approx(measured.tolist(), abs=0.051)
             image = images[index, side]
             near = image[int(v) - 6 : int(v) + 7, int(u) - 6 : int(u) + 7]
             # The steel is darker than what is around it.

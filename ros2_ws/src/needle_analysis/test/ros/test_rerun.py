@@ -16,10 +16,11 @@ import yaml
 from rclpy.parameter import Parameter
 from rosbags.typesys import Stores, get_typestore
 
-from needle_analysis.rerun.rerun_bag import TABLE
+from needle_analysis.rerun.bag_pass import Output
+from needle_analysis.rerun.rerun_bag import TABLE, write_rerun
 from needle_analysis.ros import rerun as rerun_node
 from needle_bags.format.bag_copy import BagCopy, standard_text, standard_topic
-from needle_bags.reading.bag_files import read_contents
+from needle_bags.reading.bag_files import read_contents, read_messages
 from needle_bags.reading.bag_order import raw_as_sent
 from needle_bags.reading.bag_reader import read_run
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -161,6 +162,19 @@ def test_another_preset_is_a_run_of_its_own(eight_steps: Path, paper_bag: Path) 
     lines = (paper_bag / TABLE).read_text().splitlines()
     assert len(lines) == 1 + before.counts["/needle/estimate"]
     assert lines[0].split()[:3] == ["insertion_mm", "tip_x_mm", "tip_y_mm"]
+
+
+def test_tips_whose_images_are_not_in_the_bag_stay_as_they_were(
+    eight_steps: Path, tmp_path: Path
+) -> None:
+    run, topic = read_run(eight_steps), "/needle/tip"
+    tips = [message for _, _, message in read_messages(eight_steps, topic.__eq__)]
+    tips[3].point.x = 0.5
+    output = Output("needle/tip", run.tips.received[3], int(run.tips.stamps[3]), tips[3])
+    write_rerun(run, tmp_path / "bag", [output], {}, "")
+    assert read_contents(tmp_path / "bag").counts == read_contents(eight_steps).counts
+    after = read_run(tmp_path / "bag").tips.values
+    assert np.flatnonzero((after != run.tips.values).any(axis=1)).tolist() == [3]
 
 
 def copied(bag: Path, target: Path, custom: dict[str, str], topic: str, kind: str) -> Any:
