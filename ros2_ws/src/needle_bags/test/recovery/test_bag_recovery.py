@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import resource
 import shutil
@@ -20,6 +19,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from rosbags.rosbag2 import Writer as OtherWriter
 
 from needle_bags.format.bag_copy import standard_text, standard_topic
+from needle_bags.format.bag_writer import BagWriter
 from needle_bags.reading.bag_files import read_contents, read_messages
 from needle_bags.reading.bag_reader import read_run
 from needle_bags.recovery import bag_recovery, recover
@@ -104,14 +104,14 @@ def test_the_command_says_what_was_lost_and_leaves_a_whole_bag(
 
 
 def test_a_bag_that_is_being_recorded_is_left_alone(tmp_path: Path) -> None:
-    path = kill(write(tmp_path / "bag"))
-    with (path / "bag_0.mcap").open("r+b") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
-        for act in (recover_bag, read_run):
-            for named in (path, path / "bag_0.mcap"):
-                with pytest.raises(UserError, match="still being recorded"):
-                    act(named)
-    recover_bag(path)
+    path = tmp_path / "bag"
+    bag = BagWriter(path)
+    for act in (recover_bag, read_run):
+        for named in (path, path / "bag_0.mcap"):
+            with pytest.raises(UserError, match="still being recorded"):
+                act(named)
+    bag.close()
+    assert recover_bag(path).was_whole
 
 
 def write_compressed(path: Path, mode: CompressionMode) -> Path:
