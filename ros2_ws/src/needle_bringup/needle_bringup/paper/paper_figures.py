@@ -9,6 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from needle_analysis.figures.figure_style import ESTIMATE, GOAL_BAND, INK, STYLE
 from needle_bringup.paper.paper_results import (
     DEPTH_MM,
     DOMAIN_PITCH_DEG,
@@ -22,22 +23,7 @@ from needle_bringup.paper.paper_results import (
 )
 from needle_bringup.paper.paper_runs import Columns
 
-TRUTH = "#1b1b1b"
-ESTIMATE = "#13838c"
 MEAN = "#b5179e"
-BAND = "#2e9d55"
-STYLE: dict[Any, Any] = {
-    "font.size": 9,
-    "axes.formatter.useoffset": False,
-    "axes.grid": True,
-    "grid.color": "#e4e6ea",
-    "axes.edgecolor": "#9aa0a8",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 9.5,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-}
 _DOTS: dict[str, Any] = {
     "marker": "o",
     "linestyle": "none",
@@ -71,16 +57,16 @@ def figure_3(results: PaperRuns) -> Figure:
     for column, (title, trial, truth_known, measured) in enumerate(columns):
         axes = grid[:, column]
         axes[0].set_title(title)
-        axes[0].axhspan(-GOAL_MM, GOAL_MM, color=BAND, alpha=0.15, lw=0)
+        axes[0].axhspan(-GOAL_MM, GOAL_MM, color=GOAL_BAND, alpha=0.15, lw=0)
         if measured:
             axes[0].plot(trial.insertion_mm, trial.measured_mm, **_DOTS, label="measured")
         states = trial.truth if truth_known else trial.estimate
-        color, label = (TRUTH, "truth") if truth_known else (ESTIMATE, "estimate")
+        color, label = (INK, "truth") if truth_known else (ESTIMATE, "estimate")
         for row in range(3):
             axes[row].plot(trial.insertion_mm, states[:, row], color=color, lw=1.5, label=label)
             axes[row].axhline(0.0, color="#9aa0a8", lw=0.8, ls="--")
         axes[0].legend(loc="best")
-        axes[3].plot(trial.insertion_mm, trial.rotation_deg, color=TRUTH, lw=1.3)
+        axes[3].plot(trial.insertion_mm, trial.rotation_deg, color=INK, lw=1.3)
         axes[3].set_xlabel("insertion [mm]")
         if not np.any(trial.rotation_deg):
             axes[3].set_ylim(-1.0, 1.0)
@@ -95,11 +81,11 @@ def figure_4(trials: list[SteeringTrial]) -> Figure:
     axes = figure.add_subplot()
     insertion, r1 = common_r1(trials)
     mean, std = r1.mean(axis=0), r1.std(axis=0)
-    axes.axhspan(-GOAL_MM, GOAL_MM, color=BAND, alpha=0.15, lw=0, label="±1 mm")
+    axes.axhspan(-GOAL_MM, GOAL_MM, color=GOAL_BAND, alpha=0.15, lw=0, label="±1 mm")
     axes.fill_between(insertion, mean - std, mean + std, color="#c9ccd1", lw=0, label="± std")
     axes.plot(insertion, mean, color=MEAN, lw=1.8, label=f"mean of {len(trials)} trials")
     axes.plot(insertion, r1[0], color=ESTIMATE, lw=1.4, label="the trial of figure 3")
-    axes.axhline(0.0, color=TRUTH, lw=0.9, ls="--")
+    axes.axhline(0.0, color=INK, lw=0.9, ls="--")
     axes.set(xlabel="insertion [mm]", ylabel="r1, estimated [mm]")
     axes.legend(loc="lower right")
     return figure
@@ -117,12 +103,12 @@ def study_figure(results: PaperRuns) -> Figure:
             off = np.sort(np.abs(runs["r1_final_mm"]))
             missing = 1.0 - np.arange(len(off)) / len(off)
             share.semilogy(off, missing, style, color=color, label=f"{grid}, {depth:.0f} mm")
-    share.axvline(GOAL_MM, color=BAND, lw=1.2)
+    share.axvline(GOAL_MM, color=GOAL_BAND, lw=1.2)
     share.set(title="Share of runs farther off than", xlabel="|r1| at the end [mm]")
     share.legend(loc="best")
     runs, longer = results.runs["endpoint"], results.longer["endpoint"]
     missed = np.abs(runs["r1_final_mm"]) > GOAL_MM
-    later.axhspan(-GOAL_MM, GOAL_MM, color=BAND, alpha=0.15, lw=0)
+    later.axhspan(-GOAL_MM, GOAL_MM, color=GOAL_BAND, alpha=0.15, lw=0)
     later.plot(
         runs["r1_final_mm"][missed],
         longer["r1_final_mm"][missed],

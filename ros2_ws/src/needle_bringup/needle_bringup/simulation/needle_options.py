@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from needle_core.settings.parameter_files import Parameters
 
@@ -19,8 +18,7 @@ _RELATIVE = 1e-3
 _GATES = {("sim_rig", "curvature"): ("stereo_tracker", "max_curvature", 9.0)}
 
 
-@dataclasses.dataclass(frozen=True)
-class Shared:
+class Shared(NamedTuple):
     """Value on which several nodes must agree.
 
     Attributes
@@ -29,52 +27,32 @@ class Shared:
         Its name, and the option of simulate that sets it everywhere.
     default : float or str
         Of every node.
-    places : tuple of tuple of str
-        Node and parameter.
     unit : str
         Of all.
+    places : dict of str to str
+        Node to its parameter.
     """
 
     what: str
     option: str
     default: float | str
-    places: tuple[tuple[str, str], ...]
     unit: str
+    places: dict[str, str]
 
 
+_CURVATURES = {"sim_rig": "curvature", "plane_controller": "curvature"}
+_WIDTHS = {
+    "sim_rig": "needle_diameter",
+    "stereo_tracker": "needle_width",
+    "plane_controller": "needle_diameter",
+}
+_LEANS = {"sim_rig": "pre_bend_lean", "stereo_tracker": "lean"}
+_FILES = {"sim_rig": "calibration_file", "stereo_tracker": "calibration_file"}
 SHARED = (
-    Shared(
-        "curvature",
-        "--curvature",
-        CURVATURE,
-        (("sim_rig", "curvature"), ("plane_controller", "curvature")),
-        "1/m",
-    ),
-    Shared(
-        "diameter",
-        "--diameter-mm",
-        DIAMETER,
-        (
-            ("sim_rig", "needle_diameter"),
-            ("stereo_tracker", "needle_width"),
-            ("plane_controller", "needle_diameter"),
-        ),
-        "m",
-    ),
-    Shared(
-        "lean of the needle's end",
-        "--pre-bend-deg",
-        LEAN,
-        (("sim_rig", "pre_bend_lean"), ("stereo_tracker", "lean")),
-        "rad",
-    ),
-    Shared(
-        "calibration",
-        "--params",
-        "",
-        (("sim_rig", "calibration_file"), ("stereo_tracker", "calibration_file")),
-        "",
-    ),
+    Shared("curvature", "--curvature", CURVATURE, "1/m", _CURVATURES),
+    Shared("diameter", "--diameter-mm", DIAMETER, "m", _WIDTHS),
+    Shared("lean of the needle's end", "--pre-bend-deg", LEAN, "rad", _LEANS),
+    Shared("calibration", "--params", "", "", _FILES),
 )
 
 
@@ -123,7 +101,7 @@ def contradictions(parameters: Parameters, nodes: Sequence[str]) -> list[str]:
     for shared in SHARED:
         told = {
             (node, name): parameters.get(node, {}).get(name, shared.default)
-            for node, name in shared.places
+            for node, name in shared.places.items()
             if node in nodes
         }
         values = list(told.values())

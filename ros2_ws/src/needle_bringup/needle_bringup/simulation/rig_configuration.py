@@ -41,35 +41,20 @@ CONTINUOUS_CAMERA_RATE = 30.0
 SMALLEST_NOISE = 1e-5
 
 # Parameter that simulate sets -> the option that it comes from.
+_ALIKE = ("level", "seed", "bag", "estimator", "law", "planner", "insertion", "obstacles")
 OPTIONS = {
-    "level": "--level",
-    "seed": "--seed",
-    "initial_pitch": "--initial",
-    "initial_roll": "--initial",
-    "target_offset": "--initial",
+    **{name: f"--{name}" for name in _ALIKE},
+    **dict.fromkeys(("initial_pitch", "initial_roll", "target_offset"), "--initial"),
+    **dict.fromkeys(("tip_noise", "tip_covariance", "tip_noise_bound"), "--noise-mm"),
+    **dict.fromkeys(("needle_diameter", "needle_width"), "--diameter-mm"),
+    **dict.fromkeys(("pre_bend", "pre_bend_lean", "lean", "tip_lean"), "--pre-bend-deg"),
+    **dict.fromkeys(("curvature", "max_curvature"), "--curvature"),
     "torsion_play": "--play-deg",
     "torsion_lag": "--lag-mm",
-    "tip_noise": "--noise-mm",
-    "tip_covariance": "--noise-mm",
-    "tip_noise_bound": "--noise-mm",
     "measurement_std": "--noise-mm",
-    "bag": "--bag",
     "preset": "--controller",
-    "estimator": "--estimator",
-    "law": "--law",
-    "planner": "--planner",
-    "insertion": "--insertion",
-    "curvature": "--curvature",
-    "max_curvature": "--curvature",
-    "needle_diameter": "--diameter-mm",
-    "needle_width": "--diameter-mm",
-    "pre_bend": "--pre-bend-deg",
-    "pre_bend_lean": "--pre-bend-deg",
-    "lean": "--pre-bend-deg",
-    "tip_lean": "--pre-bend-deg",
     "depth": "--depth-mm",
     "target_point": "--target",
-    "obstacles": "--obstacles",
 }
 
 # Seven processes share the cores: drives and driver wait for each other longer than by default [s].

@@ -33,6 +33,7 @@ from needle_bringup.simulation.rig_configuration import (
     write_parameters,
 )
 from needle_bringup.simulation.simulate_options import SimulateOptions, command_of, parse
+from needle_bringup.workplace import checkout
 from needle_core.commands.cli import (
     EXIT_DONE,
     EXIT_MISSED,
@@ -113,11 +114,7 @@ def simulate(options: SimulateOptions) -> int:
         if error.is_bad_input:
             shutil.rmtree(bag, ignore_errors=True)
         raise
-    except UserError:
-        if not (bag / METADATA).exists():
-            shutil.rmtree(bag, ignore_errors=True)
-        raise
-    except KeyboardInterrupt:
+    except (UserError, KeyboardInterrupt):
         if not (bag / METADATA).exists():
             shutil.rmtree(bag, ignore_errors=True)
         raise
@@ -273,9 +270,8 @@ def _make_folder(options: SimulateOptions) -> Path:
 
 def _checkout() -> Path:
     """Return the checkout's folder; the current one where the package runs without it."""
-    for folder in Path(__file__).resolve().parents:
-        if (folder / "scripts" / "simulate").is_file():
-            return folder
+    with contextlib.suppress(UserError):
+        return checkout()
     return Path.cwd()
 
 

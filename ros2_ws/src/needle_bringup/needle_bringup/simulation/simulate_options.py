@@ -127,8 +127,9 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         raise UserError(f"--noise-mm goes with --level tip only, not with {given.level}")
     x_mm, pitch_deg, roll_deg = start(given.initial, largest_x=50.0, largest_pitch=45.0)
     target = None if given.target is None else _target(given.target)
-    if given.planner and target is None:
-        raise UserError("--planner goes with --target only")
+    for option in ("planner", "obstacles"):
+        if getattr(given, option) and target is None:
+            raise UserError(f"--{option} goes with --target only")
     depth = given.depth_mm or (DEPTH_MM if target is None else f"{LARGEST_DEPTH_MM:g}")
     factor = number("--real-time-factor", given.real_time_factor or "0", 0.0, 100.0, "-")
     if given.graph and given.real_time_factor is not None and factor != 1.0:
@@ -149,7 +150,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         noise_mm=noise,
         depth_mm=number("--depth-mm", depth, 1.0, LARGEST_DEPTH_MM, "mm"),
         target_mm=target,
-        obstacles=_obstacles(given.obstacles, target),
+        obstacles=_readable("--obstacles", given.obstacles),
         curvature=_optional("--curvature", given.curvature, 0.1, 45.0, "1/m"),
         diameter_mm=_optional("--diameter-mm", given.diameter_mm, 0.2, 3.0, "mm"),
         pre_bend_deg=_optional("--pre-bend-deg", given.pre_bend_deg, 0.0, 25.0, "deg"),
@@ -216,7 +217,7 @@ def _parser() -> CommandParser:
         default="best",
         metavar="paper|best|open_loop",
         help="how the needle is turned: as in the paper, by the best controller known here, or not "
-        f"at all (default: best); for comparison also {', '.join(CONTROLLERS[3:])}",
+        "at all (default: best)",
     )
     add_own_part_options(add, "--target")
     add(
@@ -350,12 +351,6 @@ def _new_bag(text: str | None) -> Path | None:
     if path.exists() or path.is_symlink():
         raise UserError(f"--bag {text}: exists already; give a new folder")
     return path.absolute()
-
-
-def _obstacles(text: str | None, target: tuple[float, float, float] | None) -> Path | None:
-    if text is not None and target is None:
-        raise UserError("--obstacles goes with --target only")
-    return _readable("--obstacles", text)
 
 
 def _readable(name: str, text: str | None) -> Path | None:

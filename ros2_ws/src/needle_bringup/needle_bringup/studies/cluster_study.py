@@ -56,31 +56,12 @@ class PartDone:
     witness: str
 
 
-@dataclasses.dataclass(frozen=True)
-class StudyDone:
-    """Result of all parts.
-
-    Attributes
-    ----------
-    outcomes : list of Outcomes or PointOutcomes
-        In the order of the parts.
-    cpu_s : float
-        What they cost together [s].
-    differing : tuple of str
-        Machines that round otherwise than this one does.
-    """
-
-    outcomes: list[Outcomes | PointOutcomes]
-    cpu_s: float
-    differing: tuple[str, ...]
-
-
 def run_parts(
     address: str,
     parts: Sequence[StudyPart],
     witness: StudyPart,
     on_progress: Callable[[int], None],
-) -> StudyDone:
+) -> tuple[list[Outcomes | PointOutcomes], float, list[str]]:
     """Steer the needles of all parts on the cluster of a scheduler.
 
     Parameters
@@ -94,6 +75,15 @@ def run_parts(
     on_progress : callable
         Told after each part how many needles it had.
 
+    Returns
+    -------
+    outcomes : list of Outcomes or PointOutcomes
+        In the order of the parts.
+    cpu_s : float
+        What they cost together [s].
+    differing : list of str
+        Machines that round otherwise than this one does.
+
     Raises
     ------
     UserError
@@ -105,11 +95,8 @@ def run_parts(
         done.append(result)
         on_progress(len(part.starts))
     wanted = digest(witness.run())
-    return StudyDone(
-        [part.outcomes for part in done],
-        sum(part.cpu_s for part in done),
-        tuple(sorted({part.machine for part in done if part.witness != wanted})),
-    )
+    differing = sorted({part.machine for part in done if part.witness != wanted})
+    return [part.outcomes for part in done], sum(part.cpu_s for part in done), differing
 
 
 def run_part(asked: ClusterPart) -> PartDone:

@@ -66,11 +66,10 @@ def monte_carlo(options: MonteCarloOptions) -> int:
         disable=not sys.stderr.isatty(),
     ) as bar:
         if options.scheduler:
-            done = run_parts(
+            outcomes, worked, differing = run_parts(
                 options.scheduler, parts, witness, lambda needles: bar.update(needles * steps)
             )
-            outcomes, worked = done.outcomes, done.cpu_s
-            for machine in done.differing:
+            for machine in differing:
                 print(
                     f"warning: {machine} rounds otherwise than this machine (another processor?): "
                     "figures may differ in their last digits",
@@ -85,14 +84,8 @@ def monte_carlo(options: MonteCarloOptions) -> int:
     if options.csv is not None:
         write_csv(options.csv, results.columns, options.of_a_run)
     if options.json is not None:
-        asked: dict[str, JsonValue] = {
-            "controller": options.controller,
-            "estimator": options.estimator,
-            "law": options.law,
-            "planner": options.planner,
-            "grid": options.grid,
-            "seed": options.seed,
-        }
+        names = ("controller", "estimator", "law", "planner", "grid", "seed")
+        asked: dict[str, JsonValue] = {name: getattr(options, name) for name in names}
         # Of a plane there are no figures of points, and the other way round.
         write_json(options.json, {**dict.fromkeys(LABELS), **seen, **asked})
     return EXIT_DONE

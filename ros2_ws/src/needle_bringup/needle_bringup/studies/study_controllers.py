@@ -5,9 +5,9 @@ needle_sim, whose studies these are for, does not know the controller under test
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -283,28 +283,6 @@ def needles_at_a_time(name: str) -> int:
     return _LINEAR_CHUNK if name in ONE_SIDED_PRESETS else CHUNK
 
 
-@dataclasses.dataclass(frozen=True)
-class OwnParts:
-    """Parts of a controller that come from other packages: names, empty where a preset's are used.
-
-    Attributes
-    ----------
-    estimator, law, planner : str
-        See `SteeringSettings`.
-    seed, first : int
-        Key what chance the estimator uses: of the study, and the first needle.
-    """
-
-    estimator: str = ""
-    law: str = ""
-    planner: str = ""
-    seed: int = 0
-    first: int = 0
-
-
-PRESETS_OWN = OwnParts()
-
-
 def controller_factory(
     name: str,
     claimed: float,
@@ -312,7 +290,8 @@ def controller_factory(
     *,
     sigma_scale: float = 1.0,
     turn_delay: float = 0.0,
-    own: OwnParts = PRESETS_OWN,
+    own: Mapping[str, Any] = {},
+    first: int = 0,
 ) -> Callable[[], SteeredNeedles]:
     """Return what makes the controller of some needles.
 
@@ -329,8 +308,11 @@ def controller_factory(
         standard deviations are those of uniform noise within `claimed`, divided by this.
     turn_delay : float
         As of `study.StudySettings` [m].
-    own : OwnParts
-        What other packages have in place of the preset's.
+    own : mapping
+        What other packages have in place of the preset's: settings `estimator`, `law`, `planner`
+        and `seed`.
+    first : int
+        Number of the first needle, which keys what chance an own estimator uses.
 
     Raises
     ------
@@ -339,7 +321,7 @@ def controller_factory(
     """
     settings, covariance = _what_is_told(name, claimed, sigma_scale, flip_depths, own)
     return lambda: SteeredNeedles(
-        *make_controller(settings, np.eye(3), np.zeros(3), first=own.first), covariance, turn_delay
+        *make_controller(settings, np.eye(3), np.zeros(3), first=first), covariance, turn_delay
     )
 
 
@@ -349,7 +331,8 @@ def point_controller_factory(
     *,
     sigma_scale: float = 1.0,
     rotation_budget: float = math.inf,
-    own: OwnParts = PRESETS_OWN,
+    own: Mapping[str, Any] = {},
+    first: int = 0,
 ) -> Callable[[], NeedlesToPoints]:
     """Return what makes the controller of some needles that are steered to points.
 
@@ -371,29 +354,30 @@ def point_controller_factory(
         return PointSteering(settings, motion).command
 
     def needles() -> NeedlesToPoints:
-        estimator, _ = make_controller(settings, np.eye(3), np.zeros(3), first=own.first)
+        estimator, _ = make_controller(settings, np.eye(3), np.zeros(3), first=first)
         return NeedlesToPoints(estimator, new_law, covariance, rotation_budget)
 
     return needles
 
 
 def _what_is_told(
-    name: str, claimed: float, sigma_scale: float, flip_depths: Sequence[float], own: OwnParts
+    name: str,
+    claimed: float,
+    sigma_scale: float,
+    flip_depths: Sequence[float],
+    own: Mapping[str, Any],
 ) -> tuple[SteeringSettings, Array | None]:
     if name not in PRESETS:
         raise UserError(f"--controller {name!r} is not available; there is {', '.join(PRESETS)}")
     settings = SteeringSettings(
         preset=name,
-        estimator=own.estimator,
-        law=own.law,
-        planner=own.planner,
-        seed=own.seed,
         tip_covariance="configured" if sigma_scale == 1.0 else "from_tip_pose",
         tip_noise="bounded",
         tip_noise_bound=claimed,
         measurement_std=claimed / math.sqrt(3.0),
         depth=_DEEPEST,
         flip_depths=tuple(flip_depths),
+        **own,
     )
     if sigma_scale == 1.0:
         return settings, None

@@ -15,7 +15,6 @@ from needle_bringup.studies.monte_carlo_options import MonteCarloOptions
 from needle_bringup.studies.study_controllers import (
     CURVATURE,
     STEP_LENGTH,
-    OwnParts,
     controller_factory,
     needles_at_a_time,
     point_controller_factory,
@@ -128,9 +127,8 @@ def _starts(options: MonteCarloOptions) -> FloatArray:
     return GRIDS[grid](options.bounds, draws, options.seed)[:count]
 
 
-def _own(part: StudyPart) -> OwnParts:
-    asked = part.options
-    return OwnParts(asked.estimator, asked.law, asked.planner, asked.seed, part.first)
+def _own(options: MonteCarloOptions) -> dict[str, str | int]:
+    return {name: getattr(options, name) for name in ("estimator", "law", "planner", "seed")}
 
 
 def _to_plane(part: StudyPart, on_progress: Callable[[int], None]) -> Outcomes:
@@ -144,7 +142,8 @@ def _to_plane(part: StudyPart, on_progress: Callable[[int], None]) -> Outcomes:
             flips,
             sigma_scale=options.sigma_scale,
             turn_delay=options.turn_delay,
-            own=_own(part),
+            own=_own(options),
+            first=part.first,
         ),
         settings_of(options),
         on_progress=on_progress,
@@ -165,7 +164,8 @@ def _to_points(part: StudyPart, on_progress: Callable[[int], None]) -> PointOutc
             options.claimed_bound,
             sigma_scale=options.sigma_scale,
             rotation_budget=options.rotation_budget,
-            own=_own(part),
+            own=_own(options),
+            first=part.first,
         ),
         settings_of(options),
         on_progress=on_progress,

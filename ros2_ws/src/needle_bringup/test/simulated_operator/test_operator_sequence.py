@@ -144,6 +144,7 @@ def test_a_call_whose_answer_was_lost_is_made_again_and_a_late_one_is_to_it_alon
 def test_a_homing_is_waited_for_whatever_was_heard_before_it() -> None:
     sequence = reach(HOME)
     sequence.take_answer(HOME, True, "homing", 1.0)
+    assert sequence.next_call(1.0) is None
     # A device may say that it is homed, from last time, while it looks for its switches.
     for homed in (False, True):
         see(sequence, dataclasses.replace(MOVING, homed=homed), 2.0)

@@ -135,7 +135,7 @@ def test_every_yaml_of_the_package_parses() -> None:
 
 def test_the_defaults_of_a_needle_are_those_of_the_nodes() -> None:
     for shared in SHARED:
-        for node, name in shared.places:
+        for node, name in shared.places.items():
             default = getattr(CLASSES[node](), name)
             if isinstance(shared.default, float):
                 # rad: the tracker's lean is rounded
@@ -153,7 +153,9 @@ def test_the_options_of_a_needle_set_every_node_alike_also_beside_continuous_ins
         for node, kind in CLASSES.items()
     }
     for shared in SHARED:
-        assert len({getattr(nodes[node], name) for node, name in shared.places}) == 1, shared
+        assert len({getattr(nodes[node], name) for node, name in shared.places.items()}) == 1, (
+            shared
+        )
     rig, tracker = nodes["sim_rig"], nodes["stereo_tracker"]
     assert (rig.curvature, rig.needle_diameter) == (5.0, pytest.approx(0.0012))
     assert rig.pre_bend == pytest.approx(math.radians(6.0))
