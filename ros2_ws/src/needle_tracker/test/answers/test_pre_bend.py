@@ -44,13 +44,10 @@ def test_a_wrong_roll_is_off_by_what_the_covariance_says() -> None:
         np.testing.assert_allclose(abs(heading[0]), abs(roll) * math.sin(LEAN), rtol=0.05)
 
 
-def test_without_lean_nothing_changes() -> None:
+def test_without_lean_nothing_changes_and_one_that_is_none_is_refused() -> None:
     direction = np.array([0.1, 0.2, math.sqrt(0.95)])
     heading, covariance = heading_of(direction, np.eye(3) * 1e-4, np.eye(3), 1.0, 0.0)
     np.testing.assert_allclose(heading, direction)
     np.testing.assert_array_equal(covariance, np.eye(3) * 1e-4)
-
-
-def test_a_lean_that_is_none_is_refused() -> None:
     with pytest.raises(OutOfBoundsError):
-        heading_of(np.array([0.0, 0.0, 1.0]), np.zeros((3, 3)), np.eye(3), 0.0, 2.0)
+        heading_of(direction, np.zeros((3, 3)), np.eye(3), 0.0, 2.0)

@@ -169,9 +169,9 @@ TRUTH = "name,x_m,y_m,z_m\n"
 NODE = "stereo_tracker: {ros__parameters: {%s}}"
 
 
-@pytest.mark.parametrize(
-    ("option", "text", "says"),
-    [
+def test_what_cannot_be_used_is_one_line(track: Track, folder: Path, capsys: Out) -> None:
+    given = folder / "given.txt"
+    for option, text, says in (
         ("--params", NODE % "needle_widht: 0.001", "needle_widht"),
         ("--params", NODE % "needle_width: 1.0", "needle_width"),
         ("--params", "stereo_trakcer: {ros__parameters: {needle_width: 0.001}}", "stereo_trakcer"),
@@ -189,17 +189,14 @@ NODE = "stereo_tracker: {ros__parameters: {%s}}"
         ("--left", None, "does not exist"),
         ("--insertion", None, "No such file"),
         ("--overlay", "", "File exists|has something in it|Not a directory"),
-    ],
-)
-def test_what_cannot_be_used_is_one_line(
-    track: Track, folder: Path, capsys: Out, option: str, text: str | None, says: str
-) -> None:
-    if text is not None:
-        (folder / "given.txt").write_text(text)
-    code, rows = track(option, "given.txt")
-    error = capsys.readouterr().err
-    assert (code, rows, error.count("\n")) == (2, [], 1)
-    assert any(one in error for one in says.split("|")), error
+    ):
+        given.unlink(missing_ok=True)
+        if text is not None:
+            given.write_text(text)
+        code, rows = track(option, "given.txt")
+        error = capsys.readouterr().err
+        assert (code, rows, error.count("\n")) == (2, [], 1)
+        assert any(one in error for one in says.split("|")), error
 
 
 def test_wrong_options_are_one_line(track: Track, folder: Path, capsys: Out) -> None:

@@ -72,9 +72,9 @@ def test_places_are_found_by_name_or_pattern_and_lie_flat_by_default() -> None:
     assert session.place_of("on_17") is None
 
 
-@pytest.mark.parametrize(
-    ("place", "says"),
-    [
+def test_a_wrong_place_is_named() -> None:
+    place: dict[str, Any]
+    for place, says in (
         ({}, "places.a.origin"),
         ({"origin": [0, 0]}, "places.a.origin wants 3 numbers, has 2"),
         ({"origin": [0.018, 0, float("nan")]}, "places.a.origin .* not a finite number"),
@@ -86,34 +86,27 @@ def test_places_are_found_by_name_or_pattern_and_lie_flat_by_default() -> None:
         ({"origin": [0.0, 0, 0]}, "below the surface"),
         ({"origin": [0.0, 0, 0], "under_surface": "yes"}, "not true or false"),
         ({"under_surface": True, "sigma": 1e-4}, "places.a.origin"),
-    ],
-)
-def test_a_wrong_place_is_named(place: dict[str, Any], says: str) -> None:
-    with pytest.raises(UserError, match=says):
-        parse_session(session_content(a=place))
-
-
-@pytest.mark.parametrize(
-    ("place", "says"),
-    [
-        # Level, its print up: the camera beside sees its edge.
+    ):
+        with pytest.raises(UserError, match=says):
+            parse_session(session_content(a=place))
+    for place, says in (
+        # In a box. Level, its print up: the camera beside sees its edge.
         ({"origin": [0.0, -0.04, 0.01]}, "away from the camera"),
         ({"origin": [0.03, -0.01, 0.01], "rows": [-1, 1, 0]}, "above the surface"),
-    ],
-)
-def test_a_wrong_place_in_a_box_is_named(place: dict[str, Any], says: str) -> None:
-    with pytest.raises(UserError, match=says):
-        parse_session(box_content(a=place | {"under_surface": True}))
+    ):
+        with pytest.raises(UserError, match=says):
+            parse_session(box_content(a=place | {"under_surface": True}))
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [(b"\xff\xfe\x00", "not a text file"), (b"a: [", "not YAML"), (b"[]", "not a mapping")],
-)
-def test_a_file_that_is_no_session_is_refused(tmp_path: Path, text: bytes, says: str) -> None:
+def test_a_file_that_is_no_session_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "session.yaml"
     with pytest.raises(UserError, match="cannot be read: No such file"):
         load_session(path)
-    path.write_bytes(text)
-    with pytest.raises(UserError, match=says):
-        load_session(path)
+    for data, says in (
+        (b"\xff\xfe\x00", "not a text file"),
+        (b"a: [", "not YAML"),
+        (b"[]", "not a mapping"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(UserError, match=says):
+            load_session(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,19 +33,17 @@ def test_corners_are_found_where_they_are_drawn() -> None:
     np.testing.assert_allclose(pixels, expected[numbers], atol=0.5)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "says"),
-    [
+def test_a_board_that_cannot_be_is_refused() -> None:
+    wrong: dict[str, Any]
+    for wrong, says in (
         ({"columns": 2}, "board.columns"),
         ({"square": 1.0}, "board.square"),
         ({"marker": 0.02}, "board.marker"),
         ({"dictionary": "DICT_9X9"}, "dictionary"),
         ({"dictionary": "DICT_4X4_50"}, "54 markers"),
-    ],
-)
-def test_a_board_that_cannot_be_is_refused(wrong: dict[str, object], says: str) -> None:
-    with pytest.raises(UserError, match=says):
-        CharucoBoard(**wrong)  # type: ignore[arg-type]
+    ):
+        with pytest.raises(UserError, match=says):
+            CharucoBoard(**wrong)
 
 
 def test_the_printed_board_has_its_true_size(tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def largest_sum(evidence: np.ndarray, steps: np.ndarray, first_end: int) -> floa
     return best
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_best_path_is_the_best_of_all(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(seed)
     rows, columns = 5, 6
@@ -81,8 +81,8 @@ def path_along(grid: SearchGrid, angles: np.ndarray) -> Path:
     return Path(rows, columns, grid.pixels[rows, columns].astype(np.float64), 30.0)
 
 
-@pytest.mark.parametrize("curvature", [0.0, 4.0, 8.0])
-@pytest.mark.parametrize("length", [8e-3, 41e-3, 93.2e-3])
+@pytest.mark.parametrize("curvature", [0.0, 8.0])
+@pytest.mark.parametrize("length", [8e-3, 93.2e-3])
 def test_a_path_is_cut_at_its_length(
     views: Views, settings: TrackerSettings, curvature: float, length: float
 ) -> None:

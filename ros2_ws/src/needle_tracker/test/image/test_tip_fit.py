@@ -39,7 +39,7 @@ def fitted(
 
 
 @pytest.mark.parametrize("bright", [False, True])
-@pytest.mark.parametrize("angle_deg", [0.0, 17.0, 45.0, -63.0, 122.0, 206.0])
+@pytest.mark.parametrize("angle_deg", [17.0, -63.0, 206.0])
 def test_end_and_direction_to_a_fraction_of_a_pixel(
     make_line: Callable[..., np.ndarray], angle_deg: float, bright: bool
 ) -> None:
@@ -77,7 +77,7 @@ def test_a_bent_shaft_does_not_pull_the_end_aside(make_line: Callable[..., np.nd
     np.testing.assert_allclose(tip.direction, [1.0, 0.0], atol=0.01)
 
 
-@pytest.mark.parametrize("beside", [-3.5, -2.5, 2.5, 3.5])
+@pytest.mark.parametrize("beside", [-3.5, 2.5])
 @pytest.mark.parametrize("glint", [False, True])
 def test_a_shadow_along_the_needle_does_not_draw_it_aside(
     make_line: Callable[..., np.ndarray], beside: float, glint: bool
@@ -99,8 +99,8 @@ def test_a_shadow_along_the_needle_does_not_draw_it_aside(
     assert abs(across) < 3.0 * tip.sigma_across
 
 
-@pytest.mark.parametrize("beside", [-8.0, -6.5, 6.5, 8.0])
-@pytest.mark.parametrize("short", [0.0, 4.0, 9.0])
+@pytest.mark.parametrize("beside", [-6.5, 8.0])
+@pytest.mark.parametrize("short", [0.0, 9.0])
 def test_a_shadow_that_ends_first_does_not_hide_the_needles_end(
     make_line: Callable[..., np.ndarray], beside: float, short: float
 ) -> None:
@@ -137,8 +137,8 @@ def test_of_two_lines_that_touch_either_may_be_the_needle(
     assert alone.sigma_across < 0.15
 
 
-@pytest.mark.parametrize("aside", [-0.4, 0.0, 0.4])
-@pytest.mark.parametrize(("first", "last"), [(0.0, 0.88), (0.5, 0.9), (0.6, 1.0)])
+@pytest.mark.parametrize("aside", [-0.4, 0.4])
+@pytest.mark.parametrize(("first", "last"), [(0.0, 0.88), (0.6, 1.0)])
 def test_a_streak_of_light_along_the_needle_hides_neither_its_line_nor_its_end(
     make_line: Callable[..., np.ndarray], first: float, last: float, aside: float
 ) -> None:
@@ -197,8 +197,8 @@ def draw_needle(end: np.ndarray, bevel: float, blur: float, noise: np.ndarray) -
     return np.asarray(np.clip(np.round(image), 0, 255), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("bevel", [0.0, 5.0, 10.0])
-@pytest.mark.parametrize("blur", [0.7, 1.5, 2.2])
+@pytest.mark.parametrize("bevel", [0.0, 10.0])
+@pytest.mark.parametrize("blur", [0.7, 2.2])
 def test_how_well_an_end_is_known_fits_bevels_and_blur(bevel: float, blur: float) -> None:
     rng = np.random.default_rng(3)
     squares, sigmas = [], []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -87,9 +88,9 @@ def one_place(content: Any) -> None:
     content["right"]["T_optical_rig"] = content["left"]["T_optical_rig"]
 
 
-@pytest.mark.parametrize(
-    ("spoil", "named"),
-    [
+def test_bad_content_is_named(calibration_path: Path, tmp_path: Path) -> None:
+    text, path = calibration_path.read_text(encoding="utf-8"), tmp_path / "rig.yaml"
+    for spoil, named in (
         (lambda content: content.pop("right"), "right"),
         (put("phantom", "refractive_index", 0.9), "refractive_index"),
         (put("phantom", "surface_height", float("nan")), "surface_height"),
@@ -101,18 +102,14 @@ def one_place(content: Any) -> None:
         (put("left", "camera_matrix", "data", 1, 0.5), "left.camera_matrix"),
         (put("right", "T_optical_rig", "rotation", [0, 0, 0, 0.1]), "right.T_optical_rig.rotation"),
         (one_place, "same place"),
-    ],
-)
-def test_bad_content_is_named(
-    content: Any, spoil: Callable[[Any], None], named: str, tmp_path: Path
-) -> None:
-    spoil(content)
-    path = tmp_path / "rig.yaml"
-    path.write_text(yaml.safe_dump(content), encoding="utf-8")
-    with pytest.raises(UserError, match=named) as caught:
-        load_calibration(path)
-    assert "\n" not in str(caught.value)
-    assert str(path) in str(caught.value)
+    ):
+        content = yaml.safe_load(text)
+        spoil(content)
+        path.write_text(yaml.safe_dump(content), encoding="utf-8")
+        with pytest.raises(UserError, match=named) as caught:
+            load_calibration(path)
+        assert "\n" not in str(caught.value)
+        assert str(path) in str(caught.value)
 
 
 def no_window(content: Any) -> None:
@@ -123,9 +120,8 @@ def no_window(content: Any) -> None:
 LAYER = ("right", "window", "layers", 0, "thickness")
 
 
-@pytest.mark.parametrize(
-    ("spoil", "named"),
-    [
+def test_bad_windows_are_named(own_windows: Any) -> None:
+    for spoil, named in (
         (put("phantom", {"surface_height": 0.01, "refractive_index": 1.3}), "take phantom out"),
         (no_window, "phantom is missing.*give phantom .*or each camera its window"),
         (lambda content: content["right"].pop("window"), "right.window.point is missing"),
@@ -138,29 +134,25 @@ LAYER = ("right", "window", "layers", 0, "thickness")
         (put(*LAYER, 5), "right.window.layers.0..thickness"),
         (put("right", "window", "inside", 0.9), "right.window.inside"),
         (put("right", "window", "point", [0.0, 0.06]), "right.window.point wants 3 numbers"),
-    ],
-)
-def test_bad_windows_are_named(own_windows: Any, spoil: Callable[[Any], None], named: str) -> None:
-    spoil(own_windows)
-    with pytest.raises(UserError, match=named) as caught:
-        parse_calibration(own_windows)
-    assert "\n" not in str(caught.value)
+    ):
+        content = copy.deepcopy(own_windows)
+        spoil(content)
+        with pytest.raises(UserError, match=named) as caught:
+            parse_calibration(content)
+        assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("data", "says"),
-    [
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    for data, says in (
         (None, "No such file"),
         (b"\xff\xfe\x80\x81", "not a text file"),
         (b"", "phantom"),
         (b"[1, 2]", "rig.yaml"),
         (b"{a: [", "YAML"),
         (b"phantom: 3", "phantom"),
-    ],
-)
-def test_other_files_are_refused(data: bytes | None, says: str, tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    if data is not None:
-        path.write_bytes(data)
-    with pytest.raises(UserError, match=says):
-        load_calibration(path)
+    ):
+        if data is not None:
+            path.write_bytes(data)
+        with pytest.raises(UserError, match=says):
+            load_calibration(path)

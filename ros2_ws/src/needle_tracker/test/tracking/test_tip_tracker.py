@@ -153,7 +153,7 @@ class Waiting(TipTracker):
         return False
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(2))
 def test_maps_drawn_after_an_answer_change_no_answer(
     calibration: StereoCalibration, settings: TrackerSettings, seed: int
 ) -> None:

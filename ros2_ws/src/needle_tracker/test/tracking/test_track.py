@@ -34,9 +34,9 @@ def tip(x: float = 0.0, y: float = 0.0, z: float = 0.05) -> SpatialTip:
     )
 
 
-@pytest.mark.parametrize("curvature", [2.0, 5.0, 9.0])
-@pytest.mark.parametrize("length", [0.01, 0.06, 0.14])
-@pytest.mark.parametrize("angle", [-0.15, 0.0, 0.1])
+@pytest.mark.parametrize("curvature", [2.0, 9.0])
+@pytest.mark.parametrize("length", [0.01, 0.14])
+@pytest.mark.parametrize("angle", [-0.15, 0.1])
 def test_every_reachable_arc_passes(
     gates: GateSettings,
     make_arc: Callable[..., np.ndarray],
