@@ -42,6 +42,7 @@ def test_rotation_waits_for_a_hand_and_follows_it_no_faster_than_its_rate() -> N
     for hand, rotation in ((0.5, 0.0), (1.25, 0.25), (1.1, 0.25), (2.5, 0.75), (2.5, 0.75)):
         assert motion.follow(hand, 1.0, 0.5).rotation == pytest.approx(rotation)
         assert not motion.complete
+    assert CoordinatedMotion((1.0, 0.0), [Leg(1.0, 1.0, 1.0)]).follow(1.0, 1.0, 0.5).rotation == 0.5
     wanted = ((0.0, 1.0), (2.25, 0.75), (9.0, 0.0))
     assert [motion.rotation_at(hand) for hand, _ in wanted] == [rotation for _, rotation in wanted]
     assert motion.follow(3.0, 10.0, 0.5).rotation == 0.0

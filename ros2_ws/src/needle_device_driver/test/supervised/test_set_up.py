@@ -149,7 +149,10 @@ REFUSED: list[tuple[Change, str]] = [
         "the drive scales speeds by 0.003 (0x6096), wanted counts/s",
     ),
     # It answers no SYNC.
-    (refuses(RANGE, 0x1800), "node 1 refuses to write"),
+    (
+        has(refuses=lambda i, sub, v: RANGE * ((i, sub) == (0x1800, 2))),
+        "node 1 refuses to write 1 to 0x1800:2 transmission type",
+    ),
     (has(state="enabled", deaf_to={"all"}), "node 1 does not switch off"),
     (has(beats=False), "node 1 sends no heartbeat (0x1017)"),
 ]
@@ -290,6 +293,13 @@ def test_parameters_go_before_what_a_drive_tells() -> None:
     bench.rotation.tells({(0x60A9, 0): RPM, (0x60AA, 0): RPM_S})
     bench.configured()
     assert bench.rotation.holds(0x6085) == 955
+
+
+def test_who_is_set_up_again_is_homed_again() -> None:
+    bench = DriveBench().homed()
+    assert bench.run(bench.supervisor.deconfigure()).success
+    bench.configured()
+    assert not bench.is_homed()
 
 
 def test_a_drive_that_started_anew_is_asked_anew() -> None:

@@ -19,7 +19,8 @@ def test_quick_stop_goes_out_at_once_stays_and_forgets_the_set_point() -> None:
     bench.hold(False)
     assert bench.bus.sent == [(0x201, QUICK_STOP), (0x202, QUICK_STOP)]
     at = bench.positions
-    bench.go(20)
+    # However long.
+    bench.go(105)
     assert bench.insertion.state == bench.rotation.state == "quick stop"
     assert bench.positions == at
     bench.steps()
@@ -160,6 +161,11 @@ def test_drive_watchdog_that_tripped_has_its_name_also_before_the_start() -> Non
     assert bench.insertion.state == "fault"
     assert bench.reset().success
     bench.wait(3)
+    assert bench.state == "DISABLED"
+    # What a drive told before its set-up, and is over, is none.
+    bench = DriveBench()
+    bench.insertion.say(0x80, bytes.fromhex("0573000000000000"))
+    bench.configured()
     assert bench.state == "DISABLED"
 
 

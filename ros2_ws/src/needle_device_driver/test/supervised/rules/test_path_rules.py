@@ -52,6 +52,11 @@ def test_coordinated_a_path_takes_the_place_of_another_without_a_stop() -> None:
     while bench.state == "MOVING":
         bench.go()
     assert bench.results == [(first, "replaced"), (second, "succeeded")]
+    # One of its knots may be where the needle is.
+    bench = Bench().ready()
+    path(bench, (-1.0, 0.0), (0.0, 0.2), (1.0, 0.3))
+    bench.go(5)
+    assert bench.positions == pytest.approx((0.0005, 0.15))
 
 
 def test_forward_only_a_path_that_ends_where_the_needle_is_moves_nothing() -> None:
