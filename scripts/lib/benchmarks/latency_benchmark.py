@@ -23,7 +23,7 @@ import latency_rig
 import needle_tracker
 from campaign.trials.steered_needle import FRAME_RATE, OFFSET, steer
 from campaign.trials.trial_processes import TrialProcesses
-from campaign.trials.virtual_rig import Held
+from scenario.virtual_rig import Held
 from needle_analysis.run.stage_timing import stage_timings
 from needle_bags.reading.bag_reader import read_run
 from needle_bringup.simulation.rig_configuration import GRAPH_WATCHDOG, can_adapter
