@@ -1,196 +1,144 @@
-"""The stand-in as a component, before a rig that a test plays."""
+"""The stand-in as a component: what a rig says becomes the hold, calls, and an end."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
-from needle_bringup.simulated_operator.component import PROGRESS, SimulatedOperator
+from needle_bringup.simulated_operator.component import SimulatedOperator
 from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
+from needle_bringup.simulated_operator.progress import Shown
 from needle_core import messages as m
-from needle_core.component import (
-    BEST_EFFORT,
-    LATCHED,
-    Actions,
-    Component,
-    Input,
-    Moment,
-    Output,
-    Port,
-    Publish,
-    Reply,
-    Service,
-    Timer,
-)
+from needle_core.component import Action, Answer, Call, Exit, Moment, Peers, Publish, Send
 from needle_core.diagnostics import Level
-from needle_core.runners.virtual import DIAGNOSTICS, VirtualRunner
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 CONFIRM, HOME, START = "device/confirm_needle_out", "device/home", "plane_controller/start"
-STARTED = [f"{CONFIRM} True", HOME, "device/enable True", START]
-DISABLE = "device/enable False"
-
-
-class PlayedRig(Component):
-    """Answers like sim_rig and plane_controller; remembers what was asked and held."""
-
-    name = "played_rig"
-
-    def __init__(self) -> None:
-        self.device = DeviceStatus(source=self.name, homed=True, state="DISABLED", simulated=True)
-        self.controller = ControllerStatus(state="IDLE", starts=0, depth_m=0.12)
-        self.refusal, self.recorded = "", ""
-        self.mute: set[str] = set()
-        self.asked: list[str] = []
-        self.holds: list[m.HoldState] = []
-        self.shown: list[Any] = []
-        self.inputs = (Input("device/hold", m.HoldState, self._on_hold, BEST_EFFORT),)
-        self.outputs = (
-            Output("device/status", DeviceStatus, LATCHED),
-            Output("needle/controller_status", ControllerStatus, LATCHED),
-            DIAGNOSTICS,
-        )
-        self.ports = (Port(PROGRESS, self._show),)
-        self.services = tuple(
-            Service(name, self._answering(name), takes)
-            for name, takes in (
-                (CONFIRM, True),
-                (HOME, False),
-                ("device/enable", True),
-                (START, False),
-            )
-        )
-        self.timers = (Timer(0.1, self._tell),)
-
-    def _on_hold(self, hold: m.HoldState, at: Moment) -> Actions:
-        self.holds.append(hold)
-        return ()
-
-    def _show(self, batch: Sequence[Any], at: Moment) -> Actions:
-        self.shown += batch
-        return ()
-
-    def _tell(self, at: Moment) -> Actions:
-        yield Publish("device/status", self.device)
-        self.device = dataclasses.replace(self.device, state="DISABLED")
-        yield Publish("needle/controller_status", self.controller)
-        if self.recorded:
-            told = m.Status("/recorder", "parameters_of", Level.OK, self.recorded, {})
-            yield Publish(DIAGNOSTICS.topic, m.Diagnostics(at.stamp_ns, (told,)))
-
-    def _answering(self, name: str) -> Any:
-        def answer(data: bool | None, number: int, at: Moment) -> Actions:
-            asked = name if data is None else f"{name} {data}"
-            self.asked.append(asked)
-            if name == START and not self.refusal:
-                said: dict[str, Any] = {"state": "STEERING", "starts": 1}
-                self.controller = dataclasses.replace(self.controller, **said)
-            if name == HOME:
-                self.device = dataclasses.replace(self.device, state="MOVING")
-            if asked in self.mute:
-                self.mute.remove(asked)
-            else:
-                yield Reply(number, not self.refusal, self.refusal or "homing" * (name == HOME))
-
-        return answer
-
-    def tell(self, state: str, step: int, reason: str = "") -> None:
-        self.controller = dataclasses.replace(
-            self.controller, state=state, step=step, insertion_m=step * 1e-3, reason=reason
-        )
+STARTED = [(CONFIRM, True), (HOME, None), ("device/enable", True), (START, None)]
+DISABLE = ("device/enable", False)
+RIG = "sim_rig"
 
 
 class Scene:
-    """The stand-in before a played rig."""
+    """The stand-in in a rig that agrees to what is called, unless it is mute."""
 
-    def __init__(self, *, mute: str = "", run: bool = True, **settings: Any) -> None:
-        self.rig = PlayedRig()
-        self.rig.mute = {mute} - {""}
-        self.operator = SimulatedOperator(SimulatedOperatorParameters(**settings))
-        self.runner = VirtualRunner([self.operator, self.rig], 1)
-        if run:
-            self.steer()
+    def __init__(self, *, refusal: str = "", mute: bool = False, **settings: Any) -> None:
+        self.operator = SimulatedOperator(SimulatedOperatorParameters(**settings), "stand_in")
+        self.refusal, self.mute = refusal, mute
+        self.now = 0.0
+        self.device = DeviceStatus(source=RIG, homed=True, state="DISABLED", simulated=True)
+        self.controller = ControllerStatus(state="IDLE", starts=0, depth_m=0.12)
+        self.asked: list[tuple[str, bool | None]] = []
+        self.holds: list[m.HoldState] = []
+        self.shown: list[Shown] = []
+        self.end: Exit | None = None
+        self.see((RIG,))
 
-    def steer(self) -> None:
-        self.runner.run(4.0)
-        self.rig.tell("STEERING", 1)
-        self.runner.run(1.0)
+    @property
+    def at(self) -> Moment:
+        return Moment(self.now, round(self.now * 1e9))
 
-    def end(self) -> tuple[int, str]:
-        assert self.runner.run(10.0)
-        ended = self.runner.exits["simulated_operator"]
-        assert not self.rig.holds or not self.rig.holds[-1].pressed
-        return ended.code, ended.text
+    def see(self, devices: tuple[str, ...]) -> None:
+        topics = {"device/status": devices, "needle/controller_status": (RIG,)}
+        services = frozenset(service for service, _ in STARTED)
+        peers = Peers(topics, {"device/hold": devices}, services, frozenset({RIG, "stand_in"}))
+        self.take(self.operator.on_peers(peers, self.at))
+
+    def take(self, actions: Iterable[Action]) -> None:
+        for action in actions:
+            match action:
+                case Publish():
+                    self.holds.append(action.message)
+                case Send():
+                    self.shown += action.batch
+                case Exit():
+                    self.end = action
+                case Call(service, data):
+                    self.asked.append((service, data))
+                    if not self.mute:
+                        answer = Answer(service, not self.refusal, self.refusal)
+                        self.take(self.operator.on_answer(answer, self.at))
+
+    def run(self, seconds: float = 1.0, **said: Any) -> None:
+        """Let the controller say something, and time pass."""
+        self.controller = dataclasses.replace(self.controller, **said)
+        rows = {row.topic: row.handler for row in self.operator.inputs}
+        for _ in range(round(seconds / 0.05)):
+            self.now += 0.05
+            self.take(rows["device/status"](self.device, self.at))
+            self.take(rows["needle/controller_status"](self.controller, self.at))
+            self.take(self.operator.timers[0].handler(self.at))
+
+
+def steered() -> Scene:
+    scene = Scene()
+    scene.run()
+    scene.run(state="STEERING", starts=1, step=1, insertion_m=0.001)
+    assert scene.asked == STARTED
+    assert scene.holds[-1].pressed
+    return scene
 
 
 def test_it_prepares_holds_until_done_releases_and_disables() -> None:
-    scene = Scene()
-    rig = scene.rig
-    assert rig.asked == STARTED
-    pressed = [hold.pressed for hold in rig.holds]
-    # A press from before it was ready would not count; then it is kept.
-    assert pressed == sorted(pressed)
-    assert (pressed[0], pressed[-1]) == (False, True)
-    assert (rig.holds[-1].source, rig.holds[-1].speed_scale) == ("simulated_operator", 1.0)
-    assert (rig.shown[-1].insertion, rig.shown[-1].depth) == (0.001, 0.12)
-    rig.tell("DONE", 120)
-    assert scene.end() == (0, "inserted 120.0 mm in 120 steps")
-    assert rig.asked == [*STARTED, DISABLE]
+    scene = Scene(mute=True)
+    scene.run(0.2)
+    # A press from before it was ready would not count.
+    assert scene.holds
+    assert not any(hold.pressed for hold in scene.holds)
+    scene.mute = False
+    scene.run(1.5)
+    scene.run(state="STEERING", starts=1, step=1, insertion_m=0.001)
+    assert scene.asked == [STARTED[0], *STARTED]
+    assert scene.holds[-1].pressed
+    assert (scene.holds[-1].source, scene.holds[-1].speed_scale) == ("stand_in", 1.0)
+    assert scene.shown[-1] == Shown(0.001, 0.12, "")
+    scene.run(state="DONE", step=120, insertion_m=0.12)
+    assert scene.end == Exit(0, "inserted 120.0 mm in 120 steps")
+    assert scene.asked[-2:] == [STARTED[-1], DISABLE]
+    assert [hold.pressed for hold in scene.holds[-3:]] == [False] * 3
 
 
 def test_a_signal_releases_and_disables_before_the_end_and_a_second_one_ends_at_once() -> None:
-    for mute in ("", DISABLE):
-        scene = Scene(mute=mute)
-        scene.runner.stop("simulated_operator")
+    for mute in (False, True):
+        scene = steered()
+        scene.mute = mute
+        scene.take(scene.operator.on_stop(scene.at))
+        assert not scene.holds[-1].pressed
+        assert scene.asked[-1] == DISABLE
         if mute:
-            scene.runner.run(0.5)
-            assert not scene.runner.exits
-            scene.runner.stop("simulated_operator")
-        assert scene.end() == (130, "interrupted")
-        assert scene.rig.asked[-1] == DISABLE
+            assert scene.end is None
+            scene.take(scene.operator.on_stop(scene.at))
+        assert scene.end == Exit(130, "interrupted")
 
 
-def test_a_fault_and_a_refusal_are_its_reason() -> None:
-    scene = Scene()
-    scene.rig.tell("FAULT", 7, "the needle is gone")
-    assert scene.end() == (1, "plane_controller FAULT: the needle is gone")
-    refused = Scene(run=False)
-    refused.rig.refusal = "the door is open"
-    code, said = refused.end()
-    assert (code, "the door is open" in said) == (2, True)
-    assert not any(hold.pressed for hold in refused.rig.holds)
-
-
-def test_answers_that_are_lost_are_asked_for_again() -> None:
-    for mute in STARTED:
-        scene = Scene(mute=mute)
-        assert not scene.rig.mute
-        assert list(dict.fromkeys(scene.rig.asked)) == STARTED
-        # That it homes or was started is seen.
-        assert scene.rig.asked.count(mute) == (1 if mute in (HOME, START) else 2)
-        assert scene.rig.holds[-1].pressed
-
-
-def test_a_real_device_is_asked_for_nothing_and_a_second_one_ends_it() -> None:
-    real = Scene(run=False)
-    real.rig.device = dataclasses.replace(real.rig.device, simulated=False)
-    code, said = real.end()
-    assert (code, "played_rig is a real device" in said) == (2, True)
-    assert (real.rig.asked, real.rig.holds) == ([], [])
-    scene, second = Scene(), PlayedRig()
-    second.name, second.services = "device_driver", ()
-    scene.runner.start(second)
-    code, said = scene.end()
-    assert (code, "more than one device" in said) == (1, True)
-    assert "device_driver" in said
+def test_what_ends_it_is_its_reason() -> None:
+    scene = steered()
+    scene.run(state="FAULT", reason="the needle is gone")
+    assert scene.end == Exit(1, "plane_controller FAULT: the needle is gone")
+    refused = Scene(refusal="the door is open")
+    refused.run(5.0)
+    assert refused.end == Exit(2, "device/confirm_needle_out was refused: the door is open")
+    assert not any(hold.pressed for hold in refused.holds)
+    scene = steered()
+    scene.see((RIG, "device_driver"))
+    scene.run()
+    assert scene.end is not None
+    assert (scene.end.code, "sim_rig, device_driver" in scene.end.text) == (1, True)
+    assert not scene.holds[-1].pressed
+    real = Scene()
+    real.device = dataclasses.replace(real.device, simulated=False)
+    real.run()
+    assert real.end is not None
+    assert (real.end.code, "sim_rig is a real device" in real.end.text) == (2, True)
+    assert (real.asked, real.holds) == ([], [])
 
 
 def test_it_waits_until_the_recorder_has_the_parameters_of_all() -> None:
-    scene = Scene(run=False, wait_for_recorder=True)
-    scene.rig.recorded = "/simulated_operator"
-    scene.runner.run(2.0)
-    assert scene.rig.asked == []
-    scene.rig.recorded = "/simulated_operator, /played_rig"
-    scene.runner.run(2.0)
-    assert scene.rig.asked == STARTED
+    scene = Scene(wait_for_recorder=True)
+    (row,) = (row for row in scene.operator.inputs if row.topic == "/diagnostics")
+    for recorded, asked in (("/stand_in", []), (f"/stand_in, /{RIG}", STARTED)):
+        told = m.Status("/recorder", "parameters_of", Level.OK, recorded)
+        scene.take(row.handler(m.Diagnostics(scene.at.stamp_ns, (told,)), scene.at))
+        scene.run()
+        assert scene.asked == asked
