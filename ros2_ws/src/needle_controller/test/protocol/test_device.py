@@ -121,6 +121,7 @@ def test_a_device_that_stops_ends_steering() -> None:
 
 def test_commands_that_never_move_end_in_a_fault_and_a_start_counts_anew() -> None:
     rig = Rig()
+    rig.steps(1)
     for _ in range(2):
         for _ in range(MOST_REFUSALS):
             assert rig.steering.state is SteeringState.STEERING
@@ -130,10 +131,12 @@ def test_commands_that_never_move_end_in_a_fault_and_a_start_counts_anew() -> No
         assert "10 commands in a row ended without motion" in logged(actions)
         assert "beyond a limit" in logged(actions)
         assert rig.start() == "steering"
-    # One that moved a little is no refusal.
-    for _ in range(2 * MOST_REFUSALS):
+    # One that moved a little is no refusal, and those before it are forgotten.
+    for _ in range(3):
         rig.run(sent(rig.expose()), part=0.01, text="aborted: slow")
-    assert rig.steering.state is SteeringState.STEERING
+        for _ in range(MOST_REFUSALS - 1):
+            rig.steering.on_result(sent(rig.expose()).stamp_ns, "aborted: no")
+        assert rig.steering.state is SteeringState.STEERING
 
 
 def test_a_person_who_lets_go_at_once_many_times_is_no_fault() -> None:

@@ -10,7 +10,6 @@ import pytest
 from needle_controller.protocol.joint_history import CONFIRMED_BY, JointSample
 from needle_controller.protocol.steering_types import Awaiting, SteeringState
 from needle_controller.protocol.tip_gate import Fault, TipMeasurement
-from needle_controller.protocol.tip_intake import SETTLED_BY
 
 from .rig import MOVING, SECOND, TICK, Rig, logged, none_sent, sent, where
 
@@ -48,14 +47,14 @@ def test_after_bad_tips_a_few_good_ones_are_enough(wrong: str) -> None:
 def test_tips_that_jumped_together_count_from_the_fourth() -> None:
     rig = Rig()
     rig.steps(10)
-    for count in range(1, SETTLED_BY):
+    for count in range(1, 4):
         assert "jumped" in logged(rig.expose(x=0.006))
         assert rig.steering.intake.refused == {Fault.JUMP: count}
     rig.run(sent(rig.expose(x=0.006)))
-    assert rig.steering.intake.refused == {Fault.JUMP: SETTLED_BY - 1}
+    assert rig.steering.intake.refused == {Fault.JUMP: 3}
     # One that is away from the others begins the count anew, and so does one that is not.
     for _ in range(2):
-        for _ in range(SETTLED_BY - 1):
+        for _ in range(3):
             assert none_sent(rig.expose(x=0.0))
         assert none_sent(rig.expose(x=0.012))
     for x in (0.0, 0.0, 0.0):
