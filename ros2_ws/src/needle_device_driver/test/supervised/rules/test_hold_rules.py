@@ -132,6 +132,7 @@ def test_hold_new_press_one_from_before_does_not_count(press_before: str) -> Non
         assert bench.supervisor.stop().success
     elif press_before == "disable":
         assert bench.enable(False).success
+        assert bench.status.hold_owner == ""
         assert bench.enable().success
     elif press_before == "fault":
         bench.supervisor.fail("test")
