@@ -297,8 +297,9 @@ def test_swapped_images_are_suspected_aloud(bench: Bench) -> None:
 
 def test_pictures_are_drawn_where_somebody_looks_and_not_for_every_pair(make: Make) -> None:
     bench = make(annotated_rate=2.0)
-    bench.pair(1)
     topic = "stereo_tracker/annotated_image"
+    bench.pair(1)
+    assert not bench.sent[topic]
     list(bench.tracker.on_peers(Peers(subscribers={topic: ("viewer",)}), Moment(0.0, 0)))
     for stamp, bench.now, pictures in ((2, 0.0, 1), (3, 0.4, 1), (4, 0.5, 2)):
         bench.pair(stamp)

@@ -28,10 +28,15 @@ def test_tip_region_and_state_are_drawn_where_they_are(
     assert measured.regions[0] is not None
     picture = annotate(left, right, measured)
     assert picture.shape[1] == 1024 + 4
-    coloured = np.ptp(picture[:384].astype(int), axis=2) > 60
+    red, green, blue = np.moveaxis(picture[:384].astype(int), 2, 0)
+    coloured, shaft = np.ptp(picture[:384], axis=2) > 60, green - np.maximum(red, blue) > 60
     for side, tip in enumerate(measured.image_tips):
         assert tip is not None
-        v, u = np.nonzero(coloured[:, side * 514 : side * 514 + 512])
+        of_view = slice(side * 514, side * 514 + 512)
+        for behind, is_shaft in ((4.0, True), (30.0, True), (-60.0, False)):
+            u, v = np.rint((tip.point - behind * tip.direction) / 2).astype(int)
+            assert shaft[:, of_view][v - 1 : v + 2, u - 1 : u + 2].any() == is_shaft
+        v, u = np.nonzero(coloured[:, of_view])
         assert np.linalg.norm([u.mean(), v.mean()] - tip.point / 2) < 20.0
     assert describe(measured).startswith("TRACKING: x ")
     assert picture[390:].any()

@@ -51,7 +51,7 @@ class Scripted:
         tip = SpatialTip(
             np.array([0.0, 0.0, 1e-3 * mm]),
             SIGMA**2 * np.eye(3),
-            np.array([math.sin(0.1), 0.0, math.cos(0.1)]),
+            np.array([math.sin(0.1), -0.2, 0.8]),
             np.eye(3),
             0.0,
             0.0,
@@ -125,7 +125,7 @@ def test_every_pair_has_its_line_and_what_cannot_be_used_is_named(
     assert not any(value for key, value in rows[0].items() if key not in ("name", "valid"))
     found = {key: float(value) for key, value in rows[1].items() if key not in ("name", "valid")}
     sigmas = {f"sigma_{axis}_m": SIGMA for axis in "xyz"}
-    place = {"x_m": 0.0, "y_m": 0.0, "z_m": 0.05, "pitch_rad": 0.1, "yaw_rad": 0.0}
+    place = {"x_m": 0.0, "y_m": 0.0, "z_m": 0.05, "pitch_rad": 0.1, "yaw_rad": math.atan(0.25)}
     assert found == pytest.approx(place | sigmas)
     said = capsys.readouterr()
     for name in ("left image_53.png", "image_51.png (left", "image_52.png (right image is 640x480"):
@@ -224,8 +224,10 @@ def test_videos_serve_too(track: Track, folder: Path) -> None:
 
 
 def test_tips_are_held_against_the_truth(track: Track, folder: Path, capsys: Out) -> None:
-    # 50 is right, 51 is 1 mm off, there is no needle in 52, and one is not told.
-    lines = ["image_50.png,0,0,0.05", "image_51.png,0,0,0.052", "image_52.png,,,"]
+    # 50 is right, 51 is 1 mm off, there is no needle in 3 and 52, and 60 is not told.
+    lines = ["image_50.png,0,0,0.05", "image_51.png,0,0,0.052", "image_52.png,,,", "image_3.png,,,"]
+    for side in ("left", "right"):
+        save(folder / side / "image_60.png", 60)
     (folder / "truth.csv").write_text(TRUTH + "\n".join(lines) + "\n")
     words = ("--truth", "truth.csv", "--json", "o.json")
     assert track(*words)[0] == 0

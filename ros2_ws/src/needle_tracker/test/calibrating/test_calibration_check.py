@@ -66,6 +66,7 @@ def test_a_turned_camera_is_found(
     size = float(np.rad2deg(found.deviations[0].size))
     assert size == pytest.approx(degrees, abs=max(0.003, 0.01 * degrees))
     assert f"{side} camera turned by" in report(found)
+    assert f"the {side} camera was turned (or moved)" in found.problems
     assert figures(found)[f"{side}_camera_turned_deg"] == pytest.approx(size)
     assert found.tip_error > LIMIT
 
@@ -90,7 +91,7 @@ def test_another_surface_or_index_is_found(
     assert [deviation.cause for deviation in found.deviations] == [cause]
     assert found.deviations[0].size == pytest.approx(off, abs=tolerance)
     assert 0.1e-3 < found.tip_error < 0.5e-3
-    assert f"{cause.replace('_', ' ')} is " in report(found)
+    assert f"{cause.replace('_', ' ')} is {'+' if off > 0 else '-'}" in report(found)
 
 
 def test_a_target_that_cannot_show_it_is_never_ok(
@@ -103,6 +104,8 @@ def test_a_target_that_cannot_show_it_is_never_ok(
         assert not found.ok
         assert "cannot show" in found.problems[-1]
         assert "cannot be seen" in report(found)
+    found = check(calibration, target(rig), 0.01e-3)
+    assert any("cannot show errors of tips below 0.0" in problem for problem in found.problems)
 
 
 def test_other_cameras_or_lenses_are_no_turned_camera(

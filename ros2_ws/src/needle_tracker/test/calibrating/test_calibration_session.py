@@ -64,7 +64,7 @@ def test_a_session_says_windows_and_what_is_held_in_the_box() -> None:
 
 
 def test_places_are_found_by_name_or_pattern_and_lie_flat_by_default() -> None:
-    session = parse_session(session_content(**{"on_17.5": FLAT, "on_18.*": FLAT}))
+    session = parse_session(session_content(**{"on_17.*": FLAT, "on_17.5": FLAT, "on_18.*": FLAT}))
     place = session.place_of("on_17.5")
     assert place is session.places["on_17.5"]
     np.testing.assert_allclose(place.T_rig_board, flat_pose([0.018, -0.04, 0.01]), atol=1e-12)

@@ -83,7 +83,7 @@ OLD = CharucoBoard(6, 4, dictionary="DICT_4X4_50", legacy=True)
 def test_the_board_that_the_images_show_is_named(
     printed: CharucoBoard, said: CharucoBoard, cure: str
 ) -> None:
-    image = board_image(printed, 20, 20)
+    image = board_image(printed, 16, 16)
     assert not len(said.find(image)[0])
     with pytest.raises(UserError, match=f"another one, give {cure} as its board"):
         check_board_seen([image], said)
