@@ -10,6 +10,7 @@ from reference.rig_nodes import executables
 HELP = Path(__file__).resolve().parent / "help"
 CHANGED = {
     "scripts_console": "the rig is in one process, cameras and tracker in a second one",
+    "scripts_train_needle_map": "what draws its patches is in needle_bringup",
     "scripts_simulate": "the run is in one process: --graph runs the nodes, --component adds one",
 }
 """Commands whose text differs from the frozen one, and why."""

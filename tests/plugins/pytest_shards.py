@@ -59,6 +59,8 @@ def pytest_runtestloop(session: pytest.Session) -> object:
         for part in compile_ahead.PARTS.values():
             part()
         _budget.is_enforced = True
+    # The first look at it empties it: that must not be a shard's.
+    session.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
     files = _by_file(session.items)
     smoke = [item for file in files if file.startswith(SMOKE) for item in files[file]]
     others = sorted(

@@ -23,7 +23,6 @@ import latency_rig
 import needle_tracker
 from campaign.trials.steered_needle import FRAME_RATE, OFFSET, steer
 from campaign.trials.trial_processes import TrialProcesses
-from scenario.virtual_rig import Held
 from needle_analysis.run.stage_timing import stage_timings
 from needle_bags.reading.bag_reader import read_run
 from needle_bringup.simulation.rig_configuration import GRAPH_WATCHDOG, can_adapter
@@ -34,6 +33,7 @@ from needle_core.settings.parameter_files import Parameters
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.sensors import TipSensor
+from scenario.virtual_rig import Held
 
 CALIBRATION = Path(needle_tracker.__file__).resolve().parents[1] / "config" / "calibration.yaml"
 FRAME = 1.0 / FRAME_RATE
