@@ -41,6 +41,11 @@ class Layer:
 
 
 LAYERS = (
+    Layer(
+        "sequences",
+        re.compile(r"ros2_ws/src/(needle_tracker/test/(tracking|calibrating)|.*/test_vision)"),
+        2.0,
+    ),
     Layer("unit and component", re.compile(r"ros2_ws/src/"), 0.3),
     Layer("scenario", re.compile(r"tests/scenario/"), 20.0),
     Layer("smoke", re.compile(r"tests/smoke/"), 60.0),

@@ -36,8 +36,9 @@ def _handlers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
     monkeypatch.setattr(os, "_exit", leave)
     before = {number: signal.getsignal(number) for number in ENDING_SIGNALS}
-    # A shell's background, where tests may run, ignores SIGINT.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    # A shell's background, where tests may run, ignores SIGINT, and nohup SIGHUP.
+    for number in ENDING_SIGNALS:
+        signal.signal(number, signal.default_int_handler)
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
