@@ -1,4 +1,4 @@
-"""The campaign runs when it is asked for: `pytest -m campaign`, or `scripts/verify`."""
+"""The campaign runs when it is asked for: `scripts/test -m campaign`, or `scripts/verify`."""
 
 from __future__ import annotations
 

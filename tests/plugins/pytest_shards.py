@@ -1,8 +1,8 @@
 """A pytest plugin of scripts/test: collect once, run on all cores, hold each test to its budget.
 
 The process that collected forks one shard per core. The shards take test files from one pipe, the
-longest ones first, and send their reports back. Smoke tests start real nodes: they run at the end,
-one after the other, with nothing beside them.
+longest ones first, and send their reports back. Smoke tests and the campaign start real nodes: they
+run at the end, one after the other, with nothing beside them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from needle_core.process.ros_domain import own_domain
 SHARDS = os.cpu_count() or 1
 # What takes longest is begun first, or one of them would hold up the end of the run.
 LONG = re.compile(r"tests/(static|scenario)/|.*/test/(tracking|studies|curvature)/")
-SMOKE = "tests/smoke/"
+ALONE = ("tests/smoke/", "tests/campaign/")
 WHOLE = 1000
 """With more tests than this, a run is one of all."""
 _INDEX_BYTES = 4
@@ -51,7 +51,7 @@ def pytest_unconfigure() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtestloop(session: pytest.Session) -> object:
-    """Run the collected tests: in shards, smoke tests afterwards."""
+    """Run the collected tests: in shards, then those that must be alone."""
     if session.config.option.collectonly or session.testsfailed:
         return None
     if len(session.items) > WHOLE:
@@ -62,13 +62,13 @@ def pytest_runtestloop(session: pytest.Session) -> object:
     # The first look at it empties it: that must not be a shard's.
     session.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
     files = _by_file(session.items)
-    smoke = [item for file in files if file.startswith(SMOKE) for item in files[file]]
+    alone = [item for file in files if file.startswith(ALONE) for item in files[file]]
     others = sorted(
-        (items for file, items in files.items() if not file.startswith(SMOKE)),
+        (items for file, items in files.items() if not file.startswith(ALONE)),
         key=lambda items: LONG.match(items[0].nodeid) is None,
     )
     _run_in_shards(session, others)
-    _run_all(session, iter(smoke))
+    _run_all(session, iter(alone))
     return True
 
 

@@ -355,4 +355,4 @@ MENDED = {
         "no_motion_by_another", _set(HoldWitness, lose_device=lambda *_: None)
     ),
 }
-"""By the schedule, in test/soak/schedules, that found them."""
+"""By the schedule, in tests/scenario/tests/schedules, that found them."""
