@@ -43,7 +43,9 @@ class Layer:
 LAYERS = (
     Layer(
         "sequences",
-        re.compile(r"ros2_ws/src/(needle_tracker/test/(tracking|calibrating)|.*/test_vision)"),
+        re.compile(
+            r"ros2_ws/src/(needle_tracker/test/(tracking|calibrating|image)|.*/test_vision)"
+        ),
         2.0,
     ),
     Layer("unit and component", re.compile(r"ros2_ws/src/"), 0.3),

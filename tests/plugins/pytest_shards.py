@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import io
 import multiprocessing
 import os
 import re
@@ -22,6 +23,7 @@ import pytest
 import compile_ahead
 from cpu_budget import CpuBudget
 from left_processes import end_left_processes
+from needle_bringup.studies import monte_carlo
 from needle_core.process.ros_domain import own_domain
 
 SHARDS = os.cpu_count() or 1
@@ -55,9 +57,7 @@ def pytest_runtestloop(session: pytest.Session) -> object:
     if session.config.option.collectonly or session.testsfailed:
         return None
     if len(session.items) > WHOLE:
-        # What a process has to load once counts to no test, and is loaded once for all shards.
-        for part in compile_ahead.PARTS.values():
-            part()
+        _warm_up()
         _budget.is_enforced = True
     # The first look at it empties it: that must not be a shard's.
     session.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
@@ -79,6 +79,16 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
         if reporter is not None:
             reporter.write_line(f"FAILED process left behind: {line}", red=True)
+
+
+def _warm_up() -> None:
+    """Load compiled code, or compile it: that counts to no test, and is done for all shards."""
+    for part in compile_ahead.PARTS.values():
+        part()
+    troubled = ["--targets", "2", "--depth-mm", "2", "--play-deg", "10", "--lag-mm", "5"]
+    with contextlib.redirect_stdout(io.StringIO()):
+        for law in ("best", "rrt"):
+            monte_carlo.main(["--controller", law, *troubled])
 
 
 class _Sender:

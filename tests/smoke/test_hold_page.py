@@ -113,17 +113,6 @@ def test_mouse_space_bar_and_finger_hold_until_they_are_let_go(scene: Scene) -> 
     scene.ends(scene.hold_touch, tab.touch)
 
 
-def test_the_speed_is_what_was_set_last_and_is_one(scene: Scene) -> None:
-    scene.hold_pointer()
-    assert scene.states[-1].speed == 1.0
-    scene.tab.run("needleHold.setSpeed(0.25); needleHold.setSpeed(NaN); needleHold.setSpeed(2)")
-    scene.hold_pointer()
-    assert scene.states[-1].speed == 0.25
-    scene.tab.run("needleHold.setSpeed(1)")
-    scene.tab.release_pointer(*BUTTON)
-    scene.until_released()
-
-
 def test_a_second_finger_or_button_or_key_ends_a_hold(scene: Scene) -> None:
     tab = scene.tab
     scene.ends(scene.hold_touch, lambda: tab.touch(BUTTON, ELSEWHERE))

@@ -47,7 +47,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         [sys.executable, "-m", "docs_site.build", "--out", out],
         env={
             **os.environ,
-            "PYTHONPATH": f"{TOOLS}:{ROOT / 'scripts/lib'}:{os.environ['PYTHONPATH']}",
+            "PYTHONPATH": os.pathsep.join(
+                [*map(str, (TOOLS, ROOT / "scripts/lib", ROOT / "tests")), os.environ["PYTHONPATH"]]
+            ),
         },
         capture_output=True,
         text=True,

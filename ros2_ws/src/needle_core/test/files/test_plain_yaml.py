@@ -14,7 +14,7 @@ from needle_core.files.plain_yaml import load_plain, read_yaml
 
 KEYS = st.text("ab1", min_size=1, max_size=2)
 VALUES = st.recursive(
-    st.none() | st.integers() | st.text(max_size=3),
+    st.none() | st.integers() | st.text("a1 :-#'\n\u00e9", max_size=3),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=3),
     max_leaves=12,
 )
