@@ -208,6 +208,14 @@ def recording() -> Iterator[Row]:
         yield Row("recording", what, "s", size / speeds.recorder, against, size / speed)
 
 
+def reception() -> Iterator[Row]:
+    """Stereo images at 2 x 30 Hz over DDS, and what they cost the recorder."""
+    found = recording_benchmark.reception()
+    against = "a bare subscriber"
+    yield Row("stereo_received", "stereo recorded", "%", found["recorded"], against, found["heard"])
+    yield Row("recorder_core", "recorder, share of a core", "%", found["core"], "one core", 100.0)
+
+
 def latency() -> Iterator[Row]:
     """From both images to the set-points made from them, recorder and console running."""
     for stage, (median, worst) in latency_benchmark.measure().items():
@@ -223,6 +231,7 @@ BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
     "memory": memory,
     "tracker": tracker,
     "recording": recording,
+    "reception": reception,
     "drives": drives,
     "latency": latency,
 }

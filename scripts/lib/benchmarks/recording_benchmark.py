@@ -14,11 +14,13 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from campaign.trials.recording_trials import record_full_rate
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.recording.allocator import keep_freed_memory
 from needle_core.files.bag_topic import BagTopic
 
 EXPOSURES = 150
+SECONDS = 20.0
 SMALL_EACH = 10
 _IMAGE = "sensor_msgs/msg/Image"
 _SMALL = "sensor_msgs/msg/JointState"
@@ -107,3 +109,23 @@ def _write_plainly(path: Path, messages: Iterator[Message]) -> None:
     with (path / "data").open("wb") as stream:
         for _, _, data in messages:
             stream.write(data)
+
+
+def reception() -> dict[str, float]:
+    """Record stereo images at 2 x 30 Hz with all that goes with them, over DDS.
+
+    Returns
+    -------
+    dict
+        Shares [%]: `recorded` and `heard` of the images, by the recorder and by a bare subscriber
+        with the tracker's quality of service; `core`, of a core, what the recorder takes.
+    """
+    with tempfile.TemporaryDirectory(prefix="needle_bench_") as folder:
+        found = record_full_rate(Path(folder), SECONDS, others=0)
+    images = 2 * 30.0 * SECONDS
+    lost = sum(found["missing"].get(f"/stereo/{side}/image_raw", 0) for side in ("left", "right"))
+    return {
+        "recorded": 100.0 * (1.0 - lost / images),
+        "heard": 100.0 * (1.0 - found["unheard"] / images),
+        "core": 100.0 * found["share"],
+    }

@@ -61,6 +61,8 @@ def main(duration: float, *, images: bool) -> None:
         for publisher in publishers
     ):
         time.sleep(0.05)
+    # Others that listen, too, have the time that discovery takes.
+    time.sleep(1.0)
     begin = time.monotonic()
     while (elapsed := time.monotonic() - begin) < duration:
         for number, (_, _, rate, _) in enumerate(chosen):
