@@ -1,0 +1,98 @@
+"""README's nodes by hand: they steer in whatever order they start, and after one was killed."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import random
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag2 import Reader
+
+from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
+from needle_core.files.installed import find_executable
+from needle_core.process.ros_domain import own_domain
+
+PATIENCE = 120.0  # [s]
+LEASE = 9.0  # [s]
+STAND_IN = "simulated_operator"
+NODES = {
+    "sim_rig": ("needle_sim", ("-p", "level:=tip", "-p", "seed:=1")),
+    "plane_controller": ("needle_controller", ("-p", "depth:=0.006")),
+    "recorder": ("needle_bags", ("-p", "bag:={bag}")),
+    STAND_IN: ("needle_bringup", ("-p", "wait_for_recorder:=true")),
+}
+ORDERS = random.Random(1).sample(list(itertools.permutations(NODES)), 6)
+
+
+class Hand:
+    """Starts nodes as somebody does in terminals."""
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.bag = folder / "bag"
+        self._folder, self._domain = folder, domain
+        self.nodes: dict[str, NodeProcess] = {}
+
+    def start(self, name: str) -> None:
+        """Start a node, or start it again."""
+        package, words = NODES[name]
+        self.nodes[name] = NodeProcess(
+            name,
+            [find_executable(package, name), "--ros-args"]
+            + [word.format(bag=self.bag) for word in words],
+            environment={**os.environ, "ROS_DOMAIN_ID": str(self._domain)},
+            log=self._folder / f"{name}.log",
+        )
+
+    def has_steered(self) -> bool:
+        """Return whether the stand-in ends, having inserted the needle."""
+        return wait_for([self.nodes[STAND_IN]], PATIENCE) == [] and (
+            self.nodes[STAND_IN].exit_code == 0
+        )
+
+
+@contextmanager
+def hand_at(folder: Path) -> Iterator[Hand]:
+    with own_domain() as domain:
+        hand = Hand(folder, domain)
+        try:
+            yield hand
+        finally:
+            stop(hand.nodes.values())
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("order", ORDERS, ids=" ".join)
+def test_nodes_steer_in_any_order(order: tuple[str, ...], tmp_path: Path) -> None:
+    with hand_at(tmp_path) as hand:
+        for name in order:
+            hand.start(name)
+            time.sleep(2.0)
+        assert hand.has_steered(), hand.nodes[STAND_IN].tail(5)
+        assert stop([hand.nodes["recorder"]]) == []
+    with Reader(hand.bag) as reader:
+        counts = {topic: info.msgcount for topic, info in reader.topics.items()}
+    # 6 steps, and a tip before the first.
+    assert counts["/device/result"] >= 6
+    assert counts["/needle/tip"] >= 7
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("victim", ["sim_rig", "plane_controller"])
+def test_nodes_steer_after_one_was_killed_and_started_again(victim: str, tmp_path: Path) -> None:
+    with hand_at(tmp_path) as hand:
+        for name in ("sim_rig", "plane_controller", "recorder"):
+            hand.start(name)
+        time.sleep(3.0)
+        hand.nodes[victim].signal_group(signal.SIGKILL)
+        assert wait_for([hand.nodes[victim]], PATIENCE) == []
+        hand.start(victim)
+        # The driver counts a killed sender of commands for as long (docs/safety.md).
+        time.sleep(LEASE)
+        hand.start(STAND_IN)
+        assert hand.has_steered(), hand.nodes[STAND_IN].tail(5)
