@@ -42,9 +42,10 @@ class Layer:
 
 LAYERS = (
     Layer(
-        "sequences",
+        "sequences and studies",
         re.compile(
-            r"ros2_ws/src/(needle_tracker/test/(tracking|calibrating|image)|.*/test_vision)"
+            r"ros2_ws/src/"
+            r"(needle_tracker/test/(tracking|calibrating|image)|.*/test/studies|.*/test_vision)"
         ),
         2.0,
     ),
