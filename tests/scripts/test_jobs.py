@@ -9,7 +9,7 @@ import pytest
 
 JOBS = Path(__file__).parents[2] / "scripts" / "lib" / "jobs.sh"
 SCRIPT = """
-. {jobs}
+. '{jobs}'
 run bash -c 'echo $$; exec sleep 1000'
 echo not reached
 """
@@ -35,7 +35,7 @@ def test_a_signal_ends_script_and_child(number: signal.Signals) -> None:
 
 
 def test_the_exit_code_of_a_command_comes_through() -> None:
-    words = ["bash", "-c", f". {JOBS}; run false; echo $code; run true; echo $code"]
+    words = ["bash", "-c", f". '{JOBS}'; run false; echo $code; run true; echo $code"]
     assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "1\n0\n"
 
 
