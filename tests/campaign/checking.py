@@ -9,6 +9,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -207,6 +208,19 @@ def in_own_process(function: Callable[..., T], *arguments: object) -> T:
     """Call a function in a fresh process: it may start ROS, or move into another network."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result()
+
+
+@contextlib.contextmanager
+def busy(count: int) -> Iterator[None]:
+    """Keep the processors busy with so many processes."""
+    idle = [sys.executable, "-c", "while True: pass"]
+    processes = [subprocess.Popen(idle) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:

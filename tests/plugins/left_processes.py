@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
-from pathlib import Path
 
-RUN = os.environ.get("NEEDLE_TEST_RUN", "")
+from needle_bringup.descendants import processes_with
+
+NAME = "NEEDLE_TEST_RUN"
+RUN = os.environ.get(NAME, "")
 # What was just told to end may need a moment [s].
 PATIENCE = 2.0
 
@@ -15,30 +18,20 @@ PATIENCE = 2.0
 def end_left_processes() -> list[str]:
     """End what this run started and did not end; return a line for each."""
     until = time.monotonic() + PATIENCE
-    while (left := _processes_of_run()) and time.monotonic() < until:
+    while (left := _left()) and time.monotonic() < until:
         time.sleep(0.05)
-    for process in left:
-        try:
+    for process, _ in left:
+        with contextlib.suppress(ProcessLookupError):
             os.kill(process, signal.SIGKILL)
-        except ProcessLookupError:
-            continue
-    return [f"{process} {command}" for process, command in left.items()]
+    return [f"{process} {command}" for process, command in left]
 
 
-def _processes_of_run() -> dict[int, str]:
-    found: dict[int, str] = {}
+def _left() -> list[tuple[int, str]]:
+    """Return (pid, command) of what still runs; a zombie has no command, and is left out."""
     if not RUN:
-        return found
-    mark = f"NEEDLE_TEST_RUN={RUN}".encode()
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            if int(folder.name) == os.getpid() or mark not in (
-                (folder / "environ").read_bytes().split(b"\0")
-            ):
-                continue
-            command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
-        except OSError:
-            continue
-        if command:
-            found[int(folder.name)] = command
-    return found
+        return []
+    return [
+        (process, command)
+        for process, command in processes_with(NAME, RUN)
+        if process != os.getpid() and command
+    ]

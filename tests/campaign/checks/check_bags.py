@@ -13,10 +13,10 @@ from typing import Any
 
 from rosbags.typesys import Stores, get_typestore
 
-from campaign.checking import Check, Finding, Workbench, payloads, unreadable
+from campaign.checking import Check, Finding, Workbench, busy, payloads, unreadable
 from campaign.trials.recording_trials import record_and_kill, record_full_rate, recorder
 from campaign.trials.signal_trials import signal_trials
-from needle_bringup.descendants import busy, ran
+from needle_bringup.descendants import ran
 
 DURATION = 60.0
 MOMENTS = 25

@@ -10,9 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from campaign.checking import unreadable
+from campaign.checking import busy, unreadable
 from campaign.trials.trial_processes import TrialProcesses
-from needle_bringup.descendants import busy
 from needle_bringup.simulation.node_process import NodeProcess
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_bringup.simulation.simulate_options import SimulateOptions

@@ -159,7 +159,7 @@ def _homing_takes_for_ever(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(HomingTimes, "count", lambda *_: "")
 
 
-def _axes_part(patch: pytest.MonkeyPatch) -> None:
+def _axes_drift_apart(patch: pytest.MonkeyPatch) -> None:
     _motion_unwatched(patch)
     _faults_unheard(patch)
 
@@ -188,7 +188,7 @@ BUGS: dict[str, Plant] = {
     "max_rotation_rate": _any_bounds,
     "max_turns": _any_bounds,
     "coordinated": _rotation_comes_late,
-    "following_error": _axes_part,
+    "following_error": _axes_drift_apart,
     "retraction": _set(DeviceCore, way_out=property(lambda _: 0.0)),
     "unhomed_outward_only": _set(RetractionBound, target=lambda _, at: at.position),
     "homing_needle_out": _homing_needs_no_word,

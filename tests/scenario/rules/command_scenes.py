@@ -141,13 +141,7 @@ def command_newer() -> None:
     scene.ready()
     stamp = scene.send(((0.001, 0.0), 0.5))
     scene.until(lambda: stamp in scene.hand.results, "the step")
-    scene.hand.actions.append(
-        Publish(
-            COMMANDS.topic,
-            m.Trajectory(stamp, scene.joints, (m.TrajectoryPoint((0.002, 0.0), 0.5),)),
-        )
-    )
-    scene.runner.run(0.1)
+    scene.send(((0.002, 0.0), 0.5), stamp=stamp)
     assert scene.refuses(Rule.COMMAND_NEWER)
 
 

@@ -28,6 +28,8 @@ from scenario.virtual_rig import DRIVER, Held, VirtualRig
 
 JOINTS = (m.INSERTION_JOINT, m.ROTATION_JOINT)
 AXES = ("insertion", "rotation")
+HEARTBEAT = 0x700 + 127
+"""COB-ID of the computer's heartbeat."""
 AT_REST = (1e-6, 1e-4)
 """What motors at rest may still move [m], [rad]: counts of their encoders."""
 
@@ -85,9 +87,9 @@ class Scene(VirtualRig):
     ----------
     bus_says : list of CanFrame
         What somebody else puts on the bus, in the drives' next batch.
+    heartbeats : int
+        The computer's, so far.
     """
-
-    joints = JOINTS
 
     def __init__(
         self,
@@ -103,7 +105,7 @@ class Scene(VirtualRig):
     def _see_frames(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
         if link.topic == CAN:
             if link.sender == DRIVER:
-                self.heartbeats += sum(frame.identifier == 0x77F for frame in message)
+                self.heartbeats += sum(frame.identifier == HEARTBEAT for frame in message)
             else:
                 message, self.bus_says = (*message, *self.bus_says), []
         return (Arrival(0.0, message),)
@@ -122,9 +124,15 @@ class Scene(VirtualRig):
         self.runner.run(0.1)
         return stamp
 
-    def send(self, *points: tuple[tuple[float, ...], float], age: float = 0.0) -> int:
-        """Send a command with these points and times, its stamp so old [s]."""
-        stamp = self.runner.timeline.stamp_ns - round(age * 1e9)
+    def send(
+        self,
+        *points: tuple[tuple[float, ...], float],
+        age: float = 0.0,
+        stamp: int | None = None,
+    ) -> int:
+        """Send a command with these points and times, its stamp given [ns] or so old [s]."""
+        if stamp is None:
+            stamp = self.runner.timeline.stamp_ns - round(age * 1e9)
         way = tuple(m.TrajectoryPoint(place, time) for place, time in points)
         self.hand.actions.append(Publish(COMMANDS.topic, m.Trajectory(stamp, JOINTS, way)))
         self.runner.run(0.1)

@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,19 +31,6 @@ def processes_with(name: str, value: str) -> list[tuple[int, str]]:
         except OSError:
             continue  # ended meanwhile, or another user's
     return found
-
-
-@contextlib.contextmanager
-def busy(count: int) -> Iterator[None]:
-    """Keep the processors busy with so many processes."""
-    idle = [sys.executable, "-c", "while True: pass"]
-    processes = [subprocess.Popen(idle) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
 
 
 def ran(

@@ -4,37 +4,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drawn_needles import arc, cover_line, draw_line, tracker_settings
-from needle_tracker.optics.calibration import StereoCalibration, load_calibration
-from needle_tracker.optics.refraction import RefractedCamera, stereo_views
-from needle_tracker.tracking.tracker_settings import TrackerSettings
+from drawn_needles import cover_line
+from needle_tracker.optics.refraction import RefractedCamera
+from tracker_fixtures import calibration, calibration_path, make_arc, make_line, settings, views
 
-CALIBRATION = Path(__file__).parents[1] / "config" / "calibration.yaml"
-
-
-@pytest.fixture(scope="session")
-def calibration_path() -> Path:
-    return CALIBRATION
-
-
-@pytest.fixture(scope="session")
-def calibration() -> StereoCalibration:
-    return load_calibration(CALIBRATION)
-
-
-@pytest.fixture(scope="session")
-def views(calibration: StereoCalibration) -> tuple[RefractedCamera, RefractedCamera]:
-    return stereo_views(calibration)
-
-
-@pytest.fixture
-def settings(calibration: StereoCalibration) -> TrackerSettings:
-    return tracker_settings(calibration)
+__all__ = ["calibration", "calibration_path", "make_arc", "make_line", "settings", "views"]
 
 
 def _light_and_dark(view: RefractedCamera) -> tuple[np.ndarray, np.ndarray]:
@@ -79,13 +57,3 @@ def draw_pair(views: tuple[RefractedCamera, RefractedCamera]) -> Drawer:
         return images[0], images[1]
 
     return draw
-
-
-@pytest.fixture(scope="session")
-def make_arc() -> Callable[..., np.ndarray]:
-    return arc
-
-
-@pytest.fixture(scope="session")
-def make_line() -> Callable[..., np.ndarray]:
-    return draw_line

@@ -1,0 +1,47 @@
+"""Fixtures of tests of the tracker: the rig, and needles to draw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drawn_needles import arc, draw_line, tracker_settings
+from needle_core.files.installed import find_shared
+from needle_tracker.optics.calibration import StereoCalibration, load_calibration
+from needle_tracker.optics.refraction import RefractedCamera, stereo_views
+from needle_tracker.tracking.tracker_settings import TrackerSettings
+
+__all__ = ["calibration", "calibration_path", "make_arc", "make_line", "settings", "views"]
+
+
+@pytest.fixture(scope="session")
+def calibration_path() -> Path:
+    return find_shared("needle_tracker", "config/calibration.yaml")
+
+
+@pytest.fixture(scope="session")
+def calibration(calibration_path: Path) -> StereoCalibration:
+    return load_calibration(calibration_path)
+
+
+@pytest.fixture(scope="session")
+def views(calibration: StereoCalibration) -> tuple[RefractedCamera, RefractedCamera]:
+    return stereo_views(calibration)
+
+
+@pytest.fixture
+def settings(calibration: StereoCalibration) -> TrackerSettings:
+    return tracker_settings(calibration)
+
+
+@pytest.fixture(scope="session")
+def make_arc() -> Callable[..., np.ndarray]:
+    return arc
+
+
+@pytest.fixture(scope="session")
+def make_line() -> Callable[..., np.ndarray]:
+    return draw_line
