@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from needle_bringup.training import traced_scenes
-from needle_bringup.training.floors import floor
+from needle_bringup.training.floors import clutter, floor
 from needle_bringup.training.needle_ends import Pose, draw_needle, draw_shadow, true_map
 from needle_bringup.training.patches import SIZE, patch
 from needle_bringup.training.traced_patches import BORDER, new_part, traced_patch
@@ -46,6 +46,14 @@ def test_floors_differ_and_are_never_black() -> None:
     assert min(each.min() for each in floors) >= 2.0
     assert max(each.max() for each in floors) <= 255.0
     assert np.std([each.mean() for each in floors]) > 30.0
+
+
+def test_clutter_lies_over_a_part_of_most_images_and_over_none_of_some() -> None:
+    ground = np.full((SIZE, SIZE), 120.0, np.float32)
+    seen = [clutter(np.random.default_rng(i), ground) for i in range(30)]
+    covered = np.array([np.mean(np.abs(each - ground) > 1.0) for each in seen])
+    assert 0.5 < np.mean(covered > 0.0) < 1.0
+    assert covered.max() < 0.5
 
 
 def test_patches_repeat_by_their_seed() -> None:
