@@ -128,6 +128,21 @@ def test_quick_stop_a_drive_that_ignores_the_stop_of_a_fault_is_told_too() -> No
     assert bench.status.fault == f"{reports}; insertion axis still moving"
 
 
+def test_quick_stop_of_a_drive_that_answers_again_at_a_reset_nothing_is_told_any_more() -> None:
+    bench = DriveBench().moving()
+    bench.rotation.silent = True
+    bench.supervisor.receive_estop(True)
+    bench.wait(8)
+    assert bench.status.fault == "emergency stop; rotation axis silent"
+    bench.supervisor.receive_estop(False)
+    bench.hold(False)
+    # No cycle sees it before the reset does.
+    bench.rotation.silent, bench.rotation.state = False, "disabled"
+    assert bench.reset().success
+    bench.wait(2)
+    assert (bench.state, bench.status.fault) == ("DISABLED", "")
+
+
 # ---- watchdog and emergencies -------------------------------------------------------------------
 
 
