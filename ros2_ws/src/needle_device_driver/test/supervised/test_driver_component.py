@@ -241,6 +241,19 @@ def test_link_loss_is_a_fault_at_once_and_a_reset_opens_it_anew() -> None:
     assert bench.status.state == "DISABLED"
 
 
+def test_a_master_heard_before_the_link_broke_is_no_fault_once_it_is_opened_anew() -> None:
+    bench = DriverBench()
+    port = bench.driver.ports[0]
+    bench.drives[1].silent = True
+    bench.run(10)
+    bench.do(port.handler((CanFrame(0x000, b"\x01\x00"),), bench.at))
+    bench.do(port.on_change(PortChange("unplugged"), bench.at))
+    bench.do(port.on_change(PortChange(), bench.at))
+    bench.drives[1].silent = False
+    bench.run(40)
+    assert (bench.status.state, bench.status.fault) == ("DISABLED", "")
+
+
 @pytest.mark.parametrize("how", ["stop", "disable", "emergency stop", "silence"])
 def test_an_order_that_takes_its_time_is_called_off(how: str) -> None:
     bench = DriverBench().set_up()
