@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -74,6 +76,28 @@ def test_late_tips_are_the_same_in_another_frame() -> None:
     np.testing.assert_allclose(
         elsewhere.position, here.position @ at[:3, :3].T + at[:3, 3], atol=2e-4
     )
+
+
+def test_tips_that_are_taken_again_come_with_their_covariance_in_the_new_frame() -> None:
+    class Watched(HypothesisFilter):
+        def correct(self, tip: Any, covariance: Any = None, age: Any = 0.0) -> None:
+            taken.append(covariance)
+            super().correct(tip, covariance, age)
+
+    taken: list[Any] = []
+    at, known = np.eye(4), np.diag([1e-7, 2e-7, 3e-7])
+    at[:3, :3] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+    estimator = LateTips(Watched(FilterSettings()), np.zeros(3))
+    estimator.reset(np.zeros(3), np.zeros(2))
+    for k in range(1, 21):
+        if k == 20:
+            estimator.change_frame(at)
+        turn = at[:3, :3] if k == 20 else np.eye(3)
+        estimator.advance(STEP, 0.0)
+        estimator.correct(turn @ arc(max(k - 3, 0) * STEP), turn @ known @ turn.T)
+    assert LATE in estimator.estimate().doubts
+    assert len(taken) == 40
+    np.testing.assert_allclose(taken[20:], np.broadcast_to(np.diag([2e-7, 3e-7, 1e-7]), (20, 3, 3)))
 
 
 @pytest.mark.parametrize(
