@@ -161,6 +161,14 @@ def test_every_reason_to_refuse_a_tip_is_logged_once_in_two_seconds() -> None:
     assert bench.status.state == "WAITING_FOR_TIP"
 
 
+def test_a_reason_that_goes_on_is_logged_again_every_two_seconds() -> None:
+    bench = Bench().started()
+    for _ in range(5):
+        bench.tip(float("nan"))
+        bench.later += 1.0
+    assert sum("not finite" in line for line in bench.logs) == 3
+
+
 def test_a_tip_pose_says_the_positions_covariance() -> None:
     pose = m.PoseWithCovariance(5, "rig", (0.0, 0.0, 0.0), STRAIGHT, tuple(map(float, range(36))))
     known = tip_covariance(pose)
