@@ -17,6 +17,7 @@ from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES
 SIDES = ("left", "right")
 KINDS: dict[str, type[Any]] = {
     "needle/tip": m.Point,
+    "needle/tip_pose": m.PoseWithCovariance,
     "joint_states": m.JointState,
     "sim/tip_pose": m.Pose,
     "sim/drive_positions": m.JointState,

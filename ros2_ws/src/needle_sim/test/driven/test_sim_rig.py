@@ -71,6 +71,8 @@ def test_one_seed_repeats_and_another_differs_in_the_measurement_alone() -> None
     for tip in first.heard("needle/tip"):
         assert tip.frame_id == "rig"
         assert math.dist(tip.position, truths[tip.stamp_ns]) <= math.sqrt(3) * 1e-3
+    # Uniform within 1 mm of the truth, along each axis.
+    assert first.heard("needle/tip_pose")[-1].covariance[:15:7] == pytest.approx((1e-6 / 3.0,) * 3)
     joints = first.heard("joint_states")
     assert joints[-1].positions == pytest.approx((0.002, 0.2))
     periods = [b.stamp_ns - a.stamp_ns for a, b in itertools.pairwise(joints)]
