@@ -194,6 +194,17 @@ def test_one_page_owns_the_hold_until_it_is_gone_or_idle(scene: Scene) -> None:
     assert not scene.pressed
 
 
+def test_an_owner_that_holds_for_long_is_not_idle(scene: Scene) -> None:
+    first, second = scene.page(), scene.page()
+    scene.press(first)
+    for _ in range(round(IDLE / 0.2) + 2):
+        scene.wait(0.2)
+        assert scene.say(first, True) is None
+    scene.say(second, False)
+    assert scene.say(second, True) is Refusal.BARRED
+    assert scene.pressed
+
+
 def test_a_page_is_gone_when_it_is_silent(scene: Scene, page: int) -> None:
     scene.wait(SILENCE)
     assert not scene.arbiter.is_silent(page, scene.now)
