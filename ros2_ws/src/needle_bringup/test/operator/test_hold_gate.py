@@ -62,6 +62,14 @@ def test_a_stop_is_asked_for_once_a_press_and_ends_what_is_held() -> None:
     assert [grip.held is Held.INSERT for grip in grips] == [False, True, *[False] * 5]
 
 
+def test_a_stop_that_is_pressed_when_the_source_comes_back_is_asked_for_anew() -> None:
+    gate = HoldGate()
+    pressed = Hand(stop=True)
+    readings: list[Reading] = [pressed, Lost("unplugged"), pressed, pressed]
+    grips = [gate.take(reading, CYCLE * number) for number, reading in enumerate(readings)]
+    assert [grip.stop for grip in grips] == [True, False, True, False]
+
+
 def test_who_stands_still_begins_anew_and_the_speed_is_that_of_now() -> None:
     gate = HoldGate()
     gate.take(NEUTRAL, 0.0)
