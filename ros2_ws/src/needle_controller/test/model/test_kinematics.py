@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from needle_controller.model.arc_motion import rotation_exp
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import (
     SMALLEST_STEERING,
@@ -60,6 +61,12 @@ def test_rotations_are_those_of_intrinsic_xyz_angles_and_of_quaternions() -> Non
     np.testing.assert_allclose(
         rotation_from_quaternion(expected.as_quat()), expected.as_matrix(), atol=1e-14
     )
+
+
+def test_a_turn_is_as_exact_where_it_is_small() -> None:
+    vectors = np.outer([0.0, 1e-4, 0.05, 0.0999, 0.1001, 1.0], [2.0 / 7.0, -3.0 / 7.0, 6.0 / 7.0])
+    expected = Rotation.from_rotvec(vectors).as_matrix()
+    np.testing.assert_allclose(rotation_exp(vectors), expected, rtol=0.0, atol=1e-14)
 
 
 def test_coordinate_rates_are_the_flow_on_se3() -> None:
