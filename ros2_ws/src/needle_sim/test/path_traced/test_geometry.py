@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from needle_sim.camera.projection import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
+from needle_sim.path_traced import insertion
 from needle_sim.path_traced.appearance import LAMPS, RANDOM, draw_appearance
 from needle_sim.path_traced.block import backdrop, refractive_index
 from needle_sim.path_traced.floors import FloorPicture
@@ -111,6 +114,31 @@ def test_the_mesh_is_as_thick_as_it_says_and_ends_where_it_says(hollow: bool) ->
     corners = shaft.points[shaft.faces]
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.einsum("ij,ij->i", outward, shaft.normals[shaft.faces[:, 0]]) > -1e-14).all()
+
+
+def test_an_insertion_is_the_empty_phantom_then_a_needle_that_stops_at_its_depth(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Blank:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def render(self, *_: object) -> tuple[np.ndarray, np.ndarray]:
+            return np.zeros((3, 4), np.uint8), np.zeros((3, 4), np.uint8)
+
+    monkeypatch.setattr(insertion, "PathTracedRenderer", Blank)
+    look = dataclasses.replace(draw_appearance("oxide_on_grey", 3), lag=0.0)
+    way: dict[str, Any] = {"frames": 4, "depth": 0.05, "step": 0.02, "begin": 0.01}
+    pairs = list(insertion.trace_insertion(None, RIG, look, **way, empty_first=True))  # type: ignore[arg-type]
+    assert [pair.number for pair in pairs] == [0, 1, 2, 3, 4]
+    assert (pairs[0].truth, pairs[0].meshes, pairs[0].share_seen) == (None, None, (0.0, 0.0))
+    assert [pair.insertion for pair in pairs] == pytest.approx([0.0, 0.01, 0.03, 0.05, 0.05])
+    for pair in pairs[1:]:
+        assert pair.truth is not None
+        assert pair.meshes is not None
+        inside = pair.meshes[0].line[pair.meshes[0].line[:, 2] > 0.0]
+        length = np.linalg.norm(np.diff(inside, axis=0), axis=1).sum()
+        assert length == pytest.approx(pair.insertion, abs=1e-3)
 
 
 def test_a_box_stands_before_what_is_behind_it(boxes: list[StereoRig]) -> None:
