@@ -22,8 +22,8 @@ from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.studies.disturbances import Disturbances
 from needle_sim.studies.study import StudySettings, run_study
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
-from needle_tracker.tracking.tip_tracker import TipTracker
 
 CALIBRATION = (
     Path(__file__).resolve().parents[2] / "ros2_ws/src/needle_tracker/config/calibration.yaml"
@@ -50,7 +50,7 @@ def tracker() -> None:
     settings = StereoTrackerParameters().tracker_settings(calibration)
     rig = load_stereo_rig(CALIBRATION)
     for known in (True, False):
-        stereo = TipTracker(calibration, settings)
+        stereo = NeedleTracker(calibration, settings)
         stereo.warm_up()
         for pair in render_insertion(rig, CLEAN, seed=1, frames=14):
             stereo.process(*pair.images, pair.insertion if known else None)

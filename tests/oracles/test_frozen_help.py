@@ -11,6 +11,7 @@ HELP = Path(__file__).resolve().parent / "help"
 CHANGED = {
     "scripts_console": "the rig is in one process, cameras and tracker in a second one",
     "scripts_train_needle_map": "what draws its patches is in needle_bringup",
+    "track_images": "one tracker in place of two: other rules, no searched region",
     "scripts_simulate": "the run is in one process: --graph runs the nodes, --component adds one",
 }
 """Commands whose text differs from the frozen one, and why."""

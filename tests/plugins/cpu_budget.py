@@ -45,7 +45,7 @@ LAYERS = (
         "sequences and studies",
         re.compile(
             r"ros2_ws/src/"
-            r"(needle_tracker/test/(tracking|calibrating|image)|.*/test/studies|.*/test_vision)"
+            r"(needle_tracker/test/(filter|calibrating)|.*/test/studies|.*/test_vision)"
         ),
         2.0,
     ),

@@ -7,39 +7,24 @@ import math
 
 import numpy as np
 
-from needle_tracker.image.search_grid import Reach
+from needle_tracker.detector.reach import Reach
+from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.tracking.gates import GateSettings
-from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 
 def tracker_settings(calibration: StereoCalibration) -> TrackerSettings:
-    """Return settings for the needles drawn here: wide ones are believed, too."""
-    reach = Reach(curvature=9.0, entry_angle=math.radians(10), hole_tolerance=0.5e-3, length=0.15)
-    gates = GateSettings(
-        reach=reach,
-        windows=(calibration.left.window, calibration.right.window),
-        least_distance=4e-3,
-        tip_lean=math.radians(12),
-        insertion_margin=2e-3,
-        step_margin=1.5e-3,
-        free_step=5e-3,
-        max_disagreement=1.5e-3,
-        max_miss_px=1.0,
-        max_depth_sigma=2e-3,
-        confirm_pairs=3,
-        lost_after=3,
-        forget_after=30,
-    )
+    """Return settings for the needles drawn here."""
     return TrackerSettings(
-        gates=gates,
+        reach=Reach(
+            curvature=9.0, entry_angle=math.radians(10), hole_tolerance=0.5e-3, length=0.15
+        ),
+        windows=(calibration.left.window, calibration.right.window),
         needle_width=0.7e-3,
-        bevel_length=0.0,
-        bright=False,
-        min_contrast=10.0,
-        noise_factor=5.0,
+        tip_lean=math.radians(12),
         entry_zone=5e-3,
         hole_clearance=2e-3,
+        stage_zero_sigma=0.5e-3,
+        stage_scale_sigma=0.01,
     )
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from drawn_needles import arc, draw_line, tracker_settings
 from needle_core.files.installed import find_shared
+from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
 from needle_tracker.optics.refraction import RefractedCamera, stereo_views
-from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 __all__ = ["calibration", "calibration_path", "make_arc", "make_line", "settings", "views"]
 

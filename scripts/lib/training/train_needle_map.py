@@ -1,111 +1,59 @@
-"""Train the net that draws needle maps; scripts/train_needle_map runs this.
+"""Train the net that sees needles: which pixels are shaft, and where the shaft ends.
 
-Patches are drawn at random, or cut from scenes that are path-traced at random, by
-needle_bringup.training. What comes out depends a little on the machine: another run gives
-another net, about as good.
+Scenes are path-traced at random, then samples are cut from them and others are drawn, and the net
+learns from both. Everything is kept in the folder of the run: called again with --resume, it goes
+on where it was ended, be it by a signal. On two cores it takes some four hours: half of that for
+140 scenes, half for the training.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
+import multiprocessing
 import sys
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
+import time
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
 
+import cv2
 import numpy as np
-import onnx
-import torch
-from numpy.typing import NDArray
-from torch import nn
-from torch.nn import functional
 from tqdm import tqdm
 
-from needle_bringup.training.patches import SIZE, patch
-from needle_bringup.training.traced_patches import BORDER, traced_patch
-from needle_bringup.training.traced_scenes import TracedScene, trace_scene
+from needle_bringup.training.traced_scenes import trace_scene
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_sim.path_traced.tracer import load_mitsuba
 from needle_sim.sequences.boxes import draw_box
-from needle_tracker.image.needle_map import normalized
+from net_report import report, report_views
+from sample_pool import SHARD, Pool, read_shard
+from sample_supply import read_scene, scene_paths, supply, write_validation
+from training_loop import Plan, new_run, train
+from training_net import NeedleNet
 
-Batch = tuple[NDArray[Any], NDArray[Any]]
-
-TRACKER = Path(__file__).parents[3] / "ros2_ws/src/needle_tracker"
-WEIGHTS = TRACKER / "needle_tracker/image/needle_map.onnx"
+ROOT = Path(__file__).parents[3]
+TRACKER = ROOT / "ros2_ws/src/needle_tracker"
+WEIGHTS = TRACKER / "needle_tracker/detector/needle_net.onnx"
 CALIBRATIONS = (
     TRACKER / "config/calibration.yaml",
     TRACKER / "config/calibration_top_and_side.yaml",
 )
-_CHANNELS, _FINE_CHANNELS = 16, 8
-_DILATIONS = (1, 2, 4, 8, 4, 2, 1)
-_SHARD = 256
-_TRACED_SHARE = 0.6  # of a batch
-_BATCH, _RATE, _DECAY = 16, 3e-3, 1e-4
-_RATE_ON = 1e-3  # of a net that has learned before
-_NEEDLE_WEIGHT = 4.0  # most pixels are floor
+_MINUTES = 200.0
+_POLL = 5.0  # [s]
+_EXAMPLES = """examples:
+  scripts/train_needle_map
+      all of it, from nothing; the weights replace the tracker's at the end and every 3 minutes
+      on the way there
+  scripts/train_needle_map --resume
+      what was ended, from its last checkpoint on
+  scripts/train_needle_map --scenes 12 --drawn 10 --steps 2000 --folder /tmp/try \\
+          --output /tmp/try/needle_net.onnx
+      a first try, of half an hour or so; the tracker's weights stay
+  scripts/train_needle_map --report --folder /tmp/try --output /tmp/try/needle_net.onnx
+      what that net is worth on scenes that it was not trained on
 
-
-class NeedleNet(nn.Module):
-    """A trunk at half the size that looks far around, and a head at full size for the edges."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        channels = _CHANNELS
-        self.first = nn.Conv2d(1, channels, 5, 2, 2)
-        self.trunk = nn.ModuleList(
-            nn.Conv2d(channels, channels, 3, 1, dilation, dilation) for dilation in _DILATIONS
-        )
-        self.up = nn.Conv2d(channels, 4 * _FINE_CHANNELS, 1)
-        self.fine = nn.Conv2d(1, _FINE_CHANNELS, 3, 1, 1)
-        self.last = nn.Conv2d(2 * _FINE_CHANNELS, _FINE_CHANNELS, 3, 1, 1)
-        self.out = nn.Conv2d(_FINE_CHANNELS, 1, 3, 1, 1)
-
-    def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Return the logit of being needle for each pixel of `normalized` images, (n, 1, h, w)."""
-        seen = functional.relu(self.first(image))
-        for layer in self.trunk:
-            seen = seen + functional.relu(layer(seen))
-        wide = functional.relu(functional.pixel_shuffle(self.up(seen), 2))
-        fine = functional.relu(self.fine(image))
-        return self.out(functional.relu(self.last(torch.cat([wide, fine], 1))))
-
-
-class NeedleMapNet(nn.Module):
-    """The net with chances in place of logits: what is stored."""
-
-    def __init__(self, net: NeedleNet) -> None:
-        super().__init__()
-        self.net = net
-
-    def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Return the chance of being needle for each pixel, (n, 1, h, w)."""
-        # Trained with that weight, the net takes the odds of needle for so many times too high.
-        return torch.sigmoid(self.net(image) - math.log(1.0 + _NEEDLE_WEIGHT))
-
-
-def draw_shard(number: int) -> Batch:
-    """Return drawn patches as the net sees them, and 255 times the share that is needle."""
-    drawn = [patch(np.random.default_rng([number, i])) for i in range(_SHARD)]
-    seen = np.stack([normalized(image) for image, _ in drawn]).astype(np.float16)
-    return seen, np.stack([np.rint(255.0 * share).astype(np.uint8) for _, share in drawn])
-
-
-def draw_all(shards: int) -> Batch:
-    """Return all drawn patches, by all cores."""
-    with ProcessPoolExecutor() as pool:
-        drawn = pool.map(draw_shard, range(shards))
-        parts = list(tqdm(drawn, "drawing patches", shards, unit=f"x{_SHARD}"))
-    return np.concatenate([seen for seen, _ in parts]), np.concatenate([y for _, y in parts])
-
-
-def trace_all(count: int) -> list[TracedScene]:
-    """Return path-traced scenes: on the bench, from above and beside, and in every other a box."""
-    mitsuba = load_mitsuba()
-    bar = tqdm(range(count), "tracing scenes", unit="scene")
-    return [trace_scene(mitsuba, rig_of(seed), seed) for seed in bar]
+What comes out depends a little on the machine: another run gives another net, about as good.
+Scenes whose number ends in 9 are held out for the report.
+"""
 
 
 def rig_of(seed: int) -> StereoRig:
@@ -118,91 +66,150 @@ def rig_of(seed: int) -> StereoRig:
         return load_stereo_rig(path)
 
 
-def batch(rng: np.random.Generator, drawn: Batch, scenes: list[TracedScene]) -> Batch:
-    """Return patches of both kinds, turned and mirrored at random, and 0 to 1 what is needle."""
-    seen = np.empty((_BATCH, 1, SIZE, SIZE), np.float32)
-    wanted = np.empty_like(seen)
-    traced = round(_TRACED_SHARE * _BATCH)
-    for k in range(_BATCH):
-        if k < traced:
-            image, share = traced_patch(rng, scenes[rng.integers(len(scenes))])
-            one = normalized(image)[BORDER:-BORDER, BORDER:-BORDER]
-        else:
-            i = rng.integers(len(drawn[0]))
-            one, share = drawn[0][i], drawn[1][i] / np.float32(255.0)
-        turns, mirror = int(rng.integers(4)), int(rng.choice([-1, 1]))
-        seen[k, 0] = np.rot90(one, turns)[::mirror]
-        wanted[k, 0] = np.rot90(share, turns)[::mirror]
-    return seen, wanted
+def trace_all(count: int, folder: Path) -> None:
+    """Trace scenes that are not there yet: on the bench, and in every other a box.
+
+    Parameters
+    ----------
+    count : int
+        How many there are then.
+    folder : Path
+        Where they are stored, one file each.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{seed}.npz" for seed in range(count)]
+    missing = [seed for seed, path in enumerate(paths) if not path.exists()]
+    if not missing:
+        return
+    mitsuba = load_mitsuba()
+    for seed in tqdm(missing, "tracing scenes", unit="scene"):
+        scene = trace_scene(mitsuba, rig_of(seed), seed)
+        new = paths[seed].with_suffix(".new")
+        with new.open("wb") as file:
+            np.savez(
+                file,
+                images=scene.images,
+                shares=scene.shares,
+                ends=scene.ends,
+                widths_px=scene.widths_px,
+            )
+        new.replace(paths[seed])
 
 
-def stored(weights: Path) -> dict[str, torch.Tensor]:
-    """Return the numbers of a stored net, by their names in `NeedleNet`."""
-    numbers = onnx.load(weights).graph.initializer
-    return {
-        number.name.partition(".")[2]: torch.tensor(onnx.numpy_helper.to_array(number))
-        for number in numbers
-    }
+def wait_for_samples(folder: Path, drawn: int, process: BaseProcess) -> None:
+    """Wait until samples of both kinds are there.
+
+    Parameters
+    ----------
+    folder : Path
+        Where they come.
+    drawn : int
+        So many files of drawn ones, and of traced ones as many [1].
+    process : Process
+        What draws them.
+    """
+    with tqdm(total=2 * drawn, desc="drawing samples", unit=f"x{SHARD}") as bar:
+        while bar.n < bar.total:
+            files = (len(list(folder.glob(f"{kind}-*.npz"))) for kind in ("drawn", "traced"))
+            bar.update(sum(min(n, drawn) for n in files) - bar.n)
+            if not process.is_alive():
+                raise SystemExit("what draws the samples has ended: its error is above")
+            if bar.n < bar.total:
+                time.sleep(_POLL)
 
 
-def train(
-    drawn: Batch, scenes: list[TracedScene], steps: int, begin_with: Path | None
-) -> NeedleNet:
-    """Return a net trained on these, anew or from stored weights on."""
-    torch.manual_seed(0)
-    # More threads than that wait for each other longer than they work.
-    torch.set_num_threads(1)
-    rng = np.random.default_rng(0)
-    net: NeedleNet = NeedleNet().to(memory_format=torch.channels_last)
-    rate = _RATE
-    if begin_with is not None:
-        net.load_state_dict(stored(begin_with))
-        rate = _RATE_ON
-    optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=_DECAY)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
-    bar = tqdm(range(steps), "training", unit="step")
-    mean = 0.0
-    for step in bar:
-        seen, wanted = batch(rng, drawn, scenes)
-        target = torch.from_numpy(wanted)
-        logits = net(torch.from_numpy(seen).to(memory_format=torch.channels_last))
-        losses = functional.binary_cross_entropy_with_logits(logits, target, reduction="none")
-        loss = (losses * (1.0 + _NEEDLE_WEIGHT * target)).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        mean += (loss.item() - mean) / min(step + 1, 100)
-        bar.set_postfix(loss=f"{mean:.4f}")
-    return net
+def read_arguments() -> argparse.Namespace:
+    """Return the command line's arguments."""
+    parser = argparse.ArgumentParser(
+        prog="scripts/train_needle_map",
+        description=__doc__,
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--steps", type=int, default=24000, metavar="N", help="default: 24000")
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        default=_MINUTES,
+        metavar="M",
+        help=f"the training ends after that, fewer steps or not; default: {_MINUTES:.0f}",
+    )
+    parser.add_argument("--scenes", type=int, default=140, metavar="N", help="default: 140")
+    parser.add_argument(
+        "--drawn",
+        type=int,
+        default=150,
+        metavar="N",
+        help=f"files of {SHARD} samples that are drawn, and kept of traced ones; default: 150",
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        default=ROOT / ".training/run",
+        metavar="DIR",
+        help="scenes and samples, which are made once; 8 GB; default: .training/run",
+    )
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=WEIGHTS,
+        metavar="FILE.onnx",
+        help="default: the tracker's; the checkpoint lies in the folder",
+    )
+    parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
+    parser.add_argument(
+        "--report", action="store_true", help="only say what the net of the checkpoint is worth"
+    )
+    return parser.parse_args()
 
 
 def main() -> int:
-    """Train, and write the weights; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="scripts/train_needle_map", description=__doc__)
-    parser.add_argument("--steps", type=int, default=20000, metavar="N", help="default: 20000")
-    parser.add_argument("--shards", type=int, default=72, metavar="N", help="x256; default: 72")
-    parser.add_argument("--scenes", type=int, default=140, metavar="N", help="default: 140")
-    parser.add_argument(
-        "--begin-with", type=Path, metavar="FILE.onnx", help="learn on from these; default: anew"
-    )
-    parser.add_argument("--output", type=Path, default=WEIGHTS, metavar="FILE.onnx")
-    given = parser.parse_args()
-    drawn, scenes = draw_all(given.shards), trace_all(given.scenes)
-    net = train(drawn, scenes, given.steps, given.begin_with).eval()
-    size = {2: "height", 3: "width"}
-    torch.onnx.export(
-        NeedleMapNet(net),
-        (torch.zeros(1, 1, SIZE, SIZE),),
-        str(given.output),
-        input_names=["image"],
-        output_names=["map"],
-        dynamic_axes={"image": size, "map": size},
-        opset_version=17,
-        dynamo=False,
-    )
-    print(f"written: {given.output}")
+    """Trace, draw, train, report; returns the exit code."""
+    given = read_arguments()
+    checkpoint = given.folder / "checkpoint.pt"
+    run = new_run(0)
+    if given.resume or given.report:
+        if not checkpoint.exists():
+            print(f"no checkpoint: {checkpoint}; without --resume a run begins", file=sys.stderr)
+            return 2
+        run.resume(checkpoint)
+    cv2.setNumThreads(1)
+    scenes, samples = given.folder / "scenes", given.folder / "samples"
+    validation = given.folder / "validation"
+    if not given.report:
+        most = {"drawn": given.drawn, "traced": given.drawn}
+        process = multiprocessing.get_context("spawn").Process(
+            target=supply, args=(scenes, samples, most), daemon=True
+        )
+        process.start()
+        try:
+            trace_all(given.scenes, scenes)
+            wait_for_samples(samples, min(given.drawn, 40), process)
+            train(run, Pool(samples), Plan(given.steps, given.minutes, given.output, checkpoint))
+        finally:
+            process.terminate()
+            process.join()
+        print(f"written: {given.output}")
+    print_report(run.mean_net, scenes, validation)
     return 0
+
+
+def print_report(net: NeedleNet, scenes: Path, validation: Path) -> None:
+    """Say what a net is worth on scenes that it was not trained on.
+
+    Parameters
+    ----------
+    net : NeedleNet
+        Which is judged.
+    scenes, validation : Path
+        Folders of the scenes, and of the samples for this, which are made once.
+    """
+    write_validation(scenes, validation)
+    for kind in ("traced", "drawn"):
+        shards = [read_shard(path) for path in sorted(validation.glob(f"{kind}-*.npz"))]
+        print(f"{kind} samples that it was not trained on\n{report(net, shards)}\n")
+    held_out = (read_scene(path) for path in scene_paths(scenes, held_out=True))
+    print(f"whole images of such scenes\n{report_views(net, held_out)}")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from campaign.tracking.tracker_study import (
     TrackedRun,
     run_scenario,
 )
-from needle_tracker.tracking.refusals import TrackState
+from needle_tracker.filter.measurement import TrackState
 
 STEPS = 120
 LOOPS = 20

@@ -17,10 +17,9 @@ from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_tracker.answers.pair_answers import Frame, PairAnswers, PairingSettings
 from needle_tracker.answers.swapped_images import SwapWatch
 from needle_tracker.answers.tracker_parameters import default_settings
+from needle_tracker.filter.measurement import Measurement
+from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.tip_tracker import TipTracker
-from needle_tracker.tracking.tracker import StereoTracker
 
 Pair = tuple[float, np.ndarray, np.ndarray]
 
@@ -46,7 +45,7 @@ class Looks:
 
     def __init__(self, calibration: StereoCalibration) -> None:
         settings = default_settings(calibration)
-        self.tracker = StereoTracker(calibration, settings)
+        self.tracker = NeedleTracker(calibration, settings)
         self.watch = SwapWatch(calibration, settings)
         self.ever = False
 
@@ -108,7 +107,7 @@ def test_the_answers_stay_as_they_are(
     calibration: StereoCalibration, calibration_path: Path
 ) -> None:
     settings = default_settings(calibration)
-    alone = TipTracker(calibration, settings)
+    alone = NeedleTracker(calibration, settings)
     answers = PairAnswers(calibration, settings, PairingSettings(0, 0.2, 0.0))
     for k, (insertion, left, right) in enumerate(pairs(calibration_path, "heavy_clutter", 1), 1):
         answered = [

@@ -4,37 +4,59 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
-from needle_bringup.training.patches import SIZE, WIDTH, patch
+from needle_bringup.training.patches import patch
+from needle_bringup.training.samples import SIZE
 from needle_bringup.training.traced_scenes import trace_scene
 from needle_core.errors import UserError
 from needle_core.files.installed import find_shared
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.path_traced.tracer import load_mitsuba
-from needle_tracker.image.needle_map import NeedleMap
+from sample_pool import CONTEXT, Batch, batch_of, read_shard, write_shard
 
 UNSEEN = 1_000_000
 """Shards are numbered from 0."""
+WEIGHTS = (
+    Path(__file__).parents[3] / "ros2_ws/src/needle_tracker/needle_tracker/detector/needle_net.onnx"
+)
+_NEAR_PX = 4.0
 
 
-def test_the_stored_net_shows_needles_that_it_was_not_trained_on() -> None:
-    needle_map = NeedleMap(WIDTH)
-    found, wanted, false = [], [], []
-    for i in range(150):
-        image, share = patch(np.random.default_rng([UNSEEN, i]))
-        shown = needle_map.draw(image, (0, 0, SIZE, SIZE)) / 255.0
+@pytest.fixture(scope="module")
+def unseen(tmp_path_factory: pytest.TempPathFactory) -> Batch:
+    """Return drawn samples, as the net sees them."""
+    path = tmp_path_factory.mktemp("unseen") / "drawn-00000.npz"
+    write_shard(path, [0, UNSEEN], patch)
+    count = 128
+    return batch_of([(read_shard(path), i) for i in range(count)], [0] * count, [False] * count)
+
+
+def test_the_stored_net_shows_needles_that_it_was_not_trained_on(unseen: Batch) -> None:
+    net = cv2.dnn.readNetFromONNX(str(WEIGHTS))
+    rows, columns = np.indices((SIZE, SIZE))
+    shown, excess, at_ends, without = [], [], [], []
+    for seen, share, end in zip(unseen.seen, unseen.shares, unseen.ends, strict=True):
+        net.setInput(seen[None])
+        shaft, log_intensity = (
+            out[0, 0, CONTEXT:-CONTEXT, CONTEXT:-CONTEXT] for out in net.forward(["shaft", "end"])
+        )
+        intensity = np.exp(log_intensity.astype(float))
+        excess.append(float((shaft - share).mean()))
         if share.sum() > 20.0:
-            found.append(float(shown[share > 0.5].mean()))
-        elif not share.any():
-            false.append(float((shown > 0.5).mean()))
-        wanted.append(float((shown - share).mean()))
-    # Some are hardly to be seen.
-    assert np.median(found) > 0.5
-    assert np.mean(false) < 0.01
+            shown.append(float(shaft[share > 0.5].mean()))
+        if np.isfinite(end).all():
+            at_ends.append(intensity[np.hypot(columns - end[0], rows - end[1]) < _NEAR_PX].sum())
+        else:
+            without.append(intensity.sum())
+    # Many are hardly to be seen: thin, dark, out of focus, or as their own background shows them.
+    assert np.median(shown) > 0.35
+    assert np.median(at_ends) > 0.4
+    assert np.mean(without) < 0.4
     # Its chances are chances: as much needle is shown as there is.
-    assert abs(np.mean(wanted)) < 0.01
+    assert abs(np.mean(excess)) < 0.01
 
 
 def test_a_traced_scene_says_where_its_shaft_is() -> None:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from campaign.tracking.traced_set import DrawnSequence, TracedScene
 from needle_tracker.answers.tracker_parameters import default_settings
+from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
-from needle_tracker.tracking.tip_tracker import TipTracker
-from needle_tracker.tracking.triangulation import SpatialTip
+from needle_tracker.stereo.triangulation import SpatialTip
 
 SETTLED = 3
 """Pairs of a sequence's begin that do not count: a tracker without the insertion wants to see a
@@ -85,7 +85,7 @@ def traced_looks(sequence: DrawnSequence) -> Iterator[TracedAnswer]:
     for told in Told:
         left, right = sequence.empty
         reference = (left, right) if told is Told.EMPTY_PHANTOM else None
-        tracker = TipTracker(stereo, dataclasses.replace(settings, reference=reference))
+        tracker = NeedleTracker(stereo, dataclasses.replace(settings, reference=reference))
         for number, (left, right) in enumerate(sequence.pairs):
             insertion = None if told is Told.NOTHING else float(sequence.insertions[number])
             tip, truth = tracker.process(left, right, insertion).tip, sequence.tips[number]

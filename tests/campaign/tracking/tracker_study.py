@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from campaign.tracking.tracker_sequences import Exposure, insertion_sequence
 from needle_tracker.answers.tracker_parameters import default_settings
+from needle_tracker.filter.measurement import TrackState
+from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
-from needle_tracker.tracking.refusals import TrackState
-from needle_tracker.tracking.tip_tracker import TipTracker
 
 Array = NDArray[np.float64]
 
@@ -70,13 +70,13 @@ class TrackedRun:
         return longest
 
 
-def new_tracker(calibration: StereoCalibration) -> TipTracker:
+def new_tracker(calibration: StereoCalibration) -> NeedleTracker:
     """Return a tracker as the node's defaults make it."""
-    return TipTracker(calibration, default_settings(calibration))
+    return NeedleTracker(calibration, default_settings(calibration))
 
 
 def track_run(
-    tracker: TipTracker,
+    tracker: NeedleTracker,
     exposures: Iterable[Exposure],
     *,
     searching: bool = False,
@@ -85,7 +85,7 @@ def track_run(
 
     Parameters
     ----------
-    tracker : TipTracker
+    tracker : NeedleTracker
         Forgets what it knew.
     exposures : iterable of Exposure
         The insertion.

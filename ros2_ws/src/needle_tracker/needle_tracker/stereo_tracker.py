@@ -42,8 +42,8 @@ from needle_tracker.answers.tracker_messages import (
     tip_pose_message,
 )
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+from needle_tracker.filter.measurement import TrackState
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, calibration_from
-from needle_tracker.tracking.refusals import TrackState
 
 TIP, TIP_POSE = "needle/tip", "needle/tip_pose"
 ANNOTATED, CALIBRATION = "stereo_tracker/annotated_image", "stereo_tracker/calibration"

@@ -17,17 +17,14 @@ from needle_core.diagnostics import Level
 from needle_core.errors import UserError
 from needle_tracker.answers.tracker_messages import camera_info_problem, image_geometry
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.optics.calibration import Camera, StereoCalibration
+from needle_tracker.stereo.triangulation import SpatialTip
 from needle_tracker.stereo_tracker import StereoTipTracker, make_tracker
-from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import TrackState
-from needle_tracker.tracking.triangulation import SpatialTip
 
 PIXELS = np.zeros((768, 1024), np.uint8)
 FOUND = Measurement(
-    SpatialTip(
-        np.array([0.001, 0.002, 0.05]), 1e-8 * np.eye(3), np.eye(3)[2], np.zeros((3, 3)), 0.0, 0.0
-    ),
+    SpatialTip(np.array([0.001, 0.002, 0.05]), 1e-8 * np.eye(3), np.eye(3)[2], np.zeros((3, 3))),
     TrackState.TRACKING,
     "",
 )
@@ -96,7 +93,9 @@ Make = Callable[..., Bench]
 
 @pytest.fixture
 def make(calibration: StereoCalibration, monkeypatch: pytest.MonkeyPatch) -> Make:
-    monkeypatch.setattr("needle_tracker.tracking.tip_tracker.TipTracker.warm_up", lambda _: None)
+    monkeypatch.setattr(
+        "needle_tracker.filter.needle_tracker.NeedleTracker.warm_up", lambda _: None
+    )
 
     def make(**parameters: Any) -> Bench:
         settings = StereoTrackerParameters(**parameters)
@@ -340,15 +339,16 @@ def test_bad_parameters_are_refused_and_the_installed_calibration_is_the_default
         ("calibration_file", "/nowhere/rig.yaml", "/nowhere/rig.yaml"),
         ("calibration_file", __file__, "not YAML in line"),
         ("pair_tolerance", -1.0, "pair_tolerance"),
-        ("needle_polarity", "grey", "needle_polarity"),
         ("max_curvature", math.nan, "max_curvature"),
         ("hole_clearance", 0.05, "hole_clearance = 0.05 m"),
-        ("lost_after", 31, "lost_after = 31 is above forget_after = 30"),
+        ("stage_scale_sigma", 0.5, "stage_scale_sigma"),
     ):
         with pytest.raises(UserError, match=said) as caught:
             make_tracker(StereoTrackerParameters(**{name: value}))  # type: ignore[arg-type]
         assert "\n" not in str(caught.value)
-    monkeypatch.setattr("needle_tracker.tracking.tip_tracker.TipTracker.warm_up", lambda _: None)
+    monkeypatch.setattr(
+        "needle_tracker.filter.needle_tracker.NeedleTracker.warm_up", lambda _: None
+    )
     bench = Bench(make_tracker(StereoTrackerParameters(), "left/stereo_tracker"))
     bench.check()
     assert bench.tracker.name == "left/stereo_tracker"

@@ -166,7 +166,7 @@ def _bubble(rng: np.random.Generator, image: Image) -> Image:
 def _line(rng: np.random.Generator, image: Image) -> Image:
     """Draw a scratch, lint or an earlier needle's track: thinner than a needle, or fainter."""
     size = len(image)
-    start, heading = rng.uniform(-size / 4, 1.25 * size, 2), rng.uniform(0.0, 2 * np.pi)
+    start, heading = rng.uniform(-size / 8, 1.125 * size, 2), rng.uniform(0.0, 2 * np.pi)
     bend = rng.normal(0.0, 0.02)
     steps = np.arange(0.0, rng.uniform(6.0, 1.5 * size), 2.0)
     angles = heading + bend * steps

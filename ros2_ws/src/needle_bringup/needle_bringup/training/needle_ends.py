@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 _FINE = 3
 """Points across a pixel."""
+_TWIN = 0.4  # so many shadows look like the needle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,22 +39,37 @@ class Pose:
 
     def coordinates(self, size: int) -> tuple[Image, Image]:
         """Return along (0 at the end, negative on the shaft) and across, on the fine grid [px]."""
-        places = (np.arange(size * _FINE, dtype=np.float32) + 0.5) / _FINE - 0.5
-        x, y = np.meshgrid(places - self.x, places - self.y)
-        along = np.cos(self.heading) * x + np.sin(self.heading) * y
-        across = -np.sin(self.heading) * x + np.cos(self.heading) * y
+        places = (np.arange(size * _FINE, dtype=np.float32) + np.float32(0.5)) / _FINE
+        x, y = np.meshgrid(places - np.float32(self.x + 0.5), places - np.float32(self.y + 0.5))
+        # Plain floats keep the grid in single precision.
+        cos, sin = float(np.cos(self.heading)), float(np.sin(self.heading))
+        bend, twist = float(self.bend), float(self.twist)
+        along, across = cos * x + sin * y, cos * y - sin * x
         s = np.clip(along, -200.0, 20.0)
-        slope = self.bend * s + 1.5 * self.twist * s**2
-        across = (across - 0.5 * self.bend * s**2 - 0.5 * self.twist * s**3) / np.hypot(1.0, slope)
+        slope = s * (bend + 1.5 * twist * s)
+        across = (across - s * s * (0.5 * bend + 0.5 * twist * s)) / np.sqrt(1.0 + slope * slope)
         return along, across
+
+    def slid(self, ahead: float) -> Pose:
+        """Return the pose after the needle has moved along its own curve [px]."""
+        s = ahead
+        aside = 0.5 * self.bend * s**2 + 0.5 * self.twist * s**3
+        cos, sin = np.cos(self.heading), np.sin(self.heading)
+        return dataclasses.replace(
+            self,
+            x=self.x + cos * s - sin * aside,
+            y=self.y + sin * s + cos * aside,
+            heading=self.heading + np.arctan(self.bend * s + 1.5 * self.twist * s**2),
+            bend=self.bend + 3.0 * self.twist * s,
+        )
 
 
 def random_pose(rng: np.random.Generator, size: int, radius: float) -> Pose:
-    """Return a needle's pose; most often its end is in the patch."""
-    heading = rng.normal(0.0, 0.5) if rng.random() < 0.7 else rng.uniform(0.0, 2 * np.pi)
-    x, y = rng.uniform(0.1 * size, 0.9 * size, 2)
-    if rng.random() < 0.3:
-        out = rng.uniform(0.4, 1.2) * size
+    """Return a needle's pose; most often its end is well inside."""
+    heading = rng.uniform(0.0, 2 * np.pi)
+    x, y = rng.uniform(0.2 * size, 0.8 * size, 2)
+    if rng.random() < 0.25:
+        out = rng.uniform(0.3, 0.9) * size
         x, y = x + out * np.cos(heading), y + out * np.sin(heading)
     return Pose(x, y, heading, rng.normal(0.0, 1 / 400), rng.normal(0.0, 1 / 80000), radius)
 
@@ -77,7 +93,7 @@ def draw_needle(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
     rho = np.clip(across / pose.radius, -1.0, 1.0)
     high = np.sqrt(1.0 - rho**2)
     roll = rng.uniform(0.0, 2 * np.pi)
-    length = pose.radius * 2 * rng.choice([rng.uniform(0.0, 1.0), rng.uniform(1.0, 3.2)])
+    length = pose.radius * 2 * rng.choice([rng.uniform(0.0, 1.0), rng.uniform(1.0, 3.5)])
     top = rho * np.cos(roll) + high * np.sin(roll)
     far = rho * np.cos(roll) + high * abs(np.sin(roll))
     inside = np.abs(across) <= pose.radius
@@ -100,19 +116,29 @@ def draw_needle(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
 
 
 def draw_shadow(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
-    """Return an image with a needle's shadow on the floor: beside it, softer, maybe shorter."""
-    away = rng.uniform(0.0, 45.0) * rng.choice([-1.0, 1.0])
-    shift = rng.uniform(-25.0, 10.0)
+    """Return an image with a needle's shadow on the floor: beside it, softer, maybe shorter.
+
+    Often it is as dark and sharp as the needle and touches it: only what is known of the needle's
+    way then tells the two apart, and the net must show both ends.
+    """
+    twin = rng.random() < _TWIN
+    away = rng.uniform(0.0, 10.0 * pose.radius if twin else 45.0) * rng.choice([-1.0, 1.0])
+    shift = rng.uniform(-25.0, 25.0 if twin else 10.0)
     cos, sin = np.cos(pose.heading), np.sin(pose.heading)
     other = dataclasses.replace(
         pose,
         x=pose.x + shift * cos - away * sin,
         y=pose.y + shift * sin + away * cos,
         heading=pose.heading + rng.normal(0.0, 0.06),
-        radius=pose.radius * rng.uniform(0.8, 2.0),
+        radius=pose.radius * (rng.uniform(0.9, 1.1) if twin else rng.uniform(0.8, 2.0)),
     )
-    soft = cv2.GaussianBlur(true_map(other, len(image)), (0, 0), rng.uniform(0.7, 7.0))
-    return np.asarray(image * (1.0 - rng.uniform(0.1, 0.7) * soft), np.float32)
+    if twin:
+        sharp = cv2.GaussianBlur(true_map(other, len(image)), (0, 0), rng.uniform(0.3, 0.8))
+        return np.asarray(image * (1.0 - rng.uniform(0.4, 0.9) * sharp), np.float32)
+    # Of a small lamp it is as sharp as the needle, and has an end as sharp.
+    softness = float(np.exp(rng.uniform(np.log(0.3), np.log(7.0))))
+    soft = cv2.GaussianBlur(true_map(other, len(image)), (0, 0), softness)
+    return np.asarray(image * (1.0 - rng.uniform(0.1, 0.8) * soft), np.float32)
 
 
 def _metal(rng: np.random.Generator, near: float, along: Image, rho: Image) -> Image:
@@ -154,4 +180,8 @@ def _face(
         "grey": near * rng.uniform(0.6, 1.6),
     }[kind]
     slope = rng.normal(0.0, 0.3) if rng.random() < 0.5 else 0.0
-    return np.asarray(np.clip(tone * (1.0 + slope * (along / max(length, 1.0))), 0.0, 500.0))
+    face = tone * (1.0 + slope * (along / max(length, 1.0)))
+    if rng.random() < 0.35:  # a facet mirrors a lamp, wherever on the face
+        begin, end = -np.sort(rng.uniform(0.0, 1.0, 2)) * length
+        face = np.where((along < begin) & (along > end), near + rng.uniform(30.0, 350.0), face)
+    return np.asarray(np.clip(face, 0.0, 500.0))

@@ -1,4 +1,4 @@
-"""Patches to learn from: a scene as a camera sees it, and the map that is wanted of it."""
+"""Samples whose scene is drawn: a floor, clutter, old tracks, a needle with its shadow."""
 
 from __future__ import annotations
 
@@ -7,61 +7,97 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_bringup.training.floors import clutter, floor
-from needle_bringup.training.needle_ends import draw_needle, draw_shadow, random_pose, true_map
+from needle_bringup.training.needle_ends import (
+    Pose,
+    draw_needle,
+    draw_shadow,
+    random_pose,
+    true_map,
+)
+from needle_bringup.training.old_tracks import drawn_tracks, shifted_tracks
+from needle_bringup.training.samples import (
+    CANVAS,
+    WITH_BACKGROUND,
+    Sample,
+    exposed,
+    random_width,
+)
 
 Image = NDArray[np.float32]
-SIZE = 96
-WIDTH = 5.0
-"""Of a needle in what the net sees [px]."""
-LIKE = (0.75, 1.3)
-"""Widths that it sees, as a ratio to that."""
+_THERE, _SHADOW, _TRACKS, _TORN = 0.75, 0.6, 0.4, 0.15  # so often
+_LONGER = 0.1  # so often the needle was further in before
+_SEED = 2**32
 
 
-def patch(rng: np.random.Generator, size: int = SIZE) -> tuple[NDArray[np.uint8], Image]:
-    """Return an image, and the share of each pixel that is needle.
+def patch(rng: np.random.Generator) -> Sample:
+    """Return a drawn sample.
 
     Parameters
     ----------
     rng : Generator
-        What draws them.
-    size : int
-        Width and height [px].
-
-    Returns
-    -------
-    image : ndarray of uint8, shape (size, size)
-        As a camera has it.
-    share : ndarray of float32, shape (size, size)
-        0 to 1; the shaft is cut straight at the end of its axis, whatever its bevel.
+        What draws it.
     """
-    image = floor(rng, size)
-    wanted = np.zeros((size, size), np.float32)
-    radius = 0.5 * WIDTH * rng.uniform(*LIKE)
-    pose = random_pose(rng, size, radius)
-    there = rng.random() < 0.75
-    if rng.random() < 0.6:
-        image = draw_shadow(rng, image, pose)
-    image = clutter(rng, image) if rng.random() < 0.5 else image
+    width = random_width(rng)
+    pose = random_pose(rng, CANVAS, 0.5 * width)
+    known = rng.random() < WITH_BACKGROUND
+    image = before = floor(rng, CANVAS)
+    if rng.random() < _TRACKS:
+        tracks = drawn_tracks(rng, pose, CANVAS, faint=not known)
+        image, before = image * tracks, before * shifted_tracks(rng, tracks)
+    if rng.random() < 0.5:
+        image, before = _alike(rng, image, before)
+    there = rng.random() < _THERE
+    needle, shadow = (int(seed) for seed in rng.integers(_SEED, size=2))
+    casts = rng.random() < _SHADOW
+    if rng.random() < 0.2:  # dust that has come
+        image = clutter(rng, image)
+    image = _with(image, pose, needle if there else None, shadow if casts else None)
+    if there and rng.random() < _TORN:
+        image = _torn(rng, image, pose)
+    if known:
+        earlier = _earlier(rng, pose, there)
+        if earlier is not None:
+            before = _with(before, earlier, needle, shadow if casts else None)
+    if rng.random() < 0.3:
+        image, before = _alike(rng, image, before)
+    seen, background = exposed(rng, image, before if known else None)
+    share = np.zeros((CANVAS, CANVAS), np.uint8)
+    end = np.full(2, np.nan)
     if there:
-        image = draw_needle(rng, image, pose)
-        wanted = true_map(pose, size)
-    image = clutter(rng, image) if rng.random() < 0.3 else image
-    return _exposed(rng, image), wanted
+        share = np.rint(255.0 * true_map(pose, CANVAS)).astype(np.uint8)
+        end = np.array([pose.x, pose.y])
+    return Sample(seen, background, share, end, width)
 
 
-def _exposed(rng: np.random.Generator, image: Image) -> NDArray[np.uint8]:
-    """Return what a camera makes of brightness: blur, haze, noise, 8 bits."""
-    haze = rng.uniform(0.0, 0.4) if rng.random() < 0.3 else 0.0
-    image = image * (1.0 - haze) + haze * rng.uniform(30.0, 200.0)
-    image = image * rng.uniform(0.6, 1.3)
-    image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.35, 1.3)), np.float32)
-    noise = rng.standard_normal(image.shape).astype(np.float32)
-    if rng.random() < 0.4:  # resampled, or sharpened by the camera
-        noise = cv2.GaussianBlur(noise, (0, 0), rng.uniform(0.4, 1.0))
-        noise /= max(float(noise.std()), 1e-6)
-    image = image + noise * (rng.uniform(0.3, 6.0) + rng.uniform(0.0, 0.05) * image)
-    exposed = np.clip(image, 0.0, 255.0).astype(np.uint8)
-    if rng.random() < 0.15:
-        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(50, 95))]
-        exposed = np.asarray(cv2.imdecode(cv2.imencode(".jpg", exposed, quality)[1], 0), np.uint8)
-    return exposed
+def _alike(rng: np.random.Generator, image: Image, before: Image) -> tuple[Image, Image]:
+    """Return both with the same clutter in front."""
+    seed = int(rng.integers(_SEED))
+    one, other = (clutter(np.random.default_rng(seed), each) for each in (image, before))
+    return one, other
+
+
+def _with(image: Image, pose: Pose, needle: int | None, shadow: int | None) -> Image:
+    """Return an image with a needle and its shadow, of looks that the seeds draw, or without."""
+    if shadow is not None:
+        image = draw_shadow(np.random.default_rng(shadow), image, pose)
+    if needle is not None:
+        image = draw_needle(np.random.default_rng(needle), image, pose)
+    return image
+
+
+def _earlier(rng: np.random.Generator, pose: Pose, there: bool) -> Pose | None:
+    """Return where the needle was when the background was taken; None: nowhere."""
+    chance = rng.random()
+    back = float(np.exp(rng.uniform(np.log(1.0), np.log(90.0))))
+    if chance < _LONGER:
+        return pose.slid(back)
+    return pose.slid(-back) if there and chance < 0.5 else None
+
+
+def _torn(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
+    """Return an image with gel clouded around the needle, up to its end or a little beyond."""
+    ahead = pose.slid(rng.uniform(-5.0, 5.0))
+    soft = cv2.GaussianBlur(
+        true_map(ahead, len(image)), (0, 0), pose.radius * rng.uniform(0.8, 2.5)
+    )
+    return np.asarray(image * (1.0 + rng.uniform(-0.35, 0.35) * soft), np.float32)

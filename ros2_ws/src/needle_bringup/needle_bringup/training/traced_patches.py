@@ -1,76 +1,154 @@
-"""Patches cut from path-traced images, turned, scaled and exposed anew at random."""
+"""Samples cut from path-traced images, turned, scaled and exposed anew at random."""
 
 from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_bringup.training.patches import LIKE, SIZE, WIDTH
+from needle_bringup.training.needle_ends import Pose
+from needle_bringup.training.old_tracks import drawn_tracks, faded, made_faint, shifted_tracks
+from needle_bringup.training.samples import (
+    CANVAS,
+    SIZE,
+    WITH_BACKGROUND,
+    Sample,
+    exposed,
+    random_width,
+)
 from needle_bringup.training.traced_scenes import TracedScene
-from needle_tracker.image.background import Background
 
 Array = NDArray[np.float64]
+Image = NDArray[np.float32]
 
-BORDER = 32
-"""Margin rendered around a patch [px]."""
-_AT_END, _ON_SHAFT = 0.55, 0.3  # so often there; else anywhere
-_NEW = 0.35  # so often what has come since an earlier image
-_BESIDE_PX = 38.0  # so far from the middle may be what a patch is about
+_AT_END, _ON_SHAFT = 0.55, 0.25  # so often there; else anywhere
+_BESIDE_PX = 0.4 * SIZE  # so far from the middle may be what a patch is about
+_LARGEST = 1.8  # as a ratio: enlarged more, an image is only blurred
 _SMALLER, _BLUR = 0.8, 0.45  # images made smaller than that are blurred, by so many new pixels
+_TRACKS, _OF_NEEDLE = 0.4, 0.6  # so often there are tracks, and so often they are traced needles
+_DARK = 8.0  # grey levels, that ratios of dark pixels stay sound
 
 
-def traced_patch(
-    rng: np.random.Generator, scene: TracedScene
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Return an image, and the share of each pixel that is shaft.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Cut:
+    """A patch of an image: what of it is in the middle, how large, and turned by what.
+
+    Attributes
+    ----------
+    place : ndarray, shape (2,)
+        Column and row in the middle [px].
+    scale : float
+        New pixels per pixel.
+    angle : float
+        The patch is turned by that [rad].
+    """
+
+    place: Array
+    scale: float
+    angle: float
+
+    def point(self, point: Array) -> Array:
+        """Return where a point of the image is in the patch [px]."""
+        return np.asarray(self._turn() @ (point - self.place) + 0.5 * (CANVAS - 1))
+
+    def image(self, image: NDArray[np.uint8]) -> Image:
+        """Return the patch of an image, shape (CANVAS, CANVAS); beyond its edges it is mirrored."""
+        reach = int(0.75 * CANVAS / self.scale) + 8
+        corner = np.rint(self.place).astype(int) - reach
+        low = np.clip(corner, 0, None)
+        high = np.maximum(np.rint(self.place).astype(int) + reach, low + 1)
+        part = image[low[1] : high[1], low[0] : high[0]]
+        if self.scale < _SMALLER:
+            part = cv2.GaussianBlur(part, (0, 0), _BLUR / self.scale)
+        turn = self._turn()
+        to = np.column_stack([turn, np.full(2, 0.5 * (CANVAS - 1)) - turn @ (self.place - low)])
+        cut = cv2.warpAffine(
+            part.astype(np.float32), to, (CANVAS, CANVAS), borderMode=cv2.BORDER_REFLECT
+        )
+        return np.asarray(cut, np.float32)
+
+    def _turn(self) -> Array:
+        cos, sin = np.cos(self.angle), np.sin(self.angle)
+        return self.scale * np.array([[cos, -sin], [sin, cos]])
+
+
+def traced_patch(rng: np.random.Generator, scenes: Sequence[TracedScene]) -> Sample:
+    """Return a sample cut from one of these scenes.
 
     Parameters
     ----------
     rng : Generator
         What chooses.
-    scene : TracedScene
+    scenes : sequence of TracedScene
         Where from.
-
-    Returns
-    -------
-    image : ndarray of uint8, shape (SIZE + 2 BORDER, SIZE + 2 BORDER)
-        The patch and what is around it: brightness is judged against that.
-    share : ndarray of float32, shape (SIZE, SIZE)
-        0 to 1, of the patch.
     """
-    i = int(rng.integers(len(scene.images)))
-    image, share = scene.images[i], scene.shares[i]
-    if i > 1 and rng.random() < _NEW:
-        image, share = new_part(scene, i, int(rng.choice(np.arange(i % 2, i, 2))))
-    scale = WIDTH * rng.uniform(*LIKE) / scene.widths_px[i]
-    angle = rng.uniform(0.0, 2.0 * np.pi) if rng.random() < 0.4 else 0.0
+    width = random_width(rng)
+    for _ in range(8):
+        scene = scenes[int(rng.integers(len(scenes)))]
+        i = int(rng.integers(len(scene.images)))
+        scale = width / scene.widths_px[i]
+        if scale < _LARGEST:
+            break
+    else:
+        scale, width = _LARGEST, _LARGEST * float(scene.widths_px[i])
     place = _place(rng, scene, i) + rng.uniform(-_BESIDE_PX, _BESIDE_PX, 2) / scale
-    if scale < _SMALLER:
-        image, share = (cv2.GaussianBlur(each, (0, 0), _BLUR / scale) for each in (image, share))
-    size = SIZE + 2 * BORDER
-    turn = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    to = np.column_stack([turn, np.full(2, 0.5 * (size - 1)) - turn @ place])
-    cut = cv2.warpAffine(image, to, (size, size), borderMode=cv2.BORDER_REFLECT)
-    wanted = cv2.warpAffine(share, to, (size, size))[BORDER:-BORDER, BORDER:-BORDER]
-    return _exposed_anew(rng, cut), wanted.astype(np.float32) / np.float32(255.0)
+    cut = Cut(place, scale, float(rng.uniform(0.0, 2.0 * np.pi)))
+    image, share = cut.image(scene.images[i]), cut.image(scene.shares[i])
+    known = rng.random() < WITH_BACKGROUND
+    before = cut.image(scene.images[_earlier(rng, i, len(scene.images))]) if known else None
+    if rng.random() < _TRACKS:
+        tracks = _tracks(rng, scene, i, cut, faint=not known)
+        # Most tracks are behind the needle, or the needle is in them.
+        uncovered = np.float32(1.0) - (share / np.float32(255.0)) * (rng.random() < 0.7)
+        image = image * (1.0 + (tracks - 1.0) * uncovered)
+        before = None if before is None else before * shifted_tracks(rng, tracks)
+    seen, background = exposed(rng, image, before)
+    end = cut.point(scene.ends[i])
+    return Sample(seen, background, np.rint(share).astype(np.uint8), end, width)
 
 
-def new_part(scene: TracedScene, i: int, k: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return what one image has beside an earlier one of its camera, and the shaft in that.
+def _earlier(rng: np.random.Generator, i: int, count: int) -> int:
+    """Return which image of the same camera is the background: empty, shorter or longer."""
+    others = np.arange(i % 2, count, 2)
+    longer, shorter = others[others > i], others[(others < i) & (others > 1)]
+    chance = rng.random()
+    if chance < 0.12 and len(longer):
+        return int(rng.choice(longer))
+    if chance < 0.5 and len(shorter):
+        return int(rng.choice(shorter))
+    # Rarely the image is its own background: what was never seen without needle.
+    return i if 0.5 <= chance < 0.53 else i % 2
 
-    Parameters
-    ----------
-    scene : TracedScene
-        Where from.
-    i, k : int
-        The image, and the earlier one. Where nothing is gained the image itself is returned.
-    """
-    image, share = scene.images[i], scene.shares[i]
-    difference = Background(scene.images[k], np.zeros(2), None).difference(image)
-    if difference is None:
-        return image, share
-    return difference, np.asarray(cv2.subtract(share, scene.shares[k]), np.uint8)
+
+def _tracks(
+    rng: np.random.Generator, scene: TracedScene, i: int, cut: Cut, *, faint: bool
+) -> Image:
+    """Return by what factor old tracks change the brightness of each pixel of a patch."""
+    if rng.random() > _OF_NEEDLE:
+        end = cut.point(scene.ends[i])
+        if not np.isfinite(end).all():
+            end = rng.uniform(0.0, CANVAS, 2)
+        radius = 0.5 * cut.scale * float(scene.widths_px[i])
+        heading = rng.uniform(0.0, 2.0 * np.pi)
+        return drawn_tracks(
+            rng, Pose(float(end[0]), float(end[1]), heading, 0.0, 0.0, radius), CANVAS, faint=faint
+        )
+    # A needle of the same scene, traced with all its glints and shadows, at another place.
+    k = int(rng.integers(2, len(scene.images)))
+    if rng.random() < 0.35 and k % 2 == i % 2:
+        nudge = rng.normal(0.0, 3.0, 2) / cut.scale
+        other = Cut(cut.place + nudge, cut.scale, cut.angle + rng.normal(0.0, 0.03))
+    else:
+        place = _place(rng, scene, k) + rng.uniform(-_BESIDE_PX, _BESIDE_PX, 2) / cut.scale
+        other = Cut(place, cut.scale * rng.uniform(0.7, 1.2), rng.uniform(0.0, 2.0 * np.pi))
+    with_needle, empty = (other.image(scene.images[n]) for n in (k, k % 2))
+    factor = np.clip((with_needle + _DARK) / (empty + _DARK), 0.1, 4.0)
+    blur = float(rng.choice([0.0, 0.0, 0.8, 2.0])) + (1.0 if faint else 0.0)
+    factor = faded(factor, rng.uniform(0.3, 1.1), blur)
+    return made_faint(factor) if faint else np.asarray(factor.clip(min=0.05), np.float32)
 
 
 def _place(rng: np.random.Generator, scene: TracedScene, i: int) -> Array:
@@ -78,20 +156,10 @@ def _place(rng: np.random.Generator, scene: TracedScene, i: int) -> Array:
     chance, end = rng.random(), scene.ends[i]
     if chance < _AT_END and np.isfinite(end).all():
         return np.asarray(end)
-    rows, columns = np.nonzero(scene.shares[i] > 128)
-    if chance < _AT_END + _ON_SHAFT and len(rows):
-        k = int(rng.integers(len(rows)))
-        return np.array([columns[k], rows[k]], np.float64)
+    if chance < _AT_END + _ON_SHAFT:
+        rows, columns = np.nonzero(scene.shares[i] > 128)
+        if len(rows):
+            k = int(rng.integers(len(rows)))
+            return np.array([columns[k], rows[k]], np.float64)
     height, width = scene.images.shape[1:]
     return np.asarray(rng.uniform(0.0, 1.0, 2) * [width, height])
-
-
-def _exposed_anew(rng: np.random.Generator, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image with another gamma, blur and noise."""
-    seen = image.astype(np.float32)
-    if rng.random() < 0.5:
-        seen = 255.0 * (seen / 255.0) ** np.float32(rng.uniform(0.6, 1.5))
-    if rng.random() < 0.4:
-        seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), rng.uniform(0.3, 1.0)), np.float32)
-    seen += (rng.standard_normal(seen.shape) * rng.uniform(0.0, 4.0)).astype(np.float32)
-    return np.clip(seen, 0.0, 255.0).astype(np.uint8)

@@ -1,24 +1,17 @@
-"""Patches to train on, drawn or cut from scenes: what is wanted of them is what they show."""
+"""Drawn samples to train on: what is wanted of them is what they show."""
 
 from __future__ import annotations
-
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from needle_bringup.training import traced_scenes
 from needle_bringup.training.floors import clutter, floor
 from needle_bringup.training.needle_ends import Pose, draw_needle, draw_shadow, true_map
-from needle_bringup.training.patches import SIZE, patch
-from needle_bringup.training.traced_patches import BORDER, new_part, traced_patch
-from needle_bringup.training.traced_scenes import TracedScene, shaft_share, trace_scene
-from needle_core.files.installed import find_shared
-from needle_sim.camera.projection import project
-from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_bringup.training.old_tracks import drawn_tracks, shifted_tracks
+from needle_bringup.training.patches import patch
+from needle_bringup.training.samples import CANVAS, WIDTHS, moved, random_width
 
-RIG = load_stereo_rig(find_shared("needle_tracker", "config/calibration_top_and_side.yaml"))
+SIZE = 96
 
 
 def test_the_map_is_cut_straight_where_the_axis_ends() -> None:
@@ -41,11 +34,88 @@ def test_a_needle_is_drawn_within_its_outline_and_a_shadow_takes_light_away() ->
     assert shaded.min() < 115.0
 
 
+def test_a_needle_slides_along_its_own_curve() -> None:
+    pose = Pose(60.0, 48.0, 0.3, 2e-3, 1e-5, 2.5)
+    whole, shorter = (true_map(each, SIZE) for each in (pose, pose.slid(-20.0)))
+    assert whole.sum() - shorter.sum() == pytest.approx(20.0 * 5.0, rel=0.05)
+    # What is left of it lies where it lay.
+    assert np.maximum(shorter - whole, 0.0).sum() < 0.03 * shorter.sum()
+    back = pose.slid(-20.0).slid(20.0)
+    assert np.hypot(back.x - pose.x, back.y - pose.y) < 0.5
+
+
 def test_floors_differ_and_are_never_black() -> None:
     floors = [floor(np.random.default_rng(i), SIZE) for i in range(30)]
     assert min(each.min() for each in floors) >= 2.0
     assert max(each.max() for each in floors) <= 255.0
     assert np.std([each.mean() for each in floors]) > 30.0
+
+
+def test_tracks_without_a_background_are_faint() -> None:
+    pose = Pose(88.0, 88.0, 0.0, 0.0, 0.0, 2.5)
+    strongest = {True: 0.0, False: 0.0}
+    for seed in range(12):
+        for faint in (True, False):
+            factor = drawn_tracks(np.random.default_rng(seed), pose, CANVAS, faint=faint)
+            assert factor.min() > 0.0
+            strongest[faint] = max(strongest[faint], float(np.abs(factor - 1.0).max()))
+    # Three may lie over each other.
+    assert strongest[True] < 1.15**3 - 1.0
+    assert strongest[False] > 0.5
+
+
+def test_gel_moves_tracks_by_three_pixels_at_most() -> None:
+    spot = np.ones((CANVAS, CANVAS), np.float32)
+    spot[80:90, 80:90] = 0.2
+    weight = 1.0 - spot
+    for seed in range(10):
+        before = 1.0 - shifted_tracks(np.random.default_rng(seed), spot)
+        rows, columns = np.indices(spot.shape)
+        offset = [
+            (before * axis).sum() / before.sum() - (weight * axis).sum() / weight.sum()
+            for axis in (rows, columns)
+        ]
+        assert np.hypot(*offset) < 3.2
+
+
+def test_an_image_is_moved_as_far_as_told() -> None:
+    image = np.zeros((40, 40), np.float32)
+    image[20, 20] = 100.0
+    there = moved(image, 3.0, 0.0)
+    assert there[20, 23] == pytest.approx(100.0)
+    assert there[20, 20] == 0.0
+
+
+def test_widths_are_of_every_octave_as_often() -> None:
+    rng = np.random.default_rng(0)
+    widths = np.array([random_width(rng) for _ in range(4000)])
+    assert widths.min() > WIDTHS[0]
+    assert widths.max() < WIDTHS[1]
+    middle = np.sqrt(WIDTHS[0] * WIDTHS[1])
+    assert (widths < middle).mean() == pytest.approx(0.5, abs=0.03)
+
+
+def test_patches_repeat_by_their_seed() -> None:
+    one, again, other = (patch(np.random.default_rng([1, n])) for n in (2, 2, 3))
+    assert np.array_equal(one.image, again.image)
+    assert np.array_equal(one.share, again.share)
+    assert not np.array_equal(one.image, other.image)
+
+
+def test_patches_have_needles_backgrounds_and_ends_or_none() -> None:
+    samples = [patch(np.random.default_rng([3, n])) for n in range(16)]
+    for sample in samples:
+        assert sample.image.shape == sample.share.shape == (CANVAS, CANVAS)
+        # No end without a shaft; a shaft's end may be outside.
+        assert np.isnan(sample.end).all() or sample.share.any() or sample.end.min() < 0.0
+        if sample.share.any():
+            assert np.isfinite(sample.end).all()
+    for some in (
+        [sample.share.any() for sample in samples],
+        [sample.background is not None for sample in samples],
+    ):
+        assert any(some)
+        assert not all(some)
 
 
 def test_clutter_lies_over_a_part_of_most_images_and_over_none_of_some() -> None:
@@ -54,102 +124,3 @@ def test_clutter_lies_over_a_part_of_most_images_and_over_none_of_some() -> None
     covered = np.array([np.mean(np.abs(each - ground) > 1.0) for each in seen])
     assert 0.5 < np.mean(covered > 0.0) < 1.0
     assert covered.max() < 0.5
-
-
-def test_patches_repeat_by_their_seed() -> None:
-    one, again, other = (patch(np.random.default_rng([1, n])) for n in (2, 2, 3))
-    assert np.array_equal(one[0], again[0])
-    assert np.array_equal(one[1], again[1])
-    assert not np.array_equal(one[0], other[0])
-    # Some of many have a needle, some none.
-    shares = [patch(np.random.default_rng([3, n]))[1].any() for n in range(6)]
-    assert any(shares)
-    assert not all(shares)
-
-
-def bar(width_px: float) -> TracedScene:
-    """Return a scene with a bright bar for a needle; its image is its share."""
-    shares = np.zeros((1, 300, 400), np.uint8)
-    half = round(0.5 * width_px)
-    shares[0, 150 - half : 150 + half, :250] = 255
-    return TracedScene(shares.copy(), shares, np.array([[249.5, 149.5]]), np.array([width_px]))
-
-
-def test_a_patch_of_a_scene_is_turned_and_scaled_with_what_is_wanted_of_it() -> None:
-    widths = []
-    for width_px in (4.0, 12.0):
-        scene = bar(width_px)
-        for seed in range(40):
-            image, share = traced_patch(np.random.default_rng(seed), scene)
-            assert image.shape == (SIZE + 2 * BORDER,) * 2
-            middle = image[BORDER:-BORDER, BORDER:-BORDER]
-            # Exposed anew it is still bright where needle is, and dark where none is.
-            if (share > 0.95).any():
-                assert middle[share > 0.95].mean() > 150
-            if (share < 0.01).mean() > 0.5:
-                assert middle[share < 0.01].mean() < 40
-            if share.sum() > 300.0:
-                # A bar's area over its length, which is that of its two long edges by half.
-                edges = np.abs(np.diff(share, axis=0)).sum() + np.abs(np.diff(share, axis=1)).sum()
-                widths.append(share.sum() / (0.5 * edges))
-    # About as wide as the net knows them.
-    assert 2.5 < np.median(widths) < 6.5
-
-
-def test_what_has_come_since_an_earlier_image_is_a_needle_of_its_own() -> None:
-    shares = np.zeros((3, 300, 400), np.uint8)
-    shares[0, 148:152, :190] = shares[2, 148:152, :250] = 255
-    ground = np.random.default_rng(5).integers(60, 200, shares.shape[1:]).astype(np.uint8)
-    images = np.where(shares > 0, np.uint8(20), ground)
-    scene = TracedScene(images, shares, np.full((3, 2), np.nan), np.full(3, 4.0))
-    difference, share = new_part(scene, 2, 0)
-    assert not share[:, :190].any()
-    assert (share[148:152, 190:250] == 255).all()
-    # What is not new, floor or needle, is level.
-    assert np.abs(difference[share == 0].astype(int) - 128).max() < 5
-    assert difference[share > 0].mean() < 60
-
-
-def test_both_cameras_see_a_shaft_as_wide_as_it_is_whichever_way_they_look() -> None:
-    line = np.linspace([0.0, 0.0, 0.001], [0.003, -0.004, 0.06], 200)
-    ahead = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
-    # Points of its surface all around the end: the farthest ones across the line are its edges.
-    angle = np.linspace(0.0, 2.0 * np.pi, 400)[:, None]
-    one = np.cross(ahead, [1.0, 0.0, 0.0])
-    one /= np.linalg.norm(one)
-    ring = line[-1] + 0.5e-3 * (np.cos(angle) * one + np.sin(angle) * np.cross(ahead, one))
-    for camera in (RIG.left, RIG.right):
-        share, end, width = shaft_share(line, 1e-3, camera)
-        before, last = project(line[-2:], camera)
-        along = (last - before) / np.linalg.norm(last - before)
-        edges = (project(ring, camera) - last) @ [-along[1], along[0]]
-        assert width == pytest.approx(np.ptp(edges), rel=0.1)
-        length = np.linalg.norm(np.diff(project(line, camera), axis=0), axis=1).sum()
-        assert share.sum(dtype=float) / 255.0 == pytest.approx(width * length, rel=0.05)
-        np.testing.assert_allclose(end, last)
-
-
-def test_a_scene_is_the_empty_phantom_then_a_needle_in_both_cameras(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    images = [
-        np.zeros((camera.image_height, camera.image_width), np.uint8)
-        for camera in (RIG.left, RIG.right)
-    ]
-    line = np.linspace([0.0, 0.0, -0.01], [0.003, -0.004, 0.06], 200)
-    meshes = [SimpleNamespace(line=line)] * 2
-    asked: dict[str, Any] = {}
-
-    def trace(*_: object, **words: Any) -> list[SimpleNamespace]:
-        asked.update(words)
-        pairs = (None, meshes, meshes)
-        return [SimpleNamespace(images=images, meshes=pair) for pair in pairs]
-
-    monkeypatch.setattr(traced_scenes, "trace_insertion", trace)
-    scene = trace_scene(SimpleNamespace(), RIG, 3)  # type: ignore[arg-type]
-    assert asked["depth"] == pytest.approx(asked["begin"] + asked["step"] * (asked["frames"] - 1))
-    assert not scene.shares[:2].any()
-    assert np.isnan(scene.ends[:2]).all()
-    assert scene.shares[2:].any(axis=(1, 2)).all()
-    # Where it will be in the empty phantom it is as wide as in the first pair.
-    np.testing.assert_array_equal(scene.widths_px[:2], scene.widths_px[2:4])

@@ -8,21 +8,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.image.tip_fit import Expected, ImageTip
-from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.detector.end_fit import ImageEnd
+from needle_tracker.filter.measurement import Measurement
 
 Image = NDArray[np.uint8]
 
 _SCALE = 0.5
-_BLUE, _GREEN, _YELLOW, _RED = (80, 160, 255), (90, 230, 90), (255, 220, 60), (255, 80, 60)
+_GREEN, _YELLOW, _RED = (90, 230, 90), (255, 220, 60), (255, 80, 60)
 _SHAFT_PX = 40.0
 _SHIFT = 4  # sub-pixel drawing: OpenCV takes fixed-point numbers
 _BAR_PX = 26
-_AHEAD_PX = 30.0
+_CLEAR = 0.5  # expected ends from which on a view shows the end itself
 
 
 def annotate(left: Image, right: Image, measured: Measurement) -> Image:
-    """Draw region, shaft line, tip and state over a pair.
+    """Draw shaft line, tip and state over a pair.
 
     Parameters
     ----------
@@ -34,15 +34,12 @@ def annotate(left: Image, right: Image, measured: Measurement) -> Image:
     Returns
     -------
     ndarray of uint8, shape (rows, columns, 3)
-        RGB, at half the size: left and right side by side, a line of text below. Blue: the region
-        that was searched (none: everything was); green: a clear end; yellow: only the line counts;
-        red: found but not believed.
+        RGB, at half the size: left and right side by side, a line of text below. Green: a clear
+        end; yellow: the shaft's line, its end unclear; red: found but not believed.
     """
     views = [
-        _view(image, tip, region, measured.tip is not None)
-        for image, tip, region in zip(
-            (left, right), measured.image_tips, measured.regions, strict=True
-        )
+        _view(image, end, measured.tip is not None)
+        for image, end in zip((left, right), measured.ends, strict=True)
     ]
     height = max(view.shape[0] for view in views)
     views = [cv2.copyMakeBorder(v, 0, height - len(v), 0, 2, cv2.BORDER_CONSTANT) for v in views]
@@ -75,24 +72,14 @@ def describe(measured: Measurement) -> str:
     )
 
 
-def _view(image: Image, tip: ImageTip | None, region: Expected | None, believed: bool) -> Image:
+def _view(image: Image, end: ImageEnd | None, believed: bool) -> Image:
     small = cv2.resize(image, None, fx=_SCALE, fy=_SCALE, interpolation=cv2.INTER_AREA)
     view = cv2.cvtColor(small, cv2.COLOR_GRAY2RGB)
-    if region is not None:
-        along = region.direction
-        across = np.array([-along[1], along[0]])
-        behind = min(region.room, 1.4 * _SHAFT_PX)
-        half = max(region.search, 6)
-        corners = [
-            region.point + a * along + b * across
-            for a, b in ((-behind, -half), (-behind, half), (_AHEAD_PX, half), (_AHEAD_PX, -half))
-        ]
-        cv2.polylines(view, [_fixed(np.array(corners))], True, _BLUE, 1, cv2.LINE_AA, _SHIFT)
-    if tip is not None:
-        colour = _RED if not believed else _GREEN if tip.clear else _YELLOW
-        line = np.stack([tip.point - _SHAFT_PX * tip.direction, tip.point])
+    if end is not None:
+        colour = _RED if not believed else _GREEN if end.ends > _CLEAR else _YELLOW
+        line = np.stack([end.point - _SHAFT_PX * end.direction, end.point])
         cv2.polylines(view, [_fixed(line)], False, colour, 1, cv2.LINE_AA, _SHIFT)
-        u, v = (int(part) for part in _fixed(tip.point[None])[0, 0])
+        u, v = (int(part) for part in _fixed(end.point[None])[0, 0])
         cv2.circle(view, (u, v), 5 << _SHIFT, colour, 1, cv2.LINE_AA, _SHIFT)
     return np.asarray(view, dtype=np.uint8)
 

@@ -9,9 +9,8 @@ from typing import Any
 from needle_core.diagnostics import Diagnostic, Level
 from needle_tracker.answers.pair_answers import PairAnswers
 from needle_tracker.answers.swapped_images import SUSPICION
+from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.sources.pairing import OTHER_SIDE, PairMatcher
-from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import TrackState
 
 TROUBLE_SHOWN = 5.0  # a warning stays this long after what caused it [s]
 CLOCKS_DIFFER = 1_000_000_000  # pairs so long before the first joint state are no start [ns]
@@ -76,9 +75,10 @@ class Health:
         default_factory=lambda: deque(maxlen=1000)
     )
     _tips: int = 0
-    _single_tips: int = 0
     _state: TrackState = TrackState.SEARCHING
     _reason: str = "no images yet"
+    _probability: float = 0.0
+    _stage: tuple[float, float] = (0.0, 0.0)
 
     def image_came(self, side: str, now: float) -> None:
         """Note an image of one side."""
@@ -96,11 +96,11 @@ class Health:
         self._done.append((now, now - arrival))
         self._state = measured.state
         self._reason = measured.reason
+        self._probability, self._stage = measured.probability, measured.stage
         if measured.tip is None:
             self.rejected.add(measured.reason)
         else:
             self._tips += 1
-            self._single_tips += bool(measured.reason)
 
     def note_pairing(self, now: float, matcher: PairMatcher[Any]) -> None:
         """Note whether images were dropped for want of a partner since the last call."""
@@ -113,7 +113,12 @@ class Health:
         good = self._state in (TrackState.TRACKING, TrackState.ENTRY) and not self._reason
         message = self._state.value + (f": {self._reason}" if self._reason else "")
         values = {"state": self._state.value, "reason": self._reason, "tips": str(self._tips)}
-        values["tips of single views"] = str(self._single_tips)
+        zero, scale = self._stage
+        values["probability"] = f"{self._probability:.3f}"
+        values["stage zero [mm]"], values["stage scale error [%]"] = (
+            f"{1e3 * zero:.2f}",
+            f"{100 * scale:.2f}",
+        )
         values.update({f"no tip: {reason}": str(n) for reason, n in self.rejected.items()})
         return Diagnostic(Level.OK if good else Level.WARN, message, values)
 

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from needle_tracker.answers.pre_bend import heading_of
 from needle_tracker.answers.swapped_images import SwapWatch
+from needle_tracker.filter.measurement import Measurement
+from needle_tracker.filter.needle_tracker import NeedleTracker
+from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.sources.insertion_history import InsertionHistory
 from needle_tracker.sources.pairing import Pair, PairMatcher
-from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.tip_tracker import TipTracker
-from needle_tracker.tracking.tracker_settings import TrackerSettings
-from needle_tracker.tracking.triangulation import SpatialTip
+from needle_tracker.stereo.triangulation import SpatialTip
 
 _NEW_RECORDING = 1_000_000_000  # [ns]: a longer step back in time begins a new recording
 _ROLL_AGE = 5_000_000_000  # [ns]
@@ -117,7 +117,7 @@ class PairAnswers:
         tracker: TrackerSettings,
         settings: PairingSettings,
     ) -> None:
-        self.tracker = TipTracker(calibration, tracker)
+        self.tracker = NeedleTracker(calibration, tracker)
         self.tracker.warm_up()
         self.swap = SwapWatch(calibration, tracker)
         self.matcher: PairMatcher[Frame] = PairMatcher(settings.pair_tolerance_ns)
@@ -175,8 +175,7 @@ class PairAnswers:
             self._queue.popleft()
             answer = self._answer(arrival, pair)
             yield answer
-            # No answer waits for a comparison or a suspicion.
-            self.tracker.catch_up()
+            # No answer waits for a suspicion.
             self._suspect(answer)
 
     def _answer(self, arrival: float, pair: Pair[Frame]) -> Answer:

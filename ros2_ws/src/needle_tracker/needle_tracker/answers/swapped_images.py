@@ -7,13 +7,11 @@ is a suspicion, and no tip.
 
 from __future__ import annotations
 
-from needle_tracker.image.detection import Image
+from needle_tracker.filter.background import Image
+from needle_tracker.filter.measurement import Measurement, TrackState
+from needle_tracker.filter.needle_tracker import NeedleTracker
+from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.tracking.evidence import CLEAR_ALONG_PX, CLEAR_PX, is_sound
-from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import TrackState
-from needle_tracker.tracking.tracker import StereoTracker
-from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 SUSPICION = "left and right images seem to be swapped: the other way round they show a needle"
 # Pairs without a tip before the first look, pairs looked at in a row, and how often that is done.
@@ -44,7 +42,7 @@ class SwapWatch:
         self._can_look = (left.height, left.width) == (right.height, right.width)
         self._calibration = calibration
         self._settings = settings
-        self._other: StereoTracker | None = None
+        self._other: NeedleTracker | None = None
         self._missed = 0
         self._agreeing = 0
         self.suspected = False
@@ -75,11 +73,10 @@ class SwapWatch:
         if self.suspected or not looks:
             return
         if self._other is None:
-            self._other = StereoTracker(self._calibration, self._settings)
+            self._other = NeedleTracker(self._calibration, self._settings)
         if turn == 0:
             self._other.reset()
             self._agreeing = 0
         other = self._other.process(right, left, insertion)
-        found = not other.reason and is_sound(other.image_tips, CLEAR_PX, CLEAR_ALONG_PX)
-        self._agreeing = self._agreeing + 1 if found else 0
+        self._agreeing = self._agreeing + 1 if other.tip is not None else 0
         self.suspected = self._agreeing >= _AGREEING

@@ -24,11 +24,10 @@ from needle_tracker.answers.annotation import Image, annotate
 from needle_tracker.answers.swapped_images import SUSPICION, SwapWatch
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.answers.truth_comparison import TruthComparison, read_truth
+from needle_tracker.filter.measurement import Measurement, TrackState
+from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.sources.image_files import NamedPair, PairSequence, open_pairs, read_insertions
-from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import TrackState
-from needle_tracker.tracking.tip_tracker import TipTracker
 
 DESCRIPTION = """\
 Measure the needle's tip in stereo images, paired by file name and taken in the order of their names
@@ -42,12 +41,11 @@ The output is a CSV file, one line for each pair:
   x_m y_m z_m     the tip in rig: x up, z along the insertion, from the needle's entry point
   sigma_*_m       its standard deviations
   pitch_rad yaw_rad   of the shaft at its visible end: asin(d_x) and atan2(-d_y, d_z)
---insertion changes tips: below 4.5 mm (entry_zone) there is none, and beyond none whose distance
-or shaft is off by more than 2 mm (insertion_margin). A followed tip is merged with where the last
-one and the insertion have it, and an end that needle maps show is moved along the shaft towards
-where the insertion has it: an insertion that is 1 mm off moves that by 0.5 to 0.8 mm.
-Without --insertion tips come from the images alone. The first two pairs that show a needle have
-none: three have to agree, and the end has to move. One at rest is not told from an old track.
+--insertion helps: one look at the needle is then enough, and a followed tip is merged with where
+the last one and the insertion have it. Below 4.5 mm (entry_zone) there is no tip. The stage's zero
+and scale may be off (stage_zero_sigma, stage_scale_sigma); both are estimated and printed.
+Without --insertion tips come from the images alone: the needle is believed when its end has moved
+as a needle does. One at rest is not told from an old track.
 --params takes the parameters of the node stereo_tracker, of which those for topics change nothing.
 
 examples:
@@ -80,7 +78,8 @@ _NEW_RUN = 10e-3  # a jump of the insertion that no run makes between two images
 class TrackedSequence:
     """Results of a sequence: CSV rows, reasons for missing tips, names of unreadable pairs.
 
-    And whether left and right images seem to be swapped.
+    And whether left and right images seem to be swapped, and the stage's zero [m] and scale error
+    [-] as estimated.
     """
 
     rows: list[list[str]]
@@ -88,6 +87,7 @@ class TrackedSequence:
     unreadable: list[str]
     without_insertion: int
     swapped: bool
+    stage: tuple[float, float]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -113,7 +113,7 @@ def _run(words: Sequence[str]) -> int:
         if overlays is not None and pair.left is not None and pair.right is not None:
             write_overlay(overlays, pair.name, annotate(pair.left, pair.right, measured))
 
-    tracker = TipTracker(calibration, parameters.tracker_settings(calibration))
+    tracker = NeedleTracker(calibration, parameters.tracker_settings(calibration))
     tracker.warm_up()
     begin = time.perf_counter()
     tracked = track_sequence(pairs, tracker, calibration, insertions, on_measured)
@@ -131,6 +131,9 @@ def _run(words: Sequence[str]) -> int:
     print(f"{found} tips in {len(tracked.rows)} pairs: {output}")
     for reason, count in tracked.reasons.most_common():
         print(f"  no tip {count:6d} x  {reason}")
+    if insertions is not None:
+        zero, scale = tracked.stage
+        print(f"  stage: zero off by {1e3 * zero:.2f} mm, scale by {100.0 * scale:.2f} %")
     if truth is not None:
         print(truth.describe())
     if overlays is not None:
@@ -171,7 +174,7 @@ def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
 
 def track_sequence(
     pairs: PairSequence,
-    tracker: TipTracker,
+    tracker: NeedleTracker,
     calibration: StereoCalibration,
     insertions: Mapping[str, float] | None,
     on_measured: Callable[[NamedPair, Measurement], None] = lambda *_: None,
@@ -182,7 +185,7 @@ def track_sequence(
     ----------
     pairs : PairSequence
         The images.
-    tracker : TipTracker
+    tracker : NeedleTracker
         A fresh one.
     calibration : StereoCalibration
         The tracker's.
@@ -204,7 +207,7 @@ def track_sequence(
     rows: list[list[str]] = []
     reasons: Counter[str] = Counter()
     unusable: list[str] = []
-    without, last, checked = 0, None, False
+    without, last, checked, stage = 0, None, False, (0.0, 0.0)
     swap = SwapWatch(calibration, tracker.settings)
     bar = tqdm(
         pairs,
@@ -235,12 +238,13 @@ def track_sequence(
             measured = tracker.skip(f"{image} cannot be used")
             unusable.append(f"{pair.name} ({image} is {problem})")
         on_measured(pair, measured)
+        stage = measured.stage if measured.tip is not None else stage
         row = to_row(pair.name, measured)
         if row[1] == "0":
             entry = measured.state is TrackState.ENTRY
             reasons["in the entry zone" if entry else measured.reason] += 1
         rows.append(row)
-    return TrackedSequence(rows, reasons, unusable, without, swap.suspected)
+    return TrackedSequence(rows, reasons, unusable, without, swap.suspected, stage)
 
 
 def image_problem(pair: NamedPair, calibration: StereoCalibration) -> tuple[str, str]:
@@ -334,8 +338,8 @@ def _parser() -> CommandParser:
     add(
         "--overlay",
         metavar="DIR",
-        help="new folder for pictures of what was found in each pair: the searched region blue, "
-        "the shaft's end green (yellow: its line alone), red where it is not believed",
+        help="new folder for pictures of what was found in each pair: the shaft's end green "
+        "(yellow: its line alone), red where it is not believed",
     )
     add(
         "--truth",

@@ -21,7 +21,7 @@ from needle_tracker.answers.orientation import orientation, rotation_covariance
 from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.optics.calibration import Camera, rotation_matrix
 from needle_tracker.sources.image_encodings import ENCODINGS, WANTED, bytes_per_pixel, grey_image
-from needle_tracker.tracking.triangulation import SpatialTip
+from needle_tracker.stereo.triangulation import SpatialTip
 
 RIG_FRAME = "rig"
 LEFT_FRAME = "left_camera_optical"

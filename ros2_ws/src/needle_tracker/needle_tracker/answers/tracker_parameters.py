@@ -9,10 +9,9 @@ from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.answers.pair_answers import PairingSettings
 from needle_tracker.answers.reference_images import read_reference
-from needle_tracker.image.search_grid import Reach
+from needle_tracker.detector.reach import Reach
+from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.tracking.gates import GateSettings
-from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,21 +50,8 @@ class StereoTrackerParameters:
         0.0,
         60.0,
     )
-    needle_width: float = fixed_parameter(0.7e-3, "m", "Diameter of the needle.", 0.2e-3, 3e-3)
-    bevel_length: float = fixed_parameter(
-        0.0, "m", "Length of the needle's ground face, along the shaft; 0: unknown.", 0.0, 0.01
-    )
-    needle_polarity: str = fixed_parameter(
-        "auto",
-        "-",
-        "Whether the needle is darker or brighter than what is around it; auto: found.",
-        choices=("auto", "dark", "bright"),
-    )
-    min_contrast: float = fixed_parameter(
-        10.0, "-", "Least contrast of the needle that counts [grey levels].", 1.0, 255.0
-    )
-    noise_factor: float = fixed_parameter(
-        5.0, "-", "Detection threshold in standard deviations of the images' noise.", 1.0, 50.0
+    needle_width: float = fixed_parameter(
+        0.7e-3, "m", "Diameter of the needle, good to 30 %.", 0.2e-3, 3e-3
     )
     entry_zone: float = fixed_parameter(
         4.5e-3,
@@ -88,6 +74,16 @@ class StereoTrackerParameters:
     )
     max_insertion: float = fixed_parameter(
         0.15, "m", "Longest insertion; nothing is looked for farther from the entry.", 0.01, 1.0
+    )
+    stage_zero_sigma: float = fixed_parameter(
+        0.5e-3,
+        "m",
+        "How well the stage knows where the tip is at the entry (standard deviation).",
+        0.01e-3,
+        5e-3,
+    )
+    stage_scale_sigma: float = fixed_parameter(
+        0.01, "-", "How well the insertion's scale is known (standard deviation).", 1e-4, 0.1
     )
     tip_lean: float = fixed_parameter(
         0.21,
@@ -113,53 +109,6 @@ class StereoTrackerParameters:
         0.0,
         100.0,
     )
-    insertion_margin: float = fixed_parameter(
-        2.0e-3,
-        "m",
-        "Tolerance between the tip's distance from the entry and the insertion.",
-        0.1e-3,
-        0.05,
-    )
-    step_margin: float = fixed_parameter(
-        1.0e-3,
-        "m",
-        "Tolerance of the tip against where the last tip and the insertion have it.",
-        0.1e-3,
-        0.05,
-    )
-    free_step: float = fixed_parameter(
-        5.0e-3,
-        "m",
-        "Largest move of the tip per pair where the insertion is not known, unless both views "
-        "show that it has come since an earlier pair.",
-        0.1e-3,
-        0.1,
-    )
-    max_disagreement: float = fixed_parameter(
-        1.5e-3,
-        "m",
-        "Largest disagreement of the cameras about the end along the needle.",
-        0.05e-3,
-        0.05,
-    )
-    confirm_pairs: int = fixed_parameter(
-        3,
-        "-",
-        "Pairs in a row that must agree, and between them the needle move, where the insertion is "
-        "not known and nothing shows that the needle has come since the first pair.",
-        1,
-        100,
-    )
-    lost_after: int = fixed_parameter(
-        10, "-", "Pairs in a row without a tip after which the track is lost.", 1, 1000
-    )
-    forget_after: int = fixed_parameter(
-        30,
-        "-",
-        "Pairs in a row without a tip after which the last place no longer counts.",
-        1,
-        10000,
-    )
 
     def __post_init__(self) -> None:
         """Check the fields, and what holds between them."""
@@ -168,10 +117,6 @@ class StereoTrackerParameters:
             raise UserError(
                 f"hole_clearance = {self.hole_clearance:g} m is not below "
                 f"max_insertion = {self.max_insertion:g} m"
-            )
-        if self.lost_after > self.forget_after:
-            raise UserError(
-                f"lost_after = {self.lost_after} is above forget_after = {self.forget_after}"
             )
 
     def answering_settings(self) -> PairingSettings:
@@ -201,32 +146,17 @@ class StereoTrackerParameters:
             If there are no reference images where they should be.
         """
         folder = self.reference_folder
-        gates = GateSettings(
+        return TrackerSettings(
             reach=Reach(
                 self.max_curvature, self.entry_angle, self.hole_tolerance, self.max_insertion
             ),
             windows=(calibration.left.window, calibration.right.window),
-            least_distance=self.hole_clearance + 1.5e-3,
-            tip_lean=self.tip_lean,
-            insertion_margin=self.insertion_margin,
-            step_margin=self.step_margin,
-            free_step=self.free_step,
-            max_disagreement=self.max_disagreement,
-            max_miss_px=1.0,
-            max_depth_sigma=0.5e-3,
-            confirm_pairs=self.confirm_pairs,
-            lost_after=self.lost_after,
-            forget_after=self.forget_after,
-        )
-        return TrackerSettings(
-            gates=gates,
             needle_width=self.needle_width,
-            bevel_length=self.bevel_length,
-            bright=None if self.needle_polarity == "auto" else self.needle_polarity == "bright",
-            min_contrast=self.min_contrast,
-            noise_factor=self.noise_factor,
+            tip_lean=self.tip_lean,
             entry_zone=self.entry_zone,
             hole_clearance=self.hole_clearance,
+            stage_zero_sigma=self.stage_zero_sigma,
+            stage_scale_sigma=self.stage_scale_sigma,
             reference=read_reference(Path(folder), calibration) if folder else None,
         )
 

@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_core.commands.cli import JsonValue
+from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.sources.image_files import read_numbers
-from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import TrackState
 
 Array = npt.NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from needle_tracker.calibrating.calibration_session import Place
 from needle_tracker.calibrating.rig_model import BoardView, Corners, RigModel
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.optics.refraction import stereo_views
-from needle_tracker.tracking.triangulation import midpoint
+from needle_tracker.stereo.triangulation import midpoint
 
 Array = NDArray[np.float64]
 

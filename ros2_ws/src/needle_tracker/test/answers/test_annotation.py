@@ -8,29 +8,27 @@ import numpy as np
 
 from needle_tracker.answers.annotation import annotate, describe
 from needle_tracker.answers.tracker_messages import picture_message
+from needle_tracker.filter.measurement import Measurement, TrackState
+from needle_tracker.filter.needle_tracker import NeedleTracker
+from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import TrackState
-from needle_tracker.tracking.tracker import StereoTracker
-from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 
-def test_tip_region_and_state_are_drawn_where_they_are(
+def test_tip_and_state_are_drawn_where_they_are(
     calibration: StereoCalibration,
     settings: TrackerSettings,
     draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
     make_arc: Callable[..., np.ndarray],
 ) -> None:
-    tracker = StereoTracker(calibration, settings)
+    tracker = NeedleTracker(calibration, settings)
     left, right = draw_pair(make_arc(0.05, 5.0, 1.0))
     for _ in range(2):
         measured = tracker.process(left, right, 0.05)
-    assert measured.regions[0] is not None
     picture = annotate(left, right, measured)
     assert picture.shape[1] == 1024 + 4
     red, green, blue = np.moveaxis(picture[:384].astype(int), 2, 0)
     coloured, shaft = np.ptp(picture[:384], axis=2) > 60, green - np.maximum(red, blue) > 60
-    for side, tip in enumerate(measured.image_tips):
+    for side, tip in enumerate(measured.ends):
         assert tip is not None
         of_view = slice(side * 514, side * 514 + 512)
         for behind, is_shaft in ((4.0, True), (30.0, True), (-60.0, False)):

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from needle_tracker.answers.pair_answers import Answer, Frame, PairAnswers, PairingSettings
+from needle_tracker.filter.measurement import Measurement, TrackState
+from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import TrackState
-from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 FRAME = Frame(np.zeros((768, 1024), np.uint8))
 TIMEOUT = 0.1
@@ -48,7 +47,9 @@ class Answering:
 def answering(
     calibration: StereoCalibration, settings: TrackerSettings, monkeypatch: pytest.MonkeyPatch
 ) -> Answering:
-    monkeypatch.setattr("needle_tracker.tracking.tip_tracker.TipTracker.warm_up", lambda _: None)
+    monkeypatch.setattr(
+        "needle_tracker.filter.needle_tracker.NeedleTracker.warm_up", lambda _: None
+    )
     bench = Answering(PairAnswers(calibration, settings, PairingSettings(None, TIMEOUT, 0.0)))
     monkeypatch.setattr(bench.answers.tracker, "process", bench.process)
     monkeypatch.setattr(bench.answers.swap, "see", lambda *_: None)
@@ -63,14 +64,13 @@ def test_an_answer_is_out_before_what_it_does_not_need(
     def note(what: str) -> Callable[..., None]:
         return lambda *_: done.append(what)
 
-    monkeypatch.setattr(answering.answers.tracker, "catch_up", note("caught up"))
     monkeypatch.setattr(answering.answers.swap, "see", note("suspected"))
     for stamp in (1, 2):
         list(answering.answers.add_image("left", stamp, FRAME, 0.0))
         list(answering.answers.add_image("right", stamp, FRAME, 0.0))
     for _ in answering.answers.ready(TIMEOUT):
         done.append("published")
-    assert done == ["published", "caught up", "suspected"] * 2
+    assert done == ["published", "suspected"] * 2
 
 
 def test_a_pair_waits_for_the_joint_state_that_follows_it(answering: Answering) -> None:

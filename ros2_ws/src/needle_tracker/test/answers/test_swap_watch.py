@@ -10,10 +10,9 @@ import pytest
 
 from needle_tracker.answers import swapped_images
 from needle_tracker.answers.swapped_images import SwapWatch
+from needle_tracker.filter.measurement import Measurement, TrackState
+from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import TrackState
-from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 LEFT, RIGHT = np.zeros((2, 4, 4), np.uint8)
 MISSED = Measurement(None, TrackState.SEARCHING, "no needle")
@@ -32,14 +31,14 @@ class Other:
         assert left is RIGHT
         assert right is LEFT
         self.looks += 1
-        return Measurement(None, TrackState.TRACKING, "" if self.finds else "no needle")
+        tip: Any = object() if self.finds else None
+        return Measurement(tip, TrackState.TRACKING, "")
 
 
 @pytest.fixture
 def other(monkeypatch: pytest.MonkeyPatch) -> Other:
     other = Other()
-    monkeypatch.setattr(swapped_images, "StereoTracker", lambda *_: other)
-    monkeypatch.setattr(swapped_images, "is_sound", lambda *_: True)
+    monkeypatch.setattr(swapped_images, "NeedleTracker", lambda *_: other)
     return other
 
 

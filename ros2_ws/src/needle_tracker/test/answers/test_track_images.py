@@ -15,10 +15,9 @@ import pytest
 
 from needle_tracker.answers import track_images
 from needle_tracker.answers.track_images import COLUMNS, main
-from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import TrackState
-from needle_tracker.tracking.tracker_settings import TrackerSettings
-from needle_tracker.tracking.triangulation import SpatialTip
+from needle_tracker.filter.measurement import Measurement, TrackState
+from needle_tracker.filter.settings import TrackerSettings
+from needle_tracker.stereo.triangulation import SpatialTip
 
 Out = pytest.CaptureFixture[str]
 LENGTHS_MM = (3, 50, 51, 52)
@@ -53,8 +52,6 @@ class Scripted:
             SIGMA**2 * np.eye(3),
             np.array([math.sin(0.1), -0.2, 0.8]),
             np.eye(3),
-            0.0,
-            0.0,
         )
         return Measurement(tip, TrackState.ENTRY if mm == 3 else TrackState.TRACKING, "")
 
@@ -62,7 +59,7 @@ class Scripted:
 @pytest.fixture(autouse=True)
 def scripted(monkeypatch: pytest.MonkeyPatch) -> type[Scripted]:
     Scripted.made, Scripted.resets = [], []
-    monkeypatch.setattr(track_images, "TipTracker", Scripted)
+    monkeypatch.setattr(track_images, "NeedleTracker", Scripted)
     return Scripted
 
 
@@ -140,11 +137,13 @@ def test_every_pair_has_its_line_and_what_cannot_be_used_is_named(
 
 def test_parameters_of_the_node_count_here_too(track: Track, folder: Path, capsys: Out) -> None:
     params = folder / "rig.yaml"
-    params.write_text("stereo_tracker: {ros__parameters: {confirm_pairs: 2, needle_width: 0.001}}")
+    params.write_text(
+        "stereo_tracker: {ros__parameters: {stage_zero_sigma: 0.002, needle_width: 0.001}}"
+    )
     assert track("--params", str(params))[0] == 0
     assert track("--params", str(params), "--needle-width-mm", "0.5")[0] == 0
     first, second = Scripted.made
-    assert (first.gates.confirm_pairs, first.needle_width) == (2, 0.001)
+    assert (first.stage_zero_sigma, first.needle_width) == (0.002, 0.001)
     assert second.needle_width == pytest.approx(0.5e-3)
     for side, mm in (("left", 7), ("right", 9)):
         (folder / "empty" / side).mkdir(parents=True)

@@ -1,0 +1,1 @@
+"""One camera's image in, needle ends with their uncertainty out."""

@@ -1,0 +1,292 @@
+"""One camera's images: search them for the needle, or fit its end where it is expected."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_tracker.detector.end_fit import ASIDE_WIDTHS, LINE_WIDTHS, ImageEnd, fit_end
+from needle_tracker.detector.end_search import ShaftPath, find_paths
+from needle_tracker.detector.needle_net import (
+    MARGIN_PX,
+    MAX_WIDTH_PX,
+    Image,
+    Map,
+    NeedleNet,
+    normalized,
+)
+from needle_tracker.detector.reach import Reach
+from needle_tracker.detector.search_grid import SearchGrid, make_search_grid
+from needle_tracker.optics.refraction import RefractedCamera
+
+Array = NDArray[np.float64]
+
+_COARSE_WIDTH_PX = 4.4
+"""Needles at least so wide are searched at half size: there they are 2.2 px, the least trained."""
+_CORRIDOR_WIDTHS = 5.0  # about a path, in which it is traced at full size [needle widths]
+_STRIPS = 3  # boxes that an image is searched in
+_END_BLUR_PX = 5  # side of the square that ends are summed over at a cell of the search grid
+_NEAR_WIDTHS = 5.0  # about a path's end, ends are looked for at full size [needle widths]
+_LEAST_ENDS = 0.05  # expected in a window from which on it is a candidate
+_AHEAD_WIDTHS = 4.0  # seen beyond the expected end: the network must see what follows
+
+
+class NeedleDetector:
+    """The needle in one camera's images.
+
+    Parameters
+    ----------
+    view : RefractedCamera
+        The camera.
+    needle_width : float
+        Diameter of the needle, good to 30 % [m].
+    reach : Reach
+        What the needle can do.
+    hole_clearance : float
+        Radius about the entry that is not searched [m].
+    net : NeedleNet
+        The network.
+
+    Attributes
+    ----------
+    width_px : float
+        Width of the needle in the image [px].
+    """
+
+    def __init__(
+        self,
+        view: RefractedCamera,
+        needle_width: float,
+        reach: Reach,
+        hole_clearance: float,
+        net: NeedleNet,
+    ) -> None:
+        self._view, self._net = view, net
+        middle = np.array([0.0, 0.0, 0.5 * reach.length])
+        facing = np.stack([view.sideways, [0.0, 0.0, 1.0]], axis=-1)
+        self._px_per_m = float(np.linalg.norm(view.jacobian(middle) @ facing, axis=0).mean())
+        self.width_px = needle_width * self._px_per_m
+        self._shrink = 1 if self.width_px <= MAX_WIDTH_PX else 2
+        self._search_shrink = self._shrink
+        if self.width_px >= _COARSE_WIDTH_PX * self._shrink:
+            self._search_shrink *= 2
+        self._grid: SearchGrid = make_search_grid(view, reach, first_distance=hole_clearance)
+        self._entry = view.project(np.zeros(3))
+        self._clear_px = hole_clearance * self._px_per_m
+        self._image: Image | None = None
+        self._backgrounds: dict[int, Map] = {}
+        self._shrunk: dict[int, Image] = {}
+
+    def set_background(self, image: Image | None) -> None:
+        """Take the view with less needle in it than any other, None to forget it."""
+        self._backgrounds = {}
+        if image is not None:
+            for shrink in {self._shrink, self._search_shrink}:
+                self._backgrounds[shrink] = normalized(_smaller(image, shrink))
+
+    def see(self, image: Image) -> None:
+        """Take the image that the next calls are about."""
+        self._shrunk = {1: image}
+
+    def search(self, least: float, most: float) -> list[ShaftPath]:
+        """Return paths to what may be the needle's end, the best first.
+
+        Parameters
+        ----------
+        least, most : float
+            Distance of the end from the entry [m].
+        """
+        grid = self._grid
+        first, last = grid.row_of(least), grid.row_of(most)
+        reachable = grid.reachable[: last + 1]
+        if not reachable.any():
+            return []
+        shaft, ends = self._sampled(reachable, self._search_shrink)
+        return find_paths(grid, shaft, ends, first, last)
+
+    def trace(self, path: ShaftPath, end: ImageEnd) -> ShaftPath:
+        """Return the path to an end as the image at full size shows it, near one that was found."""
+        grid, rows = self._grid, len(path.pixels)
+        off = np.linalg.norm(grid.pixels[:rows] - path.pixels[:, None], axis=-1)
+        near = grid.reachable[:rows] & (off < _CORRIDOR_WIDTHS * self.width_px)
+        if not near.any():
+            return path
+        shaft, ends = self._sampled(near, self._shrink)
+        away = np.where(near, np.linalg.norm(grid.pixels[:rows] - end.point, axis=-1), np.inf)
+        row, column = np.unravel_index(int(away.argmin()), away.shape)
+        ends[:] = 0.0
+        ends[row, column] = 1.0
+        corridor = dataclasses.replace(grid, reachable=near)
+        found = find_paths(corridor, shaft, ends, int(row), int(row))
+        return found[0] if found else path
+
+    def _sampled(self, cells: NDArray[np.bool_], shrink: int) -> tuple[Map, Map]:
+        """Return the maps at cells of the grid's first rows, 0 at all others."""
+        # Pixel centres: pixel i of an image at half size covers the pixels 2 i and 2 i + 1.
+        places = (self._grid.pixels[: len(cells)] + 0.5) / np.float32(shrink) - np.float32(0.5)
+        height, width = self._at(shrink).shape
+        shaft, ends = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+        for box in _strips(places[cells]):
+            seen_shaft, seen_ends, (x0, y0) = self._evidence(shrink, box)
+            rows, columns = seen_shaft.shape
+            shaft[y0 : y0 + rows, x0 : x0 + columns] = seen_shaft
+            ends[y0 : y0 + rows, x0 : x0 + columns] = seen_ends
+        ends = cv2.boxFilter(ends, -1, (_END_BLUR_PX, _END_BLUR_PX), normalize=False)
+        # Cells may be farther apart than a thin needle is wide.
+        shaft = cv2.dilate(shaft, np.ones((3, 3), np.uint8))
+        sampled = [
+            cv2.remap(each, places[..., 0], places[..., 1], cv2.INTER_LINEAR)
+            for each in (shaft, ends)
+        ]
+        return sampled[0], sampled[1]
+
+    def ends_near(self, path: ShaftPath) -> list[ImageEnd]:
+        """Return the ends that the image at full size shows about the end of a path.
+
+        What half the size shows as one may be two, such as a needle beside its shadow.
+        """
+        shrink, width = self._shrink, self.width_px
+        half = _NEAR_WIDTHS * width
+        box = self._box(path.end, path.direction, (-LINE_WIDTHS * width - half, half), half)
+        if box is None:
+            return []
+        shaft, ends, corner = self._evidence(shrink, box)
+        size = 2 * round(width / shrink) + 1
+        mass = cv2.boxFilter(ends, -1, (size, size), normalize=False)
+        peaks = (mass >= cv2.dilate(mass, np.ones((size, size), np.uint8))) & (mass > _LEAST_ENDS)
+        found = []
+        for row, column in np.argwhere(peaks):
+            place = np.array([column, row], np.float64)
+            off = (place + corner + 0.5) * shrink - 0.5 - path.end
+            if math.hypot(*off) > half:
+                continue
+            end = self._fitted((shaft, ends, corner), place, path.direction, width, 0.5 * width)
+            if end is not None:
+                found.append(end)
+        return found
+
+    def fit(
+        self, point: Array, direction: Array, *, along: float, across: float
+    ) -> ImageEnd | None:
+        """Fit line and end about where they are expected.
+
+        Parameters
+        ----------
+        point, direction : ndarray, shape (2,)
+            Expected end [px], and unit vector along the shaft towards it.
+        along, across : float
+            How far from the point the end may be, along and across the direction [px].
+
+        Returns
+        -------
+        ImageEnd or None
+            None if no shaft is seen there.
+        """
+        shrink, width = self._shrink, self.width_px
+        back, ahead = LINE_WIDTHS * width + along, along + _AHEAD_WIDTHS * width
+        box = self._box(point, direction, (-back, ahead), across)
+        if box is None:
+            return None
+        maps = self._evidence(shrink, box)
+        place = (point + 0.5) / shrink - 0.5 - maps[2]
+        return self._fitted(maps, place, direction, along, across)
+
+    def _fitted(
+        self,
+        maps: tuple[Map, Map, tuple[int, int]],
+        place: Array,
+        direction: Array,
+        along: float,
+        across: float,
+    ) -> ImageEnd | None:
+        """Fit line and end in maps, about a place in them; return them in the whole image."""
+        shaft, ends, corner = maps
+        shrink, width = self._shrink, self.width_px
+        point = (place + corner + 0.5) * shrink - 0.5
+        found = fit_end(
+            shaft,
+            ends,
+            place,
+            direction,
+            behind=(math.dist(point, self._entry) - self._clear_px) / shrink,
+            along=along / shrink,
+            across=across / shrink,
+            width=width / shrink,
+        )
+        if found is None:
+            return None
+        return ImageEnd(
+            (found.point + corner + 0.5) * shrink - 0.5,
+            found.direction,
+            found.sigma_across * shrink,
+            found.sigma_along * shrink,
+            found.sigma_angle,
+            found.ends,
+            found.shaft,
+        )
+
+    def _box(
+        self, point: Array, direction: Array, along: tuple[float, float], across: float
+    ) -> tuple[int, ...] | None:
+        """Return the box that holds a strip, in the image as the network sees it; None outside."""
+        corners = np.array(along)[:, None] * direction + point
+        beside = across + ASIDE_WIDTHS * self.width_px
+        low, high = corners.min(axis=0) - beside, corners.max(axis=0) + beside
+        height, width = self._shape
+        if not np.isfinite(low + high).all() or (high < 0).any() or (low > (width, height)).any():
+            return None
+        first = np.floor(low / self._shrink).astype(int)
+        last = np.ceil(high / self._shrink).astype(int) + 1
+        return (*first.tolist(), *last.tolist())
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        height, width = self._shrunk[1].shape
+        return height, width
+
+    def _at(self, shrink: int) -> Image:
+        if shrink not in self._shrunk:
+            self._shrunk[shrink] = _smaller(self._shrunk[1], shrink)
+        return self._shrunk[shrink]
+
+    def _evidence(self, shrink: int, box: tuple[int, ...]) -> tuple[Map, Map, tuple[int, int]]:
+        """Return the maps of a box (columns and rows, first and after the last), and its corner."""
+        image = self._at(shrink)
+        height, width = image.shape
+        x0, y0 = max(box[0] - MARGIN_PX, 0), max(box[1] - MARGIN_PX, 0)
+        x1, y1 = min(box[2] + MARGIN_PX, width), min(box[3] + MARGIN_PX, height)
+        background = self._backgrounds.get(shrink)
+        if background is not None:
+            background = background[y0:y1, x0:x1]
+        shaft, ends = self._net.evidence(normalized(image[y0:y1, x0:x1]), background)
+        return shaft, ends, (x0, y0)
+
+
+def _strips(places: Map) -> list[tuple[int, ...]]:
+    """Return boxes that hold places, shape (n, 2).
+
+    They are strips across the longer side, each as wide as the places in it need, since a needle's
+    reach is a cone.
+    """
+    low, high = places.min(axis=0), places.max(axis=0)
+    axis = int((high - low).argmax())
+    edges = np.linspace(low[axis], high[axis], _STRIPS + 1)
+    boxes: list[tuple[int, ...]] = []
+    for begin, end in itertools.pairwise(edges):
+        inside = places[(places[:, axis] >= begin) & (places[:, axis] <= end)]
+        if len(inside):
+            (x0, y0), (x1, y1) = np.floor(inside.min(axis=0)), np.ceil(inside.max(axis=0)) + 1.0
+            boxes.append((int(x0), int(y0), int(x1), int(y1)))
+    return boxes
+
+
+def _smaller(image: Image, shrink: int) -> Image:
+    if shrink == 1:
+        return image
+    size = (image.shape[1] // shrink, image.shape[0] // shrink)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,85 @@
+"""The network that sees needles: per pixel the probability of shaft, and the intensity of ends.
+
+The weights (`needle_net.onnx`) come from `scripts/train_needle_map`. The network knows needles of
+2 to 9 px. It sees brightness against the surroundings, so light and floor matter little, and beside
+the image the background: the same view with less needle in it.
+"""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Map = NDArray[np.float32]
+
+MAX_WIDTH_PX = 7.0
+"""Wider needles are shown at half size [px]; the network was trained with up to 9 px."""
+MARGIN_PX = 20
+"""Pixels around a window that the network sees beside it: half the surroundings."""
+_SURROUNDINGS_PX = 41  # side of the square that brightness is judged against, as in training
+_DARK_NOISE, _CLIP = 2.0, 4.0  # grey levels and standard deviations, as in training
+_MULTIPLE = 4  # the network halves its input twice
+
+
+def normalized(image: Image) -> Map:
+    """Return brightness against the surroundings, in units of how much that varies there.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (height, width)
+
+    Returns
+    -------
+    ndarray of float32, shape (height, width)
+    """
+    size = (_SURROUNDINGS_PX, _SURROUNDINGS_PX)
+    values = image.astype(np.float32)
+    values -= cv2.blur(values, size, borderType=cv2.BORDER_REFLECT)
+    # Rounding leaves the mean of squares a little below zero on flat images.
+    variance = np.maximum(cv2.blur(values * values, size, borderType=cv2.BORDER_REFLECT), 0.0)
+    return np.asarray(
+        np.clip(values / (np.sqrt(variance) + _DARK_NOISE), -_CLIP, _CLIP), np.float32
+    )
+
+
+class NeedleNet:
+    """The network, ready to run on one thread."""
+
+    def __init__(self) -> None:
+        content = (files("needle_tracker") / "detector" / "needle_net.onnx").read_bytes()
+        self._net = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
+
+    def evidence(self, image: Map, background: Map | None) -> tuple[Map, Map]:
+        """Return what the network sees.
+
+        Parameters
+        ----------
+        image : ndarray of float32, shape (height, width)
+            From `normalized`.
+        background : ndarray of float32, shape (height, width), or None
+            The same view with less needle, from `normalized`; None if unknown.
+
+        Returns
+        -------
+        shaft : ndarray of float32, shape (height, width)
+            Probability that a pixel is needle.
+        ends : ndarray of float32, shape (height, width)
+            Expected number of needle ends in each pixel; the sum over an area is the expected
+            number of ends there.
+        """
+        height, width = image.shape
+        padded = np.zeros((1, 2, _padded(height), _padded(width)), np.float32)
+        padded[0, 0, :height, :width] = image
+        if background is not None:
+            padded[0, 1, :height, :width] = background
+        self._net.setInput(padded)
+        shaft, log_ends = self._net.forward(["shaft", "end"])
+        return shaft[0, 0, :height, :width], np.exp(log_ends[0, 0, :height, :width])
+
+
+def _padded(size: int) -> int:
+    return -(-size // _MULTIPLE) * _MULTIPLE

@@ -1,0 +1,1 @@
+"""Candidate tips over time in, the believed tip out."""

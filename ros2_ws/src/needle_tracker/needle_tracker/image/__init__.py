@@ -1,1 +1,0 @@
-"""The needle in one image: paths, shaft, end."""

@@ -1,0 +1,1 @@
+"""Needle ends of both views in, candidate tips in space out."""

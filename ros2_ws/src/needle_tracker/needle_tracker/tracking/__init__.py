@@ -1,1 +1,0 @@
-"""The needle found, followed and believed, in both views."""

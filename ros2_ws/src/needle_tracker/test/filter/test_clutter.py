@@ -1,0 +1,111 @@
+"""Runs through the renderer's scenarios, a sample of what `scripts/verify C` does at full size."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from needle_sim.camera.renderer import StereoRenderer
+from needle_sim.camera.scenarios import find_scenario
+from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_tracker.answers.tracker_parameters import default_settings
+from needle_tracker.filter.measurement import TrackState
+from needle_tracker.filter.needle_tracker import NeedleTracker
+from needle_tracker.optics.calibration import Camera, StereoCalibration
+
+Exposure = tuple[float, np.ndarray, np.ndarray, np.ndarray]
+
+
+@pytest.fixture
+def tracker(calibration: StereoCalibration) -> NeedleTracker:
+    return NeedleTracker(calibration, default_settings(calibration))
+
+
+def insertion(
+    path: Path, scenario: str, seed: int, first_mm: int, last_mm: int
+) -> Iterator[Exposure]:
+    renderer = StereoRenderer(load_stereo_rig(path), seed, scenario=find_scenario(scenario))
+    plant = NeedlePlant(initial_pose(math.radians(1.0), 0.5 * seed), curvature=8.2)
+    for mm in range(1, last_mm + 1):
+        plant.advance(1e-3, 0.06)
+        if mm >= first_mm:
+            pose = np.asarray(plant.T_rig_tip)
+            left, right = renderer.render(pose, plant.centreline(5e-4), mm)
+            yield 1e-3 * mm, pose[:3, 3], left, right
+
+
+@pytest.mark.parametrize(
+    ("scenario", "bound", "least"), [("clutter", 0.5e-3, 13), ("heavy_clutter", 1.5e-3, 8)]
+)
+def test_what_is_believed_is_right(
+    tracker: NeedleTracker, calibration_path: Path, scenario: str, bound: float, least: int
+) -> None:
+    found = 0
+    for length, truth, left, right in insertion(calibration_path, scenario, 3, 44, 58):
+        measured = tracker.process(left, right, length)
+        assert measured.state is not TrackState.LOST
+        if measured.tip is not None:
+            found += 1
+            assert np.linalg.norm(measured.tip.position - truth) < bound
+    assert found >= least
+
+
+def test_clutter_without_a_needle_is_no_needle(
+    tracker: NeedleTracker, calibration_path: Path
+) -> None:
+    for length, _, left, right in insertion(calibration_path, "absent", 2, 35, 50):
+        assert tracker.process(left, right, length).tip is None
+
+
+def test_a_needle_may_be_dark_or_bright(
+    calibration: StereoCalibration, calibration_path: Path
+) -> None:
+    for length, truth, left, right in insertion(calibration_path, "clean", 1, 60, 62):
+        for picture in ((left, right), (255 - left, 255 - right)):
+            tracker = NeedleTracker(calibration, default_settings(calibration))
+            measured = tracker.process(*picture, length)
+            assert measured.tip is not None
+            assert np.linalg.norm(measured.tip.position - truth) < 0.25e-3
+
+
+def test_cameras_may_be_turned(calibration_path: Path, calibration: StereoCalibration) -> None:
+    """Both images turned by a quarter or half about the optical axis, the calibration with them."""
+    exposures = list(insertion(calibration_path, "clean", 1, 70, 72))
+    for quarters in (1, 2, 3):
+        cameras = []
+        for camera in (calibration.left, calibration.right):
+            turned = camera
+            for _ in range(quarters):
+                turned = quarter_turned(turned)
+            cameras.append(turned)
+        rig = dataclasses.replace(calibration, left=cameras[0], right=cameras[1])
+        tracker = NeedleTracker(rig, default_settings(rig))
+        for length, truth, left, right in exposures:
+            pair = [np.ascontiguousarray(np.rot90(image, -quarters)) for image in (left, right)]
+            measured = tracker.process(pair[0], pair[1], length)
+            assert measured.tip is not None
+            assert np.linalg.norm(measured.tip.position - truth) < 0.25e-3
+
+
+def quarter_turned(camera: Camera) -> Camera:
+    """The camera whose image is this one's, turned clockwise: u' = height - 1 - v, v' = u."""
+    turn = np.eye(4)
+    turn[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    fx, fy = camera.camera_matrix[0, 0], camera.camera_matrix[1, 1]
+    cx, cy = camera.camera_matrix[0, 2], camera.camera_matrix[1, 2]
+    k1, k2, p1, p2, k3 = camera.distortion
+    return dataclasses.replace(
+        camera,
+        width=camera.height,
+        height=camera.width,
+        camera_matrix=np.array([[fy, 0, camera.height - 1 - cy], [0, fx, cx], [0, 0, 1.0]]),
+        # Brown's tangential terms under x' = -y, y' = x.
+        distortion=np.array([k1, k2, p2, -p1, k3]),
+        T_optical_rig=turn @ camera.T_optical_rig,
+    )

@@ -1,0 +1,77 @@
+"""Needle or anything else: what sightings in a row say."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from needle_tracker.detector.end_fit import ImageEnd
+from needle_tracker.filter.needle_track import NeedleTrack
+from needle_tracker.filter.settings import TrackerSettings
+from needle_tracker.stereo.sighting import Sighting
+from needle_tracker.stereo.triangulation import SpatialTip
+
+AHEAD = np.array([0.0, 0.0, 1.0])
+SIGMA = 0.1e-3
+ACCEPTED = math.log(0.9 / 0.1)
+
+
+def sighting(z: float, evidence: float = 4.0) -> Sighting:
+    tip = SpatialTip(np.array([0.0, 0.0, z]), SIGMA**2 * np.eye(3), AHEAD, 1e-4 * np.eye(3))
+    end = ImageEnd(np.zeros(2), np.array([1.0, 0.0]), 0.1, 0.5, 0.01, 0.9, 0.9)
+    return Sighting(tip, (end, end), evidence, z)
+
+
+def after(
+    settings: TrackerSettings, places: list[float], insertions: list[float | None]
+) -> NeedleTrack:
+    """Return the track of something seen at these places [m]."""
+    track = NeedleTrack.begin(sighting(places[0]), insertions[0], settings)
+    for place, insertion in zip(places[1:], insertions[1:], strict=True):
+        track = track.predicted(insertion, settings)
+        if track.fits(sighting(place).tip, settings):
+            track = track.seen(sighting(place), settings)
+        else:
+            track = track.missed()
+    return track
+
+
+def test_an_end_at_the_insertion_is_the_needle_at_once(settings: TrackerSettings) -> None:
+    accepted = ACCEPTED
+    assert after(settings, [0.05], [0.05]).log_odds > accepted
+    assert after(settings, [0.05], [0.056]).log_odds < 0.0
+    # A stage 1 mm off does not hide the needle.
+    assert after(settings, [0.05], [0.051]).log_odds > accepted
+
+
+def test_what_stands_while_the_stage_moves_is_no_needle(settings: TrackerSettings) -> None:
+    insertions = [0.049 + 5e-4 * n for n in range(8)]
+    assert after(settings, [0.05] * 8, list(insertions)).log_odds < 0.0
+    moving = after(settings, [0.001 + i for i in insertions], list(insertions))
+    assert moving.log_odds > ACCEPTED
+
+
+def test_without_the_insertion_what_has_moved_is_the_needle(settings: TrackerSettings) -> None:
+    nothing: list[float | None] = [None] * 10
+    resting = after(settings, [0.05] * 10, nothing)
+    assert resting.log_odds < ACCEPTED
+    moving = after(settings, [0.05 + 1e-3 * n for n in range(4)], nothing[:4])
+    assert moving.log_odds > ACCEPTED
+
+
+def test_a_miss_costs_rank_and_no_belief(settings: TrackerSettings) -> None:
+    before = after(settings, [0.05], [0.05])
+    missed = before.predicted(0.051, settings).missed()
+    assert missed.log_odds == before.log_odds
+    assert missed.rank(settings) == before.rank(settings) - settings.filter.miss_cost
+    assert missed.misses == 1
+
+
+def test_the_stage_is_told_as_it_is(settings: TrackerSettings) -> None:
+    track = after(
+        settings, [0.0508 + 1e-3 * n for n in range(20)], [0.05 + 1e-3 * n for n in range(20)]
+    )
+    zero, scale = track.stage
+    assert zero + scale * 0.06 == pytest.approx(0.8e-3, abs=0.4e-3)

@@ -1,0 +1,275 @@
+"""The whole pipeline on drawn pairs and on the simulated bench's renderer (an independent one)."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+from needle_sim.camera.renderer import StereoRenderer
+from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_tracker.filter.measurement import Measurement, NoTip, TrackState
+from needle_tracker.filter.needle_tracker import NeedleTracker
+from needle_tracker.filter.settings import TrackerSettings
+from needle_tracker.optics.calibration import StereoCalibration
+
+Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
+MakeArc = Callable[..., np.ndarray]
+
+
+@pytest.fixture
+def tracker(calibration: StereoCalibration, settings: TrackerSettings) -> NeedleTracker:
+    return NeedleTracker(calibration, settings)
+
+
+def steered(
+    calibration_path: Path, rotation_per_length: float, roll: float, first_mm: int, last_mm: int
+) -> list[tuple[float, np.ndarray, np.ndarray, np.ndarray]]:
+    """Return (insertion, true tip pose, left, right) for each mm of a simulated insertion."""
+    renderer = StereoRenderer(load_stereo_rig(calibration_path), 7)
+    plant = NeedlePlant(initial_pose(math.radians(2.0), roll), curvature=8.2)
+    exposures = []
+    for number in range(1, last_mm + 1):
+        plant.advance(1e-3, rotation_per_length * 1e-3)
+        if number >= first_mm:
+            pose = np.asarray(plant.T_rig_tip)
+            left, right = renderer.render(pose, plant.centreline(5e-4), number)
+            exposures.append((1e-3 * number, pose, left, right))
+    return exposures
+
+
+def tip_errors(measured: list[Measurement], truth: list[np.ndarray]) -> np.ndarray:
+    errors = [
+        m.tip.position - pose[:3, 3] if m.tip is not None else np.full(3, np.nan)
+        for m, pose in zip(measured, truth, strict=True)
+    ]
+    return np.array(errors)
+
+
+@pytest.mark.parametrize(
+    ("rotation_per_length", "roll"), [(0.0, 0.0), (60.0, 2.5)], ids=["in plane", "spun"]
+)
+@pytest.mark.parametrize("insertion_known", [True, False])
+def test_rendered_needle_is_measured_to_some_tenths_of_a_millimetre(
+    tracker: NeedleTracker,
+    calibration_path: Path,
+    rotation_per_length: float,
+    roll: float,
+    insertion_known: bool,
+) -> None:
+    exposures = steered(calibration_path, rotation_per_length, roll, 80, 92)
+    measured = [
+        tracker.process(left, right, insertion if insertion_known else None)
+        for insertion, _, left, right in exposures
+    ]
+    errors = tip_errors(measured, [pose for _, pose, _, _ in exposures])
+    if not insertion_known:
+        # It must move before it is believed.
+        assert np.all(np.isnan(errors[0]))
+        errors, measured, exposures = errors[2:], measured[2:], exposures[2:]
+    assert np.linalg.norm(errors, axis=1).max() < 0.3e-3
+    assert np.abs(errors[:, 0]).max() < 0.2e-3
+    assert all(m.state is TrackState.TRACKING for m in measured)
+    for m, error, (_, pose, _, _) in zip(measured, errors, exposures, strict=True):
+        assert m.tip is not None
+        assert error @ np.linalg.solve(m.tip.covariance, error) < 20.0
+        # The visible end leans by the pre-bend, not more.
+        assert m.tip.direction @ pose[:3, 2] > math.cos(math.radians(8.0))
+
+
+def test_the_needle_is_seen_from_just_beyond_the_entry(
+    tracker: NeedleTracker, calibration_path: Path
+) -> None:
+    exposures = steered(calibration_path, 0.0, 1.0, 2, 9)
+    measured = [tracker.process(left, right, s) for s, _, left, right in exposures]
+    states = [m.state for m in measured]
+    assert states[:3] == [TrackState.ENTRY] * 3
+    assert states[3:] == [TrackState.TRACKING] * 5
+    errors = tip_errors(measured, [pose for _, pose, _, _ in exposures])
+    assert np.linalg.norm(errors, axis=1).max() < 0.3e-3
+    for m, error in zip(measured, errors, strict=True):
+        assert m.tip is not None
+        assert error @ np.linalg.solve(m.tip.covariance, error) < 20.0
+
+
+def test_drawn_needles_dark_and_bright(
+    calibration: StereoCalibration,
+    settings: TrackerSettings,
+    draw_pair: Drawer,
+    make_arc: MakeArc,
+) -> None:
+    path = make_arc(0.07, 6.0, 0.4, 0.03)
+    for bright in (False, True):
+        tracker = NeedleTracker(calibration, settings)
+        measured = tracker.process(*draw_pair(path, seed=3, noise=5.0, bright=bright), 0.07)
+        assert measured.tip is not None
+        assert np.linalg.norm(measured.tip.position - path[-1]) < 0.25e-3
+
+
+def test_same_images_give_the_same_bits(
+    calibration: StereoCalibration, settings: TrackerSettings, calibration_path: Path
+) -> None:
+    exposures = steered(calibration_path, 100.0, 0.0, 40, 43)
+    runs = []
+    for _ in range(2):
+        tracker = NeedleTracker(calibration, settings)
+        tips = [tracker.process(left, right, s).tip for s, _, left, right in exposures]
+        runs.append(b"".join(t.position.tobytes() + t.covariance.tobytes() for t in tips if t))
+    assert runs[0] == runs[1]
+    assert len(runs[0]) == 4 * 12 * 8
+
+
+def test_whatever_the_needles_length_nothing_is_compiled_anew(
+    tracker: NeedleTracker, draw_pair: Drawer, make_arc: Callable[..., np.ndarray]
+) -> None:
+    """A first needle of another length must not make a pair wait for seconds."""
+
+    def compiled_for() -> dict[str, int]:
+        return {
+            f"{function.py_func.__module__}.{function.py_func.__qualname__}": len(
+                function.signatures
+            )
+            for name, module in list(sys.modules.items())
+            if name.startswith("needle_tracker.")
+            for function in vars(module).values()
+            if isinstance(function, Dispatcher)
+        }
+
+    tracker.warm_up()
+    before = compiled_for()
+    assert len(before) > 10
+    for length in (0.012, 0.06, 0.11):
+        images = draw_pair(make_arc(length, 4.0, 0.5))
+        for insertion in (length, None):
+            tracker.reset()
+            for _ in range(3):
+                tracker.process(*images, insertion)
+    assert compiled_for() == before
+
+
+def test_an_absent_needle_is_never_found(tracker: NeedleTracker, draw_pair: Drawer) -> None:
+    """Sheath, hole, uneven light and noise are there; the needle is not."""
+    for seed, insertion in enumerate((0.005, 0.02, 0.08, 0.12, None, None, None, None)):
+        measured = tracker.process(*draw_pair(None, seed=seed, noise=5.0), insertion)
+        assert measured.tip is None
+        assert measured.reason
+        assert measured.state is TrackState.SEARCHING
+
+
+def test_a_needle_shorter_than_the_insertion_is_refused(
+    calibration: StereoCalibration,
+    settings: TrackerSettings,
+    draw_pair: Drawer,
+    make_arc: MakeArc,
+) -> None:
+    images = draw_pair(make_arc(0.05, 5.0, 1.0))
+    for insertion, fits in ((0.06, False), (0.045, False), (0.05, True)):
+        measured = NeedleTracker(calibration, settings).process(*images, insertion)
+        assert (measured.tip is not None) == fits
+        assert (measured.reason == "") == fits
+
+
+def test_one_blocked_camera_loses_the_track_and_sight_restores_it(
+    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
+) -> None:
+    left, right = draw_pair(make_arc(0.05, 5.0, 1.0))
+    assert tracker.process(left, right, 0.05).state is TrackState.TRACKING
+    blocked = np.full_like(right, 140)
+    answers = [
+        tracker.process(left, blocked, 0.05) for _ in range(tracker.settings.filter.lost_after)
+    ]
+    assert all(answer.reason == NoTip.NOTHING for answer in answers)
+    assert answers[-1].state is TrackState.LOST
+    assert answers[-1].tip is None
+    again = tracker.process(left, right, 0.05)
+    assert again.state is TrackState.TRACKING
+    assert again.tip is not None
+
+
+def test_without_an_encoder_a_needle_that_went_on_unseen_is_found_again(
+    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
+) -> None:
+    for mm in range(46, 52):
+        tracker.process(*draw_pair(make_arc(1e-3 * mm, 5.0, 1.0), seed=mm), None)
+    unseen = draw_pair(None)
+    while (answer := tracker.process(*unseen, None)).state is not TrackState.LOST:
+        assert answer.tip is None
+    for mm in range(65, 68):
+        path = make_arc(1e-3 * mm, 5.0, 1.0)
+        answer = tracker.process(*draw_pair(path, seed=mm), None)
+    assert answer.tip is not None
+    assert np.linalg.norm(answer.tip.position - path[-1]) < 0.25e-3
+
+
+def test_without_an_encoder_a_needle_is_found_beside_an_old_track_that_stands(
+    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
+) -> None:
+    old, reasons = make_arc(0.045, 5.0, 0.5), []
+    for mm in [40] * 4 + list(range(42, 50, 2)):
+        path = make_arc(1e-3 * mm, 6.0, 2.6)
+        (left, right), (old_left, old_right) = (draw_pair(each, seed=mm) for each in (path, old))
+        answer = tracker.process(np.minimum(left, old_left), np.minimum(right, old_right), None)
+        reasons.append(answer.reason)
+        if answer.tip is not None:
+            assert np.linalg.norm(answer.tip.position - path[-1]) < 0.25e-3
+    assert set(reasons[:4]) == {NoTip.UNCONFIRMED}
+    assert reasons[-2:] == ["", ""]
+
+
+def test_without_an_encoder_an_old_track_does_not_delay_a_needle_that_moves(
+    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
+) -> None:
+    old = make_arc(0.06, 5.0, 0.5)
+    for mm in range(40, 44):
+        path = make_arc(1e-3 * mm, 6.0, 2.6)
+        (left, right), (old_left, old_right) = (draw_pair(each, seed=mm) for each in (path, old))
+        answer = tracker.process(np.minimum(left, old_left), np.minimum(right, old_right), None)
+    assert answer.tip is not None
+    assert np.linalg.norm(answer.tip.position - path[-1]) < 0.25e-3
+
+
+def test_images_of_two_exposures_are_refused(
+    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
+) -> None:
+    """Left of one exposure with the right of another: the ends do not meet."""
+    left, _ = draw_pair(make_arc(0.050, 5.0, 1.0))
+    _, right = draw_pair(make_arc(0.046, 5.0, 1.0))
+    measured = tracker.process(left, right, None)
+    assert measured.tip is None
+    assert measured.reason == NoTip.NOTHING
+
+
+def test_a_black_image_is_named(
+    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
+) -> None:
+    left, right = draw_pair(make_arc(0.05, 5.0, 1.0))
+    for insertion in (0.001, 0.05, None):
+        measured = tracker.process(left, np.zeros_like(right), insertion)
+        assert measured.tip is None
+        assert measured.reason == "right image is black"
+
+
+def test_nonsense_images_give_no_tip_and_no_error(tracker: NeedleTracker) -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(8):
+        pair = []
+        for _ in range(2):
+            image = rng.normal(rng.uniform(40, 200), rng.choice([0.0, 8.0, 40.0]), (768, 1024))
+            for _ in range(4):
+                u, v = rng.integers(0, 900), rng.integers(0, 700)
+                width, height = rng.integers(2, 300, 2)
+                image[v : v + height, u : u + width] = rng.uniform(0, 255)
+            pair.append(np.clip(image, 0, 255).astype(np.uint8))
+        assert tracker.process(pair[0], pair[1], float(rng.uniform(0.01, 0.2))).tip is None
+
+
+def test_another_size_is_a_bad_call(tracker: NeedleTracker) -> None:
+    small = np.zeros((480, 640), np.uint8)
+    with pytest.raises(ValueError, match=r"left image is uint8\(480, 640\)"):
+        tracker.process(small, small, None)

@@ -1,0 +1,132 @@
+"""The tracker on path-traced pairs: steel under lamps, over floors and before clutter."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from needle_tracker.answers.tracker_parameters import default_settings
+from needle_tracker.filter.background import Image
+from needle_tracker.filter.needle_tracker import NeedleTracker
+from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
+from needle_tracker.stereo.triangulation import SpatialTip
+
+SCENES = Path(__file__).parents[1] / "data" / "traced"
+SIDES = ("left", "right")
+_CHI_SQUARED_999 = 16.27  # of three degrees of freedom
+
+
+def cut(camera: Camera, crop: list[int]) -> Camera:
+    """Return the camera that sees only a part of the image."""
+    column, row, width, height = crop
+    matrix = camera.camera_matrix.copy()
+    matrix[:2, 2] -= column, row
+    return dataclasses.replace(camera, width=width, height=height, camera_matrix=matrix)
+
+
+def read(folder: Path, name: str) -> tuple[Image, Image]:
+    images = [
+        cv2.imread(str(folder / side / f"{name}.png"), cv2.IMREAD_GRAYSCALE) for side in SIDES
+    ]
+    assert images[0] is not None
+    assert images[1] is not None
+    return np.asarray(images[0], np.uint8), np.asarray(images[1], np.uint8)
+
+
+def tracked(
+    calibration: StereoCalibration,
+    name: str,
+    *,
+    empty: bool,
+    insertion: bool = True,
+) -> list[tuple[SpatialTip | None, np.ndarray]]:
+    """Return what is said of each pair of a scene, and the truth; a box has its own cameras."""
+    folder = SCENES / name
+    scene: dict[str, Any] = yaml.safe_load((folder / "scene.yaml").read_text(encoding="utf-8"))
+    if (folder / "calibration.yaml").is_file():
+        calibration = load_calibration(folder / "calibration.yaml")
+    left, right = (cut(getattr(calibration, side), scene["crop"][side]) for side in SIDES)
+    cut_out = StereoCalibration(left, right)
+    settings = dataclasses.replace(
+        default_settings(cut_out),
+        needle_width=scene["diameter"],
+        reference=read(folder, "empty") if empty else None,
+    )
+    tracker = NeedleTracker(cut_out, settings)
+    return [
+        (
+            tracker.process(
+                *read(folder, pair["name"]), pair["insertion"] if insertion else None
+            ).tip,
+            np.array(pair.get("tip", [])),
+        )
+        for pair in scene["pairs"]
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "empty"),
+    [
+        ("steel_on_dark", False),
+        ("steel_on_brushed_metal", False),
+        ("steel_on_graph_paper", True),
+    ],
+)
+def test_a_steel_needle_is_found_and_mostly_no_surer_than_it_is_known(
+    calibration: StereoCalibration, name: str, empty: bool
+) -> None:
+    squares = []
+    for tip, truth in tracked(calibration, name, empty=empty)[1:]:
+        assert tip is not None
+        off = tip.position - truth
+        assert np.linalg.norm(off) < 1e-3
+        squares.append(off @ np.linalg.solve(tip.covariance, off))
+    assert np.mean(np.array(squares) < _CHI_SQUARED_999) > 0.5
+
+
+def test_over_graph_paper_the_empty_phantom_is_what_helps(calibration: StereoCalibration) -> None:
+    found = [
+        tip is not None for tip, _ in tracked(calibration, "steel_on_graph_paper", empty=False)
+    ]
+    assert sum(found) < len(found) - 1
+
+
+def test_without_the_insertion_nothing_over_graph_paper_is_believed_at_once_or_wrongly(
+    calibration: StereoCalibration,
+) -> None:
+    looks = tracked(calibration, "steel_on_graph_paper", empty=True, insertion=False)
+    assert looks[0][0] is None
+    for tip, truth in looks:
+        assert tip is None or np.linalg.norm(tip.position - truth) < 0.75e-3
+
+
+TOLD = [
+    {"empty": True, "insertion": True},
+    {"empty": False, "insertion": True},
+    {"empty": False, "insertion": False},
+]
+
+
+@pytest.mark.parametrize("told", TOLD)
+@pytest.mark.parametrize("name", ["box_steel", "box_clutter"])
+def test_a_needle_in_a_box_before_clutter_is_found_through_its_walls(
+    calibration: StereoCalibration, name: str, told: dict[str, bool]
+) -> None:
+    for tip, truth in tracked(calibration, name, **told)[2:]:
+        assert tip is not None
+        off = tip.position - truth
+        assert np.linalg.norm(off) < 0.5e-3
+        assert off @ np.linalg.solve(tip.covariance, off) < _CHI_SQUARED_999
+
+
+@pytest.mark.parametrize("told", TOLD)
+def test_old_tracks_and_rails_behind_a_box_are_no_needle(
+    calibration: StereoCalibration, told: dict[str, bool]
+) -> None:
+    assert not any(tip for tip, _ in tracked(calibration, "box_empty", **told))

@@ -1,0 +1,215 @@
+"""Figures of a trained net, on samples of scenes that it was not trained on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from needle_bringup.training.samples import exposed
+from needle_bringup.training.traced_scenes import TracedScene
+from needle_tracker.detector.needle_net import normalized
+from sample_pool import CONTEXT, SHARD, Shard, batch_of
+from training_net import NeedleNet, StoredNet
+
+Array = NDArray[np.float64]
+
+WIDTHS_PX = (2.2, 4.0, 6.0, 9.0)
+"""Needles are told apart by width at these [px]."""
+_NEAR_PX = 4  # an end is seen where the net expects it within that
+_AROUND_PX = 8  # what belongs to one peak
+_SEEN = 0.5  # the chance that a peak is taken for an end from
+_SHAFT_PX = 15.0  # of the shaft tells its direction
+_AT_ONCE = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class EndError:
+    """Error of one end as the net sees it.
+
+    Attributes
+    ----------
+    along, across : float
+        To the shaft [px].
+    sigmas : float
+        The same as a whole, in units of what the net expects (Mahalanobis).
+    """
+
+    along: float
+    across: float
+    sigmas: float
+
+
+@dataclasses.dataclass
+class Figures:
+    """Of all samples of one kind."""
+
+    samples: int = 0
+    entropy: float = 0.0
+    end_loss: float = 0.0
+    ends: int = 0
+    empty: int = 0
+    false_peaks: int = 0
+    errors: list[EndError] = dataclasses.field(default_factory=list)
+
+    def line(self) -> str:
+        """Return a line of a table."""
+        errors = self.errors or [EndError(np.nan, np.nan, np.nan)]
+        along = [abs(error.along) for error in errors]
+        across = [abs(error.across) for error in errors]
+        within = np.mean([error.sigmas < 2.0 for error in errors])
+        return (
+            f"{self.samples:5d} {self.entropy / max(self.samples, 1):7.4f} "
+            f"{self.end_loss / max(self.samples, 1):6.2f} "
+            f"{self.ends:5d} {len(self.errors) / max(self.ends, 1):6.1%} "
+            f"{np.median(along):6.2f} {np.median(across):6.2f} {within:6.1%} "
+            f"{self.empty:5d} {self.false_peaks / max(self.empty, 1):7.3f}"
+        )
+
+
+HEADER = (
+    "width px  background   n  shaft BCE  end NLL ends  seen  along across 2sigma empty false/patch"
+)
+
+
+def discs(intensity: Array) -> Array:
+    """Return what is expected within 4 px of each pixel."""
+    reach = np.arange(-_NEAR_PX, _NEAR_PX + 1)
+    disc = (np.hypot(*np.meshgrid(reach, reach)) <= _NEAR_PX).astype(np.float64)
+    return np.asarray(cv2.filter2D(intensity, -1, disc, borderType=cv2.BORDER_CONSTANT))
+
+
+def peaks(intensity: Array) -> NDArray[np.int64]:
+    """Return where ends are seen, column and row, shape (n, 2)."""
+    expected = discs(intensity)
+    side = 2 * _AROUND_PX + 1
+    highest = cv2.dilate(expected, np.ones((side, side), np.uint8))
+    rows, columns = np.nonzero((expected == highest) & (expected > _SEEN))
+    return np.stack([columns, rows], axis=1)
+
+
+def end_error(intensity: Array, share: Array, end: Array) -> EndError | None:
+    """Return how far from its place an end was seen; None where it was not.
+
+    Parameters
+    ----------
+    intensity : ndarray, shape (height, width)
+        Of ends [1/px^2].
+    share : ndarray, shape (height, width)
+        Of each pixel that is shaft.
+    end : ndarray, shape (2,)
+        Column and row [px].
+    """
+    rows, columns = np.indices(intensity.shape)
+    places = np.stack([columns, rows], axis=-1)
+    away = np.hypot(*np.moveaxis(places - end, -1, 0))
+    if intensity[away <= _NEAR_PX].sum() <= _SEEN:
+        return None
+    shaft = (share > 0.5) & (away < _SHAFT_PX)
+    ahead = end - places[shaft].mean(axis=0) if shaft.any() else np.array([1.0, 0.0])
+    ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+    near = away <= _AROUND_PX
+    weights, around = intensity[near], places[near].astype(np.float64)
+    centre = weights @ around / weights.sum()
+    spread = (weights * (around - centre).T) @ (around - centre) / weights.sum()
+    error = centre - end
+    sigmas = float(np.sqrt(error @ np.linalg.solve(spread + 1e-3 * np.eye(2), error)))
+    return EndError(float(error @ ahead), float(error @ [-ahead[1], ahead[0]]), sigmas)
+
+
+def report(net: NeedleNet, shards: Iterable[Shard]) -> str:
+    """Return a table of what a net is worth, by width and with or without a background."""
+    stored = StoredNet(net).eval()
+    table: dict[tuple[int, bool], Figures] = {}
+    for shard in shards:
+        for first in range(0, SHARD, _AT_ONCE):
+            chosen = [(shard, i) for i in range(first, first + _AT_ONCE)]
+            batch = batch_of(chosen, [0] * _AT_ONCE, [False] * _AT_ONCE)
+            with torch.no_grad():
+                shaft, log_intensity = (
+                    each.numpy()[:, 0, CONTEXT:-CONTEXT, CONTEXT:-CONTEXT].astype(np.float64)
+                    for each in stored(torch.from_numpy(batch.seen))
+                )
+            for k in range(_AT_ONCE):
+                width = int(np.searchsorted(WIDTHS_PX[1:-1], batch.widths_px[k]))
+                figures = table.setdefault((width, bool(batch.known[k])), Figures())
+                share, end = batch.shares[k].astype(np.float64), batch.ends[k].astype(np.float64)
+                _count(figures, shaft[k], log_intensity[k], share, end)
+    lines = [HEADER]
+    for (width, known), figures in sorted(table.items()):
+        name = f"{WIDTHS_PX[width]:.1f}-{WIDTHS_PX[width + 1]:.1f}  {'yes' if known else 'no ':3s}"
+        lines.append(f"{name}  {figures.line()}")
+    return "\n".join(lines)
+
+
+def _count(figures: Figures, shaft: Array, log_intensity: Array, share: Array, end: Array) -> None:
+    """Add one sample."""
+    chance = np.clip(shaft, 1e-6, 1.0 - 1e-6)
+    intensity = np.exp(log_intensity)
+    figures.samples += 1
+    figures.entropy -= float(np.mean(share * np.log(chance) + (1 - share) * np.log(1 - chance)))
+    figures.end_loss += float(intensity.sum())
+    if np.isfinite(end).all():
+        figures.ends += 1
+        place = np.asarray([[end]], np.float32)
+        at_end = cv2.remap(intensity, place, None, cv2.INTER_LINEAR)
+        figures.end_loss -= float(np.log(max(float(np.ravel(at_end)[0]), 1e-9)))
+        error = end_error(intensity, share, end)
+        if error is not None:
+            figures.errors.append(error)
+    else:
+        figures.empty += 1
+        figures.false_peaks += len(peaks(intensity))
+
+
+def report_views(net: NeedleNet, scenes: Iterable[TracedScene]) -> str:
+    """Return a table of what a net sees in whole images, without and with the empty phantom.
+
+    Parameters
+    ----------
+    net : NeedleNet
+        Which looks.
+    scenes : iterable of TracedScene
+        That it was not trained on.
+    """
+    stored = StoredNet(net).eval()
+    seen, wrong, false = np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
+    for number, scene in enumerate(scenes):
+        for i in range(len(scene.images)):
+            for known in (False, True):
+                rng = np.random.default_rng([number, i])
+                empty = scene.images[i % 2].astype(np.float32)
+                views = exposed(rng, scene.images[i].astype(np.float32), empty if known else None)
+                intensity = _look(stored, *views)
+                found = peaks(intensity)
+                if i < 2:
+                    false[int(known)] += [1, len(found)]
+                elif np.isfinite(scene.ends[i]).all():
+                    away = np.hypot(*(found - scene.ends[i]).T)
+                    seen[int(known)] += [1, (away < _AROUND_PX).any()]
+                    wrong[int(known)] += (away >= _AROUND_PX).sum()
+    lines = ["background  ends  seen  others/image  empty  false/image"]
+    for row, name in enumerate(("no", "yes")):
+        ends, empty = seen[row, 0], false[row, 0]
+        lines.append(
+            f"{name:10s}  {ends:4.0f} {seen[row, 1] / max(ends, 1):5.1%}  "
+            f"{wrong[row] / max(ends, 1):8.2f}  {empty:9.0f} {false[row, 1] / max(empty, 1):8.2f}"
+        )
+    return "\n".join(lines)
+
+
+def _look(
+    stored: StoredNet, image: NDArray[np.uint8], background: NDArray[np.uint8] | None
+) -> Array:
+    """Return the intensity of ends in an image whose sides are multiples of 4 [1/px^2]."""
+    seen = np.zeros((1, 2, *image.shape), np.float32)
+    seen[0, 0] = normalized(image)
+    if background is not None:
+        seen[0, 1] = normalized(background)
+    with torch.no_grad():
+        log_intensity = stored(torch.from_numpy(seen))[1]
+    return np.asarray(np.exp(log_intensity.numpy()[0, 0].astype(np.float64)))

@@ -1,0 +1,179 @@
+"""Samples in files, for training to draw from: another process adds to them meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_bringup.training.samples import BORDER, CANVAS, SIZE, Sample
+from needle_tracker.detector.needle_net import normalized
+
+Float = NDArray[np.float32]
+
+SHARD = 128
+"""Samples in a file."""
+CONTEXT = 8
+"""What the net sees around a patch [px]: fewer pixels are at a border than else."""
+KINDS = ("drawn", "traced")
+_TRACED_SHARE = 0.6  # of a batch
+_OUTSIDE = BORDER - CONTEXT
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Shard:
+    """The samples of one file, in arrays; a background that is not known is 0 everywhere."""
+
+    images: NDArray[np.uint8]
+    backgrounds: NDArray[np.uint8]
+    known: NDArray[np.bool_]
+    shares: NDArray[np.uint8]
+    ends: NDArray[np.float64]
+    widths_px: NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Batch:
+    """Samples as the net sees them, and what is wanted of it.
+
+    Attributes
+    ----------
+    seen : ndarray of float32, shape (n, 2, SIZE + 2 CONTEXT, SIZE + 2 CONTEXT)
+        Images and backgrounds, normalized.
+    shares : ndarray of float32, shape (n, SIZE, SIZE)
+        0 to 1, the share of each pixel that is shaft.
+    ends : ndarray of float32, shape (n, 2)
+        Column and row of the needles' ends in the patch [px]; NaN where none is.
+    widths_px : ndarray, shape (n,)
+        Of the needles [px].
+    known : ndarray of bool, shape (n,)
+        Whether there is a background.
+    """
+
+    seen: Float
+    shares: Float
+    ends: Float
+    widths_px: NDArray[np.float64]
+    known: NDArray[np.bool_]
+
+
+def write_shard(path: Path, seed: list[int], draw: Callable[[np.random.Generator], Sample]) -> None:
+    """Write a file of samples, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        Where.
+    seed : list of int
+        Keys all that is random.
+    draw : callable
+        Returns a sample.
+    """
+    drawn = [draw(np.random.default_rng([*seed, i])) for i in range(SHARD)]
+    empty = np.zeros((CANVAS, CANVAS), np.uint8)
+    new = path.with_suffix(".new")
+    with new.open("wb") as file:
+        np.savez(
+            file,
+            images=np.stack([each.image for each in drawn]),
+            backgrounds=np.stack(
+                [empty if each.background is None else each.background for each in drawn]
+            ),
+            known=np.array([each.background is not None for each in drawn]),
+            shares=np.stack([each.share for each in drawn]),
+            ends=np.stack([each.end for each in drawn]),
+            widths_px=np.array([each.width_px for each in drawn]),
+        )
+    new.replace(path)
+
+
+def read_shard(path: Path) -> Shard:
+    """Return the samples of a file."""
+    with np.load(path) as content:
+        return Shard(**content)
+
+
+class Pool:
+    """All samples of a folder: files `drawn-*.npz` and `traced-*.npz`."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._shards: dict[str, dict[str, Shard]] = {kind: {} for kind in KINDS}
+
+    def update(self) -> int:
+        """Read what is new, forget what is gone; returns the number of samples."""
+        for kind, shards in self._shards.items():
+            there = {path.name: path for path in self._folder.glob(f"{kind}-*.npz")}
+            for name in shards.keys() - there.keys():
+                del shards[name]
+            for name in sorted(there.keys() - shards.keys()):
+                # One that is replaced meanwhile is gone.
+                with contextlib.suppress(FileNotFoundError):
+                    shards[name] = read_shard(there[name])
+        return SHARD * sum(len(shards) for shards in self._shards.values())
+
+    def batch(self, rng: np.random.Generator, count: int) -> Batch:
+        """Return samples of both kinds, turned and mirrored at random.
+
+        Parameters
+        ----------
+        rng : Generator
+            What chooses.
+        count : int
+            How many.
+        """
+        traced = round(_TRACED_SHARE * count)
+        kinds = [KINDS[1]] * traced + [KINDS[0]] * (count - traced)
+        chosen = []
+        for kind in kinds:
+            shards = list((self._shards[kind] or self._shards[KINDS[0]]).values())
+            chosen.append((shards[rng.integers(len(shards))], int(rng.integers(SHARD))))
+        turns, mirrors = rng.integers(4, size=count), rng.random(count) < 0.5
+        return batch_of(chosen, [int(n) for n in turns], [bool(m) for m in mirrors])
+
+
+def batch_of(chosen: list[tuple[Shard, int]], turns: list[int], mirrors: list[bool]) -> Batch:
+    """Return samples as the net sees them.
+
+    Parameters
+    ----------
+    chosen : list of tuple
+        Files and places in them.
+    turns : list of int
+        Quarter turns of each.
+    mirrors : list of bool
+        Whether each is mirrored after that.
+    """
+    side = SIZE + 2 * CONTEXT
+    seen = np.zeros((len(chosen), 2, side, side), np.float32)
+    shares = np.empty((len(chosen), SIZE, SIZE), np.float32)
+    ends = np.full((len(chosen), 2), np.nan, np.float32)
+    inner, shown = slice(BORDER, -BORDER), slice(_OUTSIDE, -_OUTSIDE)
+    for k, ((shard, i), turn, mirror) in enumerate(zip(chosen, turns, mirrors, strict=True)):
+        flip = -1 if mirror else 1
+        images = [shard.images[i]] + [shard.backgrounds[i]] * bool(shard.known[i])
+        for channel, image in enumerate(images):
+            seen[k, channel] = np.rot90(normalized(image)[shown, shown], turn)[::flip]
+        shares[k] = np.rot90(shard.shares[i][inner, inner], turn)[::flip]
+        ends[k] = _turned(shard.ends[i] - BORDER, turn, mirror)
+    outside = ~((ends >= 0.0) & (ends <= SIZE - 1.0)).all(axis=1)
+    ends[outside] = np.nan
+    return Batch(
+        seen,
+        shares / np.float32(255.0),
+        ends,
+        np.array([shard.widths_px[i] for shard, i in chosen]),
+        np.array([shard.known[i] for shard, i in chosen]),
+    )
+
+
+def _turned(end: NDArray[np.float64], turn: int, mirror: bool) -> NDArray[np.float64]:
+    """Return where a point of a patch is after it was turned and mirrored [px]."""
+    x, y = end
+    for _ in range(turn):
+        x, y = y, SIZE - 1.0 - x
+    return np.array([x, SIZE - 1.0 - y if mirror else y])

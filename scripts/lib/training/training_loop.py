@@ -1,0 +1,243 @@
+"""The training itself: losses, schedule, checkpoints."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn import functional
+from tqdm import tqdm
+
+from sample_pool import CONTEXT, Batch, Pool
+from training_net import LOG_INTENSITY, NEEDLE_WEIGHT, NeedleNet, export
+
+_BATCH, _RATE, _DECAY = 16, 3e-3, 1e-4
+_WARM_UP, _FIRST_RATE, _LAST_RATE = 0.08, 0.04, 0.002  # share of the run, and of the rate
+_END_WEIGHT = 0.04  # of a nat about an end, against one about each pixel of shaft
+_LARGEST_STEP = 2.0  # of all gradients together
+_WORST, _MOST_BAD = (1.0, 30.0), 20  # losses of batches that are left out, and so many in a row
+_FULL_PRECISION = 0.9  # the last part of a run rounds no more
+_MEAN_OVER = 1000  # steps that the weights are averaged over
+_LOOK_EVERY = 200  # steps until new samples are looked for
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Length of a training, and where it is stored.
+
+    Attributes
+    ----------
+    steps : int
+        Of the whole run.
+    minutes : float
+        After so long it ends too, its rate down as after all steps [min].
+    output, checkpoint : Path
+        Where the net is written, and all that `Run.resume` needs.
+    every : float
+        Time from one checkpoint to the next [s].
+    """
+
+    steps: int
+    minutes: float
+    output: Path
+    checkpoint: Path
+    every: float = 180.0
+
+
+@dataclasses.dataclass
+class Run:
+    """A training that can be stored and resumed.
+
+    Attributes
+    ----------
+    net, mean_net : NeedleNet
+        What learns, and its weights averaged over the last steps: what is stored.
+    optimizer : AdamW
+        Of it.
+    rng : Generator
+        What chooses samples.
+    step : int
+        Steps done.
+    seconds : float
+        Time they took [s].
+    """
+
+    net: NeedleNet
+    mean_net: NeedleNet
+    optimizer: torch.optim.AdamW
+    rng: np.random.Generator
+    step: int = 0
+    seconds: float = 0.0
+
+    def state(self) -> dict[str, Any]:
+        """Return all that `resume` needs."""
+        return {
+            "net": self.net.state_dict(),
+            "mean_net": self.mean_net.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "rng": self.rng.bit_generator.state,
+            "torch_rng": torch.get_rng_state(),
+            "step": self.step,
+            "seconds": self.seconds,
+        }
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint, whole or not at all."""
+        new = path.with_suffix(".new")
+        torch.save(self.state(), new)
+        new.replace(path)
+
+    def resume(self, path: Path) -> None:
+        """Go on from a checkpoint."""
+        state = torch.load(path, weights_only=True)
+        self.net.load_state_dict(state["net"])
+        self.mean_net.load_state_dict(state["mean_net"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.rng.bit_generator.state = state["rng"]
+        torch.set_rng_state(state["torch_rng"])
+        self.step, self.seconds = state["step"], state["seconds"]
+
+
+def new_run(seed: int) -> Run:
+    """Return a run with an untrained net."""
+    torch.manual_seed(seed)
+    net: NeedleNet = NeedleNet().to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=_DECAY)
+    return Run(net, copy.deepcopy(net), optimizer, np.random.default_rng(seed))
+
+
+def rate_at(progress: float) -> float:
+    """Return the learning rate after a share of the run: up along a line, down along a cosine."""
+    if progress < _WARM_UP:
+        return _RATE * (_FIRST_RATE + (1.0 - _FIRST_RATE) * progress / _WARM_UP)
+    left = 0.5 * (1.0 + np.cos(np.pi * min((progress - _WARM_UP) / (1.0 - _WARM_UP), 1.0)))
+    return float(_RATE * (_LAST_RATE + (1.0 - _LAST_RATE) * left))
+
+
+def shaft_loss(logits: torch.Tensor, shares: torch.Tensor) -> torch.Tensor:
+    """Return the mean loss of a pixel's chance of being shaft; needle weighs more than floor."""
+    losses = functional.binary_cross_entropy_with_logits(logits, shares, reduction="none")
+    return (losses * (1.0 + NEEDLE_WEIGHT * shares)).mean()
+
+
+def end_loss(log_intensity: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
+    """Return the mean over patches of minus the log-likelihood of their ends.
+
+    Ends are a Poisson process of intensity lambda: -log L = sum(lambda) - sum_ends log(lambda).
+    Likelihood is a proper score: the spread of a peak learns to be its error, and its sum the
+    chance that an end is there.
+
+    Parameters
+    ----------
+    log_intensity : Tensor, shape (n, height, width)
+        log(lambda) [1/px^2].
+    ends : Tensor, shape (n, 2)
+        Column and row of the end in each patch [px]; NaN where none is.
+    """
+    # What is cut off still has a slope: else it would never return.
+    cut = log_intensity + (log_intensity.clamp(*LOG_INTENSITY) - log_intensity).detach()
+    intensity = torch.exp(cut)
+    total = intensity.sum()
+    which = torch.isfinite(ends).all(dim=1).nonzero()[:, 0]
+    x, y = ends[which].unbind(dim=1)
+    height, width = intensity.shape[1:]
+    column = x.floor().long().clamp(0, width - 2)
+    row = y.floor().long().clamp(0, height - 2)
+    right, down = x - column, y - row
+    at_end = (1 - down) * (
+        (1 - right) * intensity[which, row, column] + right * intensity[which, row, column + 1]
+    ) + down * (
+        (1 - right) * intensity[which, row + 1, column]
+        + right * intensity[which, row + 1, column + 1]
+    )
+    return (total - torch.log(at_end).sum()) / len(ends)
+
+
+def losses(net: NeedleNet, batch: Batch, *, rounded: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the losses of shaft and end; rounded: with numbers of 16 bits, which is quicker."""
+    seen = torch.from_numpy(batch.seen).to(memory_format=torch.channels_last)
+    with torch.autocast("cpu", torch.bfloat16, enabled=rounded):
+        out = net(seen)
+    out = out.float()[:, :, CONTEXT:-CONTEXT, CONTEXT:-CONTEXT]
+    return (
+        shaft_loss(out[:, 0], torch.from_numpy(batch.shares)),
+        end_loss(out[:, 1], torch.from_numpy(batch.ends)),
+    )
+
+
+def rounds_quickly() -> bool:
+    """Return whether this processor is quicker with numbers of 16 bits."""
+    cpu = Path("/proc/cpuinfo")
+    return cpu.exists() and "amx_bf16" in cpu.read_text(encoding="utf-8")
+
+
+def train(run: Run, pool: Pool, plan: Plan) -> None:
+    """Train to the end, and write net and checkpoint now and then.
+
+    Parameters
+    ----------
+    run : Run
+        New, or resumed.
+    pool : Pool
+        Samples.
+    plan : Plan
+        How long, and where to.
+
+    Raises
+    ------
+    RuntimeError
+        The net diverged: one run of 32,000 steps did after 18,000, for a reason that is not known.
+        The last checkpoint stays, and from there it did not.
+    """
+    # More threads than that wait for each other longer than they work.
+    torch.set_num_threads(1)
+    quick = rounds_quickly()
+    began = saved = time.monotonic()
+    before = run.seconds
+    means = np.zeros(2)
+    bad = 0
+    bar = tqdm(total=plan.steps, initial=run.step, desc="training", unit="step", mininterval=10.0)
+    pool.update()
+    while (progress := max(run.step / plan.steps, run.seconds / (60.0 * plan.minutes))) < 1.0:
+        if run.step % _LOOK_EVERY == 0:
+            pool.update()
+        for group in run.optimizer.param_groups:
+            group["lr"] = rate_at(progress)
+        batch = pool.batch(run.rng, _BATCH)
+        shaft, end = losses(run.net, batch, rounded=quick and progress < _FULL_PRECISION)
+        if not (shaft.item() < _WORST[0] and end.item() < _WORST[1]):
+            bad += 1
+            if bad >= _MOST_BAD:
+                raise RuntimeError(f"diverged at step {run.step}: go on from {plan.checkpoint}")
+            continue
+        bad = 0
+        run.optimizer.zero_grad()
+        (shaft + _END_WEIGHT * end).backward()
+        torch.nn.utils.clip_grad_norm_(run.net.parameters(), _LARGEST_STEP)
+        run.optimizer.step()
+        run.step += 1
+        with torch.no_grad():
+            share = 1.0 / min(run.step / 10.0 + 1.0, _MEAN_OVER)
+            for mean, new in zip(run.mean_net.parameters(), run.net.parameters(), strict=True):
+                mean.lerp_(new, share)
+        now = time.monotonic()
+        run.seconds = before + now - began
+        means += (np.array([shaft.item(), end.item()]) - means) / min(run.step, 200)
+        bar.update()
+        bar.set_postfix(shaft=f"{means[0]:.4f}", end=f"{means[1]:.3f}", refresh=False)
+        if now - saved > plan.every:
+            saved = now
+            store(run, plan.output, plan.checkpoint)
+    bar.close()
+    store(run, plan.output, plan.checkpoint)
+
+
+def store(run: Run, output: Path, checkpoint: Path) -> None:
+    """Write the net and the checkpoint."""
+    export(run.mean_net, output)
+    run.save(checkpoint)
