@@ -34,8 +34,19 @@ BOUNDS = {
     "settling_time": 1.0,
 }
 HARD = {
+    "max_depth": 0.5,
     "max_step_length": 0.005,
     "max_speed": 0.005,
+    "max_rotation_step": 2.0 * math.pi,
+    "max_rotation_rate": 20.0,
+    "max_turns": 1000.0,
+    "tip_age_limit": 60.0,
+    "settling_time": 10.0,
+    "homing_rotation_rate": 20.0,
+    "insertion_following_error": 10.0,
+    "rotation_following_error": 10.0,
+    "insertion_tolerance": 1.0,
+    "rotation_tolerance": 1.0,
     "retraction_speed": 0.005,
     "homing_speed": 0.005,
     "hold_timeout": 0.5,
@@ -60,6 +71,7 @@ def test_a_bound_is_finite_positive_and_no_more_than_the_hard_one() -> None:
         assert getattr(SafetyLimits(**{name: bound}), name) == bound
         with pytest.raises(OutOfBoundsError, match=name):
             SafetyLimits(**{name: bound * 1.001})
+    assert HARD.keys() == BOUNDS.keys()
     for name in BOUNDS:
         for bad in (0.0, -1.0, math.nan, math.inf):
             with pytest.raises(UserError, match=name):
