@@ -11,7 +11,7 @@ from needle_device_driver.supervisor.command import Command, CommandPoint, check
 from needle_device_driver.supervisor.limits import SafetyLimits
 
 from ..ideal_axes import Bench
-from ..supervisor_bench import NAMES
+from ..supervisor_bench import NAMES, PERIOD
 
 MS = 1_000_000
 Point = tuple[float, float, float]
@@ -186,6 +186,17 @@ def test_tip_age_counts_steady_seconds_whatever_ros_time_does() -> None:
     bench.now += 0.2
     bench.step(stamp_ns=stamp)
     assert bench.state == "MOVING"
+
+
+def test_tip_age_is_told_however_long_ros_time_stands_still() -> None:
+    bench = Bench().ready()
+    # Longer than notes are kept, and more cycles than are kept of it.
+    for _ in range(1500):
+        bench.now += PERIOD
+        bench.supervisor.note_time(bench.ros_ns, bench.now)
+    bench.press()
+    bench.step()
+    assert "30.000 s old, limit 2 s" in bench.refused("tip_age")
 
 
 def test_tip_age_unknown_old_or_from_the_future() -> None:

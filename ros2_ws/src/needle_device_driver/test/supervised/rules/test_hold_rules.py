@@ -8,6 +8,9 @@ from collections.abc import Callable
 
 import pytest
 
+from needle_core.messages import HoldState
+from needle_device_driver.supervisor.hold import Hold
+
 from ..ideal_axes import Bench
 
 MS = 1_000_000
@@ -74,6 +77,14 @@ def test_hold_age_a_message_counts_as_long_as_it_says_and_a_quarter_of_a_second(
     assert bench.status.watchdog_trips == 1
     bench.now = arrival + lives + 0.001
     assert says(bench, "+ - +") == "- - a"
+
+
+@pytest.mark.parametrize("start", [0.0, 0.1, 1e6])
+def test_hold_age_is_told_alike_however_long_the_steady_clock_has_run(start: float) -> None:
+    hold = Hold(0.25)
+    hold.receive(HoldState("a", "", 1, True, 1.0, math.inf), start, counting=True)
+    assert hold.lapse(start + 0.249) == ""
+    assert hold.lapse(start + 0.251) == "no hold message for 0.251 s, limit 0.25 s"
 
 
 def test_hold_age_one_that_lives_for_no_time_is_a_release() -> None:
@@ -310,6 +321,18 @@ def test_command_newer_a_reset_lets_commands_in_after_time_went_back(back_ns: in
     bench.press()
     bench.step()
     assert bench.state == "MOVING"
+
+
+def test_command_newer_tells_of_time_that_went_back_only_where_it_did() -> None:
+    bench = Bench().ready()
+    last = bench.step()
+    bench.go(25)
+    # As far as a stamp may be ahead of its arrival it is no time that went back.
+    for back_ns, told in ((-MS, False), (0, False), (100 * MS, False), (100 * MS + 1, True)):
+        bench.supervisor.note_time(last - back_ns, bench.now)
+        bench.step(stamp_ns=last)
+        assert bench.rule == "command_newer"
+        assert ("ROS time went back" in bench.outcomes[-1]) is told, back_ns
 
 
 def test_command_newer_no_stamp_is_used_twice_though_time_went_back() -> None:
