@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import pytest
@@ -35,6 +36,15 @@ def test_a_period_at_half_speed_goes_half_as_far_and_one_may_end_a_leg() -> None
     assert not motion.complete
     motion.advance(0.4, 1.0)
     assert motion.complete
+
+
+def test_what_a_leg_leaves_of_a_period_is_gone_at_the_speed_of_the_next() -> None:
+    motion = CoordinatedMotion((0.0, 0.0), [Leg(1.0, -2.0, 0.5), Leg(2.0, -2.0, 1.0)])
+    motion.advance(0.4, 1.0)
+    # The last fifth of the first leg takes 0.1 s, at half speed 0.2 s.
+    for scale, reached in ((1.0, 1.2), (0.5, 1.05)):
+        at = copy.deepcopy(motion).advance(0.3, scale)
+        assert (at.insertion, at.rotation) == pytest.approx((reached, -2.0))
 
 
 def test_rotation_waits_for_a_hand_and_follows_it_no_faster_than_its_rate() -> None:

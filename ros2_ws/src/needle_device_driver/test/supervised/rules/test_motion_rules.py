@@ -59,6 +59,21 @@ def test_settling_time_is_a_second_beside_the_target(which: str, tolerance: floa
     assert "not at their target 1 s after the last set-point" in bench.status.fault
 
 
+@pytest.mark.parametrize(("which", "end", "tolerance"), [("insertion", 9, 20), ("rotation", 1, 10)])
+def test_settling_time_an_axis_off_by_just_its_tolerance_has_arrived(
+    which: str, end: int, tolerance: int
+) -> None:
+    # Powers of two: what lies between them is exact.
+    for off, state in ((2.0**-tolerance, "HOLDING"), (1.001 * 2.0**-tolerance, "MOVING")):
+        bench = Bench(insertion_tolerance=2.0**-20, rotation_tolerance=2.0**-10).ready()
+        bench.step(2.0**-9, 2.0**-1)
+        bench.go(24)
+        axis = bench.axis(which)
+        axis.stuck, axis.position = True, 2.0**-end - off
+        bench.go()
+        assert bench.state == state
+
+
 # ---- retraction ---------------------------------------------------------------------------------
 
 
