@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -162,6 +163,20 @@ class DriveBench(SupervisorBench):
         event()
         self.bus.flush()
         self.go()
+
+    def obeys_late(self, drive: ScriptedDrive, seconds: float) -> None:
+        """Let a drive be off so long after the last order, whatever it is [s]."""
+        due = math.inf
+
+        def command(word: int) -> None:
+            nonlocal due
+            drive.last_word, due = word, self.now + seconds
+
+        def sending() -> None:
+            if self.now >= due:
+                drive.state = "disabled"
+
+        drive.command, self.bus.sending = command, sending  # type: ignore[method-assign]
 
     # ---- checks -------------------------------------------------------------------------------
 

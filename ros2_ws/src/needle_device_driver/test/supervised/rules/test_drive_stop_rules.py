@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from needle_device_driver.axes.axis import AxisError
 
 from ..drive_bench import DriveBench
+from ..supervisor_bench import PERIOD
 
 QUICK_STOP = b"\x02\x00\x08"
 
@@ -143,6 +145,22 @@ def test_quick_stop_of_a_drive_that_answers_again_at_a_reset_nothing_is_told_any
     assert (bench.state, bench.status.fault) == ("DISABLED", "")
 
 
+def test_quick_stop_at_the_end_a_drive_has_time_to_answer_between_two_cycles() -> None:
+    bench = DriveBench().moving()
+    sync, times = bench.insertion.sync, []
+
+    def noted() -> None:
+        times.append(bench.now)
+        sync()
+
+    bench.insertion.sync = noted  # type: ignore[method-assign]
+    bench.run(bench.axes[0].close())
+    assert bench.insertion.state == "disabled"
+    assert len(times) > 3
+    # Half a cycle: each SYNC is answered at once.
+    assert np.diff(times) == pytest.approx([PERIOD / 2] * (len(times) - 1))
+
+
 # ---- watchdog and emergencies -------------------------------------------------------------------
 
 
@@ -198,7 +216,8 @@ def test_drive_emergency_stops_both_says_why_and_is_acknowledged_in_the_process_
         bench.run(bench.axes[0].home(0.001))
     bench.hold(False)
     stopping = "rotation axis: is still stopping: reset again when it stands"
-    assert bench.reset().message == stopping
+    reset = bench.reset()
+    assert (reset.success, reset.message) == (False, stopping)
     assert bench.state == "FAULT"
     bench.stopped("drive_emergency", "the drive reports 0x7305 encoder error")
     # A fault without message counts, too.
@@ -219,11 +238,37 @@ def test_drive_emergency_that_stays_keeps_the_device_in_fault(lacking: set[int],
     bench.wait(5)
     bench.sdo_time = 0.05
     reset = bench.reset()
-    assert reset.message == f"insertion axis: the drive does not leave its fault{why}"
+    wanted = f"insertion axis: the drive does not leave its fault{why}"
+    assert (reset.success, reset.message) == (False, wanted)
     assert bench.state == "FAULT"
     # The edge counts: the order before was one to reset, too.
     drive.deaf_to_reset, drive.missing_objects = False, set()
     assert bench.reset().success
+
+
+@pytest.mark.parametrize(("seconds", "leaves"), [(0.9, True), (1.1, False)])
+def test_drive_emergency_a_drive_may_take_a_second_to_leave_its_fault(
+    seconds: float, leaves: bool
+) -> None:
+    bench = DriveBench().homed()
+    bench.after(lambda: bench.insertion.fail(0x7121))
+    bench.hold(False)
+    bench.wait(5)
+    bench.sdo_time = 0.02
+    bench.obeys_late(bench.insertion, seconds)
+    assert bench.reset().success is leaves
+
+
+def test_drive_emergency_that_only_an_answer_from_before_the_reset_tells_is_over() -> None:
+    bench = DriveBench().homed()
+    # It answers with what it sampled at the SYNC before.
+    bench.insertion.tells_late = True
+    bench.after(lambda: bench.insertion.fail(0x7305))
+    bench.hold(False)
+    bench.wait(5)
+    assert bench.reset().success
+    bench.wait(5)
+    assert bench.state == "DISABLED", bench.status.fault
 
 
 def test_drive_emergency_between_two_cycles_refuses_a_retraction() -> None:
