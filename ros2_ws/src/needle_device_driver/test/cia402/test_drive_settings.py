@@ -1,0 +1,30 @@
+"""Which settings a drive can have."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from needle_core.errors import OutOfBoundsError, UserError
+from needle_device_driver.parameters import DeviceDriverParameters
+
+SETTINGS = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
+
+
+def test_a_node_has_any_number_below_that_of_the_computer() -> None:
+    for node_id in (1, 126):
+        assert dataclasses.replace(SETTINGS, node_id=node_id).node_id == node_id
+    for node_id in (0, 127):
+        with pytest.raises(OutOfBoundsError, match="node_id"):
+            dataclasses.replace(SETTINGS, node_id=node_id)
+
+
+def test_homing_methods_are_those_of_the_standard_that_end_at_a_switch_an_index_or_here() -> None:
+    methods = {*range(1, 15), *range(17, 31), 33, 34, 35, 37}
+    for method in range(-1, 40):
+        if method in methods:
+            assert dataclasses.replace(SETTINGS, homing_method=method).homing_method == method
+        else:
+            with pytest.raises(UserError, match=f"homing_method = {method} is none"):
+                dataclasses.replace(SETTINGS, homing_method=method)
