@@ -165,6 +165,16 @@ def test_a_fault_is_left_alone_and_a_word_of_no_state_is_trouble(machine: DriveM
     assert (machine.trouble, machine.target, machine.switching) == ("", 7, False)
 
 
+def test_a_drive_that_leaves_its_mode_has_as_long_as_one_that_is_switched_on(
+    machine: DriveMachine,
+) -> None:
+    enabled(machine)
+    orders(machine, *[said(ENABLED, mode=6)] * 100)
+    assert machine.trouble == ""
+    machine.update(said(ENABLED, mode=6))
+    assert machine.trouble == "is not on after 2 s: OPERATION_ENABLED, mode 6"
+
+
 @pytest.mark.parametrize(("statusword", "told"), [(0x0250, False), (0x0050, True)])
 def test_a_drive_that_does_not_listen_to_the_bus_is_told(
     machine: DriveMachine, statusword: int, told: bool

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
+
+from needle_device_driver.cia402.drive_monitor import Feedback
 
 from .drive_bench import RAD, DriveBench
 
@@ -63,6 +67,12 @@ def test_the_outer_end_is_the_negative_limit_switch_or_the_home_switch() -> None
             assert at.at_inner_switch is any(inputs & bits for bits in inner)
 
 
+def test_a_drive_that_said_nothing_yet_is_nowhere_and_on_its_way_nowhere() -> None:
+    bench = DriveBench()
+    assert bench.axes[0].monitor.feedback == Feedback(0, 0, 0, 0, 0, 0)
+    assert bench.axes[0].monitor.fresh_time == -math.inf
+
+
 # ---- homing -------------------------------------------------------------------------------------
 
 
@@ -116,14 +126,15 @@ def test_a_homing_can_be_stopped_and_leaves_the_axis_un_homed() -> None:
 # ---- an insertion axis that a hand pushes -------------------------------------------------------
 
 
-def pushed() -> DriveBench:
+def pushed(home: int = 777) -> DriveBench:
     bench = DriveBench(insertion_drive="hand")
-    bench.insertion.position = 777
+    bench.insertion.position = home
     return bench.ready()
 
 
-def test_a_pushed_axis_is_told_nothing_that_moves_and_depends_on_no_computer() -> None:
-    bench = pushed()
+@pytest.mark.parametrize("home", [777, -777])
+def test_a_pushed_axis_is_told_nothing_that_moves_and_depends_on_no_computer(home: int) -> None:
+    bench = pushed(home)
     assert bench.status.insertion_m == pytest.approx(0.0)
     bench.step(0.001, 0.2)
     bench.go()

@@ -23,12 +23,21 @@ def test_look_ahead_refuses_a_set_point_that_is_further() -> None:
     bench = DriveBench().moving()
     # A cycle's way at 5 mm/s, 1 % and a count.
     at = bench.joint()
-    assert "ahead in a cycle" in refused(bench, at + 2022 / 20e6, Rule.LOOK_AHEAD)
+    why = "set-point 0.0001011 ahead in a cycle at 0.005/s, at most 0.00010105"
+    assert why in refused(bench, at + 2022 / 20e6, Rule.LOOK_AHEAD)
     bench.axes[0].start_move(at + 2021 / 20e6, 0.005)
     bench.axes[0].start_move(at, 0.005)
     most = (math.pi * 0.02 * 1.01 * RAD) + 1
     refused(bench, bench.joint(1) + (most + 1) / RAD, Rule.LOOK_AHEAD, 1)
     bench.axes[1].start_move(bench.joint(1) + (most - 1) / RAD, 0.005)
+
+
+@pytest.mark.parametrize(("speed", "counts"), [(0.0025, 1010), (0.0025025, 1011)])
+def test_look_ahead_has_room_for_one_count_of_rounding(speed: float, counts: int) -> None:
+    bench = DriveBench(max_speed=speed).moving()
+    at = bench.joint()
+    refused(bench, at + (counts + 2) / 20e6, Rule.LOOK_AHEAD)
+    bench.axes[0].start_move(at + (counts + 1) / 20e6, 0.005)
 
 
 @pytest.mark.parametrize("left_over", [-90, 90])

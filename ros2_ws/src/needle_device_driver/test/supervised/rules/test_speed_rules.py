@@ -10,6 +10,7 @@ import pytest
 
 from needle_device_driver.cia402.axis_speed import SpeedWatch
 from needle_device_driver.cia402.drive_monitor import Feedback
+from needle_device_driver.cia402.homing_run import HomingRun
 from needle_device_driver.parameters import DeviceDriverParameters
 
 from ..drive_bench import RAD, DriveBench
@@ -212,6 +213,8 @@ def test_homing_time_a_drive_that_goes_away_from_its_switch_is_stopped(
     for reverse in (False, True):
         bench = DriveBench(insertion_homing_method=method, insertion_reverse=reverse)
         bench.insertion.searches(forever=away * 2 * MM_S)
+        # Its other switches say nothing about this one.
+        bench.insertion.inputs = 7 - switch
         bench.homing()
         text = f"away from the limit switch of homing method {method}"
         assert text in until_fault(bench, "homing_time")
@@ -229,6 +232,18 @@ def test_homing_time_a_drive_that_goes_away_from_its_switch_is_stopped(
         bench.wait(60)
         assert abs(bench.insertion.position) > 20_000
         assert bench.state == "MOVING", bench.status.fault
+
+
+@pytest.mark.parametrize(("counts", "is_away"), [(1, True), (-1, False)])
+def test_homing_time_a_count_is_away_from_the_switch_where_it_is_more_than_the_bound(
+    counts: int, is_away: bool
+) -> None:
+    settings = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
+    settings = dataclasses.replace(settings, counts_per_unit=1000.0)
+    homing = HomingRun(settings, 0.002, switches=True)
+    for position in (0, counts):
+        homing.update(Feedback(1, 0x0237, 6, 0, position, 0), position)
+    assert ("went 1 mm away from the limit switch" in homing.trouble) is is_away
 
 
 def test_homing_time_a_drive_that_reports_a_failure_has_no_other_name() -> None:
