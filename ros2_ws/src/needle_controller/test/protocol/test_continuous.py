@@ -72,6 +72,10 @@ class ContinuousRig(Rig):
             self.steering.on_result(path_in(self.see()).stamp_ns, "aborted: no")
 
 
+def test_the_same_tip_leads_to_the_same_path() -> None:
+    assert len({path_in(ContinuousRig().see()) for _ in range(2)}) == 1
+
+
 def test_a_tip_leads_to_the_turn_of_a_step_and_a_path_beyond(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

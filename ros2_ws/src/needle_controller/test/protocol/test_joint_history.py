@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from needle_controller.protocol.joint_history import Heard, JointHistory, JointSample
+from needle_controller.protocol.joint_history import CONFIRMED_BY, Heard, JointHistory, JointSample
 
 TICK = 20_000_000
 SECOND = 10**9
@@ -56,6 +56,15 @@ def test_memory_is_bounded() -> None:
     assert made.at(995) == JointSample(995, 1e-6 * 995, 0.0)
 
 
+def test_memory_is_bounded_also_where_a_new_truth_is_longer_than_it() -> None:
+    made = JointHistory(length=2)
+    for start in (0, HOUR, 2 * HOUR):
+        for tick in range(20):
+            made.add(JointSample(start + tick * TICK, 0.0, 0.0))
+            assert len(list(made.after(-1))) <= CONFIRMED_BY
+        assert made.latest == JointSample(start + 19 * TICK, 0.0, 0.0)
+
+
 def test_a_sample_counts_that_follows_from_the_one_before() -> None:
     for gap_ns, insertion, rotation, heard in (
         # As far as a hand pushes and a motor turns in the time, and the noise of both.
@@ -103,6 +112,15 @@ def test_a_spike_is_dropped_and_what_stays_is_the_new_truth() -> None:
         assert heard == [Heard.DOUBTED] * 4 + [Heard.JUMPED]
         assert made.oldest == JointSample(START + stamp, insertion, rotation)
         assert (made.complaint, made.doubted) == ("", 7)
+
+
+def test_a_complaint_says_from_where_to_where_and_in_what_time() -> None:
+    made = history((START, 0.05, -1.0))
+    made.add(JointSample(START + TICK, 0.0625, 2.5))
+    said = "joint_states do not follow from the last: 0.0625 m, 2.5 rad after 0.05 m, -1 rad"
+    assert made.complaint == f"{said}, 0.02 s later"
+    made.add(JointSample(START - HOUR, 0.0625, 2.5))
+    assert made.complaint == f"{said}, -3600 s later"
 
 
 def test_two_truths_in_turn_leave_the_first() -> None:

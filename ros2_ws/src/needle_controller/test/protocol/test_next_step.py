@@ -56,13 +56,15 @@ def test_a_step_goes_on_by_its_length_or_ends_at_depth_or_point() -> None:
 
 def test_trust_is_the_interval_of_the_covariance_the_doubts_and_the_end() -> None:
     estimator = HypothesisFilter(FilterSettings())
-    estimator.reset([0.002, 0.0, 0.0], np.zeros(2))
-    estimate = estimator.estimate()
-    trust = trust_of(estimate)
-    half = 1.96 * math.sqrt(estimate.covariance[0, 0])
-    assert trust.r1 == pytest.approx(0.002, rel=1e-12)
-    assert (trust.r1 - trust.low, trust.high - trust.r1) == pytest.approx((half, half), rel=1e-4)
-    assert (trust.verdict, trust.is_doubtful) == ("trusted", False)
+    for r1 in (-0.002, 0.002):
+        estimator.reset([r1, 0.0, 0.0], np.zeros(2))
+        estimate = estimator.estimate()
+        trust = trust_of(estimate)
+        half = 1.96 * math.sqrt(estimate.covariance[0, 0])
+        assert trust.r1 == pytest.approx(r1, rel=1e-12)
+        ends = trust.r1 - trust.low, trust.high - trust.r1
+        assert ends == pytest.approx((half, half), rel=1e-4)
+        assert (trust.verdict, trust.is_doubtful) == ("trusted", False)
     there, elsewhere = trust_of(estimate, 0.00099), trust_of(estimate, -0.0072)
     assert (there.verdict, there.is_doubtful) == ("trusted", False)
     assert elsewhere.verdict == "doubtful: the needle ends -0.0072 m from its target"
@@ -89,10 +91,12 @@ def test_what_was_heard_is_read_back_in_its_order_and_told_once() -> None:
         heard.add(*message)
     assert heard_messages(heard.take_text()) == messages
     assert heard.take_text() == ""
-    for number in range(100):
-        assert not heard.is_full
+    # It is full until it is told.
+    for number in range(103):
+        assert heard.is_full is (number >= 100)
         heard.add("joint_states", number)
-    assert heard.is_full
+    assert len(heard_messages(heard.take_text())) == 103
+    assert not heard.is_full
     # What nobody sent so is no message.
     found = heard_messages("joint_states soon, needle/tip -1, device/result 7, x 8 9")
     assert found == [("device/result", 7)]

@@ -9,6 +9,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from needle_controller.bank import hypothesis_filter
+from needle_controller.bank.estimate_tiles import Tiles, tidied
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.planning.obstacles import Obstacle, Obstacles
@@ -116,6 +118,22 @@ def test_a_flip_turns_the_bevel_over_and_holds_the_plane() -> None:
     needle.steer(51)
     assert needle.plant.T_rig_tip[0, 0] < -0.25
     assert max(needle.track[69:]) < 1e-3
+
+
+def test_all_that_a_filter_runs_has_run_before_the_needle_waits_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    times = 0
+
+    def noted(tiles: Tiles) -> Tiles:
+        nonlocal times
+        times += 1
+        return tidied(tiles)
+
+    # Only with every eighth tip.
+    monkeypatch.setattr(hypothesis_filter, "tidied", noted)
+    Needle(PLANE)
+    assert times == 1
 
 
 def test_a_change_of_preset_keeps_the_estimated_pose_and_steers_on() -> None:

@@ -79,6 +79,17 @@ def test_a_stamp_that_is_old_or_far_ahead_does_not_set_the_clock() -> None:
     assert "older" in logged(other.steering.on_tip(TipMeasurement(1, "rig", np.zeros(3))))
 
 
+def test_of_tips_that_wait_those_go_that_came_before_their_time() -> None:
+    rig = Rig()
+    for ahead in (1, 3, 4):
+        assert rig.steering.on_tip(rig.measured(ahead=ahead * TICK)) == []
+    # Its topic keeps its order: two had a stamp too late, the first had a good one.
+    assert rig.steering.on_tip(rig.measured(ahead=2 * TICK)) == []
+    assert rig.steering.intake.refused == {Fault.AHEAD_OF_JOINTS: 2}
+    rig.now += TICK
+    assert sent(rig.joints()).stamp_ns == rig.now
+
+
 def test_no_tip_in_time_waits_and_a_good_one_goes_on() -> None:
     rig = Rig()
     timeout = rig.steering.settings.tip_timeout
