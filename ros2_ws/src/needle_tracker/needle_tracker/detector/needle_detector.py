@@ -145,10 +145,17 @@ class NeedleDetector:
         ]
         return sampled[0], sampled[1]
 
-    def ends_near(self, path: ShaftPath) -> list[ImageEnd]:
+    def ends_near(self, path: ShaftPath, *, hidden: bool) -> list[ImageEnd]:
         """Return the ends that the image at full size shows about the end of a path.
 
         What half the size shows as one may be two, such as a needle beside its shadow.
+
+        Parameters
+        ----------
+        path : ShaftPath
+            From `search`.
+        hidden : bool
+            Whether a shaft's line without an end will do where no end is seen.
         """
         shrink, width = self._shrink, self.width_px
         half = _NEAR_WIDTHS * width
@@ -168,6 +175,11 @@ class NeedleDetector:
             end = self._fitted((shaft, ends, corner), place, path.direction, width, 0.5 * width)
             if end is not None:
                 found.append(end)
+        if hidden and not found:
+            # The end is hidden: the shaft's line still says where it is, across.
+            place = (path.end + 0.5) / shrink - 0.5 - corner
+            end = self._fitted((shaft, ends, corner), place, path.direction, half, 0.5 * width)
+            found = [] if end is None else [end]
         return found
 
     def fit(

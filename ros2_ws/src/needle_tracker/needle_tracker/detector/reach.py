@@ -1,4 +1,4 @@
-"""What the needle can reach, by its curvature, its longest insertion and how it enters."""
+"""Reach of the needle, by its curvature, its longest insertion and how it enters."""
 
 from __future__ import annotations
 

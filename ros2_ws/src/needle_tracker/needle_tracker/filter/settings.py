@@ -1,4 +1,4 @@
-"""What the tracker is told beside the calibration, and the numbers of its filter."""
+"""Settings of the tracker beside the calibration, and the numbers of its filter."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ class SeenLines:
     def search(self, least: float, most: float) -> list[ShaftPath]:
         return [ShaftPath(self.view.project(line), 10.0, 0.9) for line in self.lines]
 
-    def ends_near(self, path: ShaftPath) -> list[ImageEnd]:
+    def ends_near(self, path: ShaftPath, *, hidden: bool) -> list[ImageEnd]:
         return [ImageEnd(path.end, path.direction, 0.2, 1.0, 0.01, self.ends, 0.9)]
 
     def trace(self, path: ShaftPath, end: ImageEnd) -> ShaftPath:
@@ -98,7 +98,9 @@ def test_only_ends_at_the_distances_that_are_asked_for(
 
 def test_evidence_is_the_sum_of_what_the_views_say(views: Views, needle: np.ndarray) -> None:
     left, right = (
-        SeenLines(view, [needle]).ends_near(ShaftPath(view.project(needle), 1.0, 1.0))[0]
+        SeenLines(view, [needle]).ends_near(
+            ShaftPath(view.project(needle), 1.0, 1.0), hidden=False
+        )[0]
         for view in views
     )
     tip = triangulate(views, (left, right))
