@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 GATE = 25.0
 """Squared distance over the covariance from which on a sighting is not a track's: 5 sigma."""
 _LENGTH_SIGMA = 0.4e-3  # of a shaft's length as both views show it [m], from path-traced pairs
+_ASIDE_SIGMAS = 2.5  # the widest reach, in standard deviations of where needles go
 _SHADOW = 3.0  # log-odds of a needle against its own shadow or mirror image
 _JUMPS = 0.1  # probability that what is no needle ends elsewhere in the next pair
 _ACROSS = 1.0 / (2.0 * math.pi * (0.3e-3) ** 2)  # density of a chance end across the needle [1/m^2]
@@ -79,21 +80,10 @@ class NeedleTrack:
         """Return the track of something seen for the first time."""
         tip = sighting.tip
         motion = NeedleMotion.begin(tip, settings)
-        distance = float(np.linalg.norm(tip.position))
-        widest = distance * math.sin(float(settings.reach.chord_angle(np.array(distance))))
-        aside = 2.0 * float(np.linalg.norm(tip.position[:2])) / widest
-        # Most needles stay well within reach. Without the insertion nothing else is known.
-        place = -0.5 * aside * aside
         if insertion is not None and sighting.length is not None:
-            sigma = math.hypot(
-                settings.stage_zero_sigma, settings.stage_scale_sigma * insertion, _LENGTH_SIGMA
-            )
-            off = (sighting.length - insertion) / sigma
-            # Other things end at any distance.
-            density = math.exp(-0.5 * off * off) / (math.sqrt(2.0 * math.pi) * sigma)
-            place += math.log(max(density * settings.reach.length, 1e-9))
             motion = motion.measured(sighting.length, insertion, _LENGTH_SIGMA)
         end = settings.filter.prior_log_odds + sighting.evidence
+        place = place_log_odds(sighting, insertion, settings)
         return NeedleTrack(
             motion, tip.position, tip.covariance, end, place, 0.0, insertion
         )._bounded(settings)
@@ -135,6 +125,10 @@ class NeedleTrack:
             place=place,
             place_covariance=covariance,
             end_log_odds=self.end_log_odds + numbers.repeat_weight * sighting.evidence,
+            # What once ended where the needle cannot is not the needle.
+            place_log_odds=min(
+                self.place_log_odds, place_log_odds(sighting, self.insertion, settings)
+            ),
             motion_log_odds=self.motion_log_odds + gain,
             misses=0,
             sightings=self.sightings + 1,
@@ -201,6 +195,33 @@ class NeedleTrack:
     def stage(self) -> tuple[float, float]:
         """Return the stage's zero [m] and scale error [-], as estimated."""
         return float(self.motion.mean[ZERO]), float(self.motion.mean[SCALE])
+
+
+def place_log_odds(sighting: Sighting, insertion: float | None, settings: TrackerSettings) -> float:
+    """Return the log-odds that the needle ends in a place, and not something else.
+
+    A needle that ends far aside has bent outwards all the way, so its tangent at the tip passes the
+    entry on the other side; a shadow beside it runs parallel. And a needle is as long as the stage
+    says, where other things end at any distance.
+    """
+    position, ahead = sighting.tip.position, sighting.tip.direction
+    distance = float(np.linalg.norm(position))
+    widest = distance * math.sin(float(settings.reach.chord_angle(np.array(distance))))
+    outwards = position[:2] / max(float(np.linalg.norm(position[:2])), 1e-9)
+    # Where the tangent passes the entry, outwards.
+    passes = float((position[:2] - position[2] / max(ahead[2], 0.1) * ahead[:2]) @ outwards)
+    aside = _ASIDE_SIGMAS * max(passes, 0.0) / widest
+    log_odds = -0.5 * aside * aside
+    if insertion is not None and sighting.length is not None:
+        sigma = math.hypot(
+            settings.stage_zero_sigma, settings.stage_scale_sigma * insertion, _LENGTH_SIGMA
+        )
+        off = (sighting.length - insertion) / sigma
+        density = math.exp(-0.5 * off * off) / (math.sqrt(2.0 * math.pi) * sigma)
+        log_odds += math.log(max(density * settings.reach.length, 1e-9))
+    elif insertion is not None:
+        log_odds = math.inf
+    return log_odds
 
 
 def _merged(place: Array, covariance: Array, tip: SpatialTip) -> tuple[Array, Array]:

@@ -55,7 +55,7 @@ class FilterSettings:
     repeat_weight: float = 0.1
     miss_cost: float = 0.5
     max_log_odds: float = 8.0
-    accepted: float = 0.9
+    accepted: float = 0.85
     max_sigma: float = 0.6e-3
     lost_after: int = 10
     forgotten_after: int = 30

@@ -23,8 +23,7 @@ Array = NDArray[np.float64]
 _CLOSER_LOOKS = 5  # pairs of paths whose ends are fitted at full size
 # Of a path's end [px] and direction [rad]: what half the size shows as one line may be two.
 _PATH_ACROSS_PX, _PATH_ALONG_PX, _PATH_ANGLE = 4.0, 10.0, 0.1
-# A loop that waits for its first tip moves nothing: of a needle so short one view's end will do [m].
-_YOUNG = 15e-3
+_YOUNG = 15e-3  # of a shorter needle one view's end will do: a loop waits for its first tip [m]
 _SAME_PX = 2.0  # ends so near are one [px]
 _MAX_MISFIT = 25.0  # chi-squared of one degree of freedom: worse pairs show two things
 _LEAST_CHANCE = 0.02  # the network is not surer than that
