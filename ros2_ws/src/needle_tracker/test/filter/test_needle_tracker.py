@@ -144,11 +144,11 @@ def test_whatever_the_needles_length_nothing_is_compiled_anew(
     tracker.warm_up()
     before = compiled_for()
     assert len(before) > 10
-    for length in (0.012, 0.06, 0.11):
+    for length in (0.012, 0.11):
         images = draw_pair(make_arc(length, 4.0, 0.5))
         for insertion in (length, None):
             tracker.reset()
-            for _ in range(3):
+            for _ in range(2):
                 tracker.process(*images, insertion)
     assert compiled_for() == before
 
@@ -195,10 +195,9 @@ def test_one_blocked_camera_loses_the_track_and_sight_restores_it(
 def test_without_an_encoder_a_needle_that_went_on_unseen_is_found_again(
     tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
 ) -> None:
-    for mm in range(46, 52):
+    for mm in range(48, 52):
         tracker.process(*draw_pair(make_arc(1e-3 * mm, 5.0, 1.0), seed=mm), None)
-    unseen = draw_pair(None)
-    while (answer := tracker.process(*unseen, None)).state is not TrackState.LOST:
+    while (answer := tracker.skip("covered")).state is not TrackState.LOST:
         assert answer.tip is None
     for mm in range(65, 68):
         path = make_arc(1e-3 * mm, 5.0, 1.0)
@@ -211,14 +210,14 @@ def test_without_an_encoder_a_needle_is_found_beside_an_old_track_that_stands(
     tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
 ) -> None:
     old, reasons = make_arc(0.045, 5.0, 0.5), []
-    for mm in [40] * 4 + list(range(42, 50, 2)):
+    for mm in [40] * 2 + list(range(42, 50, 2)):
         path = make_arc(1e-3 * mm, 6.0, 2.6)
         (left, right), (old_left, old_right) = (draw_pair(each, seed=mm) for each in (path, old))
         answer = tracker.process(np.minimum(left, old_left), np.minimum(right, old_right), None)
         reasons.append(answer.reason)
         if answer.tip is not None:
             assert np.linalg.norm(answer.tip.position - path[-1]) < 0.25e-3
-    assert set(reasons[:4]) == {NoTip.UNCONFIRMED}
+    assert set(reasons[:2]) == {NoTip.UNCONFIRMED}
     assert reasons[-2:] == ["", ""]
 
 
