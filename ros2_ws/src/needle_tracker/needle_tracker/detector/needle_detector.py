@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -25,6 +26,7 @@ from needle_tracker.detector.search_grid import SearchGrid, make_search_grid
 from needle_tracker.optics.refraction import RefractedCamera
 
 Array = NDArray[np.float64]
+Pixels = TypeVar("Pixels", NDArray[np.float32], NDArray[np.float64])
 
 _COARSE_WIDTH_PX = 4.4
 """Needles at least so wide are searched at half size: there they are 2.2 px, the least trained."""
@@ -66,7 +68,7 @@ class NeedleDetector:
         hole_clearance: float,
         net: NeedleNet,
     ) -> None:
-        self._view, self._net = view, net
+        self._net = net
         middle = np.array([0.0, 0.0, 0.5 * reach.length])
         facing = np.stack([view.sideways, [0.0, 0.0, 1.0]], axis=-1)
         self._px_per_m = float(np.linalg.norm(view.jacobian(middle) @ facing, axis=0).mean())
@@ -78,7 +80,6 @@ class NeedleDetector:
         self._grid: SearchGrid = make_search_grid(view, reach, first_distance=hole_clearance)
         self._entry = view.project(np.zeros(3))
         self._clear_px = hole_clearance * self._px_per_m
-        self._image: Image | None = None
         self._backgrounds: dict[int, Map] = {}
         self._shrunk: dict[int, Image] = {}
 
@@ -127,8 +128,7 @@ class NeedleDetector:
 
     def _sampled(self, cells: NDArray[np.bool_], shrink: int) -> tuple[Map, Map]:
         """Return the maps at cells of the grid's first rows, 0 at all others."""
-        # Pixel centres: pixel i of an image at half size covers the pixels 2 i and 2 i + 1.
-        places = (self._grid.pixels[: len(cells)] + 0.5) / np.float32(shrink) - np.float32(0.5)
+        places = _shrunk_px(self._grid.pixels[: len(cells)], np.float32(shrink))
         height, width = self._at(shrink).shape
         shaft, ends = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
         for box in _strips(places[cells]):
@@ -169,7 +169,7 @@ class NeedleDetector:
         found = []
         for row, column in np.argwhere(peaks):
             place = np.array([column, row], np.float64)
-            off = (place + corner + 0.5) * shrink - 0.5 - path.end
+            off = _full_px(place + corner, shrink) - path.end
             if math.hypot(*off) > half:
                 continue
             end = self._fitted((shaft, ends, corner), place, path.direction, width, 0.5 * width)
@@ -177,7 +177,7 @@ class NeedleDetector:
                 found.append(end)
         if hidden and not found:
             # The end is hidden: the shaft's line still says where it is, across.
-            place = (path.end + 0.5) / shrink - 0.5 - corner
+            place = _shrunk_px(path.end, shrink) - corner
             end = self._fitted((shaft, ends, corner), place, path.direction, half, 0.5 * width)
             found = [] if end is None else [end]
         return found
@@ -205,7 +205,7 @@ class NeedleDetector:
         if box is None:
             return None
         maps = self._evidence(shrink, box)
-        place = (point + 0.5) / shrink - 0.5 - maps[2]
+        place = _shrunk_px(point, shrink) - maps[2]
         return self._fitted(maps, place, direction, along, across)
 
     def _fitted(
@@ -219,7 +219,7 @@ class NeedleDetector:
         """Fit line and end in maps, about a place in them; return them in the whole image."""
         shaft, ends, corner = maps
         shrink, width = self._shrink, self.width_px
-        point = (place + corner + 0.5) * shrink - 0.5
+        point = _full_px(place + corner, shrink)
         found = fit_end(
             shaft,
             ends,
@@ -233,7 +233,7 @@ class NeedleDetector:
         if found is None:
             return None
         return ImageEnd(
-            (found.point + corner + 0.5) * shrink - 0.5,
+            _full_px(found.point + corner, shrink),
             found.direction,
             found.sigma_across * shrink,
             found.sigma_along * shrink,
@@ -295,6 +295,21 @@ def _strips(places: Map) -> list[tuple[int, ...]]:
             (x0, y0), (x1, y1) = np.floor(inside.min(axis=0)), np.ceil(inside.max(axis=0)) + 1.0
             boxes.append((int(x0), int(y0), int(x1), int(y1)))
     return boxes
+
+
+def _shrunk_px(pixels: Pixels, shrink: float) -> Pixels:
+    """Return where pixels are in an image made smaller.
+
+    Pixel i of an image at half size covers the pixels 2 i and 2 i + 1.
+    """
+    half = pixels.dtype.type(0.5)
+    shrunk: Pixels = (pixels + half) / shrink - half
+    return shrunk
+
+
+def _full_px(pixels: Array, shrink: float) -> Array:
+    """Return where pixels of an image made smaller are in the image itself."""
+    return np.asarray((pixels + 0.5) * shrink - 0.5)
 
 
 def _smaller(image: Image, shrink: int) -> Image:

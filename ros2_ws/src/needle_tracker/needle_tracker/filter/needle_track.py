@@ -1,8 +1,9 @@
 """One thing that may be the needle: where it is, and how likely it is the needle after all.
 
-Two questions, each with its log-odds. Is there an end at all? The images say. Is it the needle's?
-The needle goes as the stage does, or along its heading where the insertion is unknown; anything
-else (an old track, a scratch, a screw) stays where it is, or ends elsewhere by chance.
+It is the needle, and moves as the stage does, or along its heading where the insertion is unknown.
+Or it is another thing (an old track, a scratch, a screw), which stays where it is or ends elsewhere
+by chance. Or it is the needle's shadow, which moves with the needle in another place. Or there is
+no end at all.
 """
 
 from __future__ import annotations
@@ -58,8 +59,6 @@ class NeedleTrack:
         Standard deviation of the way since the pair before [m]; 0 where the stage tells it.
     misses : int
         Pairs in a row without a sighting.
-    sightings : int
-        Pairs with one.
     """
 
     motion: NeedleMotion
@@ -71,7 +70,6 @@ class NeedleTrack:
     insertion: float | None
     way_sigma: float = 0.0
     misses: int = 0
-    sightings: int = 1
 
     @staticmethod
     def begin(
@@ -131,7 +129,6 @@ class NeedleTrack:
             ),
             motion_log_odds=self.motion_log_odds + gain,
             misses=0,
-            sightings=self.sightings + 1,
         )._bounded(settings)
 
     def _motion_to(self, tip: SpatialTip, settings: TrackerSettings) -> NeedleMotion:
@@ -202,8 +199,11 @@ def place_log_odds(sighting: Sighting, insertion: float | None, settings: Tracke
 
     A needle that ends far aside has bent outwards all the way, so its tangent at the tip passes the
     entry on the other side; a shadow beside it runs parallel. And a needle is as long as the stage
-    says, where other things end at any distance.
+    says, where other things end at any distance. An end that is followed by the stage says nothing
+    new of it: infinite.
     """
+    if insertion is not None and sighting.length is None:
+        return math.inf
     position, ahead = sighting.tip.position, sighting.tip.direction
     distance = float(np.linalg.norm(position))
     widest = distance * math.sin(float(settings.reach.chord_angle(np.array(distance))))
@@ -219,8 +219,6 @@ def place_log_odds(sighting: Sighting, insertion: float | None, settings: Tracke
         off = (sighting.length - insertion) / sigma
         density = math.exp(-0.5 * off * off) / (math.sqrt(2.0 * math.pi) * sigma)
         log_odds += math.log(max(density * settings.reach.length, 1e-9))
-    elif insertion is not None:
-        log_odds = math.inf
     return log_odds
 
 

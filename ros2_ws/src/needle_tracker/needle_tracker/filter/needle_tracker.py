@@ -188,27 +188,20 @@ class NeedleTracker:
         if insertion is not None:
             least = max(least, settings.reach.shortest_chord(insertion) - margin - 1e-3)
             most = min(most, insertion + margin + 1e-3)
-        sightings = self._search.search(least, max(most, least + 1e-3))
-        given: dict[int, Sighting] = {}
-        tracks: list[NeedleTrack] = []
-        left = list(sightings)
+        left = self._search.search(least, max(most, least + 1e-3))
+        tracks: list[tuple[NeedleTrack, Sighting | None]] = []
         for track in sorted(self._tracks, key=lambda t: -t.rank(settings)):
             own = next((s for s in left if track.fits(s.tip, settings)), None)
             if own is None:
-                tracks.append(track.missed())
-                continue
-            left.remove(own)
-            seen = track.seen(own, settings)
-            given[id(seen)] = own
-            tracks.append(seen)
-        for sighting in left:
-            track = NeedleTrack.begin(sighting, insertion, settings)
-            given[id(track)] = sighting
-            tracks.append(track)
-        kept = [t for t in tracks if t.misses < settings.filter.forgotten_after]
-        self._tracks = sorted(kept, key=lambda t: -t.rank(settings))[:_TRACKS]
-        best = self._best()
-        return None if best is None else given.get(id(best))
+                tracks.append((track.missed(), None))
+            else:
+                left.remove(own)
+                tracks.append((track.seen(own, settings), own))
+        tracks += [(NeedleTrack.begin(each, insertion, settings), each) for each in left]
+        kept = [pair for pair in tracks if pair[0].misses < settings.filter.forgotten_after]
+        kept.sort(key=lambda pair: -pair[0].rank(settings))
+        self._tracks = [track for track, _ in kept[:_TRACKS]]
+        return kept[0][1] if kept else None
 
     def _follow(self, track: NeedleTrack) -> Sighting | None:
         """Look for the end where a track has it."""

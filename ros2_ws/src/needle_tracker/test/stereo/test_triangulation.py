@@ -63,16 +63,18 @@ def moved(tip: ImageEnd, along: float, across: float, turn: float) -> ImageEnd:
     )
 
 
+def measured(tip: ImageEnd, rng: np.random.Generator) -> ImageEnd:
+    """Return an end with the errors that it claims."""
+    return moved(tip, rng.normal(0, 0.5), rng.normal(0, 0.05), rng.normal(0, 2e-3))
+
+
 def test_covariances_fit_the_errors(views: Views) -> None:
     rng = np.random.default_rng(0)
     exact = seen(views)
     errors, plain, turns = [], [], []
     squared = []
     for _ in range(400):
-        left, right = (
-            moved(tip, rng.normal(0, 0.5), rng.normal(0, 0.05), rng.normal(0, 2e-3))
-            for tip in exact
-        )
+        left, right = (measured(tip, rng) for tip in exact)
         tip = triangulate(views, (left, right))
         assert tip is not None
         error = tip.position - TIP
@@ -119,10 +121,7 @@ def test_the_misfit_of_two_ends_of_one_needle_is_chi_squared(views: Views) -> No
     rng = np.random.default_rng(1)
     exact, misfits = seen(views), []
     for _ in range(400):
-        left, right = (
-            moved(tip, rng.normal(0, 0.5), rng.normal(0, 0.05), rng.normal(0, 2e-3))
-            for tip in exact
-        )
+        left, right = (measured(tip, rng) for tip in exact)
         tip = triangulate(views, (left, right))
         assert tip is not None
         misfits.append(tip.misfit)
