@@ -10,10 +10,12 @@ from campaign.checking import Check, Finding, Workbench
 from campaign.tracking.traced_set import HELD_BACK, RIGS, drawn, scenes
 from campaign.tracking.traced_study import Told, TracedAnswer, traced_looks
 from campaign.tracking.tracker_study import WRONG
+from campaign.tracking.variations import VARIATIONS
 from needle_bringup.workplace import checkout
 
 _LEAST = {Told.EMPTY_PHANTOM: 0.97, Told.INSERTION: 0.97, Told.NOTHING: 0.92}
 _LEAST_OF_A_KIND = 0.85
+_LEAST_VARIED = 0.9
 _LARGEST_P95 = {"bench": 0.3, "top_and_side": 0.25, "webcams": 0.3}  # [mm]
 _CHI_SQUARED_95 = 7.815  # of three degrees of freedom
 
@@ -27,7 +29,8 @@ def path_traced(_: Workbench) -> Iterator[Finding]:
     looks = [
         look
         for sequence in drawn(checkout() / ".traced", scenes(HELD_BACK))
-        for look in traced_looks(sequence)
+        for told in Told
+        for look in traced_looks(sequence, told)
     ]
     needles = [look for look in looks if look.truth is not None]
     for told, least in _LEAST.items():
@@ -50,7 +53,33 @@ def path_traced(_: Workbench) -> Iterator[Finding]:
     )
 
 
-CHECKS: tuple[Check, ...] = (path_traced,)
+def path_traced_variations(_: Workbench) -> Iterator[Finding]:
+    """Find the same needles where the images or what is told of the rig are otherwise."""
+    sequences = [
+        sequence
+        for sequence in drawn(checkout() / ".traced", scenes(HELD_BACK))
+        if sequence.scene.look.needle
+    ]
+    for variation in VARIATIONS:
+        looks = [
+            look
+            for sequence in sequences
+            for look in traced_looks(sequence, Told.INSERTION, variation)
+        ]
+        tips = [look for look in looks if look.tip is not None]
+        found, median = _found(looks), 1e3 * float(np.median([look.error for look in tips]))
+        inside = float(np.mean([look.normalised <= _CHI_SQUARED_95 for look in tips]))
+        wrong = sum(look.error > WRONG for look in tips)
+        yield Finding(
+            "path_traced_" + variation.name.replace(" ", "_"),
+            f"path-traced, {variation.name}, {len(looks)} pairs with the insertion",
+            f">= {_LEAST_VARIED:.0%} found, 0 wrong",
+            f"{found:.1%} found, {wrong} wrong, median {median:.2f} mm, {inside:.1%} within 95 %",
+            found >= _LEAST_VARIED and wrong == 0,
+        )
+
+
+CHECKS: tuple[Check, ...] = (path_traced, path_traced_variations)
 
 
 def _found(looks: Sequence[TracedAnswer]) -> float:

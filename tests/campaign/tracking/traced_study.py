@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from campaign.tracking.traced_set import DrawnSequence, TracedScene
+from campaign.tracking.variations import AS_TRACED, Variation
 from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
@@ -67,8 +68,10 @@ class TracedAnswer:
         return np.asarray(self.tip.position - self.truth)
 
 
-def traced_looks(sequence: DrawnSequence) -> Iterator[TracedAnswer]:
-    """Yield what is said of a sequence's pairs, whatever is told.
+def traced_looks(
+    sequence: DrawnSequence, told: Told, variation: Variation = AS_TRACED
+) -> Iterator[TracedAnswer]:
+    """Yield what is said of a sequence's pairs.
 
     Of a needle the first `SETTLED` pairs are shown and not yielded, nor are pairs that have not all
     of its last 10 mm in both images.
@@ -77,19 +80,27 @@ def traced_looks(sequence: DrawnSequence) -> Iterator[TracedAnswer]:
     ----------
     sequence : DrawnSequence
         The pairs.
+    told : Told
+        What the tracker is told.
+    variation : Variation
+        What is otherwise than the tracker expects.
     """
+    rng = np.random.default_rng(sequence.scene.seed)
     stereo = load_calibration(sequence.calibration)
-    settings = dataclasses.replace(
-        default_settings(stereo), needle_width=sequence.scene.look.diameter
+    left, right = (variation.seen(image, rng) for image in sequence.empty)
+    tracker = NeedleTracker(
+        stereo,
+        dataclasses.replace(
+            default_settings(stereo),
+            needle_width=variation.width * sequence.scene.look.diameter,
+            reference=(left, right) if told is Told.EMPTY_PHANTOM else None,
+        ),
     )
-    for told in Told:
-        left, right = sequence.empty
-        reference = (left, right) if told is Told.EMPTY_PHANTOM else None
-        tracker = NeedleTracker(stereo, dataclasses.replace(settings, reference=reference))
-        for number, (left, right) in enumerate(sequence.pairs):
-            insertion = None if told is Told.NOTHING else float(sequence.insertions[number])
-            tip, truth = tracker.process(left, right, insertion).tip, sequence.tips[number]
-            if not sequence.scene.look.needle:
-                yield TracedAnswer(sequence.scene, told, tip, None)
-            elif number >= SETTLED and sequence.seen[number].min() >= 1.0:
-                yield TracedAnswer(sequence.scene, told, tip, truth)
+    for number, pair in enumerate(sequence.pairs):
+        left, right = (variation.seen(image, rng) for image in pair)
+        insertion = float(sequence.insertions[number]) + variation.zero
+        tip = tracker.process(left, right, None if told is Told.NOTHING else insertion).tip
+        if not sequence.scene.look.needle:
+            yield TracedAnswer(sequence.scene, told, tip, None)
+        elif number >= SETTLED and sequence.seen[number].min() >= 1.0:
+            yield TracedAnswer(sequence.scene, told, tip, sequence.tips[number])
