@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from functools import partial
 from itertools import count
@@ -33,6 +34,14 @@ def read_scene(path: Path) -> TracedScene:
     """Return a stored scene."""
     with np.load(path) as content:
         return TracedScene(**content)
+
+
+def write_scene(path: Path, scene: TracedScene) -> None:
+    """Store a scene, whole or not at all."""
+    new = path.with_suffix(".new")
+    with new.open("wb") as file:
+        np.savez(file, **{f.name: getattr(scene, f.name) for f in dataclasses.fields(scene)})
+    new.replace(path)
 
 
 def scene_paths(folder: Path, held_out: bool) -> list[Path]:

@@ -2,8 +2,14 @@
 
 Scenes are path-traced at random, then samples are cut from them and others are drawn, and the net
 learns from both. Everything is kept in the folder of the run: called again with --resume, it goes
-on where it was ended, be it by a signal. On two cores it takes some four hours: half of that for
-140 scenes, half for the training.
+on where it was ended, be it by a signal. On two cores it takes some two hours: half an hour for 140
+scenes, then the training.
+
+With --own the net goes on learning from a recording of your own rig: FOLDER has calibration.yaml,
+empty/left and empty/right (an insertion without a needle), needle/left, needle/right and
+needle/insertion.csv (one with; files as for track_images). The path of the tips that the tracker
+believes says where the shaft was, also in the pairs between them. A fifth of the pairs is held out,
+and the report says what the net sees there before and after.
 """
 
 from __future__ import annotations
@@ -17,17 +23,18 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import cv2
-import numpy as np
 from tqdm import tqdm
 
 from needle_bringup.training.traced_scenes import trace_scene
+from needle_core.commands.cli import run_command
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_sim.path_traced.tracer import load_mitsuba
 from needle_sim.sequences.boxes import draw_box
 from net_report import report, report_views
+from own_scenes import own_scenes
 from sample_pool import SHARD, Pool, read_shard
-from sample_supply import read_scene, scene_paths, supply, write_validation
-from training_loop import Plan, new_run, train
+from sample_supply import read_scene, scene_paths, supply, write_scene, write_validation
+from training_loop import Plan, new_run, resumed, train
 from training_net import NeedleNet
 
 ROOT = Path(__file__).parents[3]
@@ -37,8 +44,9 @@ CALIBRATIONS = (
     TRACKER / "config/calibration.yaml",
     TRACKER / "config/calibration_top_and_side.yaml",
 )
-_MINUTES = 200.0
+_MINUTES, _OWN_MINUTES = 90.0, 30.0
 _POLL = 5.0  # [s]
+_OWN, _OWN_HELD_OUT = "0.npz", "9.npz"
 _EXAMPLES = """examples:
   scripts/train_needle_map
       all of it, from nothing; the weights replace the tracker's at the end and every 3 minutes
@@ -48,6 +56,8 @@ _EXAMPLES = """examples:
   scripts/train_needle_map --scenes 12 --drawn 10 --steps 2000 --folder /tmp/try \\
           --output /tmp/try/needle_net.onnx
       a first try, of half an hour or so; the tracker's weights stay
+  scripts/train_needle_map --own recordings/monday --needle-width-mm 1.3
+      what is seen on a rig of one's own, better; half an hour
   scripts/train_needle_map --report --folder /tmp/try --output /tmp/try/needle_net.onnx
       what that net is worth on scenes that it was not trained on
 
@@ -83,17 +93,7 @@ def trace_all(count: int, folder: Path) -> None:
         return
     mitsuba = load_mitsuba()
     for seed in tqdm(missing, "tracing scenes", unit="scene"):
-        scene = trace_scene(mitsuba, rig_of(seed), seed)
-        new = paths[seed].with_suffix(".new")
-        with new.open("wb") as file:
-            np.savez(
-                file,
-                images=scene.images,
-                shares=scene.shares,
-                ends=scene.ends,
-                widths_px=scene.widths_px,
-            )
-        new.replace(paths[seed])
+        write_scene(paths[seed], trace_scene(mitsuba, rig_of(seed), seed))
 
 
 def wait_for_samples(folder: Path, drawn: int, process: BaseProcess) -> None:
@@ -130,9 +130,9 @@ def read_arguments() -> argparse.Namespace:
     parser.add_argument(
         "--minutes",
         type=float,
-        default=_MINUTES,
         metavar="M",
-        help=f"the training ends after that, fewer steps or not; default: {_MINUTES:.0f}",
+        help="the training ends after that, fewer steps or not; "
+        f"default: {_MINUTES:.0f}, with --own {_OWN_MINUTES:.0f}",
     )
     parser.add_argument("--scenes", type=int, default=140, metavar="N", help="default: 140")
     parser.add_argument(
@@ -145,9 +145,9 @@ def read_arguments() -> argparse.Namespace:
     parser.add_argument(
         "--folder",
         type=Path,
-        default=ROOT / ".training/run",
         metavar="DIR",
-        help="scenes and samples, which are made once; 8 GB; default: .training/run",
+        help="scenes and samples, which are made once; 8 GB; default: .training/run, "
+        "with --own .training/own",
     )
     parser.add_argument(
         "--output",
@@ -156,26 +156,48 @@ def read_arguments() -> argparse.Namespace:
         metavar="FILE.onnx",
         help="default: the tracker's; the checkpoint lies in the folder",
     )
-    parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
     parser.add_argument(
-        "--report", action="store_true", help="only say what the net of the checkpoint is worth"
+        "--resume",
+        action="store_true",
+        help="go on from the last checkpoint in the folder; if there is none, from --output",
     )
-    return parser.parse_args()
+    parser.add_argument(
+        "--report",
+        action="store_true",
+        help="only say what the net is worth that --resume would begin with",
+    )
+    parser.add_argument("--own", type=Path, metavar="FOLDER", help="learn from a recording")
+    parser.add_argument(
+        "--needle-width-mm", type=float, default=0.7, metavar="W", help="with --own; default: 0.7"
+    )
+    given = parser.parse_args()
+    own = given.own is not None
+    given.folder = given.folder or ROOT / ".training" / ("own" if own else "run")
+    given.minutes = given.minutes or (_OWN_MINUTES if own else _MINUTES)
+    return given
 
 
 def main() -> int:
     """Trace, draw, train, report; returns the exit code."""
     given = read_arguments()
     checkpoint = given.folder / "checkpoint.pt"
-    run = new_run(0)
-    if given.resume or given.report:
-        if not checkpoint.exists():
-            print(f"no checkpoint: {checkpoint}; without --resume a run begins", file=sys.stderr)
-            return 2
-        run.resume(checkpoint)
-    cv2.setNumThreads(1)
     scenes, samples = given.folder / "scenes", given.folder / "samples"
     validation = given.folder / "validation"
+    cv2.setNumThreads(1)
+    if (given.resume or given.report) and checkpoint.exists():
+        run = resumed(checkpoint)
+    else:
+        from_weights = given.resume or given.report or given.own is not None
+        run = new_run(0, given.output if from_weights else None)
+    if given.own is not None:
+        scenes.mkdir(parents=True, exist_ok=True)
+        for path, scene in zip(
+            (scenes / _OWN, scenes / _OWN_HELD_OUT),
+            own_scenes(given.own, 1e-3 * given.needle_width_mm),
+            strict=True,
+        ):
+            write_scene(path, scene)
+        print_report(run.mean_net, scenes, validation)
     if not given.report:
         most = {"drawn": given.drawn, "traced": given.drawn}
         process = multiprocessing.get_context("spawn").Process(
@@ -183,7 +205,8 @@ def main() -> int:
         )
         process.start()
         try:
-            trace_all(given.scenes, scenes)
+            if given.own is None:
+                trace_all(given.scenes, scenes)
             wait_for_samples(samples, min(given.drawn, 40), process)
             train(run, Pool(samples), Plan(given.steps, given.minutes, given.output, checkpoint))
         finally:
@@ -213,4 +236,4 @@ def print_report(net: NeedleNet, scenes: Path, validation: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_command(main))

@@ -14,12 +14,17 @@ from torch.nn import functional
 from tqdm import tqdm
 
 from sample_pool import CONTEXT, Batch, Pool
-from training_net import LOG_INTENSITY, NEEDLE_WEIGHT, NeedleNet, export
+from training_net import (
+    LOG_INTENSITY,
+    NEEDLE_WEIGHT,
+    NeedleNet,
+    export,
+    load_weights,
+    normalized_layer,
+)
 
-_BATCH, _RATE, _DECAY = 16, 3e-3, 1e-4
-# Gradients below that move a weight by less than the rate: units that were silent for thousands of
-# steps have no other scale, and one that wakes moved all its weights at once.
-_SMALLEST = 1e-5
+_BATCH, _DECAY = 16, 1e-4
+_RATE, _TUNING_RATE = 3e-3, 3e-4  # largest, of a new net and of one that was trained before
 _WARM_UP, _FIRST_RATE, _LAST_RATE = 0.08, 0.04, 0.002  # share of the run, and of the rate
 _END_WEIGHT = 0.04  # of a nat about an end, against one about each pixel of shaft
 _LARGEST_STEP = 2.0  # of all gradients together
@@ -40,7 +45,7 @@ class Plan:
     minutes : float
         After so long it ends too, its rate down as after all steps [min].
     output, checkpoint : Path
-        Where the net is written, and all that `Run.resume` needs.
+        Where the net is written, and all that `resumed` needs.
     every : float
         Time from one checkpoint to the next [s].
     """
@@ -64,6 +69,8 @@ class Run:
         Of it.
     rng : Generator
         What chooses samples.
+    rate : float
+        Largest learning rate.
     step : int
         Steps done.
     seconds : float
@@ -74,17 +81,19 @@ class Run:
     mean_net: NeedleNet
     optimizer: torch.optim.AdamW
     rng: np.random.Generator
+    rate: float
     step: int = 0
     seconds: float = 0.0
 
     def state(self) -> dict[str, Any]:
-        """Return all that `resume` needs."""
+        """Return all that `resumed` needs."""
         return {
             "net": self.net.state_dict(),
             "mean_net": self.mean_net.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "rng": self.rng.bit_generator.state,
             "torch_rng": torch.get_rng_state(),
+            "rate": self.rate,
             "step": self.step,
             "seconds": self.seconds,
         }
@@ -95,31 +104,51 @@ class Run:
         torch.save(self.state(), new)
         new.replace(path)
 
-    def resume(self, path: Path) -> None:
-        """Go on from a checkpoint."""
-        state = torch.load(path, weights_only=True)
-        self.net.load_state_dict(state["net"])
-        self.mean_net.load_state_dict(state["mean_net"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.rng.bit_generator.state = state["rng"]
-        torch.set_rng_state(state["torch_rng"])
-        self.step, self.seconds = state["step"], state["seconds"]
 
+def new_run(seed: int, weights: Path | None = None) -> Run:
+    """Return a run that begins.
 
-def new_run(seed: int) -> Run:
-    """Return a run with an untrained net."""
+    Parameters
+    ----------
+    seed : int
+        Keys what is random.
+    weights : Path or None
+        Of a net that `export` wrote, to begin with; None: an untrained one.
+    """
     torch.manual_seed(seed)
-    net: NeedleNet = NeedleNet().to(memory_format=torch.channels_last)
-    optimizer = torch.optim.AdamW(net.parameters(), _RATE, eps=_SMALLEST, weight_decay=_DECAY)
-    return Run(net, copy.deepcopy(net), optimizer, np.random.default_rng(seed))
+    if weights is None:
+        return _run(NeedleNet(normalized_layer), _RATE)
+    net = NeedleNet()
+    load_weights(net, weights)
+    return _run(net, _TUNING_RATE)
 
 
-def rate_at(progress: float) -> float:
-    """Return the learning rate after a share of the run: up along a line, down along a cosine."""
+def resumed(path: Path) -> Run:
+    """Return the run of a checkpoint."""
+    state = torch.load(path, weights_only=True)
+    normalized = "middle.0.weight" in state["net"]
+    run = _run(NeedleNet(normalized_layer) if normalized else NeedleNet(), state["rate"])
+    run.net.load_state_dict(state["net"])
+    run.mean_net.load_state_dict(state["mean_net"])
+    run.optimizer.load_state_dict(state["optimizer"])
+    run.rng.bit_generator.state = state["rng"]
+    torch.set_rng_state(state["torch_rng"])
+    run.step, run.seconds = state["step"], state["seconds"]
+    return run
+
+
+def _run(net: NeedleNet, rate: float) -> Run:
+    net = net.to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=_DECAY)
+    return Run(net, copy.deepcopy(net), optimizer, np.random.default_rng(0), rate)
+
+
+def rate_share(progress: float) -> float:
+    """Return the share of the largest rate: up along a line, then down along a cosine."""
     if progress < _WARM_UP:
-        return _RATE * (_FIRST_RATE + (1.0 - _FIRST_RATE) * progress / _WARM_UP)
+        return _FIRST_RATE + (1.0 - _FIRST_RATE) * progress / _WARM_UP
     left = 0.5 * (1.0 + np.cos(np.pi * min((progress - _WARM_UP) / (1.0 - _WARM_UP), 1.0)))
-    return float(_RATE * (_LAST_RATE + (1.0 - _LAST_RATE) * left))
+    return float(_LAST_RATE + (1.0 - _LAST_RATE) * left)
 
 
 def shaft_loss(logits: torch.Tensor, shares: torch.Tensor) -> torch.Tensor:
@@ -210,7 +239,7 @@ def train(run: Run, pool: Pool, plan: Plan) -> None:
         if run.step % _LOOK_EVERY == 0:
             pool.update()
         for group in run.optimizer.param_groups:
-            group["lr"] = rate_at(progress)
+            group["lr"] = run.rate * rate_share(progress)
         batch = pool.batch(run.rng, _BATCH)
         shaft, end = losses(run.net, batch, rounded=quick and progress < _FULL_PRECISION)
         if not (shaft.item() < _WORST[0] and end.item() < _WORST[1]):
@@ -226,8 +255,12 @@ def train(run: Run, pool: Pool, plan: Plan) -> None:
         run.step += 1
         with torch.no_grad():
             share = 1.0 / min(run.step / 10.0 + 1.0, _MEAN_OVER)
-            for mean, new in zip(run.mean_net.parameters(), run.net.parameters(), strict=True):
-                mean.lerp_(new, share)
+            means_and_news = zip(
+                run.mean_net.state_dict().values(), run.net.state_dict().values(), strict=True
+            )
+            for mean, new in means_and_news:
+                if mean.is_floating_point():
+                    mean.lerp_(new, share)
         now = time.monotonic()
         run.seconds = before + now - began
         means += (np.array([shaft.item(), end.item()]) - means) / min(run.step, 200)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import onnx
 import torch
+from onnx import numpy_helper
 from torch import nn
 from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 NEEDLE_WEIGHT = 4.0
 """So much more than a pixel of floor counts one of needle: most pixels are floor."""
@@ -19,18 +23,34 @@ _DILATIONS = (1, 2, 4, 8, 4, 1)
 _FIRST_LOG_INTENSITY = -9.5  # of a new net: an end or so per patch
 
 
-class NeedleNet(nn.Module):
-    """A trunk at a quarter of the size that looks far around, and two heads at full size."""
+def normalized_layer(*shape: int) -> nn.Sequential:
+    """Return a convolution whose channels are normalized over each batch, as training needs it.
 
-    def __init__(self) -> None:
+    Without that, what six layers add grows by ten to a hundred times, and half of the channels fall
+    silent. `folded` takes it out again.
+    """
+    return nn.Sequential(nn.Conv2d(*shape, bias=False), nn.BatchNorm2d(shape[1]))
+
+
+class NeedleNet(nn.Module):
+    """A trunk at a quarter of the size that looks far around, and two heads at full size.
+
+    Parameters
+    ----------
+    layer : callable
+        Returns a layer of the trunk and after it: `normalized_layer` to train from nothing, a plain
+        convolution to run. At full size normalizing takes as long as all else.
+    """
+
+    def __init__(self, layer: Callable[..., nn.Module] = nn.Conv2d) -> None:
         super().__init__()
         self.first = nn.Conv2d(2, _HALF, 5, 2, 2)
-        self.second = nn.Conv2d(_HALF, _QUARTER, 3, 2, 1)
+        self.second = layer(_HALF, _QUARTER, 3, 2, 1)
         self.trunk = nn.ModuleList(
-            nn.Conv2d(_QUARTER, _QUARTER, 3, 1, dilation, dilation) for dilation in _DILATIONS
+            layer(_QUARTER, _QUARTER, 3, 1, dilation, dilation) for dilation in _DILATIONS
         )
-        self.up_middle = nn.Conv2d(_QUARTER, 4 * _HALF, 1)
-        self.middle = nn.Conv2d(_HALF, _HALF, 3, 1, 1)
+        self.up_middle = layer(_QUARTER, 4 * _HALF, 1)
+        self.middle = layer(_HALF, _HALF, 3, 1, 1)
         self.up_full = nn.Conv2d(_HALF, 4 * _FINE, 1)
         self.fine = nn.Conv2d(2, _FINE, 3, 1, 1)
         self.last = nn.Conv2d(2 * _FINE, _FINE, 3, 1, 1)
@@ -73,6 +93,18 @@ def twice_as_large(image: torch.Tensor) -> torch.Tensor:
     return parts.reshape(count, channels // 4, 2 * height, 2 * width)
 
 
+def folded(net: NeedleNet) -> NeedleNet:
+    """Return the same net of plain convolutions, each with its normalization in its weights."""
+    plain, trained = NeedleNet(), copy.deepcopy(net).eval()
+    for name, layer in plain.named_modules():
+        if isinstance(layer, nn.Conv2d):
+            part = trained.get_submodule(name)
+            if isinstance(part, nn.Sequential):
+                part = fuse_conv_bn_eval(part[0], part[1])
+            layer.load_state_dict(part.state_dict())
+    return plain
+
+
 class StoredNet(nn.Module):
     """The net with chances in place of logits: what is stored."""
 
@@ -100,7 +132,7 @@ def export(net: NeedleNet, path: Path) -> None:
     """
     size = {2: "height", 3: "width"}
     new = path.with_suffix(".new")
-    stored = StoredNet(net).eval()
+    stored = StoredNet(folded(net)).eval()
     torch.onnx.export(
         stored,
         (torch.zeros(1, 2, 64, 64),),
@@ -111,6 +143,20 @@ def export(net: NeedleNet, path: Path) -> None:
         opset_version=17,
         dynamo=False,
     )
-    net.train()
     onnx.checker.check_model(onnx.load(new))
     new.replace(path)
+
+
+def load_weights(net: NeedleNet, path: Path) -> None:
+    """Give a net the weights that `export` wrote.
+
+    Parameters
+    ----------
+    net : NeedleNet
+        Which takes them.
+    path : Path
+        ONNX file.
+    """
+    stored = onnx.load(path).graph.initializer
+    weights = {each.name: torch.from_numpy(numpy_helper.to_array(each).copy()) for each in stored}
+    StoredNet(net).load_state_dict(weights)

@@ -12,6 +12,8 @@ Image = NDArray[np.float32]
 _FINE = 3
 """Points across a pixel."""
 _TWIN = 0.4  # so many shadows look like the needle
+_FADING = 0.25  # so many ends lose contrast on their last widths, as in real photographs
+_BLUNT = 0.15  # ends cut straight, burr included, as a share of the needle's width
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +95,8 @@ def draw_needle(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
     rho = np.clip(across / pose.radius, -1.0, 1.0)
     high = np.sqrt(1.0 - rho**2)
     roll = rng.uniform(0.0, 2 * np.pi)
-    length = pose.radius * 2 * rng.choice([rng.uniform(0.0, 1.0), rng.uniform(1.0, 3.5)])
+    kinds = rng.uniform([0.0, 0.0, 1.0], [_BLUNT, 1.0, 3.5])
+    length = pose.radius * 2 * rng.choice(kinds)
     top = rho * np.cos(roll) + high * np.sin(roll)
     far = rho * np.cos(roll) + high * abs(np.sin(roll))
     inside = np.abs(across) <= pose.radius
@@ -112,6 +115,9 @@ def draw_needle(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
         middle, wall = -0.5 * length, rng.uniform(0.4, 0.75)
         bore = face & (np.hypot((along - middle) / (0.5 * length), rho) < wall)
         fine = np.where(bore, near * rng.uniform(0.0, 1.2), fine)
+    if rng.random() < _FADING:
+        begin, left = -2.0 * pose.radius * rng.uniform(0.5, 2.5), rng.uniform(0.1, 0.6)
+        fine = ground + (fine - ground) * (1.0 - (1.0 - left) * np.clip(1 - along / begin, 0, 1))
     return coarse(fine.astype(np.float32))
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_bringup.training.needle_ends import Pose, draw_needle, random_pose, true_map
+from needle_bringup.training.needle_ends import Pose, coarse, draw_needle, random_pose, true_map
 from needle_bringup.training.samples import moved
 
 Image = NDArray[np.float32]
@@ -16,6 +16,7 @@ Image = NDArray[np.float32]
 _FAINT = 0.15  # so much may a track change brightness that no background explains
 _GEL_PX = 3.0  # so far may gel move
 _MOST = 3
+_BROKEN, _PIECE_PX = 0.4, (5.0, 80.0)  # so many are in pieces, these and their gaps so long
 
 
 def drawn_tracks(rng: np.random.Generator, pose: Pose, size: int, *, faint: bool) -> Image:
@@ -82,5 +83,14 @@ def _cloudy(rng: np.random.Generator, pose: Pose, size: int, faint: bool) -> Ima
     patches = np.clip(cv2.resize(patches, (size, size), interpolation=cv2.INTER_CUBIC), 0.0, 1.0)
     share = rng.uniform(0.0, 0.9)
     soft = soft * (1.0 - share + share * patches)
+    if rng.random() < _BROKEN:
+        soft = soft * _pieces(rng, pose, size)
     most = _FAINT if faint else rng.choice([0.3, 0.8])
     return np.asarray(np.clip(1.0 + rng.uniform(-most, most) * soft, 0.1, 3.0), np.float32)
+
+
+def _pieces(rng: np.random.Generator, pose: Pose, size: int) -> Image:
+    """Return 1 on pieces along a track and 0 in the gaps between them."""
+    along, _ = pose.coordinates(size)
+    edges = np.cumsum(np.exp(rng.uniform(*np.log(_PIECE_PX), 60))) - 2.0 * size
+    return coarse(np.searchsorted(edges, along).astype(np.float32) % 2)

@@ -18,7 +18,7 @@ BORDER = 32
 """Margin around a patch: brightness is judged against the surroundings [px]."""
 CANVAS = SIZE + 2 * BORDER
 """Width and height of the images [px]."""
-WIDTHS = (2.2, 9.0)
+WIDTHS = (2.2, 10.0)
 """Of the needles [px]."""
 WITH_BACKGROUND = 0.6
 """So often a background is given."""

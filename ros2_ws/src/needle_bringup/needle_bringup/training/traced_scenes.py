@@ -16,7 +16,7 @@ from needle_sim.path_traced.tracer import Mitsuba
 
 _EXPOSURES = 6
 # Insertions are drawn from these [m]; a short step shows what a needle's first new part looks like.
-_BEGIN, _STEP = (0.012, 0.03), (0.002, 0.008)
+_BEGIN, _STEP = (0.005, 0.03), (0.002, 0.008)
 _FINE, _SUBPIXEL_BITS = 4, 4  # points across a pixel, and bits of a corner's place
 _SIDEWAYS = 1e-4  # for the shaft's width in pixels [m]
 

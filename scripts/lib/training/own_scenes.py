@@ -1,0 +1,154 @@
+"""Scenes out of a user's own recording: the tracker says where the needle was."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_bringup.training.traced_scenes import TracedScene, shaft_share
+from needle_core.errors import UserError
+from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+from needle_tracker.filter.needle_tracker import NeedleTracker
+from needle_tracker.optics.calibration import load_calibration
+from needle_tracker.sources.image_files import open_pairs, read_insertions
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+_LEAST_TIPS = 10  # the path is fitted to
+_MOST_PAIRS = 60  # of each recording, so that memory holds them
+_EVERY = 5  # so many pairs, one is held out
+_HOLE_SIGMA, _TIP_SIGMA = 0.3e-3, 0.2e-3  # of the path at the entry and of a tip about it [m]
+_PASSES, _POINTS = 5, 60  # of the fit; along a shaft that is drawn
+_SHORT = 10e-3  # of a needle whose width in the image stands for one that is not there [m]
+
+
+def own_scenes(folder: Path, width: float) -> tuple[TracedScene, TracedScene]:
+    """Return what to learn from in a recording, and what is held out of it.
+
+    A needle follows its tip, so the path of the tips that the tracker believed is where the shaft
+    was in each image; pairs between them are learned from too, believed or not.
+
+    Parameters
+    ----------
+    folder : Path
+        calibration.yaml; empty/left and empty/right, images of an insertion without a needle;
+        needle/left, needle/right and needle/insertion.csv, the same with one.
+    width : float
+        Diameter of the needle [m].
+
+    Raises
+    ------
+    UserError
+        Something is missing, or the tracker believed too few tips.
+    """
+    calibration = load_calibration(folder / "calibration.yaml")
+    parameters = StereoTrackerParameters(needle_width=width)
+    rig = load_stereo_rig(folder / "calibration.yaml")
+    tracker = NeedleTracker(calibration, parameters.tracker_settings(calibration))
+    empty = _pairs(folder / "empty", {})
+    tracker.process(*empty[0].images, 0.0)
+    known = read_insertions(folder / "needle" / "insertion.csv")
+    shown = [
+        pair
+        for pair in _pairs(folder / "needle", known)
+        if pair.insertion is not None and pair.insertion >= parameters.entry_zone
+    ]
+    tips = [tracker.process(*pair.images, pair.insertion).tip for pair in shown]
+    insertions = np.array([pair.insertion for pair in shown], np.float64)
+    believed = np.array([tip is not None for tip in tips], np.bool_)
+    if believed.sum() < _LEAST_TIPS:
+        raise UserError(
+            f"{folder}: the tracker believed {believed.sum()} tips of {len(tips)} pairs, and "
+            f"{_LEAST_TIPS} are needed to say where the needle was; `track_images` tells why"
+        )
+    path = TipPath(insertions[believed], np.array([tip.position for tip in tips if tip]))
+    least, most = insertions[believed].min(), insertions[believed].max()
+    labelled = [pair for pair in shown if least <= (pair.insertion or 0.0) <= most]
+    learned = [pair for n, pair in enumerate(labelled) if n % _EVERY]
+    return (
+        _scene(rig, width, path, empty[0], empty[1::2] + learned),
+        _scene(rig, width, path, empty[0], empty[2::2] + labelled[::_EVERY]),
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OwnPair:
+    """Images of one exposure, left and right, and the insertion [m] where there is a needle."""
+
+    images: tuple[Image, Image]
+    insertion: float | None
+
+
+class TipPath:
+    """The way that the tip took: a cubic of the insertion, through the entry.
+
+    Parameters
+    ----------
+    insertions : ndarray, shape (n,)
+        Of the tips [m].
+    tips : ndarray, shape (n, 3)
+        In `rig` [m].
+    """
+
+    def __init__(self, insertions: Array, tips: Array) -> None:
+        self._scale = float(insertions.max())
+        s = np.append(insertions, 0.0)
+        terms, points = self._terms(s), np.vstack([tips, np.zeros(3)])
+        sigmas = np.append(np.full(len(tips), _TIP_SIGMA), _HOLE_SIGMA)
+        weights = 1.0 / sigmas
+        # Reweighted least squares: a tip that was wrong counts for little.
+        for _ in range(_PASSES):
+            rows = weights[:, None]
+            self._cubic, *_ = np.linalg.lstsq(terms * rows, points * rows, rcond=None)
+            off = np.linalg.norm(points - terms @ self._cubic, axis=1) / sigmas
+            weights = 1.0 / (sigmas * (1.0 + off**2))
+
+    def shaft(self, insertion: float) -> Array:
+        """Return points along the shaft, from the entry to the tip, shape (n, 3) [m]."""
+        return np.asarray(self._terms(np.linspace(0.0, insertion, _POINTS)) @ self._cubic)
+
+    def _terms(self, insertions: Array) -> Array:
+        return np.vander(insertions / self._scale, 4, increasing=True)
+
+
+def _scene(
+    rig: StereoRig, width: float, path: TipPath, empty: OwnPair, pairs: list[OwnPair]
+) -> TracedScene:
+    """Return pairs as a scene: first the phantom without a needle."""
+    step = -(-len(pairs) // _MOST_PAIRS)
+    images, shares, ends, widths = [], [], [], []
+    for pair in [empty, *pairs[::step]]:
+        for camera, image in zip((rig.left, rig.right), pair.images, strict=True):
+            line = path.shaft(pair.insertion or _SHORT)
+            share, end, width_px = shaft_share(line[line[:, 2] > 0.0], width, camera)
+            if pair.insertion is None:
+                share, end = np.zeros_like(image), np.full(2, np.nan)
+            images.append(image)
+            shares.append(share)
+            ends.append(end)
+            widths.append(width_px)
+    return TracedScene(np.stack(images), np.stack(shares), np.stack(ends), np.array(widths))
+
+
+def _pairs(folder: Path, insertions: Mapping[str, float]) -> list[OwnPair]:
+    """Return the pairs of a folder that can be read.
+
+    Raises
+    ------
+    UserError
+        There is none.
+    """
+    found = []
+    for pair in open_pairs(folder / "left", folder / "right"):
+        if pair.left is not None and pair.right is not None:
+            insertion = next((insertions[name] for name in pair.names if name in insertions), None)
+            found.append(OwnPair((pair.left, pair.right), insertion))
+    if not found:
+        raise UserError(f"{folder}: no pair can be read")
+    return found
