@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from needle_analysis.rerun.bag_pass import TYPES
+from needle_analysis.rerun.comparison import FIELDS
 from needle_analysis.ros import rerun
 from needle_analysis.ros.controller_rerun import ControllerStage, step_ends
 from needle_bags.format.bag_copy import BagCopy
@@ -40,7 +40,7 @@ DELAYS = {
 """What the controller hears, and by how much late at most [ms]."""
 HANGS, HANG = 6, 200 * MILLISECOND
 ROOM = 10
-OUTPUTS = {f"/{topic}" for topic in TYPES if topic not in DELAYS}
+OUTPUTS = {f"/{topic}" for topic in FIELDS if topic not in DELAYS}
 
 
 @functools.cache
