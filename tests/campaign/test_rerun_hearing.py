@@ -85,9 +85,11 @@ class LateController:
             self.sent.append((time + 10 * number, f"/{output.topic}", output.data))
         self.say(time + 100)
 
-    def start(self, time: int) -> None:
-        self.stage._steering.on_start()
+    def start(self, time: int) -> bool:
+        """Start it, or return False: it has not heard yet that the device is ready."""
+        reply, _ = self.stage._steering.on_start()
         self.say(time)
+        return reply.success
 
     def say(self, time: int) -> None:
         status = controller_status(self.stage._steering, "best")
@@ -110,8 +112,7 @@ def late_bag(folder: Path, source: random.Random) -> Path:
     is_started = False
     for time, message in heard(messages, source):
         if time > start and not is_started:
-            controller.start(start)
-            is_started = True
+            is_started = controller.start(time)
         controller.hear(time, message)
     everything = [(m.time, m.topic, m.data) for m in messages] + controller.sent
     for time, topic, data in sorted(everything, key=itemgetter(0)):
