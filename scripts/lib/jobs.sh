@@ -26,3 +26,12 @@ run() {
     child=
     [ -z "$interrupted" ] || exit 130
 }
+
+# Set the checkout up where that is not done, and enter its environment: $here is its folder of scripts.
+# With `tests`, what is in the folder tests can be imported, too.
+enter() {
+    run "$here/setup" --quiet
+    [ "$code" = 0 ] || exit "$code"
+    . "$here/env.sh" || exit 2
+    [ "${1:-}" != tests ] || export PYTHONPATH="$here/../tests:$PYTHONPATH"
+}

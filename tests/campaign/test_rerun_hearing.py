@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from needle_analysis.rerun.bag_pass import TYPES
+from needle_analysis.rerun.comparison import FIELDS
 from needle_analysis.ros import rerun
 from needle_analysis.ros.controller_rerun import ControllerStage, step_ends
 from needle_bags.format.bag_copy import BagCopy
@@ -40,7 +40,7 @@ DELAYS = {
 """What the controller hears, and by how much late at most [ms]."""
 HANGS, HANG = 6, 200 * MILLISECOND
 ROOM = 10
-OUTPUTS = {f"/{topic}" for topic in TYPES if topic not in DELAYS}
+OUTPUTS = {f"/{topic}" for topic in FIELDS if topic not in DELAYS}
 
 
 @functools.cache
@@ -85,9 +85,11 @@ class LateController:
             self.sent.append((time + 10 * number, f"/{output.topic}", output.data))
         self.say(time + 100)
 
-    def start(self, time: int) -> None:
-        self.stage._steering.on_start()
+    def start(self, time: int) -> bool:
+        """Start it, or return False: it has not heard yet that the device is ready."""
+        reply, _ = self.stage._steering.on_start()
         self.say(time)
+        return reply.success
 
     def say(self, time: int) -> None:
         status = controller_status(self.stage._steering, "best")
@@ -110,8 +112,7 @@ def late_bag(folder: Path, source: random.Random) -> Path:
     is_started = False
     for time, message in heard(messages, source):
         if time > start and not is_started:
-            controller.start(start)
-            is_started = True
+            is_started = controller.start(time)
         controller.hear(time, message)
     everything = [(m.time, m.topic, m.data) for m in messages] + controller.sent
     for time, topic, data in sorted(everything, key=itemgetter(0)):

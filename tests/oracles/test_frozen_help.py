@@ -9,6 +9,7 @@ from reference.rig_nodes import executables
 
 HELP = Path(__file__).resolve().parent / "help"
 CHANGED = {
+    "rerun": "--viewers takes a bag through live_view and openigtlink",
     "scripts_console": "the rig is in one process, cameras and tracker in a second one",
     "scripts_train_needle_map": "what draws its patches is in needle_bringup",
     "track_images": "one tracker in place of two: other rules, no searched region",

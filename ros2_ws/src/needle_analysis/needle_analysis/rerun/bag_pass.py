@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import sys
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Sequence, Set
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from rosbags.typesys import Stores, get_typestore
 from tqdm import tqdm
 
-from needle_analysis.rerun.comparison import Record, members
+from needle_analysis.rerun.comparison import FIELDS, Record, members
 from needle_analysis.rerun.reception_order import in_reception_order
 from needle_analysis.run.run_summary import estimate_error
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
@@ -24,16 +24,6 @@ from needle_core.message_types import rosbags_types
 
 POSE = "needle/tip_pose"
 TIP_TOPICS = ("needle/tip", POSE)
-TYPES: Mapping[str, str] = {
-    "needle/tip": "geometry_msgs/msg/PointStamped",
-    "needle/tip_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "needle/estimate": "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "needle/reduced_state": "geometry_msgs/msg/Vector3Stamped",
-    "needle/linearized_state": "geometry_msgs/msg/Vector3Stamped",
-    "needle/control_input": "geometry_msgs/msg/Vector3Stamped",
-    "device/joint_trajectory": "trajectory_msgs/msg/JointTrajectory",
-}
-"""Relative topic to type of what the stages put out."""
 
 # What was asked so shortly before the bag's end may not have its answer in it [ns].
 _LAST_ANSWERS = 500_000_000
@@ -64,9 +54,14 @@ class Output:
     message: Any
 
     @property
+    def type_name(self) -> str:
+        """Name of the message's type."""
+        return str(self.message.__msgtype__)
+
+    @property
     def data(self) -> bytes:
         """The message as CDR."""
-        return bytes(_STORE.serialize_cdr(self.message, TYPES[self.topic]))
+        return bytes(_STORE.serialize_cdr(self.message, self.type_name))
 
 
 class Stage(Protocol):
@@ -146,7 +141,7 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
     if tracker is not None:
         watched.update(TIP_TOPICS)
     if controller is not None:
-        watched.update(topic for topic in TYPES if topic not in TIP_TOPICS)
+        watched.update(topic for topic in FIELDS if topic not in TIP_TOPICS)
     recorded: list[Record] = []
     outputs: list[Output] = []
     exposed: set[int] = set()
@@ -181,6 +176,22 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
         for o in _recordable(recorded, outputs, last_time)
     ]
     return Rerun(recorded, today, outputs, without_images, unanswered)
+
+
+def run_stage(run: Run, stage: FinishingStage) -> list[Output]:
+    """Take a bag through one stage, in the order of sending; return what it puts out.
+
+    Raises
+    ------
+    UserError
+        If the bag is broken.
+    """
+    outputs: list[Output] = []
+    last_time = 0
+    for topic, sent, message in _inputs(run, stage.topics):
+        last_time = max(last_time, sent.log_time)
+        outputs += stage.take(topic, sent, message)
+    return outputs + stage.finish(last_time)
 
 
 def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Output]:

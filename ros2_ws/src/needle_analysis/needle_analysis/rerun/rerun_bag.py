@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from needle_analysis.rerun.bag_pass import TIP_TOPICS, TYPES, Output
+from needle_analysis.rerun.bag_pass import TIP_TOPICS, Output
 from needle_analysis.rerun.rerun_text import outputs_table
 from needle_analysis.run.run_summary import steered_by
 from needle_bags.format.bag_copy import BagCopy, stamp_of, standard_text, standard_topic
@@ -31,6 +31,8 @@ def write_rerun(
     outputs: Sequence[Output],
     parameters: Mapping[str, Mapping[str, Any]],
     calibration: str,
+    *,
+    shown: Sequence[Output] = (),
 ) -> None:
     """Write the copy, and `outputs.txt` beside it: today's outputs to be read, and diffed.
 
@@ -47,6 +49,8 @@ def write_rerun(
         Full node name to the parameters that were used.
     calibration : str
         The calibration that was used.
+    shown : sequence of Output
+        What viewers show today, in place of all that the bag has on these topics.
 
     Raises
     ------
@@ -57,6 +61,7 @@ def write_rerun(
     for output in outputs:
         waiting[output.topic, output.stamp].append(output)
     topics = {output.topic for output in outputs}
+    shown_topics = {output.topic for output in shown}
     answered = {output.stamp for output in outputs if output.topic in TIP_TOPICS}
     contents = read_contents(run.path)
     custom = {**contents.custom_data, "calibration": calibration}
@@ -66,6 +71,8 @@ def write_rerun(
         topic = contents.topics[message.topic]
         name = topic.name.removeprefix(run.namespace)
         data = message.data
+        if name in shown_topics:
+            continue
         if name == CALIBRATION:
             data = standard_text(calibration)
         if name in topics:
@@ -75,9 +82,9 @@ def write_rerun(
                     continue
                 data = waiting[name, stamp].popleft().data
         copy.put(topic, data, message.log_time, message.time)
-    rest = [output for queue in waiting.values() for output in queue]
-    for output in sorted(rest, key=lambda output: output.log_time):
-        new = standard_topic(run.namespace + output.topic, TYPES[output.topic])
+    rest = (output for queue in waiting.values() for output in queue)
+    for output in sorted((*rest, *shown), key=lambda output: output.log_time):
+        new = standard_topic(run.namespace + output.topic, output.type_name)
         copy.put(new, output.data, output.log_time, output.log_time)
     copy.close()
     try:

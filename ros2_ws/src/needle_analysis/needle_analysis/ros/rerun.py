@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from needle_analysis.link.openigtlink import LINK, Listeners, OpenIGTLink, OpenIGTLinkParameters
+from needle_analysis.live.live_view import LiveView, LiveViewParameters
 from needle_analysis.rerun.bag_pass import (
     TIP_TOPICS,
     has_images,
     run_again,
+    run_stage,
     run_tips,
 )
+from needle_analysis.rerun.bag_stage import BagStage
 from needle_analysis.rerun.comparison import compare
 from needle_analysis.rerun.rerun_bag import write_rerun
 from needle_analysis.rerun.rerun_text import describe, errors_text, flat, tolerance_table
 from needle_analysis.ros.controller_rerun import ControllerStage, step_ends
-from needle_analysis.ros.tracker_rerun import TrackerStage
 from needle_bags.format.bag_writer import refuse_existing_bag
 from needle_bags.reading.bag_files import read_messages
 from needle_bags.reading.bag_reader import Run, read_run
@@ -28,13 +32,16 @@ from needle_controller.presets.steering_settings import PRESETS, SteeringSetting
 from needle_controller.protocol.joint_history import JointSample
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_core.commands.options import CommandParser, output_file
+from needle_core.component import Moment
 from needle_core.errors import UserError
 from needle_core.files.calibration_text import read_calibration
 from needle_core.files.plain_yaml import load_plain
+from needle_core.messages import Text
 from needle_core.ros.parameters import OF_EVERY_NODE
 from needle_core.settings.parameter_files import Sections, none_for, read_sections, values_for
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import parse_calibration
+from needle_tracker.stereo_tracker import CALIBRATION, TIP_POSE, StereoTipTracker
 
 DESCRIPTION = """\
 Run a bag again, without a graph and without waiting: its images through today's tracker, its tips
@@ -42,6 +49,9 @@ through today's estimator, law and step protocol, with the parameters and the ca
 recorded. Compare every output with the recorded one, field by field, and say what changed where.
 
 The needle does what it did: joints, tips and the device's answers are the recorded ones.
+
+With --viewers, live_view and openigtlink see the recorded needle as well. No bag tells when they
+looked, and ports are not recorded: what they send is counted, not compared; --output writes topics.
 """
 EPILOG = f"""\
 examples:
@@ -52,6 +62,8 @@ examples:
   ros2 run needle_analysis rerun bags/my_run --params other.yaml --output bags/again
   ros2 run needle_analysis report bags/my_run bags/again
       other parameters, and both in one report
+  ros2 run needle_analysis rerun bags/my_run --viewers --output bags/shown
+      a bag for Foxglove, with markers, and images that have shaft and tip drawn in
 
 tolerances: a value may differ by absolute + relative x recorded
 {tolerance_table()}
@@ -61,6 +73,11 @@ broke, 130 interrupted.
 """
 FILE = "calibration_file"
 TRACKER, CONTROLLER = "stereo_tracker", "plane_controller"
+NOT_COMPARED = {
+    LiveView.name: "since no bag tells when it looked",
+    OpenIGTLink.name: "since ports are not recorded",
+}
+"""Viewer to why nothing of it can be compared."""
 
 P = TypeVar("P")
 
@@ -130,9 +147,13 @@ def _run(words: Sequence[str]) -> int:
     controller = _controller(controller_node, ends)
     rerun = run_again(run, tracker, controller)
     comparison = compare(rerun.recorded, rerun.today)
+    viewers = _viewers(run, params, calibration) if given.viewers else {}
+    shown = [output for viewer in viewers.values() for output in run_stage(run, viewer)]
 
     if file is not None:
-        write_json(file, flat(run, comparison, rerun.outputs))
+        sent = [item for viewer in viewers.values() for item in viewer.runner.counts.items()]
+        counts = {f"{what.replace('/', '_')}_sent": count for what, count in sent}
+        write_json(file, {**flat(run, comparison, rerun.outputs), **counts})
     if given.output is not None:
         outputs = rerun.outputs
         answers = [output for output in outputs if output.topic in TIP_TOPICS]
@@ -140,7 +161,7 @@ def _run(words: Sequence[str]) -> int:
             outputs = [*answers, *run_tips(run, _controller(controller_node, ends), answers)]
         nodes = [node for node in (tracker_node, controller_node) if node is not None]
         used = {node.name: node.values for node in nodes}
-        write_rerun(run, given.output, outputs, used, calibration)
+        write_rerun(run, given.output, outputs, used, calibration, shown=shown)
     print(f"{run.path}: {_summary(tracker, controller)}")
     for note in controller.notes:
         print(f"note: {note}")
@@ -149,7 +170,7 @@ def _run(words: Sequence[str]) -> int:
     if rerun.unanswered:
         print(f"note: {rerun.unanswered} pairs are left out: stereo_tracker did not hear them")
     print("CHANGED" if comparison.changed else f"UNCHANGED: {len(rerun.recorded)} messages agree")
-    for text in (describe(run, comparison), errors_text(run, rerun.outputs)):
+    for text in (describe(run, comparison), errors_text(run, rerun.outputs), _seen(viewers)):
         if text:
             print(text)
     if given.output is not None:
@@ -175,20 +196,30 @@ def _parser() -> CommandParser:
         metavar="NEW_BAG",
         help="write a copy of the bag with today's outputs in place of the recorded ones",
     )
+    add(
+        "--viewers",
+        action="store_true",
+        help="show the recorded needle to live_view and openigtlink, too; count what they send",
+    )
     add("--namespace", metavar="NS", help="of the rig to run again, where the bag holds several")
     add("--json", type=Path, metavar="FILE", help="write the result as one flat JSON object")
     return parser
 
 
 def _node(
-    run: Run, name: str, params: tuple[Path | None, Sections], asked: Mapping[str, str]
+    run: Run,
+    name: str,
+    params: tuple[Path | None, Sections],
+    asked: Mapping[str, str],
+    *,
+    has_defaults: bool = False,
 ) -> Node:
     recorded = run.parameters or _announced(run)
     found = [full for full in recorded if full.rsplit("/", maxsplit=1)[-1] == name]
     own = f"{run.namespace}{name}"
     full_name = found[0] if found and own not in found else own
     given = {**(values_for(*params, full_name, name) or {}), **asked}
-    if not found and not given:
+    if not (found or given or has_defaults):
         raise UserError(
             f"{run.path} has no parameters of {name} (recorded by another recorder?): give them "
             f"with --params"
@@ -222,20 +253,59 @@ def _calibration(run: Run, node: Node) -> str:
     return run.calibration
 
 
-def _tracker(run: Run, node: Node, text: str) -> TrackerStage:
+def _tracker(run: Run, node: Node, text: str) -> BagStage:
     try:
         calibration = parse_calibration(load_plain(text, aliases=True))
     except (UserError, ValueError) as error:
         raise UserError(f"{run.path}: the calibration is broken: {error}") from error
-    return TrackerStage(calibration, node.parameters(StereoTrackerParameters))
+    tracker = StereoTipTracker(node.parameters(StereoTrackerParameters), calibration)
+    return BagStage(tracker, TIP_TOPICS)
+
+
+def _viewers(
+    run: Run, params: tuple[Path | None, Sections], calibration: str
+) -> dict[str, BagStage]:
+    """Return what shows the needle: live_view, and openigtlink to one that listens."""
+    begin = Moment(0.0, 0)
+
+    def settings(name: str, kind: type[P]) -> P:
+        return _node(run, name, params, {}, has_defaults=True).parameters(kind)
+
+    # /tf is everybody's: what the bag has there stays.
+    view = LiveView(settings(LiveView.name, LiveViewParameters), transforms=False)
+    viewers = {view.name: BagStage(view, (output.topic for output in view.outputs))}
+    # Not every bag has its topic.
+    list(viewers[view.name].runner.deliver(CALIBRATION, Text(calibration), begin))
+    if importlib.util.find_spec("pyigtl") is not None:
+        link = OpenIGTLink(settings(OpenIGTLink.name, OpenIGTLinkParameters))
+        viewers[link.name] = BagStage(link, ())
+        viewers[link.name].runner.arrive(LINK, (Listeners(1, 0),), begin)
+    return viewers
+
+
+def _seen(viewers: Mapping[str, BagStage]) -> str:
+    """Return a line for each viewer; empty without any."""
+    lines = []
+    for name, viewer in viewers.items():
+        counts = ", ".join(f"{count} {what}" for what, count in viewer.runner.counts.items())
+        lines.append(
+            f"{name}: nothing to compare, {NOT_COMPARED[name]}; sent {counts or 'nothing'}"
+        )
+    if viewers and OpenIGTLink.name not in viewers:
+        lines.append(f"{OpenIGTLink.name}: left out, pyigtl is not installed (docs/slicer.md)")
+    return "\n".join(lines)
 
 
 def _controller(node: Node, ends: Mapping[int, JointSample]) -> ControllerStage:
     return ControllerStage(node.parameters(SteeringSettings), node.name, ends)
 
 
-def _summary(tracker: TrackerStage | None, controller: ControllerStage) -> str:
-    pairs = "" if tracker is None else f"{tracker.pairs} image pairs through {TRACKER}, "
+def _summary(tracker: BagStage | None, controller: ControllerStage) -> str:
+    pairs = (
+        ""
+        if tracker is None
+        else f"{tracker.runner.counts[TIP_POSE]} image pairs through {TRACKER}, "
+    )
     return f"{pairs}{controller.tips} tips through {CONTROLLER} ({controller.name})"
 
 

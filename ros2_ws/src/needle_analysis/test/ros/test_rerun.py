@@ -16,6 +16,8 @@ import yaml
 from rclpy.parameter import Parameter
 from rosbags.typesys import Stores, get_typestore
 
+from needle_analysis.link import openigtlink
+from needle_analysis.live import live_view
 from needle_analysis.rerun.bag_pass import Output
 from needle_analysis.rerun.rerun_bag import TABLE, write_rerun
 from needle_analysis.ros import rerun as rerun_node
@@ -28,6 +30,7 @@ from needle_core.errors import UserError
 from needle_tracker.optics.calibration import StereoCalibration, parse_calibration
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
+PICTURES = live_view.PICTURES.values()
 EVENT = "rcl_interfaces/msg/ParameterEvent"
 
 Capture = pytest.CaptureFixture[str]
@@ -175,6 +178,52 @@ def test_tips_whose_images_are_not_in_the_bag_stay_as_they_were(
     assert read_contents(tmp_path / "bag").counts == read_contents(eight_steps).counts
     after = read_run(tmp_path / "bag").tips.values
     assert np.flatnonzero((after != run.tips.values).any(axis=1)).tolist() == [3]
+
+
+@pytest.fixture(scope="module")
+def shown(first_pictures: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The bag up to its first pictures, seen by viewers; and what was said, pyigtl being there."""
+    bag = tmp_path_factory.mktemp("rerun") / "shown"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("importlib.util.find_spec", lambda _: True)
+        patch.setattr(openigtlink, "packed", lambda *_: b"needle")
+        code, said = printed(first_pictures, "--viewers", "--output", bag)
+    assert code == 0, said
+    return bag, said
+
+
+def test_viewers_see_the_recorded_needle_and_nothing_is_compared(
+    shown: tuple[Path, str], first_pictures: Path
+) -> None:
+    bag, said = shown
+    before, after = read_contents(first_pictures).counts, read_contents(bag).counts
+    new = {topic.removeprefix("/"): n for topic, n in (after - before).items()}
+    assert new.keys() == {live_view.TIP, live_view.PATH, live_view.MARKERS, *PICTURES}
+    (view,) = [line for line in said.splitlines() if line.startswith("live_view: ")]
+    assert "nothing to compare, since no bag tells when it looked; sent " in view
+    for topic, count in new.items():
+        assert f"{count} {topic}" in view
+    run = read_run(first_pictures)
+    seconds = (run.joints.received[-1] - run.joints.received[0]) * 1e-9
+    # Ten times a second, and each picture once.
+    assert new[live_view.PATH] == pytest.approx(10 * seconds, abs=3)
+    assert {new[topic] for topic in PICTURES} == {before["/stereo/left/image_raw/compressed"]}
+    *_, (_, _, path) = read_messages(bag, f"/{live_view.PATH}".__eq__)
+    tip = path.poses[-1].pose.position
+    assert (tip.x, tip.y, tip.z) == tuple(run.tips.values[-1])
+    (link,) = [line for line in said.splitlines() if line.startswith("openigtlink: ")]
+    assert "nothing to compare, since ports are not recorded; sent " in link
+    assert int(link.split()[-2]) == pytest.approx(10 * seconds, abs=3)
+
+
+def test_what_viewers_showed_before_is_replaced(shown: tuple[Path, str], tmp_path: Path) -> None:
+    file = tmp_path / "result.json"
+    code, said = printed(shown[0], "--viewers", "--output", tmp_path / "again", "--json", file)
+    assert code == 0
+    counts = read_contents(shown[0]).counts
+    assert json.loads(file.read_text())["live_view_path_sent"] == counts["/live_view/path"]
+    assert read_contents(tmp_path / "again").counts == counts
+    assert "openigtlink: left out, pyigtl is not installed" in said
 
 
 def copied(bag: Path, target: Path, custom: dict[str, str], topic: str, kind: str) -> Any:

@@ -8,7 +8,7 @@ from needle_bringup.operator.hand import Reading
 from needle_bringup.operator.hold_gate import Grip, Held, HoldGate
 from needle_bringup.operator.joy_source import JoySource
 from needle_bringup.operator.parameters import JOY, OperatorParameters
-from needle_bringup.operator.retraction import STOP_STEERING, Retraction
+from needle_bringup.operator.retraction import STOP_STEERING, RetractionSequence
 from needle_core import messages as m
 from needle_core.commands.cli import EXIT_DONE
 from needle_core.component import (
@@ -70,7 +70,7 @@ class Operator(Component):
             lambda: len(self._peers.publishers.get(joy, ())),
         )
         self._gate = HoldGate()
-        self._retraction = Retraction(name)
+        self._retraction = RetractionSequence(name)
         self._grip = Grip()
         self._press_again = False
         self._told = ""

@@ -30,7 +30,7 @@ _IN_VAIN = {
 }
 
 
-class Retraction:
+class RetractionSequence:
     """From the press of the button to its release.
 
     A controller that steers would answer the hold with a step forward: it is told to stop first.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from needle_bringup.operator.retraction import PATIENCE, RETRACT, STOP_STEERING, Retraction
+from needle_bringup.operator.retraction import PATIENCE, RETRACT, STOP_STEERING, RetractionSequence
 
 IN_VAIN = (
     f"no answer from {STOP_STEERING}",
@@ -12,17 +12,17 @@ IN_VAIN = (
 )
 
 
-def holds(retraction: Retraction) -> bool:
+def holds(retraction: RetractionSequence) -> bool:
     """What mypy takes for the same after a call may have changed."""
     return retraction.holds
 
 
-def at_step(steps: int) -> Retraction:
+def at_step(steps: int) -> RetractionSequence:
     """Return a button's retraction after so many steps, 1 s in.
 
     The controller was told to stop, has, the device was told to retract, and has agreed.
     """
-    retraction = Retraction("operator")
+    retraction = RetractionSequence("operator")
     retraction.see_device("", "none", 0.0)
     assert retraction.look(True, 1.0, controller=True) == STOP_STEERING
     assert retraction.look(True, 1.0, controller=True) is None
@@ -54,7 +54,7 @@ def test_the_hold_ends_with_the_retraction_though_the_button_is_held() -> None:
 
 
 def test_without_a_controller_the_hold_is_given_at_once() -> None:
-    retraction = Retraction("operator")
+    retraction = RetractionSequence("operator")
     assert retraction.look(True, 1.0, controller=False) is None
     assert holds(retraction)
 

@@ -1,0 +1,82 @@
+"""A component on a bag: its timers tick by recorded time, and what nobody hears is dropped."""
+
+from __future__ import annotations
+
+import math
+
+from needle_core import component as c
+from needle_core import messages as m
+from needle_core.runners.bag import BagRunner
+
+
+class Clerk(c.Component):
+    """Notes when its timer ticked and who it knows; repeats what it hears, aloud and at a port."""
+
+    name = "clerk"
+
+    def __init__(self) -> None:
+        self.ticks: list[float] = []
+        self.peers = c.Peers()
+        self.batches: list[object] = []
+        self.inputs = (c.Input("in", m.Text, self._on_text),)
+        self.outputs = (c.Output("out", m.Text), c.Output("aside", m.Text))
+        self.timers = (c.Timer(0.5, self._on_time),)
+        self.ports = (c.Port("door", self._on_batch),)
+
+    def on_peers(self, peers: c.Peers, at: c.Moment) -> c.Actions:
+        self.peers = peers
+        return ()
+
+    def _on_text(self, message: m.Text, at: c.Moment) -> c.Actions:
+        yield c.Log("info", "heard")
+        yield c.Publish("out", message)
+        yield c.Publish("aside", message)
+        yield c.Send("door", (message.text,))
+
+    def _on_time(self, at: c.Moment) -> c.Actions:
+        self.ticks.append(at.steady)
+        yield c.Publish("out", m.Text(f"tick {len(self.ticks)}"))
+
+    def _on_batch(self, batch: object, at: c.Moment) -> c.Actions:
+        self.batches.append(batch)
+        yield c.Publish("out", m.Text("knock"))
+
+
+def heard(clerk: Clerk, *times: float) -> tuple[BagRunner, list[str]]:
+    runner = BagRunner(clerk, ["out"])
+    said = [
+        action.message.text
+        for time in times
+        for action in runner.deliver("in", m.Text(f"at {time}"), c.Moment(time, 0))
+    ]
+    return runner, said
+
+
+def test_timers_tick_before_the_message_at_which_they_are_due() -> None:
+    clerk = Clerk()
+    _, said = heard(clerk, 10.0, 10.4, 10.6, 10.9, 11.0)
+    assert clerk.ticks == [10.6, 11.0]
+    assert said == ["at 10.0", "at 10.4", "tick 1", "at 10.6", "at 10.9", "tick 2", "at 11.0"]
+
+
+def test_a_gap_of_a_century_is_one_tick_and_the_phase_stays() -> None:
+    clerk = Clerk()
+    heard(clerk, 0.0, 3e9 + 0.1, 3e9 + 0.4, 3e9 + 0.6)
+    assert clerk.ticks == [3e9 + 0.1, 3e9 + 0.6]
+
+
+def test_what_nobody_receives_is_dropped_and_the_rest_is_counted() -> None:
+    clerk = Clerk()
+    runner, said = heard(clerk, 1.0, 1.1)
+    assert said == ["at 1.0", "at 1.1"]
+    assert runner.counts == {"out": 2, "door": 2}
+    assert set(clerk.peers.subscribers) == {"out"}
+
+
+def test_what_comes_in_at_a_port_is_handled_and_every_timer_has_a_last_tick() -> None:
+    clerk = Clerk()
+    runner, _ = heard(clerk, 1.0)
+    (answer,) = runner.arrive("door", ("a", "b"), c.Moment(1.0, 0))
+    assert (answer.message.text, clerk.batches) == ("knock", [("a", "b")])
+    assert [action.message.text for action in runner.finish(c.Moment(math.inf, 0))] == ["tick 1"]
+    assert clerk.ticks == [math.inf]
