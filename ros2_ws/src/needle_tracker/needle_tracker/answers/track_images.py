@@ -8,12 +8,12 @@ import dataclasses
 import math
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 from tqdm import tqdm
 
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
@@ -21,10 +21,11 @@ from needle_core.commands.options import CommandParser, number, output_file
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import none_for, read_sections, values_for
 from needle_tracker.answers.annotation import Image, annotate
+from needle_tracker.answers.seen import SeenCounts, missing
 from needle_tracker.answers.swapped_images import SUSPICION, SwapWatch
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.answers.truth_comparison import TruthComparison, read_truth
-from needle_tracker.filter.measurement import Measurement, TrackState
+from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.sources.image_files import NamedPair, PairSequence, open_pairs, read_insertions
@@ -37,10 +38,13 @@ are equal or differ in left and right, l and r, cam0 and cam1 (left-0001.png, ri
 EPILOG = """\
 The output is a CSV file, one line for each pair:
   name            file name without left or right (video: number of the frame)
-  valid           1 with a tip, 0 without; then the other fields are empty
+  valid           1 with a tip, 0 without; then the tip's fields are empty
   x_m y_m z_m     the tip in rig: x up, z along the insertion, from the needle's entry point
   sigma_*_m       its standard deviations
   pitch_rad yaw_rad   of the shaft at its visible end: asin(d_x) and atan2(-d_y, d_z)
+  left_end right_end  how many needle ends the network expects there, about 1 where the end is seen
+  left_shaft right_shaft  mean probability of shaft behind it; empty where nothing was found
+  missing         why there is no tip; docs/images.md says what helps
 --insertion helps: one look at the needle is then enough, and a followed tip is merged with where
 the last one and the insertion have it. Below 4.5 mm (entry_zone) there is no tip. The stage's zero
 and scale may be off (stage_zero_sigma, stage_scale_sigma); both are estimated and printed.
@@ -67,6 +71,7 @@ exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
 COLUMNS = (
     *("name", "valid", "x_m", "y_m", "z_m"),
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "pitch_rad", "yaw_rad"),
+    *("left_end", "left_shaft", "right_end", "right_shaft", "missing"),
 )
 _NODE = "stereo_tracker"
 _NAMED = 5  # so many names are shown, the others counted
@@ -76,14 +81,14 @@ _NEW_RUN = 10e-3  # a jump of the insertion that no run makes between two images
 
 @dataclasses.dataclass(frozen=True)
 class TrackedSequence:
-    """Results of a sequence: CSV rows, reasons for missing tips, names of unreadable pairs.
+    """Results of a sequence: CSV rows, what was seen, names of unreadable pairs.
 
     And whether left and right images seem to be swapped, and the stage's zero [m] and scale error
     [-] as estimated.
     """
 
     rows: list[list[str]]
-    reasons: Counter[str]
+    seen: SeenCounts
     unreadable: list[str]
     without_insertion: int
     swapped: bool
@@ -125,12 +130,12 @@ def _run(words: Sequence[str]) -> int:
         "unpaired": len(pairs.unpaired),
         "unreadable": len(tracked.unreadable),
         "without_insertion": tracked.without_insertion,
+        **tracked.seen.figures(),
         "wall_s": time.perf_counter() - begin,
         **(dict.fromkeys(TruthComparison({}).figures()) if truth is None else truth.figures()),
     }
     print(f"{found} tips in {len(tracked.rows)} pairs: {output}")
-    for reason, count in tracked.reasons.most_common():
-        print(f"  no tip {count:6d} x  {reason}")
+    print(tracked.seen.describe())
     if insertions is not None:
         zero, scale = tracked.stage
         print(f"  stage: zero off by {1e3 * zero:.2f} mm, scale by {100.0 * scale:.2f} %")
@@ -205,7 +210,7 @@ def track_sequence(
         The first images that can be read are not of the calibration's size.
     """
     rows: list[list[str]] = []
-    reasons: Counter[str] = Counter()
+    seen = SeenCounts()
     unusable: list[str] = []
     without, last, checked, stage = 0, None, False, (0.0, 0.0)
     swap = SwapWatch(calibration, tracker.settings)
@@ -239,12 +244,9 @@ def track_sequence(
             unusable.append(f"{pair.name} ({image} is {problem})")
         on_measured(pair, measured)
         stage = measured.stage if measured.tip is not None else stage
-        row = to_row(pair.name, measured)
-        if row[1] == "0":
-            entry = measured.state is TrackState.ENTRY
-            reasons["in the entry zone" if entry else measured.reason] += 1
-        rows.append(row)
-    return TrackedSequence(rows, reasons, unusable, without, swap.suspected, stage)
+        seen.add(measured)
+        rows.append(to_row(pair.name, measured))
+    return TrackedSequence(rows, seen, unusable, without, swap.suspected, stage)
 
 
 def image_problem(pair: NamedPair, calibration: StereoCalibration) -> tuple[str, str]:
@@ -262,15 +264,17 @@ def image_problem(pair: NamedPair, calibration: StereoCalibration) -> tuple[str,
 
 def to_row(name: str, measured: Measurement) -> list[str]:
     """Return a pair's line of the CSV file; a tip from the stage alone is none."""
-    tip = measured.tip
-    if tip is None or measured.state is TrackState.ENTRY:
-        return [name, "0", *[""] * (len(COLUMNS) - 2)]
-    x, y, z = tip.position.tolist()
-    sigma_x, sigma_y, sigma_z = (math.sqrt(tip.covariance[i, i]) for i in range(3))
-    d_x, d_y, d_z = tip.direction.tolist()
-    pitch, yaw = math.asin(min(max(d_x, -1.0), 1.0)), math.atan2(-d_y, d_z)
-    values = (x, y, z, sigma_x, sigma_y, sigma_z, pitch, yaw)
-    return [name, "1", *(f"{value:.9f}" for value in values)]
+    tip, cause = measured.tip, missing(measured)
+    place = [""] * 8
+    if tip is not None and not cause:
+        d_x, d_y, d_z = tip.direction.tolist()
+        angles = math.asin(min(max(d_x, -1.0), 1.0)), math.atan2(-d_y, d_z)
+        values = (*tip.position, *np.sqrt(np.diag(tip.covariance)), *angles)
+        place = [f"{value:.9f}" for value in values]
+    shown: list[str] = []
+    for end in measured.ends:
+        shown += ["", ""] if end is None else [f"{end.ends:.2f}", f"{end.shaft:.2f}"]
+    return [name, "0" if cause else "1", *place, *shown, cause]
 
 
 def write_overlay(folder: Path, name: str, picture: Image) -> None:
@@ -338,8 +342,8 @@ def _parser() -> CommandParser:
     add(
         "--overlay",
         metavar="DIR",
-        help="new folder for pictures of what was found in each pair: the shaft's end green "
-        "(yellow: its line alone), red where it is not believed",
+        help="new folder for pictures of each pair: the shaft's end green (yellow: its line alone, "
+        "red: not believed), and how surely each view shows end and shaft",
     )
     add(
         "--truth",
