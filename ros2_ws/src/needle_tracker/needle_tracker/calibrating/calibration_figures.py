@@ -13,7 +13,7 @@ from needle_core.errors import UserError
 from needle_tracker.calibrating.rig_calibration import RigCalibration
 from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import SIDES, Camera
-from needle_tracker.optics.camera_model import optical_rays
+from needle_tracker.optics.compiled_projection import pack_camera, pixel_ray
 from needle_tracker.optics.window import Window
 
 Array = NDArray[np.float64]
@@ -124,17 +124,10 @@ def _draw_face(axes: Any, window: Window, axis: int) -> None:
 
 
 def _draw_frustum(axes: Any, camera: Camera, axis: int, colour: str) -> None:
-    centre = camera.centre
-    corners = np.array(
-        [[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=float
-    )
-    rays = optical_rays(camera, corners) @ camera.T_optical_rig[:3, :3]
-    above = float(camera.window.height(centre))
-    # Down to the window; a camera that looks past it has no such end.
-    lengths = np.minimum(above / np.maximum(-rays @ camera.window.normal, 1e-9), 2.0 * above)
-    ends = centre + lengths[:, None] * rays
-    for end in ends:
-        axes.plot(
-            _MM * np.array([centre[axis], end[axis]]), _MM * np.array([centre[0], end[0]]),
-            color=colour, linewidth=0.8,
-        )  # fmt: skip
+    """Draw the rays of the image's corners, down to the window if they look at it."""
+    width, height = float(camera.width), float(camera.height)
+    packed, end, direction = pack_camera(camera), np.empty(3), np.empty(3)
+    for corner in ((0.0, 0.0), (width, 0.0), (width, height), (0.0, height)):
+        pixel_ray(packed, np.array(corner), end, direction)
+        ray = _MM * np.stack([camera.centre, end])
+        axes.plot(ray[:, axis], ray[:, 0], color=colour, linewidth=0.8)

@@ -1,6 +1,6 @@
 """Points through the refracting window into one camera, and back: for loops.
 
-The same model as `refraction`, which serves arrays of any shape; the tests hold the two together.
+`refraction` has the same projection for arrays of any shape; the tests hold the two together.
 """
 
 # Compiled functions take plain numbers, one by one.
@@ -27,26 +27,12 @@ _JACOBIAN_STEP = 1e-5  # [m]
 _LAYERS = 29  # from here on, thickness and index of each layer
 
 
-def foot_and_height(camera: Camera) -> tuple[Array, float]:
-    """Return the point of the window's outer face next to a camera, and how far it is before it.
-
-    Returns
-    -------
-    foot : ndarray, shape (3,)
-        In `rig` [m].
-    height : float
-        [m].
-    """
-    window = camera.window
-    height = float(window.height(camera.centre))
-    offset = camera.centre - window.point
-    return window.point + (offset - height * window.normal), height
-
-
 def pack_camera(camera: Camera) -> Array:
     """Return all that projection needs, as the array that `project_point` takes."""
     window = camera.window
-    foot, height = foot_and_height(camera)
+    height = float(window.height(camera.centre))
+    # The point of the outer face next to the camera.
+    foot = window.point + (camera.centre - window.point - height * window.normal)
     return np.concatenate(
         [
             camera.T_optical_rig[:3, :3].reshape(-1),
