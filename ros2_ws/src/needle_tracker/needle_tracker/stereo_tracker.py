@@ -84,7 +84,7 @@ class StereoTipTracker(Component):
     ) -> None:
         self.name, self.settings = name, settings
         self.is_annotation_wanted = False
-        self._cameras = {"left": calibration.left, "right": calibration.right}
+        self._cameras = calibration.cameras
         self._calibration_text = calibration_text
         self._is_calibration_told = False
         self.answers = PairAnswers(

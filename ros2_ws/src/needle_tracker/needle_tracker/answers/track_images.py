@@ -27,7 +27,7 @@ from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.answers.truth_comparison import TruthComparison, read_truth
 from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
+from needle_tracker.optics.calibration import StereoCalibration, load_calibration
 from needle_tracker.sources.image_files import NamedPair, PairSequence, open_pairs, read_insertions
 
 DESCRIPTION = """\
@@ -232,34 +232,21 @@ def track_sequence(
             if last is not None and abs(insertion - last) > _NEW_RUN:
                 tracker.reset()
             last = insertion
-        image, problem = image_problem(pair, calibration)
+        problem = pair.problem(calibration.sizes)
         if pair.left is not None and pair.right is not None and not problem:
             measured = tracker.process(pair.left, pair.right, insertion)
             swap.see(pair.left, pair.right, insertion, measured)
             checked = True
         else:
             if not checked and pair.left is not None and pair.right is not None:
-                raise UserError(f"{pair.name}: {image} is {problem}")
-            measured = tracker.skip(f"{image} cannot be used")
-            unusable.append(f"{pair.name} ({image} is {problem})")
+                raise UserError(f"{pair.name}: {problem}")
+            measured = tracker.skip(problem)
+            unusable.append(f"{pair.name} ({problem})")
         on_measured(pair, measured)
         stage = measured.stage if measured.tip is not None else stage
         seen.add(measured)
         rows.append(to_row(pair.name, measured))
     return TrackedSequence(rows, seen, unusable, without, swap.suspected, stage)
-
-
-def image_problem(pair: NamedPair, calibration: StereoCalibration) -> tuple[str, str]:
-    """Return which image of a pair cannot be looked at, and what it is; both empty where none."""
-    cameras = (calibration.left, calibration.right)
-    for side, image, camera in zip(SIDES, (pair.left, pair.right), cameras, strict=True):
-        if image is None:
-            return f"{side} image", "unreadable or not of 8 bit"
-        if image.shape != (camera.height, camera.width):
-            size = f"{image.shape[1]}x{image.shape[0]}"
-            wanted = f"{camera.width}x{camera.height}"
-            return f"{side} image", f"{size}, the calibration is for {wanted}"
-    return "", ""
 
 
 def to_row(name: str, measured: Measurement) -> list[str]:

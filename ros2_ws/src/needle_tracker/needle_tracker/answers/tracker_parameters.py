@@ -8,10 +8,10 @@ from pathlib import Path
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.answers.pair_answers import PairingSettings
-from needle_tracker.answers.reference_images import read_reference
 from needle_tracker.detector.reach import Reach
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.sources.image_files import mean_pair
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +145,7 @@ class StereoTrackerParameters:
         UserError
             If there are no reference images where they should be.
         """
-        folder = self.reference_folder
+        folder = Path(self.reference_folder)
         return TrackerSettings(
             reach=Reach(
                 self.max_curvature, self.entry_angle, self.hole_tolerance, self.max_insertion
@@ -157,7 +157,9 @@ class StereoTrackerParameters:
             hole_clearance=self.hole_clearance,
             stage_zero_sigma=self.stage_zero_sigma,
             stage_scale_sigma=self.stage_scale_sigma,
-            reference=read_reference(Path(folder), calibration) if folder else None,
+            reference=mean_pair(folder / "left", folder / "right", calibration.sizes)
+            if self.reference_folder
+            else None,
         )
 
 
