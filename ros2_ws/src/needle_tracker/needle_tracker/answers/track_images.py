@@ -14,7 +14,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser, number, output_file
@@ -28,7 +27,13 @@ from needle_tracker.answers.truth_comparison import TruthComparison, read_truth
 from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
-from needle_tracker.sources.image_files import NamedPair, PairSequence, open_pairs, read_insertions
+from needle_tracker.sources.image_files import (
+    NamedPair,
+    PairSequence,
+    open_pairs,
+    progress,
+    read_insertions,
+)
 
 DESCRIPTION = """\
 Measure the needle's tip in stereo images, paired by file name and taken in the order of their names
@@ -107,10 +112,10 @@ def _run(words: Sequence[str]) -> int:
     json = output_file("--json", given.json)
     parameters = _parameters(given)
     calibration = load_calibration(Path(given.calibration))
-    insertions = read_insertions(Path(given.insertion)) if given.insertion else None
+    insertions = read_insertions(Path(given.insertion)) if given.insertion else {}
     pairs = open_pairs(Path(given.left), Path(given.right))
     truth = TruthComparison(read_truth(Path(given.truth))) if given.truth else None
-    overlays = None if given.overlay is None else _new_folder("--overlay", given.overlay)
+    overlays = given.overlay and _new_folder("--overlay", given.overlay)
 
     def on_measured(pair: NamedPair, measured: Measurement) -> None:
         if truth is not None:
@@ -136,7 +141,7 @@ def _run(words: Sequence[str]) -> int:
     }
     print(f"{found} tips in {len(tracked.rows)} pairs: {output}")
     print(tracked.seen.describe())
-    if insertions is not None:
+    if given.insertion:
         zero, scale = tracked.stage
         print(f"  stage: zero off by {1e3 * zero:.2f} mm, scale by {100.0 * scale:.2f} %")
     if truth is not None:
@@ -144,16 +149,18 @@ def _run(words: Sequence[str]) -> int:
     if overlays is not None:
         print(f"drawn: {overlays}")
     if tracked.swapped:
-        print(f"warning: {SUSPICION}; exchange --left and --right", file=sys.stderr)
-    _warn("without a partner", pairs.unpaired)
-    _warn("cannot be used", tracked.unreadable)
+        _warn(f"{SUSPICION}; exchange --left and --right")
+    for what, names in (
+        ("without a partner", pairs.unpaired),
+        ("cannot be used", tracked.unreadable),
+    ):
+        if names:
+            more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+            _warn(f"{len(names)} x {what}: {', '.join(names[:_NAMED])}{more}")
     if pairs.cut_off:
-        print(
-            f"warning: {pairs.cut_off} pairs that the videos promise cannot be read",
-            file=sys.stderr,
-        )
-    if insertions is not None and tracked.without_insertion:
-        print(f"warning: {tracked.without_insertion} pairs have no insertion", file=sys.stderr)
+        _warn(f"{pairs.cut_off} pairs that the videos promise cannot be read")
+    if given.insertion and tracked.without_insertion:
+        _warn(f"{tracked.without_insertion} pairs have no insertion")
     if json is not None:
         write_json(json, result)
     return EXIT_DONE
@@ -166,7 +173,7 @@ def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
         sections = read_sections(Path(given.params))
         values = values_for(given.params, sections, f"/{_NODE}", _NODE)
         if values is None:
-            print(f"warning: {none_for(given.params, sections, f'/{_NODE}')}", file=sys.stderr)
+            _warn(none_for(given.params, sections, f"/{_NODE}"))
         changes |= values or {}
         known = {field.name for field in dataclasses.fields(StereoTrackerParameters)}
         if unknown := sorted(set(changes) - known):
@@ -181,7 +188,7 @@ def track_sequence(
     pairs: PairSequence,
     tracker: NeedleTracker,
     calibration: StereoCalibration,
-    insertions: Mapping[str, float] | None,
+    insertions: Mapping[str, float],
     on_measured: Callable[[NamedPair, Measurement], None] = lambda *_: None,
 ) -> TrackedSequence:
     """Run the tracker over a sequence of pairs.
@@ -194,8 +201,8 @@ def track_sequence(
         A fresh one.
     calibration : StereoCalibration
         The tracker's.
-    insertions : mapping or None
-        Insertion [m] by any of a pair's names, None where not known at all.
+    insertions : mapping
+        Insertion [m] by any of a pair's names.
     on_measured : callable
         Told each pair and what it gave.
 
@@ -214,19 +221,9 @@ def track_sequence(
     unusable: list[str] = []
     without, last, checked, stage = 0, None, False, (0.0, 0.0)
     swap = SwapWatch(calibration, tracker.settings)
-    bar = tqdm(
-        pairs,
-        total=len(pairs.names),
-        unit="pair",
-        delay=1.0,
-        leave=False,
-        disable=not sys.stderr.isatty(),
-    )
-    for pair in bar:
-        insertion = None
-        if insertions is not None:
-            known = (insertions[name] for name in pair.names if name in insertions)
-            insertion = next(known, None)
+    for pair in progress(pairs, "tracking"):
+        known = (insertions[name] for name in pair.names if name in insertions)
+        insertion = next(known, None)
         without += insertion is None
         if insertion is not None:
             if last is not None and abs(insertion - last) > _NEW_RUN:
@@ -309,13 +306,8 @@ def _new_folder(name: str, text: str) -> Path:
     return folder
 
 
-def _warn(what: str, names: Sequence[str]) -> None:
-    if not names:
-        return
-    shown = ", ".join(names[:_NAMED])
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    count = f"{len(names)} image" + ("s" if len(names) > 1 else "")
-    print(f"warning: {count} {what}: {shown}{more}", file=sys.stderr)
+def _warn(what: str) -> None:
+    print(f"warning: {what}", file=sys.stderr)
 
 
 def _parser() -> CommandParser:

@@ -78,15 +78,8 @@ def camera_info_problem(message: Any, side: str, camera: Camera) -> tuple[str, b
         if np.any(np.asarray(message.k) != 0.0) and difference > 0.5:
             return f"{side} camera_info differs from the calibration by {difference:.1f} px", False
         return "", False
-    of_sensor, roi = "", message.roi
-    if (width, height) != (message.width, message.height):
-        of_sensor = (
-            f" (sensor {message.width}x{message.height}, roi {roi.width}x{roi.height} at "
-            f"{roi.x_offset},{roi.y_offset}, binning "
-            f"{max(message.binning_x, 1)}x{max(message.binning_y, 1)})"
-        )
     return (
-        f"{side} camera_info is for {width}x{height}{of_sensor}, the calibration for "
+        f"{side} camera_info is for {width}x{height}, the calibration for "
         f"{camera.width}x{camera.height}"
     ), True
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_session import Session
 from needle_tracker.calibrating.charuco import check_board_seen
 from needle_tracker.calibrating.rig_model import BoardView, Corners
 from needle_tracker.optics.calibration import SIDES
-from needle_tracker.sources.image_files import Image, Sizes, open_pairs
+from needle_tracker.sources.image_files import Image, Sizes, open_pairs, progress
 
 Array = NDArray[np.float64]
 
@@ -49,11 +47,7 @@ def views_in_folders(
     views: list[BoardView] = []
     sizes: Sizes = {}
     pairs = open_pairs(left, right).refuse_unpaired()
-    total, hidden = len(pairs.names), not sys.stderr.isatty()
-    progress = tqdm(
-        pairs, "finding the board", total, unit="pair", delay=1.0, leave=False, disable=hidden
-    )
-    for pair in progress:
+    for pair in progress(pairs, "finding the board"):
         seen = []
         for side, path, image in zip(SIDES, pair.files, (pair.left, pair.right), strict=True):
             if image is None:

@@ -7,12 +7,14 @@ import dataclasses
 import itertools
 import math
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from needle_core.errors import UserError
 
@@ -198,6 +200,14 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
     return PairSequence([name for name, *_ in pairs], unpaired, left, right, files)
 
 
+def progress(pairs: PairSequence, what: str) -> Iterator[NamedPair]:
+    """Yield the pairs; a bar on a terminal says how far it is."""
+    hidden = not sys.stderr.isatty()
+    yield from tqdm(
+        pairs, what, len(pairs.names), unit="pair", delay=1.0, leave=False, disable=hidden
+    )
+
+
 def mean_pair(left: Path, right: Path, sizes: Sizes) -> tuple[Image, Image]:
     """Return the mean of all pairs of two folders or videos, which has less noise.
 
@@ -218,7 +228,7 @@ def mean_pair(left: Path, right: Path, sizes: Sizes) -> tuple[Image, Image]:
         if problem := pair.problem(sizes):
             raise UserError(f"{left.parent}, {pair.name}: {problem}")
         for total, image in zip(sums, (pair.left, pair.right), strict=True):
-            np.add(total, image, out=total)
+            np.add(total, np.asarray(image), out=total)
     first, second = (np.rint(total / count).astype(np.uint8) for total in sums)
     return first, second
 
