@@ -68,7 +68,7 @@ class CheckResult:
     ----------
     causes : tuple of str
         What was looked for: cameras that turned (`CAMERAS`), and what the windows' parameters are
-        called (`rig_model.window_names`).
+        called (`RigModel.names`).
     deviations : list of Deviation
         What was found, the most telling first.
     tip_error : float

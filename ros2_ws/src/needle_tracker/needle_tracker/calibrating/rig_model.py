@@ -17,6 +17,7 @@ first corner, T_rig_board = [exp(rotation) R0 | t0 + translation].
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from needle_tracker.calibrating.calibration_session import Place
 from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
 from needle_tracker.optics.camera_model import project_optical
 from needle_tracker.optics.refraction import RefractedCamera
-from needle_tracker.optics.window import Window, common_surface, surface_from_above
+from needle_tracker.optics.window import Window, surface_from_above
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -39,6 +40,7 @@ SURFACE = ("refractive_index", "surface_height")
 WINDOW = {"window_offset": 2e-3, "window_tilt_1": 0.02, "window_tilt_2": 0.02}
 _CAMERA = len(LENS) + len(POSE)
 CAMERA_PARAMETERS = 2 * _CAMERA
+KINDS = ("free", "surface", "under")
 # Central differences; the model is smooth, so that these are good to 1e-6 relative.
 _STEPS = {"f": 0.1, "c": 0.1, "k": 1e-4, "p": 1e-4, "r": 1e-5, "t": 1e-5, "s": 1e-5, "w": 1e-5}
 
@@ -70,10 +72,22 @@ class BoardView:
         left, right = (nothing if s == side else self.corners(s) for s in SIDES)
         return dataclasses.replace(self, left=left, right=right)
 
+    def scaled(self, size: float) -> BoardView:
+        """Return the view as if the board's squares were larger by a factor."""
+        left, right = (Corners(size * c.points, c.pixels) for c in (self.left, self.right))
+        return dataclasses.replace(self, left=left, right=right)
+
     @property
     def under_surface(self) -> bool:
         """Whether the board was in the phantom, and so seen through the windows."""
         return self.place is not None and self.place.under_surface
+
+    @property
+    def kind(self) -> str:
+        """One of `KINDS`: held freely, at a known place in air, or in the phantom."""
+        if self.place is None:
+            return "free"
+        return "under" if self.under_surface else "surface"
 
 
 def camera_slice(side: str) -> slice:
@@ -82,11 +96,11 @@ def camera_slice(side: str) -> slice:
     return slice(start, start + _CAMERA)
 
 
-def window_names(windows: tuple[Window, Window]) -> tuple[str, ...]:
-    """Return the names of the parameters that these windows have."""
-    if common_surface(*windows) is not None:
-        return SURFACE
-    return tuple(f"{side}.{name}" for side in SIDES for name in WINDOW)
+def unit_of(name: str) -> tuple[float, str]:
+    """Return the factor to a person's unit of a parameter or a camera's turn, and that unit."""
+    if "tilt" in name or "turned" in name:
+        return math.degrees(1.0), "deg"
+    return (1e3, "mm") if name.endswith(("surface_height", "window_offset")) else (1.0, "")
 
 
 class RigModel:
@@ -119,11 +133,12 @@ class RigModel:
     ) -> None:
         self.views = views
         self.tied = tied
-        self._start = {"left": start.left, "right": start.right}
+        self._start = start.cameras
         self._windows = (start.left.window, start.right.window)
         self._surface = start.surface
-        own = tuple(f"{side}.{name}" for side in SIDES for name in LENS + POSE)
-        self.names = own + window_names(self._windows)
+        self.names = tuple(f"{side}.{name}" for side in SIDES for name in LENS + POSE)
+        own = tuple(f"{side}.{name}" for side in SIDES for name in WINDOW)
+        self.names += own if self._surface is None else SURFACE
         self.shared = len(self.names)
         self._boards = np.asarray(boards, dtype=np.float64).reshape(-1, 4, 4)
         self._points = {s: _join([v.corners(s).points for v in views], 3) for s in SIDES}
@@ -167,18 +182,13 @@ class RigModel:
     def project(self, parameters: Array, side: str) -> Array:
         """Return where one camera should see its corners, shape (n, 2) [px]."""
         camera, under = self._camera(parameters, side), self._under[side]
-        corners, transform = self._corners(parameters, side), camera.T_optical_rig
+        boards, transform = self.board_poses(parameters)[self.view_of[side]], camera.T_optical_rig
+        corners = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side])
+        corners += boards[:, :3, 3]
         seen = corners @ transform[:3, :3].T + transform[:3, 3]
         if np.any(under):
             seen[under] = RefractedCamera(camera).seen_through(corners[under])
         return project_optical(camera, seen)
-
-    def _corners(self, parameters: Array, side: str) -> Array:
-        """Return where the corners are that one camera saw, in `rig`, shape (n, 3) [m]."""
-        boards = self.board_poses(parameters)[self.view_of[side]]
-        return np.asarray(
-            np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side]) + boards[:, :3, 3]
-        )
 
     def jacobian(self, parameters: Array, free: Mask) -> Array:
         """Return d(residuals)/d(free parameters), shape (2 * corners, free).
