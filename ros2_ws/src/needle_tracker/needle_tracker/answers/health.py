@@ -100,9 +100,8 @@ class Health:
 
     def note_pairing(self, now: float, matcher: PairMatcher[Any]) -> None:
         """Note whether images were dropped for want of a partner since the last call."""
-        if matcher.counts.unpaired > self._unpaired:
-            self._unpaired = matcher.counts.unpaired
-            self._last_unpaired = now
+        if matcher.unpaired.total() > self._unpaired:
+            self._unpaired, self._last_unpaired = matcher.unpaired.total(), now
 
     def track(self) -> Diagnostic:
         """Return the health of the track."""
@@ -123,16 +122,15 @@ class Health:
 
     def images(self, now: float, matcher: PairMatcher[Any]) -> Diagnostic:
         """Return the health of the images and their pairing."""
-        counts = matcher.counts
         recent = [(at, took) for at, took in self._done if now - at <= _RATE_WINDOW]
         latencies = sorted(took for _, took in recent)
         values = {
-            "pairs": str(counts.pairs),
+            "pairs": str(matcher.pairs),
             "rate_hz": f"{len(recent) / _RATE_WINDOW:.1f}",
             "latency_median_ms": f"{1e3 * latencies[len(latencies) // 2]:.1f}" if recent else "",
             "latency_max_ms": f"{1e3 * latencies[-1]:.1f}" if recent else "",
-            "left_without_right": str(counts.unpaired_left),
-            "right_without_left": str(counts.unpaired_right),
+            "left_without_right": str(matcher.unpaired["left"]),
+            "right_without_left": str(matcher.unpaired["right"]),
             "pairs_refused": str(self.refused.total()),
             "pair_tolerance_ms": f"{1e-6 * matcher.tolerance:.2f}",
         }

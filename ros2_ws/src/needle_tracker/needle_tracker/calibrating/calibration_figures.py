@@ -65,11 +65,9 @@ def residual_figure(result: RigCalibration) -> Figure:
             width=1e-3, color=_COLOURS[side],
         )  # fmt: skip
         axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal")
-        axes.set_title(
-            f"{side}: {result.reprojection_rms_px(side):.3f} px rms (arrows {enlarged:.0f} times "
-            "as long)"
-        )
-        axes.set(xlabel="u [px]", ylabel="v [px]" if number == 0 else "")
+        rms = result.reprojection_rms_px(side)
+        axes.set_title(f"{side}: {rms:.3f} px rms (arrows {enlarged:.0f} times as long)")
+        axes.set(xlabel="u [px]", ylabel="v [px]")
     axes = figure.add_axes((0.08, 0.14, 0.88, 0.30))
     places = np.arange(len(result.model.views))
     for side, offset in zip(SIDES, (-0.2, 0.2), strict=True):

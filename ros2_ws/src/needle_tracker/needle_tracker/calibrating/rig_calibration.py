@@ -187,10 +187,7 @@ def calibrate(
         raise UserError("both cameras come out in one place: are left and right the same images?")
     determined = {
         name: Determined(
-            value=float(result.parameters[i]),
-            sigma=float(sigmas[name]),
-            given=float(given[i]),
-            kept=not bool(free[i]),
+            float(result.parameters[i]), float(sigmas[name]), float(given[i]), not free[i]
         )
         for i, name in enumerate(names)
         if i >= CAMERA_PARAMETERS or (lenses is None and name.split(".")[-1] in LENS)
@@ -216,12 +213,11 @@ def _check_relative_pose(given: Array, seen: Array) -> None:
 
 def _least_determined(names: list[str], result: RigFit) -> int | None:
     """Return the free parameter that is farthest above its limit, None where there is none."""
-    worst, ratio = None, 1.0
-    for i, name in enumerate(names):
-        limit = LIMITS.get(name.split(".")[-1])
-        if limit is not None and result.free[i] and result.sigma[i] / limit > ratio:
-            worst, ratio = i, float(result.sigma[i] / limit)
-    return worst
+    limits = np.array([LIMITS.get(name.split(".")[-1], np.inf) for name in names])
+    # Of a fixed parameter the standard deviation is 0.
+    ratios = result.sigma[: len(names)] / limits
+    worst = int(ratios.argmax())
+    return worst if ratios[worst] > 1.0 else None
 
 
 def _check_cameras(

@@ -111,11 +111,10 @@ class _Capture(WholeNode):
             while len(self._pairs) < self._options.count and not self._problem:
                 left = end - time.monotonic()
                 if left <= 0.0:
-                    counts = self._matcher.counts
                     raise UserError(
                         f"{len(self._pairs)} image pairs of {self._options.count} in "
                         f"{self._options.timeout:g} s on stereo/{{left,right}}/image_raw "
-                        f"(without a partner: {counts.unpaired})"
+                        f"(without a partner: {self._matcher.unpaired.total()})"
                     )
                 executor.spin_once(timeout_sec=left)
         finally:

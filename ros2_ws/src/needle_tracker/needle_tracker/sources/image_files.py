@@ -165,7 +165,8 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
     UserError
         One is missing or cannot be opened, only one is a folder, or nothing pairs.
     """
-    for side, path in zip(_SIDES, (left, right), strict=True):
+    paths = dict(zip(_SIDES, (left, right), strict=True))
+    for side, path in paths.items():
         if not path.exists():
             raise UserError(f"--{side} {path}: does not exist")
     if left.is_dir() != right.is_dir():
@@ -349,13 +350,10 @@ def _image_folder(folder: Path) -> Path:
 
 def _images_in(side: str, folder: Path) -> set[str]:
     try:
-        names = {
-            path.name
-            for path in folder.iterdir()
-            if path.suffix.lower() in _SUFFIXES and path.is_file()
-        }
+        files = [path for path in folder.iterdir() if path.is_file()]
     except OSError as error:
         raise UserError(f"--{side} {folder}: {error.strerror}") from error
+    names = {path.name for path in files if path.suffix.lower() in _SUFFIXES}
     if not names:
         raise UserError(f"--{side} {folder}: no images in it ({', '.join(sorted(_SUFFIXES))})")
     return names
