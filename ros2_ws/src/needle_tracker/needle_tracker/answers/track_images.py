@@ -8,7 +8,7 @@ import dataclasses
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,11 @@ from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.answers.truth_comparison import TruthComparison, read_truth
 from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.optics.calibration import StereoCalibration, load_calibration
+from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.sources.image_files import (
     NamedPair,
     PairSequence,
+    Sizes,
     open_pairs,
     progress,
     read_insertions,
@@ -84,22 +85,6 @@ _JPEG_QUALITY = 90
 _NEW_RUN = 10e-3  # a jump of the insertion that no run makes between two images [m]
 
 
-@dataclasses.dataclass(frozen=True)
-class TrackedSequence:
-    """Results of a sequence: CSV rows, what was seen, names of unreadable pairs.
-
-    And whether left and right images seem to be swapped, and the stage's zero [m] and scale error
-    [-] as estimated.
-    """
-
-    rows: list[list[str]]
-    seen: SeenCounts
-    unreadable: list[str]
-    without_insertion: int
-    swapped: bool
-    stage: tuple[float, float]
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `track_images`; returns its exit code."""
     words = sys.argv[1:] if arguments is None else list(arguments)
@@ -114,54 +99,58 @@ def _run(words: Sequence[str]) -> int:
     calibration = load_calibration(Path(given.calibration))
     insertions = read_insertions(Path(given.insertion)) if given.insertion else {}
     pairs = open_pairs(Path(given.left), Path(given.right))
-    truth = TruthComparison(read_truth(Path(given.truth))) if given.truth else None
-    overlays = given.overlay and _new_folder("--overlay", given.overlay)
-
-    def on_measured(pair: NamedPair, measured: Measurement) -> None:
-        if truth is not None:
-            truth.add(pair.names, measured)
-        if overlays is not None and pair.left is not None and pair.right is not None:
-            write_overlay(overlays, pair.name, annotate(pair.left, pair.right, measured))
-
+    truth = TruthComparison(read_truth(Path(given.truth)) if given.truth else {})
+    overlays = None if given.overlay is None else _new_folder("--overlay", given.overlay)
     tracker = NeedleTracker(calibration, parameters.tracker_settings(calibration))
     tracker.warm_up()
     begin = time.perf_counter()
-    tracked = track_sequence(pairs, tracker, calibration, insertions, on_measured)
-    write_rows(output, tracked.rows)
-    found = sum(row[1] == "1" for row in tracked.rows)
-    result: dict[str, JsonValue] = {
-        "pairs": len(tracked.rows),
-        "tips": found,
-        "unpaired": len(pairs.unpaired),
-        "unreadable": len(tracked.unreadable),
-        "without_insertion": tracked.without_insertion,
-        **tracked.seen.figures(),
-        "wall_s": time.perf_counter() - begin,
-        **(dict.fromkeys(TruthComparison({}).figures()) if truth is None else truth.figures()),
-    }
-    print(f"{found} tips in {len(tracked.rows)} pairs: {output}")
-    print(tracked.seen.describe())
+    rows: list[list[str]] = []
+    unusable: list[str] = []
+    without, stage, seen = 0, (0.0, 0.0), SeenCounts()
+    swap = SwapWatch(calibration, tracker.settings)
+    for pair, insertion, measured in track(pairs, tracker, calibration.sizes, insertions):
+        without += insertion is None
+        if problem := pair.problem(calibration.sizes):
+            unusable.append(f"{pair.name} ({problem})")
+        if pair.left is not None and pair.right is not None:
+            if not problem:
+                swap.see(pair.left, pair.right, insertion, measured)
+            if overlays is not None:
+                write_overlay(overlays, pair.name, annotate(pair.left, pair.right, measured))
+        truth.add(pair.names, measured)
+        seen.add(measured)
+        rows.append(to_row(pair.name, measured))
+        stage = measured.stage if measured.tip is not None else stage
+    write_rows(output, rows)
+    found = sum(row[1] == "1" for row in rows)
+    print(f"{found} tips in {len(rows)} pairs: {output}\n{seen.describe()}")
     if given.insertion:
-        zero, scale = tracked.stage
-        print(f"  stage: zero off by {1e3 * zero:.2f} mm, scale by {100.0 * scale:.2f} %")
-    if truth is not None:
+        print(f"  stage: zero off by {1e3 * stage[0]:.2f} mm, scale by {100.0 * stage[1]:.2f} %")
+    if given.truth:
         print(truth.describe())
     if overlays is not None:
         print(f"drawn: {overlays}")
-    if tracked.swapped:
-        _warn(f"{SUSPICION}; exchange --left and --right")
-    for what, names in (
-        ("without a partner", pairs.unpaired),
-        ("cannot be used", tracked.unreadable),
-    ):
-        if names:
-            more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-            _warn(f"{len(names)} x {what}: {', '.join(names[:_NAMED])}{more}")
-    if pairs.cut_off:
-        _warn(f"{pairs.cut_off} pairs that the videos promise cannot be read")
-    if given.insertion and tracked.without_insertion:
-        _warn(f"{tracked.without_insertion} pairs have no insertion")
+    warnings = {
+        f"{SUSPICION}; exchange --left and --right": swap.suspected,
+        f"{len(pairs.unpaired)} x without a partner: {_named(pairs.unpaired)}": pairs.unpaired,
+        f"{len(unusable)} x cannot be used: {_named(unusable)}": unusable,
+        f"{pairs.cut_off} pairs that the videos promise cannot be read": pairs.cut_off,
+        f"{without} pairs have no insertion": given.insertion and without,
+    }
+    for text, holds in warnings.items():
+        if holds:
+            _warn(text)
     if json is not None:
+        result: dict[str, JsonValue] = {
+            "pairs": len(rows),
+            "tips": found,
+            "unpaired": len(pairs.unpaired),
+            "unreadable": len(unusable),
+            "without_insertion": without,
+            **seen.figures(),
+            "wall_s": time.perf_counter() - begin,
+            **(truth.figures() if given.truth else dict.fromkeys(truth.figures())),
+        }
         write_json(json, result)
     return EXIT_DONE
 
@@ -184,14 +173,10 @@ def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
     return StereoTrackerParameters(**changes)
 
 
-def track_sequence(
-    pairs: PairSequence,
-    tracker: NeedleTracker,
-    calibration: StereoCalibration,
-    insertions: Mapping[str, float],
-    on_measured: Callable[[NamedPair, Measurement], None] = lambda *_: None,
-) -> TrackedSequence:
-    """Run the tracker over a sequence of pairs.
+def track(
+    pairs: PairSequence, tracker: NeedleTracker, sizes: Sizes, insertions: Mapping[str, float]
+) -> Iterator[tuple[NamedPair, float | None, Measurement]]:
+    """Run the tracker over a sequence of pairs; yield each with its insertion and its answer.
 
     Parameters
     ----------
@@ -199,51 +184,31 @@ def track_sequence(
         The images.
     tracker : NeedleTracker
         A fresh one.
-    calibration : StereoCalibration
-        The tracker's.
+    sizes : dict of str to (int, int)
+        Width and height of the calibration's images [px].
     insertions : mapping
         Insertion [m] by any of a pair's names.
-    on_measured : callable
-        Told each pair and what it gave.
-
-    Returns
-    -------
-    TrackedSequence
-        One row for each pair.
 
     Raises
     ------
     UserError
         The first images that can be read are not of the calibration's size.
     """
-    rows: list[list[str]] = []
-    seen = SeenCounts()
-    unusable: list[str] = []
-    without, last, checked, stage = 0, None, False, (0.0, 0.0)
-    swap = SwapWatch(calibration, tracker.settings)
+    last, checked = None, False
     for pair in progress(pairs, "tracking"):
-        known = (insertions[name] for name in pair.names if name in insertions)
-        insertion = next(known, None)
-        without += insertion is None
+        insertion = next((insertions[name] for name in pair.names if name in insertions), None)
         if insertion is not None:
             if last is not None and abs(insertion - last) > _NEW_RUN:
                 tracker.reset()
             last = insertion
-        problem = pair.problem(calibration.sizes)
-        if pair.left is not None and pair.right is not None and not problem:
-            measured = tracker.process(pair.left, pair.right, insertion)
-            swap.see(pair.left, pair.right, insertion, measured)
-            checked = True
-        else:
-            if not checked and pair.left is not None and pair.right is not None:
-                raise UserError(f"{pair.name}: {problem}")
-            measured = tracker.skip(problem)
-            unusable.append(f"{pair.name} ({problem})")
-        on_measured(pair, measured)
-        stage = measured.stage if measured.tip is not None else stage
-        seen.add(measured)
-        rows.append(to_row(pair.name, measured))
-    return TrackedSequence(rows, seen, unusable, without, swap.suspected, stage)
+        problem = pair.problem(sizes)
+        if pair.left is None or pair.right is None or (problem and checked):
+            yield pair, insertion, tracker.skip(problem)
+            continue
+        if problem:
+            raise UserError(f"{pair.name}: {problem}")
+        checked = True
+        yield pair, insertion, tracker.process(pair.left, pair.right, insertion)
 
 
 def to_row(name: str, measured: Measurement) -> list[str]:
@@ -304,6 +269,11 @@ def _new_folder(name: str, text: str) -> Path:
     except OSError as error:
         raise UserError(f"{name} {folder}: {error.strerror}") from error
     return folder
+
+
+def _named(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
 
 
 def _warn(what: str) -> None:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from needle_core.errors import UserError
-from needle_tracker.sources.image_files import Image, NamedPair, Sizes, open_pairs, size_problem
+from needle_tracker.sources.image_files import Image, Sizes, open_pairs, size_problem
 
 # A camera that gives nothing for so many tries in a row is gone.
 LOST_AFTER = 20
@@ -186,31 +186,33 @@ class RecordedPairs:
     ) -> None:
         self._clock, self._sizes, self._loop = clock, sizes, loop
         self._pairs = open_pairs(Path(names[0]), Path(names[1])).refuse_unpaired()
-        self._any = False
-        self._next: Iterator[NamedPair] = iter(self._pairs)
         # A recording of another size is refused before anything is published.
-        self.next()
-        self._next = iter(self._pairs)
+        next(self._read())
+        self._events = self._read()
 
     def next(self) -> StampedPair | EndOfRecording | None:
         """Return the next pair; None where one of its images cannot be read."""
-        pair = next(self._next, None)
-        if pair is None and self._loop and self._any:
-            self._next = iter(self._pairs)
-            pair = next(self._next, None)
-        if pair is None:
-            return EndOfRecording(self._pairs.missing)
-        stamp = self._clock()
-        if pair.left is None or pair.right is None:
-            return None
-        if problem := pair.problem(self._sizes):
-            raise UserError(f"{pair.name}: {problem}")
-        self._any = True
-        return StampedPair(pair.left, pair.right, stamp, stamp)
+        return next(self._events)
 
     def close(self) -> None:
         """Let go of the files."""
-        self._next = iter(())
+        self._events = iter(())
+
+    def _read(self) -> Iterator[StampedPair | EndOfRecording | None]:
+        goes_on = True
+        while goes_on:
+            goes_on = False
+            for pair in self._pairs:
+                stamp = self._clock()
+                if pair.left is None or pair.right is None:
+                    yield None
+                    continue
+                if problem := pair.problem(self._sizes):
+                    raise UserError(f"{pair.name}: {problem}")
+                goes_on = self._loop
+                yield StampedPair(pair.left, pair.right, stamp, stamp)
+        while True:
+            yield EndOfRecording(self._pairs.missing)
 
 
 def _open_device(name: str) -> cv2.VideoCapture:
