@@ -1,4 +1,4 @@
-"""What each view shows of the needle, and what was missing where a pair gave no tip."""
+"""Shaft and end as each view shows them, and what was missing where a pair gave no tip."""
 
 from __future__ import annotations
 

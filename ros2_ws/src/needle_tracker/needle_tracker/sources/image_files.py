@@ -71,12 +71,7 @@ class NamedPair:
 def size_problem(side: str, size: tuple[int, ...], wanted: tuple[int, int]) -> str:
     """Return that a side's images are not of the calibration's size, in words; empty if they are.
 
-    Parameters
-    ----------
-    side : str
-        "left" or "right".
-    size, wanted : tuple of int
-        Width and height [px].
+    Sizes are width and height [px].
     """
     if size == wanted:
         return ""
