@@ -149,13 +149,14 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
     for name, found in result.parameters.items():
         scale, unit = unit_of(name)
         value, given, sigma = (scale * v for v in (found.value, found.given, found.sigma))
-        said = f"{value:.5g} {unit} +- {sigma:.2g} {unit}"
+        unit = unit and f" {unit}"
+        said = f"{value:.5g}{unit} +- {sigma:.2g}{unit}"
         if found.kept:
             asked = "not asked of these views"
             if math.isfinite(sigma):
-                asked = f"NOT DETERMINED by these views (+- {sigma:.2g} {unit})"
-            said = f"{asked}, kept at the given {given:g} {unit}"
-        lines.append(f"{name}: {said}".rstrip())
+                asked = f"NOT DETERMINED by these views (+- {sigma:.2g}{unit})"
+            said = f"{asked}, kept at the given {given:g}{unit}"
+        lines.append(f"{name}: {said}")
     error, sigma = (100.0 * value for value in size)
     if sigma < _SCALE_TOLD:
         lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % beside the session's")
