@@ -14,7 +14,7 @@ from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import find_scenario
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.plant import NeedlePlant, initial_pose
-from needle_tracker.answers.pair_answers import Frame, PairAnswers, PairingSettings
+from needle_tracker.answers.pair_answers import Frame, PairAnswers
 from needle_tracker.answers.swapped_images import SwapWatch
 from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.filter.measurement import Measurement
@@ -108,7 +108,7 @@ def test_the_answers_stay_as_they_are(
 ) -> None:
     settings = default_settings(calibration)
     alone = NeedleTracker(calibration, settings)
-    answers = PairAnswers(calibration, settings, PairingSettings(0, 0.2, 0.0))
+    answers = PairAnswers(calibration, settings, pair_tolerance_ns=0, joint_timeout=0.2, lean=0.0)
     for k, (insertion, left, right) in enumerate(pairs(calibration_path, "heavy_clutter", 1), 1):
         answered = [
             *answers.add_insertion(k, insertion, 0.0),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,13 +36,12 @@ from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration, 
 from needle_tracker.sources.pair_port import Event, PairPort
 from needle_tracker.sources.stereo_source import (
     EndOfRecording,
-    RateMeter,
-    SourceSettings,
     StampedPair,
     open_source,
 )
 
 PAIRS = "pairs"
+_WINDOW = 5.0  # of the rate [s]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,12 +103,13 @@ class StereoCamera(Component):
         self, settings: StereoCameraParameters, calibration: StereoCalibration, name: str = name
     ) -> None:
         self.name, self.settings = name, settings
-        self._infos = {side: _camera_info(getattr(calibration, side), side) for side in SIDES}
+        self._infos = {side: _camera_info(c, side) for side, c in calibration.cameras.items()}
         self._has_begun = not settings.wait_for_subscribers
         # Whether a tick has not asked yet, and whether what was asked for has not come yet.
         self._is_due = self._is_awaited = False
         self._started_at = math.inf
-        self._rate = RateMeter()
+        # When the latest pairs were published [s].
+        self._times: deque[float] = deque(maxlen=round(_WINDOW * settings.rate) + 1)
         self._pairs = self._dropped = self._skew_ns = 0
         self.ports = (Port(PAIRS, self._on_pairs, self._on_change),)
         self.timers = (Timer(1.0 / settings.rate, self._tick), Timer(0.5, self._report))
@@ -169,10 +170,11 @@ class StereoCamera(Component):
             image = m.Image(stamp_ns, info.frame_id, height, width, "mono8", width, data)
             yield Publish(f"stereo/{side}/image_raw", image)
         self._pairs += 1
-        self._rate.tick(at.steady)
+        self._times.append(at.steady)
 
     def _report(self, at: Moment) -> Actions:
-        rate, wanted = self._rate.rate(at.steady), self.settings.rate
+        wanted, recent = self.settings.rate, [t for t in self._times if at.steady - t <= _WINDOW]
+        rate = (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
         values = {
             "pairs": str(self._pairs),
             "rate_hz": f"{rate:.1f}",
@@ -208,11 +210,8 @@ def open_pairs(settings: StereoCameraParameters) -> PairPort:
     UserError
         A bad source.
     """
-    rig = settings.calibration()
-    cameras = zip(SIDES, (rig.left, rig.right), strict=True)
-    sizes = {side: (camera.width, camera.height) for side, camera in cameras}
-    source = SourceSettings(settings.left, settings.right, sizes, settings.rate, settings.loop)
-    return PairPort(open_source(source, time.time_ns))
+    names, sizes = (settings.left, settings.right), settings.calibration().sizes
+    return PairPort(open_source(names, sizes, settings.rate, time.time_ns, loop=settings.loop))
 
 
 def _camera_info(camera: Camera, side: str) -> m.CameraInfo:

@@ -84,11 +84,15 @@ class StereoTipTracker(Component):
     ) -> None:
         self.name, self.settings = name, settings
         self.is_annotation_wanted = False
-        self._cameras = {"left": calibration.left, "right": calibration.right}
+        self._cameras = calibration.cameras
         self._calibration_text = calibration_text
         self._is_calibration_told = False
         self.answers = PairAnswers(
-            calibration, settings.tracker_settings(calibration), settings.answering_settings()
+            calibration,
+            settings.tracker_settings(calibration),
+            pair_tolerance_ns=settings.pair_tolerance_ns,
+            joint_timeout=settings.joint_timeout,
+            lean=settings.lean,
         )
         self._health = Health()
         rate = settings.annotated_rate

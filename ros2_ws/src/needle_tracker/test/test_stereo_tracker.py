@@ -217,7 +217,7 @@ def test_a_camera_that_runs_at_another_resolution_gives_no_tip(
     sensor = dataclasses.replace(camera, width=2048, height=1536, camera_matrix=np.zeros((3, 3)))
     bench.hear(topic, info(sensor, {"binning_x": 4, "binning_y": 2}))
     bench.check()
-    reason = "left camera_info is for 512x768 (sensor 2048x1536, roi 0x0 at 0,0, binning 4x2)"
+    reason = "left camera_info is for 512x768"
     assert bench.said("images") == (Level.ERROR, f"{reason}, the calibration for 1024x768")
     assert not bench.pair(10)
     assert bench.said("images")[1].startswith(f"pair refused: {reason}")

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_tracker.answers.seen import missing, shows_end
 from needle_tracker.detector.end_fit import ImageEnd
 from needle_tracker.filter.measurement import Measurement
 
@@ -17,8 +18,7 @@ _SCALE = 0.5
 _GREEN, _YELLOW, _RED = (90, 230, 90), (255, 220, 60), (255, 80, 60)
 _SHAFT_PX = 40.0
 _SHIFT = 4  # sub-pixel drawing: OpenCV takes fixed-point numbers
-_BAR_PX = 26
-_CLEAR = 0.5  # expected ends from which on a view shows the end itself
+_BAR_PX = 44
 
 
 def annotate(left: Image, right: Image, measured: Measurement) -> Image:
@@ -34,8 +34,9 @@ def annotate(left: Image, right: Image, measured: Measurement) -> Image:
     Returns
     -------
     ndarray of uint8, shape (rows, columns, 3)
-        RGB, at half the size: left and right side by side, a line of text below. Green: a clear
-        end; yellow: the shaft's line, its end unclear; red: found but not believed.
+        RGB, at half the size: left and right side by side, below each what it shows, and a line
+        of text. Green: a clear end; yellow: the shaft's line, its end unclear; red: found but not
+        believed.
     """
     views = [
         _view(image, end, measured.tip is not None)
@@ -44,23 +45,17 @@ def annotate(left: Image, right: Image, measured: Measurement) -> Image:
     height = max(view.shape[0] for view in views)
     views = [cv2.copyMakeBorder(v, 0, height - len(v), 0, 2, cv2.BORDER_CONSTANT) for v in views]
     picture = cv2.copyMakeBorder(np.hstack(views), 0, _BAR_PX, 0, 0, cv2.BORDER_CONSTANT)
-    cv2.putText(
-        picture,
-        describe(measured),
-        (8, picture.shape[0] - 8),
-        cv2.FONT_HERSHEY_SIMPLEX,
-        0.5,
-        (255, 255, 255),
-        1,
-        cv2.LINE_AA,
-    )
+    starts = (0, views[0].shape[1])
+    for start, end in zip(starts, measured.ends, strict=True):
+        _write(picture, describe_view(end), start, height + 16)
+    _write(picture, describe(measured), 0, height + 36)
     return np.asarray(picture, dtype=np.uint8)
 
 
 def describe(measured: Measurement) -> str:
     """Return one line of text: the state, the tip, and why there is none, or of one view alone."""
     if measured.tip is None:
-        return f"{measured.state.value}: {measured.reason}"
+        return f"{measured.state.value}: {missing(measured)}"
     place = ", ".join(
         f"{axis} {1e3 * value:.2f} +- {1e3 * math.sqrt(variance):.2f}"
         for axis, value, variance in zip(
@@ -72,11 +67,21 @@ def describe(measured: Measurement) -> str:
     )
 
 
+def describe_view(end: ImageEnd | None) -> str:
+    """Return one line of text: how surely a view shows the needle's end and its shaft."""
+    return "nothing found" if end is None else f"end {end.ends:.2f}, shaft {end.shaft:.2f}"
+
+
+def _write(picture: Image, text: str, u: int, v: int) -> None:
+    font, white = cv2.FONT_HERSHEY_SIMPLEX, (255, 255, 255)
+    cv2.putText(picture, text, (u + 8, v), font, 0.5, white, 1, cv2.LINE_AA)
+
+
 def _view(image: Image, end: ImageEnd | None, believed: bool) -> Image:
     small = cv2.resize(image, None, fx=_SCALE, fy=_SCALE, interpolation=cv2.INTER_AREA)
     view = cv2.cvtColor(small, cv2.COLOR_GRAY2RGB)
     if end is not None:
-        colour = _RED if not believed else _GREEN if end.ends > _CLEAR else _YELLOW
+        colour = _RED if not believed else _GREEN if shows_end(end) else _YELLOW
         line = np.stack([end.point - _SHAFT_PX * end.direction, end.point])
         cv2.polylines(view, [_fixed(line)], False, colour, 1, cv2.LINE_AA, _SHIFT)
         u, v = (int(part) for part in _fixed(end.point[None])[0, 0])

@@ -18,6 +18,7 @@ PARTNER_LATE = 0.5  # an image without a partner is reported after [s]
 _RATE_WINDOW = 5.0  # [s]
 _MOST_REASONS = 20  # told by name
 OTHER_REASONS = "other reasons"
+_NOTHING_YET = Measurement(None, TrackState.SEARCHING, "no images yet")
 _EXCHANGE = "exchange stereo_camera's parameters left and right, or the cables"
 
 
@@ -75,10 +76,7 @@ class Health:
         default_factory=lambda: deque(maxlen=1000)
     )
     _tips: int = 0
-    _state: TrackState = TrackState.SEARCHING
-    _reason: str = "no images yet"
-    _probability: float = 0.0
-    _stage: tuple[float, float] = (0.0, 0.0)
+    _measured: Measurement = _NOTHING_YET
 
     def image_came(self, side: str, now: float) -> None:
         """Note an image of one side."""
@@ -94,9 +92,7 @@ class Health:
     def pair_done(self, arrival: float, now: float, measured: Measurement) -> None:
         """Note an answered pair, completed at `arrival` and answered at `now`."""
         self._done.append((now, now - arrival))
-        self._state = measured.state
-        self._reason = measured.reason
-        self._probability, self._stage = measured.probability, measured.stage
+        self._measured = measured
         if measured.tip is None:
             self.rejected.add(measured.reason)
         else:
@@ -104,43 +100,43 @@ class Health:
 
     def note_pairing(self, now: float, matcher: PairMatcher[Any]) -> None:
         """Note whether images were dropped for want of a partner since the last call."""
-        if matcher.counts.unpaired > self._unpaired:
-            self._unpaired = matcher.counts.unpaired
-            self._last_unpaired = now
+        if matcher.unpaired.total() > self._unpaired:
+            self._unpaired, self._last_unpaired = matcher.unpaired.total(), now
 
     def track(self) -> Diagnostic:
         """Return the health of the track."""
-        good = self._state in (TrackState.TRACKING, TrackState.ENTRY) and not self._reason
-        message = self._state.value + (f": {self._reason}" if self._reason else "")
-        values = {"state": self._state.value, "reason": self._reason, "tips": str(self._tips)}
-        zero, scale = self._stage
-        values["probability"] = f"{self._probability:.3f}"
-        values["stage zero [mm]"], values["stage scale error [%]"] = (
-            f"{1e3 * zero:.2f}",
-            f"{100 * scale:.2f}",
-        )
+        measured, (zero, scale) = self._measured, self._measured.stage
+        state, reason = measured.state, measured.reason
+        good = state in (TrackState.TRACKING, TrackState.ENTRY) and not reason
+        values = {
+            "state": state.value,
+            "reason": str(reason),
+            "tips": str(self._tips),
+            "probability": f"{measured.probability:.3f}",
+            "stage zero [mm]": f"{1e3 * zero:.2f}",
+            "stage scale error [%]": f"{100 * scale:.2f}",
+        }
         values.update({f"no tip: {reason}": str(n) for reason, n in self.rejected.items()})
+        message = state.value + (f": {reason}" if reason else "")
         return Diagnostic(Level.OK if good else Level.WARN, message, values)
 
     def images(self, now: float, matcher: PairMatcher[Any]) -> Diagnostic:
         """Return the health of the images and their pairing."""
-        counts = matcher.counts
         recent = [(at, took) for at, took in self._done if now - at <= _RATE_WINDOW]
         latencies = sorted(took for _, took in recent)
         values = {
-            "pairs": str(counts.pairs),
+            "pairs": str(matcher.pairs),
             "rate_hz": f"{len(recent) / _RATE_WINDOW:.1f}",
             "latency_median_ms": f"{1e3 * latencies[len(latencies) // 2]:.1f}" if recent else "",
             "latency_max_ms": f"{1e3 * latencies[-1]:.1f}" if recent else "",
-            "left_without_right": str(counts.unpaired_left),
-            "right_without_left": str(counts.unpaired_right),
+            "left_without_right": str(matcher.unpaired["left"]),
+            "right_without_left": str(matcher.unpaired["right"]),
             "pairs_refused": str(self.refused.total()),
             "pair_tolerance_ms": f"{1e-6 * matcher.tolerance:.2f}",
         }
         if matcher.skew is not None:
-            median, largest = matcher.skew
-            values["skew_median_ms"] = f"{1e-6 * median:.2f}"
-            values["skew_max_ms"] = f"{1e-6 * largest:.2f}"
+            skews = zip(("skew_median_ms", "skew_max_ms"), matcher.skew, strict=True)
+            values.update({name: f"{1e-6 * skew:.2f}" for name, skew in skews})
         values.update({f"refused: {reason}": str(n) for reason, n in self.refused.items()})
         return Diagnostic(*self._images_level(now, matcher), values)
 
@@ -153,27 +149,19 @@ class Health:
             "time_ran_backwards": str(history.restarts),
             "pairs_before_joint_states": str(answers.unanswered),
         }
+        level, message = Level.OK, "insertion known" if len(history) else "no joint states yet"
         if answers.too_early > CLOCKS_DIFFER:
-            return Diagnostic(
-                Level.WARN,
-                f"no pair is answered: exposed {1e-9 * answers.too_early:.1f} s before the first"
-                " joint state",
-                values,
-            )
-        if answers.joints_silent:
-            return Diagnostic(
-                Level.WARN, "no joint state follows the images: insertion unknown", values
-            )
-        if not len(history):
-            return Diagnostic(Level.OK, "no joint states yet", values)
-        return Diagnostic(Level.OK, "insertion known", values)
+            early = f"exposed {1e-9 * answers.too_early:.1f} s before the first joint state"
+            level, message = Level.WARN, f"no pair is answered: {early}"
+        elif answers.joints_silent:
+            level, message = Level.WARN, "no joint state follows the images: insertion unknown"
+        return Diagnostic(level, message, values)
 
     def _images_level(self, now: float, matcher: PairMatcher[Any]) -> tuple[Level, str]:
         if self.last_refusal is not None and now - self.last_refusal[0] <= TROUBLE_SHOWN:
             return Level.ERROR, f"pair refused: {self.last_refusal[1]}"
-        for problem in self.camera_info.values():
-            if problem:
-                return Level.ERROR, problem
+        if problem := next(filter(None, self.camera_info.values()), ""):
+            return Level.ERROR, problem
         if self.swapped:
             return Level.WARN, f"{SUSPICION}; {_EXCHANGE}"
         return self._pairing_level(now, matcher)

@@ -39,34 +39,6 @@ class Frame:
 
 
 @dataclasses.dataclass(frozen=True)
-class RollEstimate:
-    """The controller's last estimate: stamp [ns], axes of the tip's frame in `rig`, sigma [rad]."""
-
-    stamp: int
-    rotation: NDArray[np.float64]
-    sigma: float
-
-
-@dataclasses.dataclass(frozen=True)
-class PairingSettings:
-    """Settings beside the tracker's own.
-
-    Attributes
-    ----------
-    pair_tolerance_ns : int or None
-        Largest difference of the stamps of a pair [ns]; None of cameras that run freely.
-    joint_timeout : float
-        How long a pair waits for the joint state that follows it [s], steady clock.
-    lean : float
-        Angle between heading and visible end [rad].
-    """
-
-    pair_tolerance_ns: int | None
-    joint_timeout: float
-    lean: float
-
-
-@dataclasses.dataclass(frozen=True)
 class Answer:
     """Result of a pair.
 
@@ -100,8 +72,12 @@ class PairAnswers:
         The stereo rig.
     tracker : TrackerSettings
         The tracker's settings.
-    settings : PairingSettings
-        What else is told.
+    pair_tolerance_ns : int or None
+        Largest difference of the stamps of a pair [ns]; None of cameras that run freely.
+    joint_timeout : float
+        How long a pair waits for the joint state that follows it [s], steady clock.
+    lean : float
+        Angle between heading and visible end [rad].
 
     Attributes
     ----------
@@ -115,20 +91,24 @@ class PairAnswers:
         self,
         calibration: StereoCalibration,
         tracker: TrackerSettings,
-        settings: PairingSettings,
+        *,
+        pair_tolerance_ns: int | None,
+        joint_timeout: float,
+        lean: float,
     ) -> None:
         self.tracker = NeedleTracker(calibration, tracker)
         self.tracker.warm_up()
         self.swap = SwapWatch(calibration, tracker)
-        self.matcher: PairMatcher[Frame] = PairMatcher(settings.pair_tolerance_ns)
+        self.matcher: PairMatcher[Frame] = PairMatcher(pair_tolerance_ns)
         self.insertions = InsertionHistory()
         self.joints_silent = False
         self.unanswered = self.too_early = 0
-        self._settings = settings
+        self._joint_timeout, self._lean = joint_timeout, lean
         self._queue: deque[tuple[float, Pair[Frame]]] = deque()
         self._last_stamp: int | None = None
         self._contradictions: dict[str, str] = {}
-        self._roll: RollEstimate | None = None
+        # The controller's last estimate: stamp [ns], axes of the tip's frame in `rig`, sigma [rad].
+        self._roll: tuple[int, NDArray[np.float64], float] | None = None
         self._T_rig_plane = np.eye(3)
 
     def add_image(self, side: str, stamp: int, frame: Frame, now: float) -> Iterator[Answer]:
@@ -154,7 +134,7 @@ class PairAnswers:
 
     def add_roll(self, stamp: int, rotation: NDArray[np.float64], sigma: float) -> None:
         """Take the estimated axes of the tip's frame in the plane, (3, 3), and its roll's sigma."""
-        self._roll = RollEstimate(stamp, self._T_rig_plane @ rotation, sigma)
+        self._roll = stamp, self._T_rig_plane @ rotation, sigma
 
     def ready(self, now: float) -> Iterator[Answer]:
         """Yield the answers, in order, to all pairs whose insertion is settled.
@@ -169,7 +149,7 @@ class PairAnswers:
                 self._queue.popleft()
                 continue
             if not (self.joints_silent or self.insertions.is_bracketed(pair.stamp)):
-                if now - arrival < self._settings.joint_timeout:
+                if now - arrival < self._joint_timeout:
                     return
                 self.joints_silent = True
             self._queue.popleft()
@@ -212,14 +192,12 @@ class PairAnswers:
 
     def _with_heading(self, tip: SpatialTip, stamp: int) -> SpatialTip:
         """Return the tip with its heading in the visible end's place, where the roll is known."""
-        roll = self._roll
-        if roll is None or abs(stamp - roll.stamp) > _ROLL_AGE or not roll.sigma < _ROLL_SIGMA:
+        if self._roll is None:
+            return tip
+        at, rotation, sigma = self._roll
+        if abs(stamp - at) > _ROLL_AGE or not sigma < _ROLL_SIGMA:
             return tip
         heading, covariance = heading_of(
-            tip.direction,
-            tip.direction_covariance,
-            roll.rotation,
-            roll.sigma,
-            self._settings.lean,
+            tip.direction, tip.direction_covariance, rotation, sigma, self._lean
         )
         return dataclasses.replace(tip, direction=heading, direction_covariance=covariance)

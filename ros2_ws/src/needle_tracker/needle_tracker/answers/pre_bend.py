@@ -12,8 +12,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_core.errors import OutOfBoundsError
-
 Array = NDArray[np.float64]
 
 _ITERATIONS = 20
@@ -48,25 +46,14 @@ def heading_of(
         Unit vector in `rig`.
     covariance : ndarray, shape (3, 3)
         Of the heading [-]: the direction's, and what the roll leaves open.
-
-    Raises
-    ------
-    OutOfBoundsError
-        If `lean` is not within 0 and 45 degrees.
     """
-    if not 0.0 <= lean <= math.pi / 4:
-        raise OutOfBoundsError("lean", lean, 0.0, math.pi / 4, "rad")
     heading = np.array(direction, dtype=np.float64)
     aside = np.zeros(3)
     for _ in range(_ITERATIONS):
         # The estimated frame, turned the shortest way onto the heading: its roll is kept.
         aside = _turned(rotation[:, 1], rotation[:, 2], heading)
-        following = math.cos(lean) * direction + math.sin(lean) * _across(aside, direction)
-        following = following / np.linalg.norm(following)
-        change = float(np.abs(following - heading).max())
-        heading = following
-        if change < 1e-14:
-            break
+        heading = math.cos(lean) * direction + math.sin(lean) * _across(aside, direction)
+        heading /= np.linalg.norm(heading)
     sideways = np.cross(aside, heading)
     doubt = (math.sin(lean) * min(roll_sigma, math.pi)) ** 2
     return heading, direction_covariance + doubt * np.outer(sideways, sideways)

@@ -8,26 +8,33 @@ import dataclasses
 import math
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
-from tqdm import tqdm
+import numpy as np
 
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser, number, output_file
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import none_for, read_sections, values_for
 from needle_tracker.answers.annotation import Image, annotate
+from needle_tracker.answers.seen import SeenCounts, missing
 from needle_tracker.answers.swapped_images import SUSPICION, SwapWatch
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.answers.truth_comparison import TruthComparison, read_truth
-from needle_tracker.filter.measurement import Measurement, TrackState
+from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
-from needle_tracker.sources.image_files import NamedPair, PairSequence, open_pairs, read_insertions
+from needle_tracker.optics.calibration import load_calibration
+from needle_tracker.sources.image_files import (
+    NamedPair,
+    PairSequence,
+    Sizes,
+    open_pairs,
+    progress,
+    read_insertions,
+)
 
 DESCRIPTION = """\
 Measure the needle's tip in stereo images, paired by file name and taken in the order of their names
@@ -37,10 +44,13 @@ are equal or differ in left and right, l and r, cam0 and cam1 (left-0001.png, ri
 EPILOG = """\
 The output is a CSV file, one line for each pair:
   name            file name without left or right (video: number of the frame)
-  valid           1 with a tip, 0 without; then the other fields are empty
+  valid           1 with a tip, 0 without; then the tip's fields are empty
   x_m y_m z_m     the tip in rig: x up, z along the insertion, from the needle's entry point
   sigma_*_m       its standard deviations
   pitch_rad yaw_rad   of the shaft at its visible end: asin(d_x) and atan2(-d_y, d_z)
+  left_end right_end  how many needle ends the network expects there, about 1 where the end is seen
+  left_shaft right_shaft  mean probability of shaft behind it; empty where nothing was found
+  missing         why there is no tip; docs/images.md says what helps
 --insertion helps: one look at the needle is then enough, and a followed tip is merged with where
 the last one and the insertion have it. Below 4.5 mm (entry_zone) there is no tip. The stage's zero
 and scale may be off (stage_zero_sigma, stage_scale_sigma); both are estimated and printed.
@@ -67,27 +77,12 @@ exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
 COLUMNS = (
     *("name", "valid", "x_m", "y_m", "z_m"),
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "pitch_rad", "yaw_rad"),
+    *("left_end", "left_shaft", "right_end", "right_shaft", "missing"),
 )
 _NODE = "stereo_tracker"
 _NAMED = 5  # so many names are shown, the others counted
 _JPEG_QUALITY = 90
 _NEW_RUN = 10e-3  # a jump of the insertion that no run makes between two images [m]
-
-
-@dataclasses.dataclass(frozen=True)
-class TrackedSequence:
-    """Results of a sequence: CSV rows, reasons for missing tips, names of unreadable pairs.
-
-    And whether left and right images seem to be swapped, and the stage's zero [m] and scale error
-    [-] as estimated.
-    """
-
-    rows: list[list[str]]
-    reasons: Counter[str]
-    unreadable: list[str]
-    without_insertion: int
-    swapped: bool
-    stage: tuple[float, float]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -102,54 +97,60 @@ def _run(words: Sequence[str]) -> int:
     json = output_file("--json", given.json)
     parameters = _parameters(given)
     calibration = load_calibration(Path(given.calibration))
-    insertions = read_insertions(Path(given.insertion)) if given.insertion else None
+    insertions = read_insertions(Path(given.insertion)) if given.insertion else {}
     pairs = open_pairs(Path(given.left), Path(given.right))
-    truth = TruthComparison(read_truth(Path(given.truth))) if given.truth else None
+    truth = TruthComparison(read_truth(Path(given.truth)) if given.truth else {})
     overlays = None if given.overlay is None else _new_folder("--overlay", given.overlay)
-
-    def on_measured(pair: NamedPair, measured: Measurement) -> None:
-        if truth is not None:
-            truth.add(pair.names, measured)
-        if overlays is not None and pair.left is not None and pair.right is not None:
-            write_overlay(overlays, pair.name, annotate(pair.left, pair.right, measured))
-
     tracker = NeedleTracker(calibration, parameters.tracker_settings(calibration))
     tracker.warm_up()
     begin = time.perf_counter()
-    tracked = track_sequence(pairs, tracker, calibration, insertions, on_measured)
-    write_rows(output, tracked.rows)
-    found = sum(row[1] == "1" for row in tracked.rows)
-    result: dict[str, JsonValue] = {
-        "pairs": len(tracked.rows),
-        "tips": found,
-        "unpaired": len(pairs.unpaired),
-        "unreadable": len(tracked.unreadable),
-        "without_insertion": tracked.without_insertion,
-        "wall_s": time.perf_counter() - begin,
-        **(dict.fromkeys(TruthComparison({}).figures()) if truth is None else truth.figures()),
-    }
-    print(f"{found} tips in {len(tracked.rows)} pairs: {output}")
-    for reason, count in tracked.reasons.most_common():
-        print(f"  no tip {count:6d} x  {reason}")
-    if insertions is not None:
-        zero, scale = tracked.stage
-        print(f"  stage: zero off by {1e3 * zero:.2f} mm, scale by {100.0 * scale:.2f} %")
-    if truth is not None:
+    rows: list[list[str]] = []
+    unusable: list[str] = []
+    without, stage, seen = 0, (0.0, 0.0), SeenCounts()
+    swap = SwapWatch(calibration, tracker.settings)
+    for pair, insertion, measured in track(pairs, tracker, calibration.sizes, insertions):
+        without += insertion is None
+        if problem := pair.problem(calibration.sizes):
+            unusable.append(f"{pair.name} ({problem})")
+        if pair.left is not None and pair.right is not None:
+            if not problem:
+                swap.see(pair.left, pair.right, insertion, measured)
+            if overlays is not None:
+                write_overlay(overlays, pair.name, annotate(pair.left, pair.right, measured))
+        truth.add(pair.names, measured)
+        seen.add(measured)
+        rows.append(to_row(pair.name, measured))
+        stage = measured.stage if measured.tip is not None else stage
+    write_rows(output, rows)
+    found = sum(row[1] == "1" for row in rows)
+    print(f"{found} tips in {len(rows)} pairs: {output}\n{seen.describe()}")
+    if given.insertion:
+        print(f"  stage: zero off by {1e3 * stage[0]:.2f} mm, scale by {100.0 * stage[1]:.2f} %")
+    if given.truth:
         print(truth.describe())
     if overlays is not None:
         print(f"drawn: {overlays}")
-    if tracked.swapped:
-        print(f"warning: {SUSPICION}; exchange --left and --right", file=sys.stderr)
-    _warn("without a partner", pairs.unpaired)
-    _warn("cannot be used", tracked.unreadable)
-    if pairs.cut_off:
-        print(
-            f"warning: {pairs.cut_off} pairs that the videos promise cannot be read",
-            file=sys.stderr,
-        )
-    if insertions is not None and tracked.without_insertion:
-        print(f"warning: {tracked.without_insertion} pairs have no insertion", file=sys.stderr)
+    warnings = {
+        f"{SUSPICION}; exchange --left and --right": swap.suspected,
+        f"{len(pairs.unpaired)} x without a partner: {_named(pairs.unpaired)}": pairs.unpaired,
+        f"{len(unusable)} x cannot be used: {_named(unusable)}": unusable,
+        f"{pairs.cut_off} pairs that the videos promise cannot be read": pairs.cut_off,
+        f"{without} pairs have no insertion": given.insertion and without,
+    }
+    for text, holds in warnings.items():
+        if holds:
+            _warn(text)
     if json is not None:
+        result: dict[str, JsonValue] = {
+            "pairs": len(rows),
+            "tips": found,
+            "unpaired": len(pairs.unpaired),
+            "unreadable": len(unusable),
+            "without_insertion": without,
+            **seen.figures(),
+            "wall_s": time.perf_counter() - begin,
+            **(truth.figures() if given.truth else dict.fromkeys(truth.figures())),
+        }
         write_json(json, result)
     return EXIT_DONE
 
@@ -161,7 +162,7 @@ def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
         sections = read_sections(Path(given.params))
         values = values_for(given.params, sections, f"/{_NODE}", _NODE)
         if values is None:
-            print(f"warning: {none_for(given.params, sections, f'/{_NODE}')}", file=sys.stderr)
+            _warn(none_for(given.params, sections, f"/{_NODE}"))
         changes |= values or {}
         known = {field.name for field in dataclasses.fields(StereoTrackerParameters)}
         if unknown := sorted(set(changes) - known):
@@ -172,14 +173,10 @@ def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
     return StereoTrackerParameters(**changes)
 
 
-def track_sequence(
-    pairs: PairSequence,
-    tracker: NeedleTracker,
-    calibration: StereoCalibration,
-    insertions: Mapping[str, float] | None,
-    on_measured: Callable[[NamedPair, Measurement], None] = lambda *_: None,
-) -> TrackedSequence:
-    """Run the tracker over a sequence of pairs.
+def track(
+    pairs: PairSequence, tracker: NeedleTracker, sizes: Sizes, insertions: Mapping[str, float]
+) -> Iterator[tuple[NamedPair, float | None, Measurement]]:
+    """Run the tracker over a sequence of pairs; yield each with its insertion and its answer.
 
     Parameters
     ----------
@@ -187,90 +184,46 @@ def track_sequence(
         The images.
     tracker : NeedleTracker
         A fresh one.
-    calibration : StereoCalibration
-        The tracker's.
-    insertions : mapping or None
-        Insertion [m] by any of a pair's names, None where not known at all.
-    on_measured : callable
-        Told each pair and what it gave.
-
-    Returns
-    -------
-    TrackedSequence
-        One row for each pair.
+    sizes : dict of str to (int, int)
+        Width and height of the calibration's images [px].
+    insertions : mapping
+        Insertion [m] by any of a pair's names.
 
     Raises
     ------
     UserError
         The first images that can be read are not of the calibration's size.
     """
-    rows: list[list[str]] = []
-    reasons: Counter[str] = Counter()
-    unusable: list[str] = []
-    without, last, checked, stage = 0, None, False, (0.0, 0.0)
-    swap = SwapWatch(calibration, tracker.settings)
-    bar = tqdm(
-        pairs,
-        total=len(pairs.names),
-        unit="pair",
-        delay=1.0,
-        leave=False,
-        disable=not sys.stderr.isatty(),
-    )
-    for pair in bar:
-        insertion = None
-        if insertions is not None:
-            known = (insertions[name] for name in pair.names if name in insertions)
-            insertion = next(known, None)
-        without += insertion is None
+    last, checked = None, False
+    for pair in progress(pairs, "tracking"):
+        insertion = next((insertions[name] for name in pair.names if name in insertions), None)
         if insertion is not None:
             if last is not None and abs(insertion - last) > _NEW_RUN:
                 tracker.reset()
             last = insertion
-        image, problem = image_problem(pair, calibration)
-        if pair.left is not None and pair.right is not None and not problem:
-            measured = tracker.process(pair.left, pair.right, insertion)
-            swap.see(pair.left, pair.right, insertion, measured)
-            checked = True
-        else:
-            if not checked and pair.left is not None and pair.right is not None:
-                raise UserError(f"{pair.name}: {image} is {problem}")
-            measured = tracker.skip(f"{image} cannot be used")
-            unusable.append(f"{pair.name} ({image} is {problem})")
-        on_measured(pair, measured)
-        stage = measured.stage if measured.tip is not None else stage
-        row = to_row(pair.name, measured)
-        if row[1] == "0":
-            entry = measured.state is TrackState.ENTRY
-            reasons["in the entry zone" if entry else measured.reason] += 1
-        rows.append(row)
-    return TrackedSequence(rows, reasons, unusable, without, swap.suspected, stage)
-
-
-def image_problem(pair: NamedPair, calibration: StereoCalibration) -> tuple[str, str]:
-    """Return which image of a pair cannot be looked at, and what it is; both empty where none."""
-    cameras = (calibration.left, calibration.right)
-    for side, image, camera in zip(SIDES, (pair.left, pair.right), cameras, strict=True):
-        if image is None:
-            return f"{side} image", "unreadable or not of 8 bit"
-        if image.shape != (camera.height, camera.width):
-            size = f"{image.shape[1]}x{image.shape[0]}"
-            wanted = f"{camera.width}x{camera.height}"
-            return f"{side} image", f"{size}, the calibration is for {wanted}"
-    return "", ""
+        problem = pair.problem(sizes)
+        if pair.left is None or pair.right is None or (problem and checked):
+            yield pair, insertion, tracker.skip(problem)
+            continue
+        if problem:
+            raise UserError(f"{pair.name}: {problem}")
+        checked = True
+        yield pair, insertion, tracker.process(pair.left, pair.right, insertion)
 
 
 def to_row(name: str, measured: Measurement) -> list[str]:
     """Return a pair's line of the CSV file; a tip from the stage alone is none."""
-    tip = measured.tip
-    if tip is None or measured.state is TrackState.ENTRY:
-        return [name, "0", *[""] * (len(COLUMNS) - 2)]
-    x, y, z = tip.position.tolist()
-    sigma_x, sigma_y, sigma_z = (math.sqrt(tip.covariance[i, i]) for i in range(3))
-    d_x, d_y, d_z = tip.direction.tolist()
-    pitch, yaw = math.asin(min(max(d_x, -1.0), 1.0)), math.atan2(-d_y, d_z)
-    values = (x, y, z, sigma_x, sigma_y, sigma_z, pitch, yaw)
-    return [name, "1", *(f"{value:.9f}" for value in values)]
+    tip, cause = measured.tip, missing(measured)
+    place = [""] * 8
+    if tip is not None and not cause:
+        d_x, d_y, d_z = tip.direction.tolist()
+        angles = math.asin(min(max(d_x, -1.0), 1.0)), math.atan2(-d_y, d_z)
+        values = (*tip.position, *np.sqrt(np.diag(tip.covariance)), *angles)
+        place = [f"{value:.9f}" for value in values]
+    shown: list[str] = []
+    for end in measured.ends:
+        shown += ["", ""] if end is None else [f"{end.ends:.2f}", f"{end.shaft:.2f}"]
+    return [name, "0" if cause else "1", *place, *shown, cause]
 
 
 def write_overlay(folder: Path, name: str, picture: Image) -> None:
@@ -318,13 +271,13 @@ def _new_folder(name: str, text: str) -> Path:
     return folder
 
 
-def _warn(what: str, names: Sequence[str]) -> None:
-    if not names:
-        return
-    shown = ", ".join(names[:_NAMED])
+def _named(names: Sequence[str]) -> str:
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    count = f"{len(names)} image" + ("s" if len(names) > 1 else "")
-    print(f"warning: {count} {what}: {shown}{more}", file=sys.stderr)
+    return ", ".join(names[:_NAMED]) + more
+
+
+def _warn(what: str) -> None:
+    print(f"warning: {what}", file=sys.stderr)
 
 
 def _parser() -> CommandParser:
@@ -338,8 +291,8 @@ def _parser() -> CommandParser:
     add(
         "--overlay",
         metavar="DIR",
-        help="new folder for pictures of what was found in each pair: the shaft's end green "
-        "(yellow: its line alone), red where it is not believed",
+        help="new folder for pictures of each pair: the shaft's end green (yellow: its line alone, "
+        "red: not believed), and how surely each view shows end and shaft",
     )
     add(
         "--truth",

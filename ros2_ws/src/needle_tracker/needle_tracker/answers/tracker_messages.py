@@ -21,6 +21,7 @@ from needle_tracker.answers.orientation import orientation, rotation_covariance
 from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.optics.calibration import Camera, rotation_matrix
 from needle_tracker.sources.image_encodings import ENCODINGS, WANTED, bytes_per_pixel, grey_image
+from needle_tracker.sources.image_files import size_problem
 from needle_tracker.stereo.triangulation import SpatialTip
 
 RIG_FRAME = "rig"
@@ -36,12 +37,9 @@ def frame_of(message: Any, side: str, camera: Camera) -> Frame:
     if message.encoding not in ENCODINGS:
         encoding = message.encoding[:_QUOTED]
         return Frame(None, f"{side} image is {encoding!r}, wants {WANTED}")
-    if (message.width, message.height) != (camera.width, camera.height):
-        return Frame(
-            None,
-            f"{side} image is {message.width}x{message.height}, the calibration is for "
-            f"{camera.width}x{camera.height}",
-        )
+    wanted = camera.width, camera.height
+    if problem := size_problem(side, (message.width, message.height), wanted):
+        return Frame(None, problem)
     least = message.width * bytes_per_pixel(message.encoding)
     if message.step < least or len(message.data) != message.step * message.height:
         return Frame(
@@ -80,15 +78,8 @@ def camera_info_problem(message: Any, side: str, camera: Camera) -> tuple[str, b
         if np.any(np.asarray(message.k) != 0.0) and difference > 0.5:
             return f"{side} camera_info differs from the calibration by {difference:.1f} px", False
         return "", False
-    of_sensor, roi = "", message.roi
-    if (width, height) != (message.width, message.height):
-        of_sensor = (
-            f" (sensor {message.width}x{message.height}, roi {roi.width}x{roi.height} at "
-            f"{roi.x_offset},{roi.y_offset}, binning "
-            f"{max(message.binning_x, 1)}x{max(message.binning_y, 1)})"
-        )
     return (
-        f"{side} camera_info is for {width}x{height}{of_sensor}, the calibration for "
+        f"{side} camera_info is for {width}x{height}, the calibration for "
         f"{camera.width}x{camera.height}"
     ), True
 

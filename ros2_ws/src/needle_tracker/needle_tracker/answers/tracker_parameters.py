@@ -7,11 +7,10 @@ from pathlib import Path
 
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
-from needle_tracker.answers.pair_answers import PairingSettings
-from needle_tracker.answers.reference_images import read_reference
 from needle_tracker.detector.reach import Reach
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.sources.image_files import mean_pair
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,11 +30,7 @@ class StereoTrackerParameters:
         True, "-", "Take images reliably, for simulation; false: best effort, for hardware."
     )
     pair_tolerance: float = fixed_parameter(
-        0.0,
-        "s",
-        "Largest difference of the stamps of a left and a right image of one pair.",
-        0.0,
-        0.1,
+        0.0, "s", "Largest difference of the stamps of a pair's left and right image.", 0.0, 0.1
     )
     free_running: bool = fixed_parameter(
         False,
@@ -44,21 +39,13 @@ class StereoTrackerParameters:
         "and pair_tolerance does not count.",
     )
     joint_timeout: float = fixed_parameter(
-        1.0,
-        "s",
-        "How long a pair waits for the joint state that follows it (steady clock).",
-        0.0,
-        60.0,
+        1.0, "s", "Longest wait of a pair for the joint state that follows it.", 0.0, 60.0
     )
     needle_width: float = fixed_parameter(
         0.7e-3, "m", "Diameter of the needle, good to 30 %.", 0.2e-3, 3e-3
     )
     entry_zone: float = fixed_parameter(
-        4.5e-3,
-        "m",
-        "Insertion below which the tip is taken from the insertion, not looked for.",
-        0.0,
-        0.05,
+        4.5e-3, "m", "Insertion below which the tip follows from the insertion alone.", 0.0, 0.05
     )
     hole_clearance: float = fixed_parameter(
         2.0e-3, "m", "Radius about the entry point that is not looked at (hole, rim).", 0.5e-3, 0.02
@@ -76,38 +63,22 @@ class StereoTrackerParameters:
         0.15, "m", "Longest insertion; nothing is looked for farther from the entry.", 0.01, 1.0
     )
     stage_zero_sigma: float = fixed_parameter(
-        0.5e-3,
-        "m",
-        "How well the stage knows where the tip is at the entry (standard deviation).",
-        0.01e-3,
-        5e-3,
+        0.5e-3, "m", "Standard deviation of the stage's zero at the entry.", 0.01e-3, 5e-3
     )
     stage_scale_sigma: float = fixed_parameter(
-        0.01, "-", "How well the insertion's scale is known (standard deviation).", 1e-4, 0.1
+        0.01, "-", "Standard deviation of the insertion's scale.", 1e-4, 0.1
     )
     tip_lean: float = fixed_parameter(
-        0.21,
-        "rad",
-        "Largest angle between the visible end and the needle's path (pre-bend).",
-        0.0,
-        0.8,
+        0.21, "rad", "Largest angle between visible end and needle's path (pre-bend).", 0.0, 0.8
     )
     lean: float = fixed_parameter(
-        0.0977,
-        "rad",
-        "Angle between heading and visible end; taken off with heading_from_estimate.",
-        0.0,
-        0.7,
+        0.0977, "rad", "Angle of heading and visible end, for heading_from_estimate.", 0.0, 0.7
     )
     heading_from_estimate: bool = fixed_parameter(
         False, "-", "Publish the heading (lean taken off) where needle/estimate knows the roll."
     )
     annotated_rate: float = fixed_parameter(
-        2.0,
-        "Hz",
-        "Most annotated images per second, while someone subscribes; 0: none.",
-        0.0,
-        100.0,
+        2.0, "Hz", "Most annotated images a second, while someone subscribes; 0: none.", 0.0, 100.0
     )
 
     def __post_init__(self) -> None:
@@ -119,13 +90,10 @@ class StereoTrackerParameters:
                 f"max_insertion = {self.max_insertion:g} m"
             )
 
-    def answering_settings(self) -> PairingSettings:
-        """Return how pairs are made and answered."""
-        return PairingSettings(
-            pair_tolerance_ns=None if self.free_running else round(self.pair_tolerance * 1e9),
-            joint_timeout=self.joint_timeout,
-            lean=self.lean,
-        )
+    @property
+    def pair_tolerance_ns(self) -> int | None:
+        """Largest difference of the stamps of a pair [ns]; None of cameras that run freely."""
+        return None if self.free_running else round(self.pair_tolerance * 1e9)
 
     def tracker_settings(self, calibration: StereoCalibration) -> TrackerSettings:
         """Return the settings of the tracker behind the node.
@@ -145,7 +113,7 @@ class StereoTrackerParameters:
         UserError
             If there are no reference images where they should be.
         """
-        folder = self.reference_folder
+        folder = Path(self.reference_folder)
         return TrackerSettings(
             reach=Reach(
                 self.max_curvature, self.entry_angle, self.hole_tolerance, self.max_insertion
@@ -157,7 +125,9 @@ class StereoTrackerParameters:
             hole_clearance=self.hole_clearance,
             stage_zero_sigma=self.stage_zero_sigma,
             stage_scale_sigma=self.stage_scale_sigma,
-            reference=read_reference(Path(folder), calibration) if folder else None,
+            reference=mean_pair(folder / "left", folder / "right", calibration.sizes)
+            if self.reference_folder
+            else None,
         )
 
 

@@ -52,31 +52,22 @@ class TruthComparison:
         self._squares.append(float(error @ np.linalg.solve(tip.covariance, error)))
 
     def figures(self) -> dict[str, JsonValue]:
-        """Return the figures, by the names of `track_images --json`; null where nothing tells."""
-        errors = np.reshape(self._errors, (-1, 3)) * 1e3
-        found: dict[str, JsonValue] = {
-            "compared": len(errors),
+        """Return the figures, by the names of `track_images --json`; NaN where nothing tells."""
+        errors = np.array(self._errors or [np.full(3, np.nan)])
+        squares = np.array(self._squares or [np.nan])
+        size = 1e3 * np.linalg.norm(errors, axis=1)
+        rms = 1e3 * np.sqrt(np.mean(errors**2, axis=0))
+        return {
+            "compared": len(self._errors),
             "missed": self._missed,
             "tips_without_needle": self._false,
             "without_truth": self._untold,
-        }
-        names = ("error_rms_mm", "error_p95_mm", "error_max_mm", "error_sigmas", "inside_95")
-        axes = [f"error_{axis}_rms_mm" for axis in "xyz"]
-        if not len(errors):
-            return {**found, **dict.fromkeys((*names, *axes))}
-        size, squares = np.linalg.norm(errors, axis=1), np.array(self._squares)
-        values = (
-            math.sqrt(float(np.mean(size**2))),
-            float(np.percentile(size, 95.0)),
-            float(np.max(size)),
-            math.sqrt(float(np.mean(squares)) / 3.0),
-            float(np.mean(squares <= _INSIDE_95)),
-        )
-        rms = np.sqrt(np.mean(errors**2, axis=0)).tolist()
-        return {
-            **found,
-            **dict(zip(names, values, strict=True)),
-            **dict(zip(axes, rms, strict=True)),
+            "error_rms_mm": math.sqrt(float(np.mean(size**2))),
+            "error_p95_mm": float(np.percentile(size, 95.0)),
+            "error_max_mm": float(np.max(size)),
+            "error_sigmas": math.sqrt(float(np.mean(squares)) / 3.0),
+            "inside_95": float(np.mean(squares <= _INSIDE_95)) if self._errors else math.nan,
+            **{f"error_{axis}_rms_mm": float(rms[i]) for i, axis in enumerate("xyz")},
         }
 
     def describe(self) -> str:

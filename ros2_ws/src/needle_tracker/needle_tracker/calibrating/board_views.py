@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_session import Session
 from needle_tracker.calibrating.charuco import check_board_seen
 from needle_tracker.calibrating.rig_model import BoardView, Corners
 from needle_tracker.optics.calibration import SIDES
-from needle_tracker.sources.image_files import Image, open_pairs
+from needle_tracker.sources.image_files import Image, Sizes, open_pairs, progress
 
 Array = NDArray[np.float64]
-Sizes = dict[str, tuple[int, int]]
 
 
 def views_in_folders(
@@ -49,14 +46,8 @@ def views_in_folders(
     """
     views: list[BoardView] = []
     sizes: Sizes = {}
-    pairs = open_pairs(left, right)
-    if pairs.unpaired:
-        raise UserError(f"images without a partner ({len(pairs.unpaired)}): {pairs.unpaired[0]}")
-    total, hidden = len(pairs.names), not sys.stderr.isatty()
-    progress = tqdm(
-        pairs, "finding the board", total, unit="pair", delay=1.0, leave=False, disable=hidden
-    )
-    for pair in progress:
+    pairs = open_pairs(left, right).refuse_unpaired()
+    for pair in progress(pairs, "finding the board"):
         seen = []
         for side, path, image in zip(SIDES, pair.files, (pair.left, pair.right), strict=True):
             if image is None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 from scipy.spatial.transform import Rotation
 
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
@@ -21,9 +24,8 @@ from needle_tracker.calibrating.charuco import CharucoBoard, write_board
 from needle_tracker.calibrating.imported_lenses import read_lenses
 from needle_tracker.calibrating.pair_consistency import PairsApartError, apart_in_words
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
-from needle_tracker.calibrating.rig_model import SURFACE, BoardView
+from needle_tracker.calibrating.rig_model import KINDS, LENS, SURFACE, unit_of
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
-from needle_tracker.optics.window import Window
 
 _DESCRIPTION = """\
 Calibrate the stereo rig from images of a ChArUco board.
@@ -115,37 +117,28 @@ def calibrate_stereo(arguments: Sequence[str]) -> int:
     return EXIT_DONE if good else EXIT_MISSED
 
 
-def view_set(view: BoardView) -> str:
-    """Return which set a view is of: free, surface (known place in air) or under."""
-    if view.place is None:
-        return "free"
-    return "under" if view.under_surface else "surface"
-
-
-def reprojection_by_set(result: RigCalibration) -> dict[tuple[str, str], float]:
-    """Return the reprojection error by camera and set of views, rms [px]; only sets there are."""
-    errors = {}
-    sets = [view_set(view) for view in result.model.views]
-    for side in SIDES:
-        of_corner = np.array(sets)[result.model.view_of[side]]
-        for name in ("free", "surface", "under"):
-            chosen = result.residuals(side)[of_corner == name]
-            if len(chosen):
-                errors[side, name] = float(np.sqrt(np.mean(np.sum(chosen**2, axis=-1))))
-    return errors
+def reprojection_by_kind(result: RigCalibration) -> dict[tuple[str, str], float]:
+    """Return the reprojection error by camera and kind of view, rms [px]; only kinds there are."""
+    kinds = np.array([view.kind for view in result.model.views])
+    return {
+        (side, kind): result.reprojection_rms_px(side, np.flatnonzero(kinds == kind))
+        for side in SIDES
+        for kind in KINDS
+        if np.any(kinds[result.model.view_of[side]] == kind)
+    }
 
 
 def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) -> str:
     """Return a calibration as a person reads it."""
-    sets = [view_set(view) for view in result.model.views]
-    counts = ", ".join(f"{sets.count(name)} {name}" for name in ("free", "surface", "under"))
+    kinds = [view.kind for view in result.model.views]
+    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in KINDS)
     lines = [
         f"views: {counts}; corners: {len(result.model.pixels['left'])} left, "
         f"{len(result.model.pixels['right'])} right, each to {result.fit.corner_sigma_px:.3f} px"
     ]
     lines += [
-        f"reprojection error, {side} camera, {name} boards: {error:.3f} px rms"
-        for (side, name), error in reprojection_by_set(result).items()
+        f"reprojection error, {side} camera, {kind} boards: {error:.3f} px rms"
+        for (side, kind), error in reprojection_by_kind(result).items()
     ]
     if result.apart:
         lines.append(f"WARNING: {apart_in_words(result.apart)}; left out")
@@ -154,17 +147,16 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
         pose = " and relative pose" if result.model.tied else ""
         lines.append(f"lenses{pose}: as given; an error of theirs adds to that of tips below")
     for name, found in result.parameters.items():
-        scale, unit = _unit(name)
+        scale, unit = unit_of(name)
         value, given, sigma = (scale * v for v in (found.value, found.given, found.sigma))
-        if not found.kept:
-            lines.append(f"{name}: {value:.5g}{unit} +- {sigma:.2g}{unit}")
-        elif math.isfinite(sigma):
-            lines.append(
-                f"{name}: NOT DETERMINED by these views (+- {sigma:.2g}{unit}), kept at the given "
-                f"{given:g}{unit}"
-            )
-        else:
-            lines.append(f"{name}: not asked of these views, kept at the given {given:g}{unit}")
+        unit = unit and f" {unit}"
+        said = f"{value:.5g}{unit} +- {sigma:.2g}{unit}"
+        if found.kept:
+            asked = "not asked of these views"
+            if math.isfinite(sigma):
+                asked = f"NOT DETERMINED by these views (+- {sigma:.2g}{unit})"
+            said = f"{asked}, kept at the given {given:g}{unit}"
+        lines.append(f"{name}: {said}")
     error, sigma = (100.0 * value for value in size)
     if sigma < _SCALE_TOLD:
         lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % beside the session's")
@@ -195,26 +187,17 @@ def figures(result: RigCalibration, goal_mm: float) -> dict[str, JsonValue]:
         "tip_error_p95_mm": 1e3 * result.tip_error_p95,
         "goal_mm": goal_mm,
     }
-    for (side, name), error in reprojection_by_set(result).items():
-        values[f"reprojection_{side}_{name}_px"] = error
+    for (side, kind), error in reprojection_by_kind(result).items():
+        values[f"reprojection_{side}_{kind}_px"] = error
     for name, found in result.parameters.items():
         key = name.replace(".", "_")
-        scale, unit = _unit(name)
-        if unit:
-            key += f"_{unit.strip()}"
-        elif name.split(".")[-1] in ("fx", "fy", "cx", "cy"):
-            key += "_px"
+        scale, unit = unit_of(name)
+        unit = "px" if name.split(".")[-1] in LENS[:4] else unit
+        key += unit and f"_{unit}"
         values[key] = scale * found.value
         values[f"sigma_{key}"] = scale * found.sigma
         values[f"determined_{name.replace('.', '_')}"] = not found.kept
     return values
-
-
-def _unit(name: str) -> tuple[float, str]:
-    """Return the factor to a person's unit of a parameter, and that unit in words."""
-    if "tilt" in name:
-        return math.degrees(1.0), " deg"
-    return (1e3, " mm") if name.endswith(("surface_height", "window_offset")) else (1.0, "")
 
 
 def _parser() -> CommandParser:
@@ -241,49 +224,32 @@ def calibration_text(calibration: StereoCalibration, comments: list[str]) -> str
     comments : list of str
         Lines to put before it.
     """
-    surface = calibration.surface
-    lines = [f"# {line}" for line in comments]
+    surface, content = calibration.surface, dict[str, Any]()
     if surface is not None:
-        lines.append(
-            f"phantom: {{surface_height: {surface.point[0]:.9f}, "
-            f"refractive_index: {surface.inside:.6f}}}"
-        )
-    for side, camera in zip(SIDES, (calibration.left, calibration.right), strict=True):
-        matrix = ", ".join(f"{value:.4f}" for value in camera.camera_matrix.ravel())
-        lens = ", ".join(f"{value:.9f}" for value in camera.distortion)
-        translation = ", ".join(f"{value:.9f}" for value in camera.T_optical_rig[:3, 3])
-        quaternion = Rotation.from_matrix(camera.T_optical_rig[:3, :3]).as_quat()
-        rotation = ", ".join(f"{value:.12f}" for value in quaternion)
-        lines += [
-            f"{side}:",
-            f"  image_width: {camera.width}",
-            f"  image_height: {camera.height}",
-            f"  camera_matrix: {{rows: 3, cols: 3, data: [{matrix}]}}",
-            "  distortion_model: plumb_bob",
-            f"  distortion_coefficients: {{rows: 1, cols: 5, data: [{lens}]}}",
-            "  T_optical_rig:",
-            f"    translation: [{translation}]",
-            f"    rotation: [{rotation}]",
-        ]
+        height, index = float(surface.point[0]), float(surface.inside)
+        content["phantom"] = {"surface_height": height, "refractive_index": index}
+    for side, camera in calibration.cameras.items():
+        pose, window = camera.T_optical_rig, camera.window
+        content[side] = {
+            "image_width": camera.width,
+            "image_height": camera.height,
+            "camera_matrix": {"rows": 3, "cols": 3, "data": camera.camera_matrix.ravel().tolist()},
+            "distortion_model": "plumb_bob",
+            "distortion_coefficients": {"rows": 1, "cols": 5, "data": camera.distortion.tolist()},
+            "T_optical_rig": {
+                "translation": pose[:3, 3].tolist(),
+                "rotation": Rotation.from_matrix(pose[:3, :3]).as_quat().tolist(),
+            },
+        }
         if surface is None:
-            lines += _window_lines(camera.window)
-    return "\n".join(lines) + "\n"
-
-
-def _window_lines(window: Window) -> list[str]:
-    point = ", ".join(f"{value:.9f}" for value in window.point)
-    normal = ", ".join(f"{value:.12f}" for value in window.normal)
-    layers = ", ".join(
-        f"{{thickness: {layer.thickness:.9f}, refractive_index: {layer.refractive_index:.6f}}}"
-        for layer in window.layers
-    )
-    return [
-        "  window:",
-        f"    point: [{point}]",
-        f"    normal: [{normal}]",
-        f"    layers: [{layers}]",
-        f"    inside: {window.inside:.6f}",
-    ]
+            content[side]["window"] = {
+                "point": window.point.tolist(),
+                "normal": window.normal.tolist(),
+                "layers": [dataclasses.asdict(layer) for layer in window.layers],
+                "inside": float(window.inside),
+            }
+    text = yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120)
+    return "".join(f"# {line}\n" for line in comments) + text
 
 
 def save_calibration(path: Path, calibration: StereoCalibration, comments: list[str]) -> None:

@@ -68,7 +68,7 @@ class CheckResult:
     ----------
     causes : tuple of str
         What was looked for: cameras that turned (`CAMERAS`), and what the windows' parameters are
-        called (`rig_model.window_names`).
+        called (`RigModel.names`).
     deviations : list of Deviation
         What was found, the most telling first.
     tip_error : float
@@ -122,7 +122,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     """
     views = [checked_view(view) for view in views]
     model = RigModel(calibration, views, boards_seen(calibration, views))
-    causes = _all_causes(model)
+    causes = (*CAMERAS, *model.names[CAMERA_PARAMETERS:])
     everything = _fit(model, list(causes), None)
     sigma = everything.corner_sigma_px
     misfit = misfit_px(model, everything)
@@ -137,7 +137,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
             "cameras"
         )
         return CheckResult(causes, [], np.nan, unseen, sigma, reprojection, [problem])
-    found = _causes(model, sigma)
+    found = _causes(model, causes, sigma)
     best = _fit(model, found, sigma)
     deviations = [_deviation(model, best, cause) for cause in found]
     shift = _p95(calibration, model.calibration(best.parameters))
@@ -163,13 +163,8 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     return CheckResult(causes, deviations, shift, unseen, sigma, reprojection, problems)
 
 
-def _all_causes(model: RigModel) -> tuple[str, ...]:
-    return (*CAMERAS, *model.names[CAMERA_PARAMETERS:])
-
-
-def _causes(model: RigModel, sigma: float) -> list[str]:
+def _causes(model: RigModel, causes: tuple[str, ...], sigma: float) -> list[str]:
     """Return the fewest causes that explain what is seen, the most telling first."""
-    causes = _all_causes(model)
     found: list[str] = []
     cost = _fit(model, found, sigma).cost
     while len(found) < len(causes):

@@ -11,48 +11,42 @@ from numpy.typing import NDArray
 
 from needle_core.errors import UserError
 from needle_tracker.calibrating.rig_calibration import RigCalibration
-from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import SIDES, Camera
-from needle_tracker.optics.camera_model import optical_rays
+from needle_tracker.optics.compiled_projection import pack_camera, pixel_ray
 from needle_tracker.optics.window import Window
 
 Array = NDArray[np.float64]
 
 _COLOURS = {"left": "#1668b0", "right": "#d1701b"}
+_BOARDS = {
+    "free": ("board held freely", "#9aa0a8"),
+    "surface": ("board of known place in air", "#1b1b1b"),
+    "under": ("board under the surface", "#b03060"),
+}
 _MM = 1e3
 
 
 def rig_figure(result: RigCalibration) -> Figure:
     """Return the rig from the side and along the needle: cameras, surface, boards, frustums."""
     figure = Figure(figsize=(9.0, 8.5), layout="constrained")
-    calibration = result.calibration
-    planes = ((2, "z (insertion) [mm]"), (1, "y [mm]"))
-    for number, (axis, axis_label) in enumerate(planes):
-        axes = figure.add_subplot(1, 2, number + 1)
-        # The legend names each thing once.
-        named = number == 1
-        axes.plot([], [], color="#2e9d55", label="window" if named else None)
-        axes.plot(0, 0, "k+", markersize=12, label="rig (entry point)" if named else None)
+    planes = (2, "z (insertion) [mm]"), (1, "y [mm]")
+    for axes, (axis, label) in zip(figure.subplots(1, 2), planes, strict=True):
+        axes.plot(0, 0, "k+", markersize=12, label="rig (entry point)")
         for i, view in enumerate(result.model.views):
-            outline = _outline(result, i)
-            axes.plot(_MM * outline[:, axis], _MM * outline[:, 0], **_style(view))
-        for side in SIDES:
-            camera = calibration.left if side == "left" else calibration.right
-            label = f"{side} camera" if named else None
-            axes.plot(
-                _MM * camera.centre[axis], _MM * camera.centre[0], "o",
-                color=_COLOURS[side], label=label,
-            )  # fmt: skip
-            _draw_frustum(axes, camera, axis, _COLOURS[side])
+            outline, (name, colour) = _MM * _outline(result, i), _BOARDS[view.kind]
+            axes.plot(outline[:, axis], outline[:, 0], color=colour, linewidth=1.5, label=name)
+        for side, camera in result.calibration.cameras.items():
+            name, colour = f"{side} camera", _COLOURS[side]
+            centre = _MM * camera.centre
+            axes.plot(centre[axis], centre[0], "o", color=colour, label=name)
+            _draw_frustum(axes, camera, axis, colour)
             _draw_face(axes, camera.window, axis)
-        axes.set_aspect("equal")
-        axes.set_xlabel(axis_label)
-        axes.set_ylabel("x (up) [mm]")
+        axes.set(aspect="equal", xlabel=label, ylabel="x (up) [mm]")
         axes.grid(color="#e4e6ea")
-    axes.plot([], [], color="#9aa0a8", label="board held freely")
-    axes.plot([], [], color="#1b1b1b", label="board of known place in air")
-    axes.plot([], [], color="#b03060", label="board under the surface")
-    figure.legend(loc="outside lower center", ncols=4, fontsize=8)
+    # The legend names each thing once; what has no name begins with _.
+    named = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
+    shown = [line for name, line in named.items() if not str(name).startswith("_")]
+    figure.legend(handles=shown, loc="outside lower center", ncols=4, fontsize=8)
     figure.suptitle("The rig as calibrated")
     return figure
 
@@ -62,7 +56,7 @@ def residual_figure(result: RigCalibration) -> Figure:
     figure = Figure(figsize=(11.0, 8.5))
     enlarged = 20.0 / max(result.fit.corner_sigma_px, 1e-3)
     for number, side in enumerate(SIDES):
-        camera = result.calibration.left if side == "left" else result.calibration.right
+        camera = result.calibration.cameras[side]
         pixels, errors = result.model.pixels[side], result.residuals(side)
         axes = figure.add_axes((0.06 + 0.49 * number, 0.53, 0.43, 0.43))
         axes.quiver(
@@ -71,11 +65,9 @@ def residual_figure(result: RigCalibration) -> Figure:
             width=1e-3, color=_COLOURS[side],
         )  # fmt: skip
         axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal")
-        axes.set_title(
-            f"{side}: {result.reprojection_rms_px(side):.3f} px rms (arrows {enlarged:.0f} times "
-            "as long)"
-        )
-        axes.set(xlabel="u [px]", ylabel="v [px]" if number == 0 else "")
+        rms = result.reprojection_rms_px(side)
+        axes.set_title(f"{side}: {rms:.3f} px rms (arrows {enlarged:.0f} times as long)")
+        axes.set(xlabel="u [px]", ylabel="v [px]")
     axes = figure.add_axes((0.08, 0.14, 0.88, 0.30))
     places = np.arange(len(result.model.views))
     for side, offset in zip(SIDES, (-0.2, 0.2), strict=True):
@@ -109,32 +101,19 @@ def _outline(result: RigCalibration, view: int) -> Array:
     return np.asarray(ring @ pose[:3, :3].T + pose[:3, 3])
 
 
-def _style(view: BoardView) -> dict[str, Any]:
-    if view.place is None:
-        return {"color": "#9aa0a8", "linewidth": 0.8}
-    return {"color": "#b03060" if view.under_surface else "#1b1b1b", "linewidth": 2.0}
-
-
 def _draw_face(axes: Any, window: Window, axis: int) -> None:
     """Draw a window's outer face where it is seen edge on."""
     along, up = window.normal[axis], window.normal[0]
     if np.hypot(along, up) > 0.5:
         place = (_MM * window.point[axis], _MM * window.point[0])
-        axes.axline(place, (place[0] + up, place[1] - along), color="#2e9d55")
+        axes.axline(place, (place[0] + up, place[1] - along), color="#2e9d55", label="window")
 
 
 def _draw_frustum(axes: Any, camera: Camera, axis: int, colour: str) -> None:
-    centre = camera.centre
-    corners = np.array(
-        [[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=float
-    )
-    rays = optical_rays(camera, corners) @ camera.T_optical_rig[:3, :3]
-    above = float(camera.window.height(centre))
-    # Down to the window; a camera that looks past it has no such end.
-    lengths = np.minimum(above / np.maximum(-rays @ camera.window.normal, 1e-9), 2.0 * above)
-    ends = centre + lengths[:, None] * rays
-    for end in ends:
-        axes.plot(
-            _MM * np.array([centre[axis], end[axis]]), _MM * np.array([centre[0], end[0]]),
-            color=colour, linewidth=0.8,
-        )  # fmt: skip
+    """Draw the rays of the image's corners, down to the window if they look at it."""
+    width, height = float(camera.width), float(camera.height)
+    packed, end, direction = pack_camera(camera), np.empty(3), np.empty(3)
+    for corner in ((0.0, 0.0), (width, 0.0), (width, height), (0.0, height)):
+        pixel_ray(packed, np.array(corner), end, direction)
+        ray = _MM * np.stack([camera.centre, end])
+        axes.plot(ray[:, axis], ray[:, 0], color=colour, linewidth=0.8)

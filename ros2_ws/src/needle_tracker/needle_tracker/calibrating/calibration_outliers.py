@@ -20,7 +20,7 @@ from needle_tracker.calibrating.rig_fit import (
     outlier_weights,
     place_deviations,
 )
-from needle_tracker.calibrating.rig_model import BoardView
+from needle_tracker.calibrating.rig_model import BoardView, RigModel
 from needle_tracker.optics.calibration import SIDES
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ _RINGS = 10
 _RING_SIGMAS = 5.0  # 3.4 at most in 8 x 40 simulated sessions of lenses without a pattern
 _LEAST_PATTERN_PX = 0.02
 _LEAST_SHARE = 1e-9  # of what the size does to corners: rounding, where all of it is absorbed
-_TRANSLATION = np.arange(3, 6)  # of a board's six parameters
+_SIZE_STEP = 1e-4  # for the derivative by the squares' size
 
 
 def doubts(result: RigCalibration, size: tuple[float, float]) -> list[str]:
@@ -113,8 +113,7 @@ def ring_patterns(result: RigCalibration) -> dict[str, float]:
         The calibration.
     """
     found = {}
-    cameras = (result.calibration.left, result.calibration.right)
-    for side, camera in zip(SIDES, cameras, strict=True):
+    for side, camera in result.calibration.cameras.items():
         outwards = result.model.pixels[side] - camera.camera_matrix[:2, 2]
         radii = np.linalg.norm(outwards, axis=-1)
         radial = np.sum(result.residuals(side) * outwards, axis=-1) / np.maximum(radii, 1.0)
@@ -143,18 +142,13 @@ def square_error(result: RigCalibration) -> tuple[float, float]:
         True size over the given one, less 1; infinite sigma where no two places tell it.
     """
     model, fitted = result.model, result.fit
-    columns = np.arange(model.shared, len(fitted.parameters))
-    of_boards = np.zeros(len(fitted.parameters), dtype=bool)
-    of_boards[columns.reshape(-1, 6)[:, _TRANSLATION].ravel()] = True
-    by_translation = model.jacobian(fitted.parameters, of_boards).reshape(
-        len(fitted.residuals), -1, 3
-    )
-    # A larger square moves each corner away from the board's origin.
-    moves = np.concatenate([_corners_in_rig(result, side) for side in SIDES])
-    boards = np.concatenate([model.view_of[side] for side in SIDES])
-    rows = np.arange(len(fitted.residuals))
-    of_row = np.repeat(np.arange(len(boards)), 2)
-    by_size = np.sum(by_translation[rows, boards[of_row]] * moves[of_row], axis=-1)
+    poses = model.board_poses(fitted.parameters)
+    missed = []
+    for size in (1.0 + _SIZE_STEP, 1.0 - _SIZE_STEP):
+        views = [view.scaled(size) for view in model.views]
+        scaled = RigModel(result.calibration, views, poses)
+        missed.append(scaled.residuals(scaled.start))
+    by_size = (missed[0] - missed[1]) / (2.0 * _SIZE_STEP)
 
     sigma_px = max(fitted.corner_sigma_px, LEAST_CORNER_SIGMA_PX)
     whitened = fitted.residuals / sigma_px
@@ -169,14 +163,3 @@ def square_error(result: RigCalibration) -> tuple[float, float]:
     if information <= _LEAST_SHARE * float(target @ target):
         return 0.0, np.inf
     return -float(alone @ (roots * fitted.residuals)) / information, information**-0.5
-
-
-def _corners_in_rig(result: RigCalibration, side: str) -> Array:
-    """Return each corner's way from its board's origin, in `rig` [m], shape (n, 3)."""
-    poses = result.model.board_poses(result.fit.parameters)
-    return np.concatenate(
-        [
-            view.corners(side).points @ pose[:3, :3].T
-            for view, pose in zip(result.model.views, poses, strict=True)
-        ]
-    )

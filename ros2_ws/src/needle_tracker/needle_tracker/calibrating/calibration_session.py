@@ -20,7 +20,6 @@ from needle_tracker.optics.calibration import (
     number,
     numbers,
     parse_windows,
-    value_of,
 )
 from needle_tracker.optics.window import Window, common_surface
 
@@ -83,13 +82,9 @@ class Session:
         *names : str
             What the image may be called: file names without ending.
         """
-        exact = [self.places[name] for name in names if name in self.places]
-        like = [
-            place
-            for pattern, place in self.places.items()
-            if any(fnmatch.fnmatchcase(name, pattern) for name in names)
-        ]
-        return next(iter(exact + like), None)
+        exact = [name for name in names if name in self.places]
+        like = [key for key in self.places if any(fnmatch.fnmatchcase(n, key) for n in names)]
+        return next((self.places[key] for key in exact + like), None)
 
 
 def load_session(path: Path) -> Session:
@@ -179,13 +174,14 @@ def _check_side(
 
 def _board(content: Any) -> CharucoBoard:
     board = _mapping(content, "board", _BOARD_KEYS)
-    columns, rows = (value_of({"board": board}, "board", key) for key in ("columns", "rows"))
-    for key, count in (("columns", columns), ("rows", rows)):
-        if not isinstance(count, int) or isinstance(count, bool):
-            raise UserError(f"board.{key} = {count!r} is not a whole number")
-    square, marker = (number({"board": board}, "board", key) for key in ("square", "marker"))
+    columns, rows, square, marker = (
+        number({"board": board}, "board", key) for key in _BOARD_KEYS[:4]
+    )
+    if not (columns.is_integer() and rows.is_integer()):
+        raise UserError(f"board.columns, board.rows = {columns:g}, {rows:g} are not whole numbers")
     legacy = _flag(board, "board", "legacy")
-    return CharucoBoard(columns, rows, square, marker, str(board.get("dictionary")), legacy)
+    dictionary = str(board.get("dictionary"))
+    return CharucoBoard(int(columns), int(rows), square, marker, dictionary, legacy)
 
 
 def _place(content: Any, name: str) -> Place:

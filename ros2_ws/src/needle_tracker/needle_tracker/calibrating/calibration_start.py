@@ -154,7 +154,7 @@ def first_calibration(
     assert anchor is not None
     assert anchor.place is not None
     placed: list[Camera] = []
-    for side, alone in zip(SIDES, (cameras.left, cameras.right), strict=True):
+    for side, alone in cameras.cameras.items():
         board = board_pose(alone, anchor.corners(side))
         transform = board @ np.linalg.inv(anchor.place.T_rig_board)
         if placed and are_posed(cameras):
@@ -188,7 +188,7 @@ def boards_seen(calibration: StereoCalibration, views: list[BoardView]) -> Array
             boards.append(view.place.T_rig_board)
             continue
         side = next(side for side in SIDES if len(view.corners(side).points))
-        camera = calibration.left if side == "left" else calibration.right
+        camera = calibration.cameras[side]
         boards.append(np.linalg.inv(camera.T_optical_rig) @ board_pose(camera, view.corners(side)))
     return np.stack(boards)
 

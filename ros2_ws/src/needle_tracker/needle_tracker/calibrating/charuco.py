@@ -14,6 +14,7 @@ from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
 
 from needle_core.errors import UserError
 from needle_core.settings.bounds import check_bounds
@@ -148,7 +149,7 @@ class CharucoBoard:
         # OpenCV 5 drops the axis of length 1 that 4 has.
         flat = np.asarray(pixels, dtype=np.float32).reshape(-1, 2)
         # The window must not reach the markers, which pull the corner.
-        gap = 0.5 * (1.0 - self.marker / self.square) * _spacing(flat.astype(np.float64))
+        gap = 0.5 * (1.0 - self.marker / self.square) * min(pdist(flat), default=20.0)
         half = max(2, int(0.9 * gap))
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
         refined = cv2.cornerSubPix(
@@ -206,15 +207,6 @@ def write_board(board: CharucoBoard, path: Path) -> None:
         figure.savefig(path, dpi=_PRINT_DPI)
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
-
-
-def _spacing(pixels: Array) -> float:
-    """Return the least distance between corners [px]."""
-    if len(pixels) < 2:
-        return 20.0
-    gaps = np.linalg.norm(pixels[:, None] - pixels[None], axis=-1)
-    np.fill_diagonal(gaps, np.inf)
-    return float(gaps.min())
 
 
 def check_board_seen(images: Iterable[Image], board: CharucoBoard) -> None:

@@ -17,6 +17,7 @@ from needle_tracker.calibrating.calibration_check import (
     CheckResult,
     Deviation,
 )
+from needle_tracker.calibrating.rig_model import unit_of
 
 _DESCRIPTION = """\
 Check a stereo calibration with a ChArUco board of known place: a camera turned by 0.02 deg, an
@@ -106,30 +107,26 @@ def figures(result: CheckResult) -> dict[str, JsonValue]:
     }
     found = {deviation.cause: deviation for deviation in result.deviations}
     for cause in result.causes:
-        scale, unit, _ = _unit(cause)
+        scale, unit = unit_of(cause)
         deviation = found.get(cause)
-        key = f"{cause.replace('.', '_')}{'_error' if cause not in CAMERAS else ''}{unit}"
+        key = f"{cause.replace('.', '_')}{'_error' if cause not in CAMERAS else ''}"
+        key += unit and f"_{unit}"
         values[key] = None if deviation is None else scale * deviation.size
         values[f"sigma_{key}"] = None if deviation is None else scale * deviation.sigma
     return values
 
 
 def _words(deviation: Deviation) -> str:
-    scale, _, unit = _unit(deviation.cause)
+    scale, unit = unit_of(deviation.cause)
     size, sigma = scale * deviation.size, scale * deviation.sigma
     effect = f"by itself {1e3 * deviation.tip_error:.3f} mm at the tip"
     if deviation.cause in CAMERAS:
         side = deviation.cause.split("_")[0]
         return f"{side} camera turned by {size:.4f} +- {sigma:.4f} deg (or moved); {effect}"
     name = deviation.cause.replace("_", " ").replace(".", " ")
-    return f"{name} is {size:+.4f} +- {sigma:.4f}{unit} off the calibration's; {effect}"
-
-
-def _unit(cause: str) -> tuple[float, str, str]:
-    """Return the factor to a person's unit, the ending of its key, and the unit in words."""
-    if cause in CAMERAS or "tilt" in cause:
-        return math.degrees(1.0), "_deg", " deg"
-    return (1.0, "", "") if cause == "refractive_index" else (1e3, "_mm", " mm")
+    return (
+        f"{name} is {size:+.4f} +- {sigma:.4f}{unit and f' {unit}'} off the calibration's; {effect}"
+    )
 
 
 def _parser() -> CommandParser:

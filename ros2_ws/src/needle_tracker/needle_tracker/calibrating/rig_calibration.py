@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import numpy.typing as npt
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
@@ -76,7 +77,7 @@ class RigCalibration:
     model : RigModel
         What was fitted.
     parameters : dict of str to Determined
-        By name: `left.fx` ... `right.k3`, and the windows' (`rig_model.window_names`).
+        By name: `left.fx` ... `right.k3`, and the windows' (`RigModel.names`).
     tip_error_p95 : float
         Expected 95 % error of a tip in the phantom from this calibration alone [m].
     apart : list of BoardView
@@ -90,19 +91,19 @@ class RigCalibration:
     tip_error_p95: float
     apart: list[BoardView]
 
-    def reprojection_rms_px(self, side: str, view: int | None = None) -> float:
-        """Return the reprojection error of a camera, over all views or one [px].
+    def reprojection_rms_px(self, side: str, views: npt.ArrayLike | None = None) -> float:
+        """Return the reprojection error of a camera, over all views or some [px].
 
         Parameters
         ----------
         side : str
             "left" or "right".
-        view : int, optional
-            Number of the view.
+        views : int or array_like of int, optional
+            Numbers of the views.
         """
         errors = self.residuals(side)
-        if view is not None:
-            errors = errors[self.model.view_of[side] == view]
+        if views is not None:
+            errors = errors[np.isin(self.model.view_of[side], views)]
         return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else np.nan
 
     def residuals(self, side: str) -> Array:
@@ -186,10 +187,7 @@ def calibrate(
         raise UserError("both cameras come out in one place: are left and right the same images?")
     determined = {
         name: Determined(
-            value=float(result.parameters[i]),
-            sigma=float(sigmas[name]),
-            given=float(given[i]),
-            kept=not bool(free[i]),
+            float(result.parameters[i]), float(sigmas[name]), float(given[i]), not free[i]
         )
         for i, name in enumerate(names)
         if i >= CAMERA_PARAMETERS or (lenses is None and name.split(".")[-1] in LENS)
@@ -215,12 +213,11 @@ def _check_relative_pose(given: Array, seen: Array) -> None:
 
 def _least_determined(names: list[str], result: RigFit) -> int | None:
     """Return the free parameter that is farthest above its limit, None where there is none."""
-    worst, ratio = None, 1.0
-    for i, name in enumerate(names):
-        limit = LIMITS.get(name.split(".")[-1])
-        if limit is not None and result.free[i] and result.sigma[i] / limit > ratio:
-            worst, ratio = i, float(result.sigma[i] / limit)
-    return worst
+    limits = np.array([LIMITS.get(name.split(".")[-1], np.inf) for name in names])
+    # Of a fixed parameter the standard deviation is 0.
+    ratios = result.sigma[: len(names)] / limits
+    worst = int(ratios.argmax())
+    return worst if ratios[worst] > 1.0 else None
 
 
 def _check_cameras(

@@ -87,21 +87,18 @@ def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None
         The fit.
     """
     start = np.array(start)
-    known = corner_sigma_px is not None
-    sigma = corner_sigma_px if corner_sigma_px is not None else 0.3
-    rows, given_sigma = _priors(model, free)
-    passes = 1 if known else 2
-    for _ in range(passes):
-        parameters, normal, cost = _minimise(model, start, free, sigma, (rows, given_sigma))
+    priors = _priors(model, free)
+    parameters, normal, cost = _minimise(model, start, free, corner_sigma_px or 0.3, priors)
+    residuals = model.residuals(parameters)
+    sigma = corner_sigma_px
+    if sigma is None:
+        weighed = max(_spread(residuals, free, priors), LEAST_CORNER_SIGMA_PX)
+        parameters, normal, cost = _minimise(model, parameters, free, weighed, priors)
         residuals = model.residuals(parameters)
-        spare = residuals.size - int(np.count_nonzero(free)) + len(rows)
-        seen = _spread(residuals) * float(np.sqrt(residuals.size / max(spare, 1)))
-        start = parameters
-        if not known:
-            sigma = max(seen, LEAST_CORNER_SIGMA_PX)
+        sigma = _spread(residuals, free, priors)
     covariance = np.zeros((len(start), len(start)))
     covariance[np.ix_(free, free)] = _inverse_normal(normal)
-    return RigFit(parameters, free.copy(), covariance, residuals, sigma if known else seen, cost)
+    return RigFit(parameters, free.copy(), covariance, residuals, sigma, cost)
 
 
 def outlier_weights(whitened: Array) -> Array:
@@ -233,13 +230,9 @@ def _solve(normal: Array, gradient: Array, damping: float) -> Array:
 def _priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:
     """Return the parameters that what is given holds, and how tightly."""
     rows, sigmas = _place_priors(model, free)
-    of_window = {
-        row: WINDOW[name.split(".")[-1]]
-        for row, name in enumerate(model.names)
-        if free[row] and name.split(".")[-1] in WINDOW
-    }
-    window_rows = np.array(list(of_window), dtype=np.intp)
-    return np.append(window_rows, rows), np.append(list(of_window.values()), sigmas)
+    held = np.array([WINDOW.get(name.split(".")[-1], 0.0) for name in model.names])
+    window_rows = np.flatnonzero((held > 0.0) & free[: model.shared])
+    return np.append(window_rows, rows), np.append(held[window_rows], sigmas)
 
 
 def _place_priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:
@@ -259,13 +252,14 @@ def _place_priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]
     return np.array(rows, dtype=np.intp), np.array(sigmas)
 
 
-def _spread(residuals: Array) -> float:
-    """Return the standard deviation of residuals, outliers left out."""
+def _spread(residuals: Array, free: Mask, priors: tuple[NDArray[np.intp], Array]) -> float:
+    """Return the standard deviation that residuals of a fit show, outliers left out."""
     if not residuals.size:
         return 0.0
     rough = 1.4826 * float(np.median(np.abs(residuals)))
-    kept = residuals[np.abs(residuals) <= 4.0 * rough]
-    return float(np.sqrt(np.mean(kept**2))) if kept.size else rough
+    spare = residuals.size - int(np.count_nonzero(free)) + len(priors[0])
+    squares = residuals[np.abs(residuals) <= 4.0 * rough] ** 2
+    return float(np.sqrt(np.mean(squares) * residuals.size / max(spare, 1)))
 
 
 def _inverse_normal(normal: Array) -> Array:

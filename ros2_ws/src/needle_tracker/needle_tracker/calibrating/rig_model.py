@@ -17,18 +17,17 @@ first corner, T_rig_board = [exp(rotation) R0 | t0 + translation].
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Callable
+import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from needle_tracker.calibrating.calibration_session import Place
 from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
 from needle_tracker.optics.camera_model import project_optical
 from needle_tracker.optics.refraction import RefractedCamera
-from needle_tracker.optics.window import Window, common_surface, surface_from_above
+from needle_tracker.optics.window import Window, surface_from_above
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -41,9 +40,9 @@ SURFACE = ("refractive_index", "surface_height")
 WINDOW = {"window_offset": 2e-3, "window_tilt_1": 0.02, "window_tilt_2": 0.02}
 _CAMERA = len(LENS) + len(POSE)
 CAMERA_PARAMETERS = 2 * _CAMERA
+KINDS = ("free", "surface", "under")
 # Central differences; the model is smooth, so that these are good to 1e-6 relative.
 _STEPS = {"f": 0.1, "c": 0.1, "k": 1e-4, "p": 1e-4, "r": 1e-5, "t": 1e-5, "s": 1e-5, "w": 1e-5}
-_CORNER_STEP = 1e-5  # [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,10 +72,22 @@ class BoardView:
         left, right = (nothing if s == side else self.corners(s) for s in SIDES)
         return dataclasses.replace(self, left=left, right=right)
 
+    def scaled(self, size: float) -> BoardView:
+        """Return the view as if the board's squares were larger by a factor."""
+        left, right = (Corners(size * c.points, c.pixels) for c in (self.left, self.right))
+        return dataclasses.replace(self, left=left, right=right)
+
     @property
     def under_surface(self) -> bool:
         """Whether the board was in the phantom, and so seen through the windows."""
         return self.place is not None and self.place.under_surface
+
+    @property
+    def kind(self) -> str:
+        """One of `KINDS`: held freely, at a known place in air, or in the phantom."""
+        if self.place is None:
+            return "free"
+        return "under" if self.under_surface else "surface"
 
 
 def camera_slice(side: str) -> slice:
@@ -85,11 +96,11 @@ def camera_slice(side: str) -> slice:
     return slice(start, start + _CAMERA)
 
 
-def window_names(windows: tuple[Window, Window]) -> tuple[str, ...]:
-    """Return the names of the parameters that these windows have."""
-    if common_surface(*windows) is not None:
-        return SURFACE
-    return tuple(f"{side}.{name}" for side in SIDES for name in WINDOW)
+def unit_of(name: str) -> tuple[float, str]:
+    """Return the factor to a person's unit of a parameter or a camera's turn, and that unit."""
+    if "tilt" in name or "turned" in name:
+        return math.degrees(1.0), "deg"
+    return (1e3, "mm") if name.endswith(("surface_height", "window_offset")) else (1.0, "")
 
 
 class RigModel:
@@ -122,11 +133,12 @@ class RigModel:
     ) -> None:
         self.views = views
         self.tied = tied
-        self._start = {"left": start.left, "right": start.right}
+        self._start = start.cameras
         self._windows = (start.left.window, start.right.window)
         self._surface = start.surface
-        own = tuple(f"{side}.{name}" for side in SIDES for name in LENS + POSE)
-        self.names = own + window_names(self._windows)
+        self.names = tuple(f"{side}.{name}" for side in SIDES for name in LENS + POSE)
+        own = tuple(f"{side}.{name}" for side in SIDES for name in WINDOW)
+        self.names += own if self._surface is None else SURFACE
         self.shared = len(self.names)
         self._boards = np.asarray(boards, dtype=np.float64).reshape(-1, 4, 4)
         self._points = {s: _join([v.corners(s).points for v in views], 3) for s in SIDES}
@@ -146,7 +158,8 @@ class RigModel:
         if self._surface is not None:
             height = self._surface.point[0]
             self.start[CAMERA_PARAMETERS : self.shared] = self._surface.inside, height
-        self._steps = np.array([_STEPS[name.split(".")[-1][0]] for name in self.names])
+        names = [*self.names, *POSE * len(views)]
+        self._steps = np.array([_STEPS[name.split(".")[-1][0]] for name in names])
 
     def calibration(self, parameters: Array) -> StereoCalibration:
         """Return the calibration that a parameter vector stands for."""
@@ -157,8 +170,7 @@ class RigModel:
         """Return T_rig_board of each view, shape (views, 4, 4)."""
         steps = parameters[self.shared :].reshape(-1, 6)
         poses: Array = self._boards.copy()
-        for pose, step in zip(poses, steps, strict=True):
-            pose[:3, :3] = _rotation(step[:3]) @ pose[:3, :3]
+        poses[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix() @ poses[:, :3, :3]
         poses[:, :3, 3] += steps[:, 3:]
         return poses
 
@@ -169,29 +181,14 @@ class RigModel:
 
     def project(self, parameters: Array, side: str) -> Array:
         """Return where one camera should see its corners, shape (n, 2) [px]."""
-        return self._of_corners(parameters, side, self._corners(parameters, side))
-
-    def _of_corners(self, parameters: Array, side: str, corners: Array) -> Array:
-        camera = self._camera(parameters, side)
-        return project_optical(camera, self._seen(camera, side, corners))
-
-    def _through_lens(self, parameters: Array, side: str, seen: Array) -> Array:
-        return project_optical(self._camera(parameters, side), seen)
-
-    def _corners(self, parameters: Array, side: str) -> Array:
-        """Return where the corners are that one camera saw, in `rig`, shape (n, 3) [m]."""
-        boards = self.board_poses(parameters)[self.view_of[side]]
-        return np.asarray(
-            np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side]) + boards[:, :3, 3]
-        )
-
-    def _seen(self, camera: Camera, side: str, corners: Array) -> Array:
-        """Return where a camera sees corners of `rig`, in its optical frame, shape (n, 3) [m]."""
-        transform, under = camera.T_optical_rig, self._under[side]
+        camera, under = self._camera(parameters, side), self._under[side]
+        boards, transform = self.board_poses(parameters)[self.view_of[side]], camera.T_optical_rig
+        corners = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side])
+        corners += boards[:, :3, 3]
         seen = corners @ transform[:3, :3].T + transform[:3, 3]
         if np.any(under):
             seen[under] = RefractedCamera(camera).seen_through(corners[under])
-        return np.asarray(seen)
+        return project_optical(camera, seen)
 
     def jacobian(self, parameters: Array, free: Mask) -> Array:
         """Return d(residuals)/d(free parameters), shape (2 * corners, free).
@@ -208,55 +205,25 @@ class RigModel:
         for side in SIDES:
             first = 0 if side == "left" else count["left"]
             rows = slice(first, first + count[side])
-            own = camera_slice(side)
-            # What a parameter does not move is found once: where corners are, where they are seen.
-            corners = self._corners(parameters, side)
-            seen = self._seen(self._camera(parameters, side), side, corners)
-            through_lens = functools.partial(self._through_lens, side=side, seen=seen)
-            of_corners = functools.partial(self._of_corners, side=side, corners=corners)
-            cameras = range(0 if self.tied else own.start, own.stop)
+            cameras = range(0 if self.tied else camera_slice(side).start, camera_slice(side).stop)
             for column in [*cameras, *range(CAMERA_PARAMETERS, self.shared)]:
                 if free[column]:
-                    pixels = through_lens if column - own.start in range(len(LENS)) else of_corners
-                    result[rows, column] = -self._slope(pixels, parameters, column).ravel()
-            if not np.any(free[self.shared :]):
-                continue
-            # One board's pose moves that board's corners only, and each of them as it lies on it.
-            moved = self._corner_slopes(parameters, side, corners)
-            slopes = moved @ self._pose_slopes(parameters, side)
-            columns = self.shared + 6 * self.view_of[side][:, None] + np.arange(6)
-            lines = first + 2 * np.arange(len(columns))[:, None]
-            for axis in range(2):
-                result[lines + axis, columns] = -slopes[:, axis]
+                    slopes = self._slopes(parameters, side, np.array([column]))
+                    result[rows, column] = -slopes.ravel()
+            # One board's pose moves that board's corners only: all boards are moved at once.
+            of_boards = np.arange(self.shared, len(parameters)).reshape(-1, 6)
+            lines = first + np.arange(count[side]).reshape(-1, 2)
+            for columns in of_boards[:, : 6 * bool(np.any(free[self.shared :]))].T:
+                slopes = self._slopes(parameters, side, columns)
+                result[lines, columns[self.view_of[side]][:, None]] = -slopes
         return result[:, free]
 
-    def _slope(self, pixels: Callable[[Array], Array], parameters: Array, column: int) -> Array:
+    def _slopes(self, parameters: Array, side: str, columns: NDArray[np.intp]) -> Array:
+        """Return d(pixel)/d(parameters) of some that are moved together, shape (n, 2)."""
         step = np.zeros_like(parameters)
-        step[column] = self._steps[column]
-        above, below = (pixels(parameters + s * step) for s in (1.0, -1.0))
-        return np.asarray((above - below) / (2.0 * self._steps[column]))
-
-    def _corner_slopes(self, parameters: Array, side: str, corners: Array) -> Array:
-        """Return d(pixel)/d(corner), shape (n, 2, 3) [px/m]."""
-        steps = _CORNER_STEP * np.eye(3)
-        above, below = (
-            [self._of_corners(parameters, side, corners + s * step) for step in steps]
-            for s in (1.0, -1.0)
-        )
-        slopes = (np.array(above) - np.array(below)) / (2.0 * _CORNER_STEP)
-        return np.moveaxis(slopes, 0, -1)
-
-    def _pose_slopes(self, parameters: Array, side: str) -> Array:
-        """Return d(corner)/d(rotation and translation of its board), shape (n, 3, 6)."""
-        of_view = self.view_of[side]
-        vectors = parameters[self.shared :].reshape(-1, 6)[:, :3]
-        # OpenCV has a row of the matrix's nine elements for each component of the vector.
-        turns = np.array([cv2.Rodrigues(vector)[1].reshape(3, 3, 3) for vector in vectors])
-        unturned = np.einsum("nij,nj->ni", self._boards[of_view, :3, :3], self._points[side])
-        slopes = np.zeros((len(of_view), 3, 6))
-        slopes[:, :, :3] = np.einsum("nkij,nj->nik", turns.reshape(-1, 3, 3, 3)[of_view], unturned)
-        slopes[:, :, 3:] = np.eye(3)
-        return slopes
+        step[columns] = self._steps[columns]
+        above, below = (self.project(parameters + s * step, side) for s in (1.0, -1.0))
+        return np.asarray((above - below) / (2.0 * self._steps[columns[0]]))
 
     def _transform(self, parameters: Array, side: str) -> Array:
         """Return T_optical_rig: turned about the camera's own centre, then shifted."""
@@ -266,7 +233,7 @@ class RigModel:
             return np.asarray(start @ np.linalg.inv(left) @ self._transform(parameters, "left"))
         pose = parameters[camera_slice(side)][len(LENS) :]
         step = np.eye(4)
-        step[:3, :3] = _rotation(pose[:3])
+        step[:3, :3] = Rotation.from_rotvec(pose[:3]).as_matrix()
         step[:3, 3] = pose[3:]
         return np.asarray(step @ start)
 
@@ -285,15 +252,10 @@ class RigModel:
         offset, *tilt = parameters.reshape(len(SIDES), -1)[number]
         # Any two axes across the normal.
         axes = np.linalg.svd(window.normal[None])[2][1:]
-        turned = _rotation(np.array(tilt) @ axes) @ window.normal
+        turned = Rotation.from_rotvec(np.array(tilt) @ axes).apply(window.normal)
         return dataclasses.replace(
             window, point=window.point + offset * window.normal, normal=turned
         )
-
-
-def _rotation(vector: Array) -> Array:
-    """Return the matrix of a rotation vector [rad]."""
-    return np.asarray(cv2.Rodrigues(vector)[0])
 
 
 def _join(arrays: list[Array], width: int) -> Array:

@@ -65,6 +65,16 @@ class StereoCalibration:
     right: Camera
 
     @property
+    def cameras(self) -> dict[str, Camera]:
+        """Both cameras by side, left first."""
+        return {"left": self.left, "right": self.right}
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Width and height of each side's images [px]."""
+        return {side: (camera.width, camera.height) for side, camera in self.cameras.items()}
+
+    @property
     def surface(self) -> Window | None:
         """The level surface that both look through from above; None for windows of their own."""
         return common_surface(self.left.window, self.right.window)

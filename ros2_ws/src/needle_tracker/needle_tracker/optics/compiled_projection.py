@@ -1,6 +1,6 @@
 """Points through the refracting window into one camera, and back: for loops.
 
-The same model as `refraction`, which serves arrays of any shape; the tests hold the two together.
+`refraction` has the same projection for arrays of any shape; the tests hold the two together.
 """
 
 # Compiled functions take plain numbers, one by one.
@@ -27,26 +27,12 @@ _JACOBIAN_STEP = 1e-5  # [m]
 _LAYERS = 29  # from here on, thickness and index of each layer
 
 
-def foot_and_height(camera: Camera) -> tuple[Array, float]:
-    """Return the point of the window's outer face next to a camera, and how far it is before it.
-
-    Returns
-    -------
-    foot : ndarray, shape (3,)
-        In `rig` [m].
-    height : float
-        [m].
-    """
-    window = camera.window
-    height = float(window.height(camera.centre))
-    offset = camera.centre - window.point
-    return window.point + (offset - height * window.normal), height
-
-
 def pack_camera(camera: Camera) -> Array:
     """Return all that projection needs, as the array that `project_point` takes."""
     window = camera.window
-    foot, height = foot_and_height(camera)
+    height = float(window.height(camera.centre))
+    # The point of the outer face next to the camera.
+    foot = window.point + (camera.centre - window.point - height * window.normal)
     return np.concatenate(
         [
             camera.T_optical_rig[:3, :3].reshape(-1),
@@ -269,8 +255,7 @@ def point_jacobian(camera: Array, point: Array, jacobian: Array) -> None:
         moved[axis] = point[axis] - _JACOBIAN_STEP
         project_point(camera, moved, behind)
         moved[axis] = point[axis]
-        jacobian[0, axis] = (ahead[0] - behind[0]) / (2.0 * _JACOBIAN_STEP)
-        jacobian[1, axis] = (ahead[1] - behind[1]) / (2.0 * _JACOBIAN_STEP)
+        jacobian[:, axis] = (ahead - behind) / (2.0 * _JACOBIAN_STEP)
 
 
 @compiled
@@ -319,23 +304,17 @@ def solve_position(
         for i in range(2):
             project_point(cameras[i], position, pixel)
             point_jacobian(cameras[i], position, jacobians[i])
+            off = points[i] - pixel
             for k in range(2):
-                residual[2 * i + k] = axes[i, k, 0] * (points[i, 0] - pixel[0]) + axes[i, k, 1] * (
-                    points[i, 1] - pixel[1]
-                )
-                for axis in range(3):
-                    rows[2 * i + k, axis] = (
-                        axes[i, k, 0] * jacobians[i, 0, axis]
-                        + axes[i, k, 1] * jacobians[i, 1, axis]
-                    )
+                across, along = axes[i, k, 0], axes[i, k, 1]
+                residual[2 * i + k] = across * off[0] + along * off[1]
+                rows[2 * i + k] = across * jacobians[i, 0] + along * jacobians[i, 1]
         normal[:] = 0.0
         right = np.zeros(3)
         for k in range(4):
-            weight = 1.0 / (sigmas[k] * sigmas[k])
-            for a in range(3):
-                right[a] += weight * rows[k, a] * residual[k]
-                for b in range(3):
-                    normal[a, b] += weight * rows[k, a] * rows[k, b]
+            weighted = 1.0 / (sigmas[k] * sigmas[k]) * rows[k]
+            right += weighted * residual[k]
+            normal += np.outer(weighted, rows[k])
         # Scaled by its diagonal, the determinant says how well the position is determined.
         product = normal[0, 0] * normal[1, 1] * normal[2, 2]
         c00 = normal[1, 1] * normal[2, 2] - normal[1, 2] * normal[2, 1]
@@ -347,12 +326,12 @@ def solve_position(
         c11 = normal[0, 0] * normal[2, 2] - normal[0, 2] * normal[2, 0]
         c12 = normal[0, 2] * normal[1, 0] - normal[0, 0] * normal[1, 2]
         c22 = normal[0, 0] * normal[1, 1] - normal[0, 1] * normal[1, 0]
-        step_0 = (c00 * right[0] + c01 * right[1] + c02 * right[2]) / det
-        step_1 = (c01 * right[0] + c11 * right[1] + c12 * right[2]) / det
-        step_2 = (c02 * right[0] + c12 * right[1] + c22 * right[2]) / det
-        position[0] += step_0
-        position[1] += step_1
-        position[2] += step_2
-        if max(abs(step_0), abs(step_1), abs(step_2)) < 1e-10:
+        step = np.empty(3)
+        step[0] = c00 * right[0] + c01 * right[1] + c02 * right[2]
+        step[1] = c01 * right[0] + c11 * right[1] + c12 * right[2]
+        step[2] = c02 * right[0] + c12 * right[1] + c22 * right[2]
+        step /= det
+        position += step
+        if np.abs(step).max() < 1e-10:
             return 1, normal, residual, jacobians
     return 0, normal, residual, jacobians

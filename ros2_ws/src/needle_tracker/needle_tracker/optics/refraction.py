@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.optics.calibration import Camera, StereoCalibration
-from needle_tracker.optics.camera_model import optical_rays, project_optical
-from needle_tracker.optics.compiled_projection import foot_and_height, pack_camera, see_through
+from needle_tracker.optics.camera_model import project_optical
+from needle_tracker.optics.compiled_projection import pack_camera, see_through
 
 Array = NDArray[np.float64]
 
@@ -30,9 +30,6 @@ class RefractedCamera:
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
-        self._rotation = camera.T_optical_rig[:3, :3]
-        self._translation = camera.T_optical_rig[:3, 3]
-        self._foot, self._camera_height = foot_and_height(camera)
         self.packed = pack_camera(camera)
 
     def __eq__(self, other: object) -> bool:
@@ -55,33 +52,6 @@ class RefractedCamera:
         """
         sideways = np.cross([0.0, 0.0, 1.0], self.camera.window.normal)
         return np.asarray(sideways / np.linalg.norm(sideways))
-
-    def rays(self, pixels: Array) -> tuple[Array, Array]:
-        """Return the refracted rays, in the body, that pixels look along.
-
-        Parameters
-        ----------
-        pixels : ndarray, shape (..., 2)
-            Pixel coordinates.
-
-        Returns
-        -------
-        origins : ndarray, shape (..., 3)
-            Where the rays enter the body: points of the window's inner face in `rig` [m].
-        directions : ndarray, shape (..., 3)
-            Unit directions in `rig`, inwards. NaN for a pixel that does not look at the window.
-        """
-        window = self.camera.window
-        air = optical_rays(self.camera, np.asarray(pixels, dtype=np.float64)) @ self._rotation
-        inwards = -(air @ window.normal)
-        inwards = np.where(inwards > 0.0, inwards, np.nan)[..., None]
-        # The part along the window; Snell's law: it shrinks by the index, in each medium anew.
-        along = air + inwards * window.normal
-        origins = self._foot + along * (self._camera_height / inwards)
-        for layer in window.layers:
-            steep = _into(along / layer.refractive_index, window.normal)
-            origins = origins + steep * (layer.thickness / -(steep @ window.normal))[..., None]
-        return origins, _into(along / window.inside, window.normal)
 
     def project(self, points: Array) -> Array:
         """Return the pixels at which points are seen.
@@ -126,8 +96,3 @@ class RefractedCamera:
 def stereo_views(calibration: StereoCalibration) -> tuple[RefractedCamera, RefractedCamera]:
     """Return the left and the right camera of a calibration."""
     return RefractedCamera(calibration.left), RefractedCamera(calibration.right)
-
-
-def _into(sines: Array, normal: Array) -> Array:
-    """Return the unit directions (..., 3) into a medium, of their parts along the window."""
-    return np.asarray(sines - np.sqrt(1.0 - np.sum(sines**2, axis=-1))[..., None] * normal)

@@ -29,6 +29,7 @@ from needle_tracker.calibrating.calibration_session import Session, load_session
 from needle_tracker.calibrating.check_options import figures, parse, report
 from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
+from needle_tracker.sources.image_files import size_problem
 from needle_tracker.sources.pairing import PairMatcher
 
 
@@ -43,13 +44,9 @@ def check_calibration(options: Namespace, words: list[str]) -> int:
     calibration, session = load_calibration(options.calibration), load_session(options.session)
     if options.left is not None and options.right is not None:
         views, sizes = views_in_folders(options.left, options.right, session, all_places=False)
-        for side in SIDES:
-            camera = getattr(calibration, side)
-            if sizes[side] != (camera.width, camera.height):
-                raise UserError(
-                    f"{side} images are {sizes[side][0]}x{sizes[side][1]}, the calibration is for "
-                    f"{camera.width}x{camera.height}"
-                )
+        for side, wanted in calibration.sizes.items():
+            if problem := size_problem(side, sizes[side], wanted):
+                raise UserError(problem)
         free = [view.name for view in views if view.place is None]
         if free:
             print(f"held freely in air, for the session has no such place: {', '.join(free)}")
@@ -87,7 +84,7 @@ class _Capture(WholeNode):
     ) -> None:
         super().__init__("check_calibration", context=context)
         self._options = options
-        self._cameras = {"left": calibration.left, "right": calibration.right}
+        self._cameras = calibration.cameras
         self._matcher: PairMatcher[Frame] = PairMatcher(round(1e9 * options.pair_tolerance))
         self._pairs: list[dict[str, np.ndarray]] = []
         self._problem = ""
@@ -114,11 +111,10 @@ class _Capture(WholeNode):
             while len(self._pairs) < self._options.count and not self._problem:
                 left = end - time.monotonic()
                 if left <= 0.0:
-                    counts = self._matcher.counts
                     raise UserError(
                         f"{len(self._pairs)} image pairs of {self._options.count} in "
                         f"{self._options.timeout:g} s on stereo/{{left,right}}/image_raw "
-                        f"(without a partner: {counts.unpaired})"
+                        f"(without a partner: {self._matcher.unpaired.total()})"
                     )
                 executor.spin_once(timeout_sec=left)
         finally:

@@ -4,26 +4,32 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import itertools
 import math
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from needle_core.errors import UserError
 
 Image = NDArray[np.uint8]
+Sizes = dict[str, tuple[int, int]]
+"""Width and height of each side's images [px]."""
 
 _SUFFIXES = frozenset(
     (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".pnm", ".ppm", ".tif", ".tiff", ".webp", ".jp2")
 )
 # How the file names of two cameras differ: in the left one's a pattern, in the right one's a text.
 _CAMERA_NUMBER = "(?:(?<=cam)|(?<=cam[-_])|(?<=camera)|(?<=camera[-_]))%d(?!\\d)"
-_SIDES = (("left", "right"), (_CAMERA_NUMBER % 0, "1"), (_CAMERA_NUMBER % 1, "2"), ("l", "r"))
+_WORDS = (("left", "right"), (_CAMERA_NUMBER % 0, "1"), (_CAMERA_NUMBER % 1, "2"), ("l", "r"))
 _SEPARATORS = "-_. "
+_SIDES = ("left", "right")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +58,25 @@ class NamedPair:
         paths = (Path(self.name), *self.files)
         return tuple(dict.fromkeys(name for path in paths for name in (path.name, path.stem)))
 
+    def problem(self, sizes: Sizes) -> str:
+        """Return which image cannot be used, for it is not of these sizes; empty where both can."""
+        for (side, wanted), image in zip(sizes.items(), (self.left, self.right), strict=True):
+            if image is None:
+                return f"{side} image is unreadable or not of 8 bit"
+            if problem := size_problem(side, image.shape[::-1], wanted):
+                return problem
+        return ""
+
+
+def size_problem(side: str, size: tuple[int, ...], wanted: tuple[int, int]) -> str:
+    """Return that a side's images are not of the calibration's size, in words; empty if they are.
+
+    Sizes are width and height [px].
+    """
+    if size == wanted:
+        return ""
+    return f"{side} image is {size[0]}x{size[1]}, the calibration is for {wanted[0]}x{wanted[1]}"
+
 
 @dataclasses.dataclass
 class PairSequence:
@@ -75,6 +100,12 @@ class PairSequence:
     _files: list[tuple[str, str]] | None
     cut_off: int = 0
 
+    def refuse_unpaired(self) -> PairSequence:
+        """Return the sequence itself; a `UserError` where an image has no partner."""
+        if self.unpaired:
+            raise UserError(f"images without a partner ({len(self.unpaired)}): {self.unpaired[0]}")
+        return self
+
     @property
     def missing(self) -> str:
         """Frames that the videos lacked, in words, known at the end; empty where all is there."""
@@ -95,28 +126,20 @@ class PairSequence:
             yield NamedPair(name, _read(paths[0]), _read(paths[1]), paths)
 
     def _frames(self) -> Iterator[NamedPair]:
-        left, right = (cv2.VideoCapture(str(path)) for path in (self._left, self._right))
-        try:
-            number = 0
-            self.unpaired.clear()
-            while True:
-                frames = [_next_frame(video) for video in (left, right)]
-                if frames[0] is None or frames[1] is None:
-                    break
-                name = f"{number:06d}"
-                paths = self._left / name, self._right / name
-                yield NamedPair(name, frames[0], frames[1], paths)
-                number += 1
-            for side, video, more in (("left", left, frames[0]), ("right", right, frames[1])):
-                rest, unpaired = more, number
-                while rest is not None:
-                    self.unpaired.append(f"{side} {unpaired:06d}")
-                    unpaired += 1
-                    rest = _next_frame(video)
-            self.cut_off = max(len(self.names) - number, 0)
-        finally:
-            left.release()
-            right.release()
+        videos = [cv2.VideoCapture(str(path)) for path in (self._left, self._right)]
+        self.unpaired.clear()
+        for number in itertools.count():
+            left, right = frames = [_next_frame(video) for video in videos]
+            if left is None or right is None:
+                break
+            name = f"{number:06d}"
+            yield NamedPair(name, left, right, (self._left / name, self._right / name))
+        for side, video, more in zip(_SIDES, videos, frames, strict=True):
+            unpaired, frame = number, more
+            while frame is not None:
+                self.unpaired.append(f"{side} {unpaired:06d}")
+                unpaired, frame = unpaired + 1, _next_frame(video)
+        self.cut_off = max(len(self.names) - number, 0)
 
 
 def open_pairs(left: Path, right: Path) -> PairSequence:
@@ -137,18 +160,21 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
     UserError
         One is missing or cannot be opened, only one is a folder, or nothing pairs.
     """
-    for side, path in (("left", left), ("right", right)):
+    paths = dict(zip(_SIDES, (left, right), strict=True))
+    for side, path in paths.items():
         if not path.exists():
             raise UserError(f"--{side} {path}: does not exist")
     if left.is_dir() != right.is_dir():
         raise UserError(f"--left {left} and --right {right}: one is a folder, the other is not")
     if not left.is_dir():
-        counts = [_frame_count(side, path) for side, path in (("left", left), ("right", right))]
+        counts = [
+            _frame_count(side, path) for side, path in zip(_SIDES, (left, right), strict=True)
+        ]
         names = [f"{number:06d}" for number in range(max(min(counts), 0))]
         return PairSequence(names, [], left, right, None)
     one_folder = left.samefile(right)
     left, right = _image_folder(left), _image_folder(right)
-    found = [_images_in(side, path) for side, path in (("left", left), ("right", right))]
+    found = [_images_in(side, path) for side, path in zip(_SIDES, (left, right), strict=True)]
     pairs = sorted(_pair(*found, one_folder=one_folder), key=lambda pair: _natural(pair[0]))
     if not pairs:
         samples = [f"{len(names)}, such as {min(names, key=_natural)}" for names in found]
@@ -160,15 +186,47 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
         )
     files = [(left_name, right_name) for _, left_name, right_name in pairs]
     used = [set(names) for names in zip(*files, strict=True)]
-    rest = [found[0] - used[0], found[1] - used[1]]
     if one_folder:
-        rest = [found[0] - used[0] - used[1], set()]
+        used, found = [used[0] | used[1], set()], [found[0], set()]
     unpaired = [
         f"{side} {name}"
-        for side, names in zip(("left", "right"), rest, strict=True)
-        for name in sorted(names, key=_natural)
+        for side, names, taken in zip(_SIDES, found, used, strict=True)
+        for name in sorted(names - taken, key=_natural)
     ]
     return PairSequence([name for name, *_ in pairs], unpaired, left, right, files)
+
+
+def progress(pairs: PairSequence, what: str) -> Iterator[NamedPair]:
+    """Yield the pairs; a bar on a terminal says how far it is."""
+    hidden = not sys.stderr.isatty()
+    yield from tqdm(
+        pairs, what, len(pairs.names), unit="pair", delay=1.0, leave=False, disable=hidden
+    )
+
+
+def mean_pair(left: Path, right: Path, sizes: Sizes) -> tuple[Image, Image]:
+    """Return the mean of all pairs of two folders or videos, which has less noise.
+
+    Parameters
+    ----------
+    left, right : Path
+        As of `open_pairs`.
+    sizes : dict of str to (int, int)
+        Width and height that each side's images must have [px].
+
+    Raises
+    ------
+    UserError
+        As `open_pairs`, and for an image that cannot be read or is of another size.
+    """
+    sums, count = [np.zeros(size[::-1]) for size in sizes.values()], 0
+    for count, pair in enumerate(open_pairs(left, right), 1):  # noqa: B007
+        if problem := pair.problem(sizes):
+            raise UserError(f"{left.parent}, {pair.name}: {problem}")
+        for total, image in zip(sums, (pair.left, pair.right), strict=True):
+            np.add(total, np.asarray(image), out=total)
+    first, second = (np.rint(total / count).astype(np.uint8) for total in sums)
+    return first, second
 
 
 def _pair(left: set[str], right: set[str], *, one_folder: bool) -> list[tuple[str, str, str]]:
@@ -188,7 +246,7 @@ def _pair(left: set[str], right: set[str], *, one_folder: bool) -> list[tuple[st
 def _partners(name: str) -> Iterator[tuple[str, str]]:
     """Yield what the right camera's file of this name could be called, and what both share."""
     stem, suffix = Path(name).stem, Path(name).suffix
-    for left, right in _SIDES:
+    for left, right in _WORDS:
         for match in re.finditer(left, stem, re.IGNORECASE):
             word = match.group()
             word = right.upper() if word.isupper() else right.title() if word.istitle() else right
@@ -287,13 +345,10 @@ def _image_folder(folder: Path) -> Path:
 
 def _images_in(side: str, folder: Path) -> set[str]:
     try:
-        names = {
-            path.name
-            for path in folder.iterdir()
-            if path.suffix.lower() in _SUFFIXES and path.is_file()
-        }
+        files = [path for path in folder.iterdir() if path.is_file()]
     except OSError as error:
         raise UserError(f"--{side} {folder}: {error.strerror}") from error
+    names = {path.name for path in files if path.suffix.lower() in _SUFFIXES}
     if not names:
         raise UserError(f"--{side} {folder}: no images in it ({', '.join(sorted(_SUFFIXES))})")
     return names
@@ -323,12 +378,9 @@ def _read(path: Path) -> Image | None:
 
 def _frame_count(side: str, path: Path) -> int:
     video = cv2.VideoCapture(str(path))
-    try:
-        if not video.isOpened():
-            raise UserError(f"--{side} {path}: neither a folder nor a video that can be read")
-        return int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-    finally:
-        video.release()
+    if not video.isOpened():
+        raise UserError(f"--{side} {path}: neither a folder nor a video that can be read")
+    return int(video.get(cv2.CAP_PROP_FRAME_COUNT))
 
 
 def _next_frame(video: cv2.VideoCapture) -> Image | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -24,20 +24,6 @@ class Pair(Generic[T]):
     right: T
 
 
-@dataclasses.dataclass
-class PairCounts:
-    """Counts of the pairing: pairs made, and images dropped without a partner."""
-
-    pairs: int = 0
-    unpaired_left: int = 0
-    unpaired_right: int = 0
-
-    @property
-    def unpaired(self) -> int:
-        """Images of either side that never found their partner."""
-        return self.unpaired_left + self.unpaired_right
-
-
 class PairMatcher(Generic[T]):
     """Pairs images by stamp; never the latest with the latest.
 
@@ -48,6 +34,13 @@ class PairMatcher(Generic[T]):
     tolerance : int or None
         Largest difference of the stamps of a pair [ns]; 0 for cameras on one trigger. None for
         cameras that run freely: half the time from one image of a camera to its next.
+
+    Attributes
+    ----------
+    pairs : int
+        Pairs made.
+    unpaired : Counter of str
+        Images of each side that were dropped without a partner.
     """
 
     def __init__(self, tolerance: int | None) -> None:
@@ -55,11 +48,8 @@ class PairMatcher(Generic[T]):
         self._last: dict[str, int] = {}
         self._periods: deque[int] = deque(maxlen=_PERIODS)
         self._skews: deque[int] = deque(maxlen=_SKEWS)
-        self._waiting: dict[str, OrderedDict[int, T]] = {
-            "left": OrderedDict(),
-            "right": OrderedDict(),
-        }
-        self.counts = PairCounts()
+        self._waiting: dict[str, OrderedDict[int, T]] = {s: OrderedDict() for s in OTHER_SIDE}
+        self.pairs, self.unpaired = 0, Counter[str]()
 
     @property
     def tolerance(self) -> int:
@@ -99,16 +89,16 @@ class PairMatcher(Generic[T]):
         if partner is None or abs(partner - stamp) > self.tolerance:
             waiting = self._waiting[side]
             if waiting.pop(stamp, None) is not None:
-                self._count(side)
+                self.unpaired[side] += 1
             waiting[stamp] = image
             if len(waiting) > _WAITING_LIMIT:
                 waiting.popitem(last=False)
-                self._count(side)
+                self.unpaired[side] += 1
             return None
         other_image = others.pop(partner)
         self._drop_older(OTHER_SIDE[side], partner)
         self._drop_older(side, stamp)
-        self.counts.pairs += 1
+        self.pairs += 1
         self._skews.append(abs(partner - stamp))
         if side == "left":
             return Pair(stamp, image, other_image)
@@ -122,10 +112,4 @@ class PairMatcher(Generic[T]):
         waiting = self._waiting[side]
         for old in [other for other in waiting if other < stamp]:
             del waiting[old]
-            self._count(side)
-
-    def _count(self, side: str) -> None:
-        if side == "left":
-            self.counts.unpaired_left += 1
-        else:
-            self.counts.unpaired_right += 1
+            self.unpaired[side] += 1

@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 
 from needle_core.errors import UserError
-from needle_tracker.sources.image_files import Image, NamedPair, PairSequence, open_pairs
+from needle_tracker.sources.image_files import Image, Sizes, open_pairs, size_problem
 
-Sizes = dict[str, tuple[int, int]]
 # A camera that gives nothing for so many tries in a row is gone.
 LOST_AFTER = 20
 
@@ -57,60 +56,44 @@ class StereoSource(Protocol):
         """Let go of devices and files."""
 
 
-@dataclasses.dataclass(frozen=True)
-class SourceSettings:
-    """Settings of a source.
-
-    Attributes
-    ----------
-    left, right : str
-        Device number or `/dev/...`, folder, or video file.
-    sizes : dict of str to (int, int)
-        Width and height that each side's images must have [px].
-    rate : float
-        Pairs a second that cameras are asked for.
-    loop : bool
-        Whether a recording begins again at its end.
-    """
-
-    left: str
-    right: str
-    sizes: Sizes
-    rate: float
-    loop: bool
-
-
-def open_source(settings: SourceSettings, clock: Callable[[], int]) -> StereoSource:
+def open_source(
+    names: tuple[str, str], sizes: Sizes, rate: float, clock: Callable[[], int], *, loop: bool
+) -> StereoSource:
     """Open cameras or a recording.
 
     Parameters
     ----------
-    settings : SourceSettings
-        What to open.
+    names : pair of str
+        Left and right: device number or `/dev/...`, folder, or video file.
+    sizes : dict of str to (int, int)
+        Width and height that each side's images must have [px].
+    rate : float
+        Pairs a second that cameras are asked for.
     clock : callable
         Returns the time [ns] that images are stamped with.
+    loop : bool
+        Whether a recording begins again at its end.
 
     Raises
     ------
     UserError
         Something is missing, cannot be opened, or is not of the calibration's size.
     """
-    given = {"left": settings.left, "right": settings.right}
-    for side, name in given.items():
+    for side, name in zip(sizes, names, strict=True):
         if not name:
             raise UserError(f"{side} is empty: a device number, /dev/videoN, a folder or a video")
+    left, right = names
     # A camera is a number, or below /dev/.
-    are_cameras = [name.isdecimal() or name.startswith("/dev/") for name in given.values()]
-    if are_cameras[0] != are_cameras[1]:
+    are_cameras = {name.isdecimal() or name.startswith("/dev/") for name in names}
+    if len(are_cameras) > 1:
         raise UserError(
-            f"left = {settings.left!r} and right = {settings.right!r}: one is a camera, the other "
-            "a recording"
+            f"left = {left!r} and right = {right!r}: one is a camera, the other a recording"
         )
-    if are_cameras[0]:
-        if settings.left == settings.right:
-            raise UserError(f"left and right are the same camera, {settings.left!r}")
-        return CameraPair(settings, clock)
-    return RecordedPairs(settings, clock)
+    if are_cameras == {False}:
+        return RecordedPairs(names, sizes, clock, loop=loop)
+    if left == right:
+        raise UserError(f"left and right are the same camera, {left!r}")
+    return CameraPair(names, sizes, rate, clock)
 
 
 class CameraPair:
@@ -121,26 +104,25 @@ class CameraPair:
 
     Parameters
     ----------
-    settings : SourceSettings
-        What to open.
-    clock : callable
-        Returns the time [ns].
+    names, sizes, rate, clock
+        As of `open_source`.
     open_capture : callable
         Opens a device by its name; OpenCV's by default.
     """
 
     def __init__(
         self,
-        settings: SourceSettings,
+        names: tuple[str, str],
+        sizes: Sizes,
+        rate: float,
         clock: Callable[[], int],
         open_capture: Callable[[str], cv2.VideoCapture] | None = None,
     ) -> None:
-        self._clock = clock
-        self._sizes = settings.sizes
+        self._clock, self._sizes = clock, sizes
         self._failed = 0
         self._captures: dict[str, cv2.VideoCapture] = {}
         opened = open_capture or _open_device
-        for side, name in (("left", settings.left), ("right", settings.right)):
+        for side, name in zip(sizes, names, strict=True):
             if name.startswith("/dev/") and not Path(name).exists():
                 raise UserError(f"{side} camera {name} does not exist")
             capture = opened(name)
@@ -148,11 +130,10 @@ class CameraPair:
                 self.close()
                 raise UserError(f"{side} camera {name} cannot be opened: missing, or in use")
             self._captures[side] = capture
-            width, height = settings.sizes[side]
             for key, value in (
-                (cv2.CAP_PROP_FRAME_WIDTH, width),
-                (cv2.CAP_PROP_FRAME_HEIGHT, height),
-                (cv2.CAP_PROP_FPS, settings.rate),
+                (cv2.CAP_PROP_FRAME_WIDTH, sizes[side][0]),
+                (cv2.CAP_PROP_FRAME_HEIGHT, sizes[side][1]),
+                (cv2.CAP_PROP_FPS, rate),
                 # An old frame from a queue would be stamped as a new one.
                 (cv2.CAP_PROP_BUFFERSIZE, 1),
             ):
@@ -164,15 +145,16 @@ class CameraPair:
         for side, capture in self._captures.items():
             grabbed = bool(capture.grab()) and grabbed
             stamps[side] = self._clock()
-        left, right = (self._retrieve(side) if grabbed else None for side in ("left", "right"))
+        left, right = (self._retrieve(side) if grabbed else None for side in self._captures)
         if left is None or right is None:
             self._failed += 1
             if self._failed >= LOST_AFTER:
                 raise UserError(f"the cameras gave no pair {LOST_AFTER} times in a row: unplugged?")
             return None
         self._failed = 0
-        check_size("left", left, self._sizes)
-        check_size("right", right, self._sizes)
+        for (side, wanted), image in zip(self._sizes.items(), (left, right), strict=True):
+            if problem := size_problem(side, image.shape[::-1], wanted):
+                raise UserError(problem)
         return StampedPair(left, right, stamps["left"], stamps["right"])
 
     def close(self) -> None:
@@ -195,86 +177,42 @@ class RecordedPairs:
 
     Parameters
     ----------
-    settings : SourceSettings
-        What to open.
-    clock : callable
-        Returns the time [ns].
+    names, sizes, clock, loop
+        As of `open_source`.
     """
 
-    def __init__(self, settings: SourceSettings, clock: Callable[[], int]) -> None:
-        self._clock = clock
-        self._settings = settings
-        self._pairs: PairSequence = open_pairs(Path(settings.left), Path(settings.right))
-        if self._pairs.unpaired:
-            raise UserError(
-                f"images without a partner ({len(self._pairs.unpaired)}): {self._pairs.unpaired[0]}"
-            )
-        self._any = False
-        self._next: Iterator[NamedPair] = iter(self._pairs)
+    def __init__(
+        self, names: tuple[str, str], sizes: Sizes, clock: Callable[[], int], *, loop: bool
+    ) -> None:
+        self._clock, self._sizes, self._loop = clock, sizes, loop
+        self._pairs = open_pairs(Path(names[0]), Path(names[1])).refuse_unpaired()
         # A recording of another size is refused before anything is published.
-        for pair in self._pairs:
-            _check_sizes(pair, settings.sizes)
-            break
+        next(self._read())
+        self._events = self._read()
 
     def next(self) -> StampedPair | EndOfRecording | None:
         """Return the next pair; None where one of its images cannot be read."""
-        pair = next(self._next, None)
-        if pair is None and self._settings.loop and self._any:
-            self._next = iter(self._pairs)
-            pair = next(self._next, None)
-        if pair is None:
-            return EndOfRecording(self._pairs.missing)
-        stamp = self._clock()
-        if pair.left is None or pair.right is None:
-            return None
-        _check_sizes(pair, self._settings.sizes)
-        self._any = True
-        return StampedPair(pair.left, pair.right, stamp, stamp)
+        return next(self._events)
 
     def close(self) -> None:
         """Let go of the files."""
-        self._next = iter(())
+        self._events = iter(())
 
-
-def check_size(side: str, image: Image, sizes: Sizes, name: str = "") -> None:
-    """Refuse an image that is not of the calibration's size.
-
-    Raises
-    ------
-    UserError
-        With both sizes.
-    """
-    size, wanted = (image.shape[1], image.shape[0]), sizes[side]
-    if size != wanted:
-        raise UserError(
-            f"{side} image {name + ' ' if name else ''}is {size[0]}x{size[1]}, the calibration is "
-            f"for {wanted[0]}x{wanted[1]}"
-        )
-
-
-class RateMeter:
-    """Pairs a second over the last seconds."""
-
-    def __init__(self, window: float = 5.0) -> None:
-        self._window = window
-        self._times: list[float] = []
-
-    def tick(self, now: float) -> None:
-        """Note a pair."""
-        self._times = [t for t in self._times if now - t <= self._window]
-        self._times.append(now)
-
-    def rate(self, now: float) -> float:
-        """Return pairs a second; 0 before the second pair."""
-        recent = [t for t in self._times if now - t <= self._window]
-        span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
-        return (len(recent) - 1) / span if span > 0.0 else 0.0
-
-
-def _check_sizes(pair: NamedPair, sizes: Sizes) -> None:
-    for side, image in (("left", pair.left), ("right", pair.right)):
-        if image is not None:
-            check_size(side, image, sizes, pair.name)
+    def _read(self) -> Iterator[StampedPair | EndOfRecording | None]:
+        goes_on = True
+        while goes_on:
+            goes_on = False
+            for pair in self._pairs:
+                stamp = self._clock()
+                if pair.left is None or pair.right is None:
+                    yield None
+                    continue
+                if problem := pair.problem(self._sizes):
+                    raise UserError(f"{pair.name}: {problem}")
+                goes_on = self._loop
+                yield StampedPair(pair.left, pair.right, stamp, stamp)
+        while True:
+            yield EndOfRecording(self._pairs.missing)
 
 
 def _open_device(name: str) -> cv2.VideoCapture:

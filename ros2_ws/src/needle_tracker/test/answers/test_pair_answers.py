@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 
-from needle_tracker.answers.pair_answers import Answer, Frame, PairAnswers, PairingSettings
+from needle_tracker.answers.pair_answers import Answer, Frame, PairAnswers
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
@@ -50,7 +50,8 @@ def answering(
     monkeypatch.setattr(
         "needle_tracker.filter.needle_tracker.NeedleTracker.warm_up", lambda _: None
     )
-    bench = Answering(PairAnswers(calibration, settings, PairingSettings(None, TIMEOUT, 0.0)))
+    times = {"pair_tolerance_ns": None, "joint_timeout": TIMEOUT, "lean": 0.0}
+    bench = Answering(PairAnswers(calibration, settings, **times))
     monkeypatch.setattr(bench.answers.tracker, "process", bench.process)
     monkeypatch.setattr(bench.answers.swap, "see", lambda *_: None)
     return bench

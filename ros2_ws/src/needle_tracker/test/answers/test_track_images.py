@@ -119,8 +119,12 @@ def test_every_pair_has_its_line_and_what_cannot_be_used_is_named(
     assert [row["name"] for row in rows] == [f"image_{mm}.png" for mm in (3, 50, 51, 52, 60)]
     # 3 mm: known from the stage alone, which is no measurement.
     assert [row["valid"] for row in rows] == ["0", "1", "0", "0", "0"]
-    assert not any(value for key, value in rows[0].items() if key not in ("name", "valid"))
-    found = {key: float(value) for key, value in rows[1].items() if key not in ("name", "valid")}
+    told = [row["missing"] for row in rows]
+    unusable = ["left image is unreadable or not of 8 bit"]
+    unusable.append("right image is 640x480, the calibration is for 1024x768")
+    assert told == ["in the entry zone", "", *unusable, "left image is black"]
+    assert not any(rows[0][column] for column in COLUMNS[2:-1])
+    found = {column: float(rows[1][column]) for column in COLUMNS[2:10]}
     sigmas = {f"sigma_{axis}_m": SIGMA for axis in "xyz"}
     place = {"x_m": 0.0, "y_m": 0.0, "z_m": 0.05, "pitch_rad": 0.1, "yaw_rad": math.atan(0.25)}
     assert found == pytest.approx(place | sigmas)
@@ -156,7 +160,7 @@ def test_parameters_of_the_node_count_here_too(track: Track, folder: Path, capsy
     assert [np.unique(image).tolist() for image in reference] == [[9], [11]]
     save(folder / "empty" / "right" / "0.png", 9, (480, 640))
     assert track("--params", str(params))[0] == 2
-    assert "right/0.png: not an image of 1024x768" in capsys.readouterr().err
+    assert "empty, 0.png: right image is 640x480" in capsys.readouterr().err
     params.write_text("device_driver: {ros__parameters: {max_depth: 0.08}}")
     assert track("--params", str(params))[0] == 0
     warning = f"warning: {params}: no section for /stereo_tracker: it has device_driver"

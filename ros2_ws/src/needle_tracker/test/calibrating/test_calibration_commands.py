@@ -161,7 +161,7 @@ def test_bad_arguments_are_one_line_and_exit_2(
     text = calibration_path.read_text()
     other.write_text(text.replace("image_width: 1024", "image_width: 1280"))
     assert check_calibration([*arguments, "--calibration", str(other)]) == 2
-    assert "left images are 1024x768" in one_line(capsys)
+    assert "left image is 1024x768" in one_line(capsys)
 
 
 @pytest.mark.parametrize("found", ["result", "box_result"])

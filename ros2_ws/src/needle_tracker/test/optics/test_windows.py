@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from needle_tracker.detector.reach import Reach
 from needle_tracker.detector.search_grid import make_search_grid
 from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
-from needle_tracker.optics.camera_model import distort, optical_rays, project_optical, undistort
+from needle_tracker.optics.camera_model import project_optical
 from needle_tracker.optics.compiled_projection import pixel_ray, project_point
 from needle_tracker.optics.refraction import RefractedCamera, stereo_views
 from needle_tracker.optics.window import Layer, Window
@@ -129,8 +129,8 @@ def test_pixels_and_rays_are_those_of_aquacal(aquacal: Any, seed: int) -> None:
         )
         np.testing.assert_allclose(view.project(points), pixels, rtol=0.0, atol=1e-8)
     rays = np.array([aquacal.refractive_back_project(other, surface, p) for p in pixels]) @ turn
-    np.testing.assert_allclose(view.rays(pixels)[0], rays[:, 0], rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(view.rays(pixels)[1], rays[:, 1], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(compiled_rays(view, pixels)[0], rays[:, 0], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(compiled_rays(view, pixels)[1], rays[:, 1], rtol=0.0, atol=1e-12)
 
 
 @VIEWS
@@ -165,14 +165,20 @@ def test_light_takes_the_fastest_path_through_all_layers(
 
 @VIEWS
 def test_a_ray_leads_back_to_the_point_by_snells_law(view: RefractedCamera, points: Array) -> None:
-    window, pixels = view.camera.window, view.project(points)
-    origins, directions = view.rays(pixels)
-    np.testing.assert_allclose(window.depth(origins), 0.0, atol=1e-12)
-    away = points - origins
-    across = away - np.sum(away * directions, axis=1)[:, None] * directions
-    np.testing.assert_allclose(across, 0.0, atol=1e-12)
+    window = view.camera.window
+    for lens in (view.camera.distortion, np.zeros(5)):
+        camera = dataclasses.replace(view.camera, distortion=lens)
+        view = RefractedCamera(camera)
+        pixels = view.project(points)
+        origins, directions = compiled_rays(view, pixels)
+        np.testing.assert_allclose(window.depth(origins), 0.0, atol=1e-12)
+        away = points - origins
+        across = away - np.sum(away * directions, axis=1)[:, None] * directions
+        np.testing.assert_allclose(across, 0.0, atol=1e-12)
     # What lies between the faces changes the place, not the direction.
-    air = optical_rays(view.camera, pixels) @ view.camera.T_optical_rig[:3, :3]
+    matrix = np.linalg.inv(camera.camera_matrix)
+    air = np.column_stack([pixels, np.ones(len(pixels))]) @ matrix.T
+    air = air / np.linalg.norm(air, axis=1)[:, None] @ camera.T_optical_rig[:3, :3]
     bent = window.inside * np.cross(window.normal, directions)
     np.testing.assert_allclose(np.cross(window.normal, air), bent, atol=1e-12)
     assert np.all(directions @ window.normal < 0.0)
@@ -185,8 +191,6 @@ def test_the_compiled_model_is_the_same(view: RefractedCamera, points: Array) ->
     everywhere = points + (window.depth(points) - depths)[:, None] * window.normal
     pixels = view.project(everywhere)
     np.testing.assert_allclose(compiled_pixels(view, everywhere), pixels, rtol=0.0, atol=1e-9)
-    for ours, compiled in zip(view.rays(pixels), compiled_rays(view, pixels), strict=True):
-        np.testing.assert_allclose(compiled, ours, rtol=0.0, atol=1e-12)
 
 
 def test_what_has_no_ray_or_pixel_is_nan() -> None:
@@ -207,7 +211,6 @@ def test_what_has_no_ray_or_pixel_is_nan() -> None:
         (away, camera.camera_matrix[:2, 2]),
     ):
         assert np.all(np.isnan(compiled_rays(seen, pixel[None])[1]))
-        assert np.all(np.isnan(seen.rays(pixel[None])[1]))
     assert np.all(np.isnan(view.project(2.0 * camera.centre - camera.window.point)))
 
 
@@ -235,12 +238,9 @@ def test_layers_of_the_bodys_index_or_of_air_are_none() -> None:
     np.testing.assert_allclose(air.project(deep), straight(view.camera, deep), atol=1e-8)
 
 
-def test_lens_and_slopes_agree_with_finite_differences_and_their_inverse(
+def test_lens_and_slopes_agree_with_opencv_and_finite_differences(
     calibration: StereoCalibration, views: tuple[RefractedCamera, RefractedCamera]
 ) -> None:
-    ideal = np.random.default_rng(0).uniform(-0.2, 0.2, (1000, 2))
-    lens = calibration.left.distortion
-    np.testing.assert_allclose(undistort(distort(ideal, lens), lens), ideal, atol=1e-15)
     point, move = np.array([0.002, 0.01, 0.07]), np.array([1e-5, -2e-5, 1.5e-5])
     for view in views:
         moved = view.project(point + 0.5 * move) - view.project(point - 0.5 * move)

@@ -20,7 +20,7 @@ def test_equal_stamps_pair_in_any_order_of_arrival() -> None:
     pair = matcher.add("right", 20, "r20")
     assert pair is not None
     assert (pair.stamp, pair.left, pair.right) == (20, "l20", "r20")
-    assert (matcher.counts.pairs, matcher.counts.unpaired) == (2, 0)
+    assert (matcher.pairs, matcher.unpaired.total()) == (2, 0)
 
 
 def test_latest_is_never_paired_with_latest_and_what_is_passed_over_is_counted() -> None:
@@ -28,15 +28,15 @@ def test_latest_is_never_paired_with_latest_and_what_is_passed_over_is_counted()
     matcher.add("left", 10, "l10")
     assert matcher.add("right", 20, "r20") is None
     assert matcher.add("left", 21, "l21") is None
-    assert matcher.counts.pairs == 0
+    assert matcher.pairs == 0
     assert matcher.add("right", 21, "r21") is not None
-    assert (matcher.counts.unpaired_left, matcher.counts.unpaired_right) == (1, 1)
+    assert matcher.unpaired == {"left": 1, "right": 1}
     assert matcher.add("right", 10, "r10") is None
     # One camera alone does not pile up.
     for stamp in range(100, 200):
         assert matcher.add("right", stamp, "r") is None
     assert len(matcher.waiting("right")) == 3
-    assert matcher.counts.unpaired_right == 99
+    assert matcher.unpaired["right"] == 99
 
 
 def test_tolerance_is_kept_and_the_nearest_wins() -> None:
@@ -46,7 +46,7 @@ def test_tolerance_is_kept_and_the_nearest_wins() -> None:
     pair = matcher.add("left", 104, "l104")
     assert pair is not None
     assert (pair.stamp, pair.left, pair.right) == (104, "l104", "r106")
-    assert matcher.counts.unpaired_left == 1
+    assert matcher.unpaired["left"] == 1
 
 
 def test_free_running_cameras_pair_within_half_a_frame_and_the_skew_is_told() -> None:

@@ -1,4 +1,4 @@
-"""Two cameras, folders or videos as one source of pairs; the rate at which they come."""
+"""Two cameras, folders or videos as one source of pairs."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from needle_tracker.sources.stereo_source import (
     LOST_AFTER,
     CameraPair,
     EndOfRecording,
-    RateMeter,
-    SourceSettings,
     StampedPair,
     StereoSource,
     open_source,
@@ -60,18 +58,13 @@ class FakeCapture:
         self.opened = False
 
 
-def settings(left: object, right: object, **others: Any) -> SourceSettings:
-    values: dict[str, Any] = {"sizes": SIZES, "rate": 100.0, "loop": False} | others
-    return SourceSettings(str(left), str(right), **values)
-
-
-def opened(left: object, right: object, **others: Any) -> StereoSource:
-    return open_source(settings(left, right, **others), Clock())
+def opened(left: object, right: object, *, loop: bool = False) -> StereoSource:
+    return open_source((str(left), str(right)), SIZES, 100.0, Clock(), loop=loop)
 
 
 def cameras(log: list[str], width: int = 64) -> tuple[CameraPair, dict[str, Any]]:
     captures: dict[str, Any] = {"0": FakeCapture("0", log, 64), "2": FakeCapture("2", log, width)}
-    return CameraPair(settings(0, 2), Clock(), captures.__getitem__), captures
+    return CameraPair(("0", "2"), SIZES, 100.0, Clock(), captures.__getitem__), captures
 
 
 def write_pairs(folder: Path, count: int, size: tuple[int, int] = (64, 48)) -> tuple[Path, Path]:
@@ -129,7 +122,8 @@ def test_folders_come_in_order_and_end_or_begin_again(tmp_path: Path) -> None:
     assert levels_of(source, 4) == ([0, 10, 20, 0], "no end")
     again = source.next()
     assert isinstance(again, StampedPair)
-    assert again.left_stamp == 5_000_000
+    # The clock is asked for each pair, and for the one that is looked at when the source opens.
+    assert again.left_stamp == 6_000_000
     # What cannot be read, and is not of 8 bit, is dropped with its partner.
     (right / "001.png").write_bytes(b"no image")
     cv2.imwrite(str(left / "002.png"), np.full((48, 64), 3000, np.uint16))
@@ -176,12 +170,3 @@ def test_sources_that_are_wrong_are_refused(tmp_path: Path) -> None:
     (left / "000.png").unlink()
     with pytest.raises(UserError, match=r"right 000\.png"):
         opened(left, right)
-
-
-def test_the_rate_is_that_of_the_last_seconds() -> None:
-    meter = RateMeter(window=5.0)
-    assert meter.rate(0.0) == 0.0
-    for i in range(21):
-        meter.tick(0.1 * i)
-    assert meter.rate(2.0) == pytest.approx(10.0)
-    assert meter.rate(20.0) == 0.0
