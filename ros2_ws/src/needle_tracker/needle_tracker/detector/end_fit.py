@@ -22,12 +22,12 @@ ASIDE_WIDTHS = 2.0
 """Beside the line, map that is read [needle widths]."""
 _MIN_LINE_WIDTHS = 2.0  # a shorter line has no direction [needle widths]
 _SLOPES, _MAX_SLOPE = 7, 0.15  # directions tried about the expected one [-, tangent]
-_PASSES = 3  # of the line's fit; each centres the window anew
-_NEAR_WIDTHS = 0.9  # the middle of the shaft is sought so far beside the line [needle widths]
-# What light, blur and bevel leave in line and end beyond what the maps say [needle widths]: from
-# errors in held-out path-traced scenes.
-_LINE_SYSTEMATIC, _END_SYSTEMATIC = 0.07, 0.25
-_ONE_SIGMA = 0.8413  # share of a normal distribution below one standard deviation
+_PASSES = 2  # of the line's fit; each centres the window anew
+# What light and blur leave in line and end beyond what the maps say [needle widths]: from errors in
+# path-traced pairs. What a bevel does to the end of both views alike is `FilterSettings.end_sigma`.
+_LINE_SYSTEMATIC = _END_SYSTEMATIC = 0.1
+_ONE_SIGMA = 0.5 * (1.0 + math.erf(math.sqrt(0.5)))  # of a normal distribution, share below it
+_AROUND_WIDTHS = 3.0  # to both sides, ends that may be one that a bevel blurs [needle widths]
 _FLAT_SHARE = 0.05  # probability that the map of ends says nothing about the end
 
 
@@ -223,20 +223,24 @@ def _fit_line(
     """
     count = int(back)
     places, middles, weights = np.empty(count), np.empty(count), np.empty(count)
-    certainty = 0.0
-    reach = _NEAR_WIDTHS * width
+    certainty = breadth = 0.0
+    reach = width
     for i in range(count):
         s = end - i
         centre = offset + slope * s
-        mass = moment = 0.0
+        mass = moment = second = 0.0
         t = -reach
         while t <= reach:
             value = _on_line(shaft, point, direction, s, centre + t)
             mass += value
             moment += value * t
+            second += value * t * t
             t += 0.5
         places[i], weights[i] = s, min(0.5 * mass / width, 1.0)
-        middles[i] = centre + (moment / mass if mass > 0.0 else 0.0)
+        middles[i] = centre
+        if mass > 0.0:
+            middles[i] += moment / mass
+            breadth += weights[i] * (second / mass - (moment / mass) ** 2)
         certainty += _on_line(shaft, point, direction, s, centre)
     total = weights.sum()
     line[0], line[5] = total, certainty / count
@@ -251,7 +255,10 @@ def _fit_line(
     # What disturbs the middles does so over about a needle's width.
     independent = max(total / width - 2.0, 1.0)
     line[1], line[2] = middle - lean * mean, lean
-    line[3] = math.sqrt(variance / independent * (1.0 + (end - mean) ** 2 / spread))
+    # The variance of one shaft's probability across it is width^2 / 12, of blurred edges a little
+    # more. What is broader may be two, such as a needle beside its shadow.
+    doubt = max(breadth / total - width * width / 6.0, 0.0)
+    line[3] = math.sqrt(doubt + variance / independent * (1.0 + (end - mean) ** 2 / spread))
     line[4] = math.sqrt(variance / independent / spread)
 
 
@@ -281,6 +288,7 @@ def _end_on_line(
             total += _on_line(ends, point, direction, s, centre + t)
             t += 1.0
         density[i] = total
+    _keep_about_the_most(density, width)
     known = density.sum()
     flat = max(_FLAT_SHARE, 1.0 - known) if known < _FLAT_SHARE else _FLAT_SHARE
     for i in range(count):
@@ -288,6 +296,25 @@ def _end_on_line(
     density /= density.sum()
     early, late = _quantile(density, 1.0 - _ONE_SIGMA), _quantile(density, _ONE_SIGMA)
     return _quantile(density, 0.5) - along, 0.5 * (late - early)
+
+
+@compiled
+def _keep_about_the_most(density: Array, width: float) -> None:
+    """Set the density to 0 but for a part of it that holds the most.
+
+    A wide window may show other ends, too, and what is between two is none.
+    """
+    count = 2 * int(_AROUND_WIDTHS * width) + 1
+    if len(density) <= count:
+        return
+    total = most = density[:count].sum()
+    first = 0
+    for i in range(1, len(density) - count + 1):
+        total += density[i + count - 1] - density[i - 1]
+        if total > most:
+            first, most = i, total
+    density[:first] = 0.0
+    density[first + count :] = 0.0
 
 
 @compiled

@@ -30,6 +30,8 @@ Pixels = TypeVar("Pixels", NDArray[np.float32], NDArray[np.float64])
 
 _COARSE_WIDTH_PX = 4.4
 """Needles at least so wide are searched at half size: there they are 2.2 px, the least trained."""
+_FULL_SIZE_REACH = 20e-3
+"""From the entry, all is searched at full size, which shows more of a short needle [m]."""
 _CORRIDOR_WIDTHS = 5.0  # about a path, in which it is traced at full size [needle widths]
 _STRIPS = 3  # boxes that an image is searched in
 _END_BLUR_PX = 5  # side of the square that ends are summed over at a cell of the search grid
@@ -104,10 +106,17 @@ class NeedleDetector:
         """
         grid = self._grid
         first, last = grid.row_of(least), grid.row_of(most)
-        reachable = grid.reachable[: last + 1]
-        if not reachable.any():
+        near, far = grid.reachable[: last + 1].copy(), grid.reachable[: last + 1].copy()
+        near[grid.row_of(_FULL_SIZE_REACH) :] = False
+        far &= ~near
+        maps = [
+            self._sampled(cells, shrink)
+            for cells, shrink in ((near, self._shrink), (far, self._search_shrink))
+            if cells.any()
+        ]
+        if not maps:
             return []
-        shaft, ends = self._sampled(reachable, self._search_shrink)
+        shaft, ends = (np.add.reduce(each) for each in zip(*maps, strict=True))
         return find_paths(grid, shaft, ends, first, last)
 
     def trace(self, path: ShaftPath, end: ImageEnd) -> ShaftPath:
@@ -140,7 +149,7 @@ class NeedleDetector:
         # Cells may be farther apart than a thin needle is wide.
         shaft = cv2.dilate(shaft, np.ones((3, 3), np.uint8))
         sampled = [
-            cv2.remap(each, places[..., 0], places[..., 1], cv2.INTER_LINEAR)
+            np.where(cells, cv2.remap(each, places[..., 0], places[..., 1], cv2.INTER_LINEAR), 0.0)
             for each in (shaft, ends)
         ]
         return sampled[0], sampled[1]

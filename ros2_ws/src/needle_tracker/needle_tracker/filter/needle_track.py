@@ -100,12 +100,19 @@ class NeedleTrack:
             insertion=insertion,
         )
 
+    def surprise(self, tip: SpatialTip, settings: TrackerSettings) -> float:
+        """Return the squared distance over the covariance of a sighting that may be this track's.
+
+        As the needle's, a way that is unknown included, or as that of what stands: the lesser.
+        """
+        as_needle, _ = self._motion_to(tip, settings).surprise(tip)
+        as_needle += self._ways(tip) ** 2
+        as_other, _ = gaussian(tip.position - self.place, self.place_covariance + tip.covariance)
+        return min(as_needle, as_other)
+
     def fits(self, tip: SpatialTip, settings: TrackerSettings) -> bool:
         """Return whether a sighting can be this track's."""
-        as_needle, _ = self._motion_to(tip, settings).surprise(tip)
-        off = tip.position - self.place
-        as_other, _ = gaussian(off, self.place_covariance + tip.covariance)
-        return min(as_needle, as_other) < GATE
+        return self.surprise(tip, settings) < GATE
 
     def seen(self, sighting: Sighting, settings: TrackerSettings) -> NeedleTrack:
         """Return the predicted track after a sighting that `fits`."""
@@ -135,8 +142,15 @@ class NeedleTrack:
         """Return the motion up to a sighting: by the stage, or by as far as the sighting says."""
         if self.way_sigma == 0.0:
             return self.motion
-        way = float((tip.position - self.motion.mean[POSITION]) @ self.motion.mean[HEADING])
+        way = self._ways(tip) * self.way_sigma
         return self.motion.advanced(way, settings.reach.curvature, settings.filter)
+
+    def _ways(self, tip: SpatialTip) -> float:
+        """Return the way to a sighting, in standard deviations; 0 where the stage tells it."""
+        if self.way_sigma == 0.0:
+            return 0.0
+        ahead = tip.position - self.motion.mean[POSITION]
+        return float(ahead @ self.motion.mean[HEADING]) / self.way_sigma
 
     def _log_density(
         self, tip: SpatialTip, motion: NeedleMotion, stood: float, numbers: FilterSettings
@@ -149,8 +163,7 @@ class NeedleTrack:
         heading = motion.mean[HEADING]
         total = motion.covariance[POSITION, POSITION] + tip.covariance
         along = math.sqrt(float(heading @ total @ heading))
-        way = float((tip.position - self.motion.mean[POSITION]) @ heading) / self.way_sigma
-        moved += math.log(along / self.way_sigma) - 0.5 * way * way
+        moved += math.log(along / self.way_sigma) - 0.5 * self._ways(tip) ** 2
         rest = numbers.rest_probability
         return _log_sum(math.log(1.0 - rest) + moved, math.log(rest) + stood)
 

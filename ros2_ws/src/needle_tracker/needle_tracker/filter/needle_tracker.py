@@ -23,7 +23,7 @@ from needle_tracker.filter.needle_track import NeedleTrack
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.optics.refraction import stereo_views
-from needle_tracker.stereo.sighting import Sighting, StereoSearch, evidence
+from needle_tracker.stereo.sighting import Ends, Sighting, StereoSearch, evidence
 from needle_tracker.stereo.triangulation import SpatialTip, triangulate
 
 Array = NDArray[np.float64]
@@ -155,16 +155,17 @@ class NeedleTracker:
         if best is not None and self._believed:
             sighting = self._follow(best)
         if sighting is not None and best is not None:
-            followed = best.seen(sighting, settings)
-            self._tracks = [followed if t is best else t.missed() for t in self._tracks]
+            predicted, followed = self._tracks, best.seen(sighting, settings)
+            self._tracks = [followed if t is best else t.missed() for t in predicted]
             if self._probability(followed) > settings.filter.accepted:
                 return self._answer(sighting, "")
-            self._tracks = [best if t is followed else t for t in self._tracks]
+            self._tracks = predicted
         if changed:
             # A lamp was switched or a camera bumped: much is new, and little of it the needle.
             self._tracks = [track.missed() for track in self._tracks]
             return self._answer(None, NoTip.CHANGED)
-        return self._answer(self._look_everywhere(insertion), "")
+        found, ends = self._look_everywhere(insertion)
+        return self._answer(found, "", ends)
 
     def _view_changed(self, pair: Pair) -> bool:
         """Return whether most of a view differs from the last pair's by more than its light."""
@@ -178,21 +179,21 @@ class NeedleTracker:
             for now, then in zip(self._views_before, before, strict=True)
         )
 
-    def _look_everywhere(self, insertion: float | None) -> Sighting | None:
-        """Search both images and give each sighting to its track; return the best track's."""
+    def _look_everywhere(self, insertion: float | None) -> tuple[Sighting | None, Ends]:
+        """Search both images; return the best track's sighting, and what each view shows alone."""
         settings = self.settings
-        margin = 3.0 * math.hypot(
-            settings.stage_zero_sigma, settings.stage_scale_sigma * (insertion or 0.0)
-        )
-        least, most = settings.hole_clearance + 1.5e-3, settings.reach.length
+        least, most = settings.hole_clearance, settings.reach.length
         if insertion is not None:
-            least = max(least, settings.reach.shortest_chord(insertion) - margin - 1e-3)
-            most = min(most, insertion + margin + 1e-3)
-        left = self._search.search(least, max(most, least + 1e-3))
+            margin = _GATE_SIGMAS * math.hypot(
+                settings.stage_zero_sigma, settings.stage_scale_sigma * insertion
+            )
+            least = max(least, settings.reach.shortest_chord(insertion) - margin)
+            most = min(most, insertion + margin)
+        left, ends = self._search.search(least, most)
         tracks: list[tuple[NeedleTrack, Sighting | None]] = []
         for track in sorted(self._tracks, key=lambda t: -t.rank(settings)):
-            own = next((s for s in left if track.fits(s.tip, settings)), None)
-            if own is None:
+            own = min(left, key=lambda s: track.surprise(s.tip, settings), default=None)
+            if own is None or not track.fits(own.tip, settings):
                 tracks.append((track.missed(), None))
             else:
                 left.remove(own)
@@ -201,7 +202,7 @@ class NeedleTracker:
         kept = [pair for pair in tracks if pair[0].misses < settings.filter.forgotten_after]
         kept.sort(key=lambda pair: -pair[0].rank(settings))
         self._tracks = [track for track, _ in kept[:_TRACKS]]
-        return kept[0][1] if kept else None
+        return kept[0][1] if kept else None, ends
 
     def _follow(self, track: NeedleTrack) -> Sighting | None:
         """Look for the end where a track has it."""
@@ -232,11 +233,13 @@ class NeedleTracker:
         sighting = Sighting(tip, pair, evidence(pair, tip))
         return sighting if sighting.evidence > 0.0 else None
 
-    def _answer(self, sighting: Sighting | None, reason: str) -> Measurement:
+    def _answer(
+        self, sighting: Sighting | None, reason: str, ends: Ends = (None, None)
+    ) -> Measurement:
         best = self._best()
         if best is None:
             self._believed = False
-            return Measurement(None, TrackState.SEARCHING, reason or NoTip.NOTHING)
+            return Measurement(None, TrackState.SEARCHING, reason or NoTip.NOTHING, ends)
         numbers = self.settings.filter
         probability = self._probability(best)
         accepted = probability > numbers.accepted
@@ -244,29 +247,29 @@ class NeedleTracker:
         state = TrackState.TRACKING if self._believed else TrackState.CONFIRMING
         if self._believed and best.misses >= numbers.lost_after:
             state = TrackState.LOST
-        ends = (None, None) if sighting is None else sighting.ends
+        if sighting is not None:
+            ends = sighting.ends
         tip: SpatialTip | None = None
         if sighting is None:
             reason = reason or NoTip.NOTHING
         elif not accepted:
             reason = NoTip.UNCONFIRMED
         else:
-            tip = self._told(sighting, best)
+            tip = self._told(sighting.tip)
             reason = NoTip.UNCERTAIN if tip is None else ""
         return Measurement(tip, state, reason, ends, probability, best.stage)
 
-    def _told(self, sighting: Sighting, track: NeedleTrack) -> SpatialTip | None:
-        """Return what is told of a believed needle, None if it is known too badly.
+    def _told(self, tip: SpatialTip) -> SpatialTip | None:
+        """Return what is told of a believed needle, None if these two views leave it open.
 
-        That is what both views show. Errors of a bevel and its light last from pair to pair, so
-        pairs are merged only where these two views leave a direction open.
+        What a bevel and its light hide, and a shadow beside the shaft, last from pair to pair: they
+        cancel in motion, and pairs are not merged, since nothing averages out.
         """
-        position, covariance = track.tip
-        merged = dataclasses.replace(sighting.tip, position=position, covariance=covariance)
-        for tip in (sighting.tip, merged):
-            if float(np.linalg.eigvalsh(tip.covariance)[-1]) < self.settings.filter.max_sigma**2:
-                return tip
-        return None
+        numbers = self.settings.filter
+        if float(np.linalg.eigvalsh(tip.covariance)[-1]) > numbers.max_sigma**2:
+            return None
+        hidden = numbers.end_sigma * self.settings.needle_width * tip.direction
+        return dataclasses.replace(tip, covariance=tip.covariance + np.outer(hidden, hidden))
 
     def _best(self) -> NeedleTrack | None:
         return max(self._tracks, key=lambda track: track.rank(self.settings), default=None)

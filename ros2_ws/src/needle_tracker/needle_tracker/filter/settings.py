@@ -40,6 +40,9 @@ class FilterSettings:
         Largest size of a track's log-odds: no evidence is beyond doubt.
     accepted : float
         Probability from which on a track is believed.
+    end_sigma : float
+        Of the needle's end along it, alike in both views and from pair to pair: what a bevel and
+        its light hide [needle widths], from errors in path-traced pairs.
     max_sigma : float
         A tip known worse than that in any direction is not told [m].
     lost_after, forgotten_after : int
@@ -56,7 +59,8 @@ class FilterSettings:
     miss_cost: float = 0.5
     max_log_odds: float = 8.0
     accepted: float = 0.85
-    max_sigma: float = 0.6e-3
+    end_sigma: float = 0.3
+    max_sigma: float = 0.8e-3
     lost_after: int = 10
     forgotten_after: int = 30
 

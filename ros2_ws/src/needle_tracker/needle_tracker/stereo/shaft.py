@@ -5,7 +5,6 @@ a needle could; but on their way from the entry they lie too deep, too high, or 
 """
 
 # Compiled functions take plain numbers, one by one.
-# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -23,14 +22,11 @@ from needle_tracker.optics.vectors import cross, dot
 
 Array = NDArray[np.float64]
 
-_STATIONS = 10
-_OTHER_POINTS = 40
-_SMOOTH_CELLS = 7
-_LEAST_STATIONS = 4
-_TOLERANCE = 3e-3  # of a station, beyond what the needle can reach [m]
+_SMOOTH_CELLS = 7  # of a path together: cells make steps
+_TOLERANCE = 3e-3  # of a point, beyond what the needle can reach [m]
 _PASSES, _POINT_SIGMA = 4, 0.5e-3  # of the fit of a curve; of one point [m]
 _LEAST_ANGLE = 1e-4  # of two rays [rad]
-_LEAST_SINE = 0.02  # between the epipolar plane and the shaft
+_LEAST_STEP = 1e-5  # of the rays' distance from one point of a path to the next [m]
 
 
 def shaft_points(
@@ -53,18 +49,8 @@ def shaft_points(
         In `rig` [m]; few or none where the shaft runs along the cameras' baseline.
     """
     stations, others = (_smooth(path.pixels) for path in paths)
-    others = np.ascontiguousarray(others[:: max(len(others) // _OTHER_POINTS, 1)])
-    alike = len(others) / len(stations)
-    chosen = np.unique(np.linspace(0, len(stations) - 1, _STATIONS + 1).astype(int))[:-1]
-    points = np.empty((len(chosen) + 1, 3))
-    count = _meeting_points(
-        (views[0].packed, views[1].packed),
-        stations[chosen],
-        others,
-        alike * chosen,
-        _LEAST_SINE * 5e-4 / alike,
-        points,
-    )
+    points = np.empty((len(stations), 3))
+    count = _meeting_points((views[0].packed, views[1].packed), stations[:-1], others, points)
     points[count] = tip
     return points[: count + 1]
 
@@ -74,8 +60,6 @@ def _meeting_points(
     cameras: tuple[Array, Array],
     stations: Array,
     others: Array,
-    along: Array,
-    least_step: float,
     points: Array,
 ) -> int:
     """Write where the rays of one image's stations meet the surface of the other image's rays.
@@ -86,10 +70,6 @@ def _meeting_points(
         From `pack_camera`.
     stations, others : ndarray, shape (m, 2) and (n, 2)
         Pixels of the one image, and of the other in the order of its path.
-    along : ndarray, shape (m,)
-        How far along the other path each station is about, in its points.
-    least_step : float
-        Least change of the rays' distance from one of the other points to the next [m].
     points : ndarray, shape (m + 1, 3)
         Takes the points, in `rig` [m].
 
@@ -103,6 +83,7 @@ def _meeting_points(
         pixel_ray(cameras[1], others[i], origins[i], directions[i])
     origin, direction, between, across = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     miss = np.empty(len(others))
+    alike = len(others) / (len(stations) + 1)
     count = 0
     for k in range(len(stations)):
         pixel_ray(cameras[0], stations[k], origin, direction)
@@ -113,10 +94,10 @@ def _meeting_points(
             cross(direction, directions[i], across)
             miss[i] = dot(between, across) / math.sqrt(dot(across, across))
             # Of several crossings the one about as far along the path.
-            away = abs(i - 1 - along[k])
+            away = abs(i - 1 - alike * k)
             if i and miss[i] * miss[i - 1] < 0.0 and away < least:
                 chosen, least = i - 1, away
-        if chosen < 0 or abs(miss[chosen + 1] - miss[chosen]) < least_step:
+        if chosen < 0 or abs(miss[chosen + 1] - miss[chosen]) < _LEAST_STEP / alike:
             continue
         share = miss[chosen] / (miss[chosen] - miss[chosen + 1])
         other = (1.0 - share) * directions[chosen] + share * directions[chosen + 1]
@@ -142,11 +123,9 @@ def is_reachable(points: Array, reach: Reach) -> bool:
     reach : Reach
         What the needle can do.
     """
-    if len(points) < _LEAST_STATIONS:
-        return True
     distance = np.linalg.norm(points, axis=1)
     sideways = np.linalg.norm(points[:, :2], axis=1)
-    allowed = distance * np.sin(np.minimum(reach.chord_angle(distance), 1.5)) + _TOLERANCE
+    allowed = distance * np.sin(np.minimum(reach.chord_angle(distance), math.pi / 2)) + _TOLERANCE
     return bool(np.count_nonzero(sideways > allowed) <= len(points) // 4)
 
 
@@ -158,20 +137,18 @@ def shaft_length(points: Array) -> float:
     points : ndarray, shape (n, 3)
         Outwards along the shaft, in `rig` [m].
     """
-    distance = np.linalg.norm(points, axis=1)
-    span = float(distance[-1])
-    s = distance / span
-    terms = np.stack([s, s**2, s**3], axis=1)
-    weight = np.ones(len(s))
+    tip = points[-1]
+    s = np.linalg.norm(points, axis=1) / float(np.linalg.norm(tip))
+    terms = np.stack([s**2 - s, s**3 - s], axis=1)  # both ends of the curve are given
+    bent = points - s[:, None] * tip
+    solution, weight = np.zeros((2, 3)), np.ones((len(s), 1))
     # Reweighted least squares: where clutter leads a path astray, its points count for little.
     for _ in range(_PASSES):
-        weight[-1] = 10.0
-        rows = weight[:, None]
-        solution, *_ = np.linalg.lstsq(terms * rows, points * rows, rcond=None)
-        off = np.linalg.norm(points - terms @ solution, axis=1)
-        weight = 1.0 / (1.0 + (off / _POINT_SIGMA) ** 2)
-    grid = np.linspace(0.0, 1.0, 40)
-    curve = np.stack([grid, grid**2, grid**3], axis=1) @ solution
+        solution, *_ = np.linalg.lstsq(terms * weight, bent * weight, rcond=None)
+        off = np.linalg.norm(bent - terms @ solution, axis=1)
+        weight = 1.0 / (1.0 + (off[:, None] / _POINT_SIGMA) ** 2)
+    ends = np.concatenate([[0.0], np.sort(s), [1.0]])
+    curve = np.outer(ends, tip) + np.stack([ends**2 - ends, ends**3 - ends], axis=1) @ solution
     return float(np.linalg.norm(np.diff(curve, axis=0), axis=1).sum())
 
 

@@ -19,6 +19,7 @@ from needle_tracker.stereo.shaft import is_reachable, shaft_length, shaft_points
 from needle_tracker.stereo.triangulation import SpatialTip, triangulate
 
 Array = NDArray[np.float64]
+Ends = tuple[ImageEnd | None, ImageEnd | None]
 
 _CLOSER_LOOKS = 5  # pairs of paths whose ends are fitted at full size
 # Of a path's end [px] and direction [rad]: what half the size shows as one line may be two.
@@ -77,24 +78,41 @@ class StereoSearch:
     windows: tuple[Window, ...]
     tip_lean: float
 
-    def search(self, least: float, most: float) -> list[Sighting]:
-        """Return the pairs of ends that may be the needle's, the most likely first.
+    def search(self, least: float, most: float) -> tuple[list[Sighting], Ends]:
+        """Return the pairs of ends that may be the needle's, and what each view shows by itself.
 
         Parameters
         ----------
         least, most : float
             Distance of the tip from the entry [m].
+
+        Returns
+        -------
+        list of Sighting
+            The most likely first.
+        pair of (ImageEnd or None)
+            The clearest end in the left and the right image, whether or not they meet.
         """
-        paths = self._paths_that_meet([each.search(least, most) for each in self.detectors])
+        found = [each.search(least, most) for each in self.detectors]
+        meeting = self._paths_that_meet(found)
+        young = most < _YOUNG
         left, right = (
-            [(end, path) for path in own for end in detector.ends_near(path, hidden=most < _YOUNG)]
-            for detector, own in zip(self.detectors, paths, strict=True)
+            [(end, path) for path in own for end in detector.ends_near(path, hidden=young)]
+            for detector, own in zip(self.detectors, meeting, strict=True)
         )
-        found = [
+        sightings = [
             self._sighting((one[0], other[0]), (one[1], other[1]), least, most)
             for one, other in itertools.product(_apart(left), _apart(right))
         ]
-        return sorted(filter(None, found), key=lambda sighting: -sighting.evidence)
+        seen = sorted(filter(None, sightings), key=lambda sighting: -sighting.evidence)
+        if seen:
+            return seen, seen[0].ends
+        alone = (
+            [end for path in own[:1] for end in detector.ends_near(path, hidden=True)]
+            for detector, own in zip(self.detectors, found, strict=True)
+        )
+        one, other = (max(ends, key=lambda end: end.ends, default=None) for ends in alone)
+        return [], (one, other)
 
     def _paths_that_meet(
         self, paths: list[list[ShaftPath]]

@@ -50,8 +50,10 @@ def answering(
     monkeypatch.setattr(
         "needle_tracker.filter.needle_tracker.NeedleTracker.warm_up", lambda _: None
     )
-    times = {"pair_tolerance_ns": None, "joint_timeout": TIMEOUT, "lean": 0.0}
-    bench = Answering(PairAnswers(calibration, settings, **times))
+    answers = PairAnswers(
+        calibration, settings, pair_tolerance_ns=None, joint_timeout=TIMEOUT, lean=0.0
+    )
+    bench = Answering(answers)
     monkeypatch.setattr(bench.answers.tracker, "process", bench.process)
     monkeypatch.setattr(bench.answers.swap, "see", lambda *_: None)
     return bench

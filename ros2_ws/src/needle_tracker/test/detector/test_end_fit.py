@@ -44,7 +44,7 @@ def test_line_and_end_are_found(angle: float) -> None:
     assert math.remainder(
         math.atan2(end.direction[1], end.direction[0]) - angle, 2.0 * math.pi
     ) == pytest.approx(0.0, abs=0.005)
-    assert end.sigma_across < 0.4
+    assert end.sigma_across < 0.6
     assert end.ends == pytest.approx(0.95, abs=0.05)
     assert end.shaft > 0.9
 
@@ -53,7 +53,7 @@ def test_line_and_end_are_found(angle: float) -> None:
 def test_an_end_is_as_uncertain_as_its_density_says(sigma: float) -> None:
     end = fitted(maps(0.1, sigma), 0.1)
     assert end is not None
-    assert end.sigma_along == pytest.approx(math.hypot(sigma, 1.25), rel=0.25)
+    assert end.sigma_along == pytest.approx(math.hypot(sigma, 0.5), rel=0.2)
 
 
 def test_an_end_that_the_map_does_not_show_may_be_anywhere_in_the_window() -> None:
@@ -63,7 +63,7 @@ def test_an_end_that_the_map_does_not_show_may_be_anywhere_in_the_window() -> No
     # Of a uniform density over 30 px the middle 68 % are 20 px.
     assert end.sigma_along == pytest.approx(10.0, abs=1.5)
     assert end.ends < 1e-3
-    assert end.sigma_across < 0.4, "its line is seen as well as ever"
+    assert end.sigma_across < 0.6, "its line is seen as well as ever"
 
 
 def test_a_needle_beside_the_expected_place_is_found_within_the_search() -> None:
