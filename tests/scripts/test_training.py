@@ -130,8 +130,8 @@ def test_an_intensity_that_was_cut_off_returns() -> None:
 
 def test_the_rate_rises_then_falls_to_nearly_nothing() -> None:
     _, loop = torch_and_loop()
-    rates = [loop.rate_at(progress) for progress in np.linspace(0.0, 1.0, 101)]
-    assert max(rates) == pytest.approx(loop.rate_at(0.08))
+    rates = [loop.rate_share(progress) for progress in np.linspace(0.0, 1.0, 101)]
+    assert max(rates) == pytest.approx(loop.rate_share(0.08))
     assert np.all(np.diff(rates[8:]) <= 0.0)
     assert rates[-1] < 0.01 * max(rates)
 
@@ -158,8 +158,7 @@ def test_a_run_is_resumed_as_it_was_and_its_net_is_what_opencv_reads(
         # The exporter says that another one is newer.
         warnings.simplefilter("ignore")
         loop.train(run, pool, loop.Plan(4, 5.0, *paths))
-    other = loop.new_run(4)
-    other.resume(paths[1])
+    other = loop.resumed(paths[1])
     assert other.step == run.step
     assert other.rng.bit_generator.state == run.rng.bit_generator.state
     for one, same in zip(run.net.parameters(), other.net.parameters(), strict=True):
@@ -174,12 +173,30 @@ def test_a_run_is_resumed_as_it_was_and_its_net_is_what_opencv_reads(
     # Any multiples of 4: the stored net is of no size.
     seen = np.random.default_rng(0).normal(0.0, 1.0, (1, 2, 100, 148)).astype(np.float32)
     with torch.no_grad():
-        wanted = pytest.importorskip("training_net").StoredNet(run.mean_net)(torch.from_numpy(seen))
+        net = pytest.importorskip("training_net")
+        wanted = net.StoredNet(run.mean_net).eval()(torch.from_numpy(seen))
     stored = cv2.dnn.readNetFromONNX(str(paths[0]))
     stored.setInput(seen)
     for got, want in zip(stored.forward(["shaft", "end"]), wanted, strict=True):
         np.testing.assert_allclose(got, want.numpy(), atol=1e-4)
     assert 0.0 < float(wanted[0].min()) < float(wanted[0].max()) < 1.0
+
+
+def test_a_net_from_stored_weights_sees_what_the_stored_one_sees(tmp_path: Path) -> None:
+    torch, loop = torch_and_loop()
+    net = pytest.importorskip("training_net")
+    path = tmp_path / "needle_net.onnx"
+    seen = torch.from_numpy(np.random.default_rng(0).normal(0.0, 1.0, (2, 2, 64, 64)))
+    run = loop.new_run(5)
+    run.net(seen.float())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        net.export(run.net, path)
+    tuned = loop.new_run(0, path)
+    with torch.no_grad():
+        one, other = (each.net.eval()(seen.float()) for each in (run, tuned))
+    np.testing.assert_allclose(one.numpy(), other.numpy(), atol=1e-4)
+    assert tuned.rate < run.rate
 
 
 def test_a_peak_is_judged_along_and_across_the_shaft() -> None:

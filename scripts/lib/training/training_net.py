@@ -12,7 +12,6 @@ import torch
 from onnx import numpy_helper
 from torch import nn
 from torch.nn import functional
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 NEEDLE_WEIGHT = 4.0
 """So much more than a pixel of floor counts one of needle: most pixels are floor."""
@@ -100,7 +99,7 @@ def folded(net: NeedleNet) -> NeedleNet:
         if isinstance(layer, nn.Conv2d):
             part = trained.get_submodule(name)
             if isinstance(part, nn.Sequential):
-                part = fuse_conv_bn_eval(part[0], part[1])
+                part = nn.utils.fuse_conv_bn_eval(part[0], part[1])
             layer.load_state_dict(part.state_dict())
     return plain
 

@@ -35,6 +35,8 @@ EVENT = "rcl_interfaces/msg/ParameterEvent"
 
 Capture = pytest.CaptureFixture[str]
 
+Shown = tuple[Path, Path, str]
+
 
 def rerun(*arguments: object) -> int:
     return rerun_node.main([str(argument) for argument in arguments])
@@ -216,13 +218,23 @@ def test_viewers_see_the_recorded_needle_and_nothing_is_compared(
     assert int(link.split()[-2]) == pytest.approx(10 * seconds, abs=3)
 
 
-def test_what_viewers_showed_before_is_replaced(shown: tuple[Path, str], tmp_path: Path) -> None:
-    file = tmp_path / "result.json"
-    code, said = printed(shown[0], "--viewers", "--output", tmp_path / "again", "--json", file)
+@pytest.fixture(scope="module")
+def shown_again(shown: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory) -> Shown:
+    """Return what a bag with the viewers' topics gives, taken through the viewers once more."""
+    folder = tmp_path_factory.mktemp("again")
+    bag, file = folder / "bag", folder / "result.json"
+    code, said = printed(shown[0], "--viewers", "--output", bag, "--json", file)
     assert code == 0
+    return bag, file, said
+
+
+def test_what_viewers_showed_before_is_replaced(
+    shown: tuple[Path, str], shown_again: Shown
+) -> None:
+    bag, file, said = shown_again
     counts = read_contents(shown[0]).counts
     assert json.loads(file.read_text())["live_view_path_sent"] == counts["/live_view/path"]
-    assert read_contents(tmp_path / "again").counts == counts
+    assert read_contents(bag).counts == counts
     assert "openigtlink: left out, pyigtl is not installed" in said
 
 

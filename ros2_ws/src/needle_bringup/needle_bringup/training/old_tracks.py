@@ -16,7 +16,7 @@ Image = NDArray[np.float32]
 _FAINT = 0.15  # so much may a track change brightness that no background explains
 _GEL_PX = 3.0  # so far may gel move
 _MOST = 3
-_BROKEN, _PIECE_PX = 0.4, (5.0, 80.0)  # so many are in pieces, these and their gaps so long
+_BROKEN, _PIECE_PX, _PIECES = 0.4, (5.0, 80.0), 60  # so many are in pieces; so long, with gaps
 
 
 def drawn_tracks(rng: np.random.Generator, pose: Pose, size: int, *, faint: bool) -> Image:
@@ -92,5 +92,6 @@ def _cloudy(rng: np.random.Generator, pose: Pose, size: int, faint: bool) -> Ima
 def _pieces(rng: np.random.Generator, pose: Pose, size: int) -> Image:
     """Return 1 on pieces along a track and 0 in the gaps between them."""
     along, _ = pose.coordinates(size)
-    edges = np.cumsum(np.exp(rng.uniform(*np.log(_PIECE_PX), 60))) - 2.0 * size
+    shortest, longest = np.log(_PIECE_PX)
+    edges = np.cumsum(np.exp(rng.uniform(shortest, longest, _PIECES))) - 2.0 * size
     return coarse(np.searchsorted(edges, along).astype(np.float32) % 2)
