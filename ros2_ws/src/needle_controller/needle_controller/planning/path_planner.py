@@ -16,19 +16,14 @@ import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
 from needle_controller.planning.clearance import assess
+from needle_controller.planning.flood_fill import may_have_path
 from needle_controller.planning.obstacles import Obstacles
-from needle_controller.planning.path_search import MOST_VIA_POINTS, search
-from needle_controller.planning.path_settings import PathSettings, Unknown
-from needle_controller.planning.via_points import candidate_points
+from needle_controller.planning.path_search import QUICK_STARTS, first_guess, improve
+from needle_controller.planning.path_settings import PathSettings, Question, Unknown
 from needle_core.settings.bounds import check_bounded_fields, check_bounds
 
-_STREWN = 1000
-"""Points that a search grows its tree to beside those around the obstacles."""
 _BETTER_BY = 0.004
 """Cost by which another path must be better than the one that is followed [m]."""
-_PRICE_OF_DANGER, _PRICE_OF_MISS = 30.0, 5.0
-"""Length that a path may be longer for each length that it lacks of what it must be clear by, and
-that it passes the target by."""
 _ERODED = 0.5
 """Share of what must be clear beside the needle that may be lost just before it, on the way."""
 _SHORTEST_REST = 0.0005
@@ -37,7 +32,7 @@ _SHORTEST_REST = 0.0005
 
 @dataclasses.dataclass(frozen=True)
 class NeedlePath:
-    """A path that is clear.
+    """A path.
 
     Attributes
     ----------
@@ -53,10 +48,8 @@ class NeedlePath:
         Below 0 where it is followed all the same, for want of another.
     beginning : float
         The same of its first `committed_length`, for a pose that is known [m].
-    miss : float
-        Distance by which it passes the target [m].
-    scarce : float
-        The same for `curvature_share` of the curvature [m].
+    scarce, broken, cost : float
+        See `Assessment` [m].
     """
 
     legs: Array
@@ -64,8 +57,9 @@ class NeedlePath:
     length: float
     margin: float
     beginning: float
-    miss: float
     scarce: float
+    broken: float
+    cost: float
 
     @property
     def aim(self) -> Array:
@@ -115,16 +109,6 @@ class TipState:
         return Unknown(self.position_std, self.heading_std)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Question:
-    """Arguments with which a path is asked for; see `PathPlanner.path`."""
-
-    tip: TipState
-    target: Array
-    obstacles: Obstacles
-    insertion: float
-
-
 class PathPlanner:
     """Plans paths for one needle.
 
@@ -151,8 +135,9 @@ class PathPlanner:
         *,
         insertion: float = 0.0,
         followed: NeedlePath | None = None,
+        starts: int = QUICK_STARTS,
     ) -> NeedlePath | None:
-        """Return the path to follow, None where none is clear.
+        """Return the path to follow, None where none is found.
 
         Parameters
         ----------
@@ -166,104 +151,83 @@ class PathPlanner:
             Present insertion [m].
         followed : NeedlePath, optional
             What was followed up to now.
+        starts : int
+            How often the search is begun, at most.
 
         Raises
         ------
         UserError
             A curvature or insertion that is not finite or out of bounds.
         """
-        check_bounds("curvature", tip.curvature, 0.1, 100.0, "1/m")
-        goal = np.array(target, dtype=float)
-        question = _Question(tip, goal, obstacles, insertion)
-        kept = None if followed is None else self._kept(question, followed)
-        if kept is not None and kept.margin >= self.settings.comfort and kept.scarce <= 0.0:
-            # Nothing but a shorter way is better.
-            found: NeedlePath | None = self._straight(question)
-        else:
-            found = self._found(question, on_the_way=followed is not None)
+        question = self._question(tip, target, obstacles, insertion)
+        kept = None if followed is None else self._kept(question, insertion, followed)
+        found = self._found(question, insertion, kept, starts)
+        if kept is None and found is None and followed is not None:
+            # Clear by what will be known by then.
+            known = question._replace(unknown=Unknown(0.0, 0.0))
+            found = self._found(known, insertion, None, starts)
+            found = None if found is None else _answer(found.legs, question, insertion)
         if kept is None:
             return found
-        if found is None or self._cost(found) > self._cost(kept) - _BETTER_BY:
+        if found is None or found.cost > kept.cost - _BETTER_BY:
             return kept
         return found
 
-    def _straight(self, question: _Question) -> NeedlePath | None:
-        path = self._along(question, straight_to(question.target))
-        return path if path.margin >= 0.0 and path.scarce <= 0.0 else None
+    def may_have_path(self, tip: TipState, target: npt.ArrayLike, obstacles: Obstacles) -> bool:
+        """Return False where it is certain that no path exists, not even for a pose that is known.
 
-    def _kept(self, question: _Question, followed: NeedlePath) -> NeedlePath | None:
+        Parameters as of `path`.
+        """
+        return may_have_path(self._question(tip, target, obstacles, 0.0))
+
+    def _question(
+        self, tip: TipState, target: npt.ArrayLike, obstacles: Obstacles, insertion: float
+    ) -> Question:
+        check_bounds("curvature", tip.curvature, 0.1, 100.0, "1/m")
+        settings = self.settings
+        return Question(
+            tip.pose,
+            np.array(target, dtype=float),
+            settings.largest_curvature_share * tip.curvature,
+            obstacles.table,
+            tip.unknown,
+            settings.longest - insertion,
+            settings,
+        )
+
+    def _kept(
+        self, question: Question, insertion: float, followed: NeedlePath
+    ) -> NeedlePath | None:
         """Return what is left of the path followed, None where it comes too near to an obstacle."""
-        rest = followed.rest(question.insertion)
+        rest = followed.rest(insertion)
         rest[-1, :3] = question.target
-        path, settings = self._along(question, rest), self.settings
+        path, settings = _answer(rest, question, insertion), self.settings
         return path if path.beginning >= -_ERODED * settings.sigmas * settings.settled_std else None
 
-    def _along(self, question: _Question, legs: Array) -> NeedlePath:
-        tip = question.tip
-        length, margin, beginning, miss, scarce = assess(
-            tip.pose,
-            legs,
-            tip.curvature,
-            question.obstacles.table,
-            tip.unknown,
-            self.settings,
-        )
-        return NeedlePath(legs, question.insertion, length, margin, beginning, miss, scarce)
-
-    def _found(self, question: _Question, *, on_the_way: bool) -> NeedlePath | None:
-        """Return the best path of some searches, None where there is none.
-
-        Where a path with little curvature is not comfortable, one with more may be. A needle on its
-        way without a path takes one that is clear by what it will know by then.
-        """
-        settings, tip = self.settings, question.tip
-        scarce = settings._replace(curvature_share=settings.largest_curvature_share)
-        found = self._searched(question, tip.unknown, settings)
-        if found is not None and found.margin >= settings.comfort:
-            return found
-        paths = [found, self._searched(question, tip.unknown, scarce)]
-        if on_the_way and paths == [None, None]:
-            paths = [self._searched(question, Unknown(0.0, 0.0), scarce)]
-        clear = [path for path in paths if path is not None]
-        return min(clear, key=self._cost) if clear else None
-
-    def _searched(
-        self, question: _Question, unknown: Unknown, settings: PathSettings
+    def _found(
+        self, question: Question, insertion: float, kept: NeedlePath | None, starts: int
     ) -> NeedlePath | None:
-        tip, table = question.tip, question.obstacles.table
-        clear = settings.needle_radius + settings.sigmas * settings.settled_std
-        distances = clear + np.array([0.0002, settings.comfort, 3.0 * settings.comfort])
-        position = np.array(tip.position, dtype=float)
-        candidates = candidate_points(position, question.target, table, distances, _STREWN)
-        legs = np.full((MOST_VIA_POINTS + 1, 4), math.inf)
-        count = search(
-            tip.pose,
-            question.target,
-            tip.curvature,
-            table,
-            candidates,
-            unknown,
-            settings,
-            settings.longest - question.insertion,
-            legs,
-        )
-        if count < 0:
-            return None
-        legs[count, :3] = question.target
-        legs[count, 3] = math.inf
-        return self._along(question, legs[: count + 1].copy())
+        """Return the best path of the straight way and some starts, None where there is none.
 
-    def _cost(self, path: NeedlePath) -> float:
-        settings = self.settings
-        lacking = max(settings.comfort - path.margin, 0.0)
-        return (
-            path.length
-            + settings.comfort_price * lacking
-            + _PRICE_OF_DANGER * max(-path.margin, 0.0)
-            + _PRICE_OF_MISS * path.scarce
-        )
+        The first that lacks nothing ends the search, and any from `QUICK_STARTS` on.
+        """
+        straight = _answer(np.array([[*question.target, math.inf]]), question, insertion)
+        best = straight if straight.broken <= 0.0 else None
+        for number in range(starts):
+            if self._lacks_nothing(best) or self._lacks_nothing(kept):
+                break
+            if best is not None and number >= QUICK_STARTS:
+                break
+            legs, draws = first_guess(question.start[:, 3], question.target, number)
+            path = NeedlePath(legs, insertion, *improve(legs, question, draws))
+            if path.broken <= 0.0 and (best is None or path.cost < best.cost):
+                best = path
+        return best
+
+    def _lacks_nothing(self, path: NeedlePath | None) -> bool:
+        """Return whether nothing but a shorter path is better."""
+        return path is not None and path.margin >= self.settings.comfort and path.scarce <= 0.0
 
 
-def straight_to(target: Array) -> Array:
-    """Return the legs of the way to a target without via points, shape (1, 4) [m]."""
-    return np.array([[*target, math.inf]])
+def _answer(legs: Array, question: Question, insertion: float) -> NeedlePath:
+    return NeedlePath(legs, insertion, *assess(legs, question))
