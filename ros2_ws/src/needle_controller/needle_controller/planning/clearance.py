@@ -34,8 +34,8 @@ class Assessment(NamedTuple):
         Distance by which it passes the target with `curvature_share` of the curvature on the last
         leg; 0 where it leads there.
     broken : float
-        By what it breaks what it must keep: clearance, goal tolerance, longest length; 0 of a path
-        that may be followed.
+        By what it breaks what it must keep: clearance, goal tolerance, lengths; 0 of a path that
+        may be followed.
     cost : float
         The less, the better.
     """
@@ -91,7 +91,7 @@ def chain_margin(
 
 
 @compiled
-def assess(legs: Array, question: Question) -> Assessment:
+def assess(legs: Array, question: Question, shortest: float) -> Assessment:
     """Return what is to be said of a path.
 
     Parameters
@@ -101,11 +101,14 @@ def assess(legs: Array, question: Question) -> Assessment:
         its length: written.
     question : Question
         What it is an answer to.
+    shortest : float
+        Least length of a leg to a via point [m].
     """
     settings, table, known = question.settings, question.table, Unknown(0.0, 0.0)
     share = settings.curvature_share / settings.largest_curvature_share
     pose, end, points = question.start.copy(), np.empty((3, 4)), np.empty((MOST_POINTS, 4))
     length, margin, beginning, miss, scarce = 0.0, math.inf, math.inf, 0.0, 0.0
+    short = 0.0
     for i in range(legs.shape[0]):
         kappa = question.curvature
         leg = leg_towards(pose, legs[i], kappa, share, settings.max_rotation_per_length)
@@ -119,11 +122,13 @@ def assess(legs: Array, question: Question) -> Assessment:
         miss, scarce = leg.miss, leg.scarce
         legs[i, 3] = leg_length(leg)
         length += legs[i, 3]
+        if i + 1 < legs.shape[0]:
+            short += max(shortest - legs[i, 3], 0.0)
         pose[:] = end
-    # With a+ = max(a, 0): b = (-margin)+ + (miss - tolerance)+ + (length - reach)+,
-    # J = length + p_c (comfort - margin)+ + p_m scarce + p_b b.
+    # With a+ = max(a, 0): J = length + p_c (comfort - margin)+ + p_m scarce + p_b b,
+    # b = (-margin)+ + (miss - tolerance)+ + (length - reach)+ + sum (shortest - length of a leg)+.
     broken = max(-margin, 0.0) + max(miss - settings.goal_tolerance, 0.0)
-    broken += max(length - question.reach, 0.0)
+    broken += max(length - question.reach, 0.0) + short
     cost = length + _COMFORT_PRICE * max(settings.comfort - margin, 0.0)
     cost += _PRICE_OF_MISS * scarce + _PRICE_OF_BROKEN * broken
     return Assessment(length, margin, beginning, scarce, broken, cost)

@@ -173,6 +173,14 @@ class PathPlanner:
             return kept
         return found
 
+    def warm_up(self) -> None:
+        """Run what questions run: compiled code is made here, not while a needle waits for it."""
+        tip, target = TipState(np.zeros(3), np.eye(3), 1.0), np.array([0.0, 0.0, 0.01])
+        question = self._question(tip, target, Obstacles(), 0.0)
+        may_have_path(question)
+        legs, draws = first_guess(tip.position, target, 0)
+        improve(legs, question, draws[:1])
+
     def may_have_path(self, tip: TipState, target: npt.ArrayLike, obstacles: Obstacles) -> bool:
         """Return False where it is certain that no path exists, not even for a pose that is known.
 
@@ -230,4 +238,4 @@ class PathPlanner:
 
 
 def _answer(legs: Array, question: Question, insertion: float) -> NeedlePath:
-    return NeedlePath(legs, insertion, *assess(legs, question))
+    return NeedlePath(legs, insertion, *assess(legs, question, 0.0))

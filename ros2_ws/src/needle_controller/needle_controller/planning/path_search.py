@@ -43,6 +43,8 @@ per start (A. Auger, N. Hansen, "A restart CMA evolution strategy with increasin
 _GENERATIONS = 60
 _SPREAD, _LEAST_SPREAD = 0.004, 1e-5
 """sigma at the start, and below which via points no longer matter [m]."""
+_SHORTEST_LEG = 0.01
+"""To a via point [m]: the bevel's half turn takes 6 mm, and nearer points are aimed at badly."""
 _WIDTH = 0.03
 """Of the tube around the straight way in which searches start [m]: the widest obstacle's and more.
 """
@@ -101,7 +103,7 @@ def improve(legs: Array, question: Question, draws: Array) -> Assessment:
         mean[i] = legs[i // 3, i % 3]
     d, costs, order = np.empty((paths, size)), np.empty(paths), np.empty(paths, np.int64)
     tried = legs.copy()
-    best = assess(legs, question)
+    best = assess(legs, question, _SHORTEST_LEG)
     for generation in range(generations):
         z = draws[generation]
         for k in range(paths):
@@ -109,7 +111,7 @@ def improve(legs: Array, question: Question, draws: Array) -> Assessment:
             for i in range(size):
                 tried[i // 3, i % 3] = mean[i] + sigma * d[k, i]
             tried[:, 3] = math.inf
-            assessed = assess(tried, question)
+            assessed = assess(tried, question, _SHORTEST_LEG)
             costs[k] = assessed.cost
             if assessed.cost < best.cost:
                 best = assessed
