@@ -24,6 +24,7 @@ def path_planner(settings: SteeringSettings) -> PathPlanner:
         PathSettings(
             max_rotation_per_length=settings.max_rotation_per_length,
             needle_radius=0.5 * settings.needle_diameter,
+            goal_tolerance=settings.goal_tolerance,
             longest=settings.depth,
         )
     )

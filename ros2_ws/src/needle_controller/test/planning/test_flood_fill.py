@@ -103,15 +103,14 @@ def test_what_is_not_found_is_not_said_to_be_impossible(monkeypatch: pytest.Monk
 
 
 def test_the_thorough_search_finds_what_the_quick_one_misses() -> None:
-    # Scene 207 of the obstacle study of seed 909.
+    # Scene 182 of the obstacle study of seed 909.
     rows = [
-        (-0.01514, -0.0041, 0.02815, -0.00842, -0.01718, 0.02533, 0.00515),
-        (-0.01383, 0.01115, 0.04701, -0.00698, -0.00798, 0.03788, 0.00443),
-        (-0.00594, -0.00507, 0.05652, -0.00594, -0.00507, 0.05652, 0.00499),
-        (-0.01591, -0.00515, 0.06087, -0.0207, -0.01556, 0.06978, 0.00471),
+        (-0.00113, 0.01008, 0.07275, 0.01968, 0.00163, 0.04861, 0.00685),
+        (-0.00363, -0.00664, 0.0533, 0.02809, 0.00195, 0.03646, 0.0049),
+        (0.01364, 0.01014, 0.03855, 0.00344, 0.00708, 0.04418, 0.00851),
     ]
+    target = [0.00404, -0.00454, 0.08293]
     obstacles = Obstacles([Obstacle(row[:3], row[3:6], row[6]) for row in rows])
-    target = [-0.02166, -0.01052, 0.09343]
     assert PLANNER.path(ENTRY, target, obstacles) is None
     found = first_path(PLANNER, ENTRY, target, obstacles)
     assert isinstance(found, NeedlePath)
