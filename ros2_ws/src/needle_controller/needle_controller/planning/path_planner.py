@@ -48,7 +48,7 @@ class NeedlePath:
         Below 0 where it is followed all the same, for want of another.
     beginning : float
         The same of its first `committed_length`, for a pose that is known [m].
-    scarce, broken, cost : float
+    miss, broken, cost : float
         See `Assessment` [m].
     """
 
@@ -57,7 +57,7 @@ class NeedlePath:
     length: float
     margin: float
     beginning: float
-    scarce: float
+    miss: float
     broken: float
     cost: float
 
@@ -126,6 +126,7 @@ class PathPlanner:
     def __init__(self, settings: PathSettings) -> None:
         check_bounded_fields(settings)
         self.settings = settings
+        self._least_beginning = -_ERODED * settings.sigmas * settings.settled_std
 
     def path(
         self,
@@ -160,18 +161,39 @@ class PathPlanner:
             A curvature or insertion that is not finite or out of bounds.
         """
         question = self._question(tip, target, obstacles, insertion)
-        kept = None if followed is None else self._kept(question, insertion, followed)
-        found = self._found(question, insertion, kept, starts)
-        if kept is None and found is None and followed is not None:
-            # Clear by what will be known by then.
-            known = question._replace(unknown=Unknown(0.0, 0.0))
-            found = self._found(known, insertion, None, starts)
-            found = None if found is None else _answer(found.legs, question, insertion)
-        if kept is None:
-            return found
-        if found is None or found.cost > kept.cost - _BETTER_BY:
-            return kept
-        return found
+        if followed is None:
+            path = self._best(question, insertion, None, starts)
+            return path if path is not None and path.broken <= 0.0 else None
+        path = self._best(question, insertion, followed, starts)
+        if path is None or path.broken > 0.0:
+            # All of the curvature: this is what the rest was held back for.
+            path = self._best(
+                question._replace(curvature=tip.curvature), insertion, followed, starts
+            )
+        return path
+
+    def _best(
+        self, question: Question, insertion: float, followed: NeedlePath | None, starts: int
+    ) -> NeedlePath | None:
+        """Return the path that costs least, None where none is clear for its beginning."""
+        rest = np.array([[*question.target, math.inf]])
+        best = kept = _answer(rest, question, insertion)
+        if followed is not None:
+            rest = followed.rest(insertion)
+            rest[-1, :3] = question.target
+            kept = _answer(rest, question, insertion)
+        for number in range(starts):
+            if self._lacks_nothing(best) or self._lacks_nothing(kept):
+                break
+            if best.broken <= 0.0 and number >= QUICK_STARTS:
+                break
+            legs, draws = first_guess(question.start[:, 3], question.target, number)
+            path = NeedlePath(legs, insertion, *improve(legs, question, draws))
+            if path.cost < best.cost:
+                best = path
+        favour = 0.0 if followed is None else _BETTER_BY
+        clear = [path for path in (kept, best) if path.beginning >= self._least_beginning]
+        return min(clear, key=lambda path: path.cost - favour * (path is kept), default=None)
 
     def warm_up(self) -> None:
         """Run what questions run: compiled code is made here, not while a needle waits for it."""
@@ -196,45 +218,16 @@ class PathPlanner:
         return Question(
             tip.pose,
             np.array(target, dtype=float),
-            settings.largest_curvature_share * tip.curvature,
+            settings.curvature_share * tip.curvature,
             obstacles.table,
             tip.unknown,
             settings.longest - insertion,
             settings,
         )
 
-    def _kept(
-        self, question: Question, insertion: float, followed: NeedlePath
-    ) -> NeedlePath | None:
-        """Return what is left of the path followed, None where it comes too near to an obstacle."""
-        rest = followed.rest(insertion)
-        rest[-1, :3] = question.target
-        path, settings = _answer(rest, question, insertion), self.settings
-        return path if path.beginning >= -_ERODED * settings.sigmas * settings.settled_std else None
-
-    def _found(
-        self, question: Question, insertion: float, kept: NeedlePath | None, starts: int
-    ) -> NeedlePath | None:
-        """Return the best path of the straight way and some starts, None where there is none.
-
-        The first that lacks nothing ends the search, and any from `QUICK_STARTS` on.
-        """
-        straight = _answer(np.array([[*question.target, math.inf]]), question, insertion)
-        best = straight if straight.broken <= 0.0 else None
-        for number in range(starts):
-            if self._lacks_nothing(best) or self._lacks_nothing(kept):
-                break
-            if best is not None and number >= QUICK_STARTS:
-                break
-            legs, draws = first_guess(question.start[:, 3], question.target, number)
-            path = NeedlePath(legs, insertion, *improve(legs, question, draws))
-            if path.broken <= 0.0 and (best is None or path.cost < best.cost):
-                best = path
-        return best
-
-    def _lacks_nothing(self, path: NeedlePath | None) -> bool:
+    def _lacks_nothing(self, path: NeedlePath) -> bool:
         """Return whether nothing but a shorter path is better."""
-        return path is not None and path.margin >= self.settings.comfort and path.scarce <= 0.0
+        return path.margin >= self.settings.comfort and path.miss <= 0.0
 
 
 def _answer(legs: Array, question: Question, insertion: float) -> NeedlePath:

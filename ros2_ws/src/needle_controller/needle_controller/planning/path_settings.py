@@ -17,9 +17,7 @@ class PathSettings(NamedTuple):
     max_rotation_per_length : float
         Most that the bevel turns per inserted length [rad/m].
     curvature_share : float
-        Share of the curvature with which the last leg should lead to the target: the rest corrects.
-    largest_curvature_share : float
-        Share of the curvature that paths are planned with.
+        Share of the curvature that paths are planned with: the rest corrects.
     needle_radius : float
         Of the needle [m].
     sigmas : float
@@ -40,8 +38,7 @@ class PathSettings(NamedTuple):
     """
 
     max_rotation_per_length: Annotated[float, Bounds(1.0, 1e5, "rad/m")]
-    curvature_share: Annotated[float, Bounds(0.5, 1.0, "-")] = 0.8
-    largest_curvature_share: Annotated[float, Bounds(0.5, 1.0, "-")] = 0.9
+    curvature_share: Annotated[float, Bounds(0.5, 1.0, "-")] = 0.9
     needle_radius: Annotated[float, Bounds(0.0, 0.01, "m")] = 0.00035
     sigmas: Annotated[float, Bounds(0.0, 10.0, "-")] = 2.0
     settled_std: Annotated[float, Bounds(0.0, 0.01, "m")] = 0.0002
@@ -82,7 +79,7 @@ class Question(NamedTuple):
     target : ndarray, shape (3,)
         Where to [m].
     curvature : float
-        That is planned with, `largest_curvature_share` of kappa [1/m].
+        That is planned with, `curvature_share` of kappa [1/m].
     table : ndarray, shape (N, 7)
         See `Obstacles`.
     unknown : Unknown
