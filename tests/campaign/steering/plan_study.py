@@ -66,6 +66,7 @@ def study(scenes: int, seed: int, radius: float, tolerance: float) -> dict[str, 
         PathSettings(
             SteeringSettings.max_rotation_per_length,
             curvature_share=1.0,
+            comfortable_share=1.0,
             goal_tolerance=tolerance,
         )
     )
@@ -106,7 +107,7 @@ def study(scenes: int, seed: int, radius: float, tolerance: float) -> dict[str, 
         "none_found": scenes - len(paths) - none_exists,
         "least_clearance_mm": quantile(clear, 0.0),
         "median_clearance_mm": quantile(clear, 50.0),
-        "within_tolerance_only": sum(path.miss > 0.0 for path in paths),
+        "within_tolerance_only": sum(path.scarce > 0.0 for path in paths),
     }
     for what, values in times.items():
         for percent in (50, 95):

@@ -30,8 +30,9 @@ class Assessment(NamedTuple):
         By what it is clearer than it must be, at the worst place; inf without obstacles.
     beginning : float
         The same of its first `committed_length`, for a pose that is known.
-    miss : float
-        Distance by which it passes the target; 0 where it leads there.
+    scarce : float
+        Distance by which it would pass the target with `comfortable_share` of the curvature on its
+        last leg; 0 where that leads there.
     broken : float
         By what it breaks what it must keep: clearance, goal tolerance, lengths; 0 of a path that
         may be followed.
@@ -42,7 +43,7 @@ class Assessment(NamedTuple):
     length: float
     margin: float
     beginning: float
-    miss: float
+    scarce: float
     broken: float
     cost: float
 
@@ -104,11 +105,12 @@ def assess(legs: Array, question: Question, shortest: float) -> Assessment:
         Least length of a leg to a via point [m].
     """
     settings, table, known = question.settings, question.table, Unknown(0.0, 0.0)
+    share = settings.comfortable_share / settings.curvature_share
     pose, end, points = question.start.copy(), np.empty((3, 4)), np.empty((MOST_POINTS, 4))
-    length, margin, beginning, miss, short = 0.0, math.inf, math.inf, 0.0, 0.0
+    length, margin, beginning, miss, scarce, short = 0.0, math.inf, math.inf, 0.0, 0.0, 0.0
     for i in range(legs.shape[0]):
         kappa = question.curvature
-        leg = leg_towards(pose, legs[i], kappa, settings.max_rotation_per_length)
+        leg = leg_towards(pose, legs[i], kappa, share, settings.max_rotation_per_length)
         leg = cut_short(leg, legs[i, 3])
         count = trace(pose, leg, kappa, length, points, end)
         margin = min(margin, chain_margin(points, count, table, question.unknown, settings))
@@ -116,16 +118,16 @@ def assess(legs: Array, question: Question, shortest: float) -> Assessment:
         while near < count and points[near, 3] <= settings.committed_length:
             near += 1
         beginning = min(beginning, chain_margin(points, near, table, known, settings))
-        miss = leg.miss
+        miss, scarce = leg.miss, leg.scarce
         legs[i, 3] = leg_length(leg)
         length += legs[i, 3]
         if i + 1 < legs.shape[0]:
             short += max(shortest - legs[i, 3], 0.0)
         pose[:] = end
-    # With a+ = max(a, 0): J = length + p_c (comfort - margin)+ + p_m miss + p_b b,
+    # With a+ = max(a, 0): J = length + p_c (comfort - margin)+ + p_m scarce + p_b b,
     # b = (-margin)+ + (miss - tolerance)+ + (length - reach)+ + sum (shortest - length of a leg)+.
     broken = max(-margin, 0.0) + max(miss - settings.goal_tolerance, 0.0)
     broken += max(length - question.reach, 0.0) + short
     cost = length + _COMFORT_PRICE * max(settings.comfort - margin, 0.0)
-    cost += _PRICE_OF_MISS * miss + _PRICE_OF_BROKEN * broken
-    return Assessment(length, margin, beginning, miss, broken, cost)
+    cost += _PRICE_OF_MISS * scarce + _PRICE_OF_BROKEN * broken
+    return Assessment(length, margin, beginning, scarce, broken, cost)

@@ -42,6 +42,8 @@ class Leg(NamedTuple):
         Of the arc [1/m].
     miss : float
         Distance by which it passes the aim; 0 where it leads there [m].
+    scarce : float
+        The same for a share of the curvature: the rest is held back to correct with [m].
     """
 
     turn: float
@@ -50,6 +52,7 @@ class Leg(NamedTuple):
     straight: float
     curvature: float
     miss: float
+    scarce: float
 
 
 @compiled
@@ -105,7 +108,7 @@ def seen_from(pose: Array, aim: Array) -> tuple[float, float, float]:
 
 
 @compiled
-def leg_towards(pose: Array, aim: Array, curvature: float, turn_rate: float) -> Leg:
+def leg_towards(pose: Array, aim: Array, curvature: float, share: float, turn_rate: float) -> Leg:
     """Return the leg that leads from a tip to an aim.
 
     The turn, after which the aim lies in the plane of the bend, is found by iteration; arc and
@@ -119,6 +122,8 @@ def leg_towards(pose: Array, aim: Array, curvature: float, turn_rate: float) -> 
         Where to [m].
     curvature : float
         kappa [1/m].
+    share : float
+        Share of it that `scarce` is for.
     turn_rate : float
         Most that the bevel turns per inserted length [rad/m].
     """
@@ -139,19 +144,20 @@ def leg_towards(pose: Array, aim: Array, curvature: float, turn_rate: float) -> 
             if abs(change) < _TURN_FOUND:
                 break
     gentle = 2.0 * aside / (aside * aside + ahead * ahead)
-    if abs(change) >= _TURN_FOUND and gentle < curvature and ahead > 0.0:
+    if abs(change) >= _TURN_FOUND and gentle < curvature * share and ahead > 0.0:
         # So nearly ahead that the bevel bends past it while it turns: to and fro, on the mean.
         angle = 2.0 * math.atan2(aside, ahead)
-        return Leg(first, 0.0, angle / gentle, 0.0, gentle, 0.0)
+        return Leg(first, 0.0, angle / gentle, 0.0, gentle, 0.0, 0.0)
     aside, turning = math.hypot(x, y), abs(turn) / turn_rate
     if z <= 0.0:
-        return Leg(turn, turning, 0.0, 0.0, curvature, aside - z)
-    radius = 1.0 / curvature
-    # From the circle's centre; within it the aim is missed by how deep it lies.
+        return Leg(turn, turning, 0.0, 0.0, curvature, aside - z, aside - z)
+    # Within a circle the aim is missed by how deep it lies.
+    wider, radius = 1.0 / (curvature * share), 1.0 / curvature
+    scarce = max(wider - math.hypot(z, wider - aside), 0.0)
     center = math.hypot(z, radius - aside)
     miss, straight = max(radius - center, 0.0), math.sqrt(max(center**2 - radius**2, 0.0))
     angle = math.atan2(z, radius - aside) - math.atan2(straight, radius)
-    return Leg(turn, turning, max(angle, 0.0) * radius, straight, curvature, miss)
+    return Leg(turn, turning, max(angle, 0.0) * radius, straight, curvature, miss, scarce)
 
 
 @compiled
@@ -163,7 +169,7 @@ def cut_short(leg: Leg, longest: float) -> Leg:
         turn *= turning / leg.turning
     bend = min(leg.bend, longest - turning)
     straight = min(leg.straight, longest - turning - bend)
-    return Leg(turn, turning, bend, straight, leg.curvature, leg.miss)
+    return Leg(turn, turning, bend, straight, leg.curvature, leg.miss, leg.scarce)
 
 
 @compiled

@@ -48,7 +48,7 @@ class NeedlePath:
         Below 0 where it is followed all the same, for want of another.
     beginning : float
         The same of its first `committed_length`, for a pose that is known [m].
-    miss, broken, cost : float
+    scarce, broken, cost : float
         See `Assessment` [m].
     """
 
@@ -57,7 +57,7 @@ class NeedlePath:
     length: float
     margin: float
     beginning: float
-    miss: float
+    scarce: float
     broken: float
     cost: float
 
@@ -227,7 +227,7 @@ class PathPlanner:
 
     def _lacks_nothing(self, path: NeedlePath) -> bool:
         """Return whether nothing but a shorter path is better."""
-        return path.margin >= self.settings.comfort and path.miss <= 0.0
+        return path.margin >= self.settings.comfort and path.scarce <= 0.0
 
 
 def _answer(legs: Array, question: Question, insertion: float) -> NeedlePath:

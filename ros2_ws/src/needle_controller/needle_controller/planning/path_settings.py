@@ -18,6 +18,8 @@ class PathSettings(NamedTuple):
         Most that the bevel turns per inserted length [rad/m].
     curvature_share : float
         Share of the curvature that paths are planned with: the rest corrects.
+    comfortable_share : float
+        Share of the curvature with which the last leg had better lead to the target.
     needle_radius : float
         Of the needle [m].
     sigmas : float
@@ -39,6 +41,7 @@ class PathSettings(NamedTuple):
 
     max_rotation_per_length: Annotated[float, Bounds(1.0, 1e5, "rad/m")]
     curvature_share: Annotated[float, Bounds(0.5, 1.0, "-")] = 0.9
+    comfortable_share: Annotated[float, Bounds(0.5, 1.0, "-")] = 0.8
     needle_radius: Annotated[float, Bounds(0.0, 0.01, "m")] = 0.00035
     sigmas: Annotated[float, Bounds(0.0, 10.0, "-")] = 2.0
     settled_std: Annotated[float, Bounds(0.0, 0.01, "m")] = 0.0002

@@ -16,7 +16,7 @@ from needle_controller.planning.path_planner import NeedlePath, PathPlanner, Tip
 from needle_controller.planning.path_settings import PathSettings
 
 CURVATURE = 1.0 / 0.1356
-SETTINGS = PathSettings(math.radians(30.0) / 0.001, curvature_share=1.0)
+SETTINGS = PathSettings(math.radians(30.0) / 0.001, curvature_share=1.0, comfortable_share=1.0)
 PLANNER = PathPlanner(SETTINGS)
 ENTRY = TipState(np.zeros(3), np.eye(3), CURVATURE)
 TARGET = np.array([0.0, 0.0, 0.1])

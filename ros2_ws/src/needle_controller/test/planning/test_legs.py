@@ -49,9 +49,9 @@ def test_a_leg_leads_to_its_aim() -> None:
         rng = np.random.default_rng([11, seed])
         pose = pose_of(*rng.uniform([-math.pi, -0.3, -0.3], [math.pi, 0.3, 0.3]))
         aim = pose[:, :3] @ [*rng.uniform(-0.008, 0.008, 2), rng.uniform(0.06, 0.12)]
-        leg = leg_towards(pose, aim, CURVATURE, RATE)
+        leg = leg_towards(pose, aim, CURVATURE, 0.8, RATE)
         count = trace(pose, leg, CURVATURE, 0.01, points, end)
-        assert leg.miss == 0.0
+        assert leg.miss == leg.scarce == 0.0
         assert leg.turning in (0.0, pytest.approx(abs(leg.turn) / RATE))
         assert leg.curvature <= CURVATURE
         assert abs(leg.turn) <= 1.31 * math.pi
@@ -67,20 +67,28 @@ def test_an_aim_within_the_circle_is_missed_by_how_deep_it_lies() -> None:
     radius = 1.0 / CURVATURE
     inner = radius - 0.003
     aim = np.array([0.0, -radius + inner * math.cos(0.4), inner * math.sin(0.4)])
-    leg = leg_towards(pose_of(), aim, CURVATURE, RATE)
+    leg = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
     assert leg.miss == pytest.approx(0.003, abs=1e-6)
-    behind = leg_towards(pose_of(), np.array([0.0, -0.001, -0.02]), CURVATURE, RATE)
+    assert leg.scarce > leg.miss
+    behind = leg_towards(pose_of(), np.array([0.0, -0.001, -0.02]), CURVATURE, 0.8, RATE)
     assert behind.miss > 0.02
+    # Scarce is what a share of the curvature misses.
+    aim = np.array([0.0, -0.0148, 0.0605])
+    full = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
+    share = leg_towards(pose_of(), aim, 0.8 * CURVATURE, 1.0, RATE)
+    assert full.miss == 0.0
+    assert full.scarce == pytest.approx(share.miss)
+    assert full.scarce > 1e-4
 
 
 def test_a_leg_is_cut_where_its_whole_goes_through() -> None:
     aim = np.array([0.006, 0.003, 0.09])
-    whole = leg_towards(pose_of(), aim, CURVATURE, RATE)
+    whole = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
     points, end = np.empty((MOST_POINTS, 4)), np.empty((3, 4))
     for longest in (0.001, 0.01, 0.06, 1.0):
         part = cut_short(whole, longest)
         assert leg_length(part) == pytest.approx(min(longest, leg_length(whole)))
         trace(pose_of(), part, CURVATURE, 0.0, points, end)
-        rest = leg_towards(end, aim, CURVATURE, RATE)
+        rest = leg_towards(end, aim, CURVATURE, 0.8, RATE)
         both = leg_length(part) + leg_length(rest)
         assert both == pytest.approx(leg_length(whole), abs=1e-4)

@@ -44,7 +44,7 @@ def driven(tip: TipState, path: NeedlePath, curvature: float) -> Array:
     pose = np.vstack([tip.pose, [0.0, 0.0, 0.0, 1.0]])
     places = [pose[:3, 3]]
     for row in path.legs:
-        leg = leg_towards(pose[:3], row[:3], curvature, RATE)
+        leg = leg_towards(pose[:3], row[:3], curvature, 1.0, RATE)
         leg = cut_short(leg, row[3])
         # Where it bends less than it can, the bevel goes to and fro: this is the mean.
         assert leg.curvature < curvature or abs(leg.turn) <= RATE * leg.turning + 1e-9
@@ -77,7 +77,7 @@ def sampled_clearance(places: Array, obstacles: Obstacles) -> float:
 
 
 def test_a_path_that_is_driven_again_is_clear_and_ends_within_the_tolerance() -> None:
-    settings = PathSettings(RATE, curvature_share=0.9)
+    settings = PathSettings(RATE, curvature_share=0.9, comfortable_share=0.9)
     plans, paths = PathPlanner(settings), 0
     for seed in range(30):
         rng = np.random.default_rng([8, seed])
