@@ -86,31 +86,25 @@ def first_path(
     path = planner.path(entry, target, obstacles)
     if path is not None:
         return path
-    settings = planner.settings
-    for name, point in (("target point", target), ("entry", entry.position)):
-        clearance = obstacles.clearance(point)
-        if name == "target point":
-            clearance += settings.goal_tolerance
-        if clearance < settings.least_clear:
-            return NoPath(
-                f"the {name} is {obstacles.clearance(point):.4g} m from an obstacle, "
-                f"wants >= {settings.least_clear:.4g} m",
-                exists_none=True,
-            )
+    clear = planner.settings.least_clear
+    for name, point, wanted in (
+        ("target point", target, clear - planner.settings.goal_tolerance),
+        ("entry", entry.position, clear),
+    ):
+        if (there := obstacles.clearance(point)) < wanted:
+            why = f"the {name} is {there:.4g} m from an obstacle, wants >= {wanted:.4g} m"
+            return NoPath(why, exists_none=True)
     some = planner.may_have_path(entry, target, obstacles)
-    if some:
-        path = planner.path(entry, target, obstacles, starts=THOROUGH_STARTS)
-        if path is not None:
-            return path
-    why = f"no path to the target point is clear of the {len(obstacles)} obstacles"
-    if some:
-        why = f"no path to the target point was found clear of the {len(obstacles)} obstacles"
+    path = planner.path(entry, target, obstacles, starts=THOROUGH_STARTS) if some else None
+    if path is not None:
+        return path
+    is_clear = "was found clear" if some else "is clear"
+    why = f"no path to the target point {is_clear} of the {len(obstacles)} obstacles"
     nearest = nearest_entry(planner, entry, target, obstacles)
     if nearest is None:
         why += f", nor is one from an entry up to {_OFFSETS[-1]:.4g} m beside it"
     else:
-        x, y = nearest
-        why += f"; entering at ({x:.4g}, {y:.4g}) m in place of (0, 0) there is one"
+        why += "; entering at ({:.4g}, {:.4g}) m in place of (0, 0) there is one".format(*nearest)
     return NoPath(why, exists_none=not some)
 
 
@@ -124,7 +118,6 @@ def nearest_entry(
     for offset, k in itertools.product(_OFFSETS, range(_AROUND)):
         angle = 2.0 * math.pi * k / _AROUND
         moved = entry.position + offset * np.array([math.cos(angle), math.sin(angle), 0.0])
-        tip = TipState(moved, entry.rotation, entry.curvature, heading_std=entry.heading_std)
-        if planner.path(tip, target, obstacles) is not None:
+        if planner.path(dataclasses.replace(entry, position=moved), target, obstacles) is not None:
             return np.asarray(moved[:2])
     return None

@@ -140,6 +140,9 @@ class PathPlanner:
     ) -> NeedlePath | None:
         """Return the path to follow, None where none is found.
 
+        Before insertion it keeps all that it must. On the way the best is followed even where it
+        does not, while its beginning is clear: new tips may show that it does.
+
         Parameters
         ----------
         tip : TipState
@@ -161,16 +164,14 @@ class PathPlanner:
             A curvature or insertion that is not finite or out of bounds.
         """
         question = self._question(tip, target, obstacles, insertion)
-        if followed is None:
-            path = self._best(question, insertion, None, starts)
-            return path if path is not None and path.broken <= 0.0 else None
         path = self._best(question, insertion, followed, starts)
-        if path is None or path.broken > 0.0:
-            # All of the curvature: this is what the rest was held back for.
-            path = self._best(
-                question._replace(curvature=tip.curvature), insertion, followed, starts
-            )
-        return path
+        if path is not None and path.broken <= 0.0:
+            return path
+        if followed is None:
+            return None
+        # All of the curvature: this is what the rest was held back for.
+        question = question._replace(curvature=tip.curvature)
+        return self._best(question, insertion, followed, starts)
 
     def _best(
         self, question: Question, insertion: float, followed: NeedlePath | None, starts: int
