@@ -20,7 +20,7 @@ which it passes the target less, and by which it breaks less of what it must kee
 
 
 class Assessment(NamedTuple):
-    """What is to be said of a path; all in [m].
+    """Verdict on a path; all in [m].
 
     Attributes
     ----------

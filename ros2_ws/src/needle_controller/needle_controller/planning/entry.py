@@ -51,7 +51,7 @@ def entry_state(
 
 @dataclasses.dataclass(frozen=True)
 class NoPath:
-    """Why a needle that is still out cannot set out.
+    """Reason that a needle that is still out cannot set out.
 
     Attributes
     ----------

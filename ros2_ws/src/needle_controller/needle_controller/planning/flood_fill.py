@@ -1,4 +1,4 @@
-"""Where a flood fill proves that no path to a target exists; compiled.
+"""Proof that no path to a target exists, by a flood fill; compiled.
 
 The places that a path may pass are filled plane by plane from the entry on. What is asked of them
 is necessary, not sufficient, so where the fill does not come to the target no path does, however

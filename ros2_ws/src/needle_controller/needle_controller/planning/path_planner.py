@@ -2,8 +2,8 @@
 
 What is followed is the law for points (turn the bevel towards where the needle is to go) with the
 path's next via point in the target's place. The plan of the step before is kept, from where the
-needle is now, while it is clear and no other is better by `better_by`: a plan that changes its mind
-with the noise of every tip turns the bevel for nothing.
+needle is now, while its beginning is clear and no other is better by `_BETTER_BY`: a plan that
+changes its mind with the noise of every tip turns the bevel for nothing.
 """
 
 from __future__ import annotations

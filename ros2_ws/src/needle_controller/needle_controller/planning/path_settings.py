@@ -53,7 +53,7 @@ class PathSettings(NamedTuple):
 
     @property
     def least_clear(self) -> float:
-        """What a path's axis must be clear by of what is known [m]."""
+        """Least clearance of a path's axis where the pose is known [m]."""
         return self.needle_radius + self.sigmas * self.settled_std
 
 
@@ -73,7 +73,7 @@ class Unknown(NamedTuple):
 
 
 class Question(NamedTuple):
-    """What a path is asked for.
+    """Task of a path.
 
     Attributes
     ----------
