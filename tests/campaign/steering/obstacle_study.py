@@ -44,7 +44,7 @@ LABELS = {
     "solvable_reached": "  reached within 1 mm, of those solvable",
     "roomy": "solvable with 85 % of the curvature, 1.25 mm clear",
     "roomy_reached": "  reached within 1 mm, of those",
-    "unsolvable": "no way with all the curvature, 0.35 mm clear",
+    "unsolvable": "no way found with all the curvature, 0.35 mm clear",
     "unsolvable_refused": "  refused before insertion, of those",
     "taken": "taken on of all",
     "reached_of_taken": "  reached within 1 mm, of those",
@@ -242,7 +242,12 @@ def figures(outcomes: Sequence[SceneOutcome], times: Sequence[float]) -> dict[st
 
     solvable = [one for one in outcomes if one.solvable]
     roomy = [one for one in outcomes if one.roomy]
-    unsolvable = [one for one in outcomes if not (one.bare or one.solvable or one.roomy)]
+    # The judge misses some ways: where a needle was led there, there is one.
+    unsolvable = [
+        one
+        for one in outcomes
+        if not (one.bare or one.solvable or one.roomy or (reached(one) and one.least >= 0.0))
+    ]
     taken = [one for one in outcomes if one.taken]
     return {
         "scenes": len(outcomes),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
@@ -12,6 +13,7 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.planning.obstacles import Obstacles
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
+from needle_controller.planning.path_search import THOROUGH_STARTS
 
 _OFFSETS = (0.001, 0.002, 0.004, 0.007, 0.011, 0.016)
 """Distances at which other entries are looked for [m]."""
@@ -47,34 +49,63 @@ def entry_state(
     return TipState(np.array([x, y, 0.0]), angles, curvature, heading_std=heading_std)
 
 
-def why_unreachable(
+@dataclasses.dataclass(frozen=True)
+class NoPath:
+    """Reason that a needle that is still out cannot set out.
+
+    Attributes
+    ----------
+    why : str
+        In words; with an entry from where there is a path, if one is near.
+    exists_none : bool
+        Whether no path exists for certain, rather than that none was found.
+    """
+
+    why: str
+    exists_none: bool
+
+
+def first_path(
     planner: PathPlanner, entry: TipState, target: npt.ArrayLike, obstacles: Obstacles
-) -> str:
-    """Return why no path leads from the entry to a target, and from where one does.
+) -> NeedlePath | NoPath:
+    """Return the path of a needle that is still out, or why there is none.
+
+    Where the quick search finds nothing and none is proved, the thorough one is asked.
 
     Parameters
     ----------
     planner : PathPlanner
         Its settings say what must be clear.
     entry : TipState
-        The needle's tip, for which there is no path.
+        The needle's tip.
     target : array_like, shape (3,)
         In `rig` [m].
     obstacles : Obstacles
         What is in the way.
     """
-    settings = planner.settings
-    wanted = settings.needle_radius + settings.sigmas * settings.settled_std
-    for name, point in (("target point", target), ("entry", entry.position)):
-        clearance = obstacles.clearance(point)
-        if clearance < wanted:
-            return f"the {name} is {clearance:.4g} m from an obstacle, wants >= {wanted:.4g} m"
-    why = f"no path to the target point is clear of the {len(obstacles)} obstacles"
+    path = planner.path(entry, target, obstacles)
+    if path is not None:
+        return path
+    clear = planner.settings.least_clear
+    for name, point, wanted in (
+        ("target point", target, clear - planner.settings.goal_tolerance),
+        ("entry", entry.position, clear),
+    ):
+        if (there := obstacles.clearance(point)) < wanted:
+            why = f"the {name} is {there:.4g} m from an obstacle, wants >= {wanted:.4g} m"
+            return NoPath(why, exists_none=True)
+    some = planner.may_have_path(entry, target, obstacles)
+    path = planner.path(entry, target, obstacles, starts=THOROUGH_STARTS) if some else None
+    if path is not None:
+        return path
+    is_clear = "was found clear" if some else "is clear"
+    why = f"no path to the target point {is_clear} of the {len(obstacles)} obstacles"
     nearest = nearest_entry(planner, entry, target, obstacles)
     if nearest is None:
-        return f"{why}, nor is one from an entry up to {_OFFSETS[-1]:.4g} m beside it"
-    x, y = nearest
-    return f"{why}; entering at ({x:.4g}, {y:.4g}) m in place of (0, 0) there is one"
+        why += f", nor is one from an entry up to {_OFFSETS[-1]:.4g} m beside it"
+    else:
+        why += "; entering at ({:.4g}, {:.4g}) m in place of (0, 0) there is one".format(*nearest)
+    return NoPath(why, exists_none=not some)
 
 
 def nearest_entry(
@@ -82,23 +113,11 @@ def nearest_entry(
 ) -> Array | None:
     """Return the nearest entry (x, y) [m], on rings around one, from where there is a path.
 
-    Parameters as of `why_unreachable`. The needle keeps its heading and its bevel.
+    Parameters as of `first_path`. The needle keeps its heading and its bevel.
     """
     for offset, k in itertools.product(_OFFSETS, range(_AROUND)):
         angle = 2.0 * math.pi * k / _AROUND
         moved = entry.position + offset * np.array([math.cos(angle), math.sin(angle), 0.0])
-        tip = TipState(moved, entry.rotation, entry.curvature, heading_std=entry.heading_std)
-        if planner.path(tip, target, obstacles) is not None:
+        if planner.path(dataclasses.replace(entry, position=moved), target, obstacles) is not None:
             return np.asarray(moved[:2])
     return None
-
-
-def first_path(
-    planner: PathPlanner, entry: TipState, target: npt.ArrayLike, obstacles: Obstacles
-) -> tuple[NeedlePath | None, str]:
-    """Return the path of a needle that is still out, or why there is none.
-
-    Parameters as of `why_unreachable`.
-    """
-    path = planner.path(entry, target, obstacles)
-    return path, "" if path is not None else why_unreachable(planner, entry, target, obstacles)

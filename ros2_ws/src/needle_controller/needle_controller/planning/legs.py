@@ -151,21 +151,13 @@ def leg_towards(pose: Array, aim: Array, curvature: float, share: float, turn_ra
     aside, turning = math.hypot(x, y), abs(turn) / turn_rate
     if z <= 0.0:
         return Leg(turn, turning, 0.0, 0.0, curvature, aside - z, aside - z)
-    scarce, _ = _tangent(aside, z, 1.0 / (curvature * share))
-    radius = 1.0 / curvature
-    miss, straight = _tangent(aside, z, radius)
+    # Within a circle the aim is missed by how deep it lies.
+    wider, radius = 1.0 / (curvature * share), 1.0 / curvature
+    scarce = max(wider - math.hypot(z, wider - aside), 0.0)
+    center = math.hypot(z, radius - aside)
+    miss, straight = max(radius - center, 0.0), math.sqrt(max(center**2 - radius**2, 0.0))
     angle = math.atan2(z, radius - aside) - math.atan2(straight, radius)
     return Leg(turn, turning, max(angle, 0.0) * radius, straight, curvature, miss, scarce)
-
-
-@compiled
-def _tangent(aside: float, ahead: float, radius: float) -> tuple[float, float]:
-    """Return how deep in a circle a point lies, and its tangent's length if it lies outside [m]."""
-    over = radius - aside
-    square = ahead * ahead + over * over - radius * radius
-    if square < 0.0:
-        return radius - math.hypot(ahead, over), 0.0
-    return 0.0, math.sqrt(square)
 
 
 @compiled

@@ -2,8 +2,8 @@
 
 What is followed is the law for points (turn the bevel towards where the needle is to go) with the
 path's next via point in the target's place. The plan of the step before is kept, from where the
-needle is now, while it is clear and no other is better by `better_by`: a plan that changes its mind
-with the noise of every tip turns the bevel for nothing.
+needle is now, while its beginning is clear and no other is better by `_BETTER_BY`: a plan that
+changes its mind with the noise of every tip turns the bevel for nothing.
 """
 
 from __future__ import annotations
@@ -16,19 +16,14 @@ import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
 from needle_controller.planning.clearance import assess
+from needle_controller.planning.flood_fill import may_have_path
 from needle_controller.planning.obstacles import Obstacles
-from needle_controller.planning.path_search import MOST_VIA_POINTS, search
-from needle_controller.planning.path_settings import PathSettings, Unknown
-from needle_controller.planning.via_points import candidate_points
+from needle_controller.planning.path_search import QUICK_STARTS, first_guess, improve
+from needle_controller.planning.path_settings import PathSettings, Question, Unknown
 from needle_core.settings.bounds import check_bounded_fields, check_bounds
 
-_STREWN = 1000
-"""Points that a search grows its tree to beside those around the obstacles."""
 _BETTER_BY = 0.004
 """Cost by which another path must be better than the one that is followed [m]."""
-_PRICE_OF_DANGER, _PRICE_OF_MISS = 30.0, 5.0
-"""Length that a path may be longer for each length that it lacks of what it must be clear by, and
-that it passes the target by."""
 _ERODED = 0.5
 """Share of what must be clear beside the needle that may be lost just before it, on the way."""
 _SHORTEST_REST = 0.0005
@@ -37,7 +32,7 @@ _SHORTEST_REST = 0.0005
 
 @dataclasses.dataclass(frozen=True)
 class NeedlePath:
-    """A path that is clear.
+    """A path.
 
     Attributes
     ----------
@@ -53,10 +48,8 @@ class NeedlePath:
         Below 0 where it is followed all the same, for want of another.
     beginning : float
         The same of its first `committed_length`, for a pose that is known [m].
-    miss : float
-        Distance by which it passes the target [m].
-    scarce : float
-        The same for `curvature_share` of the curvature [m].
+    scarce, broken, cost : float
+        See `Assessment` [m].
     """
 
     legs: Array
@@ -64,8 +57,9 @@ class NeedlePath:
     length: float
     margin: float
     beginning: float
-    miss: float
     scarce: float
+    broken: float
+    cost: float
 
     @property
     def aim(self) -> Array:
@@ -115,16 +109,6 @@ class TipState:
         return Unknown(self.position_std, self.heading_std)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Question:
-    """Arguments with which a path is asked for; see `PathPlanner.path`."""
-
-    tip: TipState
-    target: Array
-    obstacles: Obstacles
-    insertion: float
-
-
 class PathPlanner:
     """Plans paths for one needle.
 
@@ -142,6 +126,7 @@ class PathPlanner:
     def __init__(self, settings: PathSettings) -> None:
         check_bounded_fields(settings)
         self.settings = settings
+        self._least_beginning = -_ERODED * settings.sigmas * settings.settled_std
 
     def path(
         self,
@@ -151,8 +136,12 @@ class PathPlanner:
         *,
         insertion: float = 0.0,
         followed: NeedlePath | None = None,
+        starts: int = QUICK_STARTS,
     ) -> NeedlePath | None:
-        """Return the path to follow, None where none is clear.
+        """Return the path to follow, None where none is found.
+
+        Before insertion it keeps all that it must. On the way the best is followed even where it
+        does not, while its beginning is clear: new tips may show that it does.
 
         Parameters
         ----------
@@ -166,104 +155,81 @@ class PathPlanner:
             Present insertion [m].
         followed : NeedlePath, optional
             What was followed up to now.
+        starts : int
+            How often the search is begun, at most.
 
         Raises
         ------
         UserError
             A curvature or insertion that is not finite or out of bounds.
         """
-        check_bounds("curvature", tip.curvature, 0.1, 100.0, "1/m")
-        goal = np.array(target, dtype=float)
-        question = _Question(tip, goal, obstacles, insertion)
-        kept = None if followed is None else self._kept(question, followed)
-        if kept is not None and kept.margin >= self.settings.comfort and kept.scarce <= 0.0:
-            # Nothing but a shorter way is better.
-            found: NeedlePath | None = self._straight(question)
-        else:
-            found = self._found(question, on_the_way=followed is not None)
-        if kept is None:
-            return found
-        if found is None or self._cost(found) > self._cost(kept) - _BETTER_BY:
-            return kept
-        return found
-
-    def _straight(self, question: _Question) -> NeedlePath | None:
-        path = self._along(question, straight_to(question.target))
-        return path if path.margin >= 0.0 and path.scarce <= 0.0 else None
-
-    def _kept(self, question: _Question, followed: NeedlePath) -> NeedlePath | None:
-        """Return what is left of the path followed, None where it comes too near to an obstacle."""
-        rest = followed.rest(question.insertion)
-        rest[-1, :3] = question.target
-        path, settings = self._along(question, rest), self.settings
-        return path if path.beginning >= -_ERODED * settings.sigmas * settings.settled_std else None
-
-    def _along(self, question: _Question, legs: Array) -> NeedlePath:
-        tip = question.tip
-        length, margin, beginning, miss, scarce = assess(
-            tip.pose,
-            legs,
-            tip.curvature,
-            question.obstacles.table,
-            tip.unknown,
-            self.settings,
-        )
-        return NeedlePath(legs, question.insertion, length, margin, beginning, miss, scarce)
-
-    def _found(self, question: _Question, *, on_the_way: bool) -> NeedlePath | None:
-        """Return the best path of some searches, None where there is none.
-
-        Where a path with little curvature is not comfortable, one with more may be. A needle on its
-        way without a path takes one that is clear by what it will know by then.
-        """
-        settings, tip = self.settings, question.tip
-        scarce = settings._replace(curvature_share=settings.largest_curvature_share)
-        found = self._searched(question, tip.unknown, settings)
-        if found is not None and found.margin >= settings.comfort:
-            return found
-        paths = [found, self._searched(question, tip.unknown, scarce)]
-        if on_the_way and paths == [None, None]:
-            paths = [self._searched(question, Unknown(0.0, 0.0), scarce)]
-        clear = [path for path in paths if path is not None]
-        return min(clear, key=self._cost) if clear else None
-
-    def _searched(
-        self, question: _Question, unknown: Unknown, settings: PathSettings
-    ) -> NeedlePath | None:
-        tip, table = question.tip, question.obstacles.table
-        clear = settings.needle_radius + settings.sigmas * settings.settled_std
-        distances = clear + np.array([0.0002, settings.comfort, 3.0 * settings.comfort])
-        position = np.array(tip.position, dtype=float)
-        candidates = candidate_points(position, question.target, table, distances, _STREWN)
-        legs = np.full((MOST_VIA_POINTS + 1, 4), math.inf)
-        count = search(
-            tip.pose,
-            question.target,
-            tip.curvature,
-            table,
-            candidates,
-            unknown,
-            settings,
-            settings.longest - question.insertion,
-            legs,
-        )
-        if count < 0:
+        question = self._question(tip, target, obstacles, insertion)
+        path = self._best(question, insertion, followed, starts)
+        if path is not None and path.broken <= 0.0:
+            return path
+        if followed is None:
             return None
-        legs[count, :3] = question.target
-        legs[count, 3] = math.inf
-        return self._along(question, legs[: count + 1].copy())
+        # All of the curvature: this is what the rest was held back for.
+        question = question._replace(curvature=tip.curvature)
+        return self._best(question, insertion, followed, starts)
 
-    def _cost(self, path: NeedlePath) -> float:
+    def _best(
+        self, question: Question, insertion: float, followed: NeedlePath | None, starts: int
+    ) -> NeedlePath | None:
+        """Return the path that costs least, None where none is clear for its beginning."""
+        rest = np.array([[*question.target, math.inf]])
+        best = kept = _answer(rest, question, insertion)
+        if followed is not None:
+            rest = followed.rest(insertion)
+            rest[-1, :3] = question.target
+            kept = _answer(rest, question, insertion)
+        for number in range(starts):
+            if self._lacks_nothing(best) or self._lacks_nothing(kept):
+                break
+            if best.broken <= 0.0 and number >= QUICK_STARTS:
+                break
+            legs, draws = first_guess(question.start[:, 3], question.target, number)
+            path = NeedlePath(legs, insertion, *improve(legs, question, draws))
+            if path.cost < best.cost:
+                best = path
+        favour = 0.0 if followed is None else _BETTER_BY
+        clear = [path for path in (kept, best) if path.beginning >= self._least_beginning]
+        return min(clear, key=lambda path: path.cost - favour * (path is kept), default=None)
+
+    def warm_up(self) -> None:
+        """Run what questions run: compiled code is made here, not while a needle waits for it."""
+        tip, target = TipState(np.zeros(3), np.eye(3), 1.0), np.array([0.0, 0.0, 0.01])
+        question = self._question(tip, target, Obstacles(), 0.0)
+        may_have_path(question)
+        legs, draws = first_guess(tip.position, target, 0)
+        improve(legs, question, draws[:1])
+
+    def may_have_path(self, tip: TipState, target: npt.ArrayLike, obstacles: Obstacles) -> bool:
+        """Return False where it is certain that no path exists, not even for a pose that is known.
+
+        Parameters as of `path`.
+        """
+        return may_have_path(self._question(tip, target, obstacles, 0.0))
+
+    def _question(
+        self, tip: TipState, target: npt.ArrayLike, obstacles: Obstacles, insertion: float
+    ) -> Question:
+        check_bounds("curvature", tip.curvature, 0.1, 100.0, "1/m")
         settings = self.settings
-        lacking = max(settings.comfort - path.margin, 0.0)
-        return (
-            path.length
-            + settings.comfort_price * lacking
-            + _PRICE_OF_DANGER * max(-path.margin, 0.0)
-            + _PRICE_OF_MISS * path.scarce
+        return Question(
+            tip.pose,
+            np.array(target, dtype=float),
+            settings.curvature_share * tip.curvature,
+            obstacles.table,
+            tip.unknown,
+            settings.longest - insertion,
+            settings,
         )
 
+    def _lacks_nothing(self, path: NeedlePath) -> bool:
+        """Return whether nothing but a shorter path is better."""
+        return path.margin >= self.settings.comfort and path.scarce <= 0.0
 
-def straight_to(target: Array) -> Array:
-    """Return the legs of the way to a target without via points, shape (1, 4) [m]."""
-    return np.array([[*target, math.inf]])
+
+def _answer(legs: Array, question: Question, insertion: float) -> NeedlePath:
+    return NeedlePath(legs, insertion, *assess(legs, question, 0.0))

@@ -1,10 +1,19 @@
-"""The search for a path: a tree of legs over via points, grown point by point; compiled.
+"""The search for a path: via points, moved by an evolution strategy until their path is good.
 
-Every path is a chain of legs (`legs`), each towards a via point and the last towards the target.
-Nodes of the tree are tips after legs that are clear of all obstacles. Each point is reached from
-the nodes from where that is shortest, and from each new node the target is tried (a rapidly
-exploring tree, LaValle and Kuffner 2001, that chooses its parents by cost as RRT* does, Karaman and
-Frazzoli 2011). The points are a fixed sequence: the same question has the same answer.
+A path is a chain of legs (`legs`) over m via points, the last to the target. For x, the 3 m
+coordinates of the via points, its cost J (`clearance`) says how good it is; MA-ES (H.-G. Beyer, B.
+Sendhoff, "Simplify your covariance matrix adaptation evolution strategy", IEEE Trans. Evolutionary
+Computation 21(5), 2017) minimises that, with its own constants and without derivatives:
+
+    z_k ~ N(0, I),  d_k = M z_k,  x_k = y + sigma d_k,  k = 1 .. lambda, sorted by cost
+    y     <- y + sigma sum_k w_k d_k                                   k = 1 .. mu = lambda / 2
+    s     <- (1 - c_s) s + sqrt(mu_w c_s (2 - c_s)) sum_k w_k z_k
+    M     <- M (I + c_1 / 2 (s s' - I) + c_w / 2 (sum_k w_k z_k z_k' - I))
+    sigma <- sigma exp(c_s / 2 (|s| / E|N(0, I)| - 1))
+
+It finds the narrow ways that points strewn beforehand miss, since every path that was tried, also
+one that touches something, says where better ones lie. The draws z depend on the start's number
+alone: the same question has the same answer.
 """
 
 # Compiled code takes keywords slowly or not at all.
@@ -18,220 +27,170 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
-from needle_controller.planning.clearance import chain_margin
-from needle_controller.planning.legs import (
-    MOST_POINTS,
-    cut_short,
-    leg_length,
-    leg_towards,
-    trace,
-)
-from needle_controller.planning.path_settings import PathSettings, Unknown
+from needle_controller.planning.clearance import Assessment, assess
+from needle_controller.planning.path_settings import Question
 from needle_core.compiled import compiled
 
-MOST_VIA_POINTS = 6
-_SHORTEST_LEG = 0.004
-_PARENTS_TRIED = 6
-_PARENTS_TAKEN = 2
+MOST_VIA_POINTS = 3
 _Indices = npt.NDArray[np.int64]
+QUICK_STARTS, THOROUGH_STARTS = 3, 250
+"""Starts of the search on the way, and before insertion where those find nothing: about 10 ms and 2
+s of one core."""
+_PATHS = 10
+"""lambda, paths of a generation, of a quick start; the others have twice as many, which find more
+per start (A. Auger, N. Hansen, "A restart CMA evolution strategy with increasing population size",
+2005)."""
+_GENERATIONS = 60
+_SPREAD, _LEAST_SPREAD = 0.004, 1e-5
+"""sigma at the start, and below which via points no longer matter [m]."""
+_SHORTEST_LEG = 0.01
+"""To a via point [m]: the bevel's half turn takes 6 mm, and nearer points are aimed at badly."""
+_WIDTH = 0.03
+"""Of the tube around the straight way in which searches start [m]: the widest obstacle's and more.
+"""
+_PLACES = 1.1127756842787055 ** -np.arange(1.0, 2 * MOST_VIA_POINTS + 1)
+"""Steps of the R sequence in 6 dimensions (M. Roberts 2018), of which g^7 = g + 1."""
 
 
-class _Tree(NamedTuple):
-    """Nodes of a tree: tips, with length and margin of the way there, and where it came from."""
-
-    poses: Array
-    length: Array
-    margin: Array
-    parent: _Indices
-    via: _Indices
-    depth: _Indices
-
-
-@compiled
-def search(
-    start: Array,
-    target: Array,
-    curvature: float,
-    table: Array,
-    candidates: Array,
-    unknown: Unknown,
-    settings: PathSettings,
-    reach: float,
-    via_points: Array,
-) -> int:
-    """Find a path; write its via points and return their number, -1 where there is no path.
+def first_guess(tip: Array, target: Array, number: int) -> tuple[Array, Array]:
+    """Return where one start of the search begins, and its draws.
 
     Parameters
     ----------
-    start : ndarray, shape (3, 4)
-        The tip's pose.
-    target : ndarray, shape (3,)
-        Where to [m].
-    curvature : float
-        kappa [1/m].
-    table : ndarray, shape (N, 7)
-        See `Obstacles`.
-    candidates : ndarray, shape (M, 4)
-        Points that the tree grows to, in this order, and how far at most [m].
-    unknown : Unknown
-        How well the pose is known.
-    settings : PathSettings
-        Limits and costs.
-    reach : float
-        Longest that the path may be [m].
-    via_points : ndarray, shape (>= MOST_VIA_POINTS, 4), written
-        Those of the path, and its greatest length towards each [m].
+    tip, target : ndarray, shape (3,)
+        Where from and where to [m].
+    number : int
+        Of the start, from 0 on.
+
+    Returns
+    -------
+    legs : ndarray, shape (m + 1, 4)
+        What each is steered towards, and inf. The via points divide the straight way evenly and lie
+        aside of it [m].
+    draws : ndarray, shape (generations, lambda, 3 m)
+        See `improve`.
     """
-    most = 1 + _PARENTS_TAKEN * candidates.shape[0]
-    tree = _Tree(
-        np.empty((most, 3, 4)),
-        np.zeros(most),
-        np.full(most, settings.comfort),
-        np.full(most, -1),
-        np.full(most, -1),
-        np.zeros(most, np.int64),
+    count = 1 + number % MOST_VIA_POINTS
+    share = np.arange(1.0, count + 1.0)[:, np.newaxis] / (count + 1.0)
+    points = tip + share * (target - tip)
+    aside = np.mod(0.5 + number * _PLACES[: 2 * count], 1.0) - 0.5
+    points[:, :2] += 4.0 * share * (1.0 - share) * _WIDTH * aside.reshape(-1, 2)
+    legs = np.full((count + 1, 4), math.inf)
+    legs[:count, :3], legs[count, :3] = points, target
+    paths = _PATHS if number < QUICK_STARTS else 2 * _PATHS
+    draws = np.random.default_rng(number).standard_normal((_GENERATIONS, paths, 3 * count))
+    return legs, draws
+
+
+@compiled
+def improve(legs: Array, question: Question, draws: Array) -> Assessment:
+    """Move via points until their path is good; return what is to be said of it.
+
+    Parameters
+    ----------
+    legs : ndarray, shape (m + 1, 4)
+        Of each leg what it is steered towards, and its length [m]; the via points are the best
+        that were found, and the lengths those of their path: written.
+    question : Question
+        What is wanted of the path.
+    draws : ndarray, shape (generations, lambda, 3 m)
+        z: normal numbers.
+    """
+    generations, paths, size = draws.shape
+    rates = _rates(size, paths // 2)
+    mean, path, matrix, sigma = np.empty(size), np.zeros(size), np.eye(size), _SPREAD
+    for i in range(size):
+        mean[i] = legs[i // 3, i % 3]
+    d, costs, order = np.empty((paths, size)), np.empty(paths), np.empty(paths, np.int64)
+    tried = legs.copy()
+    best = assess(legs, question, _SHORTEST_LEG)
+    for generation in range(generations):
+        z = draws[generation]
+        for k in range(paths):
+            _multiply(matrix, z[k], d[k])
+            for i in range(size):
+                tried[i // 3, i % 3] = mean[i] + sigma * d[k, i]
+            tried[:, 3] = math.inf
+            assessed = assess(tried, question, _SHORTEST_LEG)
+            costs[k] = assessed.cost
+            if assessed.cost < best.cost:
+                best = assessed
+                legs[:] = tried
+            place = k
+            while place > 0 and costs[order[place - 1]] > costs[k]:
+                order[place] = order[place - 1]
+                place -= 1
+            order[place] = k
+        sigma *= _adapt(z, d, order, sigma, rates, mean, path, matrix)
+        if sigma < _LEAST_SPREAD:
+            break
+    return best
+
+
+class _Rates(NamedTuple):
+    """Constants of MA-ES: w_k, mu_w, c_s, c_1, c_w and E|N(0, I)|."""
+
+    weights: Array
+    effective: float
+    c_s: float
+    c_1: float
+    c_w: float
+    expected: float
+
+
+@compiled
+def _rates(size: int, parents: int) -> _Rates:
+    weights = np.log(parents + 0.5) - np.log(np.arange(1.0, parents + 1.0))
+    weights /= weights.sum()
+    effective = 1.0 / (weights * weights).sum()
+    c_1 = 2.0 / ((size + 1.3) ** 2 + effective)
+    c_w = 2.0 * (effective + 1.0 / effective - 2.0) / ((size + 2.0) ** 2 + effective)
+    return _Rates(
+        weights,
+        effective,
+        (effective + 2.0) / (size + effective + 5.0),
+        c_1,
+        min(1.0 - c_1, c_w),
+        math.sqrt(size) * (1.0 - 0.25 / size + 1.0 / (21.0 * size * size)),
     )
-    tree.poses[0] = start
-    points, end = np.empty((MOST_POINTS, 4)), np.empty((3, 4))
-    near, ways = np.empty(_PARENTS_TRIED, np.int64), np.empty(_PARENTS_TRIED)
-    rate = settings.max_rotation_per_length
-    best, best_cost, nodes, tried = -1, math.inf, 1, 0
-    for k in range(-1, candidates.shape[0]):
-        if k >= 0:
-            found = _parents(tree, nodes, candidates[k], curvature, near, ways)
-            longest = min(best_cost, reach)
-            first = nodes
-            for i in range(found):
-                if nodes - first == _PARENTS_TAKEN:
-                    break
-                nodes += _grow(
-                    tree,
-                    nodes,
-                    near[i],
-                    k,
-                    candidates[k],
-                    target,
-                    curvature,
-                    table,
-                    unknown,
-                    settings,
-                    longest,
-                    points,
-                    end,
-                )
-        while tried < nodes:
-            cost = _cost_of_ending(
-                tree, tried, target, curvature, table, unknown, settings, reach, points, end
-            )
-            if cost < best_cost:
-                best, best_cost = tried, cost
-            tried += 1
-        if best == 0 and k < 0:
-            leg = leg_towards(start, target, curvature, settings.curvature_share, rate)
-            if best_cost <= leg_length(leg):
-                # It lacks nothing: no way over via points is shorter.
-                break
-    if best < 0:
-        return -1
-    count = tree.depth[best]
-    for i in range(count - 1, -1, -1):
-        via_points[i] = candidates[tree.via[best]]
-        best = tree.parent[best]
-    return int(count)
 
 
 @compiled
-def _grow(
-    tree: _Tree,
-    new: int,
-    node: int,
-    k: int,
-    candidate: Array,
-    target: Array,
-    curvature: float,
-    table: Array,
-    unknown: Unknown,
-    settings: PathSettings,
-    longest: float,
-    points: Array,
-    end: Array,
-) -> int:
-    """Write a node that is reached from another towards a point, if it is clear; return 1 if so."""
-    rate = settings.max_rotation_per_length
-    leg = leg_towards(tree.poses[node], candidate, curvature, settings.curvature_share, rate)
-    leg = cut_short(leg, candidate[3])
-    total = tree.length[node] + leg_length(leg)
-    count = trace(tree.poses[node], leg, curvature, tree.length[node], points, end)
-    if total + _distance(end, target) > longest:
-        return 0
-    clear = chain_margin(points, count, table, unknown, settings, 0.0)
-    if clear < 0.0:
-        return 0
-    tree.poses[new], tree.length[new] = end, total
-    tree.margin[new] = min(clear, tree.margin[node])
-    tree.parent[new], tree.via[new], tree.depth[new] = node, k, tree.depth[node] + 1
-    return 1
-
-
-@compiled
-def _cost_of_ending(
-    tree: _Tree,
-    node: int,
-    target: Array,
-    curvature: float,
-    table: Array,
-    unknown: Unknown,
-    settings: PathSettings,
-    reach: float,
-    points: Array,
-    end: Array,
+def _adapt(
+    z: Array,
+    d: Array,
+    order: _Indices,
+    sigma: float,
+    rates: _Rates,
+    mean: Array,
+    path: Array,
+    matrix: Array,
 ) -> float:
-    """Return the cost of the path that goes from a node to the target [m]; inf if it is none."""
-    rate = settings.max_rotation_per_length
-    leg = leg_towards(tree.poses[node], target, curvature, settings.curvature_share, rate)
-    total = tree.length[node] + leg_length(leg)
-    if leg.scarce > 0.0 or total > reach:
-        return math.inf
-    count = trace(tree.poses[node], leg, curvature, tree.length[node], points, end)
-    clear = chain_margin(points, count, table, unknown, settings, 0.0)
-    if clear < 0.0:
-        return math.inf
-    lacking = settings.comfort - min(clear, tree.margin[node])
-    return float(total + settings.comfort_price * lacking)
+    """Update y, s and M, of the best paths of a generation; return the factor of sigma."""
+    size, c_s, c_1, c_w = path.size, rates.c_s, rates.c_1, rates.c_w
+    gain, squared = math.sqrt(rates.effective * c_s * (2.0 - c_s)), 0.0
+    for i in range(size):
+        path[i] *= 1.0 - c_s
+        for k in range(rates.weights.size):
+            mean[i] += sigma * rates.weights[k] * d[order[k], i]
+            path[i] += gain * rates.weights[k] * z[order[k], i]
+        squared += path[i] * path[i]
+    # M times the bracket: M s is made first, M z is d.
+    turned = np.empty(size)
+    _multiply(matrix, path, turned)
+    for i in range(size):
+        for j in range(size):
+            change = c_1 * turned[i] * path[j] - (c_1 + c_w) * matrix[i, j]
+            for k in range(rates.weights.size):
+                change += c_w * rates.weights[k] * d[order[k], i] * z[order[k], j]
+            matrix[i, j] += 0.5 * change
+    return math.exp(min(0.5 * c_s * (math.sqrt(squared) / rates.expected - 1.0), 1.0))
 
 
 @compiled
-def _distance(pose: Array, point: Array) -> float:
-    x, y, z = pose[0, 3] - point[0], pose[1, 3] - point[1], pose[2, 3] - point[2]
-    return math.sqrt(x * x + y * y + z * z)
-
-
-@compiled
-def _parents(
-    tree: _Tree, nodes: int, point: Array, curvature: float, near: _Indices, ways: Array
-) -> int:
-    """Write the nodes from where a point is reached soonest, and the straight way from each [m]."""
-    found = 0
-    for i in range(nodes):
-        if tree.depth[i] == MOST_VIA_POINTS:
-            continue
-        pose = tree.poses[i]
-        x, y, z = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
-        ahead = x * pose[0, 2] + y * pose[1, 2] + z * pose[2, 2]
-        if ahead < _SHORTEST_LEG:
-            continue
-        squared = x * x + y * y + z * z
-        aside = math.sqrt(max(squared - ahead * ahead, 0.0))
-        if squared * curvature < 2.0 * aside:
-            # Within the circle of the bend.
-            continue
-        way = math.sqrt(squared)
-        place = found
-        while place > 0 and tree.length[near[place - 1]] + ways[place - 1] > tree.length[i] + way:
-            if place < _PARENTS_TRIED:
-                near[place], ways[place] = near[place - 1], ways[place - 1]
-            place -= 1
-        if place < _PARENTS_TRIED:
-            near[place], ways[place] = i, way
-            found = min(found + 1, _PARENTS_TRIED)
-    return found
+def _multiply(matrix: Array, vector: Array, product: Array) -> None:
+    """Write a product, without BLAS: its sums' order is not the same everywhere."""
+    for i in range(vector.size):
+        product[i] = 0.0
+        for j in range(vector.size):
+            product[i] += matrix[i, j] * vector[j]

@@ -9,7 +9,7 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import PITCH, YAW, X
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate
-from needle_controller.planning.entry import entry_state, first_path
+from needle_controller.planning.entry import NoPath, entry_state, first_path
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
 from needle_controller.planning.path_settings import PathSettings
@@ -24,6 +24,7 @@ def path_planner(settings: SteeringSettings) -> PathPlanner:
         PathSettings(
             max_rotation_per_length=settings.max_rotation_per_length,
             needle_radius=0.5 * settings.needle_diameter,
+            goal_tolerance=settings.goal_tolerance,
             longest=settings.depth,
         )
     )
@@ -88,8 +89,9 @@ class PathSteering:
         if self._own is not None:
             route = self._own.route(entry, target, obstacles)
             return "" if route is not None else self._own.why_not(obstacles)
-        self.path, why = first_path(self._planner, entry, target, obstacles)
-        return why
+        found = first_path(self._planner, entry, target, obstacles)
+        self.path = None if isinstance(found, NoPath) else found
+        return found.why if isinstance(found, NoPath) else ""
 
     def command(
         self,

@@ -80,6 +80,13 @@ class SteeringSettings:
     needle_diameter: float = fixed_parameter(
         0.0007, "m", "Diameter of the needle, which is led past obstacles.", 0.2e-3, 3e-3
     )
+    goal_tolerance: float = parameter(
+        0.001,
+        unit="m",
+        description="Distance by which a path past obstacles may pass its target point.",
+        lower=0.0,
+        upper=0.01,
+    )
     target_offset: float = parameter(
         0.0,
         unit="m",

@@ -18,7 +18,7 @@ from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate, Estimator
 from needle_controller.planning.obstacles import Obstacle, Obstacles
-from needle_controller.presets.path_steering import PathSteering, configured_obstacles
+from needle_controller.presets.path_steering import PathSteering, configured_obstacles, path_planner
 from needle_controller.presets.point_steering import PointSteering, point_law
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import ONE_SIDED_PRESETS, SteeringSettings
@@ -306,6 +306,7 @@ class PlaneControl:
             point_law(settings)(estimate, [0.0, 0.0, 1.0])
             ahead = np.array([0.0, 0.0, 0.5 * settings.depth])
             PathSteering(settings).command(estimate, self._plane, ahead, _FAR_AWAY, length)
+            path_planner(settings).warm_up()
         estimate.covariance  # noqa: B018 - lazy, and compiled too
 
 

@@ -60,7 +60,7 @@ def test_a_chord_is_as_clear_as_it_must_be_at_the_worse_of_its_ends(
     # Place, and the path's length there.
     points = np.array([[1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.01, 0.01]])
     table = np.array([[1.02, 0.0, 0.005, 1.02, 0.0, 0.005, 0.003]])
-    margin = chain_margin(points, 2, table, Unknown(*unknown), settings, -math.inf)
+    margin = chain_margin(points, 2, table, Unknown(*unknown), settings)
     assert margin == pytest.approx(0.017 - needed(worst, Unknown(*unknown), settings))
 
 

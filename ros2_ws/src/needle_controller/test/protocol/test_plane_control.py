@@ -230,10 +230,13 @@ def test_new_settings_keep_point_and_obstacles_unless_they_change_them_or_cannot
     assert control._points is None
     # Every depth that a parameter may have is one of the planner.
     for depth in (0.0, 1e-5, 1.0):
-        thick = SteeringSettings(depth=depth, needle_diameter=0.002)
+        thick = SteeringSettings(depth=depth, needle_diameter=0.002, goal_tolerance=0.002)
         control.configure(thick)
         assert path_planner(thick).settings == PathSettings(
-            thick.max_rotation_per_length, needle_radius=0.001, longest=depth
+            thick.max_rotation_per_length,
+            needle_radius=0.001,
+            goal_tolerance=0.002,
+            longest=depth,
         )
 
 

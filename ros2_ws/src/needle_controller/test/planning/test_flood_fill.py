@@ -1,0 +1,115 @@
+"""Where no path exists: proved of what is closed, never said of what has a path."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from needle_controller.model.arrays import Array
+from needle_controller.model.kinematics import rotation_from_angles
+from needle_controller.planning import entry as entries
+from needle_controller.planning.entry import NoPath, first_path
+from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
+from needle_controller.planning.path_settings import PathSettings
+
+CURVATURE = 1.0 / 0.1356
+SETTINGS = PathSettings(math.radians(30.0) / 0.001, curvature_share=1.0, comfortable_share=1.0)
+PLANNER = PathPlanner(SETTINGS)
+ENTRY = TipState(np.zeros(3), np.eye(3), CURVATURE)
+TARGET = np.array([0.0, 0.0, 0.1])
+RADIUS = 0.003
+
+
+def wall(gap: float, middle: float = 0.0, depth: float = 0.05) -> Obstacles:
+    """A wall of rods across the way; between two of them is a gap, its middle aside in x [m]."""
+    places = np.arange(0.5 * gap + RADIUS, 0.07, RADIUS)
+    rods = [middle + sign * place for sign in (-1.0, 1.0) for place in places]
+    return Obstacles([Obstacle((x, -0.08, depth), (x, 0.08, depth), RADIUS) for x in rods])
+
+
+def may(obstacles: Obstacles, tip: TipState = ENTRY, target: Array = TARGET) -> bool:
+    return PLANNER.may_have_path(tip, target, obstacles)
+
+
+def test_a_wall_with_a_gap_has_a_path_and_one_without_has_none() -> None:
+    clear = 2.0 * SETTINGS.least_clear
+    assert may(Obstacles())
+    assert may(wall(clear + 0.001))
+    # A cell's size and 0.1 mm of bending are what the fill cannot tell apart.
+    assert not may(wall(clear - 0.0015))
+    found = first_path(PLANNER, ENTRY, TARGET, wall(clear - 0.0015))
+    assert isinstance(found, NoPath)
+    assert found.exists_none
+    assert "no path to the target point is clear of the" in found.why
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_gap_counts_only_where_a_needle_can_come_to_it_and_on_to_the_target(sign: float) -> None:
+    # Over half of 100 mm a needle that comes back gets 9.2 mm aside, one that need not 9.6 mm.
+    assert may(wall(0.004, sign * 0.004))
+    assert not may(wall(0.004, sign * 0.014))
+    aside = np.array([sign * 0.025, 0.0, 0.1])
+    assert may(wall(0.004, sign * 0.008), target=aside)
+    assert not may(wall(0.004, -sign * 0.004), target=aside)
+
+
+def test_a_target_is_reached_by_all_the_curvature_and_the_tolerance_but_no_more() -> None:
+    # The circle of the largest curvature, 0.1 m on, and how far it is aside there.
+    radius = 1.0 / CURVATURE
+    aside = radius - math.sqrt(radius**2 - 0.1**2)
+    for beyond, reached in ((0.0005, True), (0.0030, False)):
+        turned = rotation_from_angles([0.2, -0.3, 1.0])
+        target = turned @ [0.6 * (aside + beyond), 0.8 * (aside + beyond), 0.1]
+        tip = TipState(np.array([0.01, 0.02, 0.0]), turned, CURVATURE)
+        assert may(Obstacles(), tip, tip.position + target) is reached
+
+
+def test_what_is_not_ahead_has_no_path() -> None:
+    assert not may(Obstacles(), target=np.array([0.0, 0.0, -0.01]))
+
+
+def test_what_has_a_path_is_never_said_to_have_none() -> None:
+    paths = 0
+    for seed in range(40):
+        rng = np.random.default_rng([5, seed])
+        rows = rng.uniform([-0.012, -0.012, 0.02], [0.012, 0.012, 0.07], (5, 3))
+        ends = rows + rng.normal(0.0, 0.008, (5, 3))
+        obstacles = Obstacles(
+            [
+                Obstacle(tuple(start), tuple(end), float(rng.uniform(0.003, 0.008)))
+                for start, end in zip(rows.tolist(), ends.tolist(), strict=True)
+            ]
+        )
+        target = np.array([*rng.uniform(-0.02, 0.02, 2), 0.09])
+        if PLANNER.path(ENTRY, target, obstacles) is not None:
+            paths += 1
+            assert may(obstacles, target=target)
+    assert 5 < paths < 35
+
+
+def test_what_is_not_found_is_not_said_to_be_impossible(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Wide enough for the fill, by its cells' size, and too narrow for a needle.
+    narrow = wall(2.0 * SETTINGS.least_clear - 0.0003)
+    monkeypatch.setattr(entries, "THOROUGH_STARTS", 5)
+    found = first_path(PLANNER, ENTRY, TARGET, narrow)
+    assert isinstance(found, NoPath)
+    assert not found.exists_none
+    assert "was found clear of the" in found.why
+
+
+def test_the_thorough_search_finds_what_the_quick_one_misses() -> None:
+    # Scene 182 of the obstacle study of seed 909.
+    rows = [
+        (-0.00113, 0.01008, 0.07275, 0.01968, 0.00163, 0.04861, 0.00685),
+        (-0.00363, -0.00664, 0.0533, 0.02809, 0.00195, 0.03646, 0.0049),
+        (0.01364, 0.01014, 0.03855, 0.00344, 0.00708, 0.04418, 0.00851),
+    ]
+    target = [0.00404, -0.00454, 0.08293]
+    obstacles = Obstacles([Obstacle(row[:3], row[3:6], row[6]) for row in rows])
+    assert PLANNER.path(ENTRY, target, obstacles) is None
+    found = first_path(PLANNER, ENTRY, target, obstacles)
+    assert isinstance(found, NeedlePath)
+    assert found.margin >= 0.0
