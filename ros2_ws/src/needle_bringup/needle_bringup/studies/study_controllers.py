@@ -5,23 +5,31 @@ needle_sim, whose studies these are for, does not know the controller under test
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from needle_controller.laws.law import SteeringCommand, StepLaw
-from needle_controller.laws.roll_law import hypotheses_of
+from needle_controller.laws.flip_plan import FlipPlan
+from needle_controller.laws.law import LinearizingLaw, SteeringCommand, StepLaw
+from needle_controller.laws.point_law import PointLawSettings
+from needle_controller.laws.roll_law import RollLawSettings, hypotheses_of
+from needle_controller.many_needles import ManyFilters, ManyObservers
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.observers.estimator import Estimate, Estimator
-from needle_controller.observers.luenberger import LuenbergerObserver
 from needle_controller.planning.obstacles import Obstacles
-from needle_controller.presets.path_steering import PathSteering, tip_states
-from needle_controller.presets.point_steering import PointSteering, prompt_point_law
-from needle_controller.presets.presets import make_controller
+from needle_controller.presets.path_steering import PathSteering, tip_state
+from needle_controller.presets.point_steering import Foresight, PointSteering, prompt_point_law
+from needle_controller.presets.presets import (
+    filter_settings,
+    make_controller,
+    make_law,
+    observer_settings,
+)
 from needle_controller.presets.steering_settings import (
     ONE_SIDED_PRESETS,
     PRESETS,
@@ -31,12 +39,14 @@ from needle_controller.protocol.trust import ends_elsewhere
 from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
+from needle_sim.studies.figures_of_merit import BoolArray
 from needle_sim.studies.point_targets import INSERTION_SPEED
 from needle_sim.studies.rrt_replanning import SAMPLES, DutyCycle, plan
 from needle_sim.studies.sliding_mode import sliding_mode_rate
 from needle_sim.studies.study import CHUNK
 
-TimedLaw = Callable[[Estimate, FloatArray, FloatArray, FloatArray], SteeringCommand]
+TimedLaw = Callable[[Estimate, float, float, float], SteeringCommand]
+"""Law to a point: takes an estimate, the time [s], the insertion [m], and what the base may turn."""
 
 SLIDING_MODE, RRT = "sliding_mode", "rrt"
 """Names of the reference laws for points."""
@@ -50,15 +60,114 @@ _LINEAR_CHUNK = 20 * CHUNK
 _DEEPEST = 1.0
 
 
-class SteeredNeedles:
-    """An estimator and a law, called as the node calls them: what `study.Controller` describes.
+class Estimators(Protocol):
+    """The estimators of N needles."""
+
+    def start(self, tips: FloatArray) -> None:
+        """Start at first tips, (N, 3) [m], with all bases at 0."""
+
+    def advance(self, lengths: FloatArray, turns: FloatArray) -> None:
+        """Move on by inserted lengths [m] and rotations of the bases [rad], (N,)."""
+
+    def correct(self, tips: FloatArray, covariance: Array | None, ages: FloatArray) -> None:
+        """Take tips, (N, 3), of a covariance, (3, 3), and their ages, (N,) [m]."""
+
+    def each(self) -> Sequence[Estimate]:
+        """Return what is known of each."""
+
+    def belief(self) -> Belief:
+        """Return what is known of all, and whether it is doubted."""
+
+    def positions(self) -> FloatArray:
+        """Return where the tips are, (N, 3) [m]."""
+
+
+class EachEstimator:
+    """Estimators of any kind, one called after the other; see `Estimators`.
 
     Parameters
     ----------
-    estimator : Estimator
-        For as many needles as there will be tips.
-    law : callable
-        Returns the command for an estimate at an inserted length [m].
+    new : callable
+        Returns the estimator of the needle with a number, counted from 0.
+    """
+
+    def __init__(self, new: Callable[[int], Estimator]) -> None:
+        self._new = new
+        self._estimators: list[Estimator] = []
+        self._known: list[Estimate] = []
+
+    def start(self, tips: FloatArray) -> None:
+        """Start at first tips."""
+        self._estimators = [self._new(n) for n in range(len(tips))]
+        for estimator, tip in zip(self._estimators, tips, strict=True):
+            estimator.reset(tip, np.zeros(2))
+        self._estimate()
+
+    def advance(self, lengths: FloatArray, turns: FloatArray) -> None:
+        """Move on."""
+        moved = zip(self._estimators, lengths.tolist(), turns.tolist(), strict=True)
+        for estimator, length, turn in moved:
+            estimator.advance(length, turn)
+
+    def correct(self, tips: FloatArray, covariance: Array | None, ages: FloatArray) -> None:
+        """Take tips."""
+        for estimator, tip, age in zip(self._estimators, tips, ages.tolist(), strict=True):
+            estimator.correct(tip, covariance, age)
+        self._estimate()
+
+    def _estimate(self) -> None:
+        self._known = [estimator.estimate() for estimator in self._estimators]
+
+    def each(self) -> Sequence[Estimate]:
+        """Return what is known of each."""
+        return self._known
+
+    def belief(self) -> Belief:
+        """Return what is known of all."""
+        uncertainty = np.array([hypotheses_of(known).uncertainty for known in self._known])
+        s = np.array([known.linearized for known in self._known])
+        doubtful = None
+        if self._known[0].doubtful is not None:
+            doubtful = np.array([bool(known.doubtful) for known in self._known])
+        return _belief(s, uncertainty, doubtful)
+
+    def positions(self) -> FloatArray:
+        """Return where the tips are."""
+        return np.array([known.position for known in self._known])
+
+
+class BestEstimators(ManyFilters):
+    """The estimators of preset `best`, in compiled loops; see `Estimators`."""
+
+    def belief(self) -> Belief:
+        """Return what is known of all."""
+        known = self.estimates
+        return _belief(known["linearized"], known["uncertainty"], known["doubts"] != 0)
+
+    def positions(self) -> FloatArray:
+        """Return where the tips are."""
+        return np.array(self.estimates["coordinates"][:, :3])
+
+
+def _belief(s: FloatArray, uncertainty: FloatArray, doubtful: BoolArray | None) -> Belief:
+    return Belief(
+        x=s[:, 0].copy(),
+        x_std=np.sqrt(np.maximum(uncertainty[:, 0], 0.0)),
+        sin_pitch=s[:, 1].copy(),
+        sin_pitch_std=np.sqrt(np.maximum(uncertainty[:, 2], 0.0)),
+        doubtful=doubtful,
+    )
+
+
+class SteeredNeedles:
+    """Estimators and laws, called as the node calls them: what `study.Controller` describes.
+
+    Parameters
+    ----------
+    new_estimators : callable
+        Returns the estimators of so many needles.
+    rates : callable
+        Returns the rotation rates, (N,) [rad/m], for estimators at an inserted length [m].
     covariance : ndarray, shape (3, 3), optional
         What each tip's is said to be [m^2]; the estimator's own assumption if none is given.
     turn_delay : float
@@ -67,23 +176,42 @@ class SteeredNeedles:
 
     def __init__(
         self,
-        estimator: Estimator,
-        law: StepLaw,
+        new_estimators: Callable[[int], Estimators],
+        rates: Callable[[Any, float], FloatArray],
         covariance: Array | None = None,
         turn_delay: float = 0.0,
     ) -> None:
-        self._turn_delay = turn_delay
-        self._estimator = estimator
-        self._law = law
+        self._new_estimators = new_estimators
+        self._rates = rates
         self._covariance = covariance
+        self._turn_delay = turn_delay
+        self._estimators: Estimators | None = None
         self._insertion: FloatArray = np.zeros(())
         self._turned: FloatArray = np.zeros(())
-        self._estimate: Estimate | None = None
+
+    @classmethod
+    def one_by_one(
+        cls, new: Callable[[], Estimator], law: StepLaw, covariance: Array | None = None
+    ) -> SteeredNeedles:
+        """Return needles of any estimator and law, each of them called in Python.
+
+        Parameters
+        ----------
+        new : callable
+            Returns a needle's estimator.
+        law : StepLaw
+            Of all needles.
+        covariance : ndarray, shape (3, 3), optional
+            See above.
+        """
+        return cls(lambda _: EachEstimator(lambda _: new()), each_rate(lambda _: law), covariance)
 
     def start(self, tips: FloatArray) -> FloatArray:
         """Take the first measured tips; see `study.Controller.start`."""
-        self._estimator.reset(tips, np.zeros((len(tips), 2)))
-        return self._rate()
+        self._estimators = self._new_estimators(len(tips))
+        self._estimators.start(np.ascontiguousarray(tips))
+        self._insertion = self._turned = np.zeros(len(tips))
+        return self._rates(self._estimators, 0.0)
 
     def step(
         self,
@@ -93,72 +221,61 @@ class SteeredNeedles:
         age: float | FloatArray,
     ) -> FloatArray:
         """Take a step and what was measured after it; see `study.Controller.step`."""
-        self._insertion = self._insertion + d_insertion
+        assert self._estimators is not None
+        lengths = np.array(np.broadcast_to(d_insertion, len(tips)))
+        self._insertion = self._insertion + lengths
         self._turned = self._turned + np.abs(d_rotation)
         if self._turn_delay > 0.0:
-            unturned = np.minimum(self._turn_delay, 0.9 * np.asarray(d_insertion))
-            self._estimator.advance(unturned, 0.0 * d_rotation)
-            d_insertion = d_insertion - unturned
-        self._estimator.advance(d_insertion, d_rotation)
-        self._estimator.correct(tips, self._covariance, age)
-        return self._rate()
+            unturned = np.minimum(self._turn_delay, 0.9 * lengths)
+            self._estimators.advance(unturned, 0.0 * d_rotation)
+            lengths -= unturned
+        self._estimators.advance(lengths, d_rotation)
+        ages = np.array(np.broadcast_to(age, len(tips)))
+        self._estimators.correct(np.ascontiguousarray(tips), self._covariance, ages)
+        return self._rates(self._estimators, float(np.max(self._insertion)))
 
     def belief(self) -> Belief | None:
-        """Return what is known after the last step; see `study.Controller.belief`.
-
-        Nothing of `LuenbergerObserver`, whose steady gain makes no use of its covariance: a study
-        of the paper's law does not pay for it.
-        """
-        estimate = self._estimate
-        if estimate is None or isinstance(self._estimator, LuenbergerObserver):
+        """Return what is known after the last step; see `study.Controller.belief`."""
+        if self._estimators is None:
             return None
-        uncertainty, doubtful = hypotheses_of(estimate).uncertainty, estimate.doubtful
-        if doubtful is not None:
-            # The last word counts, as of a node that is done.
-            doubtful = doubtful | ends_elsewhere(self._distance(estimate))
-        return Belief(
-            x=estimate.linearized[..., 0],
-            x_std=np.sqrt(np.maximum(uncertainty[..., 0], 0.0)),
-            sin_pitch=estimate.linearized[..., 1],
-            sin_pitch_std=np.sqrt(np.maximum(uncertainty[..., 2], 0.0)),
-            doubtful=doubtful,
-        )
+        belief = self._estimators.belief()
+        if belief.doubtful is None:
+            return belief
+        # The last word counts, as of a node that is done.
+        elsewhere = np.array([ends_elsewhere(off) for off in self._distance().tolist()])
+        return dataclasses.replace(belief, doubtful=belief.doubtful | elsewhere)
 
-    def _distance(self, estimate: Estimate) -> FloatArray:
+    def _distance(self) -> FloatArray:
         """Return how far each needle is from where it is to end, (N,) [m]."""
-        return np.asarray(estimate.linearized[..., 0])
-
-    def _rate(self) -> FloatArray:
-        self._estimate = self._estimator.estimate()
-        return self._law(self._estimate, float(np.max(self._insertion))).rotation_rate
+        assert self._estimators is not None
+        return np.asarray(self._estimators.positions()[:, 0])
 
 
 class NeedlesToPoints(SteeredNeedles):
-    """An estimator, and a law for points: what `point_study.PointController` describes.
+    """Estimators, and laws for points: what `point_study.PointController` describes.
 
     Parameters
     ----------
-    estimator, covariance :
+    new_estimators, covariance :
         See `SteeredNeedles`.
-    new_law : callable
-        Returns the law for targets whose motion is told to a `TargetMotion`: it takes an estimate,
-        each needle's time [s], its inserted length [m] and what its base may still turn [rad].
+    new_laws : callable
+        Returns the laws for targets whose motion is told to a `TargetMotion`.
     rotation_budget : float
         Most that each base may turn [rad].
     """
 
     def __init__(
         self,
-        estimator: Estimator,
-        new_law: Callable[[TargetMotion], TimedLaw],
+        new_estimators: Callable[[int], Estimators],
+        new_laws: Callable[[TargetMotion], PointLaws],
         covariance: Array | None = None,
         rotation_budget: float = math.inf,
     ) -> None:
         self._motion = TargetMotion()
-        self._point_law = new_law(self._motion)
+        self._point_laws = new_laws(self._motion)
         self._rotation_budget = rotation_budget
         self._left: FloatArray = np.full((), np.nan)
-        super().__init__(estimator, self._command, covariance)
+        super().__init__(new_estimators, self._command, covariance)
 
     def see_targets(self, time: float, targets: FloatArray) -> None:
         """Take where the targets are; see `point_study.PointController`."""
@@ -168,114 +285,223 @@ class NeedlesToPoints(SteeredNeedles):
         """Return how far each needle has to go; see `point_study.PointController`."""
         return self._left
 
-    def _distance(self, estimate: Estimate) -> FloatArray:
-        return np.asarray(np.linalg.norm(estimate.position - self._motion.last, axis=-1))
+    def _distance(self) -> FloatArray:
+        assert self._estimators is not None
+        off = self._estimators.positions() - self._motion.last
+        return np.asarray(np.linalg.norm(off, axis=-1))
 
-    def _command(self, estimate: Estimate, _: float) -> SteeringCommand:
-        command = self._point_law(
-            estimate,
-            self._insertion / INSERTION_SPEED,
-            self._insertion,
-            self._rotation_budget - self._turned,
+    def _command(self, estimators: Any, _: float) -> FloatArray:
+        rates, self._left = self._point_laws(
+            estimators, self._insertion, self._rotation_budget - self._turned
         )
-        assert command.insertion_left is not None
-        self._left = command.insertion_left
-        return command
+        return rates
 
 
-def sliding_law(motion: TargetMotion, largest_rate: float) -> TimedLaw:
-    """Return the published reference law, which goes to where the targets are; see `sliding_mode`.
+class PaperNeedles:
+    """The observer and the law of [KC09], in compiled loops: what `study.Controller` describes.
+
+    Parameters
+    ----------
+    settings : SteeringSettings
+        Of preset `paper` or `open_loop`.
+    turn_delay : float
+        See `SteeredNeedles`.
+    """
+
+    def __init__(self, settings: SteeringSettings, turn_delay: float) -> None:
+        self._settings, self._turn_delay = settings, turn_delay
+        self._needles: ManyObservers | None = None
+
+    def start(self, tips: FloatArray) -> FloatArray:
+        """Take the first measured tips; see `study.Controller.start`."""
+        gains = self._settings.gains()
+        law = make_law(self._settings, gains)
+        self._needles = ManyObservers(
+            observer_settings(self._settings, gains).model,
+            law.gains if isinstance(law, LinearizingLaw) else None,
+            len(tips),
+        )
+        return self._needles.start(tips)
+
+    def step(
+        self,
+        d_insertion: float | FloatArray,
+        d_rotation: FloatArray,
+        tips: FloatArray,
+        age: float | FloatArray,
+    ) -> FloatArray:
+        """Take a step and what was measured after it; see `study.Controller.step`."""
+        assert self._needles is not None
+        lengths = np.array(np.broadcast_to(d_insertion, len(tips)))
+        unturned = np.minimum(self._turn_delay, 0.9 * lengths)
+        ages = np.array(np.broadcast_to(age, len(tips)))
+        return self._needles.step(lengths, unturned, d_rotation, tips, ages)
+
+    def belief(self) -> Belief | None:
+        """Return None: the steady gain makes no use of a covariance."""
+        return None
+
+
+PointLaws = Callable[[Any, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+"""Takes estimators, inserted lengths [m] and what the bases may still turn [rad], (N,); returns
+rotation rates [rad/m] and insertions left [m], (N,)."""
+
+
+def each_rate(new_law: Callable[[int], StepLaw]) -> Callable[[Estimators, float], FloatArray]:
+    """Return rotation rates by laws that are called in Python, one after the other."""
+    laws: list[StepLaw] = []
+
+    def rates(estimators: Estimators, insertion: float) -> FloatArray:
+        known = estimators.each()
+        laws.extend(new_law(n) for n in range(len(laws), len(known)))
+        return np.array(
+            [law(one, insertion).rotation_rate for law, one in zip(laws, known, strict=True)]
+        )
+
+    return rates
+
+
+def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], TimedLaw]) -> PointLaws:
+    """Return laws for points that are called in Python, one after the other.
 
     Parameters
     ----------
     motion : TargetMotion
-        Of the targets.
+        Of all targets.
+    new_law : callable
+        Returns the law of one needle, whose target's motion is told to a `TargetMotion`.
+    """
+    laws: list[tuple[TargetMotion, TimedLaw]] = []
+
+    def commands(
+        estimators: Estimators, insertion: FloatArray, rotation_left: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        known = estimators.each()
+        for _ in range(len(laws), len(known)):
+            own = TargetMotion()
+            laws.append((own, new_law(own)))
+        targets = np.broadcast_to(motion.last, (len(known), 3))
+        rates, left = np.empty(len(known)), np.empty(len(known))
+        for n, (own, law) in enumerate(laws):
+            own.see(motion.seen, targets[n])
+            inserted = float(insertion[n])
+            said = law(known[n], inserted / INSERTION_SPEED, inserted, float(rotation_left[n]))
+            assert said.insertion_left is not None
+            rates[n], left[n] = said.rotation_rate, said.insertion_left
+        return rates, left
+
+    return commands
+
+
+def best_rates(settings: SteeringSettings) -> Callable[[ManyFilters, float], FloatArray]:
+    """Return rotation rates by the law of `best`, in compiled loops."""
+    law, plan = RollLawSettings(**settings.turning), FlipPlan(settings.flip_depths)
+
+    def rates(filters: ManyFilters, insertion: float) -> FloatArray:
+        return filters.roll_rates(law, plan.bend_sign(insertion) if plan.depths else 0.0)
+
+    return rates
+
+
+def best_point_laws(settings: SteeringSettings, motion: TargetMotion) -> PointLaws:
+    """Return the law of `best` for points, in compiled loops."""
+    law, foresight = PointLawSettings(**settings.turning), Foresight(motion)
+
+    def commands(
+        filters: ManyFilters, insertion: FloatArray, rotation_left: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        def left(targets: FloatArray) -> FloatArray:
+            return filters.point_rates(law, targets, rotation_left)[1]
+
+        targets = foresight.look(insertion / INSERTION_SPEED, insertion, left)
+        return filters.point_rates(law, targets, rotation_left)
+
+    return commands
+
+
+def sliding_law(motion: TargetMotion, largest_rate: float) -> TimedLaw:
+    """Return the published reference law, which goes to where the target is; see `sliding_mode`.
+
+    Parameters
+    ----------
+    motion : TargetMotion
+        Of the target.
     largest_rate : float
         Rotation per inserted length [rad/m].
     """
 
-    def command(estimate: Estimate, *_: FloatArray) -> SteeringCommand:
-        target = _in_frames_of_tips(motion.last, estimate)
-        rate = sliding_mode_rate(target, largest_rate)
-        return SteeringCommand(np.zeros_like(rate), rate, target[..., 2])
+    def command(estimate: Estimate, *_: float) -> SteeringCommand:
+        target = estimate.rotation.T @ (motion.last - estimate.position)
+        rate = float(sliding_mode_rate(target, largest_rate))
+        return SteeringCommand(0.0, rate, float(target[2]))
 
     return command
 
 
 def rrt_law(
-    motion: TargetMotion, settings: SteeringSettings, obstacles: Array | None = None
+    motion: TargetMotion,
+    settings: SteeringSettings,
+    rng: np.random.Generator,
+    obstacles: Array | None = None,
 ) -> TimedLaw:
     """Return the published planner as a law that plans anew at every step; see `rrt_replanning`.
 
     Parameters
     ----------
     motion : TargetMotion
-        Of the targets.
+        Of the target.
     settings : SteeringSettings
-        Of the needles.
+        Of the needle.
+    rng : numpy.random.Generator
+        All chance of the planner.
     obstacles : ndarray, shape (M, 7), optional
         Ends of the axis and radius of each capsule [m]; none by default.
     """
     around = np.zeros((0, 7)) if obstacles is None else obstacles
-    rng = np.random.default_rng(1)
     cycle = DutyCycle(settings.max_rotation_per_length, settings.step_length)
 
-    def command(estimate: Estimate, *_: FloatArray) -> SteeringCommand:
-        ahead = _in_frames_of_tips(motion.last, estimate)
-        places = np.ascontiguousarray(estimate.position.reshape(-1, 3))
-        turns = np.ascontiguousarray(estimate.rotation.reshape(-1, 3, 3))
-        targets = np.array(np.broadcast_to(motion.last, estimate.position.shape)).reshape(-1, 3)
+    def command(estimate: Estimate, *_: float) -> SteeringCommand:
+        ahead = estimate.rotation.T @ (motion.last - estimate.position)
         # Where no path is found, the tightest arc towards the target.
-        arcs = np.array(ahead.reshape(-1, 3))
-        arcs[:, 2] = 1.0
-        for n in range(len(arcs)):
-            chance = rng.random((SAMPLES, 4))
-            plan(
-                places[n], turns[n], targets[n], around, settings.curvature, CLEAR, chance, arcs[n]
-            )
-        rate = cycle.rates(arcs).reshape(ahead.shape[:-1])
-        return SteeringCommand(np.zeros_like(rate), rate, ahead[..., 2])
+        arc = np.array([ahead[0], ahead[1], 1.0])
+        plan(
+            np.array(estimate.position),
+            np.ascontiguousarray(estimate.rotation),
+            np.array(motion.last),
+            around,
+            settings.curvature,
+            CLEAR,
+            rng.random((SAMPLES, 4)),
+            arc,
+        )
+        return SteeringCommand(0.0, float(cycle.rates(arc[None])[0]), float(ahead[2]))
 
     return command
 
 
 def planned_law(motion: TargetMotion, settings: SteeringSettings) -> TimedLaw:
-    """Return the law that leads each needle along a planner's way; no obstacle is in it.
+    """Return the law that leads a needle along a planner's way; no obstacle is in it.
 
     Parameters
     ----------
     motion : TargetMotion
-        Of the targets.
+        Of the target.
     settings : SteeringSettings
-        Of the needles, and which planner.
+        Of the needle, and which planner.
     """
     law, free, plane = prompt_point_law(settings), Obstacles(), offset_plane(0.0)
-    needles: list[PathSteering] = []
+    needle = PathSteering(settings)
 
-    def command(
-        estimate: Estimate, _: FloatArray, insertion: FloatArray, __: FloatArray
-    ) -> SteeringCommand:
-        count = len(estimate.position)
-        needles.extend(PathSteering(settings) for _ in range(count - len(needles)))
-        targets = np.broadcast_to(motion.last, (count, 3))
-        inserted = np.broadcast_to(insertion, (count,))
-        # Who sees no way stays where it is.
-        aims, longer = np.array(targets), np.zeros(count)
-        for n, tip in enumerate(tip_states(estimate, plane)):
-            route = needles[n].route(tip, targets[n], free, float(inserted[n]))
-            longer[n] = -math.inf if route is None else route.length or math.nan
-            aims[n] = aims[n] if route is None else route.aim
-        said = law(estimate, aims)
-        assert said.insertion_left is not None
-        left = np.where(np.isnan(longer), said.insertion_left, longer)
+    def command(estimate: Estimate, _: float, insertion: float, __: float) -> SteeringCommand:
+        route = needle.route(tip_state(estimate, plane), motion.last, free, insertion)
+        if route is None:
+            # Who sees no way stays where it is.
+            return SteeringCommand(0.0, 0.0, -math.inf)
+        said = law(estimate, route.aim)
+        left = said.insertion_left if route.length is None else route.length
         return SteeringCommand(said.virtual_input, said.rotation_rate, left)
 
     return command
-
-
-def _in_frames_of_tips(points: Array, estimate: Estimate) -> Array:
-    off = (points - estimate.position)[..., None]
-    return np.asarray((estimate.rotation.swapaxes(-1, -2) @ off)[..., 0])
 
 
 def needles_at_a_time(name: str) -> int:
@@ -292,7 +518,7 @@ def controller_factory(
     turn_delay: float = 0.0,
     own: Mapping[str, Any] = {},
     first: int = 0,
-) -> Callable[[], SteeredNeedles]:
+) -> Callable[[], SteeredNeedles | PaperNeedles]:
     """Return what makes the controller of some needles.
 
     Parameters
@@ -320,9 +546,24 @@ def controller_factory(
         If there is no such controller, or it cannot flip.
     """
     settings, covariance = _what_is_told(name, claimed, sigma_scale, flip_depths, own)
-    return lambda: SteeredNeedles(
-        *make_controller(settings, np.eye(3), np.zeros(3), first=first), covariance, turn_delay
-    )
+    if name in ONE_SIDED_PRESETS and not settings.estimator and not settings.law:
+        return lambda: PaperNeedles(settings, turn_delay)
+    rates: Callable[[Any, float], FloatArray] = best_rates(settings)
+    if settings.estimator or settings.law or name in ONE_SIDED_PRESETS:
+        rates = each_rate(lambda _: make_controller(settings, np.eye(3))[1])
+    return lambda: SteeredNeedles(_new_estimators(settings, first), rates, covariance, turn_delay)
+
+
+def _new_estimators(settings: SteeringSettings, first: int) -> Callable[[int], Estimators]:
+    """Return what makes the estimators of so many needles, the first of which has a number."""
+    if settings.preset == "best" and not settings.estimator:
+        known = filter_settings(settings)
+        return lambda count: BestEstimators(known, count, settings.step_length)
+
+    def new(n: int) -> Estimator:
+        return make_controller(settings, np.eye(3), np.zeros(3), number=first + n)[0]
+
+    return lambda _: EachEstimator(new)
 
 
 def point_controller_factory(
@@ -344,20 +585,24 @@ def point_controller_factory(
     settings, covariance = _what_is_told(preset, claimed, sigma_scale, (), own)
     settings.check_steers_to_points()
 
-    def new_law(motion: TargetMotion) -> TimedLaw:
+    def new_laws(motion: TargetMotion) -> PointLaws:
         if name == RRT:
-            return rrt_law(motion, settings)
+            rng = np.random.default_rng(1)
+            return each_point_law(motion, lambda own_motion: rrt_law(own_motion, settings, rng))
         if name == SLIDING_MODE:
-            return sliding_law(motion, settings.max_rotation_per_length)
+            largest = settings.max_rotation_per_length
+            return each_point_law(motion, lambda own_motion: sliding_law(own_motion, largest))
         if settings.planner:
-            return planned_law(motion, settings)
-        return PointSteering(settings, motion).command
+            return each_point_law(motion, lambda own_motion: planned_law(own_motion, settings))
+        if settings.estimator or settings.law:
+            return each_point_law(
+                motion, lambda own_motion: PointSteering(settings, own_motion).command
+            )
+        return best_point_laws(settings, motion)
 
-    def needles() -> NeedlesToPoints:
-        estimator, _ = make_controller(settings, np.eye(3), np.zeros(3), first=first)
-        return NeedlesToPoints(estimator, new_law, covariance, rotation_budget)
-
-    return needles
+    return lambda: NeedlesToPoints(
+        _new_estimators(settings, first), new_laws, covariance, rotation_budget
+    )
 
 
 def _what_is_told(
