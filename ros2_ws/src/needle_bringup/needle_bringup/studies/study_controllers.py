@@ -46,7 +46,7 @@ from needle_sim.studies.sliding_mode import sliding_mode_rate
 from needle_sim.studies.study import CHUNK
 
 TimedLaw = Callable[[Estimate, float, float, float], SteeringCommand]
-"""Law to a point: takes an estimate, the time [s], the insertion [m], and what the base may turn."""
+"""Takes an estimate, the time [s], the insertion [m], and what the base may still turn [rad]."""
 
 SLIDING_MODE, RRT = "sliding_mode", "rrt"
 """Names of the reference laws for points."""
@@ -551,10 +551,10 @@ def controller_factory(
     rates: Callable[[Any, float], FloatArray] = best_rates(settings)
     if settings.estimator or settings.law or name in ONE_SIDED_PRESETS:
         rates = each_rate(lambda _: make_controller(settings, np.eye(3))[1])
-    return lambda: SteeredNeedles(_new_estimators(settings, first), rates, covariance, turn_delay)
+    return lambda: SteeredNeedles(new_estimators(settings, first), rates, covariance, turn_delay)
 
 
-def _new_estimators(settings: SteeringSettings, first: int) -> Callable[[int], Estimators]:
+def new_estimators(settings: SteeringSettings, first: int) -> Callable[[int], Estimators]:
     """Return what makes the estimators of so many needles, the first of which has a number."""
     if settings.preset == "best" and not settings.estimator:
         known = filter_settings(settings)
@@ -601,7 +601,7 @@ def point_controller_factory(
         return best_point_laws(settings, motion)
 
     return lambda: NeedlesToPoints(
-        _new_estimators(settings, first), new_laws, covariance, rotation_budget
+        new_estimators(settings, first), new_laws, covariance, rotation_budget
     )
 
 

@@ -285,7 +285,7 @@ def correct_needle(
 
 @compiled
 def _age_of(needle: Any, events: Records, known: Any) -> float:
-    """Return how late the tips of the first centimetres are, in insertion [m]; 0 if they are not."""
+    """Return how late the tips of the first centimetres are [m]; 0 if they are not."""
     inserted, ways, total = np.empty(events.size), np.empty((events.size, 3)), 0.0
     for k in range(events.size):
         event = events[k]

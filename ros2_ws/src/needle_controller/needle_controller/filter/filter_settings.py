@@ -9,6 +9,14 @@ from typing import Annotated, cast
 import numpy as np
 import numpy.typing as npt
 
+from needle_controller.filter.hypotheses import (
+    LASTING,
+    NORMAL,
+    UNIFORM,
+    NoiseHypothesis,
+    RollHypothesis,
+    TorsionHypothesis,
+)
 from needle_controller.filter.records import (
     ASSUMPTIONS,
     E_KAPPA,
@@ -17,14 +25,6 @@ from needle_controller.filter.records import (
     E_TURN,
     HYPOTHESIS,
     NOISES,
-)
-from needle_controller.filter.hypotheses import (
-    LASTING,
-    NORMAL,
-    UNIFORM,
-    NoiseHypothesis,
-    RollHypothesis,
-    TorsionHypothesis,
 )
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles

@@ -90,7 +90,7 @@ def untold_age(
     age = mean - slip * middle - of_entry * too_deep
     start_variance = noise * (1.0 - of_entry)
     std = math.sqrt(start_variance + noise / number + slip_variance * middle**2)
-    return age if age > _SURE * std else 0.0
+    return float(age) if age > _SURE * std else 0.0
 
 
 @compiled
@@ -103,4 +103,4 @@ def _median(values: Array, count: int) -> float:
             rank[place] = rank[place - 1]
             place -= 1
         rank[place] = values[k]
-    return 0.5 * (rank[(count - 1) // 2] + rank[count // 2])
+    return float(0.5 * (rank[(count - 1) // 2] + rank[count // 2]))

@@ -1,4 +1,4 @@
-"""All hypotheses of a needle as one estimate: mean pose, covariance, what the laws read; compiled."""
+"""All hypotheses of a needle as one estimate: mean pose, covariance, what laws read; compiled."""
 
 # Compiled code takes keywords slowly or not at all.
 # ruff: noqa: PLR0917
@@ -154,7 +154,7 @@ def _doubts(needle: Any, estimate: Any, known: Any) -> int:
     """Return the reasons of `DOUBTS` that hold, as bits."""
     low, high = known.smallest_curvature, known.largest_curvature
     margin = _AT_LIMIT * known.curvature
-    return (
+    return int(
         (estimate.uncertainty[0] > LARGEST_X_STD**2)
         + 2 * (needle.unexplained > LARGEST_UNEXPLAINED)
         + 4 * (estimate.noise > LARGEST_NOISE)

@@ -1,7 +1,6 @@
 """From an estimate to the rotation of the next step ([KC09] (7), (10))."""
 
 # Compiled code takes keywords slowly or not at all.
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import dataclasses

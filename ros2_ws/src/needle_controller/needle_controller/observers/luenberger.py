@@ -1,7 +1,6 @@
 """The paper's observer ([KC09] (9)): a steady gain on the tip's distance from the plane."""
 
 # Compiled code takes keywords slowly or not at all.
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import dataclasses

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from needle_controller.filter.bank import advance_needle, correct_needle
 from needle_controller.filter.filter_settings import ROLL_HYPOTHESES, FilterSettings
 from needle_controller.filter.hypotheses import (
     LASTING,
@@ -16,7 +17,6 @@ from needle_controller.filter.hypotheses import (
     RollHypothesis,
     TorsionHypothesis,
 )
-from needle_controller.filter.bank import advance_needle, correct_needle
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.filter.mixture import estimate_needle
 from needle_controller.laws.roll_law import RollLaw, RollLawSettings

@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal, norm, truncnorm
 
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypotheses import LASTING, NoiseHypothesis
-from needle_controller.filter.records import E_KAPPA, E_SCALE, ERROR, HYPOTHESIS, NOISES
+from needle_controller.filter.records import E_KAPPA, E_SCALE, ERROR, HYPOTHESIS
 from needle_controller.filter.tip_update import (
     new_reading,
     new_work,
@@ -63,7 +63,8 @@ def taken(
     noise: Array = np.eye(3) * BOUND**2 / 3.0,  # noqa: B008
     settings: FilterSettings = PLAIN,
 ) -> Records:
-    after, reading, work = before.copy(), new_reading(), new_work()
+    after: Records = before.copy()
+    reading, work = new_reading(), new_work()
     reading.tip[:], reading.covariance[:] = tip, noise
     assert read_tip(reading)
     for h in after:
@@ -209,7 +210,7 @@ def test_tips_show_which_coordinate_is_noisier() -> None:
 
 def with_state_of(after: Records, before: Records) -> Records:
     """What was learned of the noise, with the estimates as they were."""
-    h = before.copy()
+    h: Records = before.copy()
     h["noise_weights"] = after["noise_weights"]
     return h
 
