@@ -16,7 +16,7 @@ import numpy as np
 
 from campaign.steering.obstacle_scenes import ObstacleScene, clearance, make_scene
 from campaign.steering.path_judge import way_after
-from needle_bringup.studies.study_controllers import rrt_law
+from needle_bringup.studies.study_laws import rrt_law
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import offset_plane

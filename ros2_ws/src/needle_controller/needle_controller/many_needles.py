@@ -22,7 +22,8 @@ from needle_controller.filter.records import (
     TORSION,
 )
 from needle_controller.laws.law import LinearizingGains, linearizing_rate
-from needle_controller.laws.point_law import PointLawSettings, point_turn
+from needle_controller.laws.point_law import point_turn
+from needle_controller.laws.point_turns import PointLawSettings
 from needle_controller.laws.roll_law import RollLawSettings, roll_turn
 from needle_controller.model.arrays import Array
 from needle_controller.observers.estimator import Estimate

@@ -17,16 +17,13 @@ from needle_bringup.studies.particle_filter import ParticleFilter
 from needle_bringup.studies.study_controllers import (
     CURVATURE,
     STEP_LENGTH,
-    EachEstimator,
-    Estimators,
     NeedlesToPoints,
-    PointLaws,
     SteeredNeedles,
     controller_factory,
-    each_point_law,
-    each_rate,
     point_controller_factory,
 )
+from needle_bringup.studies.study_estimators import EachEstimator, Estimators
+from needle_bringup.studies.study_laws import PointLaws, each_point_law, each_rate
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.presets.point_steering import PointSteering
 from needle_controller.presets.presets import make_controller

@@ -8,22 +8,27 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from needle_controller.laws.flip_plan import FlipPlan
-from needle_controller.laws.law import LinearizingLaw, SteeringCommand, StepLaw
-from needle_controller.laws.point_law import PointLawSettings
-from needle_controller.laws.roll_law import RollLawSettings, hypotheses_of
-from needle_controller.many_needles import ManyFilters, ManyObservers
+from needle_bringup.studies.study_estimators import BestEstimators, EachEstimator, Estimators
+from needle_bringup.studies.study_laws import (
+    PointLaws,
+    best_point_laws,
+    best_rates,
+    each_point_law,
+    each_rate,
+    planned_law,
+    rrt_law,
+    sliding_law,
+)
+from needle_controller.laws.law import LinearizingLaw, StepLaw
+from needle_controller.many_needles import ManyObservers
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import TargetMotion
-from needle_controller.model.target_plane import offset_plane
-from needle_controller.observers.estimator import Estimate, Estimator
-from needle_controller.planning.obstacles import Obstacles
-from needle_controller.presets.path_steering import PathSteering, tip_state
-from needle_controller.presets.point_steering import Foresight, PointSteering, prompt_point_law
+from needle_controller.observers.estimator import Estimator
+from needle_controller.presets.point_steering import PointSteering
 from needle_controller.presets.presets import (
     filter_settings,
     make_controller,
@@ -39,124 +44,16 @@ from needle_controller.protocol.trust import ends_elsewhere
 from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
-from needle_sim.studies.figures_of_merit import BoolArray
-from needle_sim.studies.point_targets import INSERTION_SPEED
-from needle_sim.studies.rrt_replanning import SAMPLES, DutyCycle, plan
-from needle_sim.studies.sliding_mode import sliding_mode_rate
 from needle_sim.studies.study import CHUNK
-
-TimedLaw = Callable[[Estimate, float, float, float], SteeringCommand]
-"""Takes an estimate, the time [s], the insertion [m], and what the base may still turn [rad]."""
 
 SLIDING_MODE, RRT = "sliding_mode", "rrt"
 """Names of the reference laws for points."""
-CLEAR = 0.00085
-"""What the published planner keeps from obstacles: the needle's radius and half a mm [m]."""
 CURVATURE = SteeringSettings.curvature
 STEP_LENGTH = SteeringSettings.step_length
 # What the linear observer knows of a needle is a twentieth of what the bank does.
 _LINEAR_CHUNK = 20 * CHUNK
 # Studies have depths of their own; what limits flips here is what the settings take [m].
 _DEEPEST = 1.0
-
-
-class Estimators(Protocol):
-    """The estimators of N needles."""
-
-    def start(self, tips: FloatArray) -> None:
-        """Start at first tips, (N, 3) [m], with all bases at 0."""
-
-    def advance(self, lengths: FloatArray, turns: FloatArray) -> None:
-        """Move on by inserted lengths [m] and rotations of the bases [rad], (N,)."""
-
-    def correct(self, tips: FloatArray, covariance: Array | None, ages: FloatArray) -> None:
-        """Take tips, (N, 3), of a covariance, (3, 3), and their ages, (N,) [m]."""
-
-    def each(self) -> Sequence[Estimate]:
-        """Return what is known of each."""
-
-    def belief(self) -> Belief:
-        """Return what is known of all, and whether it is doubted."""
-
-    def positions(self) -> FloatArray:
-        """Return where the tips are, (N, 3) [m]."""
-
-
-class EachEstimator:
-    """Estimators of any kind, one called after the other; see `Estimators`.
-
-    Parameters
-    ----------
-    new : callable
-        Returns the estimator of the needle with a number, counted from 0.
-    """
-
-    def __init__(self, new: Callable[[int], Estimator]) -> None:
-        self._new = new
-        self._estimators: list[Estimator] = []
-        self._known: list[Estimate] = []
-
-    def start(self, tips: FloatArray) -> None:
-        """Start at first tips."""
-        self._estimators = [self._new(n) for n in range(len(tips))]
-        for estimator, tip in zip(self._estimators, tips, strict=True):
-            estimator.reset(tip, np.zeros(2))
-        self._estimate()
-
-    def advance(self, lengths: FloatArray, turns: FloatArray) -> None:
-        """Move on."""
-        moved = zip(self._estimators, lengths.tolist(), turns.tolist(), strict=True)
-        for estimator, length, turn in moved:
-            estimator.advance(length, turn)
-
-    def correct(self, tips: FloatArray, covariance: Array | None, ages: FloatArray) -> None:
-        """Take tips."""
-        for estimator, tip, age in zip(self._estimators, tips, ages.tolist(), strict=True):
-            estimator.correct(tip, covariance, age)
-        self._estimate()
-
-    def _estimate(self) -> None:
-        self._known = [estimator.estimate() for estimator in self._estimators]
-
-    def each(self) -> Sequence[Estimate]:
-        """Return what is known of each."""
-        return self._known
-
-    def belief(self) -> Belief:
-        """Return what is known of all."""
-        uncertainty = np.array([hypotheses_of(known).uncertainty for known in self._known])
-        s = np.array([known.linearized for known in self._known])
-        doubtful = None
-        if self._known[0].doubtful is not None:
-            doubtful = np.array([bool(known.doubtful) for known in self._known])
-        return _belief(s, uncertainty, doubtful)
-
-    def positions(self) -> FloatArray:
-        """Return where the tips are."""
-        return np.array([known.position for known in self._known])
-
-
-class BestEstimators(ManyFilters):
-    """The estimators of preset `best`, in compiled loops; see `Estimators`."""
-
-    def belief(self) -> Belief:
-        """Return what is known of all."""
-        known = self.estimates
-        return _belief(known["linearized"], known["uncertainty"], known["doubts"] != 0)
-
-    def positions(self) -> FloatArray:
-        """Return where the tips are."""
-        return np.array(self.estimates["coordinates"][:, :3])
-
-
-def _belief(s: FloatArray, uncertainty: FloatArray, doubtful: BoolArray | None) -> Belief:
-    return Belief(
-        x=s[:, 0].copy(),
-        x_std=np.sqrt(np.maximum(uncertainty[:, 0], 0.0)),
-        sin_pitch=s[:, 1].copy(),
-        sin_pitch_std=np.sqrt(np.maximum(uncertainty[:, 2], 0.0)),
-        doubtful=doubtful,
-    )
 
 
 class SteeredNeedles:
@@ -340,168 +237,6 @@ class PaperNeedles:
     def belief(self) -> Belief | None:
         """Return None: the steady gain makes no use of a covariance."""
         return None
-
-
-PointLaws = Callable[[Any, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""Takes estimators, inserted lengths [m] and what the bases may still turn [rad], (N,); returns
-rotation rates [rad/m] and insertions left [m], (N,)."""
-
-
-def each_rate(new_law: Callable[[int], StepLaw]) -> Callable[[Estimators, float], FloatArray]:
-    """Return rotation rates by laws that are called in Python, one after the other."""
-    laws: list[StepLaw] = []
-
-    def rates(estimators: Estimators, insertion: float) -> FloatArray:
-        known = estimators.each()
-        laws.extend(new_law(n) for n in range(len(laws), len(known)))
-        return np.array(
-            [law(one, insertion).rotation_rate for law, one in zip(laws, known, strict=True)]
-        )
-
-    return rates
-
-
-def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], TimedLaw]) -> PointLaws:
-    """Return laws for points that are called in Python, one after the other.
-
-    Parameters
-    ----------
-    motion : TargetMotion
-        Of all targets.
-    new_law : callable
-        Returns the law of one needle, whose target's motion is told to a `TargetMotion`.
-    """
-    laws: list[tuple[TargetMotion, TimedLaw]] = []
-
-    def commands(
-        estimators: Estimators, insertion: FloatArray, rotation_left: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        known = estimators.each()
-        for _ in range(len(laws), len(known)):
-            own = TargetMotion()
-            laws.append((own, new_law(own)))
-        targets = np.broadcast_to(motion.last, (len(known), 3))
-        rates, left = np.empty(len(known)), np.empty(len(known))
-        for n, (own, law) in enumerate(laws):
-            own.see(motion.seen, targets[n])
-            inserted = float(insertion[n])
-            said = law(known[n], inserted / INSERTION_SPEED, inserted, float(rotation_left[n]))
-            assert said.insertion_left is not None
-            rates[n], left[n] = said.rotation_rate, said.insertion_left
-        return rates, left
-
-    return commands
-
-
-def best_rates(settings: SteeringSettings) -> Callable[[ManyFilters, float], FloatArray]:
-    """Return rotation rates by the law of `best`, in compiled loops."""
-    law, plan = RollLawSettings(**settings.turning), FlipPlan(settings.flip_depths)
-
-    def rates(filters: ManyFilters, insertion: float) -> FloatArray:
-        return filters.roll_rates(law, plan.bend_sign(insertion) if plan.depths else 0.0)
-
-    return rates
-
-
-def best_point_laws(settings: SteeringSettings, motion: TargetMotion) -> PointLaws:
-    """Return the law of `best` for points, in compiled loops."""
-    law, foresight = PointLawSettings(**settings.turning), Foresight(motion)
-
-    def commands(
-        filters: ManyFilters, insertion: FloatArray, rotation_left: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        def left(targets: FloatArray) -> FloatArray:
-            return filters.point_rates(law, targets, rotation_left)[1]
-
-        targets = foresight.look(insertion / INSERTION_SPEED, insertion, left)
-        return filters.point_rates(law, targets, rotation_left)
-
-    return commands
-
-
-def sliding_law(motion: TargetMotion, largest_rate: float) -> TimedLaw:
-    """Return the published reference law, which goes to where the target is; see `sliding_mode`.
-
-    Parameters
-    ----------
-    motion : TargetMotion
-        Of the target.
-    largest_rate : float
-        Rotation per inserted length [rad/m].
-    """
-
-    def command(estimate: Estimate, *_: float) -> SteeringCommand:
-        target = estimate.rotation.T @ (motion.last - estimate.position)
-        rate = float(sliding_mode_rate(target, largest_rate))
-        return SteeringCommand(0.0, rate, float(target[2]))
-
-    return command
-
-
-def rrt_law(
-    motion: TargetMotion,
-    settings: SteeringSettings,
-    rng: np.random.Generator,
-    obstacles: Array | None = None,
-) -> TimedLaw:
-    """Return the published planner as a law that plans anew at every step; see `rrt_replanning`.
-
-    Parameters
-    ----------
-    motion : TargetMotion
-        Of the target.
-    settings : SteeringSettings
-        Of the needle.
-    rng : numpy.random.Generator
-        All chance of the planner.
-    obstacles : ndarray, shape (M, 7), optional
-        Ends of the axis and radius of each capsule [m]; none by default.
-    """
-    around = np.zeros((0, 7)) if obstacles is None else obstacles
-    cycle = DutyCycle(settings.max_rotation_per_length, settings.step_length)
-
-    def command(estimate: Estimate, *_: float) -> SteeringCommand:
-        ahead = estimate.rotation.T @ (motion.last - estimate.position)
-        # Where no path is found, the tightest arc towards the target.
-        arc = np.array([ahead[0], ahead[1], 1.0])
-        plan(
-            np.array(estimate.position),
-            np.ascontiguousarray(estimate.rotation),
-            np.array(motion.last),
-            around,
-            settings.curvature,
-            CLEAR,
-            rng.random((SAMPLES, 4)),
-            arc,
-        )
-        return SteeringCommand(0.0, float(cycle.rates(arc[None])[0]), float(ahead[2]))
-
-    return command
-
-
-def planned_law(motion: TargetMotion, settings: SteeringSettings) -> TimedLaw:
-    """Return the law that leads a needle along a planner's way; no obstacle is in it.
-
-    Parameters
-    ----------
-    motion : TargetMotion
-        Of the target.
-    settings : SteeringSettings
-        Of the needle, and which planner.
-    """
-    law, free, plane = prompt_point_law(settings), Obstacles(), offset_plane(0.0)
-    needle = PathSteering(settings)
-
-    def command(estimate: Estimate, _: float, insertion: float, __: float) -> SteeringCommand:
-        route = needle.route(tip_state(estimate, plane), motion.last, free, insertion)
-        if route is None:
-            # Who sees no way stays where it is.
-            return SteeringCommand(0.0, 0.0, -math.inf)
-        said = law(estimate, route.aim)
-        left = said.insertion_left if route.length is None else route.length
-        return SteeringCommand(said.virtual_input, said.rotation_rate, left)
-
-    return command
 
 
 def needles_at_a_time(name: str) -> int:

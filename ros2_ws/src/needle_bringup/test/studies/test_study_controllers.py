@@ -11,15 +11,13 @@ import pytest
 
 from needle_bringup.studies import study_controllers
 from needle_bringup.studies.study_controllers import (
-    BestEstimators,
-    EachEstimator,
     SteeredNeedles,
     controller_factory,
-    each_rate,
     needles_at_a_time,
-    planned_law,
     point_controller_factory,
 )
+from needle_bringup.studies.study_estimators import BestEstimators, EachEstimator
+from needle_bringup.studies.study_laws import each_rate, planned_law
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.laws.law import SteeringCommand

@@ -19,7 +19,7 @@ from needle_controller.model.kinematics import (
 
 @dataclasses.dataclass(frozen=True)
 class Hypotheses:
-    """What a law needs of an estimate that is the mean of several hypotheses.
+    """The part of an estimate over several hypotheses that a law needs.
 
     Attributes
     ----------

@@ -35,7 +35,7 @@ OBSERVER = np.dtype(
 
 
 class ObserverModel(NamedTuple):
-    """What the observer assumes of a needle; see `LuenbergerSettings`."""
+    """Assumptions about a needle; see `LuenbergerSettings`."""
 
     curvature: float
     margin: float
@@ -73,7 +73,7 @@ class LuenbergerSettings:
 
     @property
     def model(self) -> ObserverModel:
-        """What the compiled code needs of this."""
+        """The part that compiled code needs."""
         return ObserverModel(self.curvature, self.saturation_margin, self.observer_poles)
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.laws.law import SteeringCommand
-from needle_controller.laws.point_law import PointLaw, PointLawSettings
+from needle_controller.laws.point_law import PointLaw
+from needle_controller.laws.point_turns import PointLawSettings
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import WINDOWS, TargetMotion
 from needle_controller.observers.estimator import Estimate

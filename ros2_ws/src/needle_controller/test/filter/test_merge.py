@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_controller.filter.bank import merge
+from needle_controller.filter.merging import merge
 from needle_controller.filter.records import ERROR, HYPOTHESIS, NEEDLE
 from needle_controller.model.arrays import Array
 

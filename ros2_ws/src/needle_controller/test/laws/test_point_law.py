@@ -12,8 +12,8 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from needle_controller.filter.filter_settings import FilterSettings
-from needle_controller.laws.point_law import (
-    PointLaw,
+from needle_controller.laws.point_law import PointLaw
+from needle_controller.laws.point_turns import (
     PointLawSettings,
     affordable_reserve,
     rest_after,
