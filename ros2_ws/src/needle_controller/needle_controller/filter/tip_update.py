@@ -164,22 +164,20 @@ def update_hypothesis(h: Any, reading: Reading, known: Any, work: Work) -> None:
 @compiled
 def _innovation(h: Any, reading: Reading, i: int, work: Work) -> tuple[float, float]:
     """Return innovation and variance of one coordinate; write its covariances with the error."""
-    u, p, own = reading.directions[i], h.covariance, work.covaried[i]
+    p, c, y = h.covariance, work.covaried, reading.values[i]
+    ux, uy, uz = reading.directions[i, 0], reading.directions[i, 1], reading.directions[i, 2]
     # c = P u, u the direction of the reading in the position ...
     for k in range(ERROR):
-        own[k] = u[0] * p[0, k] + u[1] * p[1, k] + u[2] * p[2, k]
+        c[i, k] = ux * p[0, k] + uy * p[1, k] + uz * p[2, k]
     # ... less what the coordinates before have narrowed: (P - sum_b n_b c_b c_b^T) u.
     for b in range(i):
-        other = work.covaried[b]
-        by = work.narrowing[b] * (u[0] * other[0] + u[1] * other[1] + u[2] * other[2])
+        by = work.narrowing[b] * (ux * c[b, 0] + uy * c[b, 1] + uz * c[b, 2])
         for k in range(ERROR):
-            own[k] -= by * other[k]
+            c[i, k] -= by * c[b, k]
     # nu = y - u (p + dp), variance u^T P u
-    innovation, variance = reading.values[i], 0.0
-    for k in range(3):
-        innovation -= u[k] * (h.position[k] + work.change[k])
-        variance += u[k] * own[k]
-    return innovation, variance
+    x, change = h.position, work.change
+    seen = ux * (x[0] + change[0]) + uy * (x[1] + change[1]) + uz * (x[2] + change[2])
+    return y - seen, ux * c[i, 0] + uy * c[i, 1] + uz * c[i, 2]
 
 
 @compiled
@@ -303,17 +301,17 @@ def truncated_moments(lower: float, upper: float) -> tuple[float, float, float]:
 @compiled
 def _learn_noise(h: Any, known: Any, work: Work) -> None:
     """Take what the tip shows of the noise, by how likely it was none."""
-    prior = known.noises[h.shape, 1]
+    weights = h.noise_weights
     for i in range(3 if h.shape == LASTING else 1):
-        shown, weights, kept = work.shares[i], h.noise_weights[i], 0.0
+        kept = 0.0
         for m in range(NOISES):
-            likely = (1.0 - h.outlier) * shown[m] + h.outlier * weights[m]
+            likely = (1.0 - h.outlier) * work.shares[i, m] + h.outlier * weights[i, m]
             # After an outlier, widen the weights of the noise models.
-            likely += _REOPENED * h.outlier * (prior[m] - likely)
-            weights[m] = likely if likely > _GIVEN_UP else 0.0
-            kept += weights[m]
+            likely += _REOPENED * h.outlier * (known.noises[h.shape, 1, m] - likely)
+            weights[i, m] = likely if likely > _GIVEN_UP else 0.0
+            kept += weights[i, m]
         for m in range(NOISES):
-            weights[m] /= kept
+            weights[i, m] /= kept
 
 
 @compiled
