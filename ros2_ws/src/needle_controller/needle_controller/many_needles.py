@@ -26,6 +26,7 @@ from needle_controller.laws.point_law import point_turn
 from needle_controller.laws.point_turns import PointLawSettings
 from needle_controller.laws.roll_law import RollLawSettings, roll_turn
 from needle_controller.model.arrays import Array
+from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.observers.estimator import Estimate
 from needle_controller.observers.luenberger import (
     OBSERVER,
@@ -269,13 +270,18 @@ def _step_observers(
     ages: Array,
     model: ObserverModel,
 ) -> None:
+    # Steps are alike as a rule, and so are their gains.
+    since, gain = 0.0, (0.0, 0.0, 0.0)
     for n in range(needles.size):
         needle = needles[n]
         if unturned[n] > 0.0:
             advance_observer(needle, unturned[n], 0.0, model)
         advance_observer(needle, lengths[n] - unturned[n], turns[n], model)
         if math.isfinite(tips[n, 0] + tips[n, 1] + tips[n, 2]):
-            correct_observer(needle, tips[n, 0], ages[n], model)
+            if needle.since_correction != since:
+                since = needle.since_correction
+                gain = sampled_observer_gain(model.poles, since)
+            correct_observer(needle, tips[n, 0], ages[n], gain, model)
 
 
 @compiled

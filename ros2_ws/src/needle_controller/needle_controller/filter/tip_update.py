@@ -278,6 +278,8 @@ def truncated_moments(lower: float, upper: float) -> tuple[float, float, float]:
     lower, upper : float
         The bounds; those beyond 5.5 count as none (an error below 1e-6).
     """
+    if lower <= -_FAR and upper >= _FAR:
+        return 1.0, 0.0, 1.0
     below, above = min(abs(lower), _FAR), min(abs(upper), _FAR)
     # phi(z) and the tail Q(|z|) at both bounds.
     bell_lower = math.exp(-0.5 * below * below) if below < _FAR else 0.0

@@ -150,8 +150,9 @@ class LuenbergerObserver:
         if not found:
             return
         since = float(self._needle["since_correction"])
-        gain = np.array(sampled_observer_gain(self._model.poles, since))
-        correct_observer(self._needle, float(seen[0]), float(age), self._model)
+        of_each = sampled_observer_gain(self._model.poles, since)
+        correct_observer(self._needle, float(seen[0]), float(age), of_each, self._model)
+        gain = np.array(of_each)
         self._tip = seen
         if covariance is not None:
             self._tip_covariance = known
@@ -280,7 +281,9 @@ def advance_observer(needle: Any, length: float, turn: float, model: ObserverMod
 
 
 @compiled
-def correct_observer(needle: Any, x: float, age: float, model: ObserverModel) -> None:
+def correct_observer(
+    needle: Any, x: float, age: float, gain: tuple[float, float, float], model: ObserverModel
+) -> None:
     """Correct the linearized state by a measured distance from the plane: (9).
 
     Parameters
@@ -291,13 +294,16 @@ def correct_observer(needle: Any, x: float, age: float, model: ObserverModel) ->
         Of the tip [m].
     age : float
         Inserted since [m].
+    gain : tuple of float
+        L, of `sampled_observer_gain` over what was inserted since the last correction.
     model : ObserverModel
         What is assumed.
     """
-    s, gain = needle.linearized, sampled_observer_gain(model.poles, needle.since_correction)
+    s = needle.linearized
     # s <- s + L (w - C F(-age) s)
     innovation = x - (s[0] - age * s[1] + 0.5 * age * age * s[2])
-    for k in range(3):
-        s[k] += gain[k] * innovation
+    s[0] += gain[0] * innovation
+    s[1] += gain[1] * innovation
+    s[2] += gain[2] * innovation
     saturate(needle, model)
     needle.since_correction = 0.0
