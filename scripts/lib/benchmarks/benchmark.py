@@ -116,7 +116,7 @@ def _bench(arguments: Sequence[str]) -> int:
 def design() -> reference_loop.Design:
     """Return the paper preset's gains for the reference loops."""
     gains = SETTINGS.gains()
-    observer = sampled_observer_gain(gains.observer_poles, SETTINGS.step_length)
+    observer = np.array(sampled_observer_gain(gains.observer_poles, SETTINGS.step_length))
     return reference_loop.Design(
         SETTINGS.curvature,
         SETTINGS.step_length,

@@ -10,7 +10,7 @@ from reference.markdown import table
 ROOMS = (
     "needle_controller.model",
     "needle_controller.observers",
-    "needle_controller.bank",
+    "needle_controller.filter",
     "needle_controller.laws",
     "needle_controller.planning",
     "needle_controller.presets",

@@ -16,8 +16,9 @@ import numpy as np
 
 from campaign.steering.obstacle_scenes import ObstacleScene, clearance, make_scene
 from campaign.steering.path_judge import way_after
-from needle_bringup.studies.study_controllers import NeedlesToPoints, rrt_law
+from needle_bringup.studies.study_laws import rrt_law
 from needle_controller.laws.law import SteeringCommand
+from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -166,23 +167,21 @@ def _best(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
 
 def _reference(scene: ObstacleScene, settings: SteeringSettings) -> Drive:
     """Return what steers a needle by the published planner, with the estimator of `best`."""
-    needles = NeedlesToPoints(
-        make_controller(settings, np.eye(3), np.zeros(3))[0],
-        lambda motion: rrt_law(motion, settings, scene.obstacles),
-    )
-    needles.see_targets(0.0, scene.target[np.newaxis])
+    estimator = make_controller(settings, np.eye(3), np.zeros(3))[0]
+    motion = TargetMotion()
+    motion.see(0.0, scene.target)
+    law = rrt_law(motion, settings, np.random.default_rng(1), scene.obstacles)
     before: list[JointSample] = []
 
     def drive(tip: FloatArray, joints: JointSample) -> SteeringCommand:
-        tips = tip[np.newaxis]
         if before:
             last = before.pop()
-            turned = np.array([joints.rotation - last.rotation])
-            rate = needles.step(joints.insertion - last.insertion, turned, tips, 0.0)
+            estimator.advance(joints.insertion - last.insertion, joints.rotation - last.rotation)
+            estimator.correct(tip)
         else:
-            rate = needles.start(tips)
+            estimator.reset(tip, [joints.insertion, joints.rotation])
         before.append(joints)
-        return SteeringCommand(np.zeros(()), rate[0], needles.insertion_left()[0])
+        return law(estimator.estimate(), 0.0, joints.insertion, math.inf)
 
     return drive
 

@@ -14,13 +14,13 @@ class Pursuit:
     def to_plane(self, estimate, insertion):
         """Return the rotation rate [rad/m] that leads into the plane x = 0."""
         place = estimate.position.copy()
-        place[..., 0] = 0.0
-        place[..., 2] += AHEAD
+        place[0] = 0.0
+        place[2] += AHEAD
         return self.to_point(estimate, place)
 
     def to_point(self, estimate, target):
         """Return the rotation rate [rad/m] that leads to a point of the target plane's frame."""
-        way = np.einsum("...ji,...j->...i", estimate.rotation, target - estimate.position)
+        way = estimate.rotation.T @ (target - estimate.position)
         # The needle bends to -y of the tip.
-        error = np.arctan2(way[..., 0], -way[..., 1])
+        error = np.arctan2(way[0], -way[1])
         return error / self.settings.step_length

@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 import numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-_COMPILED = re.compile(rb"^(@compiled|@inlined|# Read by compiled code\.)$", re.MULTILINE)
+_COMPILED = re.compile(rb"^(@compiled|@inlined|@parallel|# Read by compiled code\.)$", re.MULTILINE)
 
 
 def compiled(function: Function) -> Function:
@@ -40,7 +40,17 @@ def compiled(function: Function) -> Function:
     callable
         The same, compiled.
     """
-    return _compile(function, always_inline=False)
+    return _compile(function)
+
+
+def parallel(function: Function) -> Function:
+    """Compile like `compiled` what loops with `numba.prange` over what does not share anything.
+
+    The rounds are divided among NUMBA_NUM_THREADS threads; each comes out the same in any of them.
+    """
+    # Threads that sleep between two calls, and bear a fork.
+    numba.config.THREADING_LAYER = "workqueue"
+    return _compile(function, parallel=True)
 
 
 def inlined(function: Function) -> Function:
@@ -48,10 +58,10 @@ def inlined(function: Function) -> Function:
 
     Its code becomes part of the caller's: only so can a loop be done for several elements at once.
     """
-    return _compile(function, always_inline=True)
+    return _compile(function, forceinline=True)
 
 
-def _compile(function: Function, *, always_inline: bool) -> Function:
+def _compile(function: Function, **options: bool) -> Function:
     folder = _cache_directory(_package_root(Path(function.__code__.co_filename)))
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = folder
@@ -59,7 +69,7 @@ def _compile(function: Function, *, always_inline: bool) -> Function:
         result = numba.njit(
             cache=bool(folder),
             error_model="numpy",
-            forceinline=always_inline,
+            **options,
         )(function)
     finally:
         numba.config.CACHE_DIR = before

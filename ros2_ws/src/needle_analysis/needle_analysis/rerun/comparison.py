@@ -93,9 +93,10 @@ FIELDS: Mapping[str, tuple[Field, ...]] = {
         Field("rotation", ("vector.z",), ANGLE),
     ),
     "device/joint_trajectory": (
-        Field("insertion", ("points.0.positions.0",), LENGTH),
-        Field("rotation", ("points.0.positions.1",), ANGLE),
-        Field("duration", ("points.0.time_from_start",), DURATION),
+        # A step is one point, a path ahead two or three.
+        Field("insertion", tuple(f"points.{k}.positions.0" for k in range(3)), LENGTH),
+        Field("rotation", tuple(f"points.{k}.positions.1" for k in range(3)), ANGLE),
+        Field("duration", tuple(f"points.{k}.time_from_start" for k in range(3)), DURATION),
     ),
 }
 """Relative topic to what is compared within the tolerance of its kind; the rest must be equal."""

@@ -9,7 +9,7 @@ import dataclasses
 import math
 import sys
 from collections.abc import Callable, Collection
-from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -19,17 +19,21 @@ from needle_bringup.studies.study_controllers import (
     STEP_LENGTH,
     NeedlesToPoints,
     SteeredNeedles,
+    controller_factory,
+    point_controller_factory,
 )
-from needle_controller.observers.estimator import Estimator
+from needle_bringup.studies.study_estimators import EachEstimator, Estimators
+from needle_bringup.studies.study_laws import PointLaws, each_point_law, each_rate
+from needle_controller.model.target_motion import TargetMotion
 from needle_controller.presets.point_steering import PointSteering
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_core.commands.cli import EXIT_DONE
 from needle_sim.studies.disturbances import Disturbances
-from needle_sim.studies.point_study import run_point_study
+from needle_sim.studies.point_study import PointController, run_point_study
 from needle_sim.studies.point_targets import FARTHEST, MovingTargets, random_targets
 from needle_sim.studies.start_grids import GRIDS, POINTS, StartBounds
-from needle_sim.studies.study import CHUNK, StudySettings, run_study
+from needle_sim.studies.study import Controller, StudySettings, run_study
 
 NEEDLES, PARTICLES = 200, 2000
 BOUNDS = StartBounds(x=0.003, pitch=math.radians(10.0), roll=math.radians(30.0))
@@ -46,8 +50,6 @@ ROWS = {
     "play 40 deg": Disturbances(noise=NOISE, play=math.radians(40.0)),
     "lag 8 mm": Disturbances(noise=NOISE, lag_length=0.008),
 }
-_CHUNK = 25
-"""Needles with all their particles that are steered at a time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,55 +92,63 @@ def limits(
         Which of `ROWS`; all by default.
     """
     settings = SteeringSettings(**PAPER_NOISE)
+    law = make_controller(settings, np.eye(3))[1]
+
+    def by_law(motion: TargetMotion) -> PointLaws:
+        return each_point_law(motion, lambda own: PointSteering(settings, own).command)
+
     rows = {}
     for label in only:
         wrong = ROWS[label]
-        key = wrong, needles, seed
+        rngs = np.random.default_rng(seed).spawn(needles)
+
+        def knowing(_: int, wrong: Disturbances = wrong, rngs: Any = rngs) -> Estimators:
+            return EachEstimator(
+                lambda n: ParticleFilter(CURVATURE, wrong, BOUNDS, particles, rngs[n])
+            )
+
         rows[label] = LimitRow(
-            best=_reached(key, partial(_best, settings), settings, CHUNK),
+            best=_reached(
+                wrong,
+                needles,
+                seed,
+                controller_factory("best", settings.tip_noise_bound),
+                point_controller_factory("best", settings.tip_noise_bound),
+            ),
             limit=_reached(
-                key,
-                partial(ParticleFilter, CURVATURE, wrong, BOUNDS, particles, seed),
-                settings,
-                _CHUNK,
+                wrong,
+                needles,
+                seed,
+                lambda: SteeredNeedles(knowing, each_rate(lambda _: law)),
+                lambda: NeedlesToPoints(knowing, by_law),
             ),
         )
     return rows
 
 
-def _best(settings: SteeringSettings) -> Estimator:
-    return make_controller(settings, np.eye(3), np.zeros(3))[0]
-
-
 def _reached(
-    key: tuple[Disturbances, int, int],
-    new_estimator: Callable[[], Estimator],
-    settings: SteeringSettings,
-    chunk: int,
+    wrong: Disturbances,
+    needles: int,
+    seed: int,
+    to_plane: Callable[[], Controller],
+    to_points: Callable[[], PointController],
 ) -> Reached:
-    """Steer needles with an estimator and the laws of `best`, to the plane and to points."""
-    wrong, needles, seed = key
+    """Steer needles to the plane and to points."""
     starts = GRIDS["random"](BOUNDS, -(-needles // POINTS**3), seed)[:needles]
-    law = make_controller(settings, np.eye(3))[1]
-    to_plane = run_study(
-        starts,
-        lambda: SteeredNeedles(new_estimator(), law),
-        StudySettings(CURVATURE, DEPTH, STEP_LENGTH, wrong, seed),
-        chunk=chunk,
+    in_plane = run_study(
+        starts, to_plane, StudySettings(CURVATURE, DEPTH, STEP_LENGTH, wrong, seed), chunk=needles
     )
-    to_points = run_point_study(
+    at_points = run_point_study(
         starts,
         MovingTargets(random_targets(starts, CURVATURE, seed)),
-        lambda: NeedlesToPoints(
-            new_estimator(), lambda motion: PointSteering(settings, motion).command
-        ),
+        to_points,
         StudySettings(CURVATURE, DEPTH_OF_POINTS, STEP_LENGTH, wrong, seed),
-        chunk=chunk,
+        chunk=needles,
     )
     return Reached(
-        rms_mm=float(np.sqrt(np.mean(to_plane.x_last**2))) * 1e3,
-        point_rms_mm=float(np.sqrt(np.mean(to_points.error**2))) * 1e3,
-        point_share=float(np.mean(to_points.reached)),
+        rms_mm=float(np.sqrt(np.mean(in_plane.x_last**2))) * 1e3,
+        point_rms_mm=float(np.sqrt(np.mean(at_points.error**2))) * 1e3,
+        point_share=float(np.mean(at_points.reached)),
     )
 
 

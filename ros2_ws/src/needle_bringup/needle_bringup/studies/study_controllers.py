@@ -5,23 +5,36 @@ needle_sim, whose studies these are for, does not know the controller under test
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from needle_controller.laws.law import SteeringCommand, StepLaw
-from needle_controller.laws.roll_law import hypotheses_of
+from needle_bringup.studies.study_estimators import BestEstimators, EachEstimator, Estimators
+from needle_bringup.studies.study_laws import (
+    PointLaws,
+    best_point_laws,
+    best_rates,
+    each_point_law,
+    each_rate,
+    planned_law,
+    rrt_law,
+    sliding_law,
+)
+from needle_controller.laws.law import LinearizingLaw, StepLaw
+from needle_controller.many_needles import ManyObservers
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import TargetMotion
-from needle_controller.model.target_plane import offset_plane
-from needle_controller.observers.estimator import Estimate, Estimator
-from needle_controller.observers.luenberger import LuenbergerObserver
-from needle_controller.planning.obstacles import Obstacles
-from needle_controller.presets.path_steering import PathSteering, tip_states
-from needle_controller.presets.point_steering import PointSteering, prompt_point_law
-from needle_controller.presets.presets import make_controller
+from needle_controller.observers.estimator import Estimator
+from needle_controller.presets.point_steering import PointSteering
+from needle_controller.presets.presets import (
+    filter_settings,
+    make_controller,
+    make_law,
+    observer_settings,
+)
 from needle_controller.presets.steering_settings import (
     ONE_SIDED_PRESETS,
     PRESETS,
@@ -31,17 +44,10 @@ from needle_controller.protocol.trust import ends_elsewhere
 from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
-from needle_sim.studies.point_targets import INSERTION_SPEED
-from needle_sim.studies.rrt_replanning import SAMPLES, DutyCycle, plan
-from needle_sim.studies.sliding_mode import sliding_mode_rate
 from needle_sim.studies.study import CHUNK
-
-TimedLaw = Callable[[Estimate, FloatArray, FloatArray, FloatArray], SteeringCommand]
 
 SLIDING_MODE, RRT = "sliding_mode", "rrt"
 """Names of the reference laws for points."""
-CLEAR = 0.00085
-"""What the published planner keeps from obstacles: the needle's radius and half a mm [m]."""
 CURVATURE = SteeringSettings.curvature
 STEP_LENGTH = SteeringSettings.step_length
 # What the linear observer knows of a needle is a twentieth of what the bank does.
@@ -51,14 +57,14 @@ _DEEPEST = 1.0
 
 
 class SteeredNeedles:
-    """An estimator and a law, called as the node calls them: what `study.Controller` describes.
+    """Estimators and laws, called as the node calls them: what `study.Controller` describes.
 
     Parameters
     ----------
-    estimator : Estimator
-        For as many needles as there will be tips.
-    law : callable
-        Returns the command for an estimate at an inserted length [m].
+    new_estimators : callable
+        Returns the estimators of so many needles.
+    rates : callable
+        Returns the rotation rates, (N,) [rad/m], for estimators at an inserted length [m].
     covariance : ndarray, shape (3, 3), optional
         What each tip's is said to be [m^2]; the estimator's own assumption if none is given.
     turn_delay : float
@@ -67,23 +73,42 @@ class SteeredNeedles:
 
     def __init__(
         self,
-        estimator: Estimator,
-        law: StepLaw,
+        new_estimators: Callable[[int], Estimators],
+        rates: Callable[[Any, float], FloatArray],
         covariance: Array | None = None,
         turn_delay: float = 0.0,
     ) -> None:
-        self._turn_delay = turn_delay
-        self._estimator = estimator
-        self._law = law
+        self._new_estimators = new_estimators
+        self._rates = rates
         self._covariance = covariance
+        self._turn_delay = turn_delay
+        self._estimators: Estimators | None = None
         self._insertion: FloatArray = np.zeros(())
         self._turned: FloatArray = np.zeros(())
-        self._estimate: Estimate | None = None
+
+    @classmethod
+    def one_by_one(
+        cls, new: Callable[[], Estimator], law: StepLaw, covariance: Array | None = None
+    ) -> SteeredNeedles:
+        """Return needles of any estimator and law, each of them called in Python.
+
+        Parameters
+        ----------
+        new : callable
+            Returns a needle's estimator.
+        law : StepLaw
+            Of all needles.
+        covariance : ndarray, shape (3, 3), optional
+            See above.
+        """
+        return cls(lambda _: EachEstimator(lambda _: new()), each_rate(lambda _: law), covariance)
 
     def start(self, tips: FloatArray) -> FloatArray:
         """Take the first measured tips; see `study.Controller.start`."""
-        self._estimator.reset(tips, np.zeros((len(tips), 2)))
-        return self._rate()
+        self._estimators = self._new_estimators(len(tips))
+        self._estimators.start(np.ascontiguousarray(tips))
+        self._insertion = self._turned = np.zeros(len(tips))
+        return self._rates(self._estimators, 0.0)
 
     def step(
         self,
@@ -93,72 +118,61 @@ class SteeredNeedles:
         age: float | FloatArray,
     ) -> FloatArray:
         """Take a step and what was measured after it; see `study.Controller.step`."""
-        self._insertion = self._insertion + d_insertion
+        assert self._estimators is not None
+        lengths = np.array(np.broadcast_to(d_insertion, len(tips)))
+        self._insertion = self._insertion + lengths
         self._turned = self._turned + np.abs(d_rotation)
         if self._turn_delay > 0.0:
-            unturned = np.minimum(self._turn_delay, 0.9 * np.asarray(d_insertion))
-            self._estimator.advance(unturned, 0.0 * d_rotation)
-            d_insertion = d_insertion - unturned
-        self._estimator.advance(d_insertion, d_rotation)
-        self._estimator.correct(tips, self._covariance, age)
-        return self._rate()
+            unturned = np.minimum(self._turn_delay, 0.9 * lengths)
+            self._estimators.advance(unturned, 0.0 * d_rotation)
+            lengths -= unturned
+        self._estimators.advance(lengths, d_rotation)
+        ages = np.array(np.broadcast_to(age, len(tips)))
+        self._estimators.correct(np.ascontiguousarray(tips), self._covariance, ages)
+        return self._rates(self._estimators, float(np.max(self._insertion)))
 
     def belief(self) -> Belief | None:
-        """Return what is known after the last step; see `study.Controller.belief`.
-
-        Nothing of `LuenbergerObserver`, whose steady gain makes no use of its covariance: a study
-        of the paper's law does not pay for it.
-        """
-        estimate = self._estimate
-        if estimate is None or isinstance(self._estimator, LuenbergerObserver):
+        """Return what is known after the last step; see `study.Controller.belief`."""
+        if self._estimators is None:
             return None
-        uncertainty, doubtful = hypotheses_of(estimate).uncertainty, estimate.doubtful
-        if doubtful is not None:
-            # The last word counts, as of a node that is done.
-            doubtful = doubtful | ends_elsewhere(self._distance(estimate))
-        return Belief(
-            x=estimate.linearized[..., 0],
-            x_std=np.sqrt(np.maximum(uncertainty[..., 0], 0.0)),
-            sin_pitch=estimate.linearized[..., 1],
-            sin_pitch_std=np.sqrt(np.maximum(uncertainty[..., 2], 0.0)),
-            doubtful=doubtful,
-        )
+        belief = self._estimators.belief()
+        if belief.doubtful is None:
+            return belief
+        # The last word counts, as of a node that is done.
+        elsewhere = np.array([ends_elsewhere(off) for off in self._distance().tolist()])
+        return dataclasses.replace(belief, doubtful=belief.doubtful | elsewhere)
 
-    def _distance(self, estimate: Estimate) -> FloatArray:
+    def _distance(self) -> FloatArray:
         """Return how far each needle is from where it is to end, (N,) [m]."""
-        return np.asarray(estimate.linearized[..., 0])
-
-    def _rate(self) -> FloatArray:
-        self._estimate = self._estimator.estimate()
-        return self._law(self._estimate, float(np.max(self._insertion))).rotation_rate
+        assert self._estimators is not None
+        return np.asarray(self._estimators.positions()[:, 0])
 
 
 class NeedlesToPoints(SteeredNeedles):
-    """An estimator, and a law for points: what `point_study.PointController` describes.
+    """Estimators, and laws for points: what `point_study.PointController` describes.
 
     Parameters
     ----------
-    estimator, covariance :
+    new_estimators, covariance :
         See `SteeredNeedles`.
-    new_law : callable
-        Returns the law for targets whose motion is told to a `TargetMotion`: it takes an estimate,
-        each needle's time [s], its inserted length [m] and what its base may still turn [rad].
+    new_laws : callable
+        Returns the laws for targets whose motion is told to a `TargetMotion`.
     rotation_budget : float
         Most that each base may turn [rad].
     """
 
     def __init__(
         self,
-        estimator: Estimator,
-        new_law: Callable[[TargetMotion], TimedLaw],
+        new_estimators: Callable[[int], Estimators],
+        new_laws: Callable[[TargetMotion], PointLaws],
         covariance: Array | None = None,
         rotation_budget: float = math.inf,
     ) -> None:
         self._motion = TargetMotion()
-        self._point_law = new_law(self._motion)
+        self._point_laws = new_laws(self._motion)
         self._rotation_budget = rotation_budget
         self._left: FloatArray = np.full((), np.nan)
-        super().__init__(estimator, self._command, covariance)
+        super().__init__(new_estimators, self._command, covariance)
 
     def see_targets(self, time: float, targets: FloatArray) -> None:
         """Take where the targets are; see `point_study.PointController`."""
@@ -168,114 +182,61 @@ class NeedlesToPoints(SteeredNeedles):
         """Return how far each needle has to go; see `point_study.PointController`."""
         return self._left
 
-    def _distance(self, estimate: Estimate) -> FloatArray:
-        return np.asarray(np.linalg.norm(estimate.position - self._motion.last, axis=-1))
+    def _distance(self) -> FloatArray:
+        assert self._estimators is not None
+        off = self._estimators.positions() - self._motion.last
+        return np.asarray(np.linalg.norm(off, axis=-1))
 
-    def _command(self, estimate: Estimate, _: float) -> SteeringCommand:
-        command = self._point_law(
-            estimate,
-            self._insertion / INSERTION_SPEED,
-            self._insertion,
-            self._rotation_budget - self._turned,
+    def _command(self, estimators: Any, _: float) -> FloatArray:
+        rates, self._left = self._point_laws(
+            estimators, self._insertion, self._rotation_budget - self._turned
         )
-        assert command.insertion_left is not None
-        self._left = command.insertion_left
-        return command
+        return rates
 
 
-def sliding_law(motion: TargetMotion, largest_rate: float) -> TimedLaw:
-    """Return the published reference law, which goes to where the targets are; see `sliding_mode`.
+class PaperNeedles:
+    """The observer and the law of [KC09], in compiled loops: what `study.Controller` describes.
 
     Parameters
     ----------
-    motion : TargetMotion
-        Of the targets.
-    largest_rate : float
-        Rotation per inserted length [rad/m].
-    """
-
-    def command(estimate: Estimate, *_: FloatArray) -> SteeringCommand:
-        target = _in_frames_of_tips(motion.last, estimate)
-        rate = sliding_mode_rate(target, largest_rate)
-        return SteeringCommand(np.zeros_like(rate), rate, target[..., 2])
-
-    return command
-
-
-def rrt_law(
-    motion: TargetMotion, settings: SteeringSettings, obstacles: Array | None = None
-) -> TimedLaw:
-    """Return the published planner as a law that plans anew at every step; see `rrt_replanning`.
-
-    Parameters
-    ----------
-    motion : TargetMotion
-        Of the targets.
     settings : SteeringSettings
-        Of the needles.
-    obstacles : ndarray, shape (M, 7), optional
-        Ends of the axis and radius of each capsule [m]; none by default.
+        Of preset `paper` or `open_loop`.
+    turn_delay : float
+        See `SteeredNeedles`.
     """
-    around = np.zeros((0, 7)) if obstacles is None else obstacles
-    rng = np.random.default_rng(1)
-    cycle = DutyCycle(settings.max_rotation_per_length, settings.step_length)
 
-    def command(estimate: Estimate, *_: FloatArray) -> SteeringCommand:
-        ahead = _in_frames_of_tips(motion.last, estimate)
-        places = np.ascontiguousarray(estimate.position.reshape(-1, 3))
-        turns = np.ascontiguousarray(estimate.rotation.reshape(-1, 3, 3))
-        targets = np.array(np.broadcast_to(motion.last, estimate.position.shape)).reshape(-1, 3)
-        # Where no path is found, the tightest arc towards the target.
-        arcs = np.array(ahead.reshape(-1, 3))
-        arcs[:, 2] = 1.0
-        for n in range(len(arcs)):
-            chance = rng.random((SAMPLES, 4))
-            plan(
-                places[n], turns[n], targets[n], around, settings.curvature, CLEAR, chance, arcs[n]
-            )
-        rate = cycle.rates(arcs).reshape(ahead.shape[:-1])
-        return SteeringCommand(np.zeros_like(rate), rate, ahead[..., 2])
+    def __init__(self, settings: SteeringSettings, turn_delay: float) -> None:
+        self._settings, self._turn_delay = settings, turn_delay
+        self._needles: ManyObservers | None = None
 
-    return command
+    def start(self, tips: FloatArray) -> FloatArray:
+        """Take the first measured tips; see `study.Controller.start`."""
+        gains = self._settings.gains()
+        law = make_law(self._settings, gains)
+        self._needles = ManyObservers(
+            observer_settings(self._settings, gains).model,
+            law.gains if isinstance(law, LinearizingLaw) else None,
+            len(tips),
+        )
+        return self._needles.start(tips)
 
+    def step(
+        self,
+        d_insertion: float | FloatArray,
+        d_rotation: FloatArray,
+        tips: FloatArray,
+        age: float | FloatArray,
+    ) -> FloatArray:
+        """Take a step and what was measured after it; see `study.Controller.step`."""
+        assert self._needles is not None
+        lengths = np.array(np.broadcast_to(d_insertion, len(tips)))
+        unturned = np.minimum(self._turn_delay, 0.9 * lengths)
+        ages = np.array(np.broadcast_to(age, len(tips)))
+        return self._needles.step(lengths, unturned, d_rotation, tips, ages)
 
-def planned_law(motion: TargetMotion, settings: SteeringSettings) -> TimedLaw:
-    """Return the law that leads each needle along a planner's way; no obstacle is in it.
-
-    Parameters
-    ----------
-    motion : TargetMotion
-        Of the targets.
-    settings : SteeringSettings
-        Of the needles, and which planner.
-    """
-    law, free, plane = prompt_point_law(settings), Obstacles(), offset_plane(0.0)
-    needles: list[PathSteering] = []
-
-    def command(
-        estimate: Estimate, _: FloatArray, insertion: FloatArray, __: FloatArray
-    ) -> SteeringCommand:
-        count = len(estimate.position)
-        needles.extend(PathSteering(settings) for _ in range(count - len(needles)))
-        targets = np.broadcast_to(motion.last, (count, 3))
-        inserted = np.broadcast_to(insertion, (count,))
-        # Who sees no way stays where it is.
-        aims, longer = np.array(targets), np.zeros(count)
-        for n, tip in enumerate(tip_states(estimate, plane)):
-            route = needles[n].route(tip, targets[n], free, float(inserted[n]))
-            longer[n] = -math.inf if route is None else route.length or math.nan
-            aims[n] = aims[n] if route is None else route.aim
-        said = law(estimate, aims)
-        assert said.insertion_left is not None
-        left = np.where(np.isnan(longer), said.insertion_left, longer)
-        return SteeringCommand(said.virtual_input, said.rotation_rate, left)
-
-    return command
-
-
-def _in_frames_of_tips(points: Array, estimate: Estimate) -> Array:
-    off = (points - estimate.position)[..., None]
-    return np.asarray((estimate.rotation.swapaxes(-1, -2) @ off)[..., 0])
+    def belief(self) -> Belief | None:
+        """Return None: the steady gain makes no use of a covariance."""
+        return None
 
 
 def needles_at_a_time(name: str) -> int:
@@ -292,7 +253,7 @@ def controller_factory(
     turn_delay: float = 0.0,
     own: Mapping[str, Any] = {},
     first: int = 0,
-) -> Callable[[], SteeredNeedles]:
+) -> Callable[[], SteeredNeedles | PaperNeedles]:
     """Return what makes the controller of some needles.
 
     Parameters
@@ -320,9 +281,24 @@ def controller_factory(
         If there is no such controller, or it cannot flip.
     """
     settings, covariance = _what_is_told(name, claimed, sigma_scale, flip_depths, own)
-    return lambda: SteeredNeedles(
-        *make_controller(settings, np.eye(3), np.zeros(3), first=first), covariance, turn_delay
-    )
+    if name in ONE_SIDED_PRESETS and not settings.estimator and not settings.law:
+        return lambda: PaperNeedles(settings, turn_delay)
+    rates: Callable[[Any, float], FloatArray] = best_rates(settings)
+    if settings.estimator or settings.law or name in ONE_SIDED_PRESETS:
+        rates = each_rate(lambda _: make_controller(settings, np.eye(3))[1])
+    return lambda: SteeredNeedles(new_estimators(settings, first), rates, covariance, turn_delay)
+
+
+def new_estimators(settings: SteeringSettings, first: int) -> Callable[[int], Estimators]:
+    """Return what makes the estimators of so many needles, the first of which has a number."""
+    if settings.preset == "best" and not settings.estimator:
+        known = filter_settings(settings)
+        return lambda count: BestEstimators(known, count, settings.step_length)
+
+    def new(n: int) -> Estimator:
+        return make_controller(settings, np.eye(3), np.zeros(3), number=first + n)[0]
+
+    return lambda _: EachEstimator(new)
 
 
 def point_controller_factory(
@@ -344,20 +320,24 @@ def point_controller_factory(
     settings, covariance = _what_is_told(preset, claimed, sigma_scale, (), own)
     settings.check_steers_to_points()
 
-    def new_law(motion: TargetMotion) -> TimedLaw:
+    def new_laws(motion: TargetMotion) -> PointLaws:
         if name == RRT:
-            return rrt_law(motion, settings)
+            rng = np.random.default_rng(1)
+            return each_point_law(motion, lambda own_motion: rrt_law(own_motion, settings, rng))
         if name == SLIDING_MODE:
-            return sliding_law(motion, settings.max_rotation_per_length)
+            largest = settings.max_rotation_per_length
+            return each_point_law(motion, lambda own_motion: sliding_law(own_motion, largest))
         if settings.planner:
-            return planned_law(motion, settings)
-        return PointSteering(settings, motion).command
+            return each_point_law(motion, lambda own_motion: planned_law(own_motion, settings))
+        if settings.estimator or settings.law:
+            return each_point_law(
+                motion, lambda own_motion: PointSteering(settings, own_motion).command
+            )
+        return best_point_laws(settings, motion)
 
-    def needles() -> NeedlesToPoints:
-        estimator, _ = make_controller(settings, np.eye(3), np.zeros(3), first=first)
-        return NeedlesToPoints(estimator, new_law, covariance, rotation_budget)
-
-    return needles
+    return lambda: NeedlesToPoints(
+        new_estimators(settings, first), new_laws, covariance, rotation_budget
+    )
 
 
 def _what_is_told(

@@ -20,7 +20,7 @@ CURVATURE, STEP, NOISE = 1.0 / 0.122, 0.001, 0.001
 
 
 def particle_filter(wrong: Disturbances, particles: int = 1500) -> ParticleFilter:
-    return ParticleFilter(CURVATURE, wrong, BOUNDS, particles, seed=7)
+    return ParticleFilter(CURVATURE, wrong, BOUNDS, particles, np.random.default_rng(7))
 
 
 def followed(filter_: ParticleFilter, wrong: Disturbances, late: int = 0) -> tuple[Array, float]:
@@ -69,6 +69,7 @@ def test_it_knows_where_the_needle_is_and_how_well(late: int, wrong: Disturbance
     assert np.linalg.norm(known.position - pose[:3, 3]) < 0.0006
     assert np.arccos(known.rotation[:, 2] @ pose[:3, 2]) < math.radians(1.0)
     assert within > 0.97
+    assert known.hypotheses is not None
     assert float(known.hypotheses.uncertainty[0]) == pytest.approx(known.covariance[0, 0])
 
 
@@ -88,10 +89,10 @@ def test_another_frame_changes_nothing_but_the_coordinates() -> None:
 
 def test_a_tip_that_was_not_found_changes_nothing() -> None:
     filter_ = particle_filter(Disturbances(noise=NOISE), 500)
-    filter_.reset(np.zeros((2, 3)), np.zeros((2, 2)))
-    filter_.advance(STEP, np.zeros(2))
+    filter_.reset(np.zeros(3), np.zeros(2))
+    filter_.advance(STEP, 0.0)
     before = filter_.estimate()
-    filter_.correct(np.full((2, 3), np.nan))
+    filter_.correct(np.full(3, np.nan))
     np.testing.assert_array_equal(filter_.estimate().coordinates, before.coordinates)
     with pytest.raises(ValueError, match="d_insertion"):
         filter_.advance(-STEP, 0.0)

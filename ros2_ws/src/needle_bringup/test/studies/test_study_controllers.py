@@ -14,15 +14,17 @@ from needle_bringup.studies.study_controllers import (
     SteeredNeedles,
     controller_factory,
     needles_at_a_time,
-    planned_law,
     point_controller_factory,
 )
-from needle_controller.bank.filter_settings import FilterSettings
-from needle_controller.bank.hypothesis_filter import HypothesisFilter
+from needle_bringup.studies.study_estimators import BestEstimators, EachEstimator
+from needle_bringup.studies.study_laws import each_rate, planned_law
+from needle_controller.filter.filter_settings import FilterSettings
+from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import TargetMotion
-from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.presets.presets import make_controller
+from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 
 pytestmark = pytest.mark.usefixtures("compiled")
 TIPS = np.array([[0.0005, 0.0, 0.001], [-0.0005, 0.0, 0.0012]])
@@ -32,64 +34,94 @@ class Recorder(HypothesisFilter):
     """Keeps how far it was advanced, and with which covariances it is corrected."""
 
     def __init__(self) -> None:
-        super().__init__(FilterSettings())
         self.given: list[Any] = []
         self.advanced: list[tuple[float, float]] = []
+        super().__init__(FilterSettings())
 
-    def advance(self, d_insertion: npt.ArrayLike, d_rotation: npt.ArrayLike) -> None:
-        self.advanced.append((np.max(d_insertion), np.max(d_rotation)))
+    def advance(self, d_insertion: float, d_rotation: float) -> None:
+        self.advanced.append((d_insertion, d_rotation))
         super().advance(d_insertion, d_rotation)
 
     def correct(
-        self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: npt.ArrayLike = 0.0
+        self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
     ) -> None:
         self.given.append(covariance)
         super().correct(tip, covariance, age)
 
 
-def still(estimate: Any, insertion: float) -> Any:
+def still(estimate: Any, insertion: float) -> SteeringCommand:
     """Turn nothing."""
-    rate = np.zeros(len(estimate.curvature))
-    return SteeringCommand(rate, rate)
+    return SteeringCommand(0.0, 0.0)
 
 
 def test_the_controller_is_told_what_is_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[SteeringSettings] = []
-    recorder = Recorder()
+    recorders: list[Recorder] = []
 
     def make(settings: SteeringSettings, *_: Array, **__: int) -> tuple[Recorder, Any]:
         made.append(settings)
-        return recorder, still
+        recorders.append(Recorder())
+        return recorders[-1], still
 
     monkeypatch.setattr(study_controllers, "make_controller", make)
+    own = {"estimator": "recorder"}
+    monkeypatch.setattr(
+        "needle_controller.presets.steering_settings.check_is_offered", lambda *_: None
+    )
     for scale in (1.0, 2.0):
-        needles = controller_factory("best", 0.002, sigma_scale=scale, turn_delay=0.0004)()
+        needles = controller_factory("best", 0.002, sigma_scale=scale, turn_delay=0.0004, own=own)()
         needles.start(TIPS)
         needles.step(0.001, np.ones(2), TIPS, 0.0)
         assert made[-1].tip_noise_bound == 0.002
-    told, given = recorder.given
-    assert told is None
+    corrected = [recorder for recorder in recorders if recorder.given]
+    assert len(corrected) == 4
+    assert corrected[0].given == [None]
     # uniform noise within 2 mm has a variance of (2 mm)^2 / 3; sigmas half as large
-    np.testing.assert_allclose(given, np.eye(3) * 0.002**2 / 3.0 / 4.0)
+    np.testing.assert_allclose(corrected[-1].given[0], np.eye(3) * 0.002**2 / 3.0 / 4.0)
     # The base turns by an answer that comes late after it has gone on.
-    np.testing.assert_allclose(recorder.advanced[:2], [(0.0004, 0.0), (0.0006, 1.0)])
+    np.testing.assert_allclose(corrected[0].advanced, [(0.0004, 0.0), (0.0006, 1.0)])
+
+
+def test_loops_in_python_and_compiled_ones_give_the_same_bits() -> None:
+    settings = SteeringSettings(**PAPER_NOISE)
+    one_by_one = SteeredNeedles(
+        lambda _: EachEstimator(lambda n: make_controller(settings, np.eye(3), np.zeros(3))[0]),
+        each_rate(lambda _: make_controller(settings, np.eye(3))[1]),
+    )
+    compiled = controller_factory("best", settings.tip_noise_bound)()
+    rng = np.random.default_rng(2)
+    rates = compiled.start(TIPS)
+    np.testing.assert_array_equal(one_by_one.start(TIPS), rates)
+    for k in range(1, 30):
+        tips = TIPS + np.array([0.0, 0.0, k * 0.001]) + rng.uniform(-0.001, 0.001, (2, 3))
+        turned = rates * 0.001
+        rates = compiled.step(0.001, turned, tips, 0.0)
+        np.testing.assert_array_equal(one_by_one.step(0.001, turned, tips, 0.0), rates)
+    one, other = one_by_one.belief(), compiled.belief()
+    assert one is not None
+    assert other is not None
+    for name in ("x", "x_std", "sin_pitch", "sin_pitch_std", "doubtful"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 def test_needles_say_what_their_estimate_says() -> None:
-    estimator = HypothesisFilter(FilterSettings())
-    needles = SteeredNeedles(estimator, still)
+    needles = SteeredNeedles(
+        lambda count: BestEstimators(FilterSettings(), count, 0.001), each_rate(lambda _: still)
+    )
     assert needles.belief() is None
     needles.start(TIPS)
     needles.step(0.001, np.zeros(2), TIPS, 0.0)
-    belief, estimate = needles.belief(), estimator.estimate()
+    belief = needles.belief()
     assert belief is not None
-    pitch, covariance = estimate.coordinates[:, 4], estimate.covariance
-    np.testing.assert_allclose(belief.x, estimate.coordinates[:, 0])
-    np.testing.assert_allclose(belief.sin_pitch, np.sin(pitch), atol=1e-9)
-    np.testing.assert_allclose(belief.x_std**2, covariance[:, 0, 0])
-    # d sin(pitch) = cos(pitch) d pitch, to first order
-    to_first_order = np.cos(pitch) * np.sqrt(covariance[:, 4, 4])
-    np.testing.assert_allclose(belief.sin_pitch_std, to_first_order, rtol=0.02)
+    assert needles._estimators is not None
+    for n, estimate in enumerate(needles._estimators.each()):
+        pitch, covariance = estimate.coordinates[4], estimate.covariance
+        assert belief.x[n] == pytest.approx(estimate.coordinates[0])
+        assert belief.sin_pitch[n] == pytest.approx(np.sin(pitch), abs=1e-9)
+        assert belief.x_std[n] ** 2 == pytest.approx(covariance[0, 0])
+        # d sin(pitch) = cos(pitch) d pitch, to first order
+        to_first_order = np.cos(pitch) * np.sqrt(covariance[4, 4])
+        assert belief.sin_pitch_std[n] == pytest.approx(to_first_order, rel=0.02)
     assert belief.doubtful is not None
     assert not np.any(belief.doubtful)
     # The paper's observer makes no use of a covariance.
@@ -101,7 +133,7 @@ def test_needles_say_what_their_estimate_says() -> None:
 
 def test_needles_that_are_not_where_they_are_to_be_say_so() -> None:
     tips = np.array([[0.0005, 0.0, 0.0], [-0.003, 0.0, 0.0]])
-    needles = SteeredNeedles(HypothesisFilter(FilterSettings()), still)
+    needles = SteeredNeedles.one_by_one(lambda: HypothesisFilter(FilterSettings()), still)
     needles.start(tips)
     # What counts is the point, not the plane x = 0.
     to_points = point_controller_factory("best", 0.001)()
@@ -114,11 +146,14 @@ def test_needles_that_are_not_where_they_are_to_be_say_so() -> None:
 
 def test_a_planner_s_way_leads_where_there_is_one_and_nowhere_else() -> None:
     motion = TargetMotion()
-    motion.see(0.0, np.array([[0.004, 0.0, 0.08], [0.05, 0.0, 0.02]]))
-    needles = HypothesisFilter(FilterSettings())
-    needles.reset(np.zeros((2, 3)), np.zeros((2, 2)))
-    settings = SteeringSettings(depth=0.2, entry_angle_std=math.radians(2.0))
-    command = planned_law(motion, settings)(needles.estimate(), *np.zeros((3, 2)))
-    assert command.insertion_left is not None
-    assert command.insertion_left[0] > 0.079
-    assert command.insertion_left[1] == -math.inf
+    needle, settings = (
+        HypothesisFilter(FilterSettings()),
+        SteeringSettings(depth=0.2, entry_angle_std=math.radians(2.0)),
+    )
+    needle.reset(np.zeros(3), np.zeros(2))
+    for target, has_a_way in (([0.004, 0.0, 0.08], True), ([0.05, 0.0, 0.02], False)):
+        motion.see(motion.seen + 1.0 if target[0] > 0.01 else 0.0, np.array(target))
+        command = planned_law(motion, settings)(needle.estimate(), 0.0, 0.0, math.inf)
+        assert command.insertion_left is not None
+        assert (command.insertion_left > 0.079) is has_a_way
+        assert (command.insertion_left == -math.inf) is not has_a_way

@@ -10,10 +10,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import numpy as np
-import numpy.typing as npt
-
-from needle_controller.model.arrays import Array
 from needle_core.errors import OutOfBoundsError, UserError
 
 
@@ -67,22 +63,16 @@ class FlipPlan:
             number = len(self.depths)
             raise OutOfBoundsError(f"flip {number}", self.depths[-1], 0.0, depth, "m")
 
-    def bend_sign(self, insertion: npt.ArrayLike) -> Array:
-        """Return the wanted sign of cos(roll) from an insertion on.
+    def bend_sign(self, insertion: float) -> float:
+        """Return the wanted sign of cos(roll), +1 or -1, from an insertion on.
 
         Parameters
         ----------
-        insertion : array_like, shape (...)
+        insertion : float
             Insertion depth [m]; at a flip's own depth the sign is that after it, to 1 um.
-
-        Returns
-        -------
-        ndarray, shape (...)
-            +1 or -1.
         """
-        reached = np.asarray(insertion, dtype=float) + DEPTH_TOLERANCE
-        done = np.searchsorted(np.asarray(self.depths, dtype=float), reached, side="right")
-        return np.asarray(np.where(done % 2 == 0, self.first_sign, -self.first_sign))
+        done = sum(depth <= insertion + DEPTH_TOLERANCE for depth in self.depths)
+        return self.first_sign if done % 2 == 0 else -self.first_sign
 
 
 DEPTH_TOLERANCE = 1e-6

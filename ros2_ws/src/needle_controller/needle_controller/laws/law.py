@@ -1,10 +1,12 @@
 """From an estimate to the rotation of the next step ([KC09] (7), (10))."""
 
+# Compiled code takes keywords slowly or not at all.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +14,8 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.model.kinematics import ROLL
 from needle_controller.observers.estimator import Estimate
-from needle_controller.observers.luenberger_steps import demand_states
+from needle_controller.observers.luenberger import keep_inside
+from needle_core.compiled import compiled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,40 +24,26 @@ class SteeringCommand:
 
     Attributes
     ----------
-    virtual_input : ndarray, shape (...)
+    virtual_input : float
         v [1/m^2], as wanted by (10), before what limits the rotation.
-    rotation_rate : ndarray, shape (...)
+    rotation_rate : float
         u, rotation of the base per inserted length, after all limits [rad/m].
-    insertion_left : ndarray, shape (...), optional
+    insertion_left : float, optional
         Insertion after which the needle is there, < 0 beyond it [m]; None from a law that does not
         say: then the depth does.
     """
 
-    virtual_input: Array
-    rotation_rate: Array
-    insertion_left: Array | None = None
+    virtual_input: float
+    rotation_rate: float
+    insertion_left: float | None = None
 
 
 StepLaw = Callable[[Estimate, float], SteeringCommand]
 """Takes the estimate and the insertion it is of [m]."""
 
 
-class Law(Protocol):
-    """A control law: called once per step."""
-
-    def __call__(self, estimate: Estimate) -> SteeringCommand:
-        """Return the rotation rate to hold over the next step."""
-
-
-@dataclasses.dataclass(frozen=True)
-class LinearizingLaw:
-    """v = -K s (10); u from (7), integrated over the step; |u| capped.
-
-    u is held over a step, during which cos(roll) changes: the inverse of (7) at the step's start
-    would, near roll +-90 deg, divide by almost 0 and carry the roll past that border, where s
-    cannot say so. So the wanted v is held over the step in (8) instead, the s it leads to is
-    saturated as the paper saturates the estimate, and u is what takes the roll there. For short
-    steps this is (7).
+class LinearizingGains(NamedTuple):
+    """Settings of the law of [KC09].
 
     Attributes
     ----------
@@ -73,30 +62,61 @@ class LinearizingLaw:
     demand_margin: float
     max_rotation_per_length: float
 
-    def __call__(self, estimate: Estimate) -> SteeringCommand:
+
+@compiled
+def linearizing_rate(
+    s: Array, roll: float, curvature: float, law: LinearizingGains
+) -> tuple[float, float]:
+    """Return v [1/m^2] and u [rad/m]: v = -K s (10); u from (7), integrated over the step; capped.
+
+    u is held over a step, during which cos(roll) changes: the inverse of (7) at the step's start
+    would, near roll +-90 deg, divide by almost 0 and carry the roll past that border, where s
+    cannot say so. So the wanted v is held over the step in (8) instead, the s it leads to is
+    saturated as the paper saturates the estimate, and u is what takes the roll there. For short
+    steps this is (7).
+
+    Parameters
+    ----------
+    s, roll : ndarray, shape (3,), float
+        The linearized state, and the roll [rad].
+    curvature : float
+        kappa [1/m].
+    law : LinearizingGains
+        Settings.
+    """
+    length, limit = law.step_length, law.max_rotation_per_length
+    v = -(s[0] * law.feedback[0] + s[1] * law.feedback[1] + s[2] * law.feedback[2])
+    s2 = s[1] + length * (s[2] + 0.5 * length * v)
+    sine = (s[2] + length * v) / curvature
+    scale = keep_inside(s2, sine, law.demand_margin)
+    s2, sine = scale * s2, scale * sine
+    wanted_roll = math.atan2(sine, math.sqrt(1.0 - s2 * s2 - sine * sine))
+    # The roll's own drift, (5): -kappa cos(roll) tan(pitch), by (6) without their slow functions.
+    squared = s[1] * s[1]
+    cosines = math.sqrt(max(1.0 - squared - (s[2] / curvature) ** 2, 0.0))
+    cosines = math.copysign(cosines, 0.5 * math.pi - abs(roll))
+    drift = -curvature * cosines * s[1] / (1.0 - squared)
+    rate = (wanted_roll - roll) / length - drift
+    return v, min(max(rate, -limit), limit)
+
+
+class LinearizingLaw:
+    """The law of [KC09]; see `linearizing_rate`."""
+
+    def __init__(self, gains: LinearizingGains) -> None:
+        self.gains = gains
+
+    def __call__(self, estimate: Estimate, _insertion: float = 0.0) -> SteeringCommand:
         """Return the rotation rate to hold over the next step."""
-        s, length, curvature = estimate.linearized, self.step_length, estimate.curvature
-        v = np.asarray(-(s @ self.feedback))
-        sine, cosine = np.empty(v.size), np.empty(v.size)
-        curvatures = np.broadcast_to(curvature, v.shape).flatten()
-        held = length, self.demand_margin
-        demand_states(s.reshape(-1, 3), v.reshape(-1), curvatures, held, (sine, cosine))
-        wanted_roll = np.arctan2(sine, cosine).reshape(v.shape)
-        roll = estimate.coordinates[..., ROLL]
-        # The roll's own drift, (5): cos(roll) tan(pitch), by (6) without their slow functions.
-        squared = s[..., 1] ** 2
-        steered = np.maximum(1.0 - squared - (s[..., 2] / curvature) ** 2, 0.0)
-        cosines = np.copysign(np.sqrt(steered), 0.5 * np.pi - np.abs(roll))
-        drift = -curvature * cosines * s[..., 1] / (1.0 - squared)
-        limit = self.max_rotation_per_length
-        rate = np.clip((wanted_roll - roll) / length - drift, -limit, limit)
-        return SteeringCommand(v, np.asarray(rate))
+        roll, curvature = float(estimate.coordinates[ROLL]), float(estimate.curvature)
+        return SteeringCommand(
+            *linearizing_rate(np.array(estimate.linearized), roll, curvature, self.gains)
+        )
 
 
 class OpenLoopLaw:
     """u = 0: the needle bends as it will; v says what that does to s3."""
 
-    def __call__(self, estimate: Estimate) -> SteeringCommand:
+    def __call__(self, estimate: Estimate, _insertion: float = 0.0) -> SteeringCommand:
         """Return no rotation."""
-        rate = np.zeros(estimate.coordinates.shape[:-1])
-        return SteeringCommand(virtual_input(estimate.reduced, rate, estimate.curvature), rate)
+        return SteeringCommand(float(virtual_input(estimate.reduced, 0.0, estimate.curvature)), 0.0)

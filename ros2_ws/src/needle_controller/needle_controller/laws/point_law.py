@@ -8,6 +8,8 @@ The reserve, and what is kept for doubt, shrink to nothing over the last centime
 can be made up for. Every hypothesis then says which turn of the base gives that turn of the tip.
 """
 
+# Compiled code takes keywords slowly or not at all.
+# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
@@ -16,13 +18,23 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.laws.law import SteeringCommand
-from needle_controller.laws.point_turns import PointLawSettings, point_turns
-from needle_controller.laws.roll_law import hypotheses_of
+from needle_controller.laws.point_turns import (
+    PointLawSettings,
+    mean_slack,
+    wanted_turn,
+    way_as_bent,
+    write_need,
+)
+from needle_controller.laws.roll_law import allowed_turn, base_turn, heaviest, hypotheses_of
+from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.model.kinematics import ROLL
 from needle_controller.observers.estimator import Estimate
+from needle_core.compiled import compiled
 from needle_core.errors import OutOfBoundsError
 from needle_core.settings.bounds import check_bounded_fields
+
+Records = npt.NDArray[np.void]
 
 
 class PointLaw:
@@ -50,7 +62,7 @@ class PointLaw:
         self,
         estimate: Estimate,
         target: npt.ArrayLike,
-        rotation_left: npt.ArrayLike = math.inf,
+        rotation_left: float = math.inf,
     ) -> SteeringCommand:
         """Return the rotation rate to hold over the next step, and the insertion left.
 
@@ -59,31 +71,91 @@ class PointLaw:
         estimate : Estimate
             Of the hypothesis filter, or of another estimator of the full pose: then as one
             hypothesis without torsion.
-        target : array_like, shape (..., 3)
+        target : array_like, shape (3,)
             Where the tip is to go, in the estimate's frame [m]. It may move between calls.
-        rotation_left : array_like, shape (...)
+        rotation_left : float
             What the base may still turn, either way [rad]: it turns as seldom as that takes.
         """
-        hypotheses = hypotheses_of(estimate)
-        shape = hypotheses.base.shape
-        points = np.broadcast_to(np.asarray(target, dtype=float), (*shape, 3))
-        needles = hypotheses.base.size
-        turn, left = np.empty(needles), np.empty(needles)
-        point_turns(
-            np.ascontiguousarray(estimate.position.reshape(-1, 3)),
-            np.ascontiguousarray(estimate.rotation.reshape(-1, 3, 3)),
-            np.ascontiguousarray(estimate.coordinates[..., ROLL].reshape(-1)),
-            np.array(np.broadcast_to(estimate.curvature, shape).reshape(-1)),
-            hypotheses.table.reshape(-1, *hypotheses.table.shape[-2:]),
-            np.ascontiguousarray(hypotheses.base.reshape(-1)),
-            np.ascontiguousarray(hypotheses.wound.reshape(-1)),
-            np.ascontiguousarray(hypotheses.uncertainty.reshape(-1, 3)),
-            np.array(points.reshape(-1, 3)),
-            np.array(np.broadcast_to(np.asarray(rotation_left, dtype=float), shape).reshape(-1)),
+        known = hypotheses_of(estimate)
+        turn, left = point_turn(
+            np.array(estimate.coordinates),
+            float(estimate.curvature),
+            known.uncertainty,
+            known.torsions,
+            known.base,
+            known.wound,
+            np.array(target, dtype=float),
+            float(rotation_left),
             self.settings,
-            turn,
-            left,
         )
-        rate = turn.reshape(shape) / self.settings.step_length
+        rate = turn / self.settings.step_length
         virtual = virtual_input(estimate.reduced, rate, estimate.curvature)
-        return SteeringCommand(np.asarray(virtual), np.asarray(rate), left.reshape(shape))
+        return SteeringCommand(float(virtual), rate, left)
+
+
+@compiled
+def point_turn(
+    coordinates: Array,
+    curvature: float,
+    uncertainty: Array,
+    torsions: Records,
+    base: float,
+    wound: float,
+    target: Array,
+    rotation_left: float,
+    settings: PointLawSettings,
+) -> tuple[float, float]:
+    """Return the turn of the base over the next step [rad] and the insertion left [m].
+
+    Parameters
+    ----------
+    coordinates, curvature : ndarray, shape (6,), float
+        Of the tip, and of its path [1/m].
+    uncertainty, torsions, base, wound :
+        See `Hypotheses`.
+    target : ndarray, shape (3,)
+        Where the tip is to go [m].
+    rotation_left : float
+        What the base may still turn, either way; infinite where that is not limited [rad].
+    settings : PointLawSettings
+        The settings.
+    """
+    ahead, need = _in_frame_of_tip(coordinates, target), np.empty(2)
+    way = write_need(ahead, need)
+    left = way_as_bent(ahead, way, curvature)
+    if way <= 0.0:
+        return 0.0, left
+    # Standard deviation of x + way sin(pitch)
+    variance = uncertainty[0] + way * (2.0 * uncertainty[1] + way * uncertainty[2])
+    std = math.sqrt(max(variance, 0.0))
+    slack = mean_slack(torsions, settings.max_rotation_per_length)
+    wanted = wanted_turn(need, way, curvature, std, slack, rotation_left, settings)
+    least = settings.smallest_weight * heaviest(torsions)
+    turns = weights = 0.0
+    for k in range(torsions.size):
+        t = torsions[k]
+        if t.weight < least or t.weight == 0.0:
+            continue
+        tip_turn = 0.0
+        if wanted != 0.0:
+            to_torsion = wanted + coordinates[ROLL] - t.roll
+            tip_turn = allowed_turn(to_torsion, wound, settings.max_winding)[0]
+        if abs(tip_turn) < settings.scatter_dead_band * (1.0 - t.agreement):
+            tip_turn = 0.0
+        asked = base_turn(t, tip_turn, base, settings.step_length)
+        turns += t.weight * min(max(asked, -settings.largest_turn), settings.largest_turn)
+        weights += t.weight
+    most = min(settings.max_rotation_per_length * settings.step_length, rotation_left)
+    return min(max(turns / weights, -most), most), left
+
+
+@compiled
+def _in_frame_of_tip(coordinates: Array, target: Array) -> Array:
+    """Return a target in the tip's frame: R^T (target - p), R = Rx(yaw) Ry(pitch) Rz(roll)."""
+    x, y, z = target[0] - coordinates[0], target[1] - coordinates[1], target[2] - coordinates[2]
+    c, s = math.cos(coordinates[3]), math.sin(coordinates[3])
+    y, z = c * y + s * z, c * z - s * y
+    c, s = math.cos(coordinates[4]), math.sin(coordinates[4])
+    x, z = c * x - s * z, c * z + s * x
+    c, s = math.cos(coordinates[5]), math.sin(coordinates[5])
+    return np.array([c * x + s * y, c * y - s * x, z])

@@ -1,4 +1,4 @@
-"""The point law's arithmetic for many needles, compiled; see `point_law`."""
+"""The way to a point, and when the bevel has to be turned for it; compiled. See `point_law`."""
 
 # Compiled code takes keywords slowly or not at all.
 # ruff: noqa: PLR0917
@@ -8,18 +8,13 @@ import math
 from typing import Annotated, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from needle_controller.bank.hypothesis_mixture import (
-    T_AGREEMENT,
-    T_LAG,
-    T_PLAY,
-    T_ROLL,
-    T_WEIGHT,
-)
-from needle_controller.laws.roll_turns import allowed_turn, base_turn
 from needle_controller.model.arrays import Array
 from needle_core.compiled import compiled
 from needle_core.settings.bounds import Bounds
+
+Records = npt.NDArray[np.void]
 
 _BEVEL = -0.5 * math.pi
 """Direction to which a needle bends, about its heading from its own x axis [rad]: -y."""
@@ -77,74 +72,6 @@ class PointLawSettings(NamedTuple):
 
 
 @compiled
-def point_turns(
-    position: Array,
-    rotation: Array,
-    roll: Array,
-    curvature: Array,
-    table: Array,
-    base: Array,
-    wound: Array,
-    uncertainty: Array,
-    target: Array,
-    rotation_left: Array,
-    settings: PointLawSettings,
-    turn: Array,
-    left: Array,
-) -> None:
-    """Write each needle's turn of the base over the next step [rad] and its insertion left [m].
-
-    Parameters
-    ----------
-    position, rotation : ndarray, shape (N, 3), (N, 3, 3)
-        Pose of the tip [m].
-    roll, curvature : ndarray, shape (N,)
-        Its roll [rad] and the curvature of its path [1/m].
-    table : ndarray, shape (N, K, 8)
-        See `Hypotheses`; likewise `base` and `wound`, shape (N,), and `uncertainty`, (N, 3).
-    target : ndarray, shape (N, 3)
-        Where the tip is to go [m].
-    rotation_left : ndarray, shape (N,)
-        What the base may still turn, either way; infinite where that is not limited [rad].
-    settings : PointLawSettings
-        The settings.
-    turn, left : ndarray, shape (N,), written
-        The results.
-    """
-    limit = settings.max_rotation_per_length * settings.step_length
-    need = np.empty(2)
-    for n in range(position.shape[0]):
-        ahead = rotation[n].T @ (target[n] - position[n])
-        way = write_need(ahead, need)
-        left[n] = way_as_bent(ahead, way, curvature[n])
-        turn[n] = 0.0
-        if way <= 0.0:
-            continue
-        variance = uncertainty[n, 0]
-        variance += way * (2.0 * uncertainty[n, 1] + way * uncertainty[n, 2])
-        std = math.sqrt(max(variance, 0.0))
-        slack = mean_slack(table[n], settings.max_rotation_per_length)
-        wanted = wanted_turn(need, way, curvature[n], std, slack, rotation_left[n], settings)
-        heaviest = np.max(table[n, :, T_WEIGHT])
-        turns = weights = 0.0
-        for k in range(table.shape[1]):
-            row = table[n, k]
-            if row[T_WEIGHT] < settings.smallest_weight * heaviest or row[T_WEIGHT] == 0.0:
-                continue
-            tip_turn = 0.0
-            if wanted != 0.0:
-                to_row = wanted + roll[n] - row[T_ROLL]
-                tip_turn = allowed_turn(to_row, wound[n], settings.max_winding)[0]
-            if abs(tip_turn) < settings.scatter_dead_band * (1.0 - row[T_AGREEMENT]):
-                tip_turn = 0.0
-            asked = base_turn(row, tip_turn, base[n], settings.step_length)
-            turns += row[T_WEIGHT] * min(max(asked, -settings.largest_turn), settings.largest_turn)
-            weights += row[T_WEIGHT]
-        most = min(limit, rotation_left[n])
-        turn[n] = min(max(turns / weights, -most), most)
-
-
-@compiled
 def write_need(target: Array, need: Array) -> float:
     """Write how far the way to a target has to bend off, and return how long it is [m].
 
@@ -194,23 +121,23 @@ def way_as_bent(target: Array, way: float, curvature: float) -> float:
 
 
 @compiled
-def mean_slack(table: Array, rate: float) -> float:
+def mean_slack(torsions: Records, rate: float) -> float:
     """Return how much longer a turn of the tip takes for the shaft's torsion [m].
 
     A lag takes its length, and a play the insertion over which the base turns through it.
 
     Parameters
     ----------
-    table : ndarray, shape (K, 8)
+    torsions : ndarray of TORSION, shape (K,)
         See `Hypotheses`.
     rate : float
         Most the base turns per inserted length [rad/m].
     """
     slack = weights = 0.0
-    for k in range(table.shape[0]):
-        row = table[k]
-        slack += row[T_WEIGHT] * (row[T_LAG] + row[T_PLAY] / rate)
-        weights += row[T_WEIGHT]
+    for k in range(torsions.size):
+        t = torsions[k]
+        slack += t.weight * (t.lag + t.play / rate)
+        weights += t.weight
     return slack / weights
 
 
@@ -239,7 +166,7 @@ def wanted_turn(
     slack : float
         See `mean_slack` [m].
     rotation_left : float
-        See `point_turns` [rad].
+        See `point_turn` [rad].
     settings : PointLawSettings
         The settings.
     """

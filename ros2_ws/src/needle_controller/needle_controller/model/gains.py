@@ -18,10 +18,8 @@ import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import A, C, transition
+from needle_core.compiled import compiled
 from needle_core.errors import UserError
-
-_SAME_LENGTH = 12
-"""Digits to which lengths of steps agree."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +123,10 @@ def held_input(length: float) -> Array:
     return np.array([length**3 / 6.0, length**2 / 2.0, length])
 
 
-def sampled_observer_gain(poles: npt.NDArray[np.complex128], length: npt.ArrayLike) -> Array:
+@compiled
+def sampled_observer_gain(
+    poles: npt.NDArray[np.complex128], length: float
+) -> tuple[float, float, float]:
     """Return the gain on one innovation after an inserted length, with unchanged error poles.
 
     With q_i = 1 - exp(lambda_i l) and e_k their elementary symmetric polynomials, the error (I -
@@ -137,35 +138,25 @@ def sampled_observer_gain(poles: npt.NDArray[np.complex128], length: npt.ArrayLi
     ----------
     poles : ndarray of complex, shape (3,)
         Eigenvalues of A - L C [1/m].
-    length : array_like, shape (...)
+    length : float
         Inserted length since the last correction, >= 0 [m].
 
     Returns
     -------
-    ndarray, shape (..., 3)
+    tuple of float
         Gain on w - C s: (-, 1/m, 1/m^2).
     """
-    length = np.asarray(length, dtype=float)
-    if length.ndim == 0:
-        # Steps are alike but for rounding, and this is done at every one.
-        return _gain_of_one(tuple(poles.tolist()), float(f"{float(length):.{_SAME_LENGTH}g}"))
-    return _observer_gain_at(poles, length)
-
-
-@functools.lru_cache(maxsize=256)
-def _gain_of_one(poles: tuple[complex, ...], length: float) -> Array:
-    gain = _observer_gain_at(np.array(poles), np.asarray(length))
-    gain.setflags(write=False)
-    return gain
-
-
-def _observer_gain_at(poles: npt.NDArray[np.complex128], length: Array) -> Array:
-    q1, q2, q3 = np.moveaxis(-np.expm1(poles * length[..., None]), -1, 0)
-    e1 = np.real(q1 + q2 + q3)
-    e2 = np.real(q1 * q2 + q1 * q3 + q2 * q3)
-    e3 = np.real(q1 * q2 * q3)
-    safe = np.where(length > 0.0, length, 1.0)
-    return np.stack([e1 - e2 + e3, (e2 - 1.5 * e3) / safe, e3 / safe**2], axis=-1)
+    if length == 0.0:
+        return 0.0, 0.0, 0.0
+    q1, q2, q3 = (
+        -np.expm1(poles[0] * length),
+        -np.expm1(poles[1] * length),
+        -np.expm1(poles[2] * length),
+    )
+    e1 = (q1 + q2 + q3).real
+    e2 = (q1 * q2 + q1 * q3 + q2 * q3).real
+    e3 = (q1 * q2 * q3).real
+    return e1 - e2 + e3, (e2 - 1.5 * e3) / length, e3 / length**2
 
 
 def checked_weights(name: str, weights: npt.ArrayLike) -> Array:

@@ -1,13 +1,8 @@
-"""Interface of every estimator, the same for one needle and for 10,000.
-
-Everything is in the frame `target_plane`, SI. Leading axes are needles: the node's single needle
-has shape (3,), a study's 10,000 needles (10000, 3).
-"""
+"""Interface of every estimator: of one needle, in the frame `target_plane`, SI."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -23,60 +18,80 @@ from needle_controller.model.kinematics import (
 
 
 @dataclasses.dataclass(frozen=True)
+class Hypotheses:
+    """The part of an estimate over several hypotheses that a law needs.
+
+    Attributes
+    ----------
+    torsions : ndarray, shape (K,)
+        The mean over each torsion, `filter.records.TORSION`.
+    base : float
+        Rotation of the base since the start [rad]; the torsions' angles count from there too.
+    wound : float
+        Rotation of the base as the joint says it [rad].
+    uncertainty : ndarray, shape (3,)
+        Variance of x [m^2], its covariance with sin(pitch) [m], variance of sin(pitch).
+    """
+
+    torsions: npt.NDArray[np.void]
+    base: float
+    wound: float
+    uncertainty: Array
+
+
+@dataclasses.dataclass(frozen=True)
 class Estimate:
     """State of the needle as known after the last measurement.
 
     Attributes
     ----------
-    coordinates : ndarray, shape (..., 6)
+    coordinates : ndarray, shape (6,)
         x, y, z [m], yaw, pitch, roll [rad]: the pose of the tip.
-    linearized : ndarray, shape (..., 3)
+    linearized : ndarray, shape (3,)
         The linearized state s of (6).
-    curvature : ndarray, shape (...)
+    curvature : float
         Curvature of the needle's path, assumed or estimated [1/m].
+    covariance : ndarray, shape (6, 6)
+        Covariance of `coordinates`, in their order.
     warnings : tuple of str
         What a user should know of this estimate; empty as a rule.
-    covariance_of : callable
-        Returns `covariance`; studies of many needles do not pay for what they do not read.
-    doubtful : ndarray of bool, shape (...), optional
+    doubtful : bool, optional
         Whether the estimate cannot be relied on; None from an estimator that never says so.
     doubts : tuple of str
-        Why not; of any of the needles.
+        Why not.
+    hypotheses : Hypotheses, optional
+        Of what it is the mean; None from an estimator that knows one state only.
     """
 
     coordinates: Array
     linearized: Array
-    curvature: Array
-    warnings: tuple[str, ...]
-    covariance_of: Callable[[], Array] = dataclasses.field(repr=False)
-    doubtful: npt.NDArray[np.bool_] | None = dataclasses.field(default=None, kw_only=True)
-    doubts: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
+    curvature: float
+    covariance: Array
+    warnings: tuple[str, ...] = ()
+    doubtful: bool | None = None
+    doubts: tuple[str, ...] = ()
+    hypotheses: Hypotheses | None = None
 
     @property
     def reduced(self) -> Array:
-        """The reduced state r = (x, pitch, roll), shape (..., 3)."""
-        return self.coordinates[..., REDUCED]
+        """The reduced state r = (x, pitch, roll), shape (3,)."""
+        return self.coordinates[list(REDUCED)]
 
     @property
     def position(self) -> Array:
-        """The tip, shape (..., 3) [m]."""
-        return self.coordinates[..., :3]
+        """The tip, shape (3,) [m]."""
+        return self.coordinates[:3]
 
     @property
     def rotation(self) -> Array:
-        """The tip's orientation, shape (..., 3, 3)."""
-        return rotation_from_angles(self.coordinates[..., 3:])
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance of `coordinates`, in their order, shape (..., 6, 6)."""
-        return self.covariance_of()
+        """The tip's orientation, shape (3, 3)."""
+        return rotation_from_angles(self.coordinates[3:])
 
 
 def pose_estimate(
     position: npt.ArrayLike,
     rotation: npt.ArrayLike,
-    curvature: npt.ArrayLike,
+    curvature: float,
     covariance: npt.ArrayLike,
     warnings: tuple[str, ...] = (),
 ) -> Estimate:
@@ -84,28 +99,26 @@ def pose_estimate(
 
     Parameters
     ----------
-    position : array_like, shape (..., 3)
+    position : array_like, shape (3,)
         The tip [m].
-    rotation : array_like, shape (..., 3, 3)
+    rotation : array_like, shape (3, 3)
         Its orientation: the heading is the last column, the needle bends to -y.
-    curvature : array_like, shape (...)
+    curvature : float
         Of the needle's path [1/m].
-    covariance : array_like, shape (..., 6, 6)
+    covariance : array_like, shape (6, 6)
         Of x, y, z [m], yaw, pitch, roll [rad].
     warnings : tuple of str
         What a user should know of it.
     """
-    places = np.asarray(position, dtype=float)
-    coordinates = np.concatenate([places, angles_from_rotation(rotation)], axis=-1)
-    shape = coordinates.shape[:-1]
-    kappa = np.array(np.broadcast_to(np.asarray(curvature, dtype=float), shape))
-    known = np.array(np.broadcast_to(np.asarray(covariance, dtype=float), (*shape, 6, 6)))
+    coordinates = np.concatenate(
+        [np.asarray(position, dtype=float), angles_from_rotation(rotation)]
+    )
     return Estimate(
         coordinates=coordinates,
-        linearized=linearized_from_reduced(coordinates[..., REDUCED], kappa),
-        curvature=kappa,
+        linearized=linearized_from_reduced(coordinates[list(REDUCED)], curvature),
+        curvature=float(curvature),
+        covariance=np.array(covariance, dtype=float),
         warnings=warnings,
-        covariance_of=lambda: known,
     )
 
 
@@ -117,20 +130,20 @@ class Estimator(Protocol):
 
         Parameters
         ----------
-        tip : array_like, shape (..., 3)
+        tip : array_like, shape (3,)
             The tip [m].
-        joints : array_like, shape (..., 2)
+        joints : array_like, shape (2,)
             Insertion [m] and rotation [rad] of the base at the same instant.
         """
 
-    def advance(self, d_insertion: npt.ArrayLike, d_rotation: npt.ArrayLike) -> None:
+    def advance(self, d_insertion: float, d_rotation: float) -> None:
         """Move on by what really happened since the last call, the rotation spread evenly over it.
 
         Parameters
         ----------
-        d_insertion : array_like, shape (...)
+        d_insertion : float
             Inserted length, >= 0 [m].
-        d_rotation : array_like, shape (...)
+        d_rotation : float
             Rotation of the base [rad].
 
         Raises
@@ -140,17 +153,17 @@ class Estimator(Protocol):
         """
 
     def correct(
-        self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: npt.ArrayLike = 0.0
+        self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
     ) -> None:
         """Take a measurement of the tip.
 
         Parameters
         ----------
-        tip : array_like, shape (..., 3)
-            The tip [m]; NaN for a needle whose tip was not found.
-        covariance : array_like, shape (..., 3, 3), optional
+        tip : array_like, shape (3,)
+            The tip [m]; NaN where it was not found.
+        covariance : array_like, shape (3, 3), optional
             Its covariance [m^2]; the estimator's own assumption if none is given.
-        age : array_like, shape (...)
+        age : float
             Length inserted since the exposure [m]; 0 when `advance` stopped at it.
         """
 

@@ -1,9 +1,11 @@
 """The paper's observer ([KC09] (9)): a steady gain on the tip's distance from the plane."""
 
+# Compiled code takes keywords slowly or not at all.
 from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +21,25 @@ from needle_controller.model.feedback_linearization import (
 from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.model.kinematics import YAW, angles_from_rotation, rotation_from_angles
 from needle_controller.observers.estimator import Estimate
-from needle_controller.observers.luenberger_steps import advance_states, correct_states
-from needle_controller.observers.saturation import saturate
+from needle_core.compiled import compiled
+
+OBSERVER = np.dtype(
+    [
+        ("linearized", np.float64, 3),  # s of (6)
+        ("yaw", np.float64),  # by (4), not observed [rad]
+        ("since_correction", np.float64),  # inserted since the last tip [m]
+        ("saturated", np.bool_),  # whether the estimate was projected
+    ]
+)
+"""What the observer knows of a needle."""
+
+
+class ObserverModel(NamedTuple):
+    """Assumptions about a needle; see `LuenbergerSettings`."""
+
+    curvature: float
+    margin: float
+    poles: npt.NDArray[np.complex128]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +71,11 @@ class LuenbergerSettings:
     initial_pitch_std: float
     initial_roll_std: float
 
+    @property
+    def model(self) -> ObserverModel:
+        """The part that compiled code needs."""
+        return ObserverModel(self.curvature, self.saturation_margin, self.observer_poles)
+
 
 class LuenbergerObserver:
     """Observer (9), sampled for the insertion that really happened, saturated as in [KC09] IV-A.
@@ -72,162 +96,214 @@ class LuenbergerObserver:
     def __init__(
         self, settings: LuenbergerSettings, initial_rotation: npt.ArrayLike | None = None
     ) -> None:
-        self._settings = settings
+        self._settings, self._model = settings, settings.model
         self.initial_rotation: Array = (
             np.eye(3) if initial_rotation is None else np.asarray(initial_rotation, dtype=float)
         )
-        self._s: Array = np.zeros(3)
-        self._yaw: Array = np.zeros(())
+        self._needle = np.zeros(1, OBSERVER)[0]
+        self._inserted = 0.0
         self._tip: Array = np.zeros(3)
         self._tip_covariance: Array = np.zeros((3, 3))
-        self._since_correction: Array = np.zeros(())
-        self._inserted: Array = np.zeros(())
         self._covariance: Array = np.zeros((3, 3))
-        self._saturated: npt.NDArray[np.bool_] = np.zeros((), dtype=bool)
 
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
         """Start at a first measurement; see `Estimator.reset`."""
-        settings = self._settings
-        tip, joints = np.asarray(tip, dtype=float), np.asarray(joints, dtype=float)
-        turned = np.zeros((*joints.shape[:-1], 3))
-        turned[..., 2] = joints[..., 1]
-        angles = angles_from_rotation(self.initial_rotation @ rotation_from_angles(turned))
-        shape = np.broadcast_shapes(tip.shape[:-1], angles.shape[:-1])
-        self._tip = np.broadcast_to(tip, (*shape, 3)).copy()
-        self._yaw = np.broadcast_to(angles[..., 0], shape).copy()
+        settings, turn = self._settings, float(np.asarray(joints, dtype=float)[1])
+        self._tip = np.array(tip, dtype=float)
+        start = self.initial_rotation @ rotation_from_angles([0.0, 0.0, turn])
+        self._place(float(self._tip[0]), start)
+        self._needle["since_correction"] = self._inserted = 0.0
         self._tip_covariance = np.eye(3) * settings.measurement_std**2
-        self._since_correction = np.zeros(())
-        self._inserted = np.zeros(())
-        reduced = np.stack(
-            np.broadcast_arrays(tip[..., 0], angles[..., 1], angles[..., 2]), axis=-1
-        )
         stds = (
             settings.measurement_std,
             settings.initial_pitch_std,
             settings.curvature * settings.initial_roll_std,
         )
         self._covariance = np.diag(np.square(stds))
-        self._take(linearized_from_reduced(reduced, settings.curvature))
 
-    def advance(self, d_insertion: npt.ArrayLike, d_rotation: npt.ArrayLike) -> None:
+    def advance(self, d_insertion: float, d_rotation: float) -> None:
         """Move on by what really happened; see `Estimator.advance`."""
-        length, turn = np.asarray(d_insertion, dtype=float), np.asarray(d_rotation, dtype=float)
-        if not (np.all(np.isfinite(length)) and np.all(length >= 0.0)):
-            raise ValueError(f"d_insertion = {length} m, wants finite and >= 0")
-        settings = self._settings
-        shape = np.broadcast_shapes(self._s.shape[:-1], length.shape, turn.shape)
-        states, saturated = _rows(self._s, shape), np.empty(math.prod(shape), dtype=bool)
-        yaw = np.broadcast_to(self._yaw, shape).flatten()
-        motion = np.broadcast_to(length, shape).flatten(), np.broadcast_to(turn, shape).flatten()
-        region = settings.curvature, settings.saturation_margin
-        advance_states(states, yaw, saturated, motion, region)
-        self._s, self._yaw = states.reshape(*shape, 3), yaw.reshape(shape)
-        self._saturated = saturated.reshape(shape)
-        self._since_correction = self._since_correction + length
-        self._inserted = self._inserted + length
+        length = float(d_insertion)
+        if not (math.isfinite(length) and length >= 0.0):
+            raise ValueError(f"d_insertion = {length!r} m, wants finite and >= 0")
+        advance_observer(self._needle, length, float(d_rotation), self._model)
+        self._inserted += length
+        # P <- F P F^T + Q
         f = transition(length)
-        self._covariance = f @ self._covariance @ np.swapaxes(f, -1, -2) + process_covariance(
-            self._settings.process_noise, length
-        )
+        added = process_covariance(self._settings.process_noise, length)
+        self._covariance = f @ self._covariance @ f.T + added
 
     def correct(
-        self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: npt.ArrayLike = 0.0
+        self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
     ) -> None:
         """Take a measurement; see `Estimator.correct`.
 
         The gain is steady: it does not use `covariance`, which only passes into the estimate's. The
         tip `age` ago is taken as x - age s2 + age^2 / 2 s3.
         """
-        tip, age = np.asarray(tip, dtype=float), np.asarray(age, dtype=float)
-        settings = self._settings
-        found = np.isfinite(tip[..., 0]) & np.isfinite(tip[..., 1]) & np.isfinite(tip[..., 2])
-        noise = np.asarray(settings.measurement_std**2)
+        seen, noise = np.array(tip, dtype=float), self._settings.measurement_std**2
+        found = bool(np.all(np.isfinite(seen)))
         if covariance is not None:
-            covariance = np.asarray(covariance, dtype=float)
-            found = found & np.isfinite(covariance[..., 0, 0])
-            noise = np.where(np.isfinite(covariance[..., 0, 0]), covariance[..., 0, 0], noise)
-        row = transition(-age)[..., 0, :]
-        all_used = bool(np.all(found))
-        gain = sampled_observer_gain(settings.observer_poles, self._since_correction)
-        shape = np.broadcast_shapes(self._s.shape[:-1], found.shape, age.shape, gain.shape[:-1])
-        states, saturated = _rows(self._s, shape), np.empty(math.prod(shape), dtype=bool)
-        x = tip[..., 0] if all_used else np.where(found, tip[..., 0], np.nan)
-        measured = np.broadcast_to(x, shape).flatten(), np.broadcast_to(age, shape).flatten()
-        gains = gain.reshape(1, 3) if gain.ndim == 1 else _rows(gain, shape)
-        region = settings.curvature, settings.saturation_margin
-        correct_states(states, saturated, measured, gains, region)
-        self._s, self._saturated = states.reshape(*shape, 3), saturated.reshape(shape)
-        self._tip = tip.copy() if all_used else np.where(found[..., None], tip, self._tip)
+            known = np.array(covariance, dtype=float)
+            noise = float(known[0, 0])
+            found = found and math.isfinite(noise)
+        if not found:
+            return
+        since = float(self._needle["since_correction"])
+        of_each = sampled_observer_gain(self._model.poles, since)
+        correct_observer(self._needle, float(seen[0]), float(age), of_each, self._model)
+        gain = np.array(of_each)
+        self._tip = seen
         if covariance is not None:
-            self._tip_covariance = np.where(
-                found[..., None, None], covariance, self._tip_covariance
-            )
-        # Only what was used narrows the covariance; one shape for all needles while all were.
-        taken = gain if all_used else gain * found[..., None]
-        keep = np.eye(3) - taken[..., :, None] * row[..., None, :]
-        self._covariance = (
-            keep @ self._covariance @ np.swapaxes(keep, -1, -2)
-            + taken[..., :, None] * taken[..., None, :] * noise[..., None, None]
-        )
-        self._since_correction = (
-            np.zeros(()) if all_used else np.where(found, 0.0, self._since_correction)
-        )
+            self._tip_covariance = known
+        # P <- (I - L c) P (I - L c)^T + L r L^T, c the row of F(-age) that gives x
+        keep = np.eye(3) - np.outer(gain, transition(-float(age))[0])
+        self._covariance = keep @ self._covariance @ keep.T + noise * np.outer(gain, gain)
 
     def estimate(self) -> Estimate:
         """Return what is known now; see `Estimator.estimate`."""
-        curvature = self._settings.curvature
-        reduced = reduced_from_linearized(self._s, curvature)
-        x, pitch, roll = (reduced[..., i] for i in range(3))
-        parts = (x, self._tip[..., 1], self._tip[..., 2], self._yaw, pitch, roll)
-        coordinates = np.stack(np.broadcast_arrays(*parts), axis=-1)
+        curvature, s = self._settings.curvature, np.array(self._needle["linearized"])
+        x, pitch, roll = reduced_from_linearized(s, curvature)
+        yaw = float(self._needle["yaw"])
         warnings: tuple[str, ...] = ()
-        if np.any(self._saturated):
+        if self._needle["saturated"]:
             warnings = (
                 "the estimate was saturated: the roll it wants is beyond what its coordinates say",
             )
         return Estimate(
-            coordinates=coordinates,
-            linearized=self._s.copy(),
-            curvature=np.full(coordinates.shape[:-1], curvature),
+            coordinates=np.array([x, self._tip[1], self._tip[2], yaw, pitch, roll]),
+            linearized=s,
+            curvature=curvature,
+            covariance=self._coordinate_covariance(np.array([x, pitch, roll])),
             warnings=warnings,
-            covariance_of=lambda: self._coordinate_covariance(reduced),
         )
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
         """Express everything in another target plane; see `Estimator.change_frame`."""
         transform = np.asarray(T_new_old, dtype=float)
         turn, shift = transform[:3, :3], transform[:3, 3]
-        coordinates = self.estimate().coordinates
-        angles = angles_from_rotation(turn @ rotation_from_angles(coordinates[..., 3:]))
-        position = coordinates[..., :3] @ turn.T + shift
-        self._tip = self._tip @ turn.T + shift
+        known = self.estimate()
+        self._tip = turn @ self._tip + shift
         self._tip_covariance = turn @ self._tip_covariance @ turn.T
-        self._yaw = angles[..., 0]
         self.initial_rotation = turn @ self.initial_rotation
-        reduced = np.stack([position[..., 0], angles[..., 1], angles[..., 2]], axis=-1)
-        self._take(linearized_from_reduced(reduced, self._settings.curvature))
+        self._place(float((turn @ known.position + shift)[0]), turn @ known.rotation)
 
-    def _take(self, linearized: Array) -> None:
-        self._s, self._saturated = saturate(
-            linearized, self._settings.curvature, self._settings.saturation_margin
+    def _place(self, x: float, rotation: Array) -> None:
+        yaw, pitch, roll = angles_from_rotation(rotation)
+        self._needle["linearized"] = linearized_from_reduced(
+            np.array([x, pitch, roll]), self._settings.curvature
         )
+        self._needle["yaw"] = yaw
+        saturate(self._needle, self._model)
 
     def _coordinate_covariance(self, reduced: Array) -> Array:
         """Return the covariance of q, linear in the estimate's error."""
         curvature = self._settings.curvature
-        of_reduced = reduced_covariance(self._covariance, reduced, curvature)
-        covariance = np.zeros((*reduced.shape[:-1], 6, 6))
+        covariance = np.zeros((6, 6))
         index = np.array([0, 4, 5])
-        covariance[..., index[:, None], index[None, :]] = of_reduced
-        covariance[..., 1:3, 1:3] = self._tip_covariance[..., 1:3, 1:3]
+        covariance[index[:, None], index[None, :]] = reduced_covariance(
+            self._covariance, reduced, curvature
+        )
+        covariance[1:3, 1:3] = self._tip_covariance[1:3, 1:3]
         # Not observed: what was unknown at the start, and all the turning that wrong rolls can have
         # hidden.
-        covariance[..., YAW, YAW] = (
-            self._settings.initial_yaw_std**2 + (curvature * self._inserted) ** 2
-        )
+        covariance[YAW, YAW] = self._settings.initial_yaw_std**2 + (curvature * self._inserted) ** 2
         return covariance
 
 
-def _rows(vectors: Array, shape: tuple[int, ...]) -> Array:
-    """Return a copy of vectors, one row for each of `shape`, (N, 3)."""
-    return np.array(np.broadcast_to(vectors, (*shape, 3)).reshape(-1, 3))
+@compiled
+def keep_inside(s2: float, sine: float, margin: float) -> float:
+    """Return what scales s2 and s3 / kappa onto s2^2 + (s3 / kappa)^2 <= 1 - margin; <= 1."""
+    squared = s2 * s2 + sine * sine
+    if squared > 1.0 - margin:
+        return math.sqrt((1.0 - margin) / squared)
+    return 1.0
+
+
+@compiled
+def saturate(needle: Any, model: ObserverModel) -> None:
+    """Project s radially onto s2^2 + (s3 / kappa)^2 <= 1 - margin ([KC09] IV-A).
+
+    The region is where a pitch and a roll within +-90 deg exist for s; s1 is free. In the
+    coordinates (s2, s3 / kappa) it is a disc and the projection the closest point, as in the paper:
+    [0, 1.5, 0] becomes [0, 1, 0] as the margin vanishes. The margin keeps cos(pitch) cos(roll) >=
+    sqrt(margin), which the inverse of (7) divides by.
+    """
+    s = needle.linearized
+    scale = keep_inside(s[1], s[2] / model.curvature, model.margin)
+    needle.saturated = scale < 1.0
+    s[1] *= scale
+    s[2] *= scale
+
+
+@compiled
+def advance_observer(needle: Any, length: float, turn: float, model: ObserverModel) -> None:
+    """Move the linearized state on by what really happened.
+
+    v is the one that takes the roll where (5) with u takes it over this length, held over it: (7)
+    for short steps, and finite also where the needle only turned. Past +-90 deg s cannot follow.
+
+    Parameters
+    ----------
+    needle : OBSERVER, changed
+        The needle.
+    length, turn : float
+        Inserted length [m] and rotation of the base [rad].
+    model : ObserverModel
+        What is assumed.
+    """
+    s, kappa = needle.linearized, model.curvature
+    s2, s3 = s[1], s[2]
+    # Within (6)'s region cos(pitch) and cos(roll) are positive square roots.
+    cos_pitch = math.sqrt(1.0 - s2 * s2)
+    sin_roll = s3 / (kappa * cos_pitch)
+    cos_roll = math.sqrt(max(1.0 - sin_roll * sin_roll, 0.0))
+    # droll = u l - kappa cos(roll) tan(pitch) l, (5)
+    turn -= kappa * cos_roll * s2 / cos_pitch * length
+    sin_turn, cos_turn = math.sin(turn), math.cos(turn)
+    sin_turned = sin_roll * cos_turn + cos_roll * sin_turn
+    # |roll| <= 90 deg: a turn takes it past +-90 deg on the side it turns to.
+    if cos_roll * cos_turn - sin_roll * sin_turn < 0.0 or abs(turn) >= math.pi:
+        sin_turned = math.copysign(1.0, turn)
+    sin_pitched = s2 + length * s3
+    cos_pitched = math.sqrt(max(1.0 - sin_pitched * sin_pitched, 0.0))
+    # s(l) of (8) with v l = kappa cos(pitch) sin(roll) - s3
+    added = kappa * cos_pitched * sin_turned - s3
+    s[0] += length * s2 + length * length * (0.5 * s3 + added / 6.0)
+    s[1] = s2 + length * (s3 + 0.5 * added)
+    s[2] = s3 + added
+    saturate(needle, model)
+    # dyaw = kappa cos(roll) / cos(pitch) l, (4), trapezoidal
+    squared = 1.0 - s[1] * s[1]
+    slope = cos_roll / cos_pitch + math.sqrt(squared - (s[2] / kappa) ** 2) / squared
+    needle.yaw += 0.5 * length * kappa * slope
+    needle.since_correction += length
+
+
+@compiled
+def correct_observer(
+    needle: Any, x: float, age: float, gain: tuple[float, float, float], model: ObserverModel
+) -> None:
+    """Correct the linearized state by a measured distance from the plane: (9).
+
+    Parameters
+    ----------
+    needle : OBSERVER, changed
+        The needle.
+    x : float
+        Of the tip [m].
+    age : float
+        Inserted since [m].
+    gain : tuple of float
+        L, of `sampled_observer_gain` over what was inserted since the last correction.
+    model : ObserverModel
+        What is assumed.
+    """
+    s = needle.linearized
+    # s <- s + L (w - C F(-age) s)
+    innovation = x - (s[0] - age * s[1] + 0.5 * age * age * s[2])
+    s[0] += gain[0] * innovation
+    s[1] += gain[1] * innovation
+    s[2] += gain[2] * innovation
+    saturate(needle, model)
+    needle.since_correction = 0.0

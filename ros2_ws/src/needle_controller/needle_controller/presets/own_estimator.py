@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from functools import cache
 
 import numpy as np
@@ -48,7 +47,6 @@ class OwnEstimator:
         rng: np.random.Generator,
     ) -> None:
         self._part = part
-        self._shape: tuple[int, ...] = ()
         turn = np.array(initial_rotation, dtype=float)
         place = None if entry is None else np.array(entry, dtype=float)
         with part.blamed(f"{part.made_by.__name__}(settings, initial_rotation, entry, rng)"):
@@ -56,26 +54,25 @@ class OwnEstimator:
 
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
         """Start over at a first measurement; see `Estimator.reset`."""
-        self._shape = np.shape(tip)[:-1]
         with self._part.blamed("reset"):
             self._own.reset(np.array(tip, dtype=float), np.array(joints, dtype=float))
 
-    def advance(self, d_insertion: npt.ArrayLike, d_rotation: npt.ArrayLike) -> None:
+    def advance(self, d_insertion: float, d_rotation: float) -> None:
         """Move on by what really happened; see `Estimator.advance`."""
         with self._part.blamed("advance"):
-            self._own.advance(np.array(d_insertion, dtype=float), np.array(d_rotation, dtype=float))
+            self._own.advance(float(d_insertion), float(d_rotation))
 
     def correct(
-        self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: npt.ArrayLike = 0.0
+        self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
     ) -> None:
         """Take a measurement; see `Estimator.correct`."""
         known = None if covariance is None else np.array(covariance, dtype=float)
         with self._part.blamed("correct"):
-            self._own.correct(np.array(tip, dtype=float), known, np.array(age, dtype=float))
+            self._own.correct(np.array(tip, dtype=float), known, float(age))
 
     def estimate(self) -> Estimate:
         """Return what is known now; see `Estimator.estimate`."""
-        part, shape = self._part, self._shape
+        part = self._part
         with part.blamed("estimate"):
             said = self._own.estimate()
         if not isinstance(said, Estimate):
@@ -87,16 +84,14 @@ class OwnEstimator:
         checked(
             "estimate().coordinates",
             said.coordinates,
-            (*shape, 6),
-            "numbers x, y, z [m], yaw, pitch, roll [rad], for each needle",
+            (6,),
+            "numbers x, y, z [m], yaw, pitch, roll [rad]",
         )
-        checked("estimate().linearized", said.linearized, (*shape, 3), "numbers s1, s2, s3 of (6)")
-        checked("estimate().curvature", said.curvature, shape, "curvature [1/m], for each needle")
-        with part.blamed("estimate().covariance"):
-            covariance = said.covariance
+        checked("estimate().linearized", said.linearized, (3,), "numbers s1, s2, s3 of (6)")
+        checked("estimate().curvature", said.curvature, (), "curvature [1/m]")
         meaning = "the covariance of the coordinates, in their order"
-        known = checked("estimate().covariance", covariance, (*shape, 6, 6), meaning)
-        return dataclasses.replace(said, covariance_of=lambda: known)
+        checked("estimate().covariance", said.covariance, (6, 6), meaning)
+        return said
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
         """Express everything in another target plane; see `Estimator.change_frame`."""
@@ -106,7 +101,7 @@ class OwnEstimator:
 
 @cache
 def tried_estimator(name: str) -> OwnPart:
-    """Return an own estimator's class that has followed a needle, and two at once.
+    """Return an own estimator's class that has followed a needle.
 
     Raises
     ------
@@ -115,37 +110,31 @@ def tried_estimator(name: str) -> OwnPart:
         tips are exact, does not bear a tip that was not found, or moves wrongly with the plane.
     """
     part = own_part("estimator", name)
-    for needles in ((), (2,)):
-        _try(part, needles)
-    return part
-
-
-def _try(part: OwnPart, needles: tuple[int, ...]) -> None:
     settings = SteeringSettings()
     rng = np.random.default_rng(0)
     estimator = OwnEstimator(part, settings, np.eye(3), np.zeros(3), rng)
-    count = f"{needles[0]} needles" if needles else "one needle"
     known = np.eye(3) * settings.measurement_std**2
-    estimator.reset(np.zeros((*needles, 3)), np.zeros((*needles, 2)))
-    tip: Array = np.zeros((*needles, 3))
+    estimator.reset(np.zeros(3), np.zeros(2))
+    tip: Array = np.zeros(3)
     for k in range(1, _TRIED_STEPS + 1):
-        tip = np.broadcast_to(arc(k * _STEP, 0.0, settings.curvature).shift, (*needles, 3))
-        estimator.advance(np.full(needles, _STEP), np.zeros(needles))
+        tip = arc(k * _STEP, 0.0, settings.curvature).shift
+        estimator.advance(_STEP, 0.0)
         estimator.correct(tip, None if k % 2 else known, 0.0)
         estimator.estimate()
-    off = float(np.max(np.linalg.norm(estimator.estimate().position - tip, axis=-1)))
+    off = float(np.linalg.norm(estimator.estimate().position - tip))
     if off > _NEAR:
         raise part.error(
-            f"after {_TRIED_STEPS} exact tips of {count}, 1 mm apart, its position is {off:.3g} m "
+            f"after {_TRIED_STEPS} exact tips, 1 mm apart, its position is {off:.3g} m "
             "off; it is wanted in m, in the target plane, z along the insertion"
         )
-    estimator.advance(np.full(needles, _STEP), np.zeros(needles))
-    estimator.correct(np.full((*needles, 3), np.nan), None, 0.0)
+    estimator.advance(_STEP, 0.0)
+    estimator.correct(np.full(3, np.nan), None, 0.0)
     before = estimator.estimate().position
     moved = np.eye(4)
     moved[0, 3] = 0.002
     estimator.change_frame(moved)
     after = estimator.estimate().position
     if not np.allclose(after, before + moved[:3, 3], rtol=0.0, atol=_FRAME_TOLERANCE):
-        by = float(np.max(after[..., 0] - before[..., 0]))
+        by = float(after[0] - before[0])
         raise part.error(f"change_frame by 0.002 m along x moves x by {by:g} m")
+    return part

@@ -15,7 +15,7 @@ from needle_controller.observers.estimator import Estimate, pose_estimate
 from needle_controller.presets.own_parts import OwnPart, own_part
 from needle_controller.presets.steering_settings import SteeringSettings
 
-_MEANING = "the rotation of the base per inserted length [rad/m], for each needle"
+_MEANING = "the rotation of the base per inserted length [rad/m]"
 
 
 class OwnLaw:
@@ -46,26 +46,26 @@ class OwnLaw:
         return self._command("to_plane()", rate, estimate)
 
     def to_point(
-        self, estimate: Estimate, target: npt.ArrayLike, rotation_left: npt.ArrayLike = np.inf
+        self, estimate: Estimate, target: npt.ArrayLike, rotation_left: float = np.inf
     ) -> SteeringCommand:
         """Return the rotation rate to hold over the next step, to a point; see `PointLaw`."""
-        goal = np.broadcast_to(np.asarray(target, dtype=float), estimate.position.shape)
+        goal = np.array(target, dtype=float)
         with self._part.blamed("to_point"):
             rate = self._own.to_point(estimate, goal.copy())
         return self._command("to_point()", rate, estimate, _arc_left(estimate, goal))
 
     def _command(
-        self, what: str, rate: Any, estimate: Estimate, left: Array | None = None
+        self, what: str, rate: Any, estimate: Estimate, left: float | None = None
     ) -> SteeringCommand:
-        checked = self._part.checked(what, rate, estimate.curvature.shape, _MEANING)
-        held = np.clip(checked, -self._limit, self._limit)
+        checked = float(self._part.checked(what, rate, (), _MEANING))
+        held = min(max(checked, -self._limit), self._limit)
         wanted = virtual_input(estimate.reduced, checked, estimate.curvature)
-        return SteeringCommand(np.asarray(wanted), np.asarray(held), left)
+        return SteeringCommand(float(wanted), held, left)
 
 
 @cache
 def tried_law(name: str) -> OwnPart:
-    """Return an own law's class that has steered a needle, and two at once.
+    """Return an own law's class that has steered a needle.
 
     Raises
     ------
@@ -74,23 +74,19 @@ def tried_law(name: str) -> OwnPart:
     """
     part = own_part("law", name)
     law = OwnLaw(part, SteeringSettings())
-    for needles in ((), (2,)):
-        turn = np.broadcast_to(np.eye(3), (*needles, 3, 3))
-        estimate = pose_estimate(
-            np.zeros((*needles, 3)), turn, np.full(needles, 8.0), np.eye(6) * 1e-6
-        )
-        law(estimate, 0.001)
-        if callable(getattr(part.made_by, "to_point", None)):
-            law.to_point(estimate, np.array([0.0, 0.0, 0.1]))
+    estimate = pose_estimate(np.zeros(3), np.eye(3), 8.0, np.eye(6) * 1e-6)
+    law(estimate, 0.001)
+    if callable(getattr(part.made_by, "to_point", None)):
+        law.to_point(estimate, np.array([0.0, 0.0, 0.1]))
     return part
 
 
-def _arc_left(estimate: Estimate, target: Array) -> Array:
-    """Return the length of the arc that leaves along the heading and leads to a target, (...) [m].
+def _arc_left(estimate: Estimate, target: Array) -> float:
+    """Return the length of the arc that leaves along the heading and leads to a target [m].
 
     Negative of a target that lies behind.
     """
-    way = ((target - estimate.position)[..., None, :] @ estimate.rotation)[..., 0, :]
-    aside, ahead = np.hypot(way[..., 0], way[..., 1]), way[..., 2]
+    x, y, ahead = (target - estimate.position) @ estimate.rotation
+    aside = np.hypot(x, y)
     angle = np.arctan2(aside, np.abs(ahead))
-    return np.asarray(np.copysign(np.hypot(aside, ahead) / np.sinc(angle / np.pi), ahead))
+    return float(np.copysign(np.hypot(aside, ahead) / np.sinc(angle / np.pi), ahead))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from needle_controller.laws.law import SteeringCommand
@@ -116,14 +118,13 @@ class PathSteering:
         insertion : float
             That the estimate is of [m].
         """
-        route = self.route(tip_states(estimate, plane)[0], target, obstacles, insertion)
+        route = self.route(tip_state(estimate, plane), target, obstacles, insertion)
         if route is None:
             return None
         command = self._law(estimate, plane.from_rig(route.aim))
         if route.length is None:
             return command
-        left = np.asarray(route.length)
-        return SteeringCommand(command.virtual_input, command.rotation_rate, left)
+        return SteeringCommand(command.virtual_input, command.rotation_rate, route.length)
 
     def route(
         self, tip: TipState, target: Array, obstacles: Obstacles, insertion: float
@@ -139,18 +140,15 @@ class PathSteering:
         return Route(path.aim, None if len(path.legs) == 1 else path.length)
 
 
-def tip_states(estimate: Estimate, plane: TargetPlane) -> list[TipState]:
-    """Return the tips that an estimate in a plane's frame is of, in `rig`."""
+def tip_state(estimate: Estimate, plane: TargetPlane) -> TipState:
+    """Return the tip that an estimate in a plane's frame is of, in `rig`."""
     turn, shift = plane.T_rig_plane[:3, :3], plane.T_rig_plane[:3, 3]
-    places, turns = estimate.position @ turn.T + shift, turn @ estimate.rotation
-    variance = np.diagonal(estimate.covariance, axis1=-2, axis2=-1)
-    across = np.maximum(variance[..., X], variance[..., X + 1])
-    heading = np.maximum(variance[..., PITCH], variance[..., YAW])
-    stds = np.sqrt(np.maximum(np.stack([across, heading], axis=-1), 0.0)).reshape(-1, 2)
-    rows = zip(
-        places.reshape(-1, 3), turns.reshape(-1, 3, 3), estimate.curvature.flat, stds, strict=True
+    variance = np.maximum(np.diagonal(estimate.covariance), 0.0)
+    across, heading = max(variance[X], variance[X + 1]), max(variance[PITCH], variance[YAW])
+    return TipState(
+        turn @ estimate.position + shift,
+        turn @ estimate.rotation,
+        estimate.curvature,
+        math.sqrt(across),
+        math.sqrt(heading),
     )
-    return [
-        TipState(place, rotation, float(kappa), float(std[0]), float(std[1]))
-        for place, rotation, kappa, std in rows
-    ]

@@ -32,9 +32,77 @@ class LawToPoint(Protocol):
     """A law for points: `PointLaw`, or that of another package."""
 
     def __call__(
-        self, estimate: Estimate, target: npt.ArrayLike, rotation_left: npt.ArrayLike = np.inf
+        self, estimate: Estimate, target: npt.ArrayLike, rotation_left: float = np.inf
     ) -> SteeringCommand:
         """Return the command for the next step; see `PointLaw`."""
+
+
+class Foresight:
+    """Foresees where a target will be when the needle is there.
+
+    Of one needle; or, in a study, of several that are inserted alike: times, lengths and points
+    then have one row for each.
+
+    Parameters
+    ----------
+    motion : TargetMotion
+        Where the target was seen; times are seconds of the tips' clock.
+
+    Attributes
+    ----------
+    motion : TargetMotion
+        See above.
+    """
+
+    def __init__(self, motion: TargetMotion) -> None:
+        self.motion = motion
+        self._insertions: deque[tuple[float, float]] = deque()
+        self._arrival: Array | float | None = None
+        self._foretold: Array | None = None
+
+    @property
+    def aim(self) -> Array:
+        """Target as expected when the needle is there [m]."""
+        return self.motion.last if self._foretold is None else self._foretold
+
+    def look(
+        self,
+        time: Array | float,
+        insertion: Array | float,
+        left: Callable[[Array], Array | float],
+    ) -> Array:
+        """Return the target as expected when the needle is there [m].
+
+        Parameters
+        ----------
+        time, insertion : float
+            Of the last tip [s], [m].
+        left : callable
+            Returns the insertion that is left to a point [m].
+        """
+        now = float(np.max(time))
+        speed = self._speed(now, float(np.max(insertion)))
+        self._foretold = None
+        if speed is None or not -_CLOCKS_APART <= now - self.motion.seen <= WINDOWS[0]:
+            return self.aim
+        if self._arrival is None:
+            self._arrival = time + np.maximum(left(self.aim), 0.0) / speed
+        for _ in range(_LOOKS):
+            self._foretold = self.motion.at(self._arrival)
+            arrival = time + np.maximum(left(self.aim), 0.0) / speed
+            self._arrival = self._arrival + _CORRECTED * (arrival - self._arrival)
+        return self.aim
+
+    def _speed(self, time: float, insertion: float) -> float | None:
+        """Return how fast the needle goes in [m/s]; None while it has not moved."""
+        seen = self._insertions
+        if seen and (time <= seen[-1][0] or insertion < seen[-1][1]):
+            seen.clear()
+        seen.append((time, insertion))
+        while len(seen) > 2 and insertion - seen[1][1] >= _AVERAGED:
+            seen.popleft()
+        began, inserted = seen[0]
+        return (insertion - inserted) / (time - began) if insertion > inserted else None
 
 
 class PointSteering:
@@ -55,22 +123,20 @@ class PointSteering:
 
     def __init__(self, settings: SteeringSettings, motion: TargetMotion) -> None:
         self._law = point_law(settings)
+        self._foresight = Foresight(motion)
         self.motion = motion
-        self._insertions: deque[tuple[float, float]] = deque()
-        self._arrival: Array | None = None
-        self._foretold: Array | None = None
 
     @property
     def aim(self) -> Array:
-        """Target as expected when the needle is there, in `rig`, shape (..., 3) [m]."""
-        return self.motion.last if self._foretold is None else self._foretold
+        """Target as expected when the needle is there, in `rig`, shape (3,) [m]."""
+        return self._foresight.aim
 
     def command(
         self,
         estimate: Estimate,
-        time: Array | float,
-        insertion: Array | float,
-        rotation_left: Array | float,
+        time: float,
+        insertion: float,
+        rotation_left: float,
         from_rig: Callable[[Array], Array] = np.asarray,
     ) -> SteeringCommand:
         """Return the rotation rate to hold over the next step, and the insertion left.
@@ -79,43 +145,21 @@ class PointSteering:
         ----------
         estimate : Estimate
             Of the needle at `time`.
-        time : float, or ndarray, shape (...)
-            Of the tip that it is made from [s].
-        insertion : float, or ndarray, shape (...)
-            Then [m].
-        rotation_left : float, or ndarray, shape (...)
+        time, insertion : float
+            Of the tip that it is made from [s], [m].
+        rotation_left : float
             What the base may still turn, either way [rad].
         from_rig : callable
             Takes points of `rig` to the estimate's frame.
         """
-        now = float(np.max(time))
-        speed = self._speed(now, float(np.max(insertion)))
-        if speed is None or not -_CLOCKS_APART <= now - self.motion.seen <= WINDOWS[0]:
-            self._foretold = None
-            return self._law(estimate, from_rig(self.aim), rotation_left)
-        if self._arrival is None:
-            self._arrival = time + self._left(estimate, from_rig(self.aim)) / speed
-        for _ in range(_LOOKS):
-            self._foretold = self.motion.at(self._arrival)
-            left = self._left(estimate, from_rig(self.aim))
-            self._arrival = self._arrival + _CORRECTED * (time + left / speed - self._arrival)
-        return self._law(estimate, from_rig(self.aim), rotation_left)
 
-    def _left(self, estimate: Estimate, target: npt.ArrayLike) -> Array:
-        left = self._law(estimate, target).insertion_left
-        assert left is not None
-        return np.maximum(left, 0.0)
+        def left(target: Array) -> float:
+            command = self._law(estimate, from_rig(target))
+            assert command.insertion_left is not None
+            return command.insertion_left
 
-    def _speed(self, time: float, insertion: float) -> float | None:
-        """Return how fast the needle goes in [m/s]; None while it has not moved."""
-        seen = self._insertions
-        if seen and (time <= seen[-1][0] or insertion < seen[-1][1]):
-            seen.clear()
-        seen.append((time, insertion))
-        while len(seen) > 2 and insertion - seen[1][1] >= _AVERAGED:
-            seen.popleft()
-        began, inserted = seen[0]
-        return (insertion - inserted) / (time - began) if insertion > inserted else None
+        aim = self._foresight.look(time, insertion, left)
+        return self._law(estimate, from_rig(aim), rotation_left)
 
 
 def point_law(settings: SteeringSettings) -> LawToPoint:

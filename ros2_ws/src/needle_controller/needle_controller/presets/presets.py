@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.bank.filter_settings import BOUNDED_NOISE, NORMAL_NOISE, FilterSettings
-from needle_controller.bank.hypothesis_filter import HypothesisFilter
-from needle_controller.bank.late_tips import LateTips
+from needle_controller.filter.filter_settings import BOUNDED_NOISE, NORMAL_NOISE, FilterSettings
+from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.laws.flip_plan import FlipPlan
-from needle_controller.laws.law import Law, LinearizingLaw, OpenLoopLaw, StepLaw
-from needle_controller.laws.roll_law import RollLaw
-from needle_controller.laws.roll_turns import RollLawSettings
+from needle_controller.laws.law import LinearizingGains, LinearizingLaw, OpenLoopLaw, StepLaw
+from needle_controller.laws.roll_law import RollLaw, RollLawSettings
 from needle_controller.model.gains import Gains
 from needle_controller.observers.estimator import Estimator
 from needle_controller.observers.luenberger import LuenbergerObserver, LuenbergerSettings
@@ -20,15 +18,27 @@ from needle_controller.presets.own_law import OwnLaw, tried_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
 
-def make_law(settings: SteeringSettings, gains: Gains) -> Law:
+def make_law(settings: SteeringSettings, gains: Gains) -> LinearizingLaw | OpenLoopLaw:
     """Return the law of preset `paper`, (7) and (10) with these gains, or of `open_loop`."""
     if settings.preset == "open_loop":
         return OpenLoopLaw()
     return LinearizingLaw(
-        feedback=gains.feedback,
-        step_length=settings.step_length,
-        demand_margin=settings.demand_margin,
-        max_rotation_per_length=settings.max_rotation_per_length,
+        LinearizingGains(
+            feedback=gains.feedback,
+            step_length=settings.step_length,
+            demand_margin=settings.demand_margin,
+            max_rotation_per_length=settings.max_rotation_per_length,
+        )
+    )
+
+
+def filter_settings(settings: SteeringSettings) -> FilterSettings:
+    """Return what the filter of preset `best` assumes."""
+    return FilterSettings(
+        curvature=settings.curvature,
+        tip_noise_bound=settings.tip_noise_bound,
+        noise_hypotheses=BOUNDED_NOISE if settings.has_bounded_noise else NORMAL_NOISE,
+        initial_angle_std=settings.entry_angle_std,
     )
 
 
@@ -59,9 +69,9 @@ def make_controller(
     initial_rotation: npt.ArrayLike,
     entry: npt.ArrayLike | None = None,
     *,
-    first: int = 0,
+    number: int = 0,
 ) -> tuple[Estimator, StepLaw]:
-    """Return estimator and law, for one needle or for as many as there will be tips.
+    """Return estimator and law of one needle.
 
     They are a preset's, or those of another package where the settings name one.
 
@@ -73,8 +83,8 @@ def make_controller(
         Orientation of a needle at its entry with the base's rotation at 0, in `target_plane`.
     entry : array_like, shape (3,), optional
         Where it enters, in `target_plane` [m]; not known if none is given.
-    first : int
-        Number of the first needle, which keys the chance of an own estimator beside the seed.
+    number : int
+        Of the needle in a study, which keys the chance of an own estimator beside the seed.
 
     Raises
     ------
@@ -84,7 +94,7 @@ def make_controller(
     estimator, law = _of_preset(settings, initial_rotation, entry)
     if settings.estimator:
         part = tried_estimator(settings.estimator)
-        rng = np.random.default_rng([settings.seed, first])
+        rng = np.random.default_rng([settings.seed, number])
         estimator = OwnEstimator(part, settings, initial_rotation, entry, rng)
     if settings.law:
         law = OwnLaw(tried_law(settings.law), settings)
@@ -95,15 +105,8 @@ def _of_preset(
     settings: SteeringSettings, initial_rotation: npt.ArrayLike, entry: npt.ArrayLike | None
 ) -> tuple[Estimator, StepLaw]:
     if settings.preset == "best":
-        known = FilterSettings(
-            curvature=settings.curvature,
-            tip_noise_bound=settings.tip_noise_bound,
-            noise_hypotheses=BOUNDED_NOISE if settings.has_bounded_noise else NORMAL_NOISE,
-            initial_angle_std=settings.entry_angle_std,
-        )
-        estimator = LateTips(HypothesisFilter(known, initial_rotation), entry)
+        estimator = HypothesisFilter(filter_settings(settings), initial_rotation, entry)
         return estimator, roll_law(settings)
     gains = settings.gains()
-    paper_law = make_law(settings, gains)
     observer = LuenbergerObserver(observer_settings(settings, gains), initial_rotation)
-    return observer, lambda estimate, _: paper_law(estimate)
+    return observer, make_law(settings, gains)

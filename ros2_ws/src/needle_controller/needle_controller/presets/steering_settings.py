@@ -306,7 +306,7 @@ class SteeringSettings:
     )
 
     def __post_init__(self) -> None:
-        """Check the whole, gains included."""
+        """Check the whole; the gains where the preset has any."""
         check_fields(self)
         for name in ("state_weights", "process_noise"):
             numbers = getattr(self, name)
@@ -330,7 +330,8 @@ class SteeringSettings:
                 f"flip_depths: preset {self.preset} cannot steer with the bevel flipped (its "
                 "coordinates end at roll +-90 deg); best can"
             )
-        self.gains()
+        if self.preset in ONE_SIDED_PRESETS:
+            self.gains()
 
     def gains(self) -> Gains:
         """Return the gains the weights give; raises UserError as `gains.design_gains` does."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from needle_controller.bank.hypothesis_filter import TIDY_EVERY
+from needle_controller.filter.bank import MERGE_EVERY
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import X, rotation_from_angles
@@ -220,7 +220,7 @@ class PlaneControl:
         command = self._command(estimate, joints)
         reach, distance = self._reach(estimate, joints), self._distance(estimate)
         if command is None:
-            still = SteeringCommand(np.zeros(()), np.zeros(()))
+            still = SteeringCommand(0.0, 0.0)
             return ControlUpdate(estimate, still, turned, reach, distance, blocked=True)
         return ControlUpdate(estimate, command, turned, reach, distance)
 
@@ -297,7 +297,7 @@ class PlaneControl:
         settings, length = self._settings, self._settings.step_length
         estimator, law = make_controller(settings, np.eye(3))
         estimator.reset(np.zeros(3), np.zeros(2))
-        for tips in range(1, TIDY_EVERY + 1):
+        for tips in range(1, MERGE_EVERY + 1):
             estimator.advance(length, 0.0)
             estimator.correct([0.0, 0.0, tips * length], settings.configured_covariance())
         estimate = estimator.estimate()
@@ -307,7 +307,6 @@ class PlaneControl:
             ahead = np.array([0.0, 0.0, 0.5 * settings.depth])
             PathSteering(settings).command(estimate, self._plane, ahead, _FAR_AWAY, length)
             path_planner(settings).warm_up()
-        estimate.covariance  # noqa: B018 - lazy, and compiled too
 
 
 def _new_controller(settings: SteeringSettings, plane: TargetPlane) -> tuple[Estimator, StepLaw]:

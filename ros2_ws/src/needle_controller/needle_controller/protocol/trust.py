@@ -6,9 +6,7 @@ import dataclasses
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import X
 from needle_controller.observers.estimator import Estimate
 
@@ -67,9 +65,9 @@ def trust_of(estimate: Estimate, ended_off: float = 0.0) -> Trust:
     return Trust(verdict, bool(doubts), x, x - half, x + half)
 
 
-def ends_elsewhere(distance: Array | float) -> npt.NDArray[np.bool_]:
-    """Return whether needles that end so far from plane or point, (...) [m], are not there.
+def ends_elsewhere(distance: float) -> bool:
+    """Return whether a needle that ends so far from plane or point [m] is not there.
 
     However well it is known where they are: nobody must take such an end for a good one.
     """
-    return np.asarray(np.abs(distance) > TARGET_TOLERANCE)
+    return abs(distance) > TARGET_TOLERANCE

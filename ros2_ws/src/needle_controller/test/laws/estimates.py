@@ -6,19 +6,11 @@ import dataclasses
 
 import numpy as np
 
-from needle_controller.bank.hypothesis_mixture import (
-    COLUMNS,
-    T_AGREEMENT,
-    T_CURVATURE,
-    T_ROLL,
-    T_WEIGHT,
-    Hypotheses,
-    MixtureEstimate,
-)
+from needle_controller.filter.records import TORSION
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import linearized_from_reduced
 from needle_controller.model.kinematics import REDUCED
-from needle_controller.observers.estimator import Estimate
+from needle_controller.observers.estimator import Estimate, Hypotheses
 
 CURVATURE = 1.0 / 0.122
 STEP = 0.001
@@ -26,33 +18,27 @@ CAP = np.deg2rad(30.0) / STEP
 
 
 def known(coordinates: Array, std: float = 0.0) -> Estimate:
-    """Return what an estimator says that knows (..., 6) coordinates, the pitch to `std` [rad]."""
-    curvature = np.full(coordinates.shape[:-1], CURVATURE)
-    covariance = np.zeros((*coordinates.shape, 6))
-    covariance[..., 4, 4] = std**2
+    """Return what an estimator says that knows (6,) coordinates, the pitch to `std` [rad]."""
+    covariance = np.zeros((6, 6))
+    covariance[4, 4] = std**2
     return Estimate(
         coordinates=coordinates,
-        linearized=linearized_from_reduced(coordinates[..., REDUCED], curvature),
-        curvature=curvature,
-        warnings=(),
-        covariance_of=lambda: covariance,
+        linearized=linearized_from_reduced(coordinates[list(REDUCED)], CURVATURE),
+        curvature=CURVATURE,
+        covariance=covariance,
     )
 
 
-def mixture(
-    rolls: list[float], *, wound: float = 0.0, columns: dict[int, float] | None = None
-) -> MixtureEstimate:
-    """Return hypotheses of these rolls [rad], equally likely, of a needle at its entry.
+def mixture(rolls: list[float], *, wound: float = 0.0, **first: float) -> Estimate:
+    """Return torsions of these rolls [rad], equally likely, of a needle at its entry.
 
-    `columns` are of the first hypothesis, by their numbers.
+    `first` changes fields of the first one.
     """
-    table = np.zeros((len(rolls), COLUMNS))
-    table[:, T_ROLL] = rolls
-    table[:, T_AGREEMENT], table[:, T_CURVATURE] = 1.0, CURVATURE
-    table[:, T_WEIGHT] = 1.0 / len(rolls)
-    for column, value in (columns or {}).items():
-        table[0, column] = value
-    plain = known(np.zeros(6))
-    fields = {field.name: getattr(plain, field.name) for field in dataclasses.fields(Estimate)}
-    hypotheses = Hypotheses(table, np.zeros(()), np.asarray(wound), np.zeros(3))
-    return MixtureEstimate(**fields, hypotheses=hypotheses)
+    torsions = np.zeros(len(rolls), TORSION)
+    torsions["roll"] = rolls
+    torsions["agreement"], torsions["curvature"] = 1.0, CURVATURE
+    torsions["weight"] = 1.0 / len(rolls)
+    for name, value in first.items():
+        torsions[name][0] = value
+    hypotheses = Hypotheses(torsions, 0.0, wound, np.zeros(3))
+    return dataclasses.replace(known(np.zeros(6)), hypotheses=hypotheses)

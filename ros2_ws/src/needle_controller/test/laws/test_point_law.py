@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from needle_controller.bank.hypothesis_mixture import T_AGREEMENT, T_LAG, T_PLAY
+from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.laws.point_law import PointLaw
 from needle_controller.laws.point_turns import (
     PointLawSettings,
@@ -20,6 +20,7 @@ from needle_controller.laws.point_turns import (
     way_as_bent,
     write_need,
 )
+from needle_controller.many_needles import ManyFilters
 from needle_controller.model.arrays import Array
 from needle_controller.observers.estimator import Estimate
 from needle_core.errors import OutOfBoundsError
@@ -30,12 +31,9 @@ ASIDE, AHEAD = [0.035, 0.0, 0.1], [0.0, 0.0, 0.1]
 
 
 def estimate(pose: Array, std: float = 0.0) -> Estimate:
-    """Return what an estimator says that knows poses, (..., 4, 4)."""
-    coordinates = np.empty((*pose.shape[:-2], 6))
-    coordinates[..., :3] = pose[..., :3, 3]
-    angles = Rotation.from_matrix(pose[..., :3, :3].reshape(-1, 3, 3)).as_euler("XYZ")
-    coordinates[..., 3:] = angles.reshape(*pose.shape[:-2], 3)
-    return known(coordinates, std)
+    """Return what an estimator says that knows a pose, (4, 4)."""
+    angles = Rotation.from_matrix(pose[:3, :3]).as_euler("XYZ")
+    return known(np.concatenate([pose[:3, 3], angles]), std)
 
 
 def entry(roll_deg: float = 0.0) -> Array:
@@ -174,13 +172,13 @@ def test_each_hypothesis_turns_from_its_own_roll_through_its_play_and_may_unwind
     quarter = 0.5 * np.pi
     assert turn(mixture([0.0])) == pytest.approx(quarter)
     assert turn(mixture([0.3, -0.1])) == pytest.approx(quarter - 0.1)
-    assert turn(mixture([0.0], columns={T_PLAY: 0.4})) == pytest.approx(quarter + 0.4)
+    assert turn(mixture([0.0], play=0.4)) == pytest.approx(quarter + 0.4)
     # At the limit of winding the other way round is taken.
     wound = mixture([0.0], wound=6.0 * np.pi - 0.5)
     assert float(law()(mixture([0.0]), ASIDE).rotation_rate) == pytest.approx(CAP)
     assert float(law()(wound, ASIDE).rotation_rate) == pytest.approx(-CAP)
     # Rolls that disagree leave the needle alone.
-    scattered = mixture([0.0], columns={T_AGREEMENT: 0.1})
+    scattered = mixture([0.0], agreement=0.1)
     assert law(scatter_dead_band=3.0)(scattered, ASIDE).rotation_rate == 0.0
 
 
@@ -191,20 +189,21 @@ def test_torsion_makes_it_turn_in_time() -> None:
         return float(next(z for z in ahead if law()(needle, [0.0, 0.0, z]).rotation_rate != 0.0))
 
     # A play takes 1.3 mm to turn through at 30 deg/mm, a lag its 8 mm.
-    for columns in ({T_LAG: 0.008}, {T_PLAY: 0.7}):
-        assert waits_until(mixture([0.0], columns=columns)) > waits_until(mixture([0.0])) + 0.001
+    for columns in ({"lag": 0.008}, {"play": 0.7}):
+        assert waits_until(mixture([0.0], **columns)) > waits_until(mixture([0.0])) + 0.001
 
 
 def test_many_needles_are_steered_as_each_alone() -> None:
-    poses = np.stack([entry(0.0), entry(100.0), moved(entry(-30.0), 0.03, 0.2)])
+    filters = ManyFilters(FilterSettings(), 3, STEP)
+    filters.start(np.array([[0.001, 0.0, 0.0], [0.0, 0.0005, 0.0], [-0.001, 0.0, 0.0]]))
+    filters.advance(np.full(3, STEP), np.array([0.1, -0.4, 1.0]))
     targets = np.array([[0.01, 0.0, 0.07], [0.0, 0.03, 0.1], [-0.01, 0.01, 0.09]])
-    together = law()(estimate(poses), targets)
-    assert together.insertion_left is not None
-    for k in range(3):
-        alone = law()(estimate(poses[k]), targets[k])
-        assert alone.rotation_rate == together.rotation_rate[k]
-        assert alone.insertion_left == together.insertion_left[k]
-        assert alone.virtual_input == together.virtual_input[k]
+    filters.correct(targets * 0.01, None, np.zeros(3))
+    rates, left = filters.point_rates(PointLawSettings(), targets, np.full(3, math.inf))
+    for k, one in enumerate(filters.each()):
+        alone = law()(one, targets[k])
+        assert alone.rotation_rate == rates[k]
+        assert alone.insertion_left == left[k]
 
 
 def test_settings_out_of_bounds_are_refused() -> None:

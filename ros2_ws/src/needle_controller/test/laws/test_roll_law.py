@@ -2,36 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from needle_controller.bank.hypothesis_mixture import (
-    COLUMNS,
-    T_AGREEMENT,
-    T_BEHIND_PLAY,
-    T_LAG,
-    T_PLAY,
-    T_TIP_ANGLE,
-    T_WEIGHT,
-    MixtureEstimate,
-)
+from needle_controller.filter.records import TORSION
 from needle_controller.laws.flip_plan import FlipPlan
-from needle_controller.laws.roll_law import RollLaw
-from needle_controller.laws.roll_turns import RollLawSettings, base_turn, nearest_turn
-from needle_controller.model.arrays import Array
+from needle_controller.laws.roll_law import RollLaw, RollLawSettings, base_turn, nearest_turn
 from needle_controller.observers.estimator import Estimate
 from needle_core.errors import OutOfBoundsError, UserError
 
 from .estimates import CAP, STEP, known, mixture
 
 
-def estimate(
-    x: npt.ArrayLike = 0.0, pitch: npt.ArrayLike = 0.0, roll: npt.ArrayLike = 0.0, std: float = 0.0
-) -> Estimate:
-    coordinates = np.zeros((*np.broadcast_shapes(np.shape(x), np.shape(roll)), 6))
-    coordinates[..., 0], coordinates[..., 4], coordinates[..., 5] = x, pitch, roll
-    return known(coordinates, std)
+def estimate(x: float = 0.0, pitch: float = 0.0, roll: float = 0.0, std: float = 0.0) -> Estimate:
+    return known(np.array([x, 0.0, 0.0, 0.0, pitch, roll]), std)
 
 
 def law(**changes: float) -> RollLaw:
@@ -44,9 +30,9 @@ def test_turns_to_where_the_needle_bends_towards_the_plane_within_the_limit() ->
         command = law()(estimate(x))
         assert np.sign(command.rotation_rate) == np.sign(command.virtual_input) == -np.sign(x)
         assert abs(command.rotation_rate) == pytest.approx(CAP)
-    many = law(max_rotation_per_length=100.0)(estimate(np.linspace(-0.01, 0.01, 50)))
-    assert many.rotation_rate.shape == (50,)
-    assert np.max(np.abs(many.rotation_rate)) <= 100.0
+    slow = law(max_rotation_per_length=100.0)
+    for x in np.linspace(-0.01, 0.01, 50).tolist():
+        assert abs(slow(estimate(x)).rotation_rate) <= 100.0
     # What is doubted is demanded less.
     sure, unsure = (law(far_dead_band=0.0)(estimate(0.003, 0.0, -0.5, std=s)) for s in (0.0, 0.3))
     assert abs(unsure.virtual_input) < abs(sure.virtual_input)
@@ -86,7 +72,7 @@ def test_the_nearer_side_is_taken_unless_it_winds_too_far() -> None:
     assert nearest_turn(0.0, -0.5, 1.0, -30.0, 7.0) > 0.0
 
 
-def turned(needle: MixtureEstimate, **changes: float) -> float:
+def turned(needle: Estimate, **changes: float) -> float:
     return float(law(near_dead_band=0.1, **changes)(needle).rotation_rate) * STEP
 
 
@@ -96,27 +82,27 @@ def test_small_errors_and_rolls_that_disagree_are_left_alone() -> None:
     assert law()(estimate(roll=1.1 * band)).rotation_rate < 0.0
     assert turned(mixture([0.2])) == pytest.approx(-0.2)
     # The less the hypotheses' rolls agree, the larger an error of their mean is left alone.
-    assert turned(mixture([0.2], columns={T_AGREEMENT: 0.85})) == 0.0
+    assert turned(mixture([0.2], agreement=0.85)) == 0.0
     # Averaged by weight; the first is within the dead band and asks for nothing.
-    weighed = mixture([0.05, 0.5], columns={T_WEIGHT: 0.5 / 3.0})
+    weighed = mixture([0.05, 0.5], weight=0.5 / 3.0)
     assert turned(weighed) == pytest.approx(-0.75 * 0.5)
 
 
-def row(tip: float = 0.0, behind: float = 0.0, play: float = 0.0, lag: float = 0.0) -> Array:
-    values = np.zeros(COLUMNS)
-    values[[T_TIP_ANGLE, T_BEHIND_PLAY, T_PLAY, T_LAG]] = tip, behind, play, lag
-    return values
+def torsion(tip: float = 0.0, behind: float = 0.0, play: float = 0.0, lag: float = 0.0) -> Any:
+    t = np.zeros(1, TORSION)[0]
+    t["tip_angle"], t["behind_play"], t["play"], t["lag"] = tip, behind, play, lag
+    return t
 
 
 def test_play_is_taken_up_and_lag_is_led() -> None:
-    assert base_turn(row(play=0.5), 0.2, 0.0, STEP) == pytest.approx(0.7)
-    assert base_turn(row(play=0.5), -0.2, 0.0, STEP) == pytest.approx(-0.7)
-    assert base_turn(row(0.1, 0.1, play=0.5), 0.2, 0.6, STEP) == pytest.approx(0.2)
-    assert base_turn(row(play=0.5), 0.0, 0.3, STEP) == 0.0
-    lead = base_turn(row(lag=0.008), 0.1, 0.0, STEP)
+    assert base_turn(torsion(play=0.5), 0.2, 0.0, STEP) == pytest.approx(0.7)
+    assert base_turn(torsion(play=0.5), -0.2, 0.0, STEP) == pytest.approx(-0.7)
+    assert base_turn(torsion(0.1, 0.1, play=0.5), 0.2, 0.6, STEP) == pytest.approx(0.2)
+    assert base_turn(torsion(play=0.5), 0.0, 0.3, STEP) == 0.0
+    lead = base_turn(torsion(lag=0.008), 0.1, 0.0, STEP)
     assert lead * (1.0 - np.exp(-1.0 / 8.0)) == pytest.approx(0.1)
     # No more turn wanted: the base goes back to where the tip is.
-    assert base_turn(row(0.2, 0.9, lag=0.008), 0.0, 0.9, STEP) == pytest.approx(-0.7)
+    assert base_turn(torsion(0.2, 0.9, lag=0.008), 0.0, 0.9, STEP) == pytest.approx(-0.7)
 
 
 def test_settings_out_of_bounds_are_refused() -> None:

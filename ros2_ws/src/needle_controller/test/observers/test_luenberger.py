@@ -8,10 +8,16 @@ import pytest
 from numpy.random import default_rng
 
 from needle_controller.laws.law import LinearizingLaw, OpenLoopLaw
+from needle_controller.many_needles import ManyObservers
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import rotation_rate
 from needle_controller.model.kinematics import rotation_from_angles
-from needle_controller.observers.luenberger import LuenbergerObserver
+from needle_controller.observers.luenberger import (
+    OBSERVER,
+    LuenbergerObserver,
+    ObserverModel,
+    saturate,
+)
 from needle_controller.presets.presets import make_law, observer_settings
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_sim.needle.plant import NeedlePlant
@@ -156,21 +162,21 @@ def test_law_is_7_for_short_steps() -> None:
     estimate = one.estimate()
     # Enough pitch for the roll's own drift to matter: it is 4.5 rad/m here.
     assert abs(CURVATURE * np.tan(estimate.reduced[1])) > 1.0
-    short = dataclasses.replace(
-        law(), step_length=1e-9, demand_margin=0.0, max_rotation_per_length=1e9
-    )
+    gains = law().gains._replace(step_length=1e-9, demand_margin=0.0, max_rotation_per_length=1e9)
+    short = LinearizingLaw(gains)
     command = short(estimate)
     expected = rotation_rate(estimate.reduced, command.virtual_input, CURVATURE)
     assert float(command.rotation_rate) == pytest.approx(float(expected), rel=1e-5)
-    assert float(command.virtual_input) == pytest.approx(-estimate.linearized @ short.feedback)
+    assert float(command.virtual_input) == pytest.approx(-estimate.linearized @ gains.feedback)
 
 
 def test_law_caps_the_rotation_and_open_loop_never_turns() -> None:
     one = observer()
-    one.reset(np.array([[0.02, 0, 0], [-0.02, 0, 0]]), np.zeros(2))
-    capped = dataclasses.replace(law(), max_rotation_per_length=10.0)(one.estimate())
-    np.testing.assert_array_equal(capped.rotation_rate, [-10.0, 10.0])
-    np.testing.assert_array_equal(OpenLoopLaw()(one.estimate()).rotation_rate, [0.0, 0.0])
+    slow = LinearizingLaw(law().gains._replace(max_rotation_per_length=10.0))
+    for x, rate in ((0.02, -10.0), (-0.02, 10.0)):
+        one.reset([x, 0.0, 0.0], [0.0, 0.0])
+        assert slow(one.estimate()).rotation_rate == rate
+        assert OpenLoopLaw()(one.estimate()).rotation_rate == 0.0
 
 
 def test_pure_rotation_turns_the_roll_alone() -> None:
@@ -180,31 +186,43 @@ def test_pure_rotation_turns_the_roll_alone() -> None:
     np.testing.assert_allclose(one.estimate().reduced, [0.001, 0.0, 0.5], atol=1e-12)
 
 
-def test_broadcasting_equals_looping() -> None:
-    rng = default_rng(8)
-    tips = rng.normal(0.0, 2e-3, (20, 5, 3))
-    insertions = rng.uniform(0.5e-3, 1e-3, 20)
-    turns = rng.normal(0.0, 0.1, (20, 5))
+def test_in_a_study_each_needle_is_as_the_node_has_it() -> None:
+    rng, count = default_rng(8), 5
+    tips = rng.normal(0.0, 2e-3, (20, count, 3))
+    turns = rng.normal(0.0, 0.1, (20, count))
     tips[3, 2] = np.nan
-    many = observer()
-    many.reset(tips[0], np.zeros(2))
-    for tip, d_insertion, turn in zip(tips[1:], insertions[1:], turns[1:], strict=True):
-        many.advance(d_insertion, turn)
-        many.correct(tip)
-    whole = many.estimate()
-    covariance = whole.covariance
-    command = law()(whole)
-    for i in range(5):
-        one = observer()
-        one.reset(tips[0, i], np.zeros(2))
-        for tip, d_insertion, turn in zip(tips[1:, i], insertions[1:], turns[1:, i], strict=True):
-            one.advance(d_insertion, turn)
-            one.correct(tip)
-        alone = one.estimate()
-        np.testing.assert_allclose(whole.coordinates[i], alone.coordinates, rtol=1e-10, atol=1e-14)
-        np.testing.assert_allclose(covariance[i], alone.covariance, rtol=1e-8, atol=1e-20)
-        single = law()(alone)
-        np.testing.assert_allclose(command.rotation_rate[i], single.rotation_rate, rtol=1e-8)
+    gains = SETTINGS.gains()
+    many = ManyObservers(observer_settings(SETTINGS, gains).model, law().gains, count)
+    every = [observer() for _ in range(count)]
+    many.start(tips[0].copy())
+    for n, one in enumerate(every):
+        one.reset(tips[0, n], np.zeros(2))
+    for tip, turn in zip(tips[1:], turns[1:], strict=True):
+        rates = many.step(np.full(count, STEP), np.zeros(count), turn, tip, np.zeros(count))
+        for n, one in enumerate(every):
+            one.advance(STEP, turn[n])
+            one.correct(tip[n])
+            assert rates[n] == law()(one.estimate()).rotation_rate
+
+
+def saturated(s: list[float], margin: float = 0.0) -> tuple[Array, bool]:
+    needle = np.zeros(1, OBSERVER)[0]
+    needle["linearized"] = s
+    saturate(needle, ObserverModel(CURVATURE, margin, np.zeros(3, dtype=complex)))
+    return needle["linearized"], bool(needle["saturated"])
+
+
+def test_saturation_is_the_nearest_point_of_the_region() -> None:
+    """The paper's example: [0, 1.5, 0] becomes [0, 1, 0]."""
+    np.testing.assert_allclose(saturated([0.0, 1.5, 0.0])[0], [0.0, 1.0, 0.0])
+    inside = [0.002, 0.3, 0.2 * CURVATURE]
+    np.testing.assert_array_equal(saturated(inside)[0], inside)
+    assert not saturated(inside)[1]
+    s, changed = saturated([0.001, 0.9, -0.9 * CURVATURE], 0.1)
+    assert changed
+    assert s[0] == 0.001
+    assert s[1] ** 2 + (s[2] / CURVATURE) ** 2 == pytest.approx(0.9)
+    assert s[2] / CURVATURE == pytest.approx(-s[1])
 
 
 def test_a_missing_tip_changes_nothing_but_time() -> None:
@@ -236,37 +254,28 @@ def test_a_late_tip_is_compared_with_where_the_tip_was() -> None:
 
 def test_covariance_is_honest() -> None:
     """Over many noisy runs the spread of the errors is within what the covariance says."""
-    rng = default_rng(9)
-    count = 2000
-    start = np.stack(
-        [
-            np.zeros(count),
-            rng.normal(0.0, SETTINGS.initial_pitch_std / 2, count),
-            rng.normal(0.0, SETTINGS.initial_roll_std / 2, count),
-        ],
-        axis=-1,
-    )
-    plant, many = NeedlePlant(poses(start), curvature=CURVATURE), observer()
-
-    def measured() -> Array:
-        noise = rng.uniform(-1e-3, 1e-3, (count, 3))
-        return np.asarray(plant.T_rig_tip[:, :3, 3] + noise)
-
-    many.reset(measured(), np.zeros(2))
-    for i in range(30):
-        plant.advance(STEP, 0.0)
-        many.advance(STEP, 0.0)
-        many.correct(measured())
-        if i % 10 == 9:
-            error = many.estimate().reduced - true_reduced(plant)
-            covariance = many.estimate().covariance
-            sigma = np.sqrt(covariance[:, [0, 4, 5], [0, 4, 5]])
-            assert np.all(np.sqrt(np.mean((error / sigma) ** 2, axis=0)) < 1.3)
-    eigenvalues = np.linalg.eigvalsh(covariance)
-    assert np.all(eigenvalues > 0.0)
+    rng, count = default_rng(9), 200
+    squares = []
+    for _ in range(count):
+        pitch = rng.normal(0.0, SETTINGS.initial_pitch_std / 2)
+        roll = rng.normal(0.0, SETTINGS.initial_roll_std / 2)
+        plant, one = (
+            NeedlePlant(poses(np.array([0.0, pitch, roll])), curvature=CURVATURE),
+            observer(),
+        )
+        one.reset(plant.T_rig_tip[:3, 3] + rng.uniform(-1e-3, 1e-3, 3), np.zeros(2))
+        for _ in range(20):
+            plant.advance(STEP, 0.0)
+            one.advance(STEP, 0.0)
+            one.correct(plant.T_rig_tip[:3, 3] + rng.uniform(-1e-3, 1e-3, 3))
+        known = one.estimate()
+        error = known.reduced - true_reduced(plant)
+        squares.append(error**2 / np.diag(known.covariance)[[0, 4, 5]])
+    assert np.all(np.sqrt(np.mean(squares, axis=0)) < 1.3)
+    assert np.all(np.linalg.eigvalsh(known.covariance) > 0.0)
     # y and z are as measured; the yaw is not observed.
-    np.testing.assert_allclose(covariance[:, 1, 1], SETTINGS.measurement_std**2)
-    assert np.all(covariance[:, 3, 3] >= SETTINGS.initial_yaw_std**2)
+    assert known.covariance[1, 1] == pytest.approx(SETTINGS.measurement_std**2)
+    assert known.covariance[3, 3] >= SETTINGS.initial_yaw_std**2
 
 
 def test_saturation_is_said() -> None:

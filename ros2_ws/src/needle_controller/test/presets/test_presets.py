@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
+from needle_controller.laws.law import LinearizingLaw
+from needle_controller.many_needles import ManyObservers
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
-from needle_controller.observers.luenberger import LuenbergerObserver
 from needle_controller.presets.presets import make_law, observer_settings
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_core.errors import UserError
@@ -24,7 +25,7 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
     ("state_weights.* -1", {"state_weights": (1.0e6, -1.0, 0.0)}),
     ("state_weights.*three numbers", {"state_weights": tuple(range(9))}),
     ("process_noise.*three numbers", {"process_noise": (1.0, 1.0)}),
-    ("input_weight", {"input_weight": 0.0}),
+    ("input_weight", {"preset": "paper", "input_weight": 0.0}),
     ("gain", {"preset": "paper", "process_noise": (0.0, 0.0, 0.0)}),
     ("target plane at 0.09 m", {"target_offset": 0.09}),
     ("flip 1 = 0.2 m is outside", {"flip_depths": (0.2,)}),
@@ -52,30 +53,37 @@ def test_what_cannot_be_steered_with_is_refused_by_name() -> None:
             SteeringSettings(**changes)
 
 
+def test_only_what_a_preset_uses_is_checked() -> None:
+    """Gains are of the paper's law, which is unstable over long steps."""
+    assert SteeringSettings(step_length=0.005).step_length == 0.005
+    with pytest.raises(UserError, match="unstable"):
+        SteeringSettings(preset="paper", step_length=0.005)
+
+
 def final_x(preset: str, seed: int) -> Array:
     """Return x of a grid of needles at the end: +-3 mm, +-10 deg, +-30 deg, the ends included."""
     settings = SteeringSettings(preset=preset, **PAPER_NOISE)
     gains = settings.gains()
     law = make_law(settings, gains)
-    observer = LuenbergerObserver(observer_settings(settings, gains))
     part = np.linspace(-1.0, 1.0, 8)
     scaled = (part * 0.003, np.deg2rad(10.0) * part, np.deg2rad(30.0) * part)
     start = np.stack(np.meshgrid(*scaled, indexing="ij"), axis=-1).reshape(-1, 3)
-    pose = np.tile(np.eye(4), (len(start), 1, 1))
+    count = len(start)
+    pose = np.tile(np.eye(4), (count, 1, 1))
     pose[:, :3, :3] = rotation_from_angles(start * [0.0, 1.0, 1.0])
     pose[:, 0, 3] = start[:, 0]
     plant, rng = NeedlePlant(pose, curvature=settings.curvature), default_rng(seed)
+    feedback = law.gains if isinstance(law, LinearizingLaw) else None
+    needles = ManyObservers(observer_settings(settings, gains).model, feedback, count)
 
     def measured() -> Array:
-        noise = rng.uniform(-1e-3, 1e-3, (len(start), 3))
-        return np.asarray(plant.T_rig_tip[:, :3, 3] + noise)
+        return np.asarray(plant.T_rig_tip[:, :3, 3] + rng.uniform(-1e-3, 1e-3, (count, 3)))
 
-    observer.reset(measured(), np.zeros(2))
+    rates = needles.start(measured())
     for _ in range(120):
-        turn = law(observer.estimate()).rotation_rate * STEP
-        plant.advance(STEP, turn)
-        observer.advance(STEP, turn)
-        observer.correct(measured())
+        plant.advance(STEP, rates * STEP)
+        tips, turns = measured(), rates * STEP
+        rates = needles.step(np.full(count, STEP), np.zeros(count), turns, tips, np.zeros(count))
     return np.asarray(plant.T_rig_tip[:, 0, 3])
 
 

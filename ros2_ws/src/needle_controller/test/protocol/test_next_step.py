@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from needle_controller.bank.filter_settings import FilterSettings
-from needle_controller.bank.hypothesis_filter import HypothesisFilter
+from needle_controller.filter.filter_settings import FilterSettings
+from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.heard_messages import HeardMessages, heard_messages
@@ -39,8 +39,7 @@ def test_a_step_goes_on_by_its_length_or_ends_at_depth_or_point() -> None:
     ]
     for insertion, left, end in rows:
         joints = JointSample(7, insertion, 1.0)
-        distance = None if left is None else np.asarray(left)
-        command = SteeringCommand(np.zeros(()), np.asarray(100.0), distance)
+        command = SteeringCommand(0.0, 100.0, left)
         step = next_step(7, joints, command, SETTINGS, slowly=False)
         assert (step is None) is (end is None), (insertion, left)
         if step is None or end is None:
@@ -69,12 +68,12 @@ def test_trust_is_the_interval_of_the_covariance_the_doubts_and_the_end() -> Non
     assert (there.verdict, there.is_doubtful) == ("trusted", False)
     assert elsewhere.verdict == "doubtful: the needle ends -0.0072 m from its target"
     assert elsewhere.is_doubtful
-    doubted = dataclasses.replace(estimate, doubtful=np.array(True), doubts=("a", "b"))
+    doubted = dataclasses.replace(estimate, doubtful=True, doubts=("a", "b"))
     assert trust_of(doubted, 0.01).verdict.startswith("doubtful: a; b; the needle ends")
     # An estimator that does not judge itself is not judged by its end either.
     unjudged = trust_of(dataclasses.replace(estimate, doubtful=None, doubts=()), 0.0072)
     assert (unjudged.verdict, unjudged.is_doubtful) == ("", False)
-    np.testing.assert_array_equal(ends_elsewhere(np.array([1e-3, -1.01e-3])), [False, True])
+    assert (ends_elsewhere(1e-3), ends_elsewhere(-1.01e-3)) == (False, True)
 
 
 def test_trust_in_a_line_says_the_distance_its_interval_and_the_verdict() -> None:

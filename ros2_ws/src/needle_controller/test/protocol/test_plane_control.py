@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
-from needle_controller.bank import hypothesis_filter
-from needle_controller.bank.estimate_tiles import Tiles, tidied
+from needle_controller.filter import hypothesis_filter
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.planning.obstacles import Obstacle, Obstacles
@@ -123,17 +123,18 @@ def test_a_flip_turns_the_bevel_over_and_holds_the_plane() -> None:
 def test_all_that_a_filter_runs_has_run_before_the_needle_waits_for_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    times = 0
+    names = ("start_needle", "advance_needle", "correct_needle", "estimate_needle")
+    ran = []
+    for name in names:
+        compiled = getattr(hypothesis_filter, name)
 
-    def noted(tiles: Tiles) -> Tiles:
-        nonlocal times
-        times += 1
-        return tidied(tiles)
+        def noted(*given: object, name: str = name, compiled: Any = compiled) -> None:
+            ran.append(name)
+            compiled(*given)
 
-    # Only with every eighth tip.
-    monkeypatch.setattr(hypothesis_filter, "tidied", noted)
+        monkeypatch.setattr(hypothesis_filter, name, noted)
     Needle(PLANE)
-    assert times == 1
+    assert set(ran) == set(names)
 
 
 def test_a_change_of_preset_keeps_the_estimated_pose_and_steers_on() -> None:

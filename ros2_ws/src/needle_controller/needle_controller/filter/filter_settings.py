@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated, cast
 
 import numpy as np
+import numpy.typing as npt
 
-from needle_controller.bank.estimate_tiles import NOISES
-from needle_controller.bank.hypotheses import (
+from needle_controller.filter.hypotheses import (
     LASTING,
     NORMAL,
     UNIFORM,
@@ -17,7 +17,17 @@ from needle_controller.bank.hypotheses import (
     RollHypothesis,
     TorsionHypothesis,
 )
+from needle_controller.filter.records import (
+    ASSUMPTIONS,
+    E_KAPPA,
+    E_SCALE,
+    E_SIZE,
+    E_TURN,
+    HYPOTHESIS,
+    NOISES,
+)
 from needle_controller.model.arrays import Array
+from needle_controller.model.kinematics import rotation_from_angles
 from needle_core.errors import UserError
 from needle_core.settings.bounds import Bounds, check_bounded_fields
 
@@ -56,34 +66,6 @@ BOUNDED_NOISE = (
 )
 """Where a bound is claimed: most likely it holds; else a larger one, or none. Were no small normal
 noise thought possible, small errors would look like errors that last."""
-
-
-class Drift(NamedTuple):
-    """Variance that each gains per inserted length; see `FilterSettings`."""
-
-    orientation: float
-    curvature: float
-    scale: float
-    play: float
-    lag: float
-
-
-class Limits(NamedTuple):
-    """Bounds on the estimates, and when they end; see `FilterSettings`."""
-
-    smallest_curvature: float
-    largest_curvature: float
-    largest_play: float
-    smallest_lag: float
-    largest_lag: float
-    smallest_weight: float
-    softness: float
-    model_error: float
-    mistrust: float
-    outlier_share: float
-    outlier_density: float
-    jump_share: float
-    jump_turn_variance: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +133,7 @@ class FilterSettings:
 
     curvature: Annotated[float, Bounds(0.1, 100.0, "1/m")] = 1.0 / 0.122
     curvature_spread: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.22
-    curvature_range: tuple[float, float] = (0.5, 1.6)
+    curvature_range: tuple[float, float] = (0.2, 1.6)
     curvature_drift: Annotated[float, Bounds(0.0, 100.0, "1/sqrt(m)")] = 0.02 * math.sqrt(1000.0)
     scale_spread: Annotated[float, Bounds(0.0, 0.3, "-")] = 0.04
     scale_drift: Annotated[float, Bounds(0.0, 10.0, "1/sqrt(m)")] = 0.01
@@ -201,33 +183,34 @@ class FilterSettings:
         """Largest error of a measured coordinate that is reckoned with [m]."""
         return max(self.tip_noise_bound, 2.0 * self.model_error)
 
-    def drift(self) -> Drift:
-        """Return what the compiled code needs of this for an advance."""
-        return Drift(
-            orientation=self.orientation_drift**2,
-            curvature=(self.curvature_drift * self.curvature) ** 2,
-            scale=self.scale_drift**2,
-            play=self.play_drift**2,
-            lag=self.lag_drift**2,
-        )
-
-    def limits(self) -> Limits:
-        """Return what the compiled code needs of this for a tip."""
-        return Limits(
-            smallest_curvature=self.curvature_range[0] * self.curvature,
-            largest_curvature=self.curvature_range[1] * self.curvature,
-            largest_play=self.play_limit,
-            smallest_lag=self.lag_range[0],
-            largest_lag=self.lag_range[1],
-            smallest_weight=1.0 / self.prune_ratio,
-            softness=self.softness**2,
-            model_error=self.model_error**2,
-            mistrust=self.mistrust,
-            outlier_share=self.outlier_share,
-            outlier_density=self.outlier_reach**-3,
-            jump_share=self.jump_share,
-            jump_turn_variance=self.jump_turn_std**2,
-        )
+    def assumptions(self) -> np.void:
+        """Return what the compiled code needs of this."""
+        known = np.zeros(1, ASSUMPTIONS)[0]
+        known["noises"] = self.noises()
+        known["curvature"] = self.curvature
+        known["smallest_curvature"] = self.curvature_range[0] * self.curvature
+        known["largest_curvature"] = self.curvature_range[1] * self.curvature
+        known["curvature_drift"] = (self.curvature_drift * self.curvature) ** 2
+        known["scale_spread"] = self.scale_spread
+        known["scale_drift"] = self.scale_drift**2
+        known["play_drift"] = self.play_drift**2
+        known["lag_drift"] = self.lag_drift**2
+        known["largest_play"] = self.play_limit
+        known["smallest_lag"] = self.lag_range[0]
+        known["largest_lag"] = self.lag_range[1]
+        known["longest_step"] = self.longest_step
+        known["believed_bound"] = self.believed_bound
+        known["entry_std"] = self.entry_std
+        known["mistrust"] = self.mistrust
+        known["softness"] = self.softness**2
+        known["model_error"] = self.model_error**2
+        known["outlier_share"] = self.outlier_share
+        known["outlier_density"] = self.outlier_reach**-3
+        known["jump_share"] = self.jump_share
+        known["jump_turn_variance"] = self.jump_turn_std**2
+        known["smallest_weight"] = 1.0 / self.prune_ratio
+        known["merge_angle"] = self.merge_angle
+        return cast(np.void, known)
 
     def noises(self) -> Array:
         """Return multiples, shares and correlations of each shape, (3, 3, NOISES)."""
@@ -237,3 +220,31 @@ class FilterSettings:
             numbers[noise.shape, :2, :count] = noise.multiples, noise.shares
             numbers[noise.shape, 2, : len(noise.lasting)] = noise.lasting
         return numbers
+
+    def prior(self) -> npt.NDArray[np.void]:
+        """Return all hypotheses of a needle that enters along z with its base at 0, shape (H,)."""
+        noises = self.noises()
+        every = [
+            (noise, number, torsion, roll)
+            for noise in self.noise_hypotheses
+            for number, torsion in enumerate(self.torsion_hypotheses)
+            for roll in self.roll_hypotheses
+        ]
+        prior = np.zeros(len(every), HYPOTHESIS)
+        for h, (noise, number, torsion, roll) in zip(prior, every, strict=True):
+            h["weight"] = torsion.weight * roll.weight * noise.weight
+            h["torsion"], h["shape"] = number, noise.shape
+            h["noise_weights"] = noises[noise.shape, 1]
+            h["curvature"], h["scale"] = self.curvature, 1.0
+            h["play"], h["lag"] = torsion.play, torsion.lag_length
+            h["orientation_drift"] = self.orientation_drift**2
+            h["rotation"] = rotation_from_angles([0.0, 0.0, roll.roll])
+            covariance = h["covariance"]
+            for k in range(2):
+                covariance[E_TURN + k, E_TURN + k] = self.initial_angle_std**2
+            covariance[E_TURN + 2, E_TURN + 2] = roll.std**2
+            covariance[E_KAPPA, E_KAPPA] = (self.curvature_spread * self.curvature) ** 2
+            covariance[E_SIZE, E_SIZE] = torsion.size_std**2
+            covariance[E_SCALE, E_SCALE] = self.scale_spread**2
+        prior["weight"] /= np.max(prior["weight"])
+        return prior

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import Annotated
 
-from needle_controller.bank.estimate_tiles import NOISES
+from needle_controller.filter.records import NOISES
 from needle_core.errors import UserError
 from needle_core.settings.bounds import Bounds, check_bounded_fields
 

@@ -7,16 +7,14 @@ import numpy.typing as npt
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from needle_controller.bank.hypotheses import (
+from needle_controller.filter.hypotheses import (
     RollHypothesis,
     TorsionHypothesis,
 )
-from needle_controller.bank.hypothesis_filter import HypothesisFilter
-from needle_controller.bank.hypothesis_mixture import (
-    MixtureEstimate,
-)
+from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
+from needle_controller.observers.estimator import Estimate
 
 CURVATURE = 1.0 / 0.122
 STEP = 0.001
@@ -59,7 +57,7 @@ def turns_for(count: int, seed: int = 5, size: float = 0.3) -> Array:
 
 def drive(
     estimator: HypothesisFilter, turns: Array, tips: Array, covariance: Array | None = None
-) -> MixtureEstimate:
+) -> Estimate:
     estimator.reset(tips[0], np.zeros(2))
     for turn, tip in zip(turns, tips[1:], strict=True):
         estimator.advance(STEP, turn)
@@ -72,5 +70,5 @@ def noisy(poses: Array, seed: int = 6, bound: float = 0.001) -> Array:
     return tips + np.random.default_rng(seed).uniform(-bound, bound, tips.shape)
 
 
-def rotation_error(estimate: MixtureEstimate, pose: Array) -> float:
+def rotation_error(estimate: Estimate, pose: Array) -> float:
     return float(np.rad2deg(Rotation.from_matrix(estimate.rotation @ pose[:3, :3].T).magnitude()))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from needle_controller.bank.filter_settings import FilterSettings
-from needle_controller.bank.hypothesis_filter import HypothesisFilter
+from needle_controller.filter.filter_settings import FilterSettings
+from needle_controller.filter.hypothesis_filter import HypothesisFilter
 
 from .needles import (
     STEP,
@@ -52,27 +52,6 @@ def test_a_late_tip_between_two_stops() -> None:
     two.correct(tips[-1] + [0.0, 0.0, 0.0006])
     two.advance(0.0004, 0.08)
     np.testing.assert_allclose(one.estimate().coordinates, two.estimate().coordinates, atol=1e-12)
-
-
-def test_late_tips_of_needles_that_are_inserted_by_lengths_of_their_own() -> None:
-    """Each is as if it were alone, whatever waits for the others."""
-    rng = np.random.default_rng(5)
-    tips = noisy(path(turns_for(30)))
-    lengths = rng.uniform(0.0, STEP, (30, 3)) * (rng.random((30, 3)) < 0.8)
-    turns, ages = rng.normal(0.0, 0.2, (30, 3)), np.array([0.0, 0.0013, 0.003])
-    many = HypothesisFilter(FilterSettings())
-    every = [HypothesisFilter(FilterSettings()) for _ in ages]
-    for estimator in (many, *every):
-        estimator.reset(np.tile(tips[0], (3, 1)) if estimator is many else tips[0], np.zeros(2))
-    for k in range(30):
-        many.advance(lengths[k], turns[k])
-        many.correct(np.tile(tips[k + 1], (3, 1)), age=ages)
-        for n, alone in enumerate(every):
-            alone.advance(lengths[k, n], turns[k, n])
-            alone.correct(tips[k + 1], age=ages[n])
-    for n, alone in enumerate(every):
-        seen, wanted = many.estimate().coordinates[n], alone.estimate().coordinates
-        np.testing.assert_allclose(seen, wanted, atol=1e-12, err_msg=str(n))
 
 
 def test_a_tip_older_than_the_last_is_dropped_and_reported() -> None:

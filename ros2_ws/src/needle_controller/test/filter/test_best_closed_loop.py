@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_controller.bank.filter_settings import FilterSettings
-from needle_controller.bank.hypothesis_filter import HypothesisFilter
-from needle_controller.laws.roll_law import RollLaw
-from needle_controller.laws.roll_turns import RollLawSettings
+from needle_controller.filter.filter_settings import FilterSettings
+from needle_controller.laws.roll_law import RollLawSettings
+from needle_controller.many_needles import ManyFilters
 from needle_controller.model.arrays import Array
 
 STEP = 0.001
@@ -37,14 +36,13 @@ def steered(
     angles = np.deg2rad(rng.uniform(-1.0, 1.0, (count, 2)) * [10.0, 30.0])
     rotation = Rotation.from_euler("YZ", angles)
     base, turned, sign = np.zeros(count), np.zeros(count), 1.0
-    estimator = HypothesisFilter(settings or FilterSettings())
-    law = RollLaw(RollLawSettings())
+    filters = ManyFilters(settings or FilterSettings(), count, STEP)
     path, last = [tip[:, 0].copy()], np.empty(0)
-    estimator.reset(tip + rng.uniform(-noise, noise, tip.shape), np.zeros((count, 2)))
+    filters.start(tip + rng.uniform(-noise, noise, tip.shape))
     at = set(np.round(np.arange(1, flips + 1) * steps / (flips + 1)).astype(int).tolist())
     for step in range(steps):
         sign = -sign if step in at else sign
-        rate = law(estimator.estimate(), sign if flips else 0.0).rotation_rate
+        rate = filters.roll_rates(RollLawSettings(), sign if flips else 0.0)
         base = base + rate * STEP
         followed = np.clip(turned, base - play, base + play)
         half = np.zeros((count, 3))
@@ -59,11 +57,11 @@ def steered(
         off = (rng.random(count) < outliers)[:, None]
         seen = np.where(off, seen + direction * rng.uniform(0.005, 0.01, (count, 1)), seen)
         seen[rng.random(count) < dropped] = np.nan
-        estimator.advance(np.full(count, STEP), rate * STEP)
+        filters.advance(np.full(count, STEP), rate * STEP)
         if not late:
-            estimator.correct(seen, covariance)
+            filters.correct(seen, covariance, np.zeros(count))
         elif step > 0:
-            estimator.correct(last, age=STEP)
+            filters.correct(last, None, np.full(count, STEP))
         last = seen
     return np.array(path)
 

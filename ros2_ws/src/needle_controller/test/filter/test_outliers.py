@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from needle_controller.bank.estimate_tiles import OUTLIER, WEIGHT, X, covariances, rows
-from needle_controller.bank.filter_settings import FilterSettings
-from needle_controller.bank.hypothesis_filter import HypothesisFilter
-from needle_controller.model.arrays import Array
+from needle_controller.filter.filter_settings import FilterSettings
+from needle_controller.filter.hypothesis_filter import HypothesisFilter
 
 from .needles import (
     STEP,
@@ -45,17 +45,18 @@ def test_what_takes_a_tip_for_an_outlier_comes_back_displaced_with_its_share() -
     # Early, while several rolls are possible; the later ones have mostly ended.
     tips[9, 0] += 0.0025
 
-    def estimates(jump_share: float, row: int) -> Array:
+    def hypotheses(jump_share: float) -> Any:
         estimator = HypothesisFilter(FilterSettings(jump_share=jump_share))
         drive(estimator, turns, tips)
-        return rows(estimator._bank.tiles, row, 1)[:, 0]
+        return estimator.hypotheses.copy()
 
     settings = FilterSettings()
-    wanted = settings.jump_share * estimates(1e-6, WEIGHT) * estimates(1e-6, OUTLIER)
+    without = hypotheses(1e-6)
+    wanted = settings.jump_share * without["weight"] * without["outlier"]
     wanted = np.sort(wanted[wanted > 1.0 / settings.prune_ratio])
-    weights = estimates(settings.jump_share, WEIGHT)
-    displaced = np.isclose(estimates(settings.jump_share, X), tips[9, 0], rtol=0.0, atol=1e-12)
-    seen = np.sort(weights[displaced & (weights > 0.0)])
+    known = hypotheses(settings.jump_share)
+    displaced = np.isclose(known["position"][:, 0], tips[9, 0], rtol=0.0, atol=1e-12)
+    seen = np.sort(known["weight"][displaced])
     # As far as there is room: the likeliest.
     assert len(seen) > 5
     np.testing.assert_allclose(seen, wanted[-len(seen) :])
@@ -70,10 +71,10 @@ def test_what_comes_back_displaced_knows_its_place_as_well_as_the_tip() -> None:
     drive(estimator, turns, tips, noise)
     seen = tips[20] + np.array([0.002, -0.001, 0.003])
     estimator.correct(seen, noise)
-    tiles = estimator._bank.tiles
-    displaced = np.all(np.isclose(rows(tiles, X, 3), seen, atol=1e-12), axis=1)
+    known = estimator.hypotheses
+    displaced = np.all(np.isclose(known["position"], seen, atol=1e-12), axis=1)
     assert np.count_nonzero(displaced) > 0
     wanted = noise + np.eye(3) * settings.model_error**2
-    for covariance in covariances(tiles)[displaced]:
+    for covariance in known["covariance"][displaced]:
         np.testing.assert_allclose(covariance[:3, :3], wanted, rtol=1e-9)
         np.testing.assert_allclose(covariance[:3, 3:], 0.0)

@@ -10,13 +10,14 @@ L.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
-from needle_controller.bank.normal_moments import falling_exponential
-from needle_core.compiled import inlined
+import math
+
+from needle_core.compiled import compiled
 
 _SHORT_RAMP = 1e-3
 
 
-@inlined
+@compiled
 def turn_tip(
     tip: float,
     behind_play: float,
@@ -50,28 +51,29 @@ def turn_tip(
     tip, behind_play, per_size : float
         The same, after.
     """
+    # |base - behind| <= D
     after = base + turn
     behind = min(max(behind_play, after - play), after + play)
     change = behind - behind_play
-    by_play = -1.0 if change > 0.0 else per_size
-    by_play = 1.0 if change < 0.0 else by_play
-    # The play closes first; the ramp that follows it is the last part of the length.
-    lag = lag_length if lag_length > 0.0 else 1.0
+    if lag_length == 0.0:
+        # Behind the play the tip is where its near edge is: base -+ D.
+        if change > 0.0:
+            per_size = -1.0
+        elif change < 0.0:
+            per_size = 1.0
+        return behind, behind, per_size
+    if length <= 0.0:
+        # The tip follows over inserted length only.
+        return tip, behind, per_size
+    # The play closes first; the ramp that follows it is the last part of the length, q lags long.
     share = min(max(change / turn, 0.0), 1.0) if turn != 0.0 else 1.0
-    ramp = length * share / lag
-    long_ramp = max(ramp, _SHORT_RAMP)
-    decay, ramp_decay = falling_exponential(-length / lag), falling_exponential(-ramp)
+    decay, q = math.exp(-length / lag_length), length * share / lag_length
+    if q < _SHORT_RAMP:
+        part, slope = 0.5 * q, -0.5 * q
+    else:
+        part = 1.0 + math.expm1(-q) / q
+        slope = (math.exp(-q) * (1.0 + q) - 1.0) / q
+    # tip(l) = behind_0 + (tip_0 - behind_0) exp(-l/L) + change (1 - (1 - exp(-q)) / q)
     distance = tip - behind_play
-    # (1 - exp(-ramp)) / ramp and its like lose digits where the ramp is short.
-    short = ramp < _SHORT_RAMP
-    part = 0.5 * ramp if short else 1.0 - (1.0 - ramp_decay) / long_ramp
-    slope = -0.5 * ramp if short else (ramp_decay * (1.0 + ramp) - 1.0) / long_ramp
-    by_lag = (per_size + distance * length / (lag * lag)) * decay + change * slope / lag
-    # Without insertion nothing follows, to the last bit.
-    lagged = behind_play + distance * decay + change * part if length > 0.0 else tip
-    has_lag = lag_length > 0.0
-    return (
-        lagged if has_lag else behind,
-        behind,
-        by_lag if has_lag else by_play,
-    )
+    by_lag = (per_size + distance * length / lag_length**2) * decay + change * slope / lag_length
+    return behind_play + distance * decay + change * part, behind, by_lag

@@ -1,0 +1,115 @@
+"""Estimators of a study's needles: any kind one by one, those of `best` in compiled loops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from needle_controller.laws.roll_law import hypotheses_of
+from needle_controller.many_needles import ManyFilters
+from needle_controller.model.arrays import Array
+from needle_controller.observers.estimator import Estimate, Estimator
+from needle_sim.needle.se3 import FloatArray
+from needle_sim.studies.beliefs import Belief
+from needle_sim.studies.figures_of_merit import BoolArray
+
+
+class Estimators(Protocol):
+    """The estimators of N needles."""
+
+    def start(self, tips: FloatArray) -> None:
+        """Start at first tips, (N, 3) [m], with all bases at 0."""
+
+    def advance(self, lengths: FloatArray, turns: FloatArray) -> None:
+        """Move on by inserted lengths [m] and rotations of the bases [rad], (N,)."""
+
+    def correct(self, tips: FloatArray, covariance: Array | None, ages: FloatArray) -> None:
+        """Take tips, (N, 3), of a covariance, (3, 3), and their ages, (N,) [m]."""
+
+    def each(self) -> Sequence[Estimate]:
+        """Return what is known of each."""
+
+    def belief(self) -> Belief:
+        """Return what is known of all, and whether it is doubted."""
+
+    def positions(self) -> FloatArray:
+        """Return where the tips are, (N, 3) [m]."""
+
+
+class EachEstimator:
+    """Estimators of any kind, one called after the other; see `Estimators`.
+
+    Parameters
+    ----------
+    new : callable
+        Returns the estimator of the needle with a number, counted from 0.
+    """
+
+    def __init__(self, new: Callable[[int], Estimator]) -> None:
+        self._new = new
+        self._estimators: list[Estimator] = []
+        self._known: list[Estimate] = []
+
+    def start(self, tips: FloatArray) -> None:
+        """Start at first tips."""
+        self._estimators = [self._new(n) for n in range(len(tips))]
+        for estimator, tip in zip(self._estimators, tips, strict=True):
+            estimator.reset(tip, np.zeros(2))
+        self._estimate()
+
+    def advance(self, lengths: FloatArray, turns: FloatArray) -> None:
+        """Move on."""
+        moved = zip(self._estimators, lengths.tolist(), turns.tolist(), strict=True)
+        for estimator, length, turn in moved:
+            estimator.advance(length, turn)
+
+    def correct(self, tips: FloatArray, covariance: Array | None, ages: FloatArray) -> None:
+        """Take tips."""
+        for estimator, tip, age in zip(self._estimators, tips, ages.tolist(), strict=True):
+            estimator.correct(tip, covariance, age)
+        self._estimate()
+
+    def _estimate(self) -> None:
+        self._known = [estimator.estimate() for estimator in self._estimators]
+
+    def each(self) -> Sequence[Estimate]:
+        """Return what is known of each."""
+        return self._known
+
+    def belief(self) -> Belief:
+        """Return what is known of all."""
+        uncertainty = np.array([hypotheses_of(known).uncertainty for known in self._known])
+        s = np.array([known.linearized for known in self._known])
+        doubtful = None
+        if self._known[0].doubtful is not None:
+            doubtful = np.array([bool(known.doubtful) for known in self._known])
+        return _belief(s, uncertainty, doubtful)
+
+    def positions(self) -> FloatArray:
+        """Return where the tips are."""
+        return np.array([known.position for known in self._known])
+
+
+class BestEstimators(ManyFilters):
+    """The estimators of preset `best`, in compiled loops; see `Estimators`."""
+
+    def belief(self) -> Belief:
+        """Return what is known of all."""
+        known = self.estimates
+        return _belief(known["linearized"], known["uncertainty"], known["doubts"] != 0)
+
+    def positions(self) -> FloatArray:
+        """Return where the tips are."""
+        return np.array(self.estimates["coordinates"][:, :3])
+
+
+def _belief(s: FloatArray, uncertainty: FloatArray, doubtful: BoolArray | None) -> Belief:
+    return Belief(
+        x=s[:, 0].copy(),
+        x_std=np.sqrt(np.maximum(uncertainty[:, 0], 0.0)),
+        sin_pitch=s[:, 1].copy(),
+        sin_pitch_std=np.sqrt(np.maximum(uncertainty[:, 2], 0.0)),
+        doubtful=doubtful,
+    )

@@ -1,0 +1,195 @@
+"""Laws of a study's needles: any kind one by one, those of `best` in compiled loops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from needle_bringup.studies.study_estimators import Estimators
+from needle_controller.laws.flip_plan import FlipPlan
+from needle_controller.laws.law import SteeringCommand, StepLaw
+from needle_controller.laws.point_turns import PointLawSettings
+from needle_controller.laws.roll_law import RollLawSettings
+from needle_controller.many_needles import ManyFilters
+from needle_controller.model.arrays import Array
+from needle_controller.model.target_motion import TargetMotion
+from needle_controller.model.target_plane import offset_plane
+from needle_controller.observers.estimator import Estimate
+from needle_controller.planning.obstacles import Obstacles
+from needle_controller.presets.path_steering import PathSteering, tip_state
+from needle_controller.presets.point_steering import Foresight, prompt_point_law
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_sim.needle.se3 import FloatArray
+from needle_sim.studies.point_targets import INSERTION_SPEED
+from needle_sim.studies.rrt_replanning import SAMPLES, DutyCycle, plan
+from needle_sim.studies.sliding_mode import sliding_mode_rate
+
+TimedLaw = Callable[[Estimate, float, float, float], SteeringCommand]
+"""Takes an estimate, the time [s], the insertion [m], and what the base may still turn [rad]."""
+
+CLEAR = 0.00085
+"""What the published planner keeps from obstacles: the needle's radius and half a mm [m]."""
+
+PointLaws = Callable[[Any, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+"""Takes estimators, inserted lengths [m] and what the bases may still turn [rad], (N,); returns
+rotation rates [rad/m] and insertions left [m], (N,)."""
+
+
+def each_rate(new_law: Callable[[int], StepLaw]) -> Callable[[Estimators, float], FloatArray]:
+    """Return rotation rates by laws that are called in Python, one after the other."""
+    laws: list[StepLaw] = []
+
+    def rates(estimators: Estimators, insertion: float) -> FloatArray:
+        known = estimators.each()
+        laws.extend(new_law(n) for n in range(len(laws), len(known)))
+        return np.array(
+            [law(one, insertion).rotation_rate for law, one in zip(laws, known, strict=True)]
+        )
+
+    return rates
+
+
+def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], TimedLaw]) -> PointLaws:
+    """Return laws for points that are called in Python, one after the other.
+
+    Parameters
+    ----------
+    motion : TargetMotion
+        Of all targets.
+    new_law : callable
+        Returns the law of one needle, whose target's motion is told to a `TargetMotion`.
+    """
+    laws: list[tuple[TargetMotion, TimedLaw]] = []
+
+    def commands(
+        estimators: Estimators, insertion: FloatArray, rotation_left: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        known = estimators.each()
+        for _ in range(len(laws), len(known)):
+            own = TargetMotion()
+            laws.append((own, new_law(own)))
+        targets = np.broadcast_to(motion.last, (len(known), 3))
+        rates, left = np.empty(len(known)), np.empty(len(known))
+        for n, (own, law) in enumerate(laws):
+            own.see(motion.seen, targets[n])
+            inserted = float(insertion[n])
+            said = law(known[n], inserted / INSERTION_SPEED, inserted, float(rotation_left[n]))
+            assert said.insertion_left is not None
+            rates[n], left[n] = said.rotation_rate, said.insertion_left
+        return rates, left
+
+    return commands
+
+
+def best_rates(settings: SteeringSettings) -> Callable[[ManyFilters, float], FloatArray]:
+    """Return rotation rates by the law of `best`, in compiled loops."""
+    law, plan = RollLawSettings(**settings.turning), FlipPlan(settings.flip_depths)
+
+    def rates(filters: ManyFilters, insertion: float) -> FloatArray:
+        return filters.roll_rates(law, plan.bend_sign(insertion) if plan.depths else 0.0)
+
+    return rates
+
+
+def best_point_laws(settings: SteeringSettings, motion: TargetMotion) -> PointLaws:
+    """Return the law of `best` for points, in compiled loops."""
+    law, foresight = PointLawSettings(**settings.turning), Foresight(motion)
+
+    def commands(
+        filters: ManyFilters, insertion: FloatArray, rotation_left: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        def left(targets: FloatArray) -> FloatArray:
+            return filters.point_rates(law, targets, rotation_left)[1]
+
+        targets = foresight.look(insertion / INSERTION_SPEED, insertion, left)
+        return filters.point_rates(law, targets, rotation_left)
+
+    return commands
+
+
+def sliding_law(motion: TargetMotion, largest_rate: float) -> TimedLaw:
+    """Return the published reference law, which goes to where the target is; see `sliding_mode`.
+
+    Parameters
+    ----------
+    motion : TargetMotion
+        Of the target.
+    largest_rate : float
+        Rotation per inserted length [rad/m].
+    """
+
+    def command(estimate: Estimate, *_: float) -> SteeringCommand:
+        target = estimate.rotation.T @ (motion.last - estimate.position)
+        rate = float(sliding_mode_rate(target, largest_rate))
+        return SteeringCommand(0.0, rate, float(target[2]))
+
+    return command
+
+
+def rrt_law(
+    motion: TargetMotion,
+    settings: SteeringSettings,
+    rng: np.random.Generator,
+    obstacles: Array | None = None,
+) -> TimedLaw:
+    """Return the published planner as a law that plans anew at every step; see `rrt_replanning`.
+
+    Parameters
+    ----------
+    motion : TargetMotion
+        Of the target.
+    settings : SteeringSettings
+        Of the needle.
+    rng : numpy.random.Generator
+        All chance of the planner.
+    obstacles : ndarray, shape (M, 7), optional
+        Ends of the axis and radius of each capsule [m]; none by default.
+    """
+    around = np.zeros((0, 7)) if obstacles is None else obstacles
+    cycle = DutyCycle(settings.max_rotation_per_length, settings.step_length)
+
+    def command(estimate: Estimate, *_: float) -> SteeringCommand:
+        ahead = estimate.rotation.T @ (motion.last - estimate.position)
+        # Where no path is found, the tightest arc towards the target.
+        arc = np.array([ahead[0], ahead[1], 1.0])
+        plan(
+            np.array(estimate.position),
+            np.ascontiguousarray(estimate.rotation),
+            np.array(motion.last),
+            around,
+            settings.curvature,
+            CLEAR,
+            rng.random((SAMPLES, 4)),
+            arc,
+        )
+        return SteeringCommand(0.0, float(cycle.rates(arc[None])[0]), float(ahead[2]))
+
+    return command
+
+
+def planned_law(motion: TargetMotion, settings: SteeringSettings) -> TimedLaw:
+    """Return the law that leads a needle along a planner's way; no obstacle is in it.
+
+    Parameters
+    ----------
+    motion : TargetMotion
+        Of the target.
+    settings : SteeringSettings
+        Of the needle, and which planner.
+    """
+    law, free, plane = prompt_point_law(settings), Obstacles(), offset_plane(0.0)
+    needle = PathSteering(settings)
+
+    def command(estimate: Estimate, _: float, insertion: float, __: float) -> SteeringCommand:
+        route = needle.route(tip_state(estimate, plane), motion.last, free, insertion)
+        if route is None:
+            # Who sees no way stays where it is.
+            return SteeringCommand(0.0, 0.0, -math.inf)
+        said = law(estimate, route.aim)
+        left = said.insertion_left if route.length is None else route.length
+        return SteeringCommand(said.virtual_input, said.rotation_rate, left)
+
+    return command

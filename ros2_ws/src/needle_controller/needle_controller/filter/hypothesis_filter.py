@@ -1,0 +1,145 @@
+"""A bank of extended Kalman filters on SE(3), one for each hypothesis of torsion, roll and noise.
+
+Each estimates the tip's full pose, the curvature and the size of its torsion from all three
+coordinates of the measured tips. Hypotheses that explain the tips badly lose weight and end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from needle_controller.filter.bank import advance_needle, correct_needle, start_needle
+from needle_controller.filter.filter_settings import FilterSettings
+from needle_controller.filter.mixture import estimate_from, estimate_needle
+from needle_controller.filter.records import ERROR, ESTIMATE, EVENT, HYPOTHESIS, NEEDLE, TORSION
+from needle_controller.model.arrays import Array
+from needle_controller.observers.estimator import Estimate
+
+AMBIGUOUS_WEIGHT = 0.1
+_EVENTS = 4096
+"""Tips of the first 2 cm that are kept, to ask whether they are late."""
+
+
+class HypothesisFilter:
+    """Estimates the tip's pose, curvature and torsion; see `estimator.Estimator`.
+
+    Tips may be older than they say: that shows over the first 2 cm (`late_tips`).
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        What is assumed.
+    initial_rotation : array_like, shape (3, 3), optional
+        Orientation of a needle at its entry with the base's rotation at 0, in `target_plane`;
+        identity by default.
+    entry : array_like, shape (3,), optional
+        Where the needle enters, in `target_plane` [m]: where its tip is with the stage at 0, along
+        the needle to within `FilterSettings.entry_std`. Not known if none is given.
+    """
+
+    def __init__(
+        self,
+        settings: FilterSettings,
+        initial_rotation: npt.ArrayLike | None = None,
+        entry: npt.ArrayLike | None = None,
+    ) -> None:
+        self.settings = settings
+        self._prior, self._known = settings.prior(), settings.assumptions()
+        self.needle = np.zeros(1, NEEDLE)[0]
+        self.needle["initial_rotation"] = (
+            np.eye(3) if initial_rotation is None else initial_rotation
+        )
+        if entry is not None:
+            self.needle["has_entry"], self.needle["entry"] = True, entry
+        self._hypotheses = np.zeros(self._prior.size + 1, HYPOTHESIS)
+        self._events = np.zeros(_EVENTS, EVENT)
+        self.reset(np.zeros(3), np.zeros(2))
+
+    @property
+    def initial_rotation(self) -> Array:
+        """Orientation of a needle at its entry with the base's rotation at 0, shape (3, 3)."""
+        return np.array(self.needle["initial_rotation"])
+
+    @property
+    def hypotheses(self) -> npt.NDArray[np.void]:
+        """The hypotheses that have not ended, shape (H,), `records.HYPOTHESIS`; a view."""
+        return self._hypotheses[: self.needle["count"]]
+
+    def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
+        """Start at a first measurement (NaN: position unknown); see `Estimator.reset`."""
+        insertion, turn = np.asarray(joints, dtype=float).tolist()
+        start_needle(
+            self.needle,
+            self._hypotheses,
+            self._prior,
+            np.array(tip, dtype=float),
+            insertion,
+            turn,
+            self._known,
+        )
+
+    def advance(self, d_insertion: float, d_rotation: float) -> None:
+        """Move on by what really happened; see `Estimator.advance`."""
+        length, turn = float(d_insertion), float(d_rotation)
+        if not (np.isfinite(length) and length >= 0.0):
+            raise ValueError(f"d_insertion = {length!r} m, wants finite and >= 0")
+        if not np.isfinite(turn):
+            raise ValueError(f"d_rotation = {turn!r} rad, wants finite")
+        advance_needle(self.needle, self._hypotheses, self._events, length, turn, self._known)
+
+    def correct(
+        self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
+    ) -> None:
+        """Take a measurement; see `Estimator.correct`.
+
+        Without a covariance the noise is taken as bounded (`tip_noise_bound`), with one as
+        Gaussian; neither as less than `model_error` allows. A tip older than the last one is
+        dropped, and `estimate` says so.
+        """
+        correct_needle(
+            self.needle,
+            self._hypotheses,
+            self._events,
+            self._prior,
+            np.array(tip, dtype=float),
+            np.zeros((3, 3)) if covariance is None else np.array(covariance, dtype=float),
+            covariance is not None,
+            float(age),
+            self._known,
+        )
+
+    def estimate(self) -> Estimate:
+        """Return what is known now; see `Estimator.estimate`."""
+        said = np.zeros(1, ESTIMATE)[0]
+        torsions = np.zeros(len(self.settings.torsion_hypotheses), TORSION)
+        estimate_needle(self.needle, self._hypotheses, said, torsions, self._known, True)
+        return estimate_from(said, torsions, self._warnings(float(said["ambiguous"])))
+
+    def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
+        """Express everything in another target plane; see `Estimator.change_frame`."""
+        transform = np.asarray(T_new_old, dtype=float)
+        turn, shift = transform[:3, :3], transform[:3, 3]
+        needle, h = self.needle, self.hypotheses
+        needle["initial_rotation"] = turn @ needle["initial_rotation"]
+        for name in ("entry", "start"):
+            needle[name] = turn @ needle[name] + shift
+        h["position"] = h["position"] @ turn.T + shift
+        h["rotation"] = turn @ h["rotation"]
+        h["residual"] = h["residual"] @ turn.T
+        turns = np.eye(ERROR)
+        turns[:3, :3] = turns[3:6, 3:6] = turn
+        h["covariance"] = turns @ h["covariance"] @ turns.T
+        events = self._events[: max(needle["events"], 0)]
+        events["tip"] = events["tip"] @ turn.T + shift
+        events["covariance"] = turn @ events["covariance"] @ turn.T
+
+    def _warnings(self, ambiguous: float) -> tuple[str, ...]:
+        warnings = []
+        if ambiguous > AMBIGUOUS_WEIGHT:
+            warnings.append(f"the roll is not known yet: {100.0 * ambiguous:.0f} % says otherwise")
+        if self.needle["refused"] > 0.5:
+            warnings.append("tip refused as an outlier")
+        if self.needle["too_late"]:
+            warnings.append("tip dropped: it is older than the last one used")
+        return tuple(warnings)

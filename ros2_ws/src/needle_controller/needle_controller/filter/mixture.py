@@ -1,0 +1,252 @@
+"""All hypotheses of a needle as one estimate: mean pose, covariance, what laws read; compiled."""
+
+# Compiled code takes keywords slowly or not at all.
+# ruff: noqa: PLR0917
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from needle_controller.filter.bank import looked_ahead
+from needle_controller.filter.hypotheses import LASTING
+from needle_controller.filter.records import E_TURN, NOISES
+from needle_controller.model.arrays import Array
+from needle_controller.model.kinematics import angle_axes
+from needle_controller.observers.estimator import Estimate, Hypotheses
+from needle_core.compiled import compiled
+
+Records = npt.NDArray[np.void]
+
+LATE = "tips lie short of the insertion from the start: late, or the needle stuck; taken as late"
+DOUBTS = (
+    "x is not known to 1 mm",
+    "too many tips are outliers",
+    "tips are far noisier than claimed",
+    "the needle does not go in as the stage does",
+    "the curvature is at its limit",
+    LATE,
+)
+"""Reasons for which an estimate declares itself doubtful."""
+LARGEST_X_STD = 0.001
+"""Standard deviation of x beyond which nothing is said of the plane [m]."""
+LARGEST_UNEXPLAINED = 0.35
+"""Share of the last ten tips or so that were outliers."""
+LARGEST_NOISE = 3.0
+"""Noise as a multiple of what is claimed."""
+LARGEST_SLIP = 0.15
+"""Distance of the insertion scale from 1."""
+_AT_LIMIT = 0.03
+_AMBIGUOUS_COSINE = math.cos(math.radians(60.0))
+_NO_MEAN_ROLL = 0.1
+
+
+@compiled
+def estimate_needle(
+    needle: Any,
+    hypotheses: Records,
+    estimate: Any,
+    torsions: Records,
+    known: Any,
+    with_covariance: bool,
+) -> None:
+    """Write what is known of a needle now.
+
+    Parameters
+    ----------
+    needle, hypotheses : NEEDLE, ndarray of HYPOTHESIS
+        See `bank.start_needle`.
+    estimate : ESTIMATE, written
+        The tip is the weighted mean; the heading is the mean heading, the roll the mean direction
+        of the tip's x axis about it, the likeliest one's where those cancel.
+    torsions : ndarray of TORSION, shape (K,), written
+        The mean over each torsion.
+    known : ASSUMPTIONS
+        As of `bank.advance_needle`.
+    with_covariance : bool
+        Whether to write the covariance.
+    """
+    every = looked_ahead(needle, hypotheses, known)
+    whole, best = 0.0, 0
+    for n in range(needle.count):
+        whole += every[n].weight
+        if every[n].weight > every[best].weight:
+            best = n
+    position, heading, side = np.zeros(3), np.zeros(3), np.zeros(3)
+    bend = curvature = scale = xx = x_pitch = pitch_pitch = ambiguous = 0.0
+    for n in range(needle.count):
+        h = every[n]
+        w, r, p = h.weight / whole, h.rotation, h.covariance
+        along = 0.0
+        for k in range(3):
+            position[k] += w * h.position[k]
+            heading[k] += w * r[k, 2]
+            side[k] += w * r[k, 0]
+            along += every[best].rotation[k, 0] * r[k, 0]
+        ambiguous += w if along < _AMBIGUOUS_COSINE else 0.0
+        # s3 = kappa cos(pitch) sin(roll) = -kappa R_01, (6)
+        bend -= w * h.curvature * r[0, 1]
+        curvature += w * h.curvature
+        scale += w * h.scale
+        # A turn w changes sin(pitch), the heading's x, by w_y heading_z - w_z heading_y.
+        x, y_y, z_z = h.position[0], p[E_TURN + 1, E_TURN + 1], p[E_TURN + 2, E_TURN + 2]
+        xx += w * (p[0, 0] + x * x)
+        of_both = p[0, E_TURN + 1] * r[2, 2] - p[0, E_TURN + 2] * r[1, 2]
+        x_pitch += w * (of_both + x * r[0, 2])
+        variance = y_y * r[2, 2] ** 2 + z_z * r[1, 2] ** 2
+        variance -= 2.0 * p[E_TURN + 1, E_TURN + 2] * r[1, 2] * r[2, 2]
+        pitch_pitch += w * (variance + r[0, 2] ** 2)
+    if side[0] ** 2 + side[1] ** 2 + side[2] ** 2 < _NO_MEAN_ROLL**2:
+        for k in range(3):
+            side[k] = every[best].rotation[k, 0]
+    for k in range(3):
+        estimate.coordinates[k] = position[k]
+    _write_angles(heading, side, estimate.coordinates)
+    estimate.linearized[0], estimate.linearized[1], estimate.linearized[2] = (
+        position[0],
+        heading[0],
+        bend,
+    )
+    estimate.uncertainty[0] = xx - position[0] * position[0]
+    estimate.uncertainty[1] = x_pitch - position[0] * heading[0]
+    estimate.uncertainty[2] = pitch_pitch - heading[0] * heading[0]
+    estimate.curvature, estimate.scale, estimate.ambiguous = curvature, scale, ambiguous
+    estimate.noise = _noise_size(every[best], known.noises)
+    estimate.base = needle.base
+    for k in range(needle.pending):
+        estimate.base += needle.pending_turn[k]
+    estimate.wound = estimate.base + needle.start_turn
+    estimate.doubts = _doubts(needle, estimate, known)
+    _average_torsions(every, whole, torsions)
+    if with_covariance:
+        _write_covariance(every, whole, estimate)
+
+
+@compiled
+def _write_angles(axis: Array, side: Array, coordinates: Array) -> None:
+    """Write yaw, pitch and roll of a mean heading and a mean x axis of the tip."""
+    norm = math.sqrt(axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2])
+    x, y, z = axis[0] / norm, axis[1] / norm, axis[2] / norm
+    along = side[0] * x + side[1] * y + side[2] * z
+    side_x, side_y, side_z = side[0] - along * x, side[1] - along * y, side[2] - along * z
+    coordinates[3] = math.atan2(-y, z)
+    coordinates[4] = math.asin(min(max(x, -1.0), 1.0))
+    # R's first row is (cos(pitch) cos(roll), -cos(pitch) sin(roll), sin(pitch)).
+    coordinates[5] = math.atan2(-(y * side_z - z * side_y), side_x)
+
+
+@compiled
+def _noise_size(h: Any, noises: Array) -> float:
+    """Return the size of the noisiest coordinate, as a multiple of what is claimed."""
+    largest = 0.0
+    for i in range(3 if h.shape == LASTING else 1):
+        size = 0.0
+        for m in range(NOISES):
+            size += h.noise_weights[i, m] * noises[h.shape, 0, m]
+        largest = max(largest, size)
+    return largest
+
+
+@compiled
+def _doubts(needle: Any, estimate: Any, known: Any) -> int:
+    """Return the reasons of `DOUBTS` that hold, as bits."""
+    low, high = known.smallest_curvature, known.largest_curvature
+    margin = _AT_LIMIT * known.curvature
+    return int(
+        (estimate.uncertainty[0] > LARGEST_X_STD**2)
+        + 2 * (needle.unexplained > LARGEST_UNEXPLAINED)
+        + 4 * (estimate.noise > LARGEST_NOISE)
+        + 8 * (abs(estimate.scale - 1.0) > LARGEST_SLIP)
+        + 16 * (estimate.curvature < low + margin or estimate.curvature > high - margin)
+        + 32 * (needle.late > 0.0)
+    )
+
+
+@compiled
+def _average_torsions(every: Records, whole: float, torsions: Records) -> None:
+    """Write the mean over the hypotheses of each torsion."""
+    for k in range(torsions.size):
+        t = torsions[k]
+        across = along = 0.0
+        t.roll = t.agreement = t.curvature = t.tip_angle = t.behind_play = 0.0
+        t.play = t.lag = t.weight = 0.0
+        for n in range(every.size):
+            h = every[n]
+            if h.torsion != k:
+                continue
+            # (cos(roll), sin(roll)) = (R_00, -R_01) / cos(pitch)
+            cosine, sine = h.rotation[0, 0], -h.rotation[0, 1]
+            unit = h.weight / math.sqrt(cosine * cosine + sine * sine)
+            along += unit * cosine
+            across += unit * sine
+            t.weight += h.weight
+            t.curvature += h.weight * h.curvature
+            t.tip_angle += h.weight * h.tip_angle
+            t.behind_play += h.weight * h.behind_play
+            t.play += h.weight * h.play
+            t.lag += h.weight * h.lag
+        if t.weight == 0.0:
+            continue
+        t.roll = math.atan2(across, along)
+        t.agreement = math.sqrt(along * along + across * across) / t.weight
+        t.curvature /= t.weight
+        t.tip_angle /= t.weight
+        t.behind_play /= t.weight
+        t.play /= t.weight
+        t.lag /= t.weight
+        t.weight /= whole
+
+
+@compiled
+def _write_covariance(every: Records, whole: float, estimate: Any) -> None:
+    """Write the covariance of the mixture about its mean, of position and rotation vector."""
+    q, error = estimate.coordinates, np.empty(6)
+    ca, sa, cb, sb = math.cos(q[3]), math.sin(q[3]), math.cos(q[4]), math.sin(q[4])
+    cg, sg = math.cos(q[5]), math.sin(q[5])
+    # R = Rx(yaw) Ry(pitch) Rz(roll)
+    mean = np.empty((3, 3))
+    mean[0, 0], mean[0, 1], mean[0, 2] = cb * cg, -cb * sg, sb
+    mean[1, 0], mean[1, 1], mean[1, 2] = ca * sg + sa * sb * cg, ca * cg - sa * sb * sg, -sa * cb
+    mean[2, 0], mean[2, 1], mean[2, 2] = sa * sg - ca * sb * cg, sa * cg + ca * sb * sg, ca * cb
+    estimate.covariance[:] = 0.0
+    for n in range(every.size):
+        h = every[n]
+        # D = R_n R^T takes the mean to this one; as a vector it is (D - D^T) / 2 times angle /
+        # sin(angle).
+        trace = 0.0
+        for i in range(3):
+            left, right, turn = (i + 1) % 3, (i + 2) % 3, 0.0
+            for m in range(3):
+                turn += h.rotation[right, m] * mean[left, m] - h.rotation[left, m] * mean[right, m]
+                trace += h.rotation[i, m] * mean[i, m]
+            error[i], error[3 + i] = h.position[i] - q[i], 0.5 * turn
+        angle = math.acos(min(max(0.5 * (trace - 1.0), -1.0), 1.0))
+        stretch = angle / max(math.sin(angle), 1e-6) if angle > 1e-6 else 1.0
+        for i in range(3):
+            error[3 + i] *= stretch
+        for i in range(6):
+            for j in range(6):
+                spread = h.covariance[i, j] + error[i] * error[j]
+                estimate.covariance[i, j] += h.weight / whole * spread
+
+
+def estimate_from(said: np.void, torsions: Records, warnings: tuple[str, ...] = ()) -> Estimate:
+    """Return what was written, an ESTIMATE and TORSION, shape (K,), as an estimate."""
+    doubts = tuple(why for k, why in enumerate(DOUBTS) if said["doubts"] >> k & 1)
+    # A change of the angles turns the tip by axes @ change.
+    to_angles = np.eye(6)
+    to_angles[3:, 3:] = np.linalg.inv(angle_axes(said["coordinates"][3:]))
+    return Estimate(
+        coordinates=said["coordinates"],
+        linearized=said["linearized"],
+        curvature=float(said["curvature"]),
+        covariance=to_angles @ said["covariance"] @ to_angles.T,
+        warnings=warnings,
+        doubtful=bool(doubts),
+        doubts=doubts,
+        hypotheses=Hypotheses(
+            torsions, float(said["base"]), float(said["wound"]), said["uncertainty"]
+        ),
+    )

@@ -1,0 +1,134 @@
+"""Records of the hypothesis filter: a hypothesis, a needle, what happened to it, its estimate.
+
+Compiled code reads and writes the fields by name. Everything is SI, in the frame `target_plane`.
+"""
+
+# Read by compiled code.
+from __future__ import annotations
+
+import numpy as np
+
+ERROR = 9
+"""Length of a hypothesis's error: position [m], rotation vector [rad] (the true orientation is
+exp(error) R, its axes those of `target_plane`), curvature [1/m], size of the torsion [rad] or [m],
+insertion scale [-]."""
+E_POSITION, E_TURN, E_KAPPA, E_SIZE, E_SCALE = 0, 3, 6, 7, 8
+"""Where each begins in the error."""
+NOISES = 6
+"""Most noise models of one shape."""
+LONGEST_QUEUE = 64
+
+HYPOTHESIS = np.dtype(
+    [
+        ("position", np.float64, 3),  # of the tip [m]
+        ("rotation", np.float64, (3, 3)),  # of the tip: the heading is the last column
+        ("curvature", np.float64),  # of the path [1/m]
+        ("scale", np.float64),  # insertion of the needle per insertion of the stage
+        ("play", np.float64),  # half width of the dead band between base and tip [rad]
+        ("lag", np.float64),  # inserted length over which the tip's angle follows [m]; 0: none
+        ("tip_angle", np.float64),  # rotation of the tip since the start [rad]
+        ("behind_play", np.float64),  # and of the shaft behind the play [rad]
+        ("dtip_dsize", np.float64),  # derivative of tip_angle by the torsion's size (play or lag)
+        ("covariance", np.float64, (ERROR, ERROR)),
+        ("noise_weights", np.float64, (3, NOISES)),  # probability of each noise model; of noise
+        # that lasts for each coordinate, else in the first row
+        ("residual", np.float64, 3),  # last tip minus what was then estimated of it [m]
+        ("orientation_drift", np.float64),  # variance of the orientation per length [rad^2/m]
+        ("torsion", np.int64),  # number of the torsion hypothesis
+        ("shape", np.int64),  # shape of the noise, see `hypotheses`
+        ("weight", np.float64),  # relative probability; the heaviest has 1
+        ("evidence", np.float64),  # likelihood of the last tip
+        ("outlier", np.float64),  # probability that the last tip was an outlier
+    ]
+)
+NEEDLE = np.dtype(
+    [
+        ("count", np.int64),  # of its hypotheses
+        ("base", np.float64),  # rotation of the base since the start [rad]
+        ("start_turn", np.float64),  # and at the start [rad]
+        ("refused", np.float64),  # probability that the last tip was an outlier
+        ("unexplained", np.float64),  # the same, in the running mean of the last tips
+        ("tips", np.int64),  # taken so far
+        ("too_late", np.bool_),  # whether the last tip was older than the one before
+        ("pending", np.int64),  # advances that wait for a tip, in
+        ("pending_length", np.float64, LONGEST_QUEUE),  # [m]
+        ("pending_turn", np.float64, LONGEST_QUEUE),  # [rad]
+        ("initial_rotation", np.float64, (3, 3)),  # at the entry, with the base at 0
+        ("has_entry", np.bool_),  # whether the entry point is known, which is
+        ("entry", np.float64, 3),  # [m]
+        ("start", np.float64, 3),  # the first tip [m]
+        ("start_insertion", np.float64),  # [m]
+        ("inserted", np.float64),  # since the start [m]
+        ("events", np.int64),  # kept of the first centimetres; -1: no longer
+        ("late", np.float64),  # insertion by which tips are older than they say [m]
+    ]
+)
+EVENT = np.dtype(
+    [
+        ("length", np.float64),  # inserted before the tip [m]
+        ("turn", np.float64),  # of the base [rad]
+        ("is_tip", np.bool_),
+        ("tip", np.float64, 3),  # [m]; NaN where it was not found
+        ("has_covariance", np.bool_),
+        ("covariance", np.float64, (3, 3)),  # [m^2]
+        ("age", np.float64),  # [m]
+    ]
+)
+ESTIMATE = np.dtype(
+    [
+        ("coordinates", np.float64, 6),  # x, y, z [m], yaw, pitch, roll [rad]
+        ("linearized", np.float64, 3),  # mean of the linearized states (6)
+        ("uncertainty", np.float64, 3),  # var(x), cov(x, sin(pitch)), var(sin(pitch))
+        ("covariance", np.float64, (6, 6)),  # of tip and rotation vector; where asked for
+        ("curvature", np.float64),  # [1/m]
+        ("scale", np.float64),  # insertion scale
+        ("noise", np.float64),  # as a multiple of what is claimed
+        ("ambiguous", np.float64),  # weight of rolls more than 60 deg from the likeliest
+        ("base", np.float64),  # rotation of the base since the start [rad]
+        ("wound", np.float64),  # rotation of the base as the joint says it [rad]
+        ("doubts", np.int64),  # bit k: reason k of `DOUBTS`
+    ]
+)
+TORSION = np.dtype(
+    [
+        ("roll", np.float64),  # mean direction [rad]
+        ("agreement", np.float64),  # of the rolls, 0..1
+        ("curvature", np.float64),  # [1/m]
+        ("tip_angle", np.float64),  # as of a hypothesis, likewise the next three
+        ("behind_play", np.float64),
+        ("play", np.float64),
+        ("lag", np.float64),
+        ("weight", np.float64),  # 0 where nothing is left of it
+    ]
+)
+"""Mean over all hypotheses of the same torsion: what the laws read."""
+ASSUMPTIONS = np.dtype(
+    [
+        ("noises", np.float64, (3, 3, NOISES)),  # multiples, shares, correlations of each shape
+        ("curvature", np.float64),
+        ("smallest_curvature", np.float64),
+        ("largest_curvature", np.float64),
+        ("curvature_drift", np.float64),
+        ("scale_spread", np.float64),
+        ("scale_drift", np.float64),
+        ("play_drift", np.float64),
+        ("lag_drift", np.float64),
+        ("largest_play", np.float64),
+        ("smallest_lag", np.float64),
+        ("largest_lag", np.float64),
+        ("longest_step", np.float64),
+        ("believed_bound", np.float64),
+        ("entry_std", np.float64),
+        ("softness", np.float64),
+        ("mistrust", np.float64),
+        ("model_error", np.float64),
+        ("outlier_share", np.float64),
+        ("outlier_density", np.float64),
+        ("jump_share", np.float64),
+        ("jump_turn_variance", np.float64),
+        ("smallest_weight", np.float64),
+        ("merge_angle", np.float64),
+    ]
+)
+"""What compiled code needs of `FilterSettings`, where it is explained; standard deviations and
+drifts of which only squares are used as squares."""

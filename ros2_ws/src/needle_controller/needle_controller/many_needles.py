@@ -1,0 +1,296 @@
+"""Many needles at once, for studies: compiled loops over what the node does for one of them."""
+
+# Compiled code takes keywords slowly or not at all.
+# ruff: noqa: PLR0917
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from needle_controller.filter.bank import advance_needle, correct_needle, start_needle
+from needle_controller.filter.filter_settings import FilterSettings
+from needle_controller.filter.late_tips import LAST
+from needle_controller.filter.mixture import estimate_from, estimate_needle
+from needle_controller.filter.records import (
+    ESTIMATE,
+    EVENT,
+    HYPOTHESIS,
+    NEEDLE,
+    TORSION,
+)
+from needle_controller.laws.law import LinearizingGains, linearizing_rate
+from needle_controller.laws.point_law import point_turn
+from needle_controller.laws.point_turns import PointLawSettings
+from needle_controller.laws.roll_law import RollLawSettings, roll_turn
+from needle_controller.model.arrays import Array
+from needle_controller.model.gains import sampled_observer_gain
+from needle_controller.observers.estimator import Estimate
+from needle_controller.observers.luenberger import (
+    OBSERVER,
+    ObserverModel,
+    advance_observer,
+    correct_observer,
+)
+from needle_core.compiled import compiled, parallel
+
+Records = npt.NDArray[np.void]
+
+
+class ManyFilters:
+    """The hypothesis filters of N needles, each as `HypothesisFilter` has it.
+
+    They enter at the origin along z, with their bases at 0.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        What is assumed.
+    count : int
+        N.
+    shortest_step : float
+        Insertion from one tip to the next, at least [m].
+
+    Attributes
+    ----------
+    estimates, torsions : ndarray of ESTIMATE, TORSION, shape (N,), (N, K)
+        What is known; without covariances.
+    """
+
+    def __init__(self, settings: FilterSettings, count: int, shortest_step: float) -> None:
+        self._prior = settings.prior()
+        # A record alone is nothing that a parallel loop can be given.
+        self._known = np.array([settings.assumptions()])
+        self._needles = np.zeros(count, NEEDLE)
+        self._needles["initial_rotation"] = np.eye(3)
+        self._needles["has_entry"] = True
+        self._hypotheses = np.empty((count, self._prior.size + 1), HYPOTHESIS)
+        # Two advances a step, where the base begins to turn on the way.
+        self._events = np.zeros((count, 2 * math.ceil(LAST / shortest_step) + 4), EVENT)
+        self.estimates = np.zeros(count, ESTIMATE)
+        self.torsions = np.zeros((count, len(settings.torsion_hypotheses)), TORSION)
+
+    def start(self, tips: Array) -> None:
+        """Start at first tips, (N, 3) [m]."""
+        _start_all(self._needles, self._hypotheses, self._prior, tips, self._known)
+        self._estimate()
+
+    def advance(self, lengths: Array, turns: Array) -> None:
+        """Move on by inserted lengths [m] and rotations of the bases [rad], (N,)."""
+        _advance_all(self._needles, self._hypotheses, self._events, lengths, turns, self._known)
+
+    def correct(self, tips: Array, covariance: Array | None, ages: Array) -> None:
+        """Take tips, (N, 3), their covariance, (3, 3), and ages, (N,)."""
+        _correct_all(
+            self._needles,
+            self._hypotheses,
+            self._events,
+            self._prior,
+            tips,
+            np.zeros((3, 3)) if covariance is None else covariance,
+            covariance is not None,
+            ages,
+            self._known,
+        )
+        self._estimate()
+
+    def _estimate(self) -> None:
+        _estimate_all(
+            self._needles, self._hypotheses, self.estimates, self.torsions, self._known, False
+        )
+
+    def each(self) -> list[Estimate]:
+        """Return the estimates as laws in Python take them, with covariances."""
+        _estimate_all(
+            self._needles, self._hypotheses, self.estimates, self.torsions, self._known, True
+        )
+        return [
+            estimate_from(said, torsions)
+            for said, torsions in zip(self.estimates, self.torsions, strict=True)
+        ]
+
+    def roll_rates(self, settings: RollLawSettings, bend_sign: float) -> Array:
+        """Return each base's rotation rate by the roll law, (N,) [rad/m]."""
+        turns = np.empty(self.estimates.size)
+        _roll_all(self.estimates, self.torsions, bend_sign, settings, turns)
+        return turns / settings.step_length
+
+    def point_rates(
+        self, settings: PointLawSettings, targets: Array, rotation_left: Array
+    ) -> tuple[Array, Array]:
+        """Return rotation rates by the point law, (N,) [rad/m], and insertions left, (N,) [m]."""
+        turns, left = np.empty(self.estimates.size), np.empty(self.estimates.size)
+        _point_all(self.estimates, self.torsions, targets, rotation_left, settings, turns, left)
+        return turns / settings.step_length, left
+
+
+class ManyObservers:
+    """The observers of N needles and the law of [KC09], each as the node has it."""
+
+    def __init__(self, model: ObserverModel, law: LinearizingGains | None, count: int) -> None:
+        self._model, self._law = model, law
+        self._needles = np.zeros(count, OBSERVER)
+
+    def start(self, tips: Array) -> Array:
+        """Start at first tips, (N, 3) [m], the bases at 0; return the rates, (N,) [rad/m]."""
+        self._needles["linearized"][:, 0] = tips[:, 0]
+        return self._rates()
+
+    def step(
+        self, lengths: Array, unturned: Array, turns: Array, tips: Array, ages: Array
+    ) -> Array:
+        """Take a step and its tips; return the rotation rates, (N,) [rad/m].
+
+        Parameters
+        ----------
+        lengths, unturned, turns : ndarray, shape (N,)
+            Inserted, before the base begins to turn [m], and rotation of the base [rad].
+        tips, ages : ndarray, shape (N, 3), (N,)
+            See `ManyFilters.correct`.
+        """
+        _step_observers(self._needles, lengths, unturned, turns, tips, ages, self._model)
+        return self._rates()
+
+    def _rates(self) -> Array:
+        rates = np.zeros(self._needles.size)
+        if self._law is not None:
+            _linearizing_all(self._needles, self._model, self._law, rates)
+        return rates
+
+
+@parallel
+def _start_all(
+    needles: Records, hypotheses: Records, prior: Records, tips: Array, known: Records
+) -> None:
+    for n in prange(needles.size):
+        start_needle(needles[n], hypotheses[n], prior, tips[n], 0.0, 0.0, known[0])
+
+
+@parallel
+def _advance_all(
+    needles: Records,
+    hypotheses: Records,
+    events: Records,
+    lengths: Array,
+    turns: Array,
+    known: Records,
+) -> None:
+    for n in prange(needles.size):
+        advance_needle(needles[n], hypotheses[n], events[n], lengths[n], turns[n], known[0])
+
+
+@parallel
+def _correct_all(
+    needles: Records,
+    hypotheses: Records,
+    events: Records,
+    prior: Records,
+    tips: Array,
+    covariance: Array,
+    has_covariance: bool,
+    ages: Array,
+    known: Records,
+) -> None:
+    for n in prange(needles.size):
+        correct_needle(
+            needles[n],
+            hypotheses[n],
+            events[n],
+            prior,
+            tips[n],
+            covariance,
+            has_covariance,
+            ages[n],
+            known[0],
+        )
+
+
+@parallel
+def _estimate_all(
+    needles: Records,
+    hypotheses: Records,
+    estimates: Records,
+    torsions: Records,
+    known: Records,
+    with_covariance: bool,
+) -> None:
+    for n in prange(needles.size):
+        estimate_needle(
+            needles[n], hypotheses[n], estimates[n], torsions[n], known[0], with_covariance
+        )
+
+
+@compiled
+def _roll_all(
+    estimates: Records, torsions: Records, bend_sign: float, settings: RollLawSettings, turns: Array
+) -> None:
+    for n in range(estimates.size):
+        known = estimates[n]
+        s, uncertainty = known.linearized, known.uncertainty
+        base, wound = known.base, known.wound
+        turns[n] = roll_turn(
+            s[0], s[1], uncertainty, torsions[n], base, wound, bend_sign, settings
+        )[0]
+
+
+@compiled
+def _point_all(
+    estimates: Records,
+    torsions: Records,
+    targets: Array,
+    rotation_left: Array,
+    settings: PointLawSettings,
+    turns: Array,
+    left: Array,
+) -> None:
+    for n in range(estimates.size):
+        known = estimates[n]
+        turns[n], left[n] = point_turn(
+            known.coordinates,
+            known.curvature,
+            known.uncertainty,
+            torsions[n],
+            known.base,
+            known.wound,
+            targets[n],
+            rotation_left[n],
+            settings,
+        )
+
+
+@compiled
+def _step_observers(
+    needles: Records,
+    lengths: Array,
+    unturned: Array,
+    turns: Array,
+    tips: Array,
+    ages: Array,
+    model: ObserverModel,
+) -> None:
+    # Steps are alike as a rule, and so are their gains.
+    since, gain = 0.0, (0.0, 0.0, 0.0)
+    for n in range(needles.size):
+        needle = needles[n]
+        if unturned[n] > 0.0:
+            advance_observer(needle, unturned[n], 0.0, model)
+        advance_observer(needle, lengths[n] - unturned[n], turns[n], model)
+        if math.isfinite(tips[n, 0] + tips[n, 1] + tips[n, 2]):
+            if needle.since_correction != since:
+                since = needle.since_correction
+                gain = sampled_observer_gain(model.poles, since)
+            correct_observer(needle, tips[n, 0], ages[n], gain, model)
+
+
+@compiled
+def _linearizing_all(
+    needles: Records, model: ObserverModel, law: LinearizingGains, rates: Array
+) -> None:
+    for n in range(needles.size):
+        s = needles[n].linearized
+        # Roll of s, the inverse of (6)
+        sine = s[2] / model.curvature
+        roll = math.atan2(sine, math.sqrt(1.0 - s[1] * s[1] - sine * sine))
+        rates[n] = linearizing_rate(s, roll, model.curvature, law)[1]

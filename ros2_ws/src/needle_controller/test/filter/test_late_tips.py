@@ -1,0 +1,174 @@
+"""Tips that are late and do not say so, and what only looks like it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from needle_controller.filter.filter_settings import FilterSettings
+from needle_controller.filter.hypothesis_filter import HypothesisFilter
+from needle_controller.filter.late_tips import FIRST, untold_age
+from needle_controller.filter.mixture import DOUBTS, LATE
+from needle_controller.many_needles import ManyFilters
+from needle_controller.model.arrays import Array
+
+STEP = 0.001
+RADIUS = 0.122
+NEEDLES = 20
+KNOWN = (0.0005, 0.001, 0.04)
+"""Entry, bound of the noise [m], insertion scale."""
+
+
+def arc(inserted: Array | float) -> Array:
+    """Return tips of a needle that bends, (..., 3) [m]."""
+    angle = np.asarray(inserted) / RADIUS
+    x = RADIUS * (1.0 - np.cos(angle))
+    return np.stack([x, np.zeros_like(x), RADIUS * np.sin(angle)], axis=-1)
+
+
+def inserted_by(
+    steps: int,
+    *,
+    late: int = 0,
+    frame: Array | None = None,
+) -> HypothesisFilter:
+    """Return what has seen a needle that is inserted without a turn, tips with +-1 mm noise.
+
+    In the middle of it everything may be expressed in another frame, (4, 4).
+    """
+    rng = np.random.default_rng(7)
+    turn, offset = (np.eye(3), np.zeros(3)) if frame is None else (frame[:3, :3], frame[:3, 3])
+    estimator = HypothesisFilter(FilterSettings(), None, np.zeros(3))
+    estimator.reset(rng.uniform(-STEP, STEP, 3), np.zeros(2))
+    for k in range(1, steps + 1):
+        estimator.advance(STEP, 0.0)
+        tip = arc(max(k - late, 0) * STEP) + rng.uniform(-STEP, STEP, 3)
+        if frame is not None and k == 10:
+            estimator.change_frame(frame)
+        estimator.correct(tip @ turn.T + offset if k >= 10 else tip)
+    return estimator
+
+
+def many_inserted_by(
+    steps: int,
+    *,
+    late: int = 0,
+    age: float = 0.0,
+    slip: float = 0.0,
+    bump: float = 0.0,
+    outliers: float = 0.0,
+) -> ManyFilters:
+    """Return what has seen twenty such needles."""
+    rng = np.random.default_rng(7)
+    filters = ManyFilters(FilterSettings(), NEEDLES, STEP)
+    filters.start(rng.uniform(-STEP, STEP, (NEEDLES, 3)))
+    for k in range(1, steps + 1):
+        filters.advance(np.full(NEEDLES, STEP), np.zeros(NEEDLES))
+        tips = arc(max(k - late, 0) * STEP / (1.0 + slip)) + rng.uniform(-STEP, STEP, (NEEDLES, 3))
+        tips[:, 2] -= bump if k > 25 else 0.0
+        off = np.where(rng.random(NEEDLES) < outliers, 0.005, 0.0)[:, None]
+        tips += off * rng.uniform(-1.0, 1.0, (NEEDLES, 3))
+        filters.correct(tips, None, np.full(NEEDLES, min(age, k * STEP)))
+    return filters
+
+
+def called_late(filters: ManyFilters) -> Array:
+    return np.asarray(filters.estimates["doubts"] >> DOUBTS.index(LATE) & 1)
+
+
+@pytest.mark.parametrize("late", [3, 5])
+def test_late_tips_are_taken_as_late_and_doubted(late: int) -> None:
+    filters = many_inserted_by(40, late=late)
+    np.testing.assert_array_equal(called_late(filters), 1)
+    # Where the needle is, not where it was.
+    off = filters.estimates["coordinates"][:, 2] - arc(40 * STEP)[2]
+    assert np.sqrt(np.mean(off**2)) < 0.6 * STEP
+
+
+def test_late_tips_are_the_same_in_another_frame() -> None:
+    at = np.eye(4)
+    # Axis for axis: noise is bounded along each.
+    at[:3] = [[0.0, 1.0, 0.0, 0.01], [-1.0, 0.0, 0.0, -0.02], [0.0, 0.0, 1.0, 0.03]]
+    elsewhere, here = (
+        inserted_by(30, late=3, frame=at).estimate(),
+        inserted_by(30, late=3).estimate(),
+    )
+    assert LATE in elsewhere.doubts
+    np.testing.assert_allclose(
+        elsewhere.position, here.position @ at[:3, :3].T + at[:3, 3], atol=2e-4
+    )
+
+
+def test_tips_that_are_taken_again_come_with_their_covariance_in_the_new_frame() -> None:
+    at, known = np.eye(4), np.diag([1e-7, 2e-7, 3e-7])
+    at[:3, :3] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+    turn, stays = at[:3, :3], HypothesisFilter(FilterSettings(), None, np.zeros(3))
+    goes = HypothesisFilter(FilterSettings(), None, np.zeros(3))
+    for estimator in (stays, goes):
+        estimator.reset(np.zeros(3), np.zeros(2))
+    for k in range(1, 21):
+        if k == 20:
+            goes.change_frame(at)
+        tip = arc(max(k - 3, 0) * STEP)
+        for estimator, r in ((stays, np.eye(3)), (goes, turn if k == 20 else np.eye(3))):
+            estimator.advance(STEP, 0.0)
+            estimator.correct(r @ tip, r @ known @ r.T)
+    here, there = stays.estimate(), goes.estimate()
+    assert LATE in here.doubts
+    assert LATE in there.doubts
+    # Coordinates come in another order, which is all that differs.
+    np.testing.assert_allclose(there.position, turn @ here.position, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {},
+        {"slip": 0.05},
+        {"slip": 0.1},
+        {"slip": -0.05},
+        {"bump": 0.003},
+        {"outliers": 0.1},
+        {"late": 3, "age": 3 * STEP},
+    ],
+)
+def test_what_is_not_late_or_says_so_is_not_called_late(other: dict[str, float]) -> None:
+    assert not np.any(called_late(many_inserted_by(40, **other)))  # type: ignore[arg-type]
+
+
+def seen(late: float, slip: float = 0.0) -> tuple[Array, Array]:
+    """Return insertions, and the ways of tips without noise."""
+    inserted = np.arange(1, 21, dtype=np.float64) * STEP
+    return inserted, arc(np.maximum(inserted - late, 0.0) / (1.0 + slip))
+
+
+def test_an_age_is_not_a_slip() -> None:
+    inserted, ways = seen(0.003)
+    # Two coordinates of two tips are off by what is claimed, in the mean.
+    ways *= np.sqrt(1.0 + 4.0 * STEP**2 / 3.0 / np.sum(ways**2, axis=-1, keepdims=True).clip(1e-9))
+    assert untold_age(inserted, ways, 0.0, *KNOWN) == pytest.approx(0.003, abs=1e-4)
+    inserted, ways = seen(0.0, 0.2)
+    assert untold_age(inserted, ways, 0.0, *KNOWN) == 0.0
+
+
+def test_a_first_tip_that_was_too_deep_is_not_an_age() -> None:
+    inserted, ways = seen(0.0)
+    ways[:, 2] -= 0.0022
+    assert untold_age(inserted, ways, 0.0, np.inf, *KNOWN[1:]) > 0.0
+    assert untold_age(inserted, ways, 0.0022, *KNOWN) == 0.0
+
+
+def test_nothing_is_said_without_a_start_or_without_tips() -> None:
+    inserted, ways = seen(0.003)
+    few = np.where((inserted < FIRST + 4.5 * STEP)[:, None], ways, np.nan)
+    ages = [untold_age(inserted, w, 0.0, *KNOWN) for w in (few, np.full_like(ways, np.nan), ways)]
+    np.testing.assert_array_equal(np.array(ages) > 0.0, [True, False, True])
+    few[np.argmax(inserted >= FIRST)] = np.nan
+    assert untold_age(inserted, few, 0.0, *KNOWN) == 0.0
+
+
+def test_a_known_insertion_scale_leaves_no_slip() -> None:
+    inserted, ways = seen(0.0, 0.2)
+    assert untold_age(inserted, ways, 0.0, *KNOWN) == 0.0
+    # What a slip would explain is then an age.
+    assert untold_age(inserted, ways, 0.0, *KNOWN[:2], 0.0) > 0.0

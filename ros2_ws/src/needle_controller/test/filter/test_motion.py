@@ -1,0 +1,149 @@
+"""One insertion of a hypothesis and its covariance, against scipy's expm, finite differences."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from needle_controller.filter.filter_settings import FilterSettings
+from needle_controller.filter.motion import (
+    LARGEST_TURN,
+    advance_hypothesis,
+    rotate,
+    rotation_factors,
+)
+from needle_controller.filter.records import E_KAPPA, E_SCALE, E_SIZE, ERROR, HYPOTHESIS
+from needle_controller.model.arrays import Array
+
+CASES = [
+    (0.001, 0.2),
+    (0.001, -0.5),
+    (0.002, 0.0),
+    (0.001, LARGEST_TURN),
+    (0.0, 0.4),
+    (0.01, 0.7),
+]
+TORSIONS = [(0.1, 0.0), (0.25, 0.0), (0.0, 0.004), (0.0, 0.008), (0.1, 0.002)]
+SCALES = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 1.0, 0.1, 0.05])
+NO_DRIFT = FilterSettings(curvature_drift=0.0, scale_drift=0.0, play_drift=0.0, lag_drift=0.0)
+
+
+def hypothesis(play: float = 0.0, lag: float = 0.0, seed: int = 1) -> Any:
+    rng = np.random.default_rng(seed)
+    h = np.zeros(1, HYPOTHESIS)[0]
+    h["position"] = rng.normal(0.0, 0.01, 3)
+    h["rotation"] = Rotation.random(random_state=seed).as_matrix()
+    h["curvature"], h["scale"] = rng.uniform(5.0, 11.0), rng.uniform(0.9, 1.1)
+    factor = rng.normal(size=(ERROR, ERROR)) * SCALES[:, None]
+    h["covariance"] = factor @ factor.T
+    h["play"], h["lag"] = play, lag
+    return h
+
+
+def moved(h: Any, length: float, turn: float, settings: FilterSettings = NO_DRIFT) -> Any:
+    after = h.copy()
+    advance_hypothesis(after, 0.0, turn, length, settings.assumptions(), np.zeros((6, 6)))
+    return after
+
+
+@pytest.mark.parametrize("angle", [1e-3, 0.5, 1.0, 2.0])
+def test_rodrigues_factors(angle: float) -> None:
+    wanted = [
+        np.sin(angle) / angle,
+        (1.0 - np.cos(angle)) / angle**2,
+        (angle - np.sin(angle)) / angle**3,
+    ]
+    assert rotation_factors(angle**2) == pytest.approx(wanted, rel=1e-6 if angle < 0.01 else 5e-8)
+
+
+@pytest.mark.parametrize(("length", "turn"), CASES)
+def test_the_step_is_the_exponential_of_the_twist(length: float, turn: float) -> None:
+    before = hypothesis()
+    after = moved(before, length, turn)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = before["rotation"], before["position"]
+    gone = before["scale"] * length
+    x, z = before["curvature"] * gone, turn
+    twist = np.array([[0, -z, 0, 0], [z, 0, -x, 0], [0, x, 0, gone], [0, 0, 0, 0.0]])
+    wanted = pose @ expm(twist)
+    np.testing.assert_allclose(after["position"], wanted[:3, 3], atol=1e-12)
+    np.testing.assert_allclose(after["rotation"], wanted[:3, :3], atol=1e-9)
+
+
+@pytest.mark.parametrize(("length", "turn"), CASES)
+@pytest.mark.parametrize(("play", "lag"), TORSIONS)
+def test_covariance_goes_by_the_steps_derivative(
+    length: float, turn: float, play: float, lag: float
+) -> None:
+    """F by central differences of the step itself, in the error's own coordinates."""
+    before = hypothesis(play, lag)
+
+    def end(error: Array) -> Any:
+        start = before.copy()
+        start["position"] += error[:3]
+        start["rotation"] = Rotation.from_rotvec(error[3:6]).as_matrix() @ before["rotation"]
+        start["curvature"] += error[E_KAPPA]
+        start["scale"] += error[E_SCALE]
+        start["lag" if lag else "play"] += error[E_SIZE]
+        return moved(start, length, turn)
+
+    transition = np.eye(ERROR)
+    for i in range(ERROR):
+        error = np.zeros(ERROR)
+        error[i] = 1e-4 if i == E_KAPPA else 1e-6
+        ahead, behind = end(error), end(-error)
+        transition[:3, i] = (ahead["position"] - behind["position"]) / (2.0 * error[i])
+        turned = ahead["rotation"] @ behind["rotation"].T
+        transition[3:6, i] = Rotation.from_matrix(turned).as_rotvec() / (2.0 * error[i])
+    # The path's own shift with the torsion is left out: curvature length^2 of what it turns.
+    transition[:3, E_SIZE] = 0.0
+    wanted = transition @ before["covariance"] @ transition.T
+    found = moved(before, length, turn)["covariance"]
+    scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
+    np.testing.assert_allclose(found / scale, wanted / scale, atol=2e-3)
+    np.testing.assert_array_equal(found, found.T)
+
+
+def test_torsions_angles_are_kept() -> None:
+    for play, lag in TORSIONS:
+        after = moved(hypothesis(play, lag), 0.001, 0.5)
+        assert after["behind_play"] == pytest.approx(0.5 - play)
+        if lag:
+            assert 0.0 < after["tip_angle"] < after["behind_play"]
+        else:
+            assert after["tip_angle"] == after["behind_play"]
+            assert after["dtip_dsize"] == -1.0
+
+
+@pytest.mark.parametrize(("play", "lag"), [(0.1, 0.0), (0.0, 0.004)])
+def test_process_noise_is_added_where_it_belongs(play: float, lag: float) -> None:
+    settings = FilterSettings(
+        curvature=1.0,
+        curvature_drift=np.sqrt(3.0),
+        scale_drift=2.0,
+        play_drift=np.sqrt(5.0),
+        lag_drift=1.0,
+    )
+    before = hypothesis(play, lag)
+    before["covariance"] = 0.0
+    before["covariance"][E_SIZE, E_SIZE] = 1e-30
+    before["orientation_drift"] = 2.0
+    added = np.diag(moved(before, 0.001, 0.0, settings)["covariance"]) * 1000.0
+    wanted = [0.0, 0.0, 0.0, 2.0, 2.0, 2.0, 3.0, 5.0 if play else 1.0, 4.0]
+    np.testing.assert_allclose(added, wanted, atol=1e-9)
+    # A size that is known exactly stays so.
+    before["covariance"][E_SIZE, E_SIZE] = 0.0
+    assert moved(before, 0.001, 0.0, settings)["covariance"][E_SIZE, E_SIZE] == 0.0
+
+
+def test_rotate_turns_about_the_frames_axes_but_not_too_far() -> None:
+    for vector, turned in (([0.3, -0.2, 0.5], 1.0), ([0.0, 3.0, 0.0], 0.5)):
+        before = Rotation.random(random_state=2).as_matrix()
+        after = before.copy()
+        rotate(after, *vector)
+        wanted = Rotation.from_rotvec(np.array(vector) * turned).as_matrix()
+        np.testing.assert_allclose(after, wanted @ before, atol=1e-8)
