@@ -62,10 +62,7 @@ class SteeringSettings:
     )
     law: str = fixed_parameter("", "-", "Likewise of a control law (needle_controller.laws).")
     planner: str = fixed_parameter(
-        "",
-        "-",
-        "Likewise of a planner of ways to a point (needle_controller.planners); empty = ours, past "
-        "obstacles.",
+        "", "-", "Likewise of a planner of ways to a point (needle_controller.planners)."
     )
     seed: int = fixed_parameter(
         0, "-", "Of what chance another package's estimator uses; ours use none.", 0, 2**31 - 1

@@ -34,6 +34,19 @@ def may(obstacles: Obstacles, tip: TipState = ENTRY, target: Array = TARGET) -> 
     return PLANNER.may_have_path(tip, target, obstacles)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _loaded() -> None:
+    """What is compiled is loaded once, and by no test."""
+    may(Obstacles())
+
+
+@pytest.fixture
+def _no_hint(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No entry near by is looked for, which takes seconds past a wall of rods."""
+    monkeypatch.setattr(entries, "nearest_entry", lambda *_: None)
+
+
+@pytest.mark.usefixtures("_no_hint")
 def test_a_wall_with_a_gap_has_a_path_and_one_without_has_none() -> None:
     clear = 2.0 * SETTINGS.least_clear
     assert may(Obstacles())
@@ -73,7 +86,7 @@ def test_what_is_not_ahead_has_no_path() -> None:
 
 def test_what_has_a_path_is_never_said_to_have_none() -> None:
     paths = 0
-    for seed in range(40):
+    for seed in range(16):
         rng = np.random.default_rng([5, seed])
         rows = rng.uniform([-0.012, -0.012, 0.02], [0.012, 0.012, 0.07], (5, 3))
         ends = rows + rng.normal(0.0, 0.008, (5, 3))
@@ -87,9 +100,10 @@ def test_what_has_a_path_is_never_said_to_have_none() -> None:
         if PLANNER.path(ENTRY, target, obstacles) is not None:
             paths += 1
             assert may(obstacles, target=target)
-    assert 5 < paths < 35
+    assert 3 < paths < 13
 
 
+@pytest.mark.usefixtures("_no_hint")
 def test_what_is_not_found_is_not_said_to_be_impossible(monkeypatch: pytest.MonkeyPatch) -> None:
     # Wide enough for the fill, by its cells' size, and too narrow for a needle.
     narrow = wall(2.0 * SETTINGS.least_clear - 0.0003)
