@@ -51,9 +51,9 @@ The output is a CSV file, one line for each pair:
   left_end right_end  how many needle ends the network expects there, about 1 where the end is seen
   left_shaft right_shaft  mean probability of shaft behind it; empty where nothing was found
   missing         why there is no tip; docs/images.md says what helps
---insertion helps: one look at the needle is then enough, and a followed tip is merged with where
-the last one and the insertion have it. Below 4.5 mm (entry_zone) there is no tip. The stage's zero
-and scale may be off (stage_zero_sigma, stage_scale_sigma); both are estimated and printed.
+--insertion helps: one look at the needle is then enough. Below 4.5 mm (entry_zone) there is no tip.
+The stage's zero and scale may be off (stage_zero_sigma, stage_scale_sigma); both are estimated and
+printed.
 Without --insertion tips come from the images alone: the needle is believed when its end has moved
 as a needle does. One at rest is not told from an old track.
 --params takes the parameters of the node stereo_tracker, of which those for topics change nothing.
