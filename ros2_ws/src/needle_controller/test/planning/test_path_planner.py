@@ -232,6 +232,9 @@ def test_safe_starts_are_those_with_a_path() -> None:
     assert not np.any(starts.tilted[:, 4])
     assert starts.largest_shift == pytest.approx(0.025)
     assert math.degrees(starts.largest_tilt) == pytest.approx(5.0 * math.sqrt(2.0))
+
+
+def test_safe_starts_are_not_in_an_obstacle_or_behind_it() -> None:
     # An axis is x first: beside the entry in +x, from the surface to near the target.
     shaded = starts_of(Obstacles([Obstacle((0.03, -0.05, 0.01), (0.03, 0.05, 0.01), 0.008)]))
     assert not np.any(shaded.shifted[4, :])
