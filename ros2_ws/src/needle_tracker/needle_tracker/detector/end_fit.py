@@ -224,13 +224,12 @@ def _fit_line(
     count = int(back)
     places, middles, weights = np.empty(count), np.empty(count), np.empty(count)
     certainty = breadth = 0.0
-    reach = width
     for i in range(count):
         s = end - i
         centre = offset + slope * s
         mass = moment = second = 0.0
-        t = -reach
-        while t <= reach:
+        t = -width
+        while t <= width:
             value = _on_line(shaft, point, direction, s, centre + t)
             mass += value
             moment += value * t

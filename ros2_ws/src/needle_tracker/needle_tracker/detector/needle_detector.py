@@ -106,13 +106,12 @@ class NeedleDetector:
         """
         grid = self._grid
         first, last = grid.row_of(least), grid.row_of(most)
-        near, far = grid.reachable[: last + 1].copy(), grid.reachable[: last + 1].copy()
-        near[grid.row_of(_FULL_SIZE_REACH) :] = False
-        far &= ~near
+        reachable = grid.reachable[: last + 1]
+        near = np.arange(last + 1)[:, None] < grid.row_of(_FULL_SIZE_REACH)
         maps = [
-            self._sampled(cells, shrink)
-            for cells, shrink in ((near, self._shrink), (far, self._search_shrink))
-            if cells.any()
+            self._sampled(reachable & part, shrink)
+            for part, shrink in ((near, self._shrink), (~near, self._search_shrink))
+            if (reachable & part).any()
         ]
         if not maps:
             return []

@@ -39,8 +39,6 @@ class SearchGrid:
         Where the camera sees the grid's points.
     reachable : ndarray, shape (rows, columns)
         Whether the needle can be there and the camera sees it.
-    pixel_bounds : ndarray, shape (rows, 2, 2), float32
-        Least and largest pixel coordinates of the reachable cells up to each row.
     """
 
     sideways: Array
@@ -48,18 +46,11 @@ class SearchGrid:
     angles: Array
     pixels: NDArray[np.float32]
     reachable: Mask
-    pixel_bounds: NDArray[np.float32]
 
     @property
     def row_pitch(self) -> float:
         """Distance between rows [m]."""
         return float(self.distances[1] - self.distances[0])
-
-    @property
-    def row_pitch_px(self) -> float:
-        """Distance between rows where the camera sees them, in the middle [px]."""
-        middle = self.pixels[:, self.pixels.shape[1] // 2]
-        return float(np.median(np.linalg.norm(np.diff(middle, axis=0), axis=1)))
 
     @property
     def angle_pitch(self) -> float:
@@ -70,34 +61,6 @@ class SearchGrid:
         """Return the index of the row nearest to a distance from the entry [m]."""
         row = round((distance - float(self.distances[0])) / self.row_pitch)
         return min(max(row, 0), len(self.distances) - 1)
-
-    def bounds(
-        self, rows: int, margin_px: float, shape: tuple[int, ...]
-    ) -> tuple[int, int, int, int]:
-        """Return the part of the image that the first rows take.
-
-        Parameters
-        ----------
-        rows : int
-            How many rows.
-        margin_px : float
-            Room around them [px].
-        shape : tuple of int
-            Height and width of the image.
-
-        Returns
-        -------
-        tuple of int
-            First column and row (even, so that half-size images agree), and those after the last.
-        """
-        low, high = self.pixel_bounds[rows - 1]
-        height, width = shape[:2]
-        return (
-            2 * int(max(0.0, float(low[0]) - margin_px) // 2),
-            2 * int(max(0.0, float(low[1]) - margin_px) // 2),
-            int(min(width, float(high[0]) + margin_px + 1)),
-            int(min(height, float(high[1]) + margin_px + 1)),
-        )
 
 
 # Trackers of the same rig, one beside the other or one after the other, share theirs.
@@ -158,14 +121,10 @@ def make_search_grid(
         )
     reachable = inside & (np.abs(angles)[None, :] <= limit[:, None])
     pixels32 = np.nan_to_num(pixels, nan=-1e3).astype(np.float32)
-    low = np.where(reachable[..., None], pixels32, np.float32(1e9)).min(axis=1)
-    high = np.where(reachable[..., None], pixels32, np.float32(-1e9)).max(axis=1)
-    bounds = np.stack([np.minimum.accumulate(low), np.maximum.accumulate(high)], axis=1)
     return SearchGrid(
         view.sideways,
         np.asarray(distances, dtype=np.float64),
         np.asarray(angles, dtype=np.float64),
         pixels32,
         reachable,
-        bounds,
     )
