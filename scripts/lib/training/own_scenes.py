@@ -147,8 +147,7 @@ def _pairs(folder: Path, insertions: Mapping[str, float]) -> list[OwnPair]:
     found = []
     for pair in open_pairs(folder / "left", folder / "right"):
         if pair.left is not None and pair.right is not None:
-            insertion = next((insertions[name] for name in pair.names if name in insertions), None)
-            found.append(OwnPair((pair.left, pair.right), insertion))
+            found.append(OwnPair((pair.left, pair.right), pair.number_in(insertions)))
     if not found:
         raise UserError(f"{folder}: no pair can be read")
     return found

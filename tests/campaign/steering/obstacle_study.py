@@ -10,7 +10,8 @@ import itertools
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.next_step import next_step
 from needle_controller.protocol.plane_control import PlaneControl
-from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_core.commands.cli import EXIT_DONE, run_command, write_json
 from needle_core.commands.options import CommandParser, number, output_file, whole_number
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
@@ -272,20 +273,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: Sequence[str]) -> int:
-    parser = CommandParser("obstacle_study", "Steer needles past generated obstacles.", "")
-    for option, default, metavar, text in (
+    options = (
         ("--scenes", "1000", "N", "how many"),
         ("--seed", "1", "N", "seed of all randomness"),
         ("--pitch-deg", "1", "P", "bound of the needles' pitch at their entries"),
         ("--roll-deg", "10", "R", "bound of their roll"),
         ("--told-deg", "2", "S", "standard deviation of the pitch that the controller is told"),
         ("--noise-mm", "1", "A", "largest error of each coordinate of a measured tip, as is told"),
-    ):
-        parser.add_argument(
-            option, default=default, metavar=metavar, help=f"{text} (default: {default})"
-        )
+    )
+    parser = study_parser("obstacle_study", "Steer needles past generated obstacles.", options)
     parser.add_argument("--rrt", action="store_true", help="steer by the published RRT planner")
-    parser.add_argument("--json", metavar="FILE", help="write the figures there too")
     given = parser.parse_args(words)
     path = output_file("--json", given.json)
     seen = study(
@@ -297,13 +294,30 @@ def _run(words: Sequence[str]) -> int:
         entry_angle_std=math.radians(number("--told-deg", given.told_deg, 0.1, 45.0, "deg")),
         noise=number("--noise-mm", given.noise_mm, 0.01, 10.0, "mm") * 1e-3,
     )
-    for name, label in LABELS.items():
+    tell(LABELS, seen, path)
+    return EXIT_DONE
+
+
+def study_parser(
+    name: str, what: str, options: Sequence[tuple[str, str, str, str]]
+) -> CommandParser:
+    """Return a study's parser: options as (name, default, metavar, help), and --json."""
+    parser = CommandParser(name, what, "")
+    for option, default, metavar, text in options:
+        parser.add_argument(
+            option, default=default, metavar=metavar, help=f"{text} (default: {default})"
+        )
+    parser.add_argument("--json", metavar="FILE", help="write the figures there too")
+    return parser
+
+
+def tell(labels: Mapping[str, str], seen: Mapping[str, float | None], path: Path | None) -> None:
+    """Print a study's figures, and write them where --json says."""
+    for name, label in labels.items():
         value = seen[name]
         print(f"{label:55s}", "-" if value is None else f"{value:.4g}")
     if path is not None:
-        told: dict[str, JsonValue] = {**seen}
-        write_json(path, told)
-    return EXIT_DONE
+        write_json(path, {**seen})
 
 
 def _tip(plant: NeedlePlant) -> FloatArray:

@@ -12,15 +12,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from campaign.steering.obstacle_scenes import ObstacleScene, make_scene
-from campaign.steering.obstacle_study import CURVATURE
+from campaign.steering.obstacle_study import CURVATURE, study_parser, tell
 from needle_controller.planning.entry import entry_state
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner
 from needle_controller.planning.path_search import THOROUGH_STARTS
 from needle_controller.planning.path_settings import PathSettings
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_core.commands.cli import EXIT_DONE, run_command, write_json
-from needle_core.commands.options import CommandParser, number, output_file, whole_number
+from needle_core.commands.cli import EXIT_DONE, run_command
+from needle_core.commands.options import number, output_file, whole_number
 
 LABELS = {
     "scenes": "scenes",
@@ -126,18 +126,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: Sequence[str]) -> int:
-    parser = CommandParser("plan_study", "Plan past generated obstacles.", "")
-    for option, default, metavar, text in (
+    options = (
         ("--scenes", "300", "N", "how many"),
         ("--seed", "909", "N", "seed of all randomness"),
         ("--radius-mm", "135.6", "R", "least radius of a path"),
         ("--tolerance-mm", "1", "A", "distance by which a path may pass the target"),
-    ):
-        parser.add_argument(
-            option, default=default, metavar=metavar, help=f"{text} (default: {default})"
-        )
-    parser.add_argument("--json", metavar="FILE", help="write the figures there too")
-    given = parser.parse_args(words)
+    )
+    given = study_parser("plan_study", "Plan past generated obstacles.", options).parse_args(words)
     path = output_file("--json", given.json)
     seen = study(
         whole_number("--scenes", given.scenes, 1, 100_000),
@@ -145,11 +140,7 @@ def _run(words: Sequence[str]) -> int:
         number("--radius-mm", given.radius_mm, 20.0, 10_000.0, "mm") * 1e-3,
         number("--tolerance-mm", given.tolerance_mm, 0.0, 10.0, "mm") * 1e-3,
     )
-    for name, label in LABELS.items():
-        value = seen[name]
-        print(f"{label:55s}", "-" if value is None else f"{value:.4g}")
-    if path is not None:
-        write_json(path, {**seen})
+    tell(LABELS, seen, path)
     return EXIT_DONE
 
 

@@ -196,7 +196,7 @@ def track(
     """
     last, checked = None, False
     for pair in progress(pairs, "tracking"):
-        insertion = next((insertions[name] for name in pair.names if name in insertions), None)
+        insertion = pair.number_in(insertions)
         if insertion is not None:
             if last is not None and abs(insertion - last) > _NEW_RUN:
                 tracker.reset()

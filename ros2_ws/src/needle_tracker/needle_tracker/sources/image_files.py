@@ -58,6 +58,10 @@ class NamedPair:
         paths = (Path(self.name), *self.files)
         return tuple(dict.fromkeys(name for path in paths for name in (path.name, path.stem)))
 
+    def number_in(self, numbers: Mapping[str, float]) -> float | None:
+        """Return the number that a CSV has for one of its names; None where it has none."""
+        return next((numbers[name] for name in self.names if name in numbers), None)
+
     def problem(self, sizes: Sizes) -> str:
         """Return which image cannot be used, for it is not of these sizes; empty where both can."""
         for (side, wanted), image in zip(sizes.items(), (self.left, self.right), strict=True):
