@@ -17,12 +17,12 @@ AT_END = "converged_at_end"
 LAST_20 = "converged_last_20"
 TRUSTED_FAR_OFF = "trusted_far_off"
 SEED = "20090201"
-ALL_TROUBLES = ("--outliers", "0.05", "--dropped", "0.2", "--delay", "1", "--kappa-patches", "0.2")
+ALL_TROUBLES = ("--outliers", "0.05", "--found", "0.8", "--delay", "1", "--kappa-patches", "0.2")
 """Together with 20 deg of play."""
 NORMAL = ("--noise-mm", "0.577", "--noise-shape", "normal")
 """Noise of the same variance as the claimed +-1 mm has."""
 MIXED = (
-    *("--noise-mm", "1.2", "--outliers", "0.03", "--outlier-mm", "2,5", "--dropped", "0.1"),
+    *("--noise-mm", "1.2", "--outliers", "0.03", "--outlier-mm", "2,5", "--found", "0.9"),
     *("--slip", "0.03", "--kappa-scale", "0.9", "--kappa-patches", "0.1", "--play-deg", "15"),
     *("--bump-mm", "1"),
 )
@@ -79,7 +79,7 @@ TROUBLE = tuple(
         *((f"play_{d}", ("--play-deg", str(d)), 0.995) for d in (10, 20, 30, 40)),
         *((f"lag_{d}", ("--lag-mm", str(d)), 0.97) for d in (4, 8)),
         ("outliers", ("--outliers", "0.05"), 0.998),
-        ("dropped", ("--dropped", "0.2"), 0.998),
+        ("found", ("--found", "0.8"), 0.998),
         ("late", ("--delay", "1"), 0.998),
         ("late_untold", ("--untold-delay", "3"), 0.98),
         ("all_troubles", (*ALL_TROUBLES, "--play-deg", "20"), 0.975),
@@ -95,8 +95,8 @@ TOLD_WRONG = tuple(
     Study(key, "best", options, {AT_END: least, **_KNOWN}, {TRUSTED_FAR_OFF: 0.0})
     for key, options, least in (
         ("normal_noise", NORMAL, 0.999),
-        ("lasting_5", (*NORMAL, "--noise-lasting", "0.5"), 0.97),
-        ("lasting_8", (*NORMAL, "--noise-lasting", "0.8"), 0.9),
+        ("lasting_5", ("--correlated", "0.5"), 0.97),
+        ("lasting_8", ("--correlated", "0.8"), 0.9),
         ("noise_13", ("--noise-mm", "1.3"), 0.995),
         ("noise_20", ("--noise-mm", "2"), 0.97),
         ("outliers_far", ("--outliers", "0.05", "--outlier-mm", "3,5"), 0.995),
@@ -115,7 +115,7 @@ TOLD_WRONG = tuple(
 """What is claimed to `best` stays +-1 mm, or the standard deviation that such noise has."""
 REACHED = "within_1_mm_point"
 _WELL = ("--noise-mm", "0.05", "--claimed-mm", "0.05")
-_MOVING = ("--target-drift-mm", "2", "--target-breath-mm", "3")
+_MOVING = ("--target-drift-mm-per-s", "0.0333", "--target-breath-mm", "3")
 POINTS = tuple(
     Study(f"points{key}", "best", options, {REACHED: least}, {**at_most, TRUSTED_FAR_OFF: 0.0})
     for key, options, least, at_most in (
