@@ -113,6 +113,35 @@ TOLD_WRONG = tuple(
     )
 )
 """What is claimed to `best` stays +-1 mm, or the standard deviation that such noise has."""
+WANDERING = tuple(
+    Study(key, "best", options, at_least)
+    for key, options, at_least in (
+        ("push_1", ("--push", "1"), {AT_END: 0.995}),
+        ("push_2", ("--push", "2"), {AT_END: 0.95}),
+        ("gain_95", ("--rotation-gain", "0.95"), {AT_END: 0.999}),
+        ("gain_80", ("--rotation-gain", "0.8"), {AT_END: 0.92}),
+        ("roll_walk_2", ("--roll-walk", "2"), {AT_END: 0.99}),
+        ("roll_walk_5", ("--roll-walk", "5"), {AT_END: 0.8}),
+        ("correlated_9", ("--correlated", "0.9"), {AT_END: 0.88}),
+        ("bias_walk", ("--bias-walk", "1"), {AT_END: 0.85, "inside_3_sigma": 0.97}),
+        ("camera", ("--claimed-mm", "0.03", "--bias-walk", "0.3"), {"inside_3_sigma": 0.95}),
+        ("layer", ("--layer", "0.3,60"), {AT_END: 0.84}),
+        ("found_30", ("--found", "0.3"), {AT_END: 0.99}),
+        ("student", ("--student", "3,0.3"), {AT_END: 0.99}),
+        ("step_2", ("--step-mm", "2"), {AT_END: 0.99}),
+    )
+)
+"""A heading, a roll or a bias that moves by itself, and other troubles that no row above has."""
+_COMPARED = (
+    *("normal_noise", "noise_13", "noise_20", "outliers", "slip_5", "play_40", "lag_8", "kappa_08"),
+    *("kappa_12", "late", "flips"),
+)
+COMPARED = {
+    BEST.key: BEST,
+    **{study.key: study for study in TROUBLE + TOLD_WRONG if study.key in _COMPARED},
+    **{study.key: study for study in WANDERING},
+}
+"""Rows of the table of estimators, by key."""
 REACHED = "within_1_mm_point"
 _WELL = ("--noise-mm", "0.05", "--claimed-mm", "0.05")
 _MOVING = ("--target-drift-mm-per-s", "0.0333", "--target-breath-mm", "3")
