@@ -20,7 +20,7 @@ TERMS = {
     "innovation": "measured minus expected tip: what a measurement tells that was not known",
     "gate": "what refuses a tip that no needle can have: too far from the entry point, or from the "
     "last tip, for how far the needle was moved",
-    "doubtful": "the controller's word for an estimate that does not fit the measurements; else "
+    "doubtful": "the controller's word for a tip that may well be more than 1 mm off; else "
     "it is trusted",
     "hold": "the needle moves only while somebody presses",
     "watchdog": "ends what waits too long for a message; it goes by real time, so a run in which "

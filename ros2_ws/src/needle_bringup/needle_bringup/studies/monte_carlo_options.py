@@ -45,8 +45,7 @@ figures (--json FILE has all of them, flat; null where there is none):
   inside_N_sigma      share of x and of pitch (the mean of both shares), over the last 20 steps of
                       all runs, within N of the estimate's own standard deviations from the truth;
                       null for paper and open_loop, whose estimate makes no use of them
-  doubtful_at_end     share of runs that say at the end that they cannot be relied on, or that the
-                      needle is not within 1 mm of where it should be
+  doubtful_at_end     share of runs that give more than 5 % at the end to being more than 1 mm off
   trusted_far_off     how many end more than 5 mm off and do not say so
 with --targets, in place of all that speaks of the plane:
   rms_point           of the tip's distance from its point at the end (p95, max likewise)
