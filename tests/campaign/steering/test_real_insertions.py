@@ -12,7 +12,7 @@ RADIUS = 2.0
 
 
 def write(path: Path, depth: float) -> Path:
-    """Write an insertion along an arc as trajcontrol does: mm, along -y, before it and zeros too."""
+    """Write an insertion along an arc as trajcontrol does: mm, along -y, and zeros at first."""
     y = np.arange(0.005, -depth - 1e-9, -0.001)
     x, z = -0.025 + y**2 / (2.0 * RADIUS), 0.020 + 0.0 * y
     lines = ["Robot x,Tip x, Tip y, Tip z,Tip sec,Tip nanosec", "0,0,0,0,0,0"]
