@@ -42,6 +42,7 @@ def test_figures_are_shares_of_what_they_are_of() -> None:
         rotation=nothing,
         inside_2_sigma=of_each,
         inside_3_sigma=of_each,
+        x_inside_3_sigma=of_each,
         doubtful=np.array([1.0, 1.0, 0.0, 0.0]),
         stated_misses=np.array([0.0, 1.0, 0.2, 0.0005]),
     )

@@ -188,6 +188,7 @@ def _of_plane(outcomes: Outcomes) -> Results:
             "rotation_deg": np.rad2deg(outcomes.rotation),
             "diverged": outcomes.diverged.astype(float),
             "inside_3_sigma": outcomes.inside_3_sigma,
+            "x_inside_3_sigma": outcomes.x_inside_3_sigma,
             "doubtful": outcomes.doubtful,
             "stated_miss": outcomes.stated_misses,
         },

@@ -39,6 +39,8 @@ class Outcomes:
     inside_2_sigma, inside_3_sigma : ndarray, shape (N,)
         Share of x and pitch after the last steps that lay within so many of the controller's own
         standard deviations from where it took them to be; NaN where it does not say.
+    x_inside_3_sigma : ndarray, shape (N,)
+        The same of x alone.
     doubtful : ndarray, shape (N,)
         Whether the controller called the end doubtful, 0 or 1; NaN where it does not say.
     stated_misses : ndarray, shape (N,)
@@ -51,6 +53,7 @@ class Outcomes:
     rotation: FloatArray
     inside_2_sigma: FloatArray
     inside_3_sigma: FloatArray
+    x_inside_3_sigma: FloatArray
     doubtful: FloatArray
     stated_misses: FloatArray
 
@@ -141,6 +144,7 @@ class Tally:
             rotation=self._rotation,
             inside_2_sigma=inside_2_sigma,
             inside_3_sigma=inside_3_sigma,
+            x_inside_3_sigma=self.beliefs.x_inside,
             doubtful=self.beliefs.doubtful,
             stated_misses=self.beliefs.stated_misses,
         )
@@ -171,6 +175,7 @@ def figures(outcomes: Outcomes) -> dict[str, float | None]:
         "diverged": float(np.mean(outcomes.diverged)),
         "inside_2_sigma": mean_of_what_is_said(outcomes.inside_2_sigma),
         "inside_3_sigma": mean_of_what_is_said(outcomes.inside_3_sigma),
+        "x_inside_3_sigma": mean_of_what_is_said(outcomes.x_inside_3_sigma),
         "doubtful_at_end": mean_of_what_is_said(outcomes.doubtful),
         "trusted_far_off": trusted_far_off(outcomes.x_end, outcomes.doubtful),
     }
