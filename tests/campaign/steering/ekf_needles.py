@@ -66,6 +66,10 @@ class EkfNeedles:
         self._prior = np.diag(np.square(spread))
         self._curvature, self._variance = known.curvature, tip_std**2
         self._needles: Records = np.zeros(0, NEEDLE)
+        # As a law reads one hypothesis: a shaft that does not twist
+        self._torsion = np.zeros(1, TORSION)
+        for name in ("agreement", "weight", "gain"):
+            self._torsion[name] = 1.0
         self._moved: list[FloatArray] = []
         self._insertion = 0.0
 
@@ -113,7 +117,7 @@ class EkfNeedles:
     def _rates(self) -> FloatArray:
         turns = np.empty(self._needles.size)
         sign = self._plan.bend_sign(self._insertion) if self._plan.depths else 0.0
-        _turn_all(self._needles, np.zeros(1, TORSION), sign, self._law, turns)
+        _turn_all(self._needles, self._torsion, sign, self._law, turns)
         return turns / self._law.step_length
 
 
@@ -206,7 +210,6 @@ def _turn_all(
         t.roll = math.atan2(-needle.rotation[0, 1], needle.rotation[0, 0])
         t.curvature = max(needle.curvature, 1.0)
         t.tip_angle = t.behind_play = needle.base
-        t.agreement = t.weight = 1.0
         known = _plane_uncertainty(needle)
         x, sin_pitch, base = needle.position[0], needle.rotation[0, 2], needle.base
         turns[n] = roll_turn(x, sin_pitch, known, only, base, base, bend_sign, law)[0]
