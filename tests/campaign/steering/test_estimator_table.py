@@ -43,14 +43,13 @@ def test_figures_are_shares_of_what_they_are_of() -> None:
         inside_2_sigma=of_each,
         inside_3_sigma=of_each,
         x_inside_3_sigma=of_each,
-        doubtful=np.array([1.0, 1.0, 0.0, 0.0]),
-        stated_misses=np.array([0.0, 1.0, 0.2, 0.0005]),
+        missed=np.array([0.06, 1.0, 0.02, 0.0005]),
     )
     row = figures(outcomes, 1.0)
     assert (row.within, row.misses, row.called, row.false_alarms) == (0.5, 2, 0.5, 0.5)
     assert row.rms_mm == pytest.approx(np.sqrt((8.0 + 0.25) / 4.0))
     assert sum(n for n, _, _ in row.bins) == 4
-    assert row.bins[0] == (2, 0.0005, 0)
+    assert row.bins[0] == (1, 0.0005, 0)
     assert row.bins[-1] == (1, 1.0, 1)
 
 
