@@ -149,7 +149,8 @@ def _rotation(bend: float, turn: float) -> FloatArray:
     first = math.sin(angle) / angle if angle > 1e-9 else 1.0
     second = (1.0 - math.cos(angle)) / (angle * angle) if angle > 1e-9 else 0.5
     cross = np.array([[0.0, -turn, 0.0], [turn, 0.0, -bend], [0.0, bend, 0.0]])
-    return np.eye(3) + first * cross + second * (cross @ cross)
+    turned: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
+    return turned
 
 
 @compiled

@@ -49,8 +49,8 @@ class Row:
     rms_mm : float
         Over the last 20 mm.
     inside : float, optional
-        Share of x and pitch within 3 standard deviations; None from one that states none, and so
-        the next three.
+        Share of x over the last 20 mm within 3 standard deviations; None from one that states none,
+        and so the next three.
     misses : int
         Needles that end farther than 1 mm off.
     called : float, optional
@@ -113,7 +113,7 @@ def figures(outcomes: Outcomes, cpu: float) -> Row:
     return Row(
         within=float(1.0 - np.mean(missed)),
         rms_mm=1e3 * float(np.sqrt(np.mean(outcomes.x_last**2))),
-        inside=float(np.mean(outcomes.inside_3_sigma)) if says else None,
+        inside=float(np.mean(outcomes.x_inside_3_sigma)) if says else None,
         misses=int(np.sum(missed)),
         called=float(np.mean(doubtful[missed])) if says and np.any(missed) else None,
         false_alarms=float(np.mean(doubtful[~missed])) if says and np.any(~missed) else None,
@@ -180,7 +180,7 @@ def markdown(table: Table, estimators: Sequence[str]) -> str:
     lines = [
         f"Each cell: {', '.join(estimators)}; what is stated: {', '.join(states)}.",
         "",
-        "| what happens | within 1 mm, % | RMS of the last 20 mm | within 3 sigma, % | misses "
+        "| what happens | within 1 mm, % | RMS of the last 20 mm | x within 3 sigma, % | misses "
         "| of them called, % | false alarms, % | bins that disagree | rotation, deg |",
         "|" + " --- |" * 9,
     ]

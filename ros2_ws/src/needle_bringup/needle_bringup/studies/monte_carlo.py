@@ -37,6 +37,7 @@ LABELS = {
     "diverged": "  share that diverged",
     "inside_2_sigma": "truth within 2 sigma",
     "inside_3_sigma": "truth within 3 sigma",
+    "x_inside_3_sigma": "  of x alone",
     "doubtful_at_end": "called doubtful at the end",
     "trusted_far_off": "  more than 5 mm off, and not",
     "wall_s": "time [s]",

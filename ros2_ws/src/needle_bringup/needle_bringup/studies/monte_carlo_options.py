@@ -44,7 +44,8 @@ figures (--json FILE has all of them, flat; null where there is none):
   diverged            share that ends outside, farther off than its start, and still moving away
   inside_N_sigma      share of x and of pitch (the mean of both shares), over the last 20 steps of
                       all runs, within N of the estimate's own standard deviations from the truth;
-                      null for paper and open_loop, whose estimate makes no use of them
+                      null for paper and open_loop, whose estimate makes no use of them;
+                      x_inside_3_sigma is that of x alone
   doubtful_at_end     share of runs that give more than 5 % at the end to being more than 1 mm off
   trusted_far_off     how many end more than 5 mm off and do not say so
 with --targets, in place of all that speaks of the plane:

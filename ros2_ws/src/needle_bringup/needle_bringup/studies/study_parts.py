@@ -189,6 +189,7 @@ def _of_plane(outcomes: Outcomes) -> Results:
             "rotation_deg": np.rad2deg(outcomes.rotation),
             "diverged": outcomes.diverged.astype(float),
             "inside_3_sigma": outcomes.inside_3_sigma,
+            "x_inside_3_sigma": outcomes.x_inside_3_sigma,
             "doubtful": doubted(outcomes.missed),
             "stated_miss": outcomes.missed,
         },

@@ -22,9 +22,20 @@ _CONTRADICTION = 4.0
 
 @dataclasses.dataclass(frozen=True)
 class CheckedFit:
-    """A fit, and what of the settings the tips contradicted and was left out of it."""
+    """A fit, and what of the settings the tips contradicted and was left out of it.
+
+    Attributes
+    ----------
+    fit : CurvatureFit
+        The fit.
+    settings : CurvatureFitSettings
+        Those it was made with.
+    warnings : tuple of str
+        A line on each that was not used.
+    """
 
     fit: CurvatureFit
+    settings: CurvatureFitSettings
     warnings: tuple[str, ...]
 
 
@@ -94,4 +105,4 @@ def fit_checked(
                 f"wants <= {math.degrees(allowed):.1f} deg"
             )
             settings = dataclasses.replace(settings, heading=(x, y, z), heading_std=math.inf)
-    return CheckedFit(fit_curvature(tips, insertion, settings), tuple(warnings))
+    return CheckedFit(fit_curvature(tips, insertion, settings), settings, tuple(warnings))

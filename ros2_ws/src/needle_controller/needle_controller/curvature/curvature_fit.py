@@ -98,6 +98,14 @@ class CurvatureFitSettings:
         if not np.all(np.isfinite(self.entry)):
             raise UserError(f"entry = {self.entry} is not finite")
 
+    def precision(self) -> Array:
+        """Return what is known of `CurvatureFit.unknowns`, as inverse variances, (8,)."""
+        precision = np.zeros(UNKNOWNS + 1)
+        precision[ENTRY] = self.entry_std**-2.0
+        precision[HEADING] = self.heading_std**-2.0
+        precision[_GAIN] = self.slip_std**-2.0
+        return precision
+
 
 @dataclasses.dataclass(frozen=True)
 class CurvatureFit:
@@ -126,6 +134,11 @@ class CurvatureFit:
     slip, slip_std : ndarray, shape (...)
         Share by which the stage moves farther than the needle goes in, and its standard deviation;
         0 and `CurvatureFitSettings.slip_std` where the insertion is not known.
+    unknowns : ndarray, shape (..., 8)
+        Those of `insertion_arc`, about the known entry in the `frame` of the known heading, and the
+        needle's insertion per stage's, less 1.
+    length : ndarray, shape (..., K)
+        Insertion of the stage at each tip [m]; where it is not known, of the needle.
     """
 
     curvature: Array
@@ -139,6 +152,8 @@ class CurvatureFit:
     heading_std: Array
     slip: Array
     slip_std: Array
+    unknowns: Array
+    length: Array
 
     @property
     def radius(self) -> Array:
@@ -189,10 +204,7 @@ def fit_curvature(
     settings = CurvatureFitSettings() if settings is None else settings
     tips = checked_tips(tips)
     axes = frame(np.asarray(settings.heading, dtype=float))
-    precision = np.zeros(UNKNOWNS + 1)
-    precision[ENTRY] = settings.entry_std**-2.0
-    precision[HEADING] = settings.heading_std**-2.0
-    precision[_GAIN] = settings.slip_std**-2.0
+    precision = settings.precision()
     # In the frame of the known heading, about the known entry.
     measured = (tips - np.asarray(settings.entry, dtype=float)) @ axes
     known = insertion is not None
@@ -249,6 +261,8 @@ def fit_curvature(
         heading_std=np.sqrt(np.max(variances[..., HEADING], axis=-1)),
         slip=1.0 / (1.0 + unknowns[..., _GAIN]) - 1.0,
         slip_std=np.sqrt(variances[..., _GAIN]) / (1.0 + unknowns[..., _GAIN]) ** 2,
+        unknowns=unknowns,
+        length=length,
     )
 
 

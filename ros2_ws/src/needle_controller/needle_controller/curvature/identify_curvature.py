@@ -15,6 +15,7 @@ from needle_controller.curvature.circle_fit import circle_curvature
 from needle_controller.curvature.curvature_checks import CheckedFit, fit_checked
 from needle_controller.curvature.curvature_data import InsertionRecord, read_record
 from needle_controller.curvature.curvature_fit import CurvatureFitSettings
+from needle_controller.curvature.tip_forecast import forecast_tip
 from needle_core.commands.cli import (
     EXIT_DONE,
     EXIT_MISSED,
@@ -56,6 +57,9 @@ examples:
   ros2 run needle_controller identify_curvature tips.csv --insertion insertion.csv --json kappa.json
   ros2 run needle_controller identify_curvature bags/steered --until-mm 40
       only what was inserted before the base began to turn
+  ros2 run needle_controller identify_curvature tips.csv --forecast-mm 98
+      where the tip will be at 98 mm, from tips of the first 50 mm, say; for tissue whose curvature
+      varies by 0.5 1/m from place to place
   ros2 run needle_controller identify_curvature tips.csv --entry-std-mm inf --heading-std-deg inf
       nothing is known of the entry but the tips
   ros2 run needle_controller identify_curvature bags/insertion --from-mm 5
@@ -79,6 +83,7 @@ class Options:
     heading_std_deg: float
     repeating_error_mm: float
     rotation_tolerance_deg: float
+    forecast_mm: float | None
 
 
 def parse(arguments: Sequence[str]) -> Options:
@@ -116,6 +121,11 @@ def parse(arguments: Sequence[str]) -> Options:
         metavar="R",
         help="what the base may turn on the way (default: 1)",
     )
+    add(
+        "--forecast-mm",
+        metavar="D",
+        help="say where the tip of the needle will be at this insertion, if it is not turned",
+    )
     given = parser.parse_args(arguments)
     return Options(
         source=given.source,
@@ -131,6 +141,9 @@ def parse(arguments: Sequence[str]) -> Options:
         rotation_tolerance_deg=number(
             "--rotation-tolerance-deg", given.rotation_tolerance_deg, 0.0, 10.0, "deg"
         ),
+        forecast_mm=None
+        if given.forecast_mm is None
+        else number("--forecast-mm", given.forecast_mm, 1.0, 1000.0, "mm"),
     )
 
 
@@ -180,6 +193,20 @@ def summary(record: InsertionRecord, checked: CheckedFit) -> dict[str, JsonValue
     }
 
 
+def _forecast(
+    options: Options, record: InsertionRecord, checked: CheckedFit
+) -> dict[str, JsonValue]:
+    """Return where the tip will be, and half the widths of the 95 % intervals; null: not asked."""
+    names = [f"forecast_{what}_mm" for what in ("x", "y", "z", "x_95", "y_95", "z_95")]
+    if options.forecast_mm is None:
+        return dict.fromkeys(names)
+    ahead = forecast_tip(
+        record.tips, record.insertion is not None, checked, 1e-3 * options.forecast_mm
+    )
+    values = 1e3 * np.concatenate([ahead.tip, ahead.interval()])
+    return dict(zip(names, values.tolist(), strict=True))
+
+
 _OUTLIER_WEIGHT = 0.5
 
 
@@ -193,8 +220,6 @@ def _run(arguments: Sequence[str]) -> int:
     options = parse(arguments)
     record, checked = identify(options)
     values = summary(record, checked)
-    if options.json is not None:
-        write_json(options.json, values)
     fit = checked.fit
     for warning in checked.warnings:
         print(f"warning: {warning}", file=sys.stderr)
@@ -203,6 +228,9 @@ def _run(arguments: Sequence[str]) -> int:
             "warning: whether the base turned is not recorded; the tips follow one arc",
             file=sys.stderr,
         )
+    values |= _forecast(options, record, checked)
+    if options.json is not None:
+        write_json(options.json, values)
     low, high = (1e3 * float(radius) for radius in fit.radius_interval())
     believable = f"{low:.1f} to {high:.1f} mm" if math.isfinite(high) else f"more than {low:.1f} mm"
     print(f"1/kappa = {1e3 * float(fit.radius):.1f} mm (95 %: {believable})")
@@ -214,6 +242,12 @@ def _run(arguments: Sequence[str]) -> int:
     if record.insertion is not None:
         slip, std = 100.0 * float(fit.slip), 100.0 * float(fit.slip_std)
         print(f"the stage moved {slip:.1f} % farther than the needle went in, +- {std:.1f} %")
+    if options.forecast_mm is not None:
+        x, y, z, *widths = (values[name] for name in values if name.startswith("forecast_"))
+        print(
+            f"at {options.forecast_mm:g} mm the tip will be at x = {x:.2f}, y = {y:.2f}, "
+            f"z = {z:.2f} mm (95 %: +- {widths[0]:.2f}, {widths[1]:.2f}, {widths[2]:.2f} mm)"
+        )
     if not math.isfinite(high):
         print("the tips cannot tell this path from a straight line: insert deeper")
         return EXIT_MISSED

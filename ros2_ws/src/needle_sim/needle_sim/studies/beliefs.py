@@ -51,6 +51,7 @@ class BeliefTally:
 
     def __init__(self, needles: int) -> None:
         self._within: FloatArray = np.zeros((2, needles))
+        self._x_within_3: FloatArray = np.zeros(needles)
         self._compared = 0
         self.missed: FloatArray = np.full(needles, np.nan)
 
@@ -72,6 +73,7 @@ class BeliefTally:
         ):
             self._within += off <= np.array([[2.0], [3.0]]) * std
             self._compared += 1
+        self._x_within_3 += np.abs(belief.x - x) <= 3.0 * belief.x_std
         if belief.missed is not None:
             self.missed = belief.missed
 
@@ -81,6 +83,13 @@ class BeliefTally:
         if not self._compared:
             return np.full_like(self._within, np.nan)
         return self._within / self._compared
+
+    @property
+    def x_inside(self) -> FloatArray:
+        """Share of x alone within 3 sigma, (N,); NaN if nothing is said."""
+        if not self._compared:
+            return np.full_like(self._x_within_3, np.nan)
+        return 2.0 * self._x_within_3 / self._compared
 
 
 def doubted(missed: FloatArray) -> FloatArray:

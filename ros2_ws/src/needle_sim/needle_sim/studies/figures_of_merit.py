@@ -39,6 +39,8 @@ class Outcomes:
     inside_2_sigma, inside_3_sigma : ndarray, shape (N,)
         Share of x and pitch after the last steps that lay within so many of the controller's own
         standard deviations from where it took them to be; NaN where it does not say.
+    x_inside_3_sigma : ndarray, shape (N,)
+        The same of x alone.
     missed : ndarray, shape (N,)
         Probability that the controller gives at the end to |x| > 1 mm; NaN where it does not say.
     """
@@ -49,6 +51,7 @@ class Outcomes:
     rotation: FloatArray
     inside_2_sigma: FloatArray
     inside_3_sigma: FloatArray
+    x_inside_3_sigma: FloatArray
     missed: FloatArray
 
     @property
@@ -138,6 +141,7 @@ class Tally:
             rotation=self._rotation,
             inside_2_sigma=inside_2_sigma,
             inside_3_sigma=inside_3_sigma,
+            x_inside_3_sigma=self.beliefs.x_inside,
             missed=self.beliefs.missed,
         )
 
@@ -167,6 +171,7 @@ def figures(outcomes: Outcomes) -> dict[str, float | None]:
         "diverged": float(np.mean(outcomes.diverged)),
         "inside_2_sigma": mean_of_what_is_said(outcomes.inside_2_sigma),
         "inside_3_sigma": mean_of_what_is_said(outcomes.inside_3_sigma),
+        "x_inside_3_sigma": mean_of_what_is_said(outcomes.x_inside_3_sigma),
         "doubtful_at_end": mean_of_what_is_said(doubted(outcomes.missed)),
         "trusted_far_off": trusted_far_off(outcomes.x_end, outcomes.missed),
     }

@@ -76,6 +76,8 @@ def test_shares_within_2_and_3_sigma_count_x_and_pitch_alike() -> None:
     assert np.all(np.isnan(tally.inside))
     tally.add(Belief(level, std, level, 10.0 * std), *truth)
     np.testing.assert_allclose(tally.inside, [[1.0, 0.5, 0.0], [1.0, 1.0, 0.5]])
+    # Of x alone
+    np.testing.assert_allclose(tally.x_inside, [1.0, 1.0, 0.0])
     assert np.all(np.isnan(tally.missed))
     assert np.all(np.isnan(doubted(tally.missed)))
     # A second step in which all is as believed; of doubts the last word counts.

@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from needle_controller.curvature import tip_forecast
+from needle_controller.curvature.curvature_checks import fit_checked
+from needle_controller.curvature.curvature_fit import CurvatureFitSettings, fit_curvature
+from needle_controller.curvature.identify_curvature import main
+from needle_controller.curvature.tip_forecast import TipForecast, forecast_tip
+from needle_controller.model.arrays import Array
+
+SEEN, AHEAD, NOISE = 0.050, 0.098, 1e-4
+HEADING_STD = math.radians(5.0)
+INSERTION = np.arange(0.0, SEEN + 1e-9, 0.001)
+
+
+def forecast(tips: Array, *, insertion_known: bool = True) -> TipForecast:
+    insertion = INSERTION if insertion_known else None
+    checked = fit_checked(tips, insertion, CurvatureFitSettings())
+    return forecast_tip(tips, insertion_known, checked, AHEAD)
+
+
+def arc(radius: float, length: Array) -> Array:
+    turned = length / radius
+    return np.stack(
+        [radius * (1.0 - np.cos(turned)), 0.0 * length, radius * np.sin(turned)], axis=-1
+    )
+
+
+@pytest.mark.parametrize("insertion_known", [True, False])
+@pytest.mark.parametrize("radius", [0.122, 0.5, 3.0])
+def test_an_arc_is_continued(radius: float, insertion_known: bool) -> None:
+    noise = np.random.default_rng(4).normal(0.0, NOISE, (len(INSERTION), 3))
+    ahead = forecast(arc(radius, INSERTION) + noise, insertion_known=insertion_known)
+    off = np.abs(ahead.tip - arc(radius, np.array(AHEAD)))
+    assert np.all(off <= 1.3 * ahead.interval() + 1e-5)
+    # Nobody forecasts 48 mm better than the tissue allows, nor is a parabola of use that is worse.
+    assert 3e-4 < ahead.interval()[1] < 3e-3
+
+
+def paths(count: int, rng: np.random.Generator) -> Array:
+    """Return paths of stiff needles in tissue that is not the same everywhere, (count, 99, 3).
+
+    Integrated from curvatures every mm: of headings, arcs and local curvature by chance.
+    """
+    places = np.arange(0.0, AHEAD + 1e-9, 0.001)
+    apart = np.abs(np.subtract.outer(places, places))
+    local = np.linalg.cholesky(
+        tip_forecast.LOCAL_SPREAD**2 * np.exp(-apart / tip_forecast.LOCAL_LENGTH)
+    )
+    scale = np.exp(rng.uniform(np.log(0.1), np.log(1.0), (count, 1, 1)))
+    curvature = scale * rng.normal(size=(count, 1, 2)) + local @ rng.normal(
+        size=(count, len(places), 2)
+    )
+    slope = rng.normal(0.0, 0.5 * HEADING_STD, (count, 1, 2)) + np.cumsum(curvature, 1) * 0.001
+    aside = np.cumsum(slope, axis=1) * 0.001
+    ahead = np.cumsum(1.0 - 0.5 * np.sum(slope**2, axis=-1), axis=1) * 0.001
+    whole = np.concatenate([aside, ahead[..., None]], axis=-1)
+    return whole - whole[:, :1]
+
+
+def test_95_of_100_tips_are_in_the_interval() -> None:
+    rng = np.random.default_rng(8)
+    inside = []
+    for path in paths(30, rng):
+        seen = path[: len(INSERTION)] + rng.normal(0.0, NOISE, (len(INSERTION), 3))
+        ahead = forecast(seen, insertion_known=False)
+        # Its way to the same depth
+        off = path[-1] - ahead.tip
+        off -= ahead.tip / ahead.tip[2] * off[2]
+        inside.append(np.abs(off[:2]) <= ahead.interval()[:2])
+    assert np.mean(inside) > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 60)
+
+
+def test_of_a_nearly_straight_needle_it_is_gaussian_process_regression(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The same model in its other form: covariances of places, in place of unknowns."""
+    scale = 0.3
+    monkeypatch.setattr(tip_forecast, "SCALES", np.array([scale]))
+    settings = CurvatureFitSettings(slip_std=1e-6, measurement_std=NOISE, outlier_limit=math.inf)
+    seen = paths(1, np.random.default_rng(5))[0, : len(INSERTION)]
+    # A tenth of it: the sine of the heading is the heading.
+    seen = np.column_stack([0.1 * seen[:, :2], INSERTION])
+    checked = fit_checked(seen, INSERTION, settings)
+    ahead = forecast_tip(seen, True, checked, AHEAD)
+    places = np.append(INSERTION, AHEAD)
+    cells = np.arange(0.0005, AHEAD, 0.001)
+    moved = np.maximum(places[:, None] - cells, 0.0) * 0.001
+    apart = np.abs(np.subtract.outer(cells, cells)) / tip_forecast.LOCAL_LENGTH
+    whole = moved @ (tip_forecast.LOCAL_SPREAD**2 * np.exp(-apart)) @ moved.T
+    whole += settings.entry_std**2 + HEADING_STD**2 * np.outer(places, places)
+    whole += scale**2 * np.outer(places**2, places**2) / 4.0
+    known = whole[:-1, :-1] + NOISE**2 * np.eye(len(INSERTION))
+    gain = np.linalg.solve(known, whole[:-1, -1])
+    np.testing.assert_allclose(ahead.tip[:2], gain @ seen[:, :2], atol=5e-6)
+    spread = math.sqrt(whole[-1, -1] - gain @ whole[:-1, -1])
+    np.testing.assert_allclose(ahead.interval()[:2], 1.96 * spread, rtol=0.01)
+
+
+@pytest.mark.parametrize("radius", [1.0, 3.0, 9.0])
+def test_the_radius_of_a_stiff_needle_is_in_its_interval(radius: float) -> None:
+    rng = np.random.default_rng(9)
+    insertion = np.arange(0.0, AHEAD, 0.001)
+    tips = arc(radius, insertion) + rng.normal(0.0, NOISE, (60, len(insertion), 3))
+    low, high = fit_curvature(tips, insertion).radius_interval()
+    # Three standard errors
+    assert np.mean((low <= radius) & (radius <= high)) > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 60)
+
+
+def test_the_command_says_where_the_tip_will_be(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    noise = np.random.default_rng(4).normal(0.0, NOISE, (len(INSERTION), 3))
+    table = np.column_stack([INSERTION, arc(3.0, INSERTION) + noise, 0.0 * INSERTION])
+    path, result = tmp_path / "tips.csv", tmp_path / "result.json"
+    header = "insertion_m,x_m,y_m,z_m,rotation_rad"
+    np.savetxt(path, table, delimiter=",", header=header, comments="")
+    words = [str(path), "--json", str(result)]
+    main([*words, "--forecast-mm", "98"])
+    values = json.loads(result.read_text(encoding="utf-8"))
+    assert f"at 98 mm the tip will be at x = {values['forecast_x_mm']:.2f}" in (
+        capsys.readouterr().out
+    )
+    truth = 1e3 * arc(3.0, np.array(AHEAD))
+    for name, wanted in zip("xyz", truth, strict=True):
+        assert values[f"forecast_{name}_mm"] == pytest.approx(
+            wanted, abs=values[f"forecast_{name}_95_mm"]
+        )
+    main(words)
+    assert json.loads(result.read_text(encoding="utf-8"))["forecast_x_mm"] is None
+    assert main([*words, "--forecast-mm", "0"]) == 2
+    assert "--forecast-mm = 0" in capsys.readouterr().err

@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from campaign.checks.control_studies import COMPARED
+from campaign.steering.estimator_table import (
+    EDGES,
+    Row,
+    agrees,
+    disagreeing,
+    figures,
+    main,
+    markdown,
+    steer,
+    together,
+)
+from needle_sim.studies.figures_of_merit import Outcomes
+
+ROW = Row(0.999, 0.15, 0.99, 1, 1.0, 0.02, [(100, 0.5, 1)] * (len(EDGES) - 1), 1200.0, 30.0)
+SILENT = dataclasses.replace(ROW, inside=None, called=None, false_alarms=None, bins=[])
+
+
+def test_every_row_of_the_step_is_there() -> None:
+    assert {"best", "push_2", "gain_80", "roll_walk_5", "camera", "layer", "found_30"} <= {
+        *COMPARED
+    }
+    assert len(COMPARED) == 25
+
+
+def test_figures_are_shares_of_what_they_are_of() -> None:
+    x = np.array([0.0, 0.002, -0.002, 0.0005])
+    nothing, of_each = np.zeros(4), np.ones(4)
+    outcomes = Outcomes(
+        x_start=nothing,
+        x_last=x[:, None],
+        settled=nothing,
+        rotation=nothing,
+        inside_2_sigma=of_each,
+        inside_3_sigma=of_each,
+        x_inside_3_sigma=of_each,
+        missed=np.array([0.06, 1.0, 0.02, 0.0005]),
+    )
+    row = figures(outcomes, 1.0)
+    assert (row.within, row.misses, row.called, row.false_alarms) == (0.5, 2, 0.5, 0.5)
+    assert row.rms_mm == pytest.approx(np.sqrt((8.0 + 0.25) / 4.0))
+    assert sum(n for n, _, _ in row.bins) == 4
+    assert row.bins[0] == (1, 0.0005, 0)
+    assert row.bins[-1] == (1, 1.0, 1)
+
+
+def test_a_stated_probability_agrees_within_the_interval_of_what_is_observed() -> None:
+    # 10 of 100: 4.9 to 17.6 % by Clopper and Pearson
+    assert [agrees(100, p, 10) for p in (0.048, 0.05, 0.17, 0.18)] == [False, True, True, False]
+    assert agrees(0, 0.5, 0)
+    assert disagreeing([(100, 10.0, 10), (0, 0.0, 0), (100, 1.0, 50)]) == (1, 2)
+    assert together([ROW, SILENT, ROW])[0] == (200, 1.0, 2)
+
+
+def test_the_table_has_a_dash_for_what_is_not_said() -> None:
+    text = markdown(
+        {"push": {"best": ROW, "paper": SILENT}, "flips": {"best": ROW}}, ["best", "paper"]
+    )
+    assert "| push | 99.90, 99.90 | 0.15, 0.15 | 99.0 | 1 | 100.0 | 2.0 |" in text
+    assert "| flips | 99.90, - |" in text
+    assert "| best | 0 to 0.001 | 200 | 0.0050 | 0.0100 |" in text
+    assert "| paper | 0" not in text
+
+
+@pytest.mark.parametrize("key", ["best", "push_2", "late", "flips"])
+def test_the_filter_that_all_is_compared_to_steers_and_knows_where_it_is(key: str) -> None:
+    row = steer(COMPARED[key], "ekf", 1000)
+    assert row.within > 0.94
+    assert row.inside is not None
+    assert row.inside > 0.98
+
+
+def test_the_command_writes_figures_that_it_reads_as_before(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--needles", "1000", "--only", "push_2", "--estimators", "paper"]
+    before, table = tmp_path / "before.json", tmp_path / "table.md"
+    before.write_text(json.dumps({"push_2": {"best": dataclasses.asdict(ROW)}}), encoding="utf-8")
+    assert main([*words, "--before", str(before), "--table", str(table)]) == 0
+    assert "Each cell: before, paper" in table.read_text(encoding="utf-8")
+    assert "| push_2 | 99.90, 9" in capsys.readouterr().out
+    assert main(["--only", "nothing"]) == 2
+    assert "nothing" in capsys.readouterr().err
