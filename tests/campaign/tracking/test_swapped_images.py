@@ -108,7 +108,7 @@ def test_the_answers_stay_as_they_are(
 ) -> None:
     settings = default_settings(calibration)
     alone = NeedleTracker(calibration, settings)
-    answers = PairAnswers(calibration, settings, pair_tolerance_ns=0, joint_timeout=0.2, lean=0.0)
+    answers = PairAnswers(calibration, settings, pair_tolerance_ns=0, joint_timeout=0.2)
     for k, (insertion, left, right) in enumerate(pairs(calibration_path, "heavy_clutter", 1), 1):
         answered = [
             *answers.add_insertion(k, insertion, 0.0),

@@ -71,12 +71,6 @@ class StereoTrackerParameters:
     tip_lean: float = fixed_parameter(
         0.21, "rad", "Largest angle between visible end and needle's path (pre-bend).", 0.0, 0.8
     )
-    lean: float = fixed_parameter(
-        0.0977, "rad", "Angle of heading and visible end, for heading_from_estimate.", 0.0, 0.7
-    )
-    heading_from_estimate: bool = fixed_parameter(
-        False, "-", "Publish the heading (lean taken off) where needle/estimate knows the roll."
-    )
     annotated_rate: float = fixed_parameter(
         2.0, "Hz", "Most annotated images a second, while someone subscribes; 0: none.", 0.0, 100.0
     )
