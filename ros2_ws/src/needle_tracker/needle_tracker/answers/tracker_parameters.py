@@ -45,7 +45,11 @@ class StereoTrackerParameters:
         0.7e-3, "m", "Diameter of the needle, good to 30 %.", 0.2e-3, 3e-3
     )
     entry_zone: float = fixed_parameter(
-        4.5e-3, "m", "Insertion below which the tip follows from the insertion alone.", 0.0, 0.05
+        8e-3,
+        "m",
+        "Insertion below which the tip of a needle that is not seen follows from the insertion.",
+        0.0,
+        0.05,
     )
     hole_clearance: float = fixed_parameter(
         2.0e-3, "m", "Radius about the entry point that is not looked at (hole, rim).", 0.5e-3, 0.02

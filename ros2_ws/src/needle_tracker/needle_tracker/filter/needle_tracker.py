@@ -136,6 +136,14 @@ class NeedleTracker:
         for side, image in zip(SIDES, pair, strict=True):
             if int(image[::8, ::8].max()) < _DARK:
                 return self.skip(f"{side} image is black")
+        measured = self._measure(pair, insertion)
+        if measured.tip is None and insertion is not None and insertion < self.settings.entry_zone:
+            tip = tip_at_entry(insertion, self.settings)
+            return dataclasses.replace(measured, tip=tip, state=TrackState.ENTRY, reason="")
+        return measured
+
+    def _measure(self, pair: Pair, insertion: float | None) -> Measurement:
+        """Measure the tip as the images show it."""
         changed = self._view_changed(pair)
         if changed:
             # What stands behind the needle is no longer known.
@@ -143,9 +151,9 @@ class NeedleTracker:
         background = self._background.see(pair, insertion)
         if background is not self._shown:
             self._use_background(background)
-        if insertion is not None and insertion < self.settings.entry_zone:
+        if insertion is not None and insertion < self.settings.hole_clearance:
             self.reset()
-            return Measurement(tip_at_entry(insertion, self.settings), TrackState.ENTRY, "")
+            return self._answer(None, NoTip.NOTHING)
         for detector, image in zip(self._detectors, pair, strict=True):
             detector.see(image)
         settings = self.settings
@@ -291,7 +299,7 @@ class NeedleTracker:
 
 
 def tip_at_entry(insertion: float, settings: TrackerSettings) -> SpatialTip:
-    """Return the tip of a needle that is too short to be seen: on the z axis of `rig`."""
+    """Return the tip of a short needle that is not seen: on the z axis of `rig`."""
     reach = settings.reach
     sideways = math.hypot(reach.hole_tolerance, insertion * math.sin(reach.entry_angle))
     along = math.hypot(reach.hole_tolerance, insertion * (1.0 - math.cos(reach.entry_angle)))
