@@ -17,6 +17,8 @@ E_POSITION, E_TURN, E_KAPPA, E_SIZE, E_SCALE = 0, 3, 6, 7, 8
 NOISES = 6
 """Most noise models of one shape."""
 LONGEST_QUEUE = 64
+NEAR = 1e-3
+"""Distance from plane or point at which the needle counts as there, [KC09] IV-A [m]."""
 
 HYPOTHESIS = np.dtype(
     [
@@ -26,14 +28,17 @@ HYPOTHESIS = np.dtype(
         ("scale", np.float64),  # insertion of the needle per insertion of the stage
         ("play", np.float64),  # half width of the dead band between base and tip [rad]
         ("lag", np.float64),  # inserted length over which the tip's angle follows [m]; 0: none
+        ("gain", np.float64),  # share of the base's rotation that reaches the shaft in the tissue
         ("tip_angle", np.float64),  # rotation of the tip since the start [rad]
         ("behind_play", np.float64),  # and of the shaft behind the play [rad]
-        ("dtip_dsize", np.float64),  # derivative of tip_angle by the torsion's size (play or lag)
+        ("dtip_dsize", np.float64),  # derivative of tip_angle by the torsion's size
+        ("sized", np.int64),  # which of play, lag and gain that is, see `hypotheses`
         ("covariance", np.float64, (ERROR, ERROR)),
         ("noise_weights", np.float64, (3, NOISES)),  # probability of each noise model; of noise
         # that lasts for each coordinate, else in the first row
         ("residual", np.float64, 3),  # last tip minus what was then estimated of it [m]
-        ("orientation_drift", np.float64),  # variance of the orientation per length [rad^2/m]
+        ("heading_drift", np.float64),  # variance of pitch and yaw per length [rad^2/m]
+        ("roll_drift", np.float64),  # and of the roll [rad^2/m]
         ("torsion", np.int64),  # number of the torsion hypothesis
         ("shape", np.int64),  # shape of the noise, see `hypotheses`
         ("weight", np.float64),  # relative probability; the heaviest has 1
@@ -49,6 +54,7 @@ NEEDLE = np.dtype(
         ("refused", np.float64),  # probability that the last tip was an outlier
         ("unexplained", np.float64),  # the same, in the running mean of the last tips
         ("tips", np.int64),  # taken so far
+        ("claimed", np.float64, 3),  # variance of each coordinate of the last one [m^2]
         ("too_late", np.bool_),  # whether the last tip was older than the one before
         ("pending", np.int64),  # advances that wait for a tip, in
         ("pending_length", np.float64, LONGEST_QUEUE),  # [m]
@@ -79,14 +85,15 @@ ESTIMATE = np.dtype(
         ("coordinates", np.float64, 6),  # x, y, z [m], yaw, pitch, roll [rad]
         ("linearized", np.float64, 3),  # mean of the linearized states (6)
         ("uncertainty", np.float64, 3),  # var(x), cov(x, sin(pitch)), var(sin(pitch))
-        ("covariance", np.float64, (6, 6)),  # of tip and rotation vector; where asked for
+        ("covariance", np.float64, (6, 6)),  # of tip and rotation vector
+        ("miss", np.float64),  # probability that the tip is farther from the plane than `NEAR`
         ("curvature", np.float64),  # [1/m]
         ("scale", np.float64),  # insertion scale
         ("noise", np.float64),  # as a multiple of what is claimed
         ("ambiguous", np.float64),  # weight of rolls more than 60 deg from the likeliest
         ("base", np.float64),  # rotation of the base since the start [rad]
         ("wound", np.float64),  # rotation of the base as the joint says it [rad]
-        ("doubts", np.int64),  # bit k: reason k of `DOUBTS`
+        ("warnings", np.int64),  # bit k: number k of `WARNINGS`
     ]
 )
 TORSION = np.dtype(
@@ -98,6 +105,7 @@ TORSION = np.dtype(
         ("behind_play", np.float64),
         ("play", np.float64),
         ("lag", np.float64),
+        ("gain", np.float64),
         ("weight", np.float64),  # 0 where nothing is left of it
     ]
 )
@@ -111,16 +119,13 @@ ASSUMPTIONS = np.dtype(
         ("curvature_drift", np.float64),
         ("scale_spread", np.float64),
         ("scale_drift", np.float64),
-        ("play_drift", np.float64),
-        ("lag_drift", np.float64),
+        ("size_drift", np.float64, 3),  # of play, lag and gain
         ("largest_play", np.float64),
         ("smallest_lag", np.float64),
         ("largest_lag", np.float64),
         ("longest_step", np.float64),
         ("believed_bound", np.float64),
         ("entry_std", np.float64),
-        ("softness", np.float64),
-        ("mistrust", np.float64),
         ("model_error", np.float64),
         ("outlier_share", np.float64),
         ("outlier_density", np.float64),
