@@ -23,13 +23,12 @@ from needle_tracker.filter.needle_track import NeedleTrack
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.optics.refraction import stereo_views
-from needle_tracker.stereo.sighting import Ends, Sighting, StereoSearch, evidence
+from needle_tracker.stereo.sighting import SIGMAS, Ends, Sighting, StereoSearch, evidence
 from needle_tracker.stereo.triangulation import SpatialTip, triangulate
 
 Array = NDArray[np.float64]
 
 _TRACKS = 4  # things followed at once
-_GATE_SIGMAS = 3.0
 _LEAST_GATE_PX = 4.0  # half the size of the window that an end is looked for in
 _MOST_FOLLOWED = 8e-3  # an end known worse than that is searched for [m]
 _LEAST_NEW_WIDTHS = 3.0  # of needle, since a background that is of use [needle widths]
@@ -192,7 +191,7 @@ class NeedleTracker:
         settings = self.settings
         least, most = settings.hole_clearance, settings.reach.length
         if insertion is not None:
-            margin = _GATE_SIGMAS * math.hypot(
+            margin = SIGMAS * math.hypot(
                 settings.stage_zero_sigma, settings.stage_scale_sigma * insertion
             )
             least = max(least, settings.reach.shortest_chord(insertion) - margin)
@@ -228,8 +227,8 @@ class NeedleTracker:
             end = detector.fit(
                 point,
                 direction,
-                along=_LEAST_GATE_PX + _GATE_SIGMAS * math.sqrt(direction @ spread @ direction),
-                across=_LEAST_GATE_PX + _GATE_SIGMAS * math.sqrt(across @ spread @ across),
+                along=_LEAST_GATE_PX + SIGMAS * math.sqrt(direction @ spread @ direction),
+                across=_LEAST_GATE_PX + SIGMAS * math.sqrt(across @ spread @ across),
             )
             if end is None:
                 return None
