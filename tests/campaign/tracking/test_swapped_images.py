@@ -118,5 +118,5 @@ def test_the_answers_stay_as_they_are(
         [answer] = answered
         measured = alone.process(right, left, insertion)
         assert (answer.measured.state, answer.measured.reason) == (measured.state, measured.reason)
-        assert (answer.tip is None) == (measured.tip is None)
+        assert (answer.measured.tip is None) == (measured.tip is None)
     assert answers.swap.suspected
