@@ -21,7 +21,7 @@ def tracker_settings(calibration: StereoCalibration) -> TrackerSettings:
         windows=(calibration.left.window, calibration.right.window),
         needle_width=0.7e-3,
         tip_lean=math.radians(12),
-        entry_zone=5e-3,
+        entry_zone=8e-3,
         hole_clearance=2e-3,
         stage_zero_sigma=0.5e-3,
         stage_scale_sigma=0.01,

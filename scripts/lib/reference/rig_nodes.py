@@ -289,9 +289,6 @@ WAYS: dict[str, tuple[Way, ...]] = {
         Way("with `wait_for_recorder`", ("wait_for_recorder:=true",)),
     ),
     "stereo_camera": (Way(make=_camera, then=_tick),),
-    "stereo_tracker": (
-        Way(then=_turn),
-        Way("with `heading_from_estimate`", ("heading_from_estimate:=true",), then=_turn),
-    ),
+    "stereo_tracker": (Way(then=_turn),),
 }
 """How to make a node that wants more than its name, or has several ways."""

@@ -108,7 +108,7 @@ def test_the_answers_stay_as_they_are(
 ) -> None:
     settings = default_settings(calibration)
     alone = NeedleTracker(calibration, settings)
-    answers = PairAnswers(calibration, settings, pair_tolerance_ns=0, joint_timeout=0.2, lean=0.0)
+    answers = PairAnswers(calibration, settings, pair_tolerance_ns=0, joint_timeout=0.2)
     for k, (insertion, left, right) in enumerate(pairs(calibration_path, "heavy_clutter", 1), 1):
         answered = [
             *answers.add_insertion(k, insertion, 0.0),
@@ -118,5 +118,5 @@ def test_the_answers_stay_as_they_are(
         [answer] = answered
         measured = alone.process(right, left, insertion)
         assert (answer.measured.state, answer.measured.reason) == (measured.state, measured.reason)
-        assert (answer.tip is None) == (measured.tip is None)
+        assert (answer.measured.tip is None) == (measured.tip is None)
     assert answers.swap.suspected

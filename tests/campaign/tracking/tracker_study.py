@@ -103,7 +103,8 @@ def track_run(
         states.append(measured.state)
         seen.append(min(exposure.seen) >= _SEEN)
         error, square = np.full(3, np.nan), np.nan
-        if measured.tip is not None:
+        # In the entry zone a tip may be the stage's alone: it was not found.
+        if measured.tip is not None and measured.state is not TrackState.ENTRY:
             error = measured.tip.position - exposure.T_rig_tip[:3, 3]
             square = float(error @ np.linalg.solve(measured.tip.covariance, error))
         errors.append(error)

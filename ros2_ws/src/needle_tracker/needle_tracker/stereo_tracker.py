@@ -13,7 +13,6 @@ from needle_core.component import (
     IMAGES_BEST_EFFORT,
     JOINT_STATES,
     LATCHED,
-    RELIABLE,
     Actions,
     Component,
     Diagnose,
@@ -36,8 +35,6 @@ from needle_tracker.answers.tracker_messages import (
     frame_of,
     insertion_of,
     picture_message,
-    roll_sigma_of,
-    rotation_of,
     tip_message,
     tip_pose_message,
 )
@@ -47,7 +44,6 @@ from needle_tracker.optics.calibration import SIDES, StereoCalibration, calibrat
 
 TIP, TIP_POSE = "needle/tip", "needle/tip_pose"
 ANNOTATED, CALIBRATION = "stereo_tracker/annotated_image", "stereo_tracker/calibration"
-TARGET_PLANE = "target_plane"
 _CHECK_PERIOD = 0.05  # [s]
 
 
@@ -92,7 +88,6 @@ class StereoTipTracker(Component):
             settings.tracker_settings(calibration),
             pair_tolerance_ns=settings.pair_tolerance_ns,
             joint_timeout=settings.joint_timeout,
-            lean=settings.lean,
         )
         self._health = Health()
         rate = settings.annotated_rate
@@ -100,7 +95,8 @@ class StereoTipTracker(Component):
         self._annotated_at = -math.inf
         # What every start begins with is not worth a warning in the log.
         self._told = {"track": TrackState.SEARCHING.value, "images": "no images yet"}
-        self.inputs = (*self._source_rows(), *self._image_rows())
+        joints = Input("joint_states", m.JointState, self._on_joints, JOINT_STATES)
+        self.inputs = (joints, *self._image_rows())
         self.outputs = (
             Output(TIP, m.Point),
             Output(TIP_POSE, m.PoseWithCovariance),
@@ -128,7 +124,7 @@ class StereoTipTracker(Component):
             stamp_ns, tip = answer.pair.stamp, answer.measured.tip
             if tip is not None:
                 yield Publish(TIP, tip_message(tip, stamp_ns))
-            yield Publish(TIP_POSE, tip_pose_message(answer.tip, stamp_ns))
+            yield Publish(TIP_POSE, tip_pose_message(tip, stamp_ns))
             yield from self._annotate(answer, at)
             if answer.refused:
                 self._health.pair_refused(answer.refused, at.steady)
@@ -136,13 +132,6 @@ class StereoTipTracker(Component):
             yield from self._report(at)
 
     # ---- inputs -------------------------------------------------------------------------------
-
-    def _source_rows(self) -> list[Input]:
-        rows = [Input("joint_states", m.JointState, self._on_joints, JOINT_STATES)]
-        if self.settings.heading_from_estimate:
-            estimate = Input("needle/estimate", m.PoseWithCovariance, self._on_estimate, RELIABLE)
-            rows += [estimate, Input(TARGET_PLANE, m.Pose, self._on_plane, LATCHED)]
-        return rows
 
     def _image_rows(self) -> list[Input]:
         delivery = IMAGES if self.settings.reliable_images else IMAGES_BEST_EFFORT
@@ -171,19 +160,6 @@ class StereoTipTracker(Component):
         problem, in_size = camera_info_problem(message, side, self._cameras[side])
         self._health.camera_info[side] = problem
         self.answers.add_contradiction(side, problem if in_size else "")
-        return ()
-
-    def _on_estimate(self, message: m.PoseWithCovariance, at: Moment) -> Actions:
-        rotation = rotation_of(message)
-        if rotation is not None:
-            sigma = roll_sigma_of(message.covariance, rotation[:, 2])
-            self.answers.add_roll(message.stamp_ns, rotation, sigma)
-        return ()
-
-    def _on_plane(self, message: m.Pose, at: Moment) -> Actions:
-        rotation = rotation_of(message)
-        if rotation is not None:
-            self.answers.add_plane(rotation)
         return ()
 
     # ---- what is said -------------------------------------------------------------------------

@@ -308,30 +308,6 @@ def test_pictures_are_drawn_where_somebody_looks_and_not_for_every_pair(make: Ma
     assert bench.sent["stereo_tracker/calibration"] == [m.Text("text of the file")]
 
 
-def test_the_heading_is_told_where_the_estimate_knows_the_roll(make: Make) -> None:
-    bench = make(heading_from_estimate=True, lean=0.1)
-    half = math.sqrt(0.5)
-    bench.hear("target_plane", m.Pose(0, "rig", (0.0, 0.0, 0.0), (0.0, 0.0, half, half)))
-    estimate = m.PoseWithCovariance(
-        0, "target_plane", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1e-4,) * 36
-    )
-    for stamp, covariance, away in (
-        (1, 1e-4, -math.sin(0.1)),
-        # A roll that is hardly known, and one of long ago, take no lean off.
-        (2, 1.0, 0.0),
-        (6 * SECOND, 1e-4, 0.0),
-    ):
-        bench.hear(
-            "needle/estimate",
-            dataclasses.replace(estimate, covariance=tuple(covariance * np.eye(6).ravel())),
-        )
-        assert bench.pair(stamp)
-        x, y, z, w = bench.sent["needle/tip_pose"][-1].orientation
-        # The plane's y is -x of rig: the visible end is bent from the heading towards it.
-        assert 2.0 * (x * z + y * w) == pytest.approx(away, abs=1e-3)
-        assert 2.0 * (y * z - x * w) == pytest.approx(0.0, abs=1e-3)
-
-
 def test_bad_parameters_are_refused_and_the_installed_calibration_is_the_default(
     calibration_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

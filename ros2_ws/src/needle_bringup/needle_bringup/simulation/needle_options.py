@@ -46,12 +46,10 @@ _WIDTHS = {
     "stereo_tracker": "needle_width",
     "plane_controller": "needle_diameter",
 }
-_LEANS = {"sim_rig": "pre_bend_lean", "stereo_tracker": "lean"}
 _FILES = {"sim_rig": "calibration_file", "stereo_tracker": "calibration_file"}
 SHARED = (
     Shared("curvature", "--curvature", CURVATURE, "1/m", _CURVATURES),
     Shared("diameter", "--diameter-mm", DIAMETER, "m", _WIDTHS),
-    Shared("lean of the needle's end", "--pre-bend-deg", LEAN, "rad", _LEANS),
     Shared("calibration", "--params", "", "", _FILES),
 )
 
@@ -83,7 +81,7 @@ def needle_parameters(
     if pre_bend is not None:
         lean = pre_bend * LEAN / PRE_BEND
         sim_rig["pre_bend"], sim_rig["pre_bend_lean"] = pre_bend, lean
-        tracker["lean"], tracker["tip_lean"] = lean, lean + _LEAN_MARGIN
+        tracker["tip_lean"] = lean + _LEAN_MARGIN
     return {"sim_rig": sim_rig, "stereo_tracker": tracker, "plane_controller": controller}
 
 

@@ -47,7 +47,7 @@ OPTIONS = {
     **dict.fromkeys(("initial_pitch", "initial_roll", "target_offset"), "--initial"),
     **dict.fromkeys(("tip_noise", "tip_covariance", "tip_noise_bound"), "--noise-mm"),
     **dict.fromkeys(("needle_diameter", "needle_width"), "--diameter-mm"),
-    **dict.fromkeys(("pre_bend", "pre_bend_lean", "lean", "tip_lean"), "--pre-bend-deg"),
+    **dict.fromkeys(("pre_bend", "pre_bend_lean", "tip_lean"), "--pre-bend-deg"),
     **dict.fromkeys(("curvature", "max_curvature"), "--curvature"),
     "torsion_play": "--play-deg",
     "torsion_lag": "--lag-mm",

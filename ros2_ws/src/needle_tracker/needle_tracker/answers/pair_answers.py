@@ -15,7 +15,6 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.answers.pre_bend import heading_of
 from needle_tracker.answers.swapped_images import SwapWatch
 from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
@@ -23,11 +22,8 @@ from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.sources.insertion_history import InsertionHistory
 from needle_tracker.sources.pairing import Pair, PairMatcher
-from needle_tracker.stereo.triangulation import SpatialTip
 
 _NEW_RECORDING = 1_000_000_000  # [ns]: a longer step back in time begins a new recording
-_ROLL_AGE = 5_000_000_000  # [ns]
-_ROLL_SIGMA = 0.6  # a roll known worse than that takes no lean off [rad]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,8 +46,6 @@ class Answer:
         When the pair was complete [s], steady clock.
     measured : Measurement
         What the tracker says.
-    tip : SpatialTip or None
-        The tip to publish, its direction the heading where the roll is known; None: no tip found.
     refused : str
         Why the pair was not looked at; empty where it was.
     """
@@ -59,7 +53,6 @@ class Answer:
     pair: Pair[Frame]
     arrival: float
     measured: Measurement
-    tip: SpatialTip | None
     refused: str
 
 
@@ -76,8 +69,6 @@ class PairAnswers:
         Largest difference of the stamps of a pair [ns]; None of cameras that run freely.
     joint_timeout : float
         How long a pair waits for the joint state that follows it [s], steady clock.
-    lean : float
-        Angle between heading and visible end [rad].
 
     Attributes
     ----------
@@ -94,7 +85,6 @@ class PairAnswers:
         *,
         pair_tolerance_ns: int | None,
         joint_timeout: float,
-        lean: float,
     ) -> None:
         self.tracker = NeedleTracker(calibration, tracker)
         self.tracker.warm_up()
@@ -103,13 +93,10 @@ class PairAnswers:
         self.insertions = InsertionHistory()
         self.joints_silent = False
         self.unanswered = self.too_early = 0
-        self._joint_timeout, self._lean = joint_timeout, lean
+        self._joint_timeout = joint_timeout
         self._queue: deque[tuple[float, Pair[Frame]]] = deque()
         self._last_stamp: int | None = None
         self._contradictions: dict[str, str] = {}
-        # The controller's last estimate: stamp [ns], axes of the tip's frame in `rig`, sigma [rad].
-        self._roll: tuple[int, NDArray[np.float64], float] | None = None
-        self._T_rig_plane = np.eye(3)
 
     def add_image(self, side: str, stamp: int, frame: Frame, now: float) -> Iterator[Answer]:
         """Take an image of one side, exposed at `stamp` [ns]; then as `ready`."""
@@ -127,14 +114,6 @@ class PairAnswers:
         self.joints_silent = False
         self.insertions.add(stamp, insertion)
         return self.ready(now)
-
-    def add_plane(self, rotation: NDArray[np.float64]) -> None:
-        """Take the axes of the target plane in `rig`, (3, 3), columns."""
-        self._T_rig_plane = rotation
-
-    def add_roll(self, stamp: int, rotation: NDArray[np.float64], sigma: float) -> None:
-        """Take the estimated axes of the tip's frame in the plane, (3, 3), and its roll's sigma."""
-        self._roll = stamp, self._T_rig_plane @ rotation, sigma
 
     def ready(self, now: float) -> Iterator[Answer]:
         """Yield the answers, in order, to all pairs whose insertion is settled.
@@ -165,10 +144,7 @@ class PairAnswers:
             measured = self.tracker.skip(refused)
         else:
             measured = self.tracker.process(left, right, self.insertions.at(pair.stamp))
-        tip = measured.tip
-        if tip is not None:
-            tip = self._with_heading(tip, pair.stamp)
-        return Answer(pair, arrival, measured, tip, refused)
+        return Answer(pair, arrival, measured, refused)
 
     def _suspect(self, answer: Answer) -> None:
         """Look whether the images seem to be swapped."""
@@ -189,15 +165,3 @@ class PairAnswers:
             self.tracker.reset()
             self._last_stamp = pair.stamp
         return "time of exposure ran backwards" if back else "time of exposure repeated"
-
-    def _with_heading(self, tip: SpatialTip, stamp: int) -> SpatialTip:
-        """Return the tip with its heading in the visible end's place, where the roll is known."""
-        if self._roll is None:
-            return tip
-        at, rotation, sigma = self._roll
-        if abs(stamp - at) > _ROLL_AGE or not sigma < _ROLL_SIGMA:
-            return tip
-        heading, covariance = heading_of(
-            tip.direction, tip.direction_covariance, rotation, sigma, self._lean
-        )
-        return dataclasses.replace(tip, direction=heading, direction_covariance=covariance)

@@ -56,7 +56,7 @@ def missing(measured: Measurement) -> str:
 
 @dataclasses.dataclass
 class SeenCounts:
-    """Counts of what pairs showed, but for those in the entry zone, which are not looked at."""
+    """Counts of what pairs showed, but for those that the entry zone excuses."""
 
     pairs: int = 0
     ends: Counter[str] = dataclasses.field(default_factory=Counter)

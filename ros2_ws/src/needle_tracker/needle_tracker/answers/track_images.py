@@ -51,7 +51,8 @@ The output is a CSV file, one line for each pair:
   left_end right_end  how many needle ends the network expects there, about 1 where the end is seen
   left_shaft right_shaft  mean probability of shaft behind it; empty where nothing was found
   missing         why there is no tip; docs/images.md says what helps
---insertion helps: one look at the needle is then enough. Below 4.5 mm (entry_zone) there is no tip.
+--insertion helps: one look at the needle is then enough. A needle shorter than 8 mm (entry_zone) is
+seen or not: nothing is wrong with images that do not show it.
 The stage's zero and scale may be off (stage_zero_sigma, stage_scale_sigma); both are estimated and
 printed.
 Without --insertion tips come from the images alone: the needle is believed when its end has moved

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numpy.typing import NDArray
 
 from needle_core.messages import (
@@ -114,13 +112,6 @@ def rotation_of(pose: Pose | PoseWithCovariance) -> NDArray[np.float64] | None:
     quaternion = np.array(pose.orientation)
     norm = float(np.linalg.norm(quaternion))
     return rotation_matrix(quaternion / norm) if 0.5 < norm < 2.0 else None
-
-
-def roll_sigma_of(covariance: npt.ArrayLike, axis: NDArray[np.float64]) -> float:
-    """Return the standard deviation of the rotation about an axis, from a pose's covariance."""
-    rotations = np.reshape(np.asarray(covariance, dtype=np.float64), (6, 6))[3:, 3:]
-    variance = float(axis @ rotations @ axis)
-    return math.sqrt(variance) if variance >= 0.0 else math.inf
 
 
 def picture_message(pixels: NDArray[np.uint8], stamp_ns: int) -> Image:

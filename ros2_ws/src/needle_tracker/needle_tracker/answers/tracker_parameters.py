@@ -45,7 +45,11 @@ class StereoTrackerParameters:
         0.7e-3, "m", "Diameter of the needle, good to 30 %.", 0.2e-3, 3e-3
     )
     entry_zone: float = fixed_parameter(
-        4.5e-3, "m", "Insertion below which the tip follows from the insertion alone.", 0.0, 0.05
+        8e-3,
+        "m",
+        "Insertion below which the tip of a needle that is not seen follows from the insertion.",
+        0.0,
+        0.05,
     )
     hole_clearance: float = fixed_parameter(
         2.0e-3, "m", "Radius about the entry point that is not looked at (hole, rim).", 0.5e-3, 0.02
@@ -70,12 +74,6 @@ class StereoTrackerParameters:
     )
     tip_lean: float = fixed_parameter(
         0.21, "rad", "Largest angle between visible end and needle's path (pre-bend).", 0.0, 0.8
-    )
-    lean: float = fixed_parameter(
-        0.0977, "rad", "Angle of heading and visible end, for heading_from_estimate.", 0.0, 0.7
-    )
-    heading_from_estimate: bool = fixed_parameter(
-        False, "-", "Publish the heading (lean taken off) where needle/estimate knows the roll."
     )
     annotated_rate: float = fixed_parameter(
         2.0, "Hz", "Most annotated images a second, while someone subscribes; 0: none.", 0.0, 100.0

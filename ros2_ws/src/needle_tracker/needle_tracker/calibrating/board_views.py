@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_session import Session
-from needle_tracker.calibrating.charuco import check_board_seen
 from needle_tracker.calibrating.rig_model import BoardView, Corners
 from needle_tracker.optics.calibration import SIDES
 from needle_tracker.sources.image_files import Image, Sizes, open_pairs, progress
@@ -63,8 +62,7 @@ def views_in_folders(
         names = [Path(path).stem for path in (pair.name, *pair.files)]
         views.append(BoardView(names[0], session.place_of(*names), *seen))
     if all(nothing_seen(view) for view in views):
-        images = (image for pair in pairs for image in (pair.left, pair.right) if image is not None)
-        check_board_seen(images, session.board)
+        raise _no_board(session)
     used = [view.place for view in views]
     for name, place in session.places.items():
         if all_places and not any(place is one for one in used):
@@ -101,5 +99,12 @@ def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) ->
         seen.append(Corners(session.board.corners[kept], pixels))
     view = BoardView(name, session.place_of(name), seen[0], seen[1])
     if nothing_seen(view):
-        check_board_seen([image for images in pairs for image in images.values()], session.board)
+        raise _no_board(session)
     return view
+
+
+def _no_board(session: Session) -> UserError:
+    return UserError(
+        f"no image shows the session's board ({session.board}): are columns, rows and dictionary "
+        "those of the print, and `legacy` if OpenCV before 4.6 made it? blurred, or too small?"
+    )

@@ -17,7 +17,7 @@ from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_comm
 from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
 from needle_tracker.calibrating.board_views import nothing_seen, views_in_folders
-from needle_tracker.calibrating.calibration_figures import residual_figure, rig_figure, save_figure
+from needle_tracker.calibrating.calibration_figures import rig_figure, save_figure
 from needle_tracker.calibrating.calibration_outliers import doubts, misfits, square_error
 from needle_tracker.calibrating.calibration_session import load_session
 from needle_tracker.calibrating.charuco import CharucoBoard, write_board
@@ -55,7 +55,7 @@ in air, and those under the surface, suffice.
 """
 _SCALE_TOLD = 0.1  # [%]
 _EPILOG = """\
-writes: FILE.yaml, FILE.rig.png (cameras, surface, boards), FILE.residuals.png
+writes: FILE.yaml, FILE.rig.png (cameras, surface, boards)
 
 examples:
   ros2 run needle_tracker calibrate_stereo --board board.pdf
@@ -108,7 +108,6 @@ def calibrate_stereo(arguments: Sequence[str]) -> int:
     print(text)
     save_calibration(options.output, result.calibration, text.splitlines())
     save_figure(rig_figure(result), options.output.with_suffix(".rig.png"))
-    save_figure(residual_figure(result), options.output.with_suffix(".residuals.png"))
     if options.json is not None:
         values = figures(result, options.goal_mm) | {"problem": "; ".join(problems) or None}
         write_json(options.json, values)

@@ -1,4 +1,4 @@
-"""Pictures of a calibration: the rig with its boards, and what the corners miss by."""
+"""Picture of a calibration: the rig with its boards."""
 
 from __future__ import annotations
 
@@ -48,34 +48,6 @@ def rig_figure(result: RigCalibration) -> Figure:
     shown = [line for name, line in named.items() if not str(name).startswith("_")]
     figure.legend(handles=shown, loc="outside lower center", ncols=4, fontsize=8)
     figure.suptitle("The rig as calibrated")
-    return figure
-
-
-def residual_figure(result: RigCalibration) -> Figure:
-    """Return each camera's residuals over the image (enlarged) and the error of every view."""
-    figure = Figure(figsize=(11.0, 8.5))
-    enlarged = 20.0 / max(result.fit.corner_sigma_px, 1e-3)
-    for number, side in enumerate(SIDES):
-        camera = result.calibration.cameras[side]
-        pixels, errors = result.model.pixels[side], result.residuals(side)
-        axes = figure.add_axes((0.06 + 0.49 * number, 0.53, 0.43, 0.43))
-        axes.quiver(
-            pixels[:, 0], pixels[:, 1], errors[:, 0], errors[:, 1],
-            angles="xy", scale_units="xy", scale=1.0 / enlarged,
-            width=1e-3, color=_COLOURS[side],
-        )  # fmt: skip
-        axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal")
-        rms = result.reprojection_rms_px(side)
-        axes.set_title(f"{side}: {rms:.3f} px rms (arrows {enlarged:.0f} times as long)")
-        axes.set(xlabel="u [px]", ylabel="v [px]")
-    axes = figure.add_axes((0.08, 0.14, 0.88, 0.30))
-    places = np.arange(len(result.model.views))
-    for side, offset in zip(SIDES, (-0.2, 0.2), strict=True):
-        errors = np.array([result.reprojection_rms_px(side, int(i)) for i in places])
-        axes.bar(places + offset, errors, 0.4, color=_COLOURS[side], label=side)
-    axes.set_xticks(places, [view.name for view in result.model.views], rotation=90, fontsize=7)
-    axes.set_ylabel("reprojection error, rms [px]")
-    axes.legend()
     return figure
 
 

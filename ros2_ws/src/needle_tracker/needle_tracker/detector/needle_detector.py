@@ -32,10 +32,9 @@ _COARSE_WIDTH_PX = 4.4
 """Needles at least so wide are searched at half size: there they are 2.2 px, the least trained."""
 _FULL_SIZE_REACH = 20e-3
 """From the entry, all is searched at full size, which shows more of a short needle [m]."""
-_CORRIDOR_WIDTHS = 5.0  # about a path, in which it is traced at full size [needle widths]
 _STRIPS = 3  # boxes that an image is searched in
 _END_BLUR_PX = 5  # side of the square that ends are summed over at a cell of the search grid
-_NEAR_WIDTHS = 5.0  # about a path's end, ends are looked for at full size [needle widths]
+_NEAR_WIDTHS = 5.0  # about a path, in which shaft and ends are looked for at full size [widths]
 _LEAST_ENDS = 0.05  # expected in a window from which on it is a candidate
 _AHEAD_WIDTHS = 4.0  # seen beyond the expected end: the network must see what follows
 
@@ -122,7 +121,7 @@ class NeedleDetector:
         """Return the path to an end as the image at full size shows it, near one that was found."""
         grid, rows = self._grid, len(path.pixels)
         off = np.linalg.norm(grid.pixels[:rows] - path.pixels[:, None], axis=-1)
-        near = grid.reachable[:rows] & (off < _CORRIDOR_WIDTHS * self.width_px)
+        near = grid.reachable[:rows] & (off < _NEAR_WIDTHS * self.width_px)
         if not near.any():
             return path
         shaft, ends = self._sampled(near, self._shrink)

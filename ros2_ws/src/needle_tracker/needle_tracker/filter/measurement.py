@@ -21,7 +21,7 @@ class TrackState(enum.Enum):
     CONFIRMING = "CONFIRMING"  # something like a needle, not believed yet
     TRACKING = "TRACKING"
     LOST = "LOST"  # was tracked and is not seen
-    ENTRY = "ENTRY"  # too short to be seen: the tip follows from the insertion
+    ENTRY = "ENTRY"  # short, and not seen: the tip follows from the insertion
 
 
 class NoTip(str, enum.Enum):

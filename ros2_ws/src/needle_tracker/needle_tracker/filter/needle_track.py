@@ -23,13 +23,11 @@ from needle_tracker.filter.needle_motion import (
     gaussian,
 )
 from needle_tracker.filter.settings import FilterSettings, TrackerSettings
-from needle_tracker.stereo.sighting import Sighting
+from needle_tracker.stereo.sighting import GATE, Sighting
 from needle_tracker.stereo.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
 
-GATE = 25.0
-"""Squared distance over the covariance from which on a sighting is not a track's: 5 sigma."""
 _LENGTH_SIGMA = 0.4e-3  # of a shaft's length as both views show it [m], from path-traced pairs
 _ASIDE_SIGMAS = 2.5  # the widest reach, in standard deviations of where needles go
 _SHADOW = 3.0  # log-odds of a needle against its own shadow or mirror image

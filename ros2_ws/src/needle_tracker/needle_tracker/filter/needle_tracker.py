@@ -23,13 +23,12 @@ from needle_tracker.filter.needle_track import NeedleTrack
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.optics.refraction import stereo_views
-from needle_tracker.stereo.sighting import Ends, Sighting, StereoSearch, evidence
+from needle_tracker.stereo.sighting import SIGMAS, Ends, Sighting, StereoSearch, evidence
 from needle_tracker.stereo.triangulation import SpatialTip, triangulate
 
 Array = NDArray[np.float64]
 
 _TRACKS = 4  # things followed at once
-_GATE_SIGMAS = 3.0
 _LEAST_GATE_PX = 4.0  # half the size of the window that an end is looked for in
 _MOST_FOLLOWED = 8e-3  # an end known worse than that is searched for [m]
 _LEAST_NEW_WIDTHS = 3.0  # of needle, since a background that is of use [needle widths]
@@ -136,6 +135,14 @@ class NeedleTracker:
         for side, image in zip(SIDES, pair, strict=True):
             if int(image[::8, ::8].max()) < _DARK:
                 return self.skip(f"{side} image is black")
+        measured = self._measure(pair, insertion)
+        if measured.tip is None and insertion is not None and insertion < self.settings.entry_zone:
+            tip = tip_at_entry(insertion, self.settings)
+            return dataclasses.replace(measured, tip=tip, state=TrackState.ENTRY, reason="")
+        return measured
+
+    def _measure(self, pair: Pair, insertion: float | None) -> Measurement:
+        """Measure the tip as the images show it."""
         changed = self._view_changed(pair)
         if changed:
             # What stands behind the needle is no longer known.
@@ -143,9 +150,9 @@ class NeedleTracker:
         background = self._background.see(pair, insertion)
         if background is not self._shown:
             self._use_background(background)
-        if insertion is not None and insertion < self.settings.entry_zone:
+        if insertion is not None and insertion < self.settings.hole_clearance:
             self.reset()
-            return Measurement(tip_at_entry(insertion, self.settings), TrackState.ENTRY, "")
+            return self._answer(None, NoTip.NOTHING)
         for detector, image in zip(self._detectors, pair, strict=True):
             detector.see(image)
         settings = self.settings
@@ -184,7 +191,7 @@ class NeedleTracker:
         settings = self.settings
         least, most = settings.hole_clearance, settings.reach.length
         if insertion is not None:
-            margin = _GATE_SIGMAS * math.hypot(
+            margin = SIGMAS * math.hypot(
                 settings.stage_zero_sigma, settings.stage_scale_sigma * insertion
             )
             least = max(least, settings.reach.shortest_chord(insertion) - margin)
@@ -220,8 +227,8 @@ class NeedleTracker:
             end = detector.fit(
                 point,
                 direction,
-                along=_LEAST_GATE_PX + _GATE_SIGMAS * math.sqrt(direction @ spread @ direction),
-                across=_LEAST_GATE_PX + _GATE_SIGMAS * math.sqrt(across @ spread @ across),
+                along=_LEAST_GATE_PX + SIGMAS * math.sqrt(direction @ spread @ direction),
+                across=_LEAST_GATE_PX + SIGMAS * math.sqrt(across @ spread @ across),
             )
             if end is None:
                 return None
@@ -291,7 +298,7 @@ class NeedleTracker:
 
 
 def tip_at_entry(insertion: float, settings: TrackerSettings) -> SpatialTip:
-    """Return the tip of a needle that is too short to be seen: on the z axis of `rig`."""
+    """Return the tip of a short needle that is not seen: on the z axis of `rig`."""
     reach = settings.reach
     sideways = math.hypot(reach.hole_tolerance, insertion * math.sin(reach.entry_angle))
     along = math.hypot(reach.hole_tolerance, insertion * (1.0 - math.cos(reach.entry_angle)))

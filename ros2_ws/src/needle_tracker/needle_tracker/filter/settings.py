@@ -80,7 +80,7 @@ class TrackerSettings:
     tip_lean : float
         Largest angle between the visible end and the needle's path (pre-bend) [rad].
     entry_zone : float
-        Insertion below which the needle is not looked for [m].
+        Insertion below which the tip of a needle that is not seen follows from the insertion [m].
     hole_clearance : float
         Radius around the entry that is not looked at [m].
     stage_zero_sigma : float

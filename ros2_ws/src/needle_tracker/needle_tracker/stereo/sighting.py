@@ -21,15 +21,17 @@ from needle_tracker.stereo.triangulation import SpatialTip, triangulate
 Array = NDArray[np.float64]
 Ends = tuple[ImageEnd | None, ImageEnd | None]
 
+GATE = 25.0
+"""Squared distance over its covariance from which on two things are not one: 5 sigma."""
+SIGMAS = 3.0
+"""Of what is known, that a place may lie off."""
 _CLOSER_LOOKS = 5  # pairs of paths whose ends are fitted at full size
 # Of a path's end [px] and direction [rad]: what half the size shows as one line may be two.
 _PATH_ACROSS_PX, _PATH_ALONG_PX, _PATH_ANGLE = 4.0, 10.0, 0.1
 _YOUNG = 15e-3  # of a shorter needle one view's end will do: a loop waits for its first tip [m]
 _SAME_PX = 2.0  # ends so near are one [px]
-_MAX_MISFIT = 25.0  # chi-squared of one degree of freedom: worse pairs show two things
 _LEAST_CHANCE = 0.02  # the network is not surer than that
 _PRE_BEND = 10e-3  # longest part of the needle that is bent beforehand [m]
-_LOOSE_SIGMAS = 3.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -121,7 +123,7 @@ class StereoSearch:
         pairs = []
         for pair in itertools.product(*paths):
             tip = triangulate(self.views, (_coarse_end(pair[0]), _coarse_end(pair[1])))
-            if tip is not None and tip.misfit < _MAX_MISFIT:
+            if tip is not None and tip.misfit < GATE:
                 pairs.append((pair[0].score + pair[1].score - 0.5 * tip.misfit, pair))
         pairs.sort(key=lambda scored: -scored[0])
         best = [pair for _, pair in pairs[:_CLOSER_LOOKS]]
@@ -137,7 +139,7 @@ class StereoSearch:
     ) -> Sighting | None:
         """Return what two ends are together; None if that cannot be the needle."""
         tip = triangulate(self.views, ends)
-        if tip is None or tip.misfit > _MAX_MISFIT or not self.is_possible(tip, least, most):
+        if tip is None or tip.misfit > GATE or not self.is_possible(tip, least, most):
             return None
         # At half the size a needle and its shadow may be one line.
         left, right = (
@@ -172,7 +174,7 @@ class StereoSearch:
         bend = 0.5 * self.reach.curvature * distance**2
         lean = math.sin(self.tip_lean) * min(distance, _PRE_BEND)
         sigma = math.sqrt(float(np.trace(tip.direction_covariance)))
-        loose = self.reach.hole_tolerance + _LOOSE_SIGMAS * sigma * distance
+        loose = self.reach.hole_tolerance + SIGMAS * sigma * distance
         return ahead > 0.0 and miss <= bend + lean + loose
 
 

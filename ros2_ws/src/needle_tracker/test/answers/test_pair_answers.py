@@ -50,9 +50,7 @@ def answering(
     monkeypatch.setattr(
         "needle_tracker.filter.needle_tracker.NeedleTracker.warm_up", lambda _: None
     )
-    answers = PairAnswers(
-        calibration, settings, pair_tolerance_ns=None, joint_timeout=TIMEOUT, lean=0.0
-    )
+    answers = PairAnswers(calibration, settings, pair_tolerance_ns=None, joint_timeout=TIMEOUT)
     bench = Answering(answers)
     monkeypatch.setattr(bench.answers.tracker, "process", bench.process)
     monkeypatch.setattr(bench.answers.swap, "see", lambda *_: None)

@@ -76,7 +76,7 @@ def another_board(folder: Path) -> None:
         (write("right/top.png", np.zeros((48, 64), np.uint8)), "top.png is 64x48"),
         (broken, "cannot read .*top.png"),
         (no_image_of_the_place, "places.top has no image"),
-        (another_board, "give `columns: 6` as its board"),
+        (another_board, "no image shows the session's board .* `legacy`"),
     ],
 )
 def test_folders_that_are_no_session_are_refused(

@@ -1,4 +1,4 @@
-"""The board: found where it is drawn, printed at its size, named where it is another one."""
+"""The board: found where it is drawn, printed at its size."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from needle_core.errors import UserError
-from needle_tracker.calibrating.charuco import CharucoBoard, check_board_seen, write_board
+from needle_tracker.calibrating.charuco import CharucoBoard, write_board
 
 from .drawn_boards import SMALL, board_image
 
@@ -65,34 +65,3 @@ def test_the_printed_board_has_its_true_size(tmp_path: Path) -> None:
         write_board(SMALL, tmp_path / "board.jpg")
     with pytest.raises(UserError, match="cannot write"):
         write_board(SMALL, tmp_path / "none" / "board.png")
-
-
-WIDE = CharucoBoard(6, 4, dictionary="DICT_4X4_50")
-OLD = CharucoBoard(6, 4, dictionary="DICT_4X4_50", legacy=True)
-
-
-@pytest.mark.parametrize(
-    ("printed", "said", "cure"),
-    [
-        (OLD, WIDE, "`legacy: True`"),
-        (WIDE, CharucoBoard(4, 6, dictionary="DICT_4X4_50"), "`columns: 6, rows: 4`"),
-        (WIDE, CharucoBoard(5, 4, dictionary="DICT_4X4_50"), "`columns: 6`"),
-        (WIDE, CharucoBoard(6, 4), "`dictionary: DICT_4X4_50`"),
-    ],
-)
-def test_the_board_that_the_images_show_is_named(
-    printed: CharucoBoard, said: CharucoBoard, cure: str
-) -> None:
-    image = board_image(printed, 16, 16)
-    assert not len(said.find(image)[0])
-    with pytest.raises(UserError, match=f"another one, give {cure} as its board"):
-        check_board_seen([image], said)
-
-
-def test_without_markers_no_board_is_named() -> None:
-    with pytest.raises(UserError, match="its markers identify no other board either"):
-        check_board_seen([np.full((30, 40), 200, np.uint8)], SMALL)
-    # Markers of one board, but none of their corners.
-    image = board_image(SMALL, 24, 24)
-    with pytest.raises(UserError, match="markers are there, but no corner between them"):
-        check_board_seen([image], SMALL)
