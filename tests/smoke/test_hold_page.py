@@ -16,7 +16,6 @@ pytest.importorskip("websockets", reason="the console's lock is not installed: s
 from campaign.trials.console.button_page import BUTTON, serving_button
 
 pytestmark = [
-    pytest.mark.timeout(300),
     pytest.mark.skipif(chromium() is None, reason="no chromium: apt-get install chromium"),
 ]
 

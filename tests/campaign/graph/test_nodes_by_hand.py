@@ -66,7 +66,6 @@ def hand_at(folder: Path) -> Iterator[Hand]:
             stop(hand.nodes.values())
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("order", ORDERS, ids=" ".join)
 def test_nodes_steer_in_any_order(order: tuple[str, ...], tmp_path: Path) -> None:
     with hand_at(tmp_path) as hand:
@@ -82,7 +81,6 @@ def test_nodes_steer_in_any_order(order: tuple[str, ...], tmp_path: Path) -> Non
     assert counts["/needle/tip"] >= 7
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("victim", ["sim_rig", "plane_controller"])
 def test_nodes_steer_after_one_was_killed_and_started_again(victim: str, tmp_path: Path) -> None:
     with hand_at(tmp_path) as hand:
