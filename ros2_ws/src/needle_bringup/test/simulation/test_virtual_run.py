@@ -6,6 +6,7 @@ import contextlib
 import io
 import itertools
 import math
+import random
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from needle_bringup.simulation.rig_configuration import command_line_parameters,
 from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.virtual_run import COMPUTE, make_components
 from needle_core.component import Output
-from needle_core.runners.faults import Fault, delay, drop, duplicate
+from needle_core.runners.faults import Arrival, Arrivals, Fault, Link, delay, drop, duplicate
 from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_sim.sim_rig import SimRig
 
@@ -152,6 +153,32 @@ def test_pairs_that_the_tracker_did_not_hear_are_left_out_when_it_runs_again(
     lossy: tuple[Rig, str],
 ) -> None:
     assert "pairs are left out: stereo_tracker did not hear them" in lossy[1]
+
+
+def late(latest: float) -> Fault:
+    """Return a fault that delays each message to the controller by up to `latest` [s]."""
+
+    def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals | None:
+        to_controller = link.receiver == "plane_controller"
+        return (Arrival(rng.uniform(0.0, latest), message),) if to_controller else None
+
+    return fault
+
+
+@pytest.mark.parametrize("insertion", ["stepwise", "continuous"])
+def test_a_bag_whose_controller_heard_late_and_stood_still_runs_again_unchanged(
+    tmp_path: Path, insertion: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / "bag"
+    words = ("--level", "tip", "--depth-mm", "4", "--insertion", insertion)
+    rig = Rig(*words, faults=(late(0.04),), bag=bag)
+    for depth in (0.001, 0.0025):
+        rig.until_depth(depth)
+        rig.runner.freeze("plane_controller", 0.2)
+    assert rig.until_end() == 0
+    assert rig.tap is not None
+    rig.tap.close()
+    assert rerun.main([str(bag)]) == 0, capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")
