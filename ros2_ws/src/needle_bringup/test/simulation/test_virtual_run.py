@@ -10,6 +10,7 @@ import random
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 
 from needle_analysis.ros import rerun
@@ -36,10 +37,18 @@ OPERATOR = "simulated_operator"
 class Rig:
     """The rig of a command line on a virtual runner, and what its components send."""
 
-    def __init__(self, *arguments: str, faults: tuple[Fault, ...] = (), bag: Path | None = None):
+    def __init__(
+        self,
+        *arguments: str,
+        faults: tuple[Fault, ...] = (),
+        bag: Path | None = None,
+        **of_rig: Any,
+    ):
         self.sent: dict[str, list[Any]] = {}
         options = parse(arguments)
-        components = make_components(command_line_parameters(options, bag or Path("none")))
+        parameters = command_line_parameters(options, bag or Path("none"))
+        parameters["sim_rig"].update(of_rig)
+        components = make_components(parameters)
         (self.sim_rig,) = [c for c in components if isinstance(c, SimRig)]
         self.tap = BagTap(bag, components, (DIAGNOSTICS, LOG), run_info(options)) if bag else None
         taps = (self._note, self.tap) if self.tap else (self._note,)
@@ -130,10 +139,13 @@ def test_a_tip_that_leaves_the_phantom_ends_the_run() -> None:
 @pytest.fixture(scope="module")
 def lossy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, str]:
     """Return a rig whose tracker did not hear every image, and what its rerun says."""
-    bag = tmp_path_factory.mktemp("lossy") / "bag"
+    folder = tmp_path_factory.mktemp("lossy")
+    bag, images = folder / "bag", str(folder / "images")
     words = ("--level", "camera", "--depth-mm", "3")
-    rig = Rig(*words, faults=(drop("stereo/left/image_raw", 0.4),), bag=bag)
+    lost = (drop("stereo/left/image_raw", 0.4),)
+    rig = Rig(*words, faults=lost, bag=bag, images=images, scenario="clutter")
     assert rig.until_end() == 0
+    rig.sim_rig.close()
     assert rig.tap is not None
     rig.tap.close()
     with contextlib.redirect_stdout(io.StringIO()) as said:
@@ -147,6 +159,26 @@ def test_pairs_are_exposed_only_when_a_tip_is_awaited(lossy: tuple[Rig, str]) ->
     pairs, tips = len(rig.sent["stereo/left/image_raw"]), len(rig.sent["needle/tip_pose"])
     # One at each depth, and again, a second later, where none came.
     assert 4 == tips < pairs < 12
+
+
+def test_what_is_rendered_is_written_with_insertion_and_truth(lossy: tuple[Rig, str]) -> None:
+    rig, _ = lossy
+    folder = Path(rig.sim_rig.settings.images)
+    for side in ("left", "right"):
+        for number, image in enumerate(rig.sent[f"stereo/{side}/image_raw"]):
+            written = cv2.imread(str(folder / side / f"{number:06d}.png"), cv2.IMREAD_UNCHANGED)
+            assert written is not None
+            assert written.tobytes() == bytes(image.data)
+            assert (image.encoding, image.step, image.frame_id) == (
+                *("mono8", 1024),
+                f"{side}_camera_optical",
+            )
+    lines = (folder / "insertion.csv").read_text().splitlines()
+    assert lines[:2] == ["name,insertion_m", "000000.png,0.0"]
+    assert float(lines[-1].split(",")[1]) == pytest.approx(0.003)
+    last = (folder / "truth.csv").read_text().splitlines()[-1].split(",")
+    assert tuple(map(float, last[1:4])) == rig.sent["sim/tip_pose"][-1].position
+    assert (folder / "calibration.yaml").is_file()
 
 
 def test_pairs_that_the_tracker_did_not_hear_are_left_out_when_it_runs_again(
