@@ -191,25 +191,29 @@ def late(latest: float) -> Fault:
     return fault
 
 
-@pytest.mark.parametrize("insertion", ["stepwise", "continuous"])
-def test_a_bag_whose_controller_heard_late_and_stood_still_runs_again_unchanged(
-    tmp_path: Path, insertion: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bag = tmp_path / "bag"
-    words = ("--level", "tip", "--depth-mm", "4", "--insertion", insertion)
+@pytest.fixture(scope="module", params=["stepwise", "continuous"])
+def late_bag(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """Return the bag of a run whose controller heard all messages late, and stood still."""
+    bag = tmp_path_factory.mktemp("late") / "bag"
+    words = ("--level", "tip", "--depth-mm", "2", "--insertion", request.param)
     rig = Rig(*words, faults=(late(0.04),), bag=bag)
-    for depth in (0.001, 0.0025):
-        rig.until_depth(depth)
-        rig.runner.freeze("plane_controller", 0.2)
+    rig.until_depth(0.001)
+    rig.runner.freeze("plane_controller", 0.2)
     assert rig.until_end() == 0
     assert rig.tap is not None
     rig.tap.close()
-    assert rerun.main([str(bag)]) == 0, capsys.readouterr().out
+    return bag
+
+
+def test_a_bag_whose_controller_heard_late_and_stood_still_runs_again_unchanged(
+    late_bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert rerun.main([str(late_bag)]) == 0, capsys.readouterr().out
 
 
 def test_at_level_drive_the_needle_goes_where_the_motors_go() -> None:
-    rig = Rig("--level", "drive", "--depth-mm", "2")
+    rig = Rig("--level", "drive", "--depth-mm", "1")
     assert rig.until_end() == 0
     motors = [at.positions[0] for at in rig.sent["sim/drive_positions"]]
-    assert rig.sim_rig._bench.insertion == motors[-1] == pytest.approx(0.002, abs=1e-5)
+    assert rig.sim_rig._bench.insertion == motors[-1] == pytest.approx(0.001, abs=1e-5)
     assert rig.sent["device/status"][-1].values["simulated"] == "true"

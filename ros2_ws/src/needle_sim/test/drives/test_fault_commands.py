@@ -48,6 +48,13 @@ def test_a_fault_happens_on_command_and_ends_with_restore(
     assert not happened(drives.bus) or line.startswith("emcy")
 
 
+def test_a_drive_that_is_rebooted_on_command_says_so(drives: DriveEmulator) -> None:
+    typed(drives, "reboot rotation")
+    said = [(frame.identifier, frame.data) for frame in drives.bus.poll(2.0)]
+    assert (0x702, b"\0") in said
+    assert (0x701, b"\0") not in said
+
+
 def test_an_adapter_is_unplugged_and_plugged_in_by_whoever_has_it(drives: DriveEmulator) -> None:
     said = typed(drives, "unplug", "restore")
     orders = [action.batch for action in said if isinstance(action, Send)]
