@@ -211,9 +211,15 @@ def test_a_bag_whose_controller_heard_late_and_stood_still_runs_again_unchanged(
     assert rerun.main([str(late_bag)]) == 0, capsys.readouterr().out
 
 
-def test_at_level_drive_the_needle_goes_where_the_motors_go() -> None:
+@pytest.fixture(scope="module")
+def driven() -> Rig:
+    """Return a rig at level drive that has come to its end."""
     rig = Rig("--level", "drive", "--depth-mm", "1")
     assert rig.until_end() == 0
-    motors = [at.positions[0] for at in rig.sent["sim/drive_positions"]]
-    assert rig.sim_rig._bench.insertion == motors[-1] == pytest.approx(0.001, abs=1e-5)
-    assert rig.sent["device/status"][-1].values["simulated"] == "true"
+    return rig
+
+
+def test_at_level_drive_the_needle_goes_where_the_motors_go(driven: Rig) -> None:
+    motors = [at.positions[0] for at in driven.sent["sim/drive_positions"]]
+    assert driven.sim_rig._bench.insertion == motors[-1] == pytest.approx(0.001, abs=1e-5)
+    assert driven.sent["device/status"][-1].values["simulated"] == "true"
