@@ -41,7 +41,7 @@ Run what each step of the project must show, at full size, and print wanted besi
 EPILOG = """\
 examples:
   scripts/verify A                 everything of step A
-  scripts/verify A --only interrupt --only open_loop
+  scripts/verify A --only camera --only same_seed
   scripts/verify --list            the names of all checks
 
 exit codes: 0 all as wanted, 1 something falls short, 2 bad input, 130 interrupted.

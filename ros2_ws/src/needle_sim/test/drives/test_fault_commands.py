@@ -76,4 +76,4 @@ def test_lines_that_are_no_commands_are_named_and_do_nothing(drives: DriveEmulat
 def test_drives_that_cannot_be_are_refused() -> None:
     for bad in ({"insertion_node_id": 2}, {"limit_action": "ignore"}, {"insertion_start": 0.3}):
         with pytest.raises(UserError, match=r"node id|one of|beyond"):
-            DriveEmulator(DriveEmulatorParameters(**bad))  # type: ignore[arg-type]
+            DriveEmulator(DriveEmulatorParameters(**bad))
