@@ -13,6 +13,7 @@ CHANGED = {
     "rerun": "--viewers takes a bag through live_view and openigtlink",
     "scripts_console": "the rig is in one process, cameras and tracker in a second one",
     "scripts_train_needle_map": "what draws its patches is in needle_bringup",
+    "scripts_verify": "interrupts and the open loop are asked of other tests",
     "track_images": "one tracker in place of two: other rules, no searched region",
     "scripts_simulate": "the run is in one process: --graph runs the nodes, --component adds one",
 }
