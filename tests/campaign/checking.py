@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import multiprocessing
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -23,8 +22,6 @@ from rosbags.rosbag2 import Reader
 
 from needle_bringup.descendants import processes_with
 from needle_core.errors import UserError
-from needle_core.process.ros_domain import ports_of
-from needle_core.process.shared_memory import dead_ports
 
 T = TypeVar("T")
 # Every process that a check starts carries this in its environment, so that none can hide.
@@ -72,7 +69,7 @@ class SimulateRun:
     bag : Path
         The folder that was asked for.
     left_over : list of str
-        Processes and shared-memory ports that outlived the command.
+        Processes that outlived the command.
     """
 
     code: int
@@ -93,89 +90,6 @@ class SimulateRun:
         return ["", *self.output.strip().splitlines()][-1]
 
 
-def _heed_signals() -> None:
-    """Undo what a shell's background or nohup ignores, and all below would."""
-    for number in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_DFL)
-
-
-class StartedRun:
-    """A run of `simulate` under way.
-
-    Parameters
-    ----------
-    command : sequence of str
-        The command line.
-    bag : Path
-        The bag's folder in it.
-    """
-
-    def __init__(self, command: Sequence[str], bag: Path) -> None:
-        self._mark = uuid.uuid4().hex
-        self._bag = bag
-        self._output = bag.with_name(bag.name + ".output")
-        self._begin = time.monotonic()
-        with self._output.open("wb") as output:
-            self.process = subprocess.Popen(
-                list(command),
-                env={**os.environ, MARK: self._mark},
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                preexec_fn=_heed_signals,  # noqa: PLW1509
-            )
-
-    @property
-    def output(self) -> str:
-        """Text that it has written so far."""
-        return self._output.read_text("utf-8", errors="replace")
-
-    def wait_until_said(self, pattern: str, timeout: float = 60.0) -> re.Match[str]:
-        """Wait until the run has written what this regular expression matches; return the match.
-
-        Raises
-        ------
-        UserError
-            If the run, or the time [s], ends before that.
-        """
-        deadline = time.monotonic() + timeout
-        while True:
-            # What it wrote last may come between the two looks: first the process, then its words.
-            ended = self.process.poll() is not None
-            if found := re.search(pattern, self.output):
-                return found
-            if ended or time.monotonic() >= deadline:
-                raise UserError(f"it has not said {pattern!r}: {self.output.strip()[-500:]}")
-            time.sleep(0.01)
-
-    def interrupt(self, number: signal.Signals) -> None:
-        """Send a signal as a terminal does: to the command's process group."""
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self.process.pid, number)
-
-    def running(self) -> list[tuple[int, str]]:
-        """Return (pid, command) of every process of this run."""
-        return processes_with(MARK, self._mark)
-
-    def wait(self, timeout: float = 300.0) -> SimulateRun:
-        """Wait for the end; a run that does not end is killed and has code -9."""
-        try:
-            code = self.process.wait(timeout)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            code = self.process.wait()
-        wall = time.monotonic() - self._begin
-        running = self.running()
-        for pid, _ in running:
-            os.kill(pid, signal.SIGKILL)
-        left_over = [f"{pid} {name}" for pid, name in running]
-        # A domain may have new users by now.
-        if domain := re.search(r"ROS_DOMAIN_ID (\d+)", self.output):
-            left_over += dead_ports(ports_of(int(domain[1])))
-        return SimulateRun(code, wall, self.output, self._bag, left_over)
-
-
 class Workbench:
     """Place in which checks run what they look at.
 
@@ -192,16 +106,32 @@ class Workbench:
         self.folder = folder
         self._runs: dict[str, SimulateRun] = {}
 
-    def start(self, name: str, *arguments: str) -> StartedRun:
-        """Start `simulate` with these arguments and a bag of this name."""
-        bag = self.folder / name
-        return StartedRun([*self._command, *arguments, "--bag", str(bag)], bag)
-
     def run(self, name: str, *arguments: str) -> SimulateRun:
         """Run `simulate`; a name that has run before gives that run again."""
         if name not in self._runs:
-            self._runs[name] = self.start(name, *arguments).wait()
+            self._runs[name] = self._run(self.folder / name, arguments)
         return self._runs[name]
+
+    def _run(self, bag: Path, arguments: Sequence[str]) -> SimulateRun:
+        mark, begin = uuid.uuid4().hex, time.monotonic()
+        said = bag.with_name(bag.name + ".output")
+        # Into a file: a process that is left over would keep a pipe open.
+        with said.open("wb") as output:
+            done = subprocess.run(
+                [*self._command, *arguments, "--bag", str(bag)],
+                env={**os.environ, MARK: mark},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                check=False,
+            )
+        wall = time.monotonic() - begin
+        running = processes_with(MARK, mark)
+        for pid, _ in running:
+            os.kill(pid, signal.SIGKILL)
+        left_over = [f"{pid} {name}" for pid, name in running]
+        text = said.read_text("utf-8", "replace")
+        return SimulateRun(done.returncode, wall, text, bag, left_over)
 
 
 def in_own_process(function: Callable[..., T], *arguments: object) -> T:

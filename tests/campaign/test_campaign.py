@@ -17,7 +17,6 @@ CHECKS = [
 ]
 
 
-@pytest.mark.timeout(6 * 3600)
 @pytest.mark.parametrize("check", CHECKS)
 def test_a_step_shows_what_it_must(check: Check, tmp_path: Path) -> None:
     bench = Workbench([str(checkout() / "scripts" / "simulate")], tmp_path)

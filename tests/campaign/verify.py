@@ -11,7 +11,6 @@ from pathlib import Path
 from campaign.checking import Check, Finding, Workbench
 from campaign.checks import (
     check_bags,
-    check_console_hold,
     check_continuous,
     check_control,
     check_driver,
@@ -32,7 +31,7 @@ STEPS: Mapping[str, tuple[Check, ...]] = {
     "C": (*check_tracker.CHECKS, *check_traced.CHECKS),
     "D": check_driver.CHECKS,
     "E": check_bags.CHECKS,
-    "I": (*check_continuous.CHECKS, *check_holds.HOLD_CHECKS, *check_console_hold.CHECKS),
+    "I": (*check_continuous.CHECKS, *check_holds.HOLD_CHECKS),
     "K": check_holds.COMPUTER_CHECKS,
 }
 
@@ -42,7 +41,7 @@ Run what each step of the project must show, at full size, and print wanted besi
 EPILOG = """\
 examples:
   scripts/verify A                 everything of step A
-  scripts/verify A --only interrupt --only open_loop
+  scripts/verify A --only camera --only same_seed
   scripts/verify --list            the names of all checks
 
 exit codes: 0 all as wanted, 1 something falls short, 2 bad input, 130 interrupted.

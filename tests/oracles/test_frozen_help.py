@@ -15,6 +15,7 @@ CHANGED = {
     "scripts_console": "the rig is in one process, cameras and tracker in a second one",
     "scripts_train_needle_map": "what draws its patches is in needle_bringup",
     "calibrate_stereo": "no picture of what the corners miss by: what is wrong is said in words",
+    "scripts_verify": "interrupts and the open loop are asked of other tests",
     "track_images": "one tracker in place of two: other rules, no searched region",
     "scripts_simulate": "the run is in one process: --graph runs the nodes, --component adds one",
 }

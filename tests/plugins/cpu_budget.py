@@ -1,5 +1,7 @@
 """A pytest plugin: how much CPU each test uses, and that none of a layer uses more than it may.
 
+A test that uses `ENDLESS` is taken for one that never ends, and fails; a check of the campaign may
+take hours.
 Processes that a test started and that ended count, too; what is shared by a module or the session
 counts to nobody. CPU-seconds are those of a machine on which `_reference` takes `NOMINAL`: on a
 slower one, or one whose cores share their units with other work, a test may use more.
@@ -10,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import resource
+import signal
 import time
 from collections import Counter
 from collections.abc import Generator
@@ -58,6 +61,8 @@ LAYERS = (
 """The first whose pattern matches is a test's."""
 TOLERANCE = 1.5
 """By so much CPU-seconds vary on a machine whose cores share their caches with other work."""
+ENDLESS = 300.0
+"""CPU-seconds at which a test is ended."""
 _CPU, _OVER = "cpu_s", "over_budget"
 
 
@@ -93,6 +98,17 @@ class CpuBudget:
     def pytest_runtest_logstart(self) -> None:
         """Begin to measure a test."""
         self._shared, self._begin = 0.0, _cpu()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, object, object]:
+        """End a test that never ends by itself."""
+        signal.signal(signal.SIGPROF, _fail_endless)
+        is_unlimited = item.get_closest_marker("campaign") is not None
+        signal.setitimer(signal.ITIMER_PROF, 0.0 if is_unlimited else ENDLESS)
+        try:
+            return (yield)
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(
@@ -136,6 +152,10 @@ class CpuBudget:
         terminalreporter.write_line(f"CPU-s          {', '.join(sums)}")
         for line in self._over:
             terminalreporter.write_line(f"FAILED over its budget: {line}", red=True)
+
+
+def _fail_endless(*_: object) -> None:
+    pytest.fail(f"it does not end: {ENDLESS:g} CPU-s")
 
 
 def _layer(nodeid: str) -> Layer:

@@ -40,15 +40,3 @@ def test_every_way_to_the_drives_is_measured_to_its_sync(key: str) -> None:
     assert len(delays) == 8
     assert min(delays) > 0.0
     assert share > 0.0
-
-
-@pytest.mark.parametrize(
-    "arguments", [["--json", "/nowhere/f.json"], ["--only", "nothing"], ["-x"]]
-)
-def test_bad_arguments_are_one_line_and_exit_2(
-    arguments: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert benchmark.main(arguments) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert len(captured.err.strip().splitlines()) == 1

@@ -146,7 +146,6 @@ def test_a_net_that_diverges_ends_the_run_and_is_not_stored(folder: Path, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.timeout(300)
 def test_a_run_is_resumed_as_it_was_and_its_net_is_what_opencv_reads(
     folder: Path, tmp_path: Path
 ) -> None:

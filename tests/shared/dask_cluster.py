@@ -21,7 +21,7 @@ _ENDS = 60.0
 class Cluster:
     """A scheduler and its workers on this machine."""
 
-    def __init__(self, folder: Path, workers: int, *options: str) -> None:
+    def __init__(self, folder: Path, workers: int) -> None:
         # Dask's processes find the parts that die as they find all else.
         paths = os.pathsep.join([str(_SHARED), os.environ.get("PYTHONPATH", "")])
         self._environment = {**os.environ, "PYTHONPATH": paths}
@@ -33,7 +33,7 @@ class Cluster:
         self.address = next(line.split()[-1] for line in said if "Scheduler at:" in line)
         self.workers = self._start(
             subprocess.DEVNULL, "worker", self.address, "--nworkers", str(workers),
-            "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder), *options,
+            "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder),
         )  # fmt: skip
 
     def _start(self, errors: int, *words: str) -> subprocess.Popen[str]:

@@ -1,4 +1,4 @@
-"""Parts that end their first worker, or each, and one that ends the scheduler."""
+"""Parts that end their first worker, or each."""
 
 from __future__ import annotations
 
@@ -22,9 +22,3 @@ def end_the_first(asked: tuple[Path, ClusterPart]) -> PartDone:
 def end_every(_: object) -> None:
     """End each worker that would do it."""
     os.kill(os.getpid(), signal.SIGKILL)
-
-
-def end_process(pid: int) -> int:
-    """Kill another process of this machine."""
-    os.kill(pid, signal.SIGKILL)
-    return pid

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from campaign.trials.console.chromium import Chromium, Tab, chromium
+from campaign.trials.console.chromium import Chromium, chromium
 from needle_console.hold.hold_state import HoldState
 
 pytest.importorskip("websockets", reason="the console's lock is not installed: scripts/console")
@@ -16,7 +16,6 @@ pytest.importorskip("websockets", reason="the console's lock is not installed: s
 from campaign.trials.console.button_page import BUTTON, serving_button
 
 pytestmark = [
-    pytest.mark.timeout(300),
     pytest.mark.skipif(chromium() is None, reason="no chromium: apt-get install chromium"),
 ]
 
@@ -28,8 +27,14 @@ _STATE = "document.documentElement.dataset.holdState"
 class Scene:
     """The page in a browser, and what the server hands on."""
 
-    def __init__(self, tab: Tab, states: list[HoldState], counts: Callable[[], dict[str, int]]):
-        self.tab = tab
+    def __init__(
+        self,
+        browser: Chromium,
+        url: str,
+        states: list[HoldState],
+        counts: Callable[[], dict[str, int]],
+    ):
+        self.browser, self.tab = browser, browser.open(url)
         self.states = states
         self._counts = counts
 
@@ -100,8 +105,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     with serving_button(states.append, lambda _: None) as (page_port, hold):
         browser = Chromium(folder / "profile")
         try:
-            tab = browser.open(f"http://127.0.0.1:{page_port}/?port={hold.port}")
-            yield Scene(tab, states, hold.counts)
+            url = f"http://127.0.0.1:{page_port}/?port={hold.port}"
+            yield Scene(browser, url, states, hold.counts)
         finally:
             browser.close()
 
@@ -122,11 +127,21 @@ def test_a_second_finger_or_button_or_key_ends_a_hold(scene: Scene) -> None:
     scene.ends(scene.hold_space, lambda: tab.press_key("Escape"))
 
 
-def test_a_button_that_goes_ends_its_hold(scene: Scene) -> None:
+def test_a_button_or_page_that_goes_ends_its_hold(scene: Scene) -> None:
     anew = "for (const old of document.querySelectorAll('button')) old.outerHTML = old.outerHTML"
     scene.ends(scene.hold_pointer, lambda: scene.tab.run(anew))
     # What takes its place is a button like it.
     scene.ends(scene.hold_pointer, lambda: scene.tab.release_pointer(*BUTTON))
+    # A page that is hidden, and one that is closed.
+    browser, url = scene.browser, scene.tab.run("location.href")
+    scene.ends(scene.hold_pointer, lambda: browser.open("about:blank"))
+    browser.close_all_but(scene.tab)
+    scene.tab.release_pointer(*BUTTON)
+    other = browser.open(url)
+    scene.tab, closed = other, scene.tab
+    scene.ends(scene.hold_space, lambda: browser.close_all_but(closed))
+    scene.tab = closed
+    scene.tab.release_space()
 
 
 def test_the_page_says_why_a_hold_ended_by_itself(scene: Scene) -> None:

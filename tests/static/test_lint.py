@@ -40,7 +40,6 @@ def test_style(how: tuple[str, ...]) -> None:
 # One package at a time: every package has a test folder, with files of the same name in several.
 # The first has the libraries' types to read; on a busy machine that takes minutes.
 @on_typed_numpy
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.name)
 def test_types_of_a_package(package: Path) -> None:
     folders = [package / package.name, package / "test"]

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
-from rosbags.typesys import Stores, get_typestore
-
-from campaign.checking import Check, Finding, Workbench, busy, payloads, unreadable
-from campaign.trials.recording_trials import record_and_kill, record_full_rate, recorder
+from campaign.checking import Check, Finding, Workbench, unreadable
+from campaign.trials.recording_trials import record_and_kill, record_full_rate
 from campaign.trials.signal_trials import signal_trials
-from needle_bringup.descendants import ran
 
 DURATION = 60.0
 MOMENTS = 25
@@ -26,8 +17,6 @@ SIGNALS = 100
 # A bag is completed first: last words are heard for up to a second, and a disk may be slow. For the
 # others launchers wait so long before they send SIGTERM [s].
 LONGEST_END, LONGEST_END_OF_OTHERS = {"recorder": 10.0}, 5.0
-REAL_TIME_BAGS, LOAD = 30, 15
-_COMMANDS, _RESULTS = "/device/joint_trajectory", "/device/result"
 
 
 def full_rate(bench: Workbench) -> Iterator[Finding]:
@@ -72,45 +61,6 @@ def killed(bench: Workbench) -> Iterator[Finding]:
         )
 
 
-def disk_full(bench: Workbench) -> Iterator[Finding]:
-    """Let the bag's disk fill in the middle of a run; a witness records on another disk."""
-    other = bench.folder / "witness"
-    with _small_disk(bench.folder / "disk"):
-        started = bench.start("disk/full", "--graph", "--depth-mm", "30")
-        domain = int(started.wait_until_said(r"ROS_DOMAIN_ID (\d+)")[1])
-        with recorder(domain, other, "witness") as witness:
-            run = started.wait()
-            witness.terminate()
-            witness.wait(30.0)
-        kept, commands = (payloads(bag, [_COMMANDS])[_COMMANDS] for bag in (run.bag, other))
-        why = unreadable(run.bag)
-        yield Finding(
-            "disk_full_bag",
-            "a disk of 40 MB that fills: its bag",
-            "opens, and holds the beginning",
-            why or f"opens, {len(kept)} of {len(commands)} commands",
-            not why and 0 < len(kept) < len(commands) and kept[-1] in commands,
-        )
-    # It may have joined a few steps late.
-    done = sum(b"succeeded" in data for data in payloads(other, [_RESULTS])[_RESULTS])
-    what = "steps of 30 that the witness heard of"
-    yield Finding("disk_full_steering", what, "at least 25: it goes on", f"{done}", done >= 25)
-    store = get_typestore(Stores.ROS2_JAZZY)
-    told = set()
-    for data in payloads(other, ["/diagnostics"])["/diagnostics"]:
-        array: Any = store.deserialize_cdr(data, "diagnostic_msgs/msg/DiagnosticArray")
-        told |= {(int(one.level), str(one.message)) for one in array.status}
-    warned = [text for level, text in told if level == 1 and "nearly full" in text]
-    reason = [text for level, text in told if level == 2 and "the disk of" in text]
-    yield Finding(
-        "disk_full_reason",
-        "the reason in /diagnostics",
-        "a warning, then an error with the reason",
-        f"{warned[:1]}; {reason[:1]}",
-        bool(reason and warned),
-    )
-
-
 def signals(bench: Workbench) -> Iterator[Finding]:
     """Send SIGINT, SIGINT twice, SIGTERM or SIGHUP to all nodes at random moments."""
     for burners in (0, 2):
@@ -134,35 +84,4 @@ def signals(bench: Workbench) -> Iterator[Finding]:
         )
 
 
-def rerun_real_time(bench: Workbench) -> Iterator[Finding]:
-    """Run real-time bags again, a third of them recorded on a machine that is busy."""
-    red = []
-    for number in range(REAL_TIME_BAGS):
-        speed = ("--level", "tip", "--real-time-factor", "4", "--depth-mm", "20")
-        with busy(LOAD if number % 3 == 2 else 0):
-            bag = bench.run(f"rerun_{number}", *speed, "--seed", str(100 + number)).bag
-        file = bag.with_name(f"{bag.name}.rerun.json")
-        rerun = (sys.executable, "-m", "needle_analysis.ros.rerun", str(bag), "--json", str(file))
-        if ran(rerun, good=(0, 1)).returncode or not json.loads(file.read_text("utf-8")):
-            red.append(bag.name)
-    yield Finding(
-        "rerun_real_time_bags",
-        f"rerun of {REAL_TIME_BAGS} untouched bags, a third recorded beside {LOAD} busy processes",
-        "0 falsely red",
-        f"{len(red)} red {', '.join(red)}",
-        not red,
-    )
-
-
-CHECKS: tuple[Check, ...] = (full_rate, killed, disk_full, rerun_real_time, signals)
-
-
-@contextlib.contextmanager
-def _small_disk(folder: Path) -> Iterator[None]:
-    """Mount a disk of 40 MB in memory; needs root."""
-    folder.mkdir()
-    ran(["mount", "-t", "tmpfs", "-o", "size=40m", "tmpfs", str(folder)])
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", str(folder)], check=False)
+CHECKS: tuple[Check, ...] = (full_rate, killed, signals)

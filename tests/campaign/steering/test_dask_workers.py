@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from dask_cluster import NEEDED, Cluster
-from dying_part import end_every, end_process, end_the_first
-from needle_bringup.studies import cluster
+from dying_part import end_every, end_the_first
 from needle_bringup.studies.cluster import on_cluster
-from needle_bringup.studies.cluster_study import ClusterPart, digest, run_part, run_parts
+from needle_bringup.studies.cluster_study import ClusterPart, digest
 from needle_bringup.studies.monte_carlo import main
 from needle_bringup.studies.monte_carlo_options import parse
 from needle_bringup.studies.study_parts import parts_of
@@ -64,40 +62,3 @@ def test_a_killed_worker_costs_only_time(two_workers: Cluster, tmp_path: Path) -
 def test_a_part_that_ends_every_worker_is_given_up(two_workers: Cluster) -> None:
     with pytest.raises(UserError, match=r"workers died while running it.*out of memory"):
         list(on_cluster(two_workers.address, end_every, [None]))
-
-
-@NEEDED
-def test_a_worker_with_other_code_is_refused(
-    two_workers: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here = {**cluster.identity(), "numpy": "1.0.0"}
-    monkeypatch.setattr(cluster, "identity", lambda: here)
-    with pytest.raises(UserError, match=r"has numpy \S+ in place of 1\.0\.0; all machines"):
-        run_parts(two_workers.address, PARTS, PARTS[0].of_first(2), lambda _: None)
-
-
-@NEEDED
-def test_a_lost_connection_is_made_again(
-    two_workers: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import distributed  # noqa: PLC0415
-
-    whole = distributed.as_completed
-
-    def cut(done: Iterator[Any]) -> Iterator[Any]:
-        monkeypatch.setattr(distributed, "as_completed", whole)
-        yield next(done)
-        raise distributed.CancelledError
-
-    monkeypatch.setattr(distributed, "as_completed", lambda futures: cut(whole(futures)))
-    asked = [ClusterPart(part, PARTS[0].of_first(2)) for part in PARTS]
-    done = on_cluster(two_workers.address, run_part, asked)
-    assert [digest(part.outcomes) for part in done] == [digest(part.run()) for part in PARTS]
-
-
-@NEEDED
-def test_a_lost_scheduler_ends_the_study_in_one_line(tmp_path: Path) -> None:
-    started = Cluster(tmp_path, 1, "--no-nanny")
-    with pytest.raises(UserError, match="lost, with 0 of 1 parts done"):
-        list(on_cluster(started.address, end_process, [started.scheduler.pid]))
-    started.end()

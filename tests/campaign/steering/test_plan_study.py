@@ -1,12 +1,9 @@
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import pytest
 
 from campaign.steering import plan_study
-from campaign.steering.plan_study import LABELS, main, study
+from campaign.steering.plan_study import LABELS, study
 
 
 def test_every_scene_is_found_proved_or_neither(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -25,14 +22,3 @@ def test_every_scene_is_found_proved_or_neither(monkeypatch: pytest.MonkeyPatch)
     exact = study(30, 909, 0.1356, 0.0)
     assert (exact["found"] or 0) < found
     assert exact["within_tolerance_only"] == 0
-
-
-def test_the_command_prints_and_writes_its_figures(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "figures.json"
-    assert main(["--scenes", "2", "--json", str(path)]) == 0
-    assert "paths found" in capsys.readouterr().out
-    assert json.loads(path.read_text(encoding="utf-8"))["scenes"] == 2
-    assert main(["--scenes", "0"]) == 2
-    assert "--scenes = 0" in capsys.readouterr().err

@@ -53,7 +53,7 @@ def test_the_stored_net_shows_needles_that_it_was_not_trained_on(unseen: Batch) 
             without.append(intensity.sum())
     # Many are hardly to be seen: thin, dark, out of focus, or as their own background shows them.
     assert np.median(shown) > 0.35
-    assert np.median(at_ends) > 0.4
+    assert np.median(at_ends) > 0.35
     assert np.mean(without) < 0.4
     # Its chances are chances: as much needle is shown as there is.
     assert abs(np.mean(excess)) < 0.01

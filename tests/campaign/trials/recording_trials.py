@@ -27,7 +27,7 @@ from needle_core.process.ros_domain import own_domain
 # message's number.
 _NUMBER = slice(8, 12)
 _START_UP = 30.0
-_LOAD, _LISTENER = "campaign.trials.recording_load", "campaign.trials.image_listener"
+_LOAD = "campaign.trials.recording_load"
 
 
 def record_full_rate(folder: Path, duration: float, others: int = 2) -> dict[str, Any]:
@@ -37,16 +37,14 @@ def record_full_rate(folder: Path, duration: float, others: int = 2) -> dict[str
     -------
     dict
         By topic what was `sent`, is `missing` in the bag, and is `counted` as lost by the recorder;
-        `unheard`, how many images did not reach a bare subscriber beside it;
-        its `share` of a core, its `memory` and how much that `grew` in the second half [MB], the
-        rate of writing, `MB_per_s`, and its exit `code`.
+        the recorder's `share` of a core, its `memory` and how much that `grew` in the second half
+        [MB], the rate of writing, `MB_per_s`, and its exit `code`.
     """
     bag = folder / "full_rate"
     with (
         own_domain() as domain,
         recorder(domain, bag) as recording,
         busy(others),
-        _process(domain, _LISTENER) as listener,
         _process(domain, _LOAD, str(duration)) as load,
     ):
         begin, before = time.monotonic(), _processor_time(recording.pid)
@@ -56,7 +54,6 @@ def record_full_rate(folder: Path, duration: float, others: int = 2) -> dict[str
             memory.append(_memory(recording.pid))
         share = (_processor_time(recording.pid) - before) / (time.monotonic() - begin)
         output, _ = load.communicate()
-        heard, _ = listener.communicate(timeout=60.0)
         recording.send_signal(signal.SIGINT)
         code = recording.wait(60.0)
     if load.returncode or not output.strip():
@@ -69,7 +66,6 @@ def record_full_rate(folder: Path, duration: float, others: int = 2) -> dict[str
     size = sum(file.stat().st_size for file in bag.glob("*.mcap"))
     return {
         "sent": sum(sent.values()),
-        "unheard": sum(sent[topic] - came for topic, came in json.loads(heard).items()),
         "missing": {topic: count for topic, count in missing.items() if count},
         "counted": {topic: lost[topic] for topic in sent if topic in lost},
         "share": share,

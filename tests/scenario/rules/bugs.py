@@ -31,12 +31,20 @@ from needle_device_driver.supervisor.supervisor import MotionSupervisor
 Plant = Callable[[pytest.MonkeyPatch], None]
 
 
-def _set(where: Any, /, **values: Any) -> Plant:
+def set_to(where: Any, /, **values: Any) -> Plant:
+    """Return what gives a class or module other attributes."""
+
     def plant(patch: pytest.MonkeyPatch) -> None:
         for name, value in values.items():
             patch.setattr(where, name, value)
 
     return plant
+
+
+def wrapped(where: Any, name: str, around: Callable[..., Any]) -> Plant:
+    """Return what calls a function in place of another, which it gets first."""
+    original = getattr(where, name)
+    return set_to(where, **{name: lambda *given, **named: around(original, *given, **named)})
 
 
 def _unheard(*_: Any, **__: Any) -> None:
@@ -50,22 +58,20 @@ def _nothing_sent(*_: Any, **__: Any) -> Any:
 
 def _of_context(**wrong: Any) -> Plant:
     """Judge commands as if the device were otherwise."""
-    check = command.check_command
 
-    def checked(asked: Any, context: Any, limits: Any) -> Any:
+    def checked(check: Any, asked: Any, context: Any, limits: Any) -> Any:
         return check(asked, dataclasses.replace(context, **wrong), limits)
 
-    return _set(command_desk, check_command=checked)
+    return wrapped(command_desk, "check_command", checked)
 
 
 def _of_messages(change: Callable[[Hold, HoldState], HoldState]) -> Plant:
     """Take another message than the one that came."""
-    receive = Hold.receive
 
-    def received(hold: Hold, message: HoldState, now: float, *, counting: bool) -> Any:
-        return receive(hold, change(hold, message), now, counting=counting)
+    def received(receive: Any, hold: Hold, message: HoldState, *more: Any, **how: Any) -> Any:
+        return receive(hold, change(hold, message), *more, **how)
 
-    return _set(Hold, receive=received)
+    return wrapped(Hold, "receive", received)
 
 
 def _press_counts(hold: Hold, message: HoldState) -> HoldState:
@@ -109,74 +115,55 @@ def _enabling_moves(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Hold, "speed_scale", property(lambda _: 1.0))
 
 
-def _rotation_comes_late(patch: pytest.MonkeyPatch) -> None:
-    advance = CoordinatedMotion.advance
-
-    def late(motion: CoordinatedMotion, period: float, speed_scale: float) -> Any:
-        before = motion._at
-        point = advance(motion, period, speed_scale)
-        return point if motion.complete else dataclasses.replace(point, rotation=before[1])
-
-    patch.setattr(CoordinatedMotion, "advance", late)
+def _rotation_comes_late(advance: Any, motion: CoordinatedMotion, *given: float) -> Any:
+    before = motion._at
+    point = advance(motion, *given)
+    return point if motion.complete else dataclasses.replace(point, rotation=before[1])
 
 
 def _only_insertion_is_told(pair: AxisPair, order: Callable[[Any], None]) -> None:
     order(pair.insertion)
 
 
-def _homing_needs_no_word(patch: pytest.MonkeyPatch) -> None:
-    home = MotionSupervisor.home
-
-    def homed(supervisor: MotionSupervisor, now: float) -> Any:
-        supervisor._needle_out = True
-        return (yield from home(supervisor, now))
-
-    patch.setattr(MotionSupervisor, "home", homed)
+def _homing_needs_no_word(home: Any, supervisor: MotionSupervisor, now: float) -> Any:
+    supervisor._needle_out = True
+    return home(supervisor, now)
 
 
-def _set_points_far_ahead(patch: pytest.MonkeyPatch) -> None:
-    advance, magnitude = CoordinatedMotion.advance, DriveSettings.magnitude
-    patch.setattr(
-        CoordinatedMotion,
-        "advance",
-        lambda motion, period, scale: advance(motion, 10.0 * period, scale),
-    )
-    patch.setattr(
-        DriveSettings,
-        "magnitude",
-        lambda settings, value: 20 * magnitude(settings, value),
-    )
-    patch.setattr(MotionRun, "problem", _unheard)
+_faults_unheard = set_to(Cia402Axis, _fault=property(lambda _: None))
+_any_bounds = set_to(command, _check_bounds=_unheard)
+_motion_unwatched = set_to(MotionRun, problem=_unheard)
 
 
-_faults_unheard = _set(Cia402Axis, _fault=property(lambda _: None))
-_any_bounds = _set(command, _check_bounds=_unheard)
-_motion_unwatched = _set(MotionRun, problem=_unheard)
+def _all_of(*plants: Plant) -> Plant:
+    def plant(patch: pytest.MonkeyPatch) -> None:
+        for one in plants:
+            one(patch)
+
+    return plant
 
 
-def _homing_takes_for_ever(patch: pytest.MonkeyPatch) -> None:
-    _faults_unheard(patch)
-    patch.setattr(HomingTimes, "count", lambda *_: "")
-
-
-def _axes_drift_apart(patch: pytest.MonkeyPatch) -> None:
-    _motion_unwatched(patch)
-    _faults_unheard(patch)
-
+_set_points_far_ahead = _all_of(
+    wrapped(CoordinatedMotion, "advance", lambda f, motion, t, scale: f(motion, 10.0 * t, scale)),
+    wrapped(DriveSettings, "magnitude", lambda f, settings, value: 20 * f(settings, value)),
+    _motion_unwatched,
+)
+_homing_takes_for_ever = _all_of(_faults_unheard, set_to(HomingTimes, count=lambda *_: ""))
+_axes_drift_apart = _all_of(_motion_unwatched, _faults_unheard)
 
 BUGS: dict[str, Plant] = {
-    "hold_to_run": _set(Hold, owner=property(lambda _: "hand")),
-    "hold_age": _set(Hold, is_fresh=lambda *_: True),
+    "hold_to_run": set_to(Hold, owner=property(lambda _: "hand")),
+    "hold_age": set_to(Hold, is_fresh=lambda *_: True),
     "hold_new_press": _of_messages(_press_counts),
     "hold_one_owner": _of_messages(_owner_is_robbed),
     "hold_in_order": _of_messages(_order_is_made_up),
     "speed_scale": _of_messages(_scale_is_one),
-    "one_device": _set(MotionSupervisor, see_others=_unheard),
+    "one_device": set_to(MotionSupervisor, see_others=_unheard),
     "no_motion_by_itself": _enabling_moves,
-    "command_state": _set(CommandDesk, _ready_for=lambda desk, _, now: desk._core.poll(now)),
+    "command_state": set_to(CommandDesk, _ready_for=lambda desk, _, now: desk._core.poll(now)),
     "command_one_publisher": _of_context(publishers=1),
-    "command_form": _set(command, check_form=_unheard),
-    "command_finite": _set(math, isfinite=lambda _: True),
+    "command_form": set_to(command, check_form=_unheard),
+    "command_finite": set_to(math, isfinite=lambda _: True),
     "command_newer": _of_context(not_new=""),
     "tip_age": _of_context(tip_age=0.0),
     "homed_first": _of_context(homed=True),
@@ -187,26 +174,26 @@ BUGS: dict[str, Plant] = {
     "max_rotation_step": _any_bounds,
     "max_rotation_rate": _any_bounds,
     "max_turns": _any_bounds,
-    "coordinated": _rotation_comes_late,
+    "coordinated": wrapped(CoordinatedMotion, "advance", _rotation_comes_late),
     "following_error": _axes_drift_apart,
-    "retraction": _set(DeviceCore, way_out=property(lambda _: 0.0)),
-    "unhomed_outward_only": _set(RetractionBound, target=lambda _, at: at.position),
-    "homing_needle_out": _homing_needs_no_word,
+    "retraction": set_to(DeviceCore, way_out=property(lambda _: 0.0)),
+    "unhomed_outward_only": set_to(RetractionBound, target=lambda _, at: at.position),
+    "homing_needle_out": wrapped(MotionSupervisor, "home", _homing_needs_no_word),
     "homing_time": _homing_takes_for_ever,
-    "estop_latches": _set(MotionSupervisor, receive_estop=_unheard),
-    "one_fault_stops_both": _set(AxisPair, each=_only_insertion_is_told),
+    "estop_latches": set_to(MotionSupervisor, receive_estop=_unheard),
+    "one_fault_stops_both": set_to(AxisPair, each=_only_insertion_is_told),
     "inner_limit_switch": _motion_unwatched,
-    "reply_age": _set(PairSnapshot, age=lambda *_: 0.0),
-    "axis_speed": _set(SpeedWatch, judge=lambda *_, **__: True),
+    "reply_age": set_to(PairSnapshot, age=lambda *_: 0.0),
+    "axis_speed": set_to(SpeedWatch, judge=lambda *_, **__: True),
     "settling_time": _motion_unwatched,
-    "link_loss": _set(DeviceDriver, _on_port_change=_nothing_sent),
+    "link_loss": set_to(DeviceDriver, _on_port_change=_nothing_sent),
     "one_master": _faults_unheard,
-    "drive_watchdog": _set(cia402_axis, arm_watchdog=_nothing_sent),
+    "drive_watchdog": set_to(cia402_axis, arm_watchdog=_nothing_sent),
     "drive_emergency": _faults_unheard,
     "drive_reboot": _faults_unheard,
-    "quick_stop": _set(Cia402Axis, stop=_unheard),
-    "software_limits": _set(cia402_axis, write_limits=_nothing_sent),
+    "quick_stop": set_to(Cia402Axis, stop=_unheard),
+    "software_limits": set_to(cia402_axis, write_limits=_nothing_sent),
     "look_ahead": _set_points_far_ahead,
-    "loop_heartbeat": _set(FrameLink, beat=_unheard),
+    "loop_heartbeat": set_to(FrameLink, beat=_unheard),
 }
 """By the rule's name."""

@@ -85,57 +85,33 @@ def test_a_second_set_up_does_nothing(workspace: Workspace, commands: Commands) 
     assert commands.names == []
 
 
-def test_a_renewed_lock_is_installed_into_the_environment(
-    workspace: Workspace, commands: Commands
-) -> None:
-    workspace.main()
-    commands.names.clear()
-    workspace.LOCKS["wheels"].write_text("setuptools==2 \\\n    --hash=sha256:0\n")
-    assert workspace.main() == 0
-    assert commands.names == ["pip", "pip", "import", *BUILD]
-
-
 @pytest.mark.parametrize(
-    "path",
-    ["needle_one/executables.py", "launch/rig.launch.py"],
+    ("file", "text", "done"),
+    [
+        ("requirements.lock", "setuptools==2 \\\n    --hash=sha256:0\n", FIRST[1:]),
+        ("ros2_ws/src/needle_one/needle_one/executables.py", "new", ["colcon"]),
+        ("ros2_ws/src/needle_one/launch/rig.launch.py", "new", ["colcon"]),
+        (
+            "ros2_ws/src/needle_one/needle_one/fast.py",
+            "from x import compiled\n\n@compiled\ndef f(): ...\n",
+            ["compile"],
+        ),
+        # What is linked needs no build.
+        ("ros2_ws/src/needle_one/config/rig.yaml", "a: 2", []),
+        ("ros2_ws/src/needle_one/needle_one/plant.py", "", []),
+    ],
 )
-def test_a_new_executable_or_file_is_only_built(
-    workspace: Workspace, commands: Commands, path: str
+def test_only_what_a_change_needs_is_done_and_once(
+    checkout: Path, workspace: Workspace, commands: Commands, file: str, text: str, done: list[str]
 ) -> None:
+    (checkout / "ros2_ws/src/needle_one/config/rig.yaml").write_text("a: 1")
     workspace.main()
-    commands.names.clear()
-    file = workspace.WORKSPACE / "src" / "needle_one" / path
-    file.parent.mkdir(exist_ok=True)
-    file.write_text("new")
-    assert workspace.main() == 0
-    assert commands.names == ["colcon"]
-
-
-def test_changed_compiled_code_is_compiled_and_not_built(
-    workspace: Workspace, commands: Commands
-) -> None:
-    workspace.main()
-    commands.names.clear()
-    module = workspace.WORKSPACE / "src" / "needle_one" / "needle_one" / "fast.py"
-    module.parent.mkdir(parents=True)
-    module.write_text("from x import compiled\n\n@compiled\ndef f(): ...\n")
-    assert workspace.main() == 0
-    assert commands.names == ["compile"]
-    commands.names.clear()
-    assert workspace.main() == 0
-    assert commands.names == []
-
-
-def test_what_is_linked_needs_no_build(workspace: Workspace, commands: Commands) -> None:
-    package = workspace.WORKSPACE / "src" / "needle_one"
-    (package / "config" / "rig.yaml").write_text("a: 1")
-    workspace.main()
-    commands.names.clear()
-    (package / "config" / "rig.yaml").write_text("a: 2")
-    (package / "needle_one").mkdir()
-    (package / "needle_one" / "plant.py").write_text("")
-    assert workspace.main() == 0
-    assert commands.names == []
+    (checkout / file).parent.mkdir(exist_ok=True)
+    (checkout / file).write_text(text)
+    for wanted in (done, []):
+        commands.names.clear()
+        assert workspace.main() == 0
+        assert commands.names == wanted
 
 
 @pytest.mark.parametrize(("stage", "again"), [("pip", FIRST), ("import", FIRST), ("colcon", BUILD)])

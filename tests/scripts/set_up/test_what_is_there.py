@@ -43,29 +43,39 @@ def setup(root: Path, path: Path | str, **variables: str) -> subprocess.Complete
     )
 
 
-def only_line(result: subprocess.CompletedProcess[str]) -> str:
-    assert result.returncode == 2
-    assert result.stdout == ""
-    lines = result.stderr.splitlines()
-    assert len(lines) == 1, result.stderr
-    assert lines[0].startswith("setup: ")
-    return lines[0]
-
-
-def test_another_machine(checkout: Path, stubs: Path) -> None:
-    add(stubs, "uname", '[ "$1" = -s ] && echo Linux || echo aarch64')
-    assert "needs Linux on x86-64" in only_line(setup(checkout, stubs))
-
-
-def test_a_shim_of_an_inactive_version_is_no_python(checkout: Path, stubs: Path) -> None:
-    add(stubs, "python3", 'echo "pyenv: python3: command not found" >&2; exit 127')
-    add(stubs, "python3.12", "exit 10")
-    assert "no Python 3.10-3.13 on the PATH" in only_line(setup(checkout, stubs))
-
-
-def test_a_python_without_venv(checkout: Path, stubs: Path) -> None:
-    add(stubs, "python3", "exit 11")
-    assert "install python3-venv" in only_line(setup(checkout, stubs))
+@pytest.mark.parametrize(
+    ("there", "variables", "said"),
+    [
+        (
+            {"uname": '[ "$1" = -s ] && echo Linux || echo aarch64'},
+            {},
+            "needs Linux on x86-64",
+        ),
+        # A shim of a version that is not active is no Python.
+        (
+            {"python3": "echo 'pyenv: command not found' >&2; exit 127", "python3.12": "exit 10"},
+            {},
+            "no Python 3.10-3.13 on the PATH",
+        ),
+        ({"python3": "exit 11"}, {}, "install python3-venv"),
+        (
+            {"python3": "exit 0"},
+            {"NEEDLE_PYTHON": "/nonexistent/python"},
+            "NEEDLE_PYTHON=/nonexistent/python is not a Python",
+        ),
+        ({"ros2": "exit 0"}, {"ROS_DISTRO": "humble"}, "ROS 2 humble is sourced"),
+    ],
+)
+def test_what_is_missing_is_said_in_one_line(
+    checkout: Path, stubs: Path, there: dict[str, str], variables: dict[str, str], said: str
+) -> None:
+    for name, text in there.items():
+        add(stubs, name, text)
+    result = setup(checkout, stubs, **variables)
+    assert (result.returncode, result.stdout) == (2, "")
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("setup: ")
+    assert said in line
 
 
 def test_the_first_python_that_fits_is_taken(checkout: Path, stubs: Path) -> None:
@@ -73,17 +83,6 @@ def test_the_first_python_that_fits_is_taken(checkout: Path, stubs: Path) -> Non
     add(stubs, "python3.11", '[ "$1" = -c ] || echo "$@"')
     result = setup(checkout, stubs)
     assert result.stdout == f"-I -B {checkout}/scripts/lib/setup_workspace.py --mode wheels\n"
-
-
-def test_a_python_that_was_asked_for_is_not_replaced(checkout: Path, stubs: Path) -> None:
-    add(stubs, "python3", "exit 0")
-    line = only_line(setup(checkout, stubs, NEEDLE_PYTHON="/nonexistent/python"))
-    assert "NEEDLE_PYTHON=/nonexistent/python is not a Python" in line
-
-
-def test_another_ros(checkout: Path, stubs: Path) -> None:
-    add(stubs, "ros2", "exit 0")
-    assert "ROS 2 humble is sourced" in only_line(setup(checkout, stubs, ROS_DISTRO="humble"))
 
 
 def test_ros_is_used_where_it_is_sourced_and_nothing_of_it_is_dropped(

@@ -31,12 +31,6 @@ _PAGE = """<!doctype html>
   import { startHold } from "/hold.js";
   const port = Number(new URLSearchParams(location.search).get("port"));
   window.needleHold = startHold({ port, speed: 1.0 });
-  // When it lost sight or focus, system clock [ms].
-  const lost = (event) => {
-    window.lostAt ??= performance.timeOrigin + event.timeStamp;
-  };
-  document.addEventListener("visibilitychange", lost);
-  window.addEventListener("blur", lost);
 </script>
 """
 

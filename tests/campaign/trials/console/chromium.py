@@ -116,16 +116,12 @@ class Chromium:
         self._socket.send(json.dumps({**command, "sessionId": session} if session else command))
         return number
 
-    def signal(self, number: signal.Signals) -> None:
-        """Send a signal to all of its processes."""
-        os.killpg(self._process.pid, number)
-
     def kill(self) -> None:
         """End all of its processes at once."""
         # Once only: later its number may be another's.
         if self._process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
-                self.signal(signal.SIGKILL)
+                os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
 
     def close(self) -> None:
@@ -174,17 +170,9 @@ class Tab:
         )
         return answer["result"].get("value")
 
-    def post(self, script: str) -> None:
-        """Run a script, and wait for nothing."""
-        self._browser.post("Runtime.evaluate", self._session, expression=script)
-
     def show(self) -> None:
         """Bring it to the front."""
         self._browser.post("Target.activateTarget", targetId=self.target)
-
-    def close(self) -> None:
-        """Close it, and wait for nothing."""
-        self._browser.post("Target.closeTarget", targetId=self.target)
 
     def press_pointer(self, x: float, y: float) -> None:
         """Press the mouse's button at a place [px]."""

@@ -6,9 +6,11 @@ import contextlib
 import io
 import itertools
 import math
+import random
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 
 from needle_analysis.ros import rerun
@@ -17,7 +19,7 @@ from needle_bringup.simulation.rig_configuration import command_line_parameters,
 from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.virtual_run import COMPUTE, make_components
 from needle_core.component import Output
-from needle_core.runners.faults import Fault, delay, drop, duplicate
+from needle_core.runners.faults import Arrival, Arrivals, Fault, Link, delay, drop, duplicate
 from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_sim.sim_rig import SimRig
 
@@ -35,10 +37,18 @@ OPERATOR = "simulated_operator"
 class Rig:
     """The rig of a command line on a virtual runner, and what its components send."""
 
-    def __init__(self, *arguments: str, faults: tuple[Fault, ...] = (), bag: Path | None = None):
+    def __init__(
+        self,
+        *arguments: str,
+        faults: tuple[Fault, ...] = (),
+        bag: Path | None = None,
+        **of_rig: Any,
+    ):
         self.sent: dict[str, list[Any]] = {}
         options = parse(arguments)
-        components = make_components(command_line_parameters(options, bag or Path("none")))
+        parameters = command_line_parameters(options, bag or Path("none"))
+        parameters["sim_rig"].update(of_rig)
+        components = make_components(parameters)
         (self.sim_rig,) = [c for c in components if isinstance(c, SimRig)]
         self.tap = BagTap(bag, components, (DIAGNOSTICS, LOG), run_info(options)) if bag else None
         taps = (self._note, self.tap) if self.tap else (self._note,)
@@ -111,12 +121,6 @@ def test_it_gets_there_in_spite_of_messages_lost_late_and_twice() -> None:
     assert rig.depth == pytest.approx(0.004, abs=1e-5)
 
 
-def test_a_silent_controller_moves_nothing() -> None:
-    rig = Rig(*SHORT, faults=(drop(COMMANDS, 1.0),))
-    rig.runner.run(10.0)
-    assert rig.depth == 0.0
-
-
 def test_a_tip_that_leaves_the_phantom_ends_the_run() -> None:
     rig = Rig("--level", "tip", "--controller", "open_loop")
     rig.sim_rig._sensor.half_sizes = (1e-3, math.inf)
@@ -129,10 +133,13 @@ def test_a_tip_that_leaves_the_phantom_ends_the_run() -> None:
 @pytest.fixture(scope="module")
 def lossy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, str]:
     """Return a rig whose tracker did not hear every image, and what its rerun says."""
-    bag = tmp_path_factory.mktemp("lossy") / "bag"
+    folder = tmp_path_factory.mktemp("lossy")
+    bag, images = folder / "bag", str(folder / "images")
     words = ("--level", "camera", "--depth-mm", "3")
-    rig = Rig(*words, faults=(drop("stereo/left/image_raw", 0.4),), bag=bag)
+    lost = (drop("stereo/left/image_raw", 0.4),)
+    rig = Rig(*words, faults=lost, bag=bag, images=images, scenario="clutter")
     assert rig.until_end() == 0
+    rig.sim_rig.close()
     assert rig.tap is not None
     rig.tap.close()
     with contextlib.redirect_stdout(io.StringIO()) as said:
@@ -148,38 +155,71 @@ def test_pairs_are_exposed_only_when_a_tip_is_awaited(lossy: tuple[Rig, str]) ->
     assert 4 == tips < pairs < 12
 
 
+def test_what_is_rendered_is_written_with_insertion_and_truth(lossy: tuple[Rig, str]) -> None:
+    rig, _ = lossy
+    folder = Path(rig.sim_rig.settings.images)
+    for side in ("left", "right"):
+        for number, image in enumerate(rig.sent[f"stereo/{side}/image_raw"]):
+            written = cv2.imread(str(folder / side / f"{number:06d}.png"), cv2.IMREAD_UNCHANGED)
+            assert written is not None
+            assert written.tobytes() == bytes(image.data)
+            assert (image.encoding, image.step, image.frame_id) == (
+                *("mono8", 1024),
+                f"{side}_camera_optical",
+            )
+    lines = (folder / "insertion.csv").read_text().splitlines()
+    assert lines[:2] == ["name,insertion_m", "000000.png,0.0"]
+    assert float(lines[-1].split(",")[1]) == pytest.approx(0.003)
+    last = (folder / "truth.csv").read_text().splitlines()[-1].split(",")
+    assert tuple(map(float, last[1:4])) == rig.sent["sim/tip_pose"][-1].position
+    assert (folder / "calibration.yaml").is_file()
+
+
 def test_pairs_that_the_tracker_did_not_hear_are_left_out_when_it_runs_again(
     lossy: tuple[Rig, str],
 ) -> None:
     assert "pairs are left out: stereo_tracker did not hear them" in lossy[1]
 
 
-@pytest.fixture(scope="module")
-def frozen() -> tuple[Rig, list[float]]:
-    """Return a rig whose driver stood still, and where its motors were at once, then, and later."""
-    rig, seen = Rig("--level", "drive", "--depth-mm", "3"), []
-    rig.until_depth(0.0015)
-    rig.runner.freeze("device_driver", 1.0)
-    for seconds in (0.1, 0.8):
-        rig.runner.run(seconds)
-        seen.append(rig.sim_rig._bench.insertion)
-    rig.until_end()
-    return rig, seen
+def late(latest: float) -> Fault:
+    """Return a fault that delays each message to the controller by up to `latest` [s]."""
+
+    def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals | None:
+        to_controller = link.receiver == "plane_controller"
+        return (Arrival(rng.uniform(0.0, latest), message),) if to_controller else None
+
+    return fault
 
 
-def test_at_level_drive_the_needle_goes_where_the_motors_go(frozen: tuple[Rig, object]) -> None:
-    rig, _ = frozen
-    motors = [at.positions[0] for at in rig.sent["sim/drive_positions"]]
-    assert max(motors) > 0.0015
-    assert rig.sim_rig._bench.insertion == motors[-1]
-    assert rig.sent["device/status"][-1].values["simulated"] == "true"
+@pytest.fixture(scope="module", params=["stepwise", "continuous"])
+def late_bag(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """Return the bag of a run whose controller heard all messages late, and stood still."""
+    bag = tmp_path_factory.mktemp("late") / "bag"
+    words = ("--level", "tip", "--depth-mm", "2", "--insertion", request.param)
+    rig = Rig(*words, faults=(late(0.04),), bag=bag)
+    rig.until_depth(0.001)
+    rig.runner.freeze("plane_controller", 0.2)
+    assert rig.until_end() == 0
+    assert rig.tap is not None
+    rig.tap.close()
+    return bag
 
 
-def test_at_level_drive_a_driver_that_stands_still_stops_the_needle(
-    frozen: tuple[Rig, list[float]],
+def test_a_bag_whose_controller_heard_late_and_stood_still_runs_again_unchanged(
+    late_bag: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig, (stopped, later) = frozen
-    # 2 mm/s until the set-points end
-    assert 0.0015 <= stopped < 0.0015 + 0.0002
-    assert later == stopped
-    assert "heartbeat was missed" in rig.runner.exits[OPERATOR].text
+    assert rerun.main([str(late_bag)]) == 0, capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def driven() -> Rig:
+    """Return a rig at level drive that has come to its end."""
+    rig = Rig("--level", "drive", "--depth-mm", "1")
+    assert rig.until_end() == 0
+    return rig
+
+
+def test_at_level_drive_the_needle_goes_where_the_motors_go(driven: Rig) -> None:
+    motors = [at.positions[0] for at in driven.sent["sim/drive_positions"]]
+    assert driven.sim_rig._bench.insertion == motors[-1] == pytest.approx(0.001, abs=1e-5)
+    assert driven.sent["device/status"][-1].values["simulated"] == "true"

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_bringup.training.floors import clutter, floor
 from needle_bringup.training.needle_ends import Pose, draw_needle, draw_shadow, true_map
 from needle_bringup.training.old_tracks import drawn_tracks, shifted_tracks
 from needle_bringup.training.patches import patch
-from needle_bringup.training.samples import CANVAS, WIDTHS, moved, random_width
+from needle_bringup.training.samples import CANVAS, moved
 
 SIZE = 96
 
@@ -42,13 +41,6 @@ def test_a_needle_slides_along_its_own_curve() -> None:
     assert np.maximum(shorter - whole, 0.0).sum() < 0.03 * shorter.sum()
     back = pose.slid(-20.0).slid(20.0)
     assert np.hypot(back.x - pose.x, back.y - pose.y) < 0.5
-
-
-def test_floors_differ_and_are_never_black() -> None:
-    floors = [floor(np.random.default_rng(i), SIZE) for i in range(30)]
-    assert min(each.min() for each in floors) >= 2.0
-    assert max(each.max() for each in floors) <= 255.0
-    assert np.std([each.mean() for each in floors]) > 30.0
 
 
 def test_tracks_without_a_background_are_faint() -> None:
@@ -86,15 +78,6 @@ def test_an_image_is_moved_as_far_as_told() -> None:
     assert there[20, 20] == 0.0
 
 
-def test_widths_are_of_every_octave_as_often() -> None:
-    rng = np.random.default_rng(0)
-    widths = np.array([random_width(rng) for _ in range(4000)])
-    assert widths.min() > WIDTHS[0]
-    assert widths.max() < WIDTHS[1]
-    middle = np.sqrt(WIDTHS[0] * WIDTHS[1])
-    assert (widths < middle).mean() == pytest.approx(0.5, abs=0.03)
-
-
 def test_patches_repeat_by_their_seed() -> None:
     one, again, other = (patch(np.random.default_rng([1, n])) for n in (2, 2, 3))
     assert np.array_equal(one.image, again.image)
@@ -116,11 +99,3 @@ def test_patches_have_needles_backgrounds_and_ends_or_none() -> None:
     ):
         assert any(some)
         assert not all(some)
-
-
-def test_clutter_lies_over_a_part_of_most_images_and_over_none_of_some() -> None:
-    ground = np.full((SIZE, SIZE), 120.0, np.float32)
-    seen = [clutter(np.random.default_rng(i), ground) for i in range(30)]
-    covered = np.array([np.mean(np.abs(each - ground) > 1.0) for each in seen])
-    assert 0.5 < np.mean(covered > 0.0) < 1.0
-    assert covered.max() < 0.5

@@ -59,13 +59,10 @@ def test_a_drive_that_counts_in_reverse_has_its_limits_the_other_way_round() -> 
 
 def test_what_no_drive_and_no_rig_can_have_is_refused() -> None:
     values: list[dict[str, Any]] = [
-        {"node_id": 0},
-        {"node_id": 127},
         {"counts_per_unit": 0.0},
         {"counts_per_unit": math.nan},
         {"speed": -1.0},
         {"quick_stop_deceleration": math.inf},
-        {"homing_method": 36},
         {"lower": 0.201},
     ]
     for changes in values:

@@ -1,1 +1,0 @@
-"""The driver's component on the emulated drives, in virtual time."""

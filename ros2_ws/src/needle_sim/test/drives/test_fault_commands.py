@@ -1,0 +1,79 @@
+"""Faults on command at the terminal of drive_emulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from needle_core.component import Action, Log, Moment, Send
+from needle_core.errors import UserError
+from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+from needle_sim.drives.emulated_bus import EmulatedBus
+from needle_sim.drives.fault_commands import PlugOrder
+
+AT = Moment(1.0, 1_000_000_000)
+
+
+@pytest.fixture
+def drives() -> DriveEmulator:
+    emulator = DriveEmulator(DriveEmulatorParameters())
+    # They have booted.
+    list(emulator.timers[0].handler(AT))
+    return emulator
+
+
+def typed(drives: DriveEmulator, *lines: str) -> list[Action]:
+    (terminal,) = (port for port in drives.ports if port.name == COMMAND_LINES)
+    return list(terminal.handler(lines, AT))
+
+
+@pytest.mark.parametrize(
+    ("line", "happened"),
+    [
+        ("stall insertion", lambda bus: bus.drives["insertion"].motor.stalled),
+        ("hang rotation", lambda bus: bus.drives["rotation"].hung),
+        ("emcy insertion 0x2310", lambda bus: bus.drives["insertion"].error_code == 0x2310),
+        ("cut_bus", lambda bus: bus.is_cut),
+    ],
+)
+def test_a_fault_happens_on_command_and_ends_with_restore(
+    drives: DriveEmulator, line: str, happened: Callable[[EmulatedBus], bool]
+) -> None:
+    (said, *_) = typed(drives, line)
+    assert said == Log("warning", f"on command: {line}, at 0.000000 mm, 0.000000 rad")
+    assert happened(drives.bus)
+    typed(drives, "restore")
+    assert not happened(drives.bus) or line.startswith("emcy")
+
+
+def test_a_drive_that_is_rebooted_on_command_says_so(drives: DriveEmulator) -> None:
+    typed(drives, "reboot rotation")
+    said = [(frame.identifier, frame.data) for frame in drives.bus.poll(2.0)]
+    assert (0x702, b"\0") in said
+    assert (0x701, b"\0") not in said
+
+
+def test_an_adapter_is_unplugged_and_plugged_in_by_whoever_has_it(drives: DriveEmulator) -> None:
+    said = typed(drives, "unplug", "restore")
+    orders = [action.batch for action in said if isinstance(action, Send)]
+    assert orders == [(PlugOrder.OUT,), (PlugOrder.IN,)]
+    assert {action.port for action in said if isinstance(action, Send)} == {ADAPTER}
+
+
+def test_lines_that_are_no_commands_are_named_and_do_nothing(drives: DriveEmulator) -> None:
+    bad = (
+        *("explode", "stall", "stall both", "stall insertion now", "cut_bus now"),
+        *("emcy insertion x", "emcy rotation 0x10000"),
+    )
+    said = typed(drives, *bad)
+    assert [action.text.split("'")[1] for action in said if isinstance(action, Log)] == list(bad)
+    assert len(said) == len(bad)
+    assert {drive.error_code for drive in drives.bus.drives.values()} == {0}
+
+
+def test_drives_that_cannot_be_are_refused() -> None:
+    for bad in ({"insertion_node_id": 2}, {"limit_action": "ignore"}, {"insertion_start": 0.3}):
+        with pytest.raises(UserError, match=r"node id|one of|beyond"):
+            DriveEmulator(DriveEmulatorParameters(**bad))
