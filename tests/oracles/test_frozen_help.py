@@ -11,6 +11,9 @@ HELP = Path(__file__).resolve().parent / "help"
 CHANGED = {
     "rerun": "--viewers takes a bag through live_view and openigtlink",
     "scripts_console": "the rig is in one process, cameras and tracker in a second one",
+    "scripts_dask": "what it installs is an extra of pyproject.toml",
+    "scripts_docs": "Sphinx goes into .venv",
+    "scripts_setup": "it takes the extras to be installed",
     "scripts_train_needle_map": "what draws its patches is in needle_bringup",
     "track_images": "one tracker in place of two: other rules, no searched region",
     "scripts_simulate": "the run is in one process: --graph runs the nodes, --component adds one",
