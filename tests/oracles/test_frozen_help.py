@@ -9,6 +9,7 @@ from reference.rig_nodes import executables
 
 HELP = Path(__file__).resolve().parent / "help"
 CHANGED = {
+    "recover": "a bag's files are told by their names alone",
     "rerun": "--viewers takes a bag through live_view and openigtlink",
     "scripts_console": "the rig is in one process, cameras and tracker in a second one",
     "scripts_dask": "what it installs is an extra of pyproject.toml",
