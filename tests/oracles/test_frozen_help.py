@@ -10,6 +10,7 @@ from reference.rig_nodes import executables
 HELP = Path(__file__).resolve().parent / "help"
 CHANGED = {
     "recover": "a bag's files are told by their names alone",
+    "monte_carlo": "tissue that pushes, a roll that wanders, a bias that walks and more go wrong",
     "rerun": "--viewers takes a bag through live_view and openigtlink",
     "scripts_console": "the rig is in one process, cameras and tracker in a second one",
     "scripts_dask": "what it installs is an extra of pyproject.toml",

@@ -16,6 +16,7 @@ from campaign.checks.control_studies import (
     POINTS,
     TOLD_WRONG,
     TROUBLE,
+    WANDERING,
     Study,
     judge,
     run,
@@ -48,7 +49,7 @@ def best(bench: Workbench) -> Iterator[Finding]:
 
 def trouble(bench: Workbench) -> Iterator[Finding]:
     """Study preset best under each trouble, of which it is told nothing."""
-    return _studied(TROUBLE + TOLD_WRONG, bench)
+    return _studied(TROUBLE + TOLD_WRONG + WANDERING, bench)
 
 
 def points(bench: Workbench) -> Iterator[Finding]:

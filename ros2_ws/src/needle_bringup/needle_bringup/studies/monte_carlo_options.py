@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from needle_bringup.simulation.simulate_options import add_own_part_options
+from needle_bringup.studies.disturbance_options import add_disturbance_options, disturbances_of
 from needle_controller.presets.steering_settings import PRESETS
 from needle_core.commands.options import (
     CommandParser,
@@ -18,7 +19,7 @@ from needle_core.commands.options import (
     whole_number,
 )
 from needle_core.errors import UserError
-from needle_sim.studies.disturbances import NOISE_SHAPES, Disturbances
+from needle_sim.studies.disturbances import Disturbances
 from needle_sim.studies.start_grids import GRIDS, StartBounds
 
 DESCRIPTION = """\
@@ -27,7 +28,7 @@ Steer many simulated needles to the plane x = 0 and say how many get there.
 The default is the study of [KC09]: 10 x 10 x 10 starts (x, pitch, roll up to the given bounds, roll
 centred on 0), each 10 times with other noise, 120 mm deep, +-1 mm noise on each coordinate of the
 tip. What is judged is the true tip. The first tip is measured before the needle moves, every other
-after a step of 1 mm, the last one after the last. Disturbances act on the plant alone; the
+after a step of --step-mm, the last one after the last. Disturbances act on the plant alone; the
 controller is told of none, but of --delay. Of the noise it believes what --claimed-mm says.
 """
 
@@ -60,7 +61,7 @@ examples:
   ros2 run needle_sim monte_carlo --noise-mm 0.58 --noise-shape normal
   ros2 run needle_sim monte_carlo --targets 2000 --csv points.csv
   ros2 run needle_sim monte_carlo --targets 2000 --rotation-deg 800
-  ros2 run needle_sim monte_carlo --targets 2000 --target-drift-mm 2 --target-breath-mm 3
+  ros2 run needle_sim monte_carlo --targets 2000 --target-drift-mm-per-s 0.03 --target-breath-mm 3
   ros2 run needle_sim monte_carlo --targets 2000 --controller sliding_mode
   ros2 run needle_sim monte_carlo --targets 2000 --controller rrt
   ros2 run needle_sim monte_carlo --estimator particle_filter --draws 1
@@ -94,6 +95,7 @@ class MonteCarloOptions:
     bounds: StartBounds
     initial: tuple[float, float, float] | None
     depth: float
+    step_length: float
     disturbances: Disturbances
     claimed_bound: float
     sigma_scale: float
@@ -121,10 +123,6 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
     given = _parser().parse_args(join_start(arguments))
     if given.grid not in GRIDS:
         raise UserError(f"--grid {given.grid!r} is not one of {', '.join(GRIDS)}")
-    if given.noise_shape not in NOISE_SHAPES:
-        raise UserError(f"--noise-shape {given.noise_shape!r} is not {' or '.join(NOISE_SHAPES)}")
-    if given.noise_lasting != "0" and given.noise_shape != "normal":
-        raise UserError("--noise-lasting is of normal noise: --noise-shape normal")
     if given.targets != "0" and given.turn_delay_mm != "0":
         raise UserError("--turn-delay-mm is of needles that are steered to the plane")
     if given.planner and given.targets == "0":
@@ -146,29 +144,16 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
         ),
         initial=None if given.initial is None else _initial(given.initial),
         depth=number("--depth-mm", depth, 1.0, 1000.0, "mm") * 1e-3,
-        disturbances=Disturbances(
-            noise=number("--noise-mm", given.noise_mm, 0.0, 20.0, "mm") * 1e-3,
-            noise_shape=given.noise_shape,
-            noise_lasting=number("--noise-lasting", given.noise_lasting, 0.0, 0.999, "-"),
-            outliers=number("--outliers", given.outliers, 0.0, 1.0, "-"),
-            outlier_size=_outlier_size(given.outlier_mm),
-            dropped=number("--dropped", given.dropped, 0.0, 1.0, "-"),
-            delay=whole_number("--delay", given.delay, 0, 100),
-            untold_delay=whole_number("--untold-delay", given.untold_delay, 0, 100),
-            curvature_scale=number("--kappa-scale", given.kappa_scale, 0.05, 20.0, "-"),
-            curvature_patches=number("--kappa-patches", given.kappa_patches, 0.0, 0.95, "-"),
-            play=math.radians(number("--play-deg", given.play_deg, 0.0, 180.0, "deg")),
-            lag_length=number("--lag-mm", given.lag_mm, 0.0, 1000.0, "mm") * 1e-3,
-            slip=number("--slip", given.slip, -0.5, 2.0, "-"),
-            bump=number("--bump-mm", given.bump_mm, 0.0, 100.0, "mm") * 1e-3,
-        ),
+        step_length=number("--step-mm", given.step_mm, 0.1, 10.0, "mm") * 1e-3,
+        disturbances=disturbances_of(given),
         claimed_bound=number("--claimed-mm", given.claimed_mm, 0.01, 100.0, "mm") * 1e-3,
         sigma_scale=number("--sigma-scale", given.sigma_scale, 0.01, 100.0, "-"),
         flips=whole_number("--flips", given.flips, 0, 100),
         turn_delay=number("--turn-delay-mm", given.turn_delay_mm, 0.0, 0.9, "mm") * 1e-3,
         targets=whole_number("--targets", given.targets, 0, 1_000_000),
         rotation_budget=math.radians(number("--rotation-deg", given.rotation_deg, 0.0, 1e6, "deg")),
-        target_drift=number("--target-drift-mm", given.target_drift_mm, 0.0, 100.0, "mm") * 1e-3,
+        target_drift=1e-3
+        * number("--target-drift-mm-per-s", given.target_drift_mm_per_s, 0.0, 10.0, "mm/s"),
         target_breath=number("--target-breath-mm", given.target_breath_mm, 0.0, 100.0, "mm") * 1e-3,
         seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
         scheduler=given.scheduler,
@@ -182,7 +167,9 @@ def _of_a_run(given: Mapping[str, str]) -> Mapping[str, str]:
     """Return the options that every run has, by name; how much a base turns is a result."""
     renamed = {"rotation_deg": "most_rotation_deg"}
     return {
-        renamed.get(name, name): value for name, value in given.items() if name not in _OF_THE_STUDY
+        renamed.get(name, name): value or ""
+        for name, value in given.items()
+        if name not in _OF_THE_STUDY
     }
 
 
@@ -205,15 +192,6 @@ def _parser() -> CommandParser:
     )
     numbers = (
         ("--draws", "10", "N", "runs from each start"),
-        (
-            "--noise-mm",
-            "1",
-            "A",
-            "error of each coordinate of a measured tip: of uniform noise the largest, of normal "
-            "noise the standard deviation",
-        ),
-        ("--noise-shape", "uniform", "|".join(NOISE_SHAPES), "how that noise is distributed"),
-        ("--noise-lasting", "0", "R", "correlation of a normal error with that of the tip before"),
         ("--claimed-mm", "1", "C", "largest error that the controller is told, whatever it is"),
         (
             "--sigma-scale",
@@ -225,17 +203,6 @@ def _parser() -> CommandParser:
         ("--x-mm", "3", "X", "bound of the starts' distance from the plane"),
         ("--pitch-deg", "10", "P", "bound of the starts' pitch"),
         ("--roll-deg", "30", "R", "bound of the starts' roll"),
-        ("--kappa-scale", "1", "S", "the needle's curvature, in terms of what is assumed"),
-        ("--play-deg", "0", "D", "dead band between base and tip angle, +-"),
-        ("--lag-mm", "0", "L", "length over which the tip's angle follows the base's"),
-        ("--outliers", "0", "F", "share of measurements off in a random direction"),
-        ("--outlier-mm", "5,10", "LO,HI", "how far those are off, uniform in between"),
-        ("--dropped", "0", "F", "share of measurements that are missing"),
-        ("--delay", "0", "N", "steps that a measurement comes late, as the controller is told"),
-        ("--untold-delay", "0", "N", "steps that it comes late, as if it were new"),
-        ("--slip", "0", "F", "share by which the stage moves farther than the needle goes in"),
-        ("--bump-mm", "0", "D", "how far the phantom, with the needle, is moved at half the depth"),
-        ("--kappa-patches", "0", "F", "curvature off by up to this share, anew every 20 mm"),
         ("--flips", "0", "N", "times the bevel is flipped, evenly spaced, mirrored"),
         (
             "--turn-delay-mm",
@@ -253,11 +220,11 @@ def _parser() -> CommandParser:
         ),
         ("--rotation-deg", "1e6", "B", "most that each base may turn on the way to its point"),
         (
-            "--target-drift-mm",
+            "--target-drift-mm-per-s",
             "0",
-            "D",
-            "how far each point drifts in a direction of its own while the needle goes in by 120 "
-            "mm, at 2 mm/s",
+            "V",
+            "how fast each point drifts in a direction of its own while the needle goes in at 2 "
+            "mm/s",
         ),
         (
             "--target-breath-mm",
@@ -265,10 +232,17 @@ def _parser() -> CommandParser:
             "A",
             "how far each point moves to and fro, 0.2 times a second, in another direction",
         ),
+        (
+            "--step-mm",
+            "1",
+            "L",
+            "insertion from one exposure to the next, as the controller is told",
+        ),
         ("--seed", "1", "N", "seed of all randomness: same seed, same figures"),
     )
     for name, default, metavar, text in numbers:
         add(name, default=default, metavar=metavar, help=f"{text} (default: {default})")
+    add_disturbance_options(parser)
     add(
         "--depth-mm",
         metavar="D",
@@ -299,12 +273,3 @@ def _parser() -> CommandParser:
 def _initial(text: str) -> tuple[float, float, float]:
     x_mm, pitch_deg, roll_deg = start(text, largest_x=100.0, largest_pitch=80.0)
     return x_mm * 1e-3, math.radians(pitch_deg), math.radians(roll_deg)
-
-
-def _outlier_size(text: str) -> tuple[float, float]:
-    parts = text.split(",")
-    if len(parts) != 2:
-        raise UserError(f"--outlier-mm {text!r} is not LO,HI, such as 5,10")
-    low = number("--outlier-mm LO", parts[0], 0.0, 1000.0, "mm")
-    high = number("--outlier-mm HI", parts[1], low, 1000.0, "mm")
-    return low * 1e-3, high * 1e-3

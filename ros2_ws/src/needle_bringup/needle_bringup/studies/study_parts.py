@@ -14,7 +14,6 @@ import numpy as np
 from needle_bringup.studies.monte_carlo_options import MonteCarloOptions
 from needle_bringup.studies.study_controllers import (
     CURVATURE,
-    STEP_LENGTH,
     controller_factory,
     needles_at_a_time,
     point_controller_factory,
@@ -26,6 +25,9 @@ from needle_sim.studies.point_study import PointOutcomes, point_figures, run_poi
 from needle_sim.studies.point_targets import MovingTargets, random_targets
 from needle_sim.studies.start_grids import GRIDS, POINTS
 from needle_sim.studies.study import StudySettings, run_study
+
+# Of the controller's settings, those that a study passes on as they are asked for.
+_OWN = ("estimator", "law", "planner", "seed", "step_length")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ def settings_of(options: MonteCarloOptions) -> StudySettings:
     return StudySettings(
         CURVATURE,
         options.depth,
-        STEP_LENGTH,
+        options.step_length,
         options.disturbances,
         options.seed,
         options.turn_delay,
@@ -127,8 +129,8 @@ def _starts(options: MonteCarloOptions) -> FloatArray:
     return GRIDS[grid](options.bounds, draws, options.seed)[:count]
 
 
-def _own(options: MonteCarloOptions) -> dict[str, str | int]:
-    return {name: getattr(options, name) for name in ("estimator", "law", "planner", "seed")}
+def _own(options: MonteCarloOptions) -> dict[str, str | float]:
+    return {name: getattr(options, name) for name in _OWN}
 
 
 def _to_plane(part: StudyPart, on_progress: Callable[[int], None]) -> Outcomes:
@@ -185,6 +187,9 @@ def _of_plane(outcomes: Outcomes) -> Results:
             "settle_mm": outcomes.settled * 1e3,
             "rotation_deg": np.rad2deg(outcomes.rotation),
             "diverged": outcomes.diverged.astype(float),
+            "inside_3_sigma": outcomes.inside_3_sigma,
+            "doubtful": outcomes.doubtful,
+            "stated_miss": outcomes.stated_misses,
         },
     )
 
@@ -199,5 +204,7 @@ def _of_points(outcomes: PointOutcomes, places: FloatArray) -> Results:
             "target_z_mm": z,
             "error_mm": outcomes.error * 1e3,
             "rotation_deg": np.rad2deg(outcomes.rotation),
+            "inside_3_sigma": outcomes.inside_3_sigma,
+            "doubtful": outcomes.doubtful,
         },
     )

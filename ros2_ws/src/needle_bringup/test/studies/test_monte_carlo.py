@@ -30,11 +30,26 @@ REFUSED = (
     ("--draws 1.5", "--draws"),
     ("--noise-mm nan", "nan"),
     ("--noise-shape round", "--noise-shape 'round'"),
-    ("--noise-lasting 0.5", "--noise-shape normal"),
+    ("--correlated 1", "--correlated = 1"),
+    ("--student 3", "--student '3' is not DOF,SCALE_MM"),
+    ("--student 0.5,1", "--student DOF = 0.5"),
+    ("--student 3,21", "--student SCALE_MM = 21"),
+    ("--bias-walk 21", "--bias-walk = 21"),
+    ("--bias-walk 1 --student 3,1", "--student and --bias-walk are each noise"),
+    ("--correlated 0.5 --noise-shape normal", "--correlated and --noise-shape normal are"),
+    ("--bias-walk 1 --noise-mm 2", "--noise-mm goes without"),
+    ("--push -1", "--push = -1"),
+    ("--rotation-gain 2.1", "--rotation-gain = 2.1"),
+    ("--roll-walk 91", "--roll-walk = 91"),
+    ("--layer 0.3", "--layer '0.3' is not S,FROM_MM"),
+    ("--layer 0.01,60", "--layer S = 0.01"),
+    ("--layer 0.3,-1", "--layer FROM_MM = -1"),
+    ("--step-mm 0", "--step-mm = 0"),
+    ("--target-drift-mm-per-s 11", "--target-drift-mm-per-s = 11"),
     ("--outliers 5", "--outliers = 5"),
     ("--outlier-mm 5", "--outlier-mm '5'"),
     ("--outlier-mm 5,2", "--outlier-mm HI = 2"),
-    ("--dropped x", "'x'"),
+    ("--found 1.1", "--found = 1.1"),
     ("--delay -1", "--delay = -1"),
     ("--untold-delay 1.5", "--untold-delay"),
     ("--depth-mm 0", "--depth-mm = 0"),
@@ -115,16 +130,31 @@ def test_bad_arguments_are_one_line_and_exit_2(capsys: pytest.CaptureFixture[str
 
 
 def test_troubles_come_in_si_and_the_claim_is_no_matter_of_the_noise() -> None:
-    noise = "--noise-mm 0.58 --noise-shape normal --noise-lasting 0.8 --outlier-mm 2,3.5"
+    noise = "--noise-mm 0.58 --noise-shape normal --outlier-mm 2,3.5"
     others = "--slip -0.05 --bump-mm 2 --untold-delay 3 --sigma-scale 2"
     options = parse([*noise.split(), *others.split()])
     found = options.disturbances
     assert found.noise == pytest.approx(0.00058)
-    assert (found.noise_shape, found.noise_lasting) == ("normal", 0.8)
+    assert found.noise_shape == "normal"
     assert found.outlier_size == pytest.approx((0.002, 0.0035))
     assert (found.slip, found.bump, found.untold_delay) == (-0.05, 0.002, 3)
     assert (options.claimed_bound, options.sigma_scale) == (0.001, 2.0)
     assert parse(["--claimed-mm", "0.5"]).claimed_bound == 0.0005
+    walking = "--push 2 --rotation-gain 0.8 --roll-walk 5 --layer 0.3,60 --bias-walk 0.3"
+    options = parse([*walking.split(), "--step-mm", "2", "--target-drift-mm-per-s", "0.3"])
+    found = options.disturbances
+    assert (found.push, found.rotation_gain, found.layer) == (2.0, 0.8, (0.3, 0.06))
+    # 5 deg of a standard deviation over 1 mm
+    assert found.roll_walk * np.sqrt(0.001) == pytest.approx(np.deg2rad(5.0))
+    assert (found.noise, found.bias_walk) == pytest.approx((0.00009, 0.0003))
+    assert (options.step_length, options.target_drift) == pytest.approx((0.002, 0.0003))
+    found = parse(["--student", "3,0.3"]).disturbances
+    assert (found.noise_shape, found.degrees_of_freedom) == ("student", 3.0)
+    assert found.noise == pytest.approx(0.0003)
+    found = parse(["--correlated", "0.9"]).disturbances
+    assert (found.noise_shape, found.noise_lasting) == ("normal", 0.9)
+    assert found.noise == pytest.approx(0.000577, abs=1e-6)
+    options = parse([])
     assert (options.controller, round(options.depth, 9)) == ("best", 0.120)
     assert parse(["--targets", "7"]).depth == pytest.approx(0.150)
 
@@ -132,7 +162,10 @@ def test_troubles_come_in_si_and_the_claim_is_no_matter_of_the_noise() -> None:
 @pytest.mark.parametrize("asked", ["--targets 11", "--controller paper --draws 1"])
 def test_a_part_of_a_study_comes_out_as_in_the_whole(asked: str) -> None:
     """Wherever it is cut: so that parts can be steered on many machines."""
-    disturbed = "--depth-mm 8 --target-drift-mm 2 --play-deg 10"
+    disturbed = (
+        "--depth-mm 8 --target-drift-mm-per-s 0.1 --play-deg 10 --push 1 --roll-walk 2 "
+        "--bias-walk 1"
+    )
     (whole,) = parts_of(parse([*asked.split(), *disturbed.split()]))
     rest = dataclasses.replace(whole, first=4, starts=whole.starts[4:], places=whole.places[4:])
     parts = [whole.of_first(4), rest]

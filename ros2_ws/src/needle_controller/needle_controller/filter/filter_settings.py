@@ -32,12 +32,14 @@ from needle_core.errors import UserError
 from needle_core.settings.bounds import Bounds, check_bounded_fields
 
 TORSION_HYPOTHESES = (
-    TorsionHypothesis(0.0, 0.0, 0.0, 0.52),
+    TorsionHypothesis(0.0, 0.0, 0.02, 0.52),
     TorsionHypothesis(math.radians(20.0), 0.0, 0.15, 0.12),
     TorsionHypothesis(math.radians(40.0), 0.0, 0.15, 0.25),
     TorsionHypothesis(0.0, 0.006, 0.003, 0.11),
+    TorsionHypothesis(0.0, 0.0, 0.15, 0.1, heading_drift=0.15, roll_drift=1.5),
 )
-"""None, a small and a large play, lag. Each one's size is estimated."""
+"""None, a small and a large play, lag, and a tip that turns by itself: tissue pushes it aside, or it
+rolls, or follows only part of the base's rotation. Each one's size is estimated."""
 ROLL_HYPOTHESES = tuple(
     RollHypothesis(math.radians(roll), math.radians(std), weight)
     for roll, std, weight in (
@@ -51,9 +53,10 @@ ROLL_HYPOTHESES = tuple(
 """Most likely as the base puts it, to some 30 deg; else anywhere. Narrow ones, for a filter that is
 linear in the roll knows less than it thinks when its roll is wide."""
 LASTING_NOISE = NoiseHypothesis(
-    LASTING, (1.0, 2.0) * 3, (1.0 / 6.0,) * 6, 0.1, (0.0, 0.0, 0.5, 0.5, 0.8, 0.8)
+    LASTING, (1.0, 2.0, 1.0, 1.0), (0.25,) * 4, 0.1, (0.0, 0.0, 0.7, 0.95)
 )
-"""Whatever is claimed: some coordinates are worse than others, or errors last for some tips."""
+"""Whatever is claimed: some coordinates are worse than others, or errors last for some tips, or for
+so many that they are as good as a bias that wanders."""
 NORMAL_NOISE = (
     NoiseHypothesis(NORMAL, (1.0, 0.5, 2.0, 4.0, 8.0), (0.5, 0.2, 0.15, 0.1, 0.05), 1.0),
     LASTING_NOISE,
@@ -98,11 +101,6 @@ class FilterSettings:
         What the model leaves out of a tip's position [m]. A better sensor is not believed beyond
         it: a filter that is linear in the roll would hold a wrong one for certain. Its square is
         added to a tip's covariance, and a bound is taken as at least twice as large.
-    softness : float
-        Standard deviation by which a coordinate is blurred [m].
-    mistrust : float
-        Share by which the variance of an expected coordinate is taken as larger than it is: a
-        filter that is linear in the roll knows less than it thinks.
     jump_share : float
         How likely a tip that looks like an outlier shows that phantom or tracker were displaced,
         against that it is one.
@@ -112,8 +110,6 @@ class FilterSettings:
         How well pitch and yaw at the entry are known [rad].
     entry_std : float
         How far from the entry point, along the needle, its tip may be with the stage at 0 [m].
-    orientation_drift : float
-        Growth of the orientation's standard deviation over a metre [rad/sqrt(m)].
     play_drift, lag_drift : float
         Growth of the standard deviations of play [rad/sqrt(m)] and lag length [sqrt(m)] over a
         metre, where they are estimated: what keeps them open for what the model does not know.
@@ -141,13 +137,10 @@ class FilterSettings:
     outlier_share: Annotated[float, Bounds(1e-6, 0.5, "-")] = 0.1
     outlier_reach: Annotated[float, Bounds(1.0, 1000.0, "-")] = 4.0
     model_error: Annotated[float, Bounds(0.0, 0.1, "m")] = 0.0001
-    softness: Annotated[float, Bounds(0.0, 0.1, "m")] = 0.00004
-    mistrust: Annotated[float, Bounds(0.0, 10.0, "-")] = 0.25
     jump_share: Annotated[float, Bounds(1e-6, 1.0, "-")] = 0.2
     jump_turn_std: Annotated[float, Bounds(0.0, 1.0, "rad")] = math.radians(2.0)
     initial_angle_std: Annotated[float, Bounds(1e-6, math.pi, "rad")] = math.radians(8.0)
     entry_std: Annotated[float, Bounds(1e-6, 0.1, "m")] = 0.0005
-    orientation_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = math.sqrt(0.001)
     play_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.2
     lag_drift: Annotated[float, Bounds(0.0, 1.0, "sqrt(m)")] = 0.003
     prune_ratio: Annotated[float, Bounds(1.0, 1e30, "-")] = 250.0
@@ -193,16 +186,13 @@ class FilterSettings:
         known["curvature_drift"] = (self.curvature_drift * self.curvature) ** 2
         known["scale_spread"] = self.scale_spread
         known["scale_drift"] = self.scale_drift**2
-        known["play_drift"] = self.play_drift**2
-        known["lag_drift"] = self.lag_drift**2
+        known["size_drift"] = self.play_drift**2, self.lag_drift**2, 0.0
         known["largest_play"] = self.play_limit
         known["smallest_lag"] = self.lag_range[0]
         known["largest_lag"] = self.lag_range[1]
         known["longest_step"] = self.longest_step
         known["believed_bound"] = self.believed_bound
         known["entry_std"] = self.entry_std
-        known["mistrust"] = self.mistrust
-        known["softness"] = self.softness**2
         known["model_error"] = self.model_error**2
         known["outlier_share"] = self.outlier_share
         known["outlier_density"] = self.outlier_reach**-3
@@ -236,8 +226,9 @@ class FilterSettings:
             h["torsion"], h["shape"] = number, noise.shape
             h["noise_weights"] = noises[noise.shape, 1]
             h["curvature"], h["scale"] = self.curvature, 1.0
-            h["play"], h["lag"] = torsion.play, torsion.lag_length
-            h["orientation_drift"] = self.orientation_drift**2
+            h["play"], h["lag"], h["gain"] = torsion.play, torsion.lag_length, 1.0
+            h["sized"] = torsion.sized
+            h["heading_drift"], h["roll_drift"] = torsion.heading_drift**2, torsion.roll_drift**2
             h["rotation"] = rotation_from_angles([0.0, 0.0, roll.roll])
             covariance = h["covariance"]
             for k in range(2):

@@ -11,9 +11,14 @@ from needle_core.errors import UserError
 from needle_core.settings.bounds import Bounds, check_bounded_fields
 
 
+# Read by compiled code.
+PLAY, LAG, GAIN = range(3)
+"""Sizes of a torsion, of which each hypothesis estimates one."""
+
+
 @dataclasses.dataclass(frozen=True)
 class TorsionHypothesis:
-    """One model of the shaft's torsion; its size, lag length or play, is then estimated.
+    """One model of how the tip's roll follows the base; its size is then estimated.
 
     Attributes
     ----------
@@ -22,19 +27,32 @@ class TorsionHypothesis:
     lag_length : float
         Inserted length over which the tip follows [m]; 0 is none.
     size_std : float
-        How well the size is known: of the lag length [m] if there is one, else of the play [rad].
+        How well the size is known: of the lag length [m] if there is one, else of the play [rad];
+        without either, of the share of the base's rotation that reaches the tip, about 1.
     weight : float
         Prior weight, relative to the others'.
+    heading_drift, roll_drift : float
+        Growth of the standard deviations of pitch and yaw, and of the roll, over a metre: how far
+        the tip turns by itself [rad/sqrt(m)].
     """
 
     play: Annotated[float, Bounds(0.0, math.pi, "rad")]
     lag_length: Annotated[float, Bounds(0.0, 0.1, "m")]
     size_std: Annotated[float, Bounds(0.0, math.pi, "m or rad")]
     weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
+    heading_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.055
+    roll_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.055
 
     def __post_init__(self) -> None:
         """Check every field; raises OutOfBoundsError."""
         check_bounded_fields(self)
+
+    @property
+    def sized(self) -> int:
+        """Which size is estimated: `PLAY`, `LAG` or `GAIN`."""
+        if self.lag_length > 0.0:
+            return LAG
+        return PLAY if self.play > 0.0 else GAIN
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,6 +16,7 @@ from needle_core.compiled import compiled
 Records = npt.NDArray[np.void]
 
 _SAME_LAG = 0.001
+_SAME_GAIN = 0.1
 _NUMBERS = HYPOTHESIS.itemsize // 8
 
 
@@ -66,6 +67,7 @@ def _are_same(a: Any, b: Any, angle: float, cosine: float) -> bool:
         and abs(p[0, 2] - q[0, 2]) < 0.25 * angle
         and abs(a.play - b.play) < 0.5 * angle
         and abs(a.lag - b.lag) < _SAME_LAG
+        and abs(a.gain - b.gain) < _SAME_GAIN
         # Else one of them has jumped.
         and (a.position[0] - b.position[0]) ** 2 < max(a.covariance[0, 0], b.covariance[0, 0])
     )
@@ -88,7 +90,7 @@ def _join(a: Any, b: Any, difference: Array) -> None:
             turn -= b.rotation[left, m] * a.rotation[right, m]
         difference[E_TURN + k] = 0.5 * turn
     difference[E_KAPPA] = b.curvature - a.curvature
-    difference[E_SIZE] = b.play - a.play + b.lag - a.lag
+    difference[E_SIZE] = b.play - a.play + b.lag - a.lag + b.gain - a.gain
     difference[E_SCALE] = b.scale - a.scale
     for k in range(ERROR):
         for m in range(ERROR):
@@ -99,6 +101,7 @@ def _join(a: Any, b: Any, difference: Array) -> None:
     a.scale += s * (b.scale - a.scale)
     a.play += s * (b.play - a.play)
     a.lag += s * (b.lag - a.lag)
+    a.gain += s * (b.gain - a.gain)
     a.tip_angle += s * (b.tip_angle - a.tip_angle)
     a.behind_play += s * (b.behind_play - a.behind_play)
     a.dtip_dsize += s * (b.dtip_dsize - a.dtip_dsize)

@@ -109,7 +109,8 @@ def estimate_needle(
         heading[0],
         bend,
     )
-    estimate.uncertainty[0] = xx - position[0] * position[0]
+    # However many tips there were: what the model leaves out of them is the same in all.
+    estimate.uncertainty[0] = xx - position[0] * position[0] + known.model_error
     estimate.uncertainty[1] = x_pitch - position[0] * heading[0]
     estimate.uncertainty[2] = pitch_pitch - heading[0] * heading[0]
     estimate.curvature, estimate.scale, estimate.ambiguous = curvature, scale, ambiguous
@@ -171,7 +172,7 @@ def _average_torsions(every: Records, whole: float, torsions: Records) -> None:
         t = torsions[k]
         across = along = 0.0
         t.roll = t.agreement = t.curvature = t.tip_angle = t.behind_play = 0.0
-        t.play = t.lag = t.weight = 0.0
+        t.play = t.lag = t.gain = t.weight = 0.0
         for n in range(every.size):
             h = every[n]
             if h.torsion != k:
@@ -187,6 +188,7 @@ def _average_torsions(every: Records, whole: float, torsions: Records) -> None:
             t.behind_play += h.weight * h.behind_play
             t.play += h.weight * h.play
             t.lag += h.weight * h.lag
+            t.gain += h.weight * h.gain
         if t.weight == 0.0:
             continue
         t.roll = math.atan2(across, along)
@@ -196,6 +198,7 @@ def _average_torsions(every: Records, whole: float, torsions: Records) -> None:
         t.behind_play /= t.weight
         t.play /= t.weight
         t.lag /= t.weight
+        t.gain /= t.weight
         t.weight /= whole
 
 

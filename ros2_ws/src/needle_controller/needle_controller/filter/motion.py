@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from needle_controller.filter.hypotheses import GAIN
 from needle_controller.filter.records import (
     E_KAPPA,
     E_SCALE,
@@ -60,8 +61,10 @@ def advance_hypothesis(
         Working memory.
     """
     tip, behind, dtip_dsize = turn_tip(
-        h.tip_angle, h.behind_play, h.dtip_dsize, base, turn, length, h.play, h.lag
+        h.tip_angle, h.behind_play, h.dtip_dsize, h.gain * base, h.gain * turn, length, h.play, h.lag
     )
+    if h.sized == GAIN:
+        dtip_dsize = base + turn
     theta, size_change = tip - h.tip_angle, dtip_dsize - h.dtip_dsize
     h.tip_angle, h.behind_play, h.dtip_dsize = tip, behind, dtip_dsize
     # T <- T exp((V1 s l + V2 theta)^), (2): in its own axes the tip turns by (kappa s l, 0, theta).
@@ -93,12 +96,16 @@ def advance_hypothesis(
         gain[3 + i, E_SCALE - E_TURN] = kappa_per_scale * bend
     p = h.covariance
     propagate(p, gain)
-    for i in range(E_TURN, E_TURN + 3):
-        p[i, i] += h.orientation_drift * length
+    # about the heading z: Q = heading_drift I + (roll_drift - heading_drift) z z^T
+    for i in range(3):
+        p[E_TURN + i, E_TURN + i] += h.heading_drift * length
+        along = (h.roll_drift - h.heading_drift) * h.rotation[i, 2] * length
+        for j in range(3):
+            p[E_TURN + i, E_TURN + j] += along * h.rotation[j, 2]
     p[E_KAPPA, E_KAPPA] += known.curvature_drift * length
     p[E_SCALE, E_SCALE] += known.scale_drift * length
     if p[E_SIZE, E_SIZE] > 0.0:
-        p[E_SIZE, E_SIZE] += (known.lag_drift if h.lag > 0.0 else known.play_drift) * length
+        p[E_SIZE, E_SIZE] += known.size_drift[h.sized] * length
 
 
 @compiled

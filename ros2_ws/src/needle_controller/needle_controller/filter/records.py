@@ -26,14 +26,17 @@ HYPOTHESIS = np.dtype(
         ("scale", np.float64),  # insertion of the needle per insertion of the stage
         ("play", np.float64),  # half width of the dead band between base and tip [rad]
         ("lag", np.float64),  # inserted length over which the tip's angle follows [m]; 0: none
+        ("gain", np.float64),  # share of the base's rotation that reaches the shaft in the tissue
         ("tip_angle", np.float64),  # rotation of the tip since the start [rad]
         ("behind_play", np.float64),  # and of the shaft behind the play [rad]
-        ("dtip_dsize", np.float64),  # derivative of tip_angle by the torsion's size (play or lag)
+        ("dtip_dsize", np.float64),  # derivative of tip_angle by the torsion's size
+        ("sized", np.int64),  # which of play, lag and gain that is, see `hypotheses`
         ("covariance", np.float64, (ERROR, ERROR)),
         ("noise_weights", np.float64, (3, NOISES)),  # probability of each noise model; of noise
         # that lasts for each coordinate, else in the first row
         ("residual", np.float64, 3),  # last tip minus what was then estimated of it [m]
-        ("orientation_drift", np.float64),  # variance of the orientation per length [rad^2/m]
+        ("heading_drift", np.float64),  # variance of pitch and yaw per length [rad^2/m]
+        ("roll_drift", np.float64),  # and of the roll [rad^2/m]
         ("torsion", np.int64),  # number of the torsion hypothesis
         ("shape", np.int64),  # shape of the noise, see `hypotheses`
         ("weight", np.float64),  # relative probability; the heaviest has 1
@@ -98,6 +101,7 @@ TORSION = np.dtype(
         ("behind_play", np.float64),
         ("play", np.float64),
         ("lag", np.float64),
+        ("gain", np.float64),
         ("weight", np.float64),  # 0 where nothing is left of it
     ]
 )
@@ -111,16 +115,13 @@ ASSUMPTIONS = np.dtype(
         ("curvature_drift", np.float64),
         ("scale_spread", np.float64),
         ("scale_drift", np.float64),
-        ("play_drift", np.float64),
-        ("lag_drift", np.float64),
+        ("size_drift", np.float64, 3),  # of play, lag and gain
         ("largest_play", np.float64),
         ("smallest_lag", np.float64),
         ("largest_lag", np.float64),
         ("longest_step", np.float64),
         ("believed_bound", np.float64),
         ("entry_std", np.float64),
-        ("softness", np.float64),
-        ("mistrust", np.float64),
         ("model_error", np.float64),
         ("outlier_share", np.float64),
         ("outlier_density", np.float64),

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.filter.hypotheses import LASTING, UNIFORM
+from needle_controller.filter.hypotheses import GAIN, LAG, LASTING, UNIFORM
 from needle_controller.filter.motion import rotate
 from needle_controller.filter.records import (
     E_KAPPA,
@@ -141,11 +141,8 @@ def update_hypothesis(h: Any, reading: Reading, known: Any, work: Work) -> None:
     for i in range(3):
         innovation, variance = _innovation(h, reading, i, work)
         bound = reading.bounds[i]
-        # Outliers are spread over a multiple of where the tip is expected. A hypothesis that is
-        # linear in the roll knows less than it thinks, unless it knows next to nothing.
-        precise = bound * bound / (bound * bound + 3.0 * variance)
-        spread *= math.sqrt(precise)
-        variance += known.softness + known.mistrust * precise * variance
+        # Outliers are spread over a multiple of where the tip is expected.
+        spread *= bound / math.sqrt(bound * bound + 3.0 * variance)
         mass, mean, share = _weigh_noises(h, reading, i, innovation, variance, known, work)
         likelihood *= mass
         # e <- e + c mean / sigma, P <- P - c c^T (1 - share) / sigma^2
@@ -343,7 +340,10 @@ def _apply(h: Any, reading: Reading, known: Any, work: Work) -> None:
     kappa = h.curvature + change[E_KAPPA]
     h.curvature = min(max(kappa, known.smallest_curvature), known.largest_curvature)
     h.scale += change[E_SCALE]
-    if change[E_SIZE] != 0.0 and h.lag > 0.0:
+    if h.sized == GAIN:
+        h.tip_angle += h.dtip_dsize * change[E_SIZE]
+        h.gain, h.behind_play = h.gain + change[E_SIZE], h.tip_angle
+    elif change[E_SIZE] != 0.0 and h.sized == LAG:
         lag = min(max(h.lag + change[E_SIZE], known.smallest_lag), known.largest_lag)
         h.tip_angle += h.dtip_dsize * (lag - h.lag)
         h.lag = lag

@@ -79,7 +79,7 @@ class RollLawSettings(NamedTuple):
         math.radians(30.0) / 0.001
     )
     max_winding: Annotated[float, Bounds(2.0 * math.pi, 1e6, "rad")] = 6.0 * math.pi
-    plane_gain: Annotated[float, Bounds(0.0, 1e5, "1/m")] = 120.0
+    plane_gain: Annotated[float, Bounds(0.0, 1e5, "1/m")] = 150.0
     pitch_gain: Annotated[float, Bounds(0.0, 1e5, "1/m")] = 200.0
     braking_share: Annotated[float, Bounds(0.01, 2.0, "-")] = 0.5
     braking_share_added: Annotated[float, Bounds(0.0, 2.0, "-")] = 0.5
@@ -87,11 +87,11 @@ class RollLawSettings(NamedTuple):
     braking_over: Annotated[float, Bounds(1e-6, 1.0, "m")] = 0.003
     lag_caution: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.45
     braking_caution: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.5
-    doubt: Annotated[float, Bounds(0.0, 10.0, "-")] = 1.0
+    doubt: Annotated[float, Bounds(0.0, 10.0, "-")] = 0.4
     scatter_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 1.0
     near: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.0005
-    near_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.25
-    far_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.15
+    near_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.35
+    far_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.2
     largest_turn: Annotated[float, Bounds(0.01, 100.0, "rad")] = 2.0
     smallest_weight: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.02
 
@@ -151,7 +151,7 @@ def hypotheses_of(estimate: Estimate) -> Hypotheses:
         return estimate.hypotheses
     only = np.zeros(1, TORSION)
     only["roll"], only["curvature"] = estimate.coordinates[ROLL], estimate.curvature
-    only["agreement"] = only["weight"] = 1.0
+    only["agreement"] = only["weight"] = only["gain"] = 1.0
     covariance, cosine = estimate.covariance, math.cos(float(estimate.coordinates[PITCH]))
     # d sin(pitch) = cos(pitch) dpitch
     uncertainty = np.array(
@@ -339,4 +339,4 @@ def base_turn(t: Any, tip_turn: float, base: float, length: float) -> float:
     change = goal - t.behind_play
     if abs(change) < 1e-9:
         return 0.0
-    return float(goal + math.copysign(t.play, change) - base)
+    return float((goal + math.copysign(t.play, change)) / t.gain - base)

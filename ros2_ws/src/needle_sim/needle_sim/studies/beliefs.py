@@ -5,9 +5,13 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from needle_sim.needle.se3 import FloatArray
+
+BAND = 1e-3
+"""Half width of what counts as in the plane [m]: the paper's +-1 mm."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +26,9 @@ class Belief:
         Sine of the pitch out of the plane, and its standard deviation.
     doubtful : ndarray of bool, shape (N,), optional
         Whether it says that it cannot be relied on; None if it never says so.
+    miss_probability : ndarray, shape (N,), optional
+        Probability by its own account that the tip is more than 1 mm from the plane; None where
+        that follows from `x` and `x_std`, as of a normal distribution.
     """
 
     x: FloatArray
@@ -29,6 +36,15 @@ class Belief:
     sin_pitch: FloatArray
     sin_pitch_std: FloatArray
     doubtful: NDArray[np.bool_] | None = None
+    miss_probability: FloatArray | None = None
+
+    def stated_misses(self) -> FloatArray:
+        """Return the probability of each tip to be more than `BAND` from the plane, (N,)."""
+        if self.miss_probability is not None:
+            return self.miss_probability
+        sigma = np.maximum(self.x_std, 1e-9)
+        above, below = (self.x - BAND) / sigma, (-BAND - self.x) / sigma
+        return np.asarray(scipy.special.ndtr(above) + scipy.special.ndtr(below))
 
 
 class BeliefTally:
@@ -44,6 +60,7 @@ class BeliefTally:
         self._within: FloatArray = np.zeros((2, needles))
         self._compared = 0
         self._doubtful: FloatArray = np.full(needles, np.nan)
+        self._stated_misses: FloatArray = np.full(needles, np.nan)
 
     def add(self, belief: Belief | None, x: FloatArray, pitch: FloatArray) -> None:
         """Take one step.
@@ -63,6 +80,7 @@ class BeliefTally:
         ):
             self._within += off <= np.array([[2.0], [3.0]]) * std
             self._compared += 1
+        self._stated_misses = belief.stated_misses()
         if belief.doubtful is not None:
             self._doubtful = belief.doubtful.astype(np.float64)
 
@@ -77,3 +95,8 @@ class BeliefTally:
     def doubtful(self) -> FloatArray:
         """1 where the last step was called doubtful, else 0, shape (N,); NaN if nothing is said."""
         return self._doubtful
+
+    @property
+    def stated_misses(self) -> FloatArray:
+        """Probability of a miss stated after the last step, shape (N,); NaN if nothing is said."""
+        return self._stated_misses

@@ -20,7 +20,6 @@ from needle_sim.studies import study_noise
 
 Insertion = TypeVar("Insertion", float, FloatArray)
 """Of all needles, or of each."""
-NOISE_SHAPES = ("uniform", "normal")
 PATCH_LENGTH = 0.020
 """Insertion over which the curvature stays the same [m]."""
 _NOTHING_LEFT = 1e-6
@@ -33,18 +32,23 @@ class Disturbances:
     Attributes
     ----------
     noise : float
-        Largest error of a measured coordinate where the noise is uniform, its standard deviation
-        where it is normal [m].
+        Of a measured coordinate: the largest error where the noise is uniform, the standard
+        deviation where it is normal, the scale where it is Student's t [m].
     noise_shape : str
-        One of `NOISE_SHAPES`.
+        "uniform", "normal" or "student".
     noise_lasting : float
         Of normal noise, the correlation of an error with that of the exposure before, in [0, 1).
+    degrees_of_freedom : float
+        Of Student's t.
+    bias_walk : float
+        Largest bias of a measured coordinate, which walks by a tenth of it from one exposure to the
+        next [m].
     outliers : float
         Share of measurements that are off in a random direction instead.
     outlier_size : tuple of float
         Least and largest distance by which an outlier is off, uniform in between [m].
-    dropped : float
-        Share of measurements that are missing.
+    found : float
+        Share of the exposures in which the tip is found.
     delay : int
         How many steps late a measurement arrives; the controller is told its age.
     untold_delay : int
@@ -53,6 +57,17 @@ class Disturbances:
         The plant's curvature as a multiple of what the controller assumes.
     curvature_patches : float
         The curvature is off by up to this share, uniform, anew every 20 mm for each needle.
+    layer : tuple of float
+        Factor of the curvature in a layer of tissue, and the insertion from which on the needle is
+        in it [m].
+    push : float
+        Curvature by which the tissue bends the path to one side, in a direction across z that is
+        fixed in space and drawn for each needle [1/m].
+    rotation_gain : float
+        Share of the base's rotation that reaches the tip, before play and lag.
+    roll_walk : float
+        Standard deviation by which the tip turns about its axis by itself, over each metre of
+        insertion [rad/sqrt(m)].
     play : float
         Dead band of the shaft's torsion, +- [rad].
     lag_length : float
@@ -67,13 +82,19 @@ class Disturbances:
     noise: float = 0.0
     noise_shape: str = "uniform"
     noise_lasting: float = 0.0
+    degrees_of_freedom: float = 3.0
+    bias_walk: float = 0.0
     outliers: float = 0.0
     outlier_size: tuple[float, float] = (0.005, 0.010)
-    dropped: float = 0.0
+    found: float = 1.0
     delay: int = 0
     untold_delay: int = 0
     curvature_scale: float = 1.0
     curvature_patches: float = 0.0
+    layer: tuple[float, float] = (1.0, 0.0)
+    push: float = 0.0
+    rotation_gain: float = 1.0
+    roll_walk: float = 0.0
     play: float = 0.0
     lag_length: float = 0.0
     slip: float = 0.0
@@ -109,16 +130,21 @@ def measured(
         seen[:] = tips + disturbances.noise * _normal_errors(lasting, seed, exposure, first, count)
     else:
         share = study_noise.uniform(seed, study_noise.NOISE, exposure, first, count)
-        _add_noise(tips, share, disturbances.noise, seen)
+        if disturbances.noise_shape == "student":
+            level = study_noise.quantile_levels(share[:, :3])
+            errors = scipy.special.stdtrit(disturbances.degrees_of_freedom, level)
+            seen[:] = tips + disturbances.noise * errors
+        else:
+            _add_noise(tips, share, disturbances.noise, seen)
     if exposure == 0:
         return seen
     if disturbances.outliers > 0.0:
         chance = study_noise.uniform(seed, study_noise.OUTLIER, exposure, first, count)[:, 0]
         off = tips + _outliers(disturbances.outlier_size, seed, exposure, first, count)
         seen = np.where((chance < disturbances.outliers)[:, np.newaxis], off, seen)
-    if disturbances.dropped > 0.0:
+    if disturbances.found < 1.0:
         chance = study_noise.uniform(seed, study_noise.MISSED, exposure, first, count)[:, 0]
-        seen[chance < disturbances.dropped] = np.nan
+        seen[chance < 1.0 - disturbances.found] = np.nan
     return seen
 
 
@@ -132,6 +158,52 @@ def bumps(distance: float, seed: int, first: int, count: int) -> FloatArray:
     """Return by what the phantom of each needle is moved, (count, 3) [m]."""
     share = study_noise.uniform(seed, study_noise.BUMP, 0, first, count)
     return np.asarray(distance * study_noise.directions(share))
+
+
+def push_axes(push: float, seed: int, first: int, count: int) -> FloatArray:
+    """Return the rotation of each needle's heading per inserted length, (count, 3) [rad/m].
+
+    It turns a heading along z towards a direction across z, uniform in angle.
+    """
+    around = 2.0 * np.pi * study_noise.uniform(seed, study_noise.PUSH, 0, first, count)[:, 0]
+    return np.asarray(push * np.stack([-np.sin(around), np.cos(around), 0.0 * around], axis=-1))
+
+
+def roll_steps(spread: float, seed: int, step: int, first: int, count: int) -> FloatArray:
+    """Return by what each tip turns by itself in a step, (count,) [rad], normal."""
+    share = study_noise.uniform(seed, study_noise.ROLL, step, first, count)[:, 0]
+    return spread * study_noise.normal(share)
+
+
+class BiasWalk:
+    """Bias of the measured tips that walks from one exposure to the next.
+
+    Each coordinate starts anywhere within +-`largest`, walks up or down by a tenth of that, and is
+    thrown back at the bounds.
+
+    Parameters
+    ----------
+    largest : float
+        [m].
+    seed, first, count : int
+        Key the randomness: of the study, the first needle, and how many there are.
+    """
+
+    def __init__(self, largest: float, seed: int, first: int, count: int) -> None:
+        self._largest = largest
+        self._key = seed, first, count
+        share = study_noise.uniform(seed, study_noise.BIAS, 0, first, count)[:, :3]
+        self._bias: FloatArray = largest * (2.0 * share.astype(np.float64) - 1.0)
+
+    def at(self, exposure: int) -> FloatArray:
+        """Return the bias of an exposure, (count, 3) [m]; called for 0, 1, 2 and so on."""
+        if exposure > 0:
+            seed, first, count = self._key
+            share = study_noise.uniform(seed, study_noise.BIAS, exposure, first, count)[:, :3]
+            walked = self._bias + 0.1 * self._largest * np.where(share < 0.5, -1.0, 1.0)
+            over = np.maximum(np.abs(walked) - self._largest, 0.0)
+            self._bias = walked - 2.0 * np.copysign(over, walked)
+        return self._bias
 
 
 class DelayLine:
@@ -195,8 +267,7 @@ def _normal_errors(lasting: float, seed: int, exposure: int, first: int, count: 
         # The first is as large as all others together.
         left *= 1.0 if back == exposure else math.sqrt(1.0 - lasting * lasting)
         share = study_noise.uniform(seed, study_noise.NOISE, exposure - back, first, count)
-        # The middle of each of the 2^24 steps that a share has: 0 would be infinitely far off.
-        errors += left * scipy.special.ndtri(share[:, :3].astype(np.float64) + 0.5**25)
+        errors += left * study_noise.normal(share[:, :3])
     return errors
 
 

@@ -9,12 +9,15 @@ from needle_sim.needle.se3 import FloatArray
 from needle_sim.needle.tissue import Torsion
 from needle_sim.studies.disturbances import (
     PATCH_LENGTH,
+    BiasWalk,
     DelayLine,
     Disturbances,
     Insertion,
     bumps,
     measured,
     patch_factors,
+    push_axes,
+    roll_steps,
 )
 from needle_sim.studies.needle_batch import NeedleBatch
 
@@ -60,15 +63,17 @@ class DisturbedNeedles:
         self._bump_at = bump_at
         self._key = seed, first
         self._count = len(starts)
+        self._push = push_axes(wrong.push, seed, first, len(starts))
+        self._bias = BiasWalk(wrong.bias_walk, seed, first, len(starts))
         self._patch = -1
+        self._insertions = 0
         self._exposure = 0
         self._untold_delay = DelayLine(wrong.untold_delay)
         self._delay = DelayLine(wrong.delay)
 
     def first_seen(self) -> FloatArray:
         """Return what is measured of the tips before they move, (N, 3) [m]."""
-        seed, first = self._key
-        return measured(self.true.tips, self._wrong, seed, 0, first)
+        return self._measured()
 
     def insert(self, begin: float, end: float, length: ArrayLike, turned: FloatArray) -> None:
         """Move the stage on by a step, from one insertion to another.
@@ -88,7 +93,23 @@ class DisturbedNeedles:
             self._patch = patch
             factors = patch_factors(wrong.curvature_patches, seed, patch, first, self._count)
             self._curvature = np.asarray(self._assumed * factors)
-        self.true.advance(np.asarray(length) / (1.0 + wrong.slip), turned, self._curvature)
+        curvature, (factor, begins) = self._curvature, wrong.layer
+        if begin + 1e-9 >= begins:
+            curvature = curvature * factor
+        inserted = np.broadcast_to(np.asarray(length) / (1.0 + wrong.slip), self._count)
+        self._insertions += 1
+        wandered: FloatArray = np.zeros(self._count)
+        if wrong.roll_walk:
+            wandered = roll_steps(wrong.roll_walk, seed, self._insertions, first, self._count)
+            wandered *= np.sqrt(inserted)
+        # Turning in space and turning with the tip commute: half of the push before, half after is
+        # exact but for the place, which is off by less than 1 um at the end.
+        half = 0.5 * inserted[:, np.newaxis] * self._push
+        if wrong.push:
+            self.true.turn(half)
+        self.true.advance(inserted, wrong.rotation_gain * turned, curvature, wandered)
+        if wrong.push:
+            self.true.turn(half)
         if wrong.bump and begin < self._bump_at <= end:
             self.true.shift(bumps(wrong.bump, seed, first, self._count))
 
@@ -108,7 +129,11 @@ class DisturbedNeedles:
             Insertion since they were measured, as the controller is told [m].
         """
         self._exposure += 1
-        seed, first = self._key
-        tips = measured(self.true.tips, self._wrong, seed, self._exposure, first)
+        tips = self._measured()
         as_new, _ = self._untold_delay.pass_on(tips, insertion)
         return self._delay.pass_on(as_new, insertion)
+
+    def _measured(self) -> FloatArray:
+        seed, first = self._key
+        tips = measured(self.true.tips, self._wrong, seed, self._exposure, first)
+        return tips + self._bias.at(self._exposure) if self._wrong.bias_walk else tips

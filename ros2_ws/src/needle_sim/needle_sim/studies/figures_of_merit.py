@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import BeliefTally
+from needle_sim.studies.beliefs import BAND, BeliefTally
 
-BAND = 1e-3
-"""Half width of what counts as in the plane [m]: the paper's +-1 mm."""
 FAR_OFF = 5e-3
 """Distance from plane or point at which an end must not be trusted [m]."""
 LAST_STEPS = 20
@@ -43,6 +41,8 @@ class Outcomes:
         standard deviations from where it took them to be; NaN where it does not say.
     doubtful : ndarray, shape (N,)
         Whether the controller called the end doubtful, 0 or 1; NaN where it does not say.
+    stated_misses : ndarray, shape (N,)
+        Probability that the controller gives at the end to |x| > 1 mm; NaN where it does not say.
     """
 
     x_start: FloatArray
@@ -52,6 +52,7 @@ class Outcomes:
     inside_2_sigma: FloatArray
     inside_3_sigma: FloatArray
     doubtful: FloatArray
+    stated_misses: FloatArray
 
     @property
     def x_end(self) -> FloatArray:
@@ -141,6 +142,7 @@ class Tally:
             inside_2_sigma=inside_2_sigma,
             inside_3_sigma=inside_3_sigma,
             doubtful=self.beliefs.doubtful,
+            stated_misses=self.beliefs.stated_misses,
         )
 
 

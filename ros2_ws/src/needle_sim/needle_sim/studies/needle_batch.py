@@ -75,7 +75,29 @@ class NeedleBatch:
         """Move all needles as they are by some offsets, shape (N, 3) [m]."""
         self._position += offsets.T
 
-    def advance(self, d_insertion: ArrayLike, d_rotation: ArrayLike, curvature: ArrayLike) -> None:
+    def turn(self, rotations: FloatArray) -> None:
+        """Turn all needles' headings, their tips at rest.
+
+        Parameters
+        ----------
+        rotations : ndarray, shape (N, 3)
+            Rotation vectors in `rig` [rad].
+        """
+        angles = np.linalg.norm(rotations, axis=1)
+        axes = (rotations / np.where(angles > 0.0, angles, 1.0)[:, np.newaxis]).T[:, np.newaxis]
+        columns = self._rotation.reshape(3, 3, -1)
+        across = np.cross(axes, columns, axis=0)
+        # Rodrigues: R <- R + sin a (k x R) + (1 - cos a) k x (k x R)
+        columns += np.sin(angles) * across
+        columns += (1.0 - np.cos(angles)) * np.cross(axes, across, axis=0)
+
+    def advance(
+        self,
+        d_insertion: ArrayLike,
+        d_rotation: ArrayLike,
+        curvature: ArrayLike,
+        wandered: ArrayLike = 0.0,
+    ) -> None:
         """Insert each needle, and turn its base over that length.
 
         Parameters
@@ -86,6 +108,8 @@ class NeedleBatch:
             Rotation of each base [rad].
         curvature : array_like, shape (N,) or ()
             kappa of each needle's path over that length [1/m].
+        wandered : array_like, shape (N,) or ()
+            Rotation of each tip by itself over that length [rad].
         """
         turned = np.asarray(d_rotation, dtype=np.float64)
         if self._torsion is not None:
@@ -94,7 +118,7 @@ class NeedleBatch:
             np.ascontiguousarray(np.broadcast_to(values, self._position.shape[1:]))
             for values in (
                 np.asarray(d_insertion, dtype=np.float64),
-                turned,
+                turned + np.asarray(wandered, dtype=np.float64),
                 np.asarray(curvature, dtype=np.float64),
             )
         )

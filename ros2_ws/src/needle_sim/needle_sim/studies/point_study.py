@@ -9,10 +9,9 @@ from typing import Protocol
 import numpy as np
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import BeliefTally
+from needle_sim.studies.beliefs import BAND, BeliefTally
 from needle_sim.studies.disturbed_needles import DisturbedNeedles
 from needle_sim.studies.figures_of_merit import (
-    BAND,
     BoolArray,
     joined,
     mean_of_what_is_said,

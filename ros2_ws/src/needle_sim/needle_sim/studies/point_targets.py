@@ -29,7 +29,7 @@ class MovingTargets:
     places : ndarray, shape (N, 3)
         Where they are at the begin but for the breath [m].
     drift : float
-        How far they have drifted after `FARTHEST` of insertion [m].
+        How fast each drifts [m/s].
     breath : float
         Amplitude of their breathing, a sine of time [m].
     seed, first : int
@@ -57,9 +57,8 @@ class MovingTargets:
         )
         drift, breath = study_noise.directions(drifts), study_noise.directions(breaths)
         phase = breaths[:, 2:3].astype(np.float64)
-        share = passed * INSERTION_SPEED / FARTHEST
         swing = np.sin(2.0 * np.pi * (BREATHING_RATE * passed + phase))
-        return np.asarray(self.places + self.drift * share * drift + self.breath * swing * breath)
+        return np.asarray(self.places + self.drift * passed * drift + self.breath * swing * breath)
 
 
 def random_targets(starts: FloatArray, curvature: float, seed: int) -> FloatArray:

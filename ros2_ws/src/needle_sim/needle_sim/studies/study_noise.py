@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from needle_sim.needle.se3 import FloatArray
 
 START, NOISE, OUTLIER, OUTLIER_DIRECTION, MISSED, CURVATURE, BUMP, TARGET, DRIFT, BREATH = range(10)
+PUSH, ROLL, BIAS = range(10, 13)
 """Purposes of random numbers."""
 PER_NEEDLE = 4
 """Numbers for each needle and draw: two needles share one block of the generator."""
@@ -24,7 +26,7 @@ def uniform(seed: int, purpose: int, step: int, first: int, count: int) -> NDArr
     seed : int
         Of the study, >= 0.
     purpose : int
-        One of `START` ... `BREATH`.
+        One of `START` ... `BIAS`.
     step : int
         Number of the exposure, or of whatever the purpose counts.
     first, count : int
@@ -39,6 +41,19 @@ def uniform(seed: int, purpose: int, step: int, first: int, count: int) -> NDArr
     bits = np.random.Philox(key=seed, counter=[block, step, purpose, 0])
     rows = np.random.Generator(bits).random((count + skip, PER_NEEDLE), dtype=np.float32)
     return rows[skip:]
+
+
+def quantile_levels(numbers: NDArray[np.float32]) -> FloatArray:
+    """Return uniform numbers as levels at which a distribution has finite quantiles.
+
+    That is the middle of each of the 2^24 steps that a number has: 0 would be infinitely far off.
+    """
+    return np.asarray(numbers.astype(np.float64) + 0.5**25)
+
+
+def normal(numbers: NDArray[np.float32]) -> FloatArray:
+    """Return normal numbers of variance 1 from as many uniform ones."""
+    return np.asarray(scipy.special.ndtri(quantile_levels(numbers)))
 
 
 def directions(numbers: NDArray[np.float32]) -> FloatArray:

@@ -9,11 +9,14 @@ from scipy import stats
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies import study_noise
 from needle_sim.studies.disturbances import (
+    BiasWalk,
     DelayLine,
     Disturbances,
     bumps,
     measured,
     patch_factors,
+    push_axes,
+    roll_steps,
 )
 
 COUNT = 4000
@@ -41,7 +44,11 @@ def check_isotropic(off: FloatArray) -> None:
 
 @pytest.mark.parametrize(
     ("shape", "spread"),
-    [("uniform", stats.uniform(-0.001, 0.002)), ("normal", stats.norm(0.0, 0.001))],
+    [
+        ("uniform", stats.uniform(-0.001, 0.002)),
+        ("normal", stats.norm(0.0, 0.001)),
+        ("student", stats.t(3.0, 0.0, 0.001)),
+    ],
 )
 def test_noise_has_its_distribution_and_is_independent(shape: str, spread: Any) -> None:
     noise = Disturbances(noise=0.001, noise_shape=shape)
@@ -49,7 +56,8 @@ def test_noise_has_its_distribution_and_is_independent(shape: str, spread: Any) 
     assert fits(off, spread)
     others = (error(noise, exposure=2), error(noise, seed=2))
     columns = np.column_stack([off, *others])
-    assert np.all(np.abs(np.corrcoef(columns.T) - np.eye(9)) < FIVE)
+    # By rank: Student's t has no fourth moment.
+    assert np.all(np.abs(stats.spearmanr(columns).statistic - np.eye(9)) < FIVE)
     np.testing.assert_array_equal(error(Disturbances(noise_shape=shape)), 0.0)
 
 
@@ -79,13 +87,13 @@ def test_outliers_are_so_many_so_far_off_in_any_direction() -> None:
 
 def test_dropped_tips_are_missing_whole_and_the_others_untouched() -> None:
     kept = measured(TIPS, Disturbances(noise=0.001), 1, 1, 0)
-    seen = measured(TIPS, Disturbances(noise=0.001, dropped=0.2), 1, 1, 0)
+    seen = measured(TIPS, Disturbances(noise=0.001, found=0.8), 1, 1, 0)
     missing = np.isnan(seen)
     assert np.all(missing.all(axis=1) == missing.any(axis=1))
     assert abs(np.mean(missing[:, 0]) - 0.2) < FIVE * np.sqrt(0.2 * 0.8)
     np.testing.assert_array_equal(seen[~missing], kept[~missing])
     # The first tip is there, and no outlier.
-    all_wrong = Disturbances(noise=0.001, outliers=1.0, dropped=1.0)
+    all_wrong = Disturbances(noise=0.001, outliers=1.0, found=0.0)
     assert np.all(np.abs(error(all_wrong, exposure=0)) <= 0.001 + 1e-12)
 
 
@@ -97,6 +105,32 @@ def test_bumps_are_of_one_size_in_any_direction_and_patches_uniform_and_anew() -
     for each in factors:
         assert fits(each, stats.uniform(0.8, 0.4))
     assert np.all(np.abs(np.corrcoef(factors) - np.eye(3)) < FIVE)
+
+
+def test_pushes_are_across_z_in_any_direction_and_roll_steps_normal_and_anew() -> None:
+    axes = push_axes(2.0, 1, 0, COUNT)
+    np.testing.assert_allclose(np.linalg.norm(axes[:, :2], axis=1), 2.0)
+    np.testing.assert_array_equal(axes[:, 2], 0.0)
+    assert fits(np.arctan2(axes[:, 1], axes[:, 0]), stats.uniform(-np.pi, 2.0 * np.pi))
+    steps = np.array([roll_steps(0.1, 1, step, 0, COUNT) for step in (1, 2, 3)])
+    assert fits(steps, stats.norm(0.0, 0.1))
+    assert np.all(np.abs(np.corrcoef(steps) - np.eye(3)) < FIVE)
+
+
+def test_a_bias_walks_by_tenths_within_its_bounds_and_stays_spread_evenly() -> None:
+    walk = BiasWalk(0.001, 1, 0, COUNT)
+    bias = np.array([walk.at(exposure) for exposure in range(60)])
+    assert np.abs(bias).max() <= 0.001 + 1e-12
+    for exposure in (0, 59):
+        assert fits(bias[exposure], stats.uniform(-0.001, 0.002))
+    steps = np.diff(bias, axis=0)
+    inside = np.abs(bias[:-1]) < 0.0009
+    np.testing.assert_allclose(np.abs(steps[inside]), 0.0001, atol=1e-12)
+    # Up as often as down, whatever the step before.
+    assert abs(np.mean(steps > 0.0) - 0.5) < 0.01
+    assert abs(np.corrcoef(steps[0].ravel(), steps[1].ravel())[0, 1]) < FIVE + 0.1
+    # Each needle's own, wherever a part begins.
+    np.testing.assert_array_equal(BiasWalk(0.001, 1, 41, 5).at(1), bias[1, 41:46])
 
 
 @pytest.mark.parametrize("steps", [0, 3])

@@ -55,7 +55,7 @@ def test_targets_lie_where_an_arc_of_the_allowed_curvature_leads_and_follow_the_
 
 def test_targets_drift_and_breathe_as_told_whichever_are_asked() -> None:
     places = random_targets(STARTS[:100], CURVATURE, 3)
-    targets = MovingTargets(places, drift=0.002, breath=0.003, seed=5)
+    targets = MovingTargets(places, drift=0.002 / 60.0, breath=0.003, seed=5)
     period, whole = 1.0 / BREATHING_RATE, FARTHEST / INSERTION_SPEED
     assert whole % period == 0.0
     drifted = targets.at(whole) - targets.at(0.0)
@@ -131,7 +131,7 @@ def test_best_comes_to_points_that_drift_and_breathe() -> None:
     noisy = StudySettings(CURVATURE, 0.150, STEP_LENGTH, Disturbances(noise=0.001), seed=7)
     places = random_targets(STARTS, CURVATURE, 7)
     near = np.argsort(places[:, 2])[:5]
-    starts, moving = STARTS[near], MovingTargets(places[near], 0.002, 0.003, seed=7)
+    starts, moving = STARTS[near], MovingTargets(places[near], 0.002 / 60.0, 0.003, seed=7)
     found = run_point_study(starts, moving, point_controller_factory("best", 0.001), noisy)
     # 0.25 mm of thousands; where nothing is foretold 2.2 mm.
     assert np.sqrt(np.mean(found.error**2)) < 0.0005

@@ -5,11 +5,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from needle_bringup.studies.study_controllers import CURVATURE, STEP_LENGTH, controller_factory
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
-from needle_sim.studies.disturbances import Disturbances
+from needle_sim.studies.disturbances import BiasWalk, Disturbances, push_axes
+from needle_sim.studies.disturbed_needles import DisturbedNeedles
 from needle_sim.studies.figures_of_merit import Outcomes, figures
 from needle_sim.studies.start_grids import GRIDS, StartBounds
 from needle_sim.studies.study import StudySettings, run_study
@@ -20,7 +22,7 @@ LEVEL = np.array([[0.0, 0.0, np.deg2rad(90.0)]])
 TROUBLE = Disturbances(
     noise=0.001,
     outliers=0.1,
-    dropped=0.2,
+    found=0.8,
     delay=2,
     curvature_scale=1.1,
     curvature_patches=0.2,
@@ -28,6 +30,11 @@ TROUBLE = Disturbances(
     lag_length=0.004,
     slip=0.02,
     bump=0.002,
+    bias_walk=0.0003,
+    layer=(0.8, 0.01),
+    push=1.0,
+    rotation_gain=0.9,
+    roll_walk=1.0,
 )
 
 
@@ -96,6 +103,64 @@ def test_curvature_and_slip_act_on_the_needle(
     assert found.x_end[0] == pytest.approx((1.0 - np.cos(bend)) / curvature, abs=1e-9)
     assert watching.tips[-1][0, 2] == pytest.approx(np.sin(bend) / curvature, abs=1e-9)
     assert np.sum(watching.lengths) == pytest.approx(0.120)
+
+
+def cross(vector: FloatArray) -> FloatArray:
+    return np.cross(vector, np.eye(3), axisb=0, axisc=0)
+
+
+def test_a_pushed_needle_goes_where_the_linear_equations_of_its_motion_lead() -> None:
+    """R' = W R + R B and p' = R e3 are linear in (R, p): one matrix exponential solves them."""
+    push, gain, turn, length = 2.0, 0.8, 20.0, 0.120
+    wrong = Disturbances(push=push, rotation_gain=gain)
+    needles = DisturbedNeedles(STARTS, wrong, curvature=CURVATURE, bump_at=1.0, seed=3, first=0)
+    begun = needles.true.T_rig_tip
+    for step in range(120):
+        needles.insert(step * 1e-3, (step + 1) * 1e-3, 1e-3, np.full(len(STARTS), turn * 1e-3))
+    body = cross(np.array([CURVATURE, 0.0, gain * turn]))
+    for pose, axis, found in zip(
+        begun, push_axes(push, 3, 0, len(STARTS)), needles.true.T_rig_tip, strict=True
+    ):
+        motion = np.zeros((12, 12))
+        # vec(W R + R B), row by row
+        motion[:9, :9] = np.kron(cross(axis), np.eye(3)) + np.kron(np.eye(3), body.T)
+        motion[9:, 2:9:3] = np.eye(3)
+        state = np.concatenate([pose[:3, :3].ravel(), pose[:3, 3]])
+        end = scipy.linalg.expm(motion * length) @ state
+        np.testing.assert_allclose(found[:3, :3].ravel(), end[:9], atol=1e-12)
+        np.testing.assert_allclose(found[:3, 3], end[9:], atol=1e-6)
+    # The push alone bends a needle without a bevel into a circle about its axis.
+    alone = DisturbedNeedles(0.0 * STARTS, wrong, curvature=0.0, bump_at=1.0, seed=3, first=0)
+    alone.insert(0.0, length, length, np.zeros(len(STARTS)))
+    np.testing.assert_allclose(alone.true.T_rig_tip[:, 2, 2], np.cos(push * length), atol=1e-12)
+
+
+def test_a_layer_bends_the_needle_otherwise_from_where_it_begins() -> None:
+    _, found = watched(LEVEL, depth=0.100, disturbances=Disturbances(layer=(0.3, 0.06)))
+    first, second = CURVATURE * 0.06, 0.3 * CURVATURE * 0.04
+    expected = (1.0 - np.cos(first)) / CURVATURE
+    expected += (np.cos(first) - np.cos(first + second)) / (0.3 * CURVATURE)
+    assert found.x_end[0] == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_roll_wanders_by_the_root_of_the_insertion_and_a_bias_is_seen_alone() -> None:
+    count = 4000
+    wrong = Disturbances(roll_walk=1.0, bias_walk=0.0003, slip=0.25)
+    needles = DisturbedNeedles(
+        np.zeros((count, 3)), wrong, curvature=0.0, bump_at=1.0, seed=3, first=0
+    )
+    bias = BiasWalk(0.0003, 3, 0, count)
+    np.testing.assert_allclose(needles.first_seen() - needles.true.tips, bias.at(0), atol=1e-15)
+    for step in range(20):
+        needles.insert(step * 1e-3, (step + 1) * 1e-3, 1e-3, np.zeros(count))
+        seen, _ = needles.seen((step + 1) * 1e-3)
+        off = seen - needles.true.tips
+        np.testing.assert_allclose(off, bias.at(step + 1), atol=1e-15)
+    turned = np.arctan2(needles.true.T_rig_tip[:, 1, 0], needles.true.T_rig_tip[:, 0, 0])
+    # 1 rad/sqrt(m) over 20 mm of stage, of which 16 mm are cut; five standard errors.
+    wanted = np.sqrt(0.016)
+    assert abs(np.std(turned) / wanted - 1.0) < 5.0 / np.sqrt(2.0 * count)
+    assert abs(np.mean(turned)) < 5.0 * wanted / np.sqrt(count)
 
 
 def test_outcomes_follow_the_seed_and_not_the_chunks() -> None:

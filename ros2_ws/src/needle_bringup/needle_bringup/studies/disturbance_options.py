@@ -1,0 +1,166 @@
+"""The options of `monte_carlo` that say what goes wrong: with the tips, the tissue, the needle."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import Any
+
+from needle_core.commands.options import CommandParser, number, whole_number
+from needle_core.errors import UserError
+from needle_sim.studies.disturbances import Disturbances
+
+_NOISE_MM = "1"
+_SHAPES = ("uniform", "normal")
+
+
+def add_disturbance_options(parser: CommandParser) -> None:
+    """Add the options to a parser."""
+    add = parser.add_argument
+    numbers = (
+        (
+            "--noise-mm",
+            _NOISE_MM,
+            "A",
+            "error of each coordinate of a measured tip: of uniform noise the largest, of normal "
+            "noise the standard deviation",
+        ),
+        ("--noise-shape", "uniform", "|".join(_SHAPES), "how that noise is distributed"),
+        ("--outliers", "0", "F", "share of measurements off in a random direction"),
+        ("--outlier-mm", "5,10", "LO,HI", "how far those are off, uniform in between"),
+        ("--found", "1", "F", "share of the exposures in which the tip is found"),
+        ("--delay", "0", "N", "steps that a measurement comes late, as the controller is told"),
+        ("--untold-delay", "0", "N", "steps that it comes late, as if it were new"),
+        ("--kappa-scale", "1", "S", "the needle's curvature, in terms of what is assumed"),
+        ("--kappa-patches", "0", "F", "curvature off by up to this share, anew every 20 mm"),
+        (
+            "--push",
+            "0",
+            "K",
+            "curvature [1/m] by which the tissue bends the path aside, in a direction fixed in "
+            "space and drawn for each needle",
+        ),
+        ("--rotation-gain", "1", "G", "share of the base's rotation that reaches the tip"),
+        (
+            "--roll-walk",
+            "0",
+            "D",
+            "by how much the tip turns about its axis by itself: standard deviation [deg] over 1 "
+            "mm, growing with the square root of the insertion",
+        ),
+        ("--play-deg", "0", "D", "dead band between base and tip angle, +-"),
+        ("--lag-mm", "0", "L", "length over which the tip's angle follows the base's"),
+        ("--slip", "0", "F", "share by which the stage moves farther than the needle goes in"),
+        ("--bump-mm", "0", "D", "how far the phantom, with the needle, is moved at half the depth"),
+    )
+    for name, default, metavar, text in numbers:
+        add(name, default=default, metavar=metavar, help=f"{text} (default: {default})")
+    add(
+        "--correlated",
+        metavar="R",
+        help="in place of that noise: normal errors of the same variance as uniform ones within "
+        "--noise-mm (0.577 mm of 1 mm), each with correlation R to the one before, in [0, 0.999]",
+    )
+    add(
+        "--student",
+        metavar="DOF,SCALE_MM",
+        help="in place of that noise: errors with Student's t distribution of DOF degrees of "
+        "freedom, times SCALE_MM",
+    )
+    add(
+        "--bias-walk",
+        metavar="A",
+        help="in place of that noise: a bias of each measured coordinate that walks within +-A mm, "
+        "up or down by A/10 from one exposure to the next, and uniform noise within +-0.3 A. A "
+        "camera that is worse than specified: --claimed-mm 0.03 --bias-walk 0.3",
+    )
+    add(
+        "--layer",
+        metavar="S,FROM_MM",
+        help="tissue in which the needle's curvature is S times as large, from the first step on "
+        "that begins at FROM_MM or deeper",
+    )
+
+
+def disturbances_of(given: argparse.Namespace) -> Disturbances:
+    """Return what is asked for.
+
+    Raises
+    ------
+    UserError
+        A value out of its bounds, or noise of two kinds.
+    """
+    return Disturbances(
+        **_noise(given),
+        outliers=number("--outliers", given.outliers, 0.0, 1.0, "-"),
+        outlier_size=_outlier_size(given.outlier_mm),
+        found=number("--found", given.found, 0.0, 1.0, "-"),
+        delay=whole_number("--delay", given.delay, 0, 100),
+        untold_delay=whole_number("--untold-delay", given.untold_delay, 0, 100),
+        curvature_scale=number("--kappa-scale", given.kappa_scale, 0.05, 20.0, "-"),
+        curvature_patches=number("--kappa-patches", given.kappa_patches, 0.0, 0.95, "-"),
+        layer=_layer(given.layer),
+        push=number("--push", given.push, 0.0, 20.0, "1/m"),
+        rotation_gain=number("--rotation-gain", given.rotation_gain, 0.0, 2.0, "-"),
+        roll_walk=math.radians(
+            number("--roll-walk", given.roll_walk, 0.0, 90.0, "deg/sqrt(mm)") / math.sqrt(1e-3)
+        ),
+        play=math.radians(number("--play-deg", given.play_deg, 0.0, 180.0, "deg")),
+        lag_length=number("--lag-mm", given.lag_mm, 0.0, 1000.0, "mm") * 1e-3,
+        slip=number("--slip", given.slip, -0.5, 2.0, "-"),
+        bump=number("--bump-mm", given.bump_mm, 0.0, 100.0, "mm") * 1e-3,
+    )
+
+
+def _noise(given: argparse.Namespace) -> dict[str, Any]:
+    """Return what of the disturbances is the noise of the tips, of one kind."""
+    kinds = [name for name in ("correlated", "student", "bias_walk") if getattr(given, name)]
+    if len(kinds) > 1 or (kinds and given.noise_shape != "uniform"):
+        names = [f"--{name.replace('_', '-')}" for name in kinds]
+        others = [f"--noise-shape {given.noise_shape}"] if given.noise_shape != "uniform" else []
+        raise UserError(f"{' and '.join(names + others)} are each noise of another kind: give one")
+    if given.noise_shape not in _SHAPES:
+        raise UserError(f"--noise-shape {given.noise_shape!r} is not {' or '.join(_SHAPES)}")
+    if given.noise_mm != _NOISE_MM and (given.student or given.bias_walk):
+        raise UserError("--noise-mm goes without --student and --bias-walk, which say their own")
+    noise = number("--noise-mm", given.noise_mm, 0.0, 20.0, "mm") * 1e-3
+    if given.correlated:
+        lasting = number("--correlated", given.correlated, 0.0, 0.999, "-")
+        return {
+            "noise": noise / math.sqrt(3.0), "noise_shape": "normal", "noise_lasting": lasting
+        }  # fmt: skip
+    if given.student:
+        freedom, scale = _pair("--student", given.student, "DOF,SCALE_MM", "3,0.3")
+        return {
+            "noise_shape": "student",
+            "degrees_of_freedom": number("--student DOF", freedom, 1.0, 1000.0, "-"),
+            "noise": number("--student SCALE_MM", scale, 0.0, 20.0, "mm") * 1e-3,
+        }
+    if given.bias_walk:
+        bias = number("--bias-walk", given.bias_walk, 0.0, 20.0, "mm") * 1e-3
+        return {"noise": 0.3 * bias, "bias_walk": bias}
+    return {"noise": noise, "noise_shape": given.noise_shape}
+
+
+def _layer(text: str | None) -> tuple[float, float]:
+    if text is None:
+        return 1.0, 0.0
+    factor, begins = _pair("--layer", text, "S,FROM_MM", "0.3,60")
+    return (
+        number("--layer S", factor, 0.05, 20.0, "-"),
+        number("--layer FROM_MM", begins, 0.0, 1000.0, "mm") * 1e-3,
+    )
+
+
+def _pair(name: str, text: str, form: str, example: str) -> tuple[str, str]:
+    parts = text.split(",")
+    if len(parts) != 2:
+        raise UserError(f"{name} {text!r} is not {form}, such as {example}")
+    return parts[0], parts[1]
+
+
+def _outlier_size(text: str) -> tuple[float, float]:
+    least, most = _pair("--outlier-mm", text, "LO,HI", "5,10")
+    low = number("--outlier-mm LO", least, 0.0, 1000.0, "mm")
+    high = number("--outlier-mm HI", most, low, 1000.0, "mm")
+    return low * 1e-3, high * 1e-3

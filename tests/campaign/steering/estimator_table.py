@@ -1,0 +1,286 @@
+"""Estimators side by side under everything that `control_studies` lets go wrong, as one table.
+
+python -m campaign.steering.estimator_table --needles 10000 --table table.md --json now.json
+    --before before.json
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from campaign.checks.control_studies import COMPARED, SEED, Study
+from campaign.steering.ekf_needles import EkfNeedles
+from needle_bringup.studies.monte_carlo_options import parse
+from needle_bringup.studies.study_parts import StudyPart, parts_of, settings_of
+from needle_core.commands.cli import EXIT_DONE, run_command
+from needle_core.commands.options import CommandParser, output_file, whole_number
+from needle_core.errors import UserError
+from needle_sim.studies.figures_of_merit import Outcomes, joined
+from needle_sim.studies.study import Controller, run_study
+
+ESTIMATORS = ("best", "ekf", "paper")
+EDGES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.7, 1.0)
+"""Of the bins of the stated probability of a miss."""
+_STARTS = 1000
+Bins = list[tuple[int, float, int]]
+"""Of each bin: needles, sum of what they state, misses."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """Figures of one estimator under one kind of trouble.
+
+    Attributes
+    ----------
+    within : float
+        Share that ends within 1 mm of the plane.
+    rms_mm : float
+        Over the last 20 mm.
+    inside : float, optional
+        Share of x and pitch within 3 standard deviations; None from one that states none, and so
+        the next three.
+    misses : int
+        Needles that end farther than 1 mm off.
+    called : float, optional
+        Share of the misses that were called doubtful.
+    false_alarms : float, optional
+        Share of the others that were.
+    bins : list of tuple
+        See `Bins`; empty likewise.
+    rotation_deg : float
+        Mean of what the base turns.
+    cpu_s : float
+        Processor time of all needles.
+    """
+
+    within: float
+    rms_mm: float
+    inside: float | None
+    misses: int
+    called: float | None
+    false_alarms: float | None
+    bins: Bins
+    rotation_deg: float
+    cpu_s: float
+
+
+Table = dict[str, dict[str, Row]]
+"""By trouble and estimator."""
+
+
+def steer(study: Study, estimator: str, needles: int) -> Row:
+    """Steer some needles of a study by one estimator."""
+    preset = "best" if estimator == "ekf" else estimator
+    words = ["--controller", preset, *study.options, "--seed", SEED]
+    options = parse([*words, "--draws", str(needles // _STARTS)])
+    begin = time.process_time()
+    outcomes = [_steered(part, estimator) for part in parts_of(options)]
+    return figures(joined(outcomes), time.process_time() - begin)
+
+
+def _steered(part: StudyPart, estimator: str) -> Outcomes:
+    options = part.options
+    flips = tuple(np.linspace(0.0, options.depth, options.flips + 2)[1:-1].tolist())
+    if estimator == "ekf":
+        std = options.claimed_bound / math.sqrt(3.0) / options.sigma_scale
+
+        def new() -> Controller:
+            return EkfNeedles(std, flips, options.step_length)
+
+        return run_study(part.starts, new, settings_of(options), first=part.first)
+    outcomes = part.run()
+    assert isinstance(outcomes, Outcomes)
+    return outcomes
+
+
+def figures(outcomes: Outcomes, cpu: float) -> Row:
+    """Return the figures of some needles."""
+    missed = ~outcomes.converged_at_end
+    doubtful, stated = outcomes.doubtful, outcomes.stated_misses
+    says = not np.any(np.isnan(stated))
+    return Row(
+        within=float(1.0 - np.mean(missed)),
+        rms_mm=1e3 * float(np.sqrt(np.mean(outcomes.x_last**2))),
+        inside=float(np.mean(outcomes.inside_3_sigma)) if says else None,
+        misses=int(np.sum(missed)),
+        called=float(np.mean(doubtful[missed])) if says and np.any(missed) else None,
+        false_alarms=float(np.mean(doubtful[~missed])) if says and np.any(~missed) else None,
+        bins=_bins(stated, missed) if says else [],
+        rotation_deg=float(np.rad2deg(np.mean(outcomes.rotation))),
+        cpu_s=cpu,
+    )
+
+
+def _bins(stated: Any, missed: Any) -> Bins:
+    of = np.clip(np.searchsorted(EDGES, stated, side="right") - 1, 0, len(EDGES) - 2)
+    return [
+        (int(np.sum(of == k)), float(np.sum(stated[of == k])), int(np.sum(missed[of == k])))
+        for k in range(len(EDGES) - 1)
+    ]
+
+
+def agrees(needles: int, stated: float, misses: int) -> bool:
+    """Tell whether misses agree with what was stated: within the 95 % interval of their share.
+
+    Parameters
+    ----------
+    needles, misses : int
+        Of a bin.
+    stated : float
+        The mean of what they stated.
+    """
+    if needles == 0:
+        return True
+    found = stats.binomtest(misses, needles).proportion_ci(0.95)
+    return bool(found.low <= stated <= found.high)
+
+
+def disagreeing(bins: Bins) -> tuple[int, int]:
+    """Return how many bins with needles disagree, and how many there are."""
+    filled = [(n, stated / n, misses) for n, stated, misses in bins if n]
+    return sum(not agrees(*one) for one in filled), len(filled)
+
+
+def together(rows: Sequence[Row]) -> Bins:
+    """Return the bins of some rows as one."""
+    said = [row.bins for row in rows if row.bins]
+    return [
+        (sum(n for n, _, _ in same), sum(p for _, p, _ in same), sum(m for _, _, m in same))
+        for same in zip(*said, strict=True)
+    ]
+
+
+def markdown(table: Table, estimators: Sequence[str]) -> str:
+    """Return the table, and that of the stated probabilities, as markdown.
+
+    Parameters
+    ----------
+    table : dict
+        Figures by trouble and estimator; an estimator may lack a trouble.
+    estimators : sequence of str
+        In the order in which each cell has them.
+    """
+    states = [
+        name
+        for name in estimators
+        if any(name in rows and rows[name].bins for rows in table.values())
+    ]
+    lines = [
+        f"Each cell: {', '.join(estimators)}; what is stated: {', '.join(states)}.",
+        "",
+        "| what happens | within 1 mm, % | RMS of the last 20 mm | within 3 sigma, % | misses "
+        "| of them called, % | false alarms, % | bins that disagree | rotation, deg |",
+        "|" + " --- |" * 9,
+    ]
+    for key, rows in table.items():
+        cells = (
+            _cell(rows, estimators, lambda row: f"{100 * row.within:.2f}"),
+            _cell(rows, estimators, lambda row: f"{row.rms_mm:.2f}"),
+            _cell(rows, states, lambda row: _percent(row.inside)),
+            _cell(rows, states, lambda row: str(row.misses)),
+            _cell(rows, states, lambda row: _percent(row.called)),
+            _cell(rows, states, lambda row: _percent(row.false_alarms)),
+            _cell(rows, states, lambda row: "{} of {}".format(*disagreeing(row.bins))),
+            _cell(rows, estimators, lambda row: f"{row.rotation_deg:.0f}"),
+        )
+        lines.append(f"| {key} | {' | '.join(cells)} |")
+    lines += [
+        "",
+        "Stated probability of a miss, and the share of misses in all rows together:",
+        "",
+        "| estimator | stated | needles | mean | missed | 95 % interval | agrees |",
+        "|" + " --- |" * 7,
+    ]
+    for name in states:
+        bins = together([rows[name] for rows in table.values() if name in rows])
+        for (low, high), (needles, stated, misses) in zip(pairwise(EDGES), bins, strict=True):
+            if needles == 0:
+                continue
+            found = stats.binomtest(misses, needles).proportion_ci(0.95)
+            lines.append(
+                f"| {name} | {low:g} to {high:g} | {needles} | {stated / needles:.4f} "
+                f"| {misses / needles:.4f} | {found.low:.4f} to {found.high:.4f} "
+                f"| {'yes' if agrees(needles, stated / needles, misses) else 'no'} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def _cell(rows: Mapping[str, Row], names: Sequence[str], text: Callable[[Row], str]) -> str:
+    return ", ".join(text(rows[name]) if name in rows else "-" for name in names)
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f}"
+
+
+def read(path: Path) -> Table:
+    """Return a table that `main` wrote as JSON; raises UserError."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return {
+            key: {name: Row(**row) for name, row in rows.items()} for key, rows in content.items()
+        }
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise UserError(f"cannot read {path}: {error}") from error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    words = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: _run(words))
+
+
+def _run(words: Sequence[str]) -> int:
+    parser = CommandParser("estimator_table", "Compare estimators under every trouble.", "")
+    add = parser.add_argument
+    add("--needles", default="10000", metavar="N", help="of each row, in thousands (10000)")
+    add("--only", default="", metavar="KEYS", help="rows, separated by commas (default: all)")
+    add("--estimators", default=",".join(ESTIMATORS), metavar="NAMES", help="which (default: all)")
+    add("--before", type=Path, metavar="FILE", help="JSON of before; adds its best as `before`")
+    add("--json", metavar="FILE", help="write all figures")
+    add("--table", metavar="FILE", help="write the markdown")
+    given = parser.parse_args(words)
+    needles = whole_number("--needles", given.needles, _STARTS, 1_000_000)
+    json_file, table_file = output_file("--json", given.json), output_file("--table", given.table)
+    before = read(given.before) if given.before else {}
+    estimators = given.estimators.split(",")
+    keys = given.only.split(",") if given.only else list(COMPARED)
+    if unknown := {*keys} - {*COMPARED} or {*estimators} - {*ESTIMATORS}:
+        raise UserError(f"no such row or estimator: {', '.join(sorted(unknown))}")
+    table: Table = {}
+    for key in keys:
+        table[key] = {"before": before[key]["best"]} if key in before else {}
+        for name in estimators:
+            # The paper's law cannot flip.
+            if name == "paper" and "--flips" in COMPARED[key].options:
+                continue
+            row = table[key][name] = steer(COMPARED[key], name, needles)
+            print(
+                f"{key:16} {name:6} {100 * row.within:6.2f} % {row.rms_mm:6.3f} mm  3 sigma "
+                f"{_percent(row.inside)}  misses {row.misses}, called {_percent(row.called)}, "
+                f"false {_percent(row.false_alarms)}  {row.cpu_s:.1f} s",
+                flush=True,
+            )
+        if json_file is not None:
+            # After each row: an hour's figures are not lost with the last.
+            json_file.write_text(json.dumps(table, default=dataclasses.asdict), encoding="utf-8")
+    text = markdown(table, ["before", *estimators] if before else estimators)
+    print(text)
+    if table_file is not None:
+        table_file.write_text(text, encoding="utf-8")
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())
