@@ -26,16 +26,9 @@ from .made_bags import (
     write_mcap,
 )
 
-HARMFUL = [
-    "a: &a [x, x]\n" + "".join(f"b{n}: &b{n} [*a, *a]\n" for n in range(40)),
-    "[" * 100_000,
-    "just text",
-    "\x00",
-]
 
-
-@pytest.mark.parametrize("text", HARMFUL, ids=["aliases", "deep", "text", "zero"])
-def test_metadata_made_to_harm_are_refused(bag: Path, text: str) -> None:
+@pytest.mark.parametrize("text", ["just text", "\x00", "a: [1", ""])
+def test_metadata_that_are_none_are_refused(bag: Path, text: str) -> None:
     (bag / "metadata.yaml").write_text(text)
     assert "metadata.yaml" in reason(bag)
 
