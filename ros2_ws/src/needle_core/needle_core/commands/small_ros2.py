@@ -28,7 +28,6 @@ This is a small stand-in: PyPI has no ros2 command line. It runs the nodes and t
 project and speaks to a running graph; `ros2 topic pub --help` and the like say more. For
 everything else (bag, launch, ...) install ROS 2 Jazzy, source it and run scripts/setup again.
 """
-GRAPH_COMMANDS = ("node", "topic", "service", "param")
 _MODULE = ".executables"
 
 
@@ -36,27 +35,18 @@ def main() -> int:
     """Do what the command line says; returns the exit code."""
     try:
         match sys.argv[1:]:
-            case [] | ["-h" | "--help", *_] | ["run" | "pkg", "-h" | "--help", *_]:
-                print(HELP, end="")
             case ["run", package, executable, *rest]:
                 run(package, executable, rest)
-            case ["run", *_]:
-                raise UserError("usage: ros2 run PACKAGE EXECUTABLE [arguments]")
-            case ["pkg", "executables"]:
-                for package, found in sorted(executables().items()):
-                    print("\n".join(f"{package} {name}" for name in found))
-            case ["pkg", "executables", package]:
-                print("\n".join(f"{package} {name}" for name in of_package(package)))
-            case [command, *rest] if command in GRAPH_COMMANDS:
+            case ["pkg", "executables", *given]:
+                for package in given or sorted(executables()):
+                    print("\n".join(f"{package} {name}" for name in of_package(package)))
+            case ["node" | "topic" | "service" | "param", *_] as words:
                 settle_environment()
                 commands = importlib.import_module("needle_core.ros.graph_commands")
-                return int(commands.main([command, *rest]))
-            case [command, *_]:
-                known = f"run, pkg executables, {', '.join(GRAPH_COMMANDS)}"
-                raise UserError(
-                    f"this stand-in knows only {known}; `ros2 {command}` needs an installed "
-                    "ROS 2 Jazzy (ros2 --help)"
-                )
+                return int(commands.main(words))
+            case words:
+                print(HELP, end="")
+                return 0 if words in ([], ["-h"], ["--help"]) else 2
     except UserError as error:
         print(f"ros2: {error}", file=sys.stderr)
         return 2

@@ -8,7 +8,6 @@ import importlib
 import itertools
 import os
 import re
-import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -23,7 +22,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, get_parameter_value, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
 # Time for discovery [s]: of all that is there, and of one node or topic that is named.
 DISCOVERY = 1.0
@@ -162,8 +160,7 @@ def list_topics(node: Node, options: argparse.Namespace) -> None:
     """Print the topics' names."""
     spin_until(node, never, DISCOVERY)
     for name, types in node.get_topic_names_and_types():
-        if not topic_or_service_is_hidden(name):
-            print(f"{name} [{', '.join(types)}]" if options.show_types else name)
+        print(f"{name} [{', '.join(types)}]" if options.show_types else name)
 
 
 def echo(node: Node, options: argparse.Namespace) -> None:
@@ -231,9 +228,7 @@ def call(node: Node, options: argparse.Namespace) -> None:
     request = service.Request()
     fill(request, parse(options.values))
     client = node.create_client(service, options.service_name)
-    if not spin_until(node, client.service_is_ready, DISCOVERY):
-        print("waiting for service to become available...", flush=True)
-        spin_until(node, client.service_is_ready, float("inf"))
+    spin_until(node, client.service_is_ready, float("inf"))
     print(f"requester: making request: {request!r}\n", flush=True)
     print(f"response:\n{_answer(node, options.service_name, client.call_async(request))!r}\n")
 
@@ -317,16 +312,14 @@ def command_parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str]) -> int:
-    """Do what the command line says; returns the exit code of the real `ros2`."""
+    """Do what the command line says; returns the exit code."""
     options = command_parser().parse_args(arguments)
     rclpy.init(args=[])
     node = Node(f"_ros2cli_{os.getpid()}", start_parameter_services=False)
     try:
         options.action(node, options)
-    except KeyboardInterrupt:
-        return int(signal.SIGINT)
-    except ExternalShutdownException:
-        return int(signal.SIGTERM)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 130
     except (CommandError, InvalidTopicNameException, InvalidServiceNameException) as error:
         print(str(error).splitlines()[0], file=sys.stderr)
         return 1
