@@ -1,4 +1,4 @@
-"""Bags made to harm, before every tool that reads bags: one line, and nothing elsewhere changes."""
+"""Bags with strange files, before every tool that reads bags: one line, no change elsewhere."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from needle_bags.ros import player as player_node
 from needle_core.errors import UserError
 
 MakeRun = Callable[..., Path]
-BOMB = "a: &a [x, x]\n" + "".join(f"b{n}: &b{n} [*a, *a]\n" for n in range(9))
 TOOLS: dict[str, Callable[[Path], int]] = {
     "report": lambda bag: report.main([str(bag)]),
     "rerun": lambda bag: rerun_node.main([str(bag)]),
@@ -34,19 +33,6 @@ def change(bag: Path, **values: object) -> None:
     document = yaml.safe_load((bag / "metadata.yaml").read_text())
     document["rosbag2_bagfile_information"].update(values)
     (bag / "metadata.yaml").write_text(yaml.safe_dump(document))
-
-
-def alias_bomb(bag: Path) -> None:
-    (bag / "metadata.yaml").write_text(BOMB)
-
-
-def huge_metadata(bag: Path) -> None:
-    with (bag / "metadata.yaml").open("r+") as stream:
-        stream.truncate(300 * 10**6)
-
-
-def deep_metadata(bag: Path) -> None:
-    (bag / "metadata.yaml").write_text("{a: " * 100_000)
 
 
 def metadata_pipe(bag: Path) -> None:
@@ -68,10 +54,8 @@ def data_outside(bag: Path) -> None:
     (bag / "run_0.mcap").symlink_to(bag.parent / "elsewhere")
 
 
-@pytest.mark.parametrize(
-    "harm", [alias_bomb, huge_metadata, deep_metadata, metadata_pipe, missing_messages]
-)
-def test_a_harmful_description_is_refused_and_made_whole(
+@pytest.mark.parametrize("harm", [metadata_pipe, missing_messages])
+def test_a_wrong_description_is_refused_and_made_whole(
     make_run: MakeRun, harm: Callable[[Path], None]
 ) -> None:
     bag = make_run(steps=3)
@@ -94,13 +78,6 @@ def test_every_tool_says_in_one_line_that_data_are_no_file_of_the_bag(
         said = capsys.readouterr()
         assert said.err.startswith("error: ")
         assert said.err.count("\n") == 1
-
-
-def test_texts_within_metadata_are_bounded_too(make_run: MakeRun) -> None:
-    bag = make_run(steps=3)
-    for text in (BOMB, "[" * 100_000):
-        change(bag, custom_data={"parameters": text, "run_info": text, "versions": text})
-        assert read_run(bag).versions == {"text": text}
 
 
 def test_an_image_of_another_size_than_it_says_is_one_line(
