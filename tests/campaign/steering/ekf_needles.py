@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import norm
 
 from needle_controller.filter.records import TORSION
 from needle_controller.laws.flip_plan import FlipPlan
@@ -19,7 +20,7 @@ from needle_controller.laws.roll_law import RollLawSettings, roll_turn
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.compiled import compiled
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import Belief
+from needle_sim.studies.beliefs import BAND, Belief
 
 Records = npt.NDArray[np.void]
 
@@ -28,8 +29,6 @@ ORIENTATION_DRIFT = math.radians(5.0) ** 2 / 0.1
 """Variance by which the orientation drifts over a length: 5 deg over 100 mm [rad^2/m]."""
 CURVATURE_SPREAD = 0.2
 """Standard deviation of the curvature, as a share of what is assumed."""
-DOUBTED = 0.05
-"""Stated probability of a miss from which on an end is called doubtful."""
 NEEDLE = np.dtype(
     [
         ("position", np.float64, 3),
@@ -101,14 +100,9 @@ class EkfNeedles:
         needles = self._needles
         known = np.array([_plane_uncertainty(needle) for needle in needles])
         x, sin_pitch = needles["position"][:, 0].copy(), needles["rotation"][:, 0, 2].copy()
-        said = Belief(x, np.sqrt(known[:, 0]), sin_pitch, np.sqrt(known[:, 2]))
-        return Belief(
-            said.x,
-            said.x_std,
-            said.sin_pitch,
-            said.sin_pitch_std,
-            doubtful=said.stated_misses() > DOUBTED,
-        )
+        sigma = np.sqrt(known[:, 0])
+        missed = norm.sf((BAND - x) / sigma) + norm.sf((BAND + x) / sigma)
+        return Belief(x, sigma, sin_pitch, np.sqrt(known[:, 2]), missed)
 
     def _rates(self) -> FloatArray:
         turns = np.empty(self._needles.size)
@@ -205,7 +199,7 @@ def _turn_all(
         t.roll = math.atan2(-needle.rotation[0, 1], needle.rotation[0, 0])
         t.curvature = max(needle.curvature, 1.0)
         t.tip_angle = t.behind_play = needle.base
-        t.agreement = t.weight = 1.0
+        t.agreement = t.weight = t.gain = 1.0
         known = _plane_uncertainty(needle)
         x, sin_pitch, base = needle.position[0], needle.rotation[0, 2], needle.base
         turns[n] = roll_turn(x, sin_pitch, known, only, base, base, bend_sign, law)[0]

@@ -26,6 +26,7 @@ from needle_bringup.studies.study_parts import StudyPart, parts_of, settings_of
 from needle_core.commands.cli import EXIT_DONE, run_command
 from needle_core.commands.options import CommandParser, output_file, whole_number
 from needle_core.errors import UserError
+from needle_sim.studies.beliefs import doubted
 from needle_sim.studies.figures_of_merit import Outcomes, joined
 from needle_sim.studies.study import Controller, run_study
 
@@ -107,7 +108,7 @@ def _steered(part: StudyPart, estimator: str) -> Outcomes:
 def figures(outcomes: Outcomes, cpu: float) -> Row:
     """Return the figures of some needles."""
     missed = ~outcomes.converged_at_end
-    doubtful, stated = outcomes.doubtful, outcomes.stated_misses
+    doubtful, stated = doubted(outcomes.missed), outcomes.missed
     says = not np.any(np.isnan(stated))
     return Row(
         within=float(1.0 - np.mean(missed)),

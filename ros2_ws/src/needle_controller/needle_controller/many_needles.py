@@ -56,7 +56,7 @@ class ManyFilters:
     Attributes
     ----------
     estimates, torsions : ndarray of ESTIMATE, TORSION, shape (N,), (N, K)
-        What is known; without covariances.
+        What is known.
     """
 
     def __init__(self, settings: FilterSettings, count: int, shortest_step: float) -> None:
@@ -97,15 +97,10 @@ class ManyFilters:
         self._estimate()
 
     def _estimate(self) -> None:
-        _estimate_all(
-            self._needles, self._hypotheses, self.estimates, self.torsions, self._known, False
-        )
+        _estimate_all(self._needles, self._hypotheses, self.estimates, self.torsions, self._known)
 
     def each(self) -> list[Estimate]:
-        """Return the estimates as laws in Python take them, with covariances."""
-        _estimate_all(
-            self._needles, self._hypotheses, self.estimates, self.torsions, self._known, True
-        )
+        """Return the estimates as laws in Python take them."""
         return [
             estimate_from(said, torsions)
             for said, torsions in zip(self.estimates, self.torsions, strict=True)
@@ -214,12 +209,9 @@ def _estimate_all(
     estimates: Records,
     torsions: Records,
     known: Records,
-    with_covariance: bool,
 ) -> None:
     for n in prange(needles.size):
-        estimate_needle(
-            needles[n], hypotheses[n], estimates[n], torsions[n], known[0], with_covariance
-        )
+        estimate_needle(needles[n], hypotheses[n], estimates[n], torsions[n], known[0])
 
 
 @compiled

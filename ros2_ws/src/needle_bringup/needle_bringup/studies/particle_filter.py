@@ -170,7 +170,7 @@ class ParticleFilter:
     def _as_hypothesis(self, roll: float, known: Array) -> Hypotheses:
         only, torsion, wrong = np.zeros(1, TORSION), self._torsion, self._wrong
         only["roll"], only["curvature"] = roll, self._curvature
-        only["agreement"] = only["weight"] = 1.0
+        only["agreement"] = only["weight"] = only["gain"] = 1.0
         only["tip_angle"], only["behind_play"] = torsion.tip_angle, torsion.behind_play
         only["play"], only["lag"] = wrong.play, wrong.lag_length
         return Hypotheses(only, self._base, self._base, known)

@@ -40,7 +40,7 @@ from needle_controller.presets.steering_settings import (
     PRESETS,
     SteeringSettings,
 )
-from needle_controller.protocol.trust import ends_elsewhere
+from needle_controller.protocol.trust import point_missed
 from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
@@ -135,17 +135,7 @@ class SteeredNeedles:
         """Return what is known after the last step; see `study.Controller.belief`."""
         if self._estimators is None:
             return None
-        belief = self._estimators.belief()
-        if belief.doubtful is None:
-            return belief
-        # The last word counts, as of a node that is done.
-        elsewhere = np.array([ends_elsewhere(off) for off in self._distance().tolist()])
-        return dataclasses.replace(belief, doubtful=belief.doubtful | elsewhere)
-
-    def _distance(self) -> FloatArray:
-        """Return how far each needle is from where it is to end, (N,) [m]."""
-        assert self._estimators is not None
-        return np.asarray(self._estimators.positions()[:, 0])
+        return self._estimators.belief()
 
 
 class NeedlesToPoints(SteeredNeedles):
@@ -182,10 +172,15 @@ class NeedlesToPoints(SteeredNeedles):
         """Return how far each needle has to go; see `point_study.PointController`."""
         return self._left
 
-    def _distance(self) -> FloatArray:
+    def belief(self) -> Belief | None:
+        """Return what is known after the last step; a miss is one of the point."""
+        belief = super().belief()
+        if belief is None or belief.missed is None:
+            return belief
         assert self._estimators is not None
-        off = self._estimators.positions() - self._motion.last
-        return np.asarray(np.linalg.norm(off, axis=-1))
+        tips, covariances = self._estimators.tips()
+        missed = point_missed(tips - self._motion.last, covariances)
+        return dataclasses.replace(belief, missed=missed)
 
     def _command(self, estimators: Any, _: float) -> FloatArray:
         rates, self._left = self._point_laws(

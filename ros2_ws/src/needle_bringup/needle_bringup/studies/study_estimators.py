@@ -13,7 +13,6 @@ from needle_controller.model.arrays import Array
 from needle_controller.observers.estimator import Estimate, Estimator
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
-from needle_sim.studies.figures_of_merit import BoolArray
 
 
 class Estimators(Protocol):
@@ -32,10 +31,10 @@ class Estimators(Protocol):
         """Return what is known of each."""
 
     def belief(self) -> Belief:
-        """Return what is known of all, and whether it is doubted."""
+        """Return what is known of all."""
 
-    def positions(self) -> FloatArray:
-        """Return where the tips are, (N, 3) [m]."""
+    def tips(self) -> tuple[FloatArray, FloatArray]:
+        """Return where the tips are, (N, 3) [m], and their covariances, (N, 3, 3) [m^2]."""
 
 
 class EachEstimator:
@@ -82,14 +81,15 @@ class EachEstimator:
         """Return what is known of all."""
         uncertainty = np.array([hypotheses_of(known).uncertainty for known in self._known])
         s = np.array([known.linearized for known in self._known])
-        doubtful = None
-        if self._known[0].doubtful is not None:
-            doubtful = np.array([bool(known.doubtful) for known in self._known])
-        return _belief(s, uncertainty, doubtful)
+        missed = None
+        if self._known[0].miss is not None:
+            missed = np.array([known.miss for known in self._known], dtype=float)
+        return _belief(s, uncertainty, missed)
 
-    def positions(self) -> FloatArray:
-        """Return where the tips are."""
-        return np.array([known.position for known in self._known])
+    def tips(self) -> tuple[FloatArray, FloatArray]:
+        """Return where the tips are, and their covariances."""
+        covariances = np.array([known.covariance[:3, :3] for known in self._known])
+        return np.array([known.position for known in self._known]), covariances
 
 
 class BestEstimators(ManyFilters):
@@ -98,18 +98,19 @@ class BestEstimators(ManyFilters):
     def belief(self) -> Belief:
         """Return what is known of all."""
         known = self.estimates
-        return _belief(known["linearized"], known["uncertainty"], known["doubts"] != 0)
+        return _belief(known["linearized"], known["uncertainty"], known["miss"].copy())
 
-    def positions(self) -> FloatArray:
-        """Return where the tips are."""
-        return np.array(self.estimates["coordinates"][:, :3])
+    def tips(self) -> tuple[FloatArray, FloatArray]:
+        """Return where the tips are, and their covariances."""
+        known = self.estimates
+        return known["coordinates"][:, :3].copy(), known["covariance"][:, :3, :3].copy()
 
 
-def _belief(s: FloatArray, uncertainty: FloatArray, doubtful: BoolArray | None) -> Belief:
+def _belief(s: FloatArray, uncertainty: FloatArray, missed: FloatArray | None) -> Belief:
     return Belief(
         x=s[:, 0].copy(),
         x_std=np.sqrt(np.maximum(uncertainty[:, 0], 0.0)),
         sin_pitch=s[:, 1].copy(),
         sin_pitch_std=np.sqrt(np.maximum(uncertainty[:, 2], 0.0)),
-        doubtful=doubtful,
+        missed=missed,
     )

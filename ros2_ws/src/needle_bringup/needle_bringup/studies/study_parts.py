@@ -20,6 +20,7 @@ from needle_bringup.studies.study_controllers import (
 )
 from needle_core.commands.cli import JsonValue
 from needle_sim.needle.se3 import FloatArray
+from needle_sim.studies.beliefs import doubted
 from needle_sim.studies.figures_of_merit import Outcomes, figures, joined
 from needle_sim.studies.point_study import PointOutcomes, point_figures, run_point_study
 from needle_sim.studies.point_targets import MovingTargets, random_targets
@@ -188,8 +189,8 @@ def _of_plane(outcomes: Outcomes) -> Results:
             "rotation_deg": np.rad2deg(outcomes.rotation),
             "diverged": outcomes.diverged.astype(float),
             "inside_3_sigma": outcomes.inside_3_sigma,
-            "doubtful": outcomes.doubtful,
-            "stated_miss": outcomes.stated_misses,
+            "doubtful": doubted(outcomes.missed),
+            "stated_miss": outcomes.missed,
         },
     )
 
@@ -205,6 +206,6 @@ def _of_points(outcomes: PointOutcomes, places: FloatArray) -> Results:
             "error_mm": outcomes.error * 1e3,
             "rotation_deg": np.rad2deg(outcomes.rotation),
             "inside_3_sigma": outcomes.inside_3_sigma,
-            "doubtful": outcomes.doubtful,
+            "doubtful": doubted(outcomes.missed),
         },
     )

@@ -307,6 +307,8 @@ def _take(needle: Any, hypotheses: Records, reading: Reading, age: float, known:
     _catch_up(needle, hypotheses, age, known)
     needle.tips += 1
     if not needle.too_late and read_tip(reading):
+        for i in range(3):
+            needle.claimed[i] = reading.covariance[i, i]
         work = new_work()
         for n in range(needle.count):
             update_hypothesis(hypotheses[n], reading, known, work)

@@ -32,14 +32,14 @@ from needle_core.errors import UserError
 from needle_core.settings.bounds import Bounds, check_bounded_fields
 
 TORSION_HYPOTHESES = (
-    TorsionHypothesis(0.0, 0.0, 0.02, 0.52),
+    TorsionHypothesis(0.0, 0.0, 0.015, 0.52),
     TorsionHypothesis(math.radians(20.0), 0.0, 0.15, 0.12),
     TorsionHypothesis(math.radians(40.0), 0.0, 0.15, 0.25),
     TorsionHypothesis(0.0, 0.006, 0.003, 0.11),
-    TorsionHypothesis(0.0, 0.0, 0.15, 0.1, heading_drift=0.15, roll_drift=1.5),
+    TorsionHypothesis(0.0, 0.0, 0.15, 0.1, heading_drift=0.15, roll_drift=1.2),
 )
-"""None, a small and a large play, lag, and a tip that turns by itself: tissue pushes it aside, or it
-rolls, or follows only part of the base's rotation. Each one's size is estimated."""
+"""None, a small and a large play, lag, and a tip that turns by itself: tissue pushes it aside, it
+rolls, or it follows part of the base's rotation only. Each one's size is estimated."""
 ROLL_HYPOTHESES = tuple(
     RollHypothesis(math.radians(roll), math.radians(std), weight)
     for roll, std, weight in (
@@ -64,7 +64,7 @@ NORMAL_NOISE = (
 """Where a covariance is claimed: normal, smaller than claimed, as claimed or larger."""
 BOUNDED_NOISE = (
     NoiseHypothesis(UNIFORM, (1.0, 1.3, 1.7, 2.2), (0.85, 0.05, 0.05, 0.05), 0.8),
-    NoiseHypothesis(NORMAL, (1.0, 0.5, 1.6, 2.6), (0.4, 0.2, 0.2, 0.2), 0.2),
+    NoiseHypothesis(NORMAL, (1.0, 0.5, 0.25, 1.6, 2.6), (0.4, 0.15, 0.15, 0.15, 0.15), 0.2),
     LASTING_NOISE,
 )
 """Where a bound is claimed: most likely it holds; else a larger one, or none. Were no small normal

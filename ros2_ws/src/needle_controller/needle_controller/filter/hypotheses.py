@@ -10,7 +10,6 @@ from needle_controller.filter.records import NOISES
 from needle_core.errors import UserError
 from needle_core.settings.bounds import Bounds, check_bounded_fields
 
-
 # Read by compiled code.
 PLAY, LAG, GAIN = range(3)
 """Sizes of a torsion, of which each hypothesis estimates one."""
@@ -40,8 +39,8 @@ class TorsionHypothesis:
     lag_length: Annotated[float, Bounds(0.0, 0.1, "m")]
     size_std: Annotated[float, Bounds(0.0, math.pi, "m or rad")]
     weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
-    heading_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.055
-    roll_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.055
+    heading_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.05
+    roll_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.05
 
     def __post_init__(self) -> None:
         """Check every field; raises OutOfBoundsError."""

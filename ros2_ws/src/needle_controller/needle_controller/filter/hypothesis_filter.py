@@ -113,7 +113,7 @@ class HypothesisFilter:
         """Return what is known now; see `Estimator.estimate`."""
         said = np.zeros(1, ESTIMATE)[0]
         torsions = np.zeros(len(self.settings.torsion_hypotheses), TORSION)
-        estimate_needle(self.needle, self._hypotheses, said, torsions, self._known, True)
+        estimate_needle(self.needle, self._hypotheses, said, torsions, self._known)
         return estimate_from(said, torsions, self._warnings(float(said["ambiguous"])))
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803

@@ -1,7 +1,6 @@
 """All hypotheses of a needle as one estimate: mean pose, covariance, what laws read; compiled."""
 
 # Compiled code takes keywords slowly or not at all.
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
@@ -11,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.filter.bank import looked_ahead
-from needle_controller.filter.hypotheses import LASTING
-from needle_controller.filter.records import E_TURN, NOISES
+from needle_controller.filter.hypotheses import LASTING, NORMAL
+from needle_controller.filter.records import E_TURN, NEAR, NOISES
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes
 from needle_controller.observers.estimator import Estimate, Hypotheses
@@ -21,17 +20,14 @@ from needle_core.compiled import compiled
 Records = npt.NDArray[np.void]
 
 LATE = "tips lie short of the insertion from the start: late, or the needle stuck; taken as late"
-DOUBTS = (
-    "x is not known to 1 mm",
+WARNINGS = (
     "too many tips are outliers",
     "tips are far noisier than claimed",
     "the needle does not go in as the stage does",
     "the curvature is at its limit",
     LATE,
 )
-"""Reasons for which an estimate declares itself doubtful."""
-LARGEST_X_STD = 0.001
-"""Standard deviation of x beyond which nothing is said of the plane [m]."""
+"""What a user should know of an estimate, whatever it makes of it."""
 LARGEST_UNEXPLAINED = 0.35
 """Share of the last ten tips or so that were outliers."""
 LARGEST_NOISE = 3.0
@@ -39,6 +35,7 @@ LARGEST_NOISE = 3.0
 LARGEST_SLIP = 0.15
 """Distance of the insertion scale from 1."""
 _AT_LIMIT = 0.03
+_HIDDEN_SHARE = 0.5
 _AMBIGUOUS_COSINE = math.cos(math.radians(60.0))
 _NO_MEAN_ROLL = 0.1
 
@@ -50,7 +47,6 @@ def estimate_needle(
     estimate: Any,
     torsions: Records,
     known: Any,
-    with_covariance: bool,
 ) -> None:
     """Write what is known of a needle now.
 
@@ -65,8 +61,6 @@ def estimate_needle(
         The mean over each torsion.
     known : ASSUMPTIONS
         As of `bank.advance_needle`.
-    with_covariance : bool
-        Whether to write the covariance.
     """
     every = looked_ahead(needle, hypotheses, known)
     whole, best = 0.0, 0
@@ -75,7 +69,7 @@ def estimate_needle(
         if every[n].weight > every[best].weight:
             best = n
     position, heading, side = np.zeros(3), np.zeros(3), np.zeros(3)
-    bend = curvature = scale = xx = x_pitch = pitch_pitch = ambiguous = 0.0
+    bend = curvature = scale = xx = x_pitch = pitch_pitch = ambiguous = miss = 0.0
     for n in range(needle.count):
         h = every[n]
         w, r, p = h.weight / whole, h.rotation, h.covariance
@@ -92,7 +86,9 @@ def estimate_needle(
         scale += w * h.scale
         # A turn w changes sin(pitch), the heading's x, by w_y heading_z - w_z heading_y.
         x, y_y, z_z = h.position[0], p[E_TURN + 1, E_TURN + 1], p[E_TURN + 2, E_TURN + 2]
-        xx += w * (p[0, 0] + x * x)
+        x_x = p[0, 0] + _the_same_in_all(needle, h, 0, known)
+        xx += w * (x_x + x * x)
+        miss += w * beyond(x, x_x)
         of_both = p[0, E_TURN + 1] * r[2, 2] - p[0, E_TURN + 2] * r[1, 2]
         x_pitch += w * (of_both + x * r[0, 2])
         variance = y_y * r[2, 2] ** 2 + z_z * r[1, 2] ** 2
@@ -109,8 +105,7 @@ def estimate_needle(
         heading[0],
         bend,
     )
-    # However many tips there were: what the model leaves out of them is the same in all.
-    estimate.uncertainty[0] = xx - position[0] * position[0] + known.model_error
+    estimate.uncertainty[0] = xx - position[0] * position[0]
     estimate.uncertainty[1] = x_pitch - position[0] * heading[0]
     estimate.uncertainty[2] = pitch_pitch - heading[0] * heading[0]
     estimate.curvature, estimate.scale, estimate.ambiguous = curvature, scale, ambiguous
@@ -119,10 +114,31 @@ def estimate_needle(
     for k in range(needle.pending):
         estimate.base += needle.pending_turn[k]
     estimate.wound = estimate.base + needle.start_turn
-    estimate.doubts = _doubts(needle, estimate, known)
+    estimate.miss = miss
+    estimate.warnings = _warnings(needle, estimate, known)
     _average_torsions(every, whole, torsions)
-    if with_covariance:
-        _write_covariance(every, whole, estimate)
+    _write_covariance(needle, every, whole, estimate, known)
+
+
+@compiled
+def _the_same_in_all(needle: Any, h: Any, i: int, known: Any) -> float:
+    """Return the variance of an error that all tips may have in common, in one coordinate [m^2].
+
+    That is what the model leaves out, and part of a claimed error of which the tips show less.
+    """
+    unseen = 0.0
+    if h.shape == NORMAL:
+        for m in range(NOISES):
+            share = 1.0 - known.noises[NORMAL, 0, m] ** 2
+            unseen += h.noise_weights[0, m] * max(share, 0.0)
+    return float(known.model_error + _HIDDEN_SHARE * unseen * needle.claimed[i])
+
+
+@compiled
+def beyond(x: float, variance: float) -> float:
+    """Return the probability that a normal number is farther from 0 than `NEAR`."""
+    per_sqrt_2 = 1.0 / math.sqrt(2.0 * variance)
+    return 0.5 * (math.erfc((NEAR - x) * per_sqrt_2) + math.erfc((NEAR + x) * per_sqrt_2))
 
 
 @compiled
@@ -151,17 +167,16 @@ def _noise_size(h: Any, noises: Array) -> float:
 
 
 @compiled
-def _doubts(needle: Any, estimate: Any, known: Any) -> int:
-    """Return the reasons of `DOUBTS` that hold, as bits."""
+def _warnings(needle: Any, estimate: Any, known: Any) -> int:
+    """Return which of `WARNINGS` hold, as bits."""
     low, high = known.smallest_curvature, known.largest_curvature
     margin = _AT_LIMIT * known.curvature
     return int(
-        (estimate.uncertainty[0] > LARGEST_X_STD**2)
-        + 2 * (needle.unexplained > LARGEST_UNEXPLAINED)
-        + 4 * (estimate.noise > LARGEST_NOISE)
-        + 8 * (abs(estimate.scale - 1.0) > LARGEST_SLIP)
-        + 16 * (estimate.curvature < low + margin or estimate.curvature > high - margin)
-        + 32 * (needle.late > 0.0)
+        (needle.unexplained > LARGEST_UNEXPLAINED)
+        + 2 * (estimate.noise > LARGEST_NOISE)
+        + 4 * (abs(estimate.scale - 1.0) > LARGEST_SLIP)
+        + 8 * (estimate.curvature < low + margin or estimate.curvature > high - margin)
+        + 16 * (needle.late > 0.0)
     )
 
 
@@ -203,7 +218,7 @@ def _average_torsions(every: Records, whole: float, torsions: Records) -> None:
 
 
 @compiled
-def _write_covariance(every: Records, whole: float, estimate: Any) -> None:
+def _write_covariance(needle: Any, every: Records, whole: float, estimate: Any, known: Any) -> None:
     """Write the covariance of the mixture about its mean, of position and rotation vector."""
     q, error = estimate.coordinates, np.empty(6)
     ca, sa, cb, sb = math.cos(q[3]), math.sin(q[3]), math.cos(q[4]), math.sin(q[4])
@@ -233,11 +248,14 @@ def _write_covariance(every: Records, whole: float, estimate: Any) -> None:
             for j in range(6):
                 spread = h.covariance[i, j] + error[i] * error[j]
                 estimate.covariance[i, j] += h.weight / whole * spread
+        for i in range(3):
+            hidden = _the_same_in_all(needle, h, i, known)
+            estimate.covariance[i, i] += h.weight / whole * hidden
 
 
 def estimate_from(said: np.void, torsions: Records, warnings: tuple[str, ...] = ()) -> Estimate:
     """Return what was written, an ESTIMATE and TORSION, shape (K,), as an estimate."""
-    doubts = tuple(why for k, why in enumerate(DOUBTS) if said["doubts"] >> k & 1)
+    warnings += tuple(why for k, why in enumerate(WARNINGS) if said["warnings"] >> k & 1)
     # A change of the angles turns the tip by axes @ change.
     to_angles = np.eye(6)
     to_angles[3:, 3:] = np.linalg.inv(angle_axes(said["coordinates"][3:]))
@@ -247,8 +265,7 @@ def estimate_from(said: np.void, torsions: Records, warnings: tuple[str, ...] = 
         curvature=float(said["curvature"]),
         covariance=to_angles @ said["covariance"] @ to_angles.T,
         warnings=warnings,
-        doubtful=bool(doubts),
-        doubts=doubts,
+        miss=float(said["miss"]),
         hypotheses=Hypotheses(
             torsions, float(said["base"]), float(said["wound"]), said["uncertainty"]
         ),

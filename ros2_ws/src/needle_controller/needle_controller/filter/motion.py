@@ -60,9 +60,9 @@ def advance_hypothesis(
     gain : ndarray, shape (6, 6)
         Working memory.
     """
-    tip, behind, dtip_dsize = turn_tip(
-        h.tip_angle, h.behind_play, h.dtip_dsize, h.gain * base, h.gain * turn, length, h.play, h.lag
-    )
+    angles = h.tip_angle, h.behind_play, h.dtip_dsize
+    follows, turns = h.gain * base, h.gain * turn
+    tip, behind, dtip_dsize = turn_tip(*angles, follows, turns, length, h.play, h.lag)
     if h.sized == GAIN:
         dtip_dsize = base + turn
     theta, size_change = tip - h.tip_angle, dtip_dsize - h.dtip_dsize

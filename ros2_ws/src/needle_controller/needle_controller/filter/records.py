@@ -17,6 +17,8 @@ E_POSITION, E_TURN, E_KAPPA, E_SIZE, E_SCALE = 0, 3, 6, 7, 8
 NOISES = 6
 """Most noise models of one shape."""
 LONGEST_QUEUE = 64
+NEAR = 1e-3
+"""Distance from plane or point at which the needle counts as there, [KC09] IV-A [m]."""
 
 HYPOTHESIS = np.dtype(
     [
@@ -52,6 +54,7 @@ NEEDLE = np.dtype(
         ("refused", np.float64),  # probability that the last tip was an outlier
         ("unexplained", np.float64),  # the same, in the running mean of the last tips
         ("tips", np.int64),  # taken so far
+        ("claimed", np.float64, 3),  # variance of each coordinate of the last one [m^2]
         ("too_late", np.bool_),  # whether the last tip was older than the one before
         ("pending", np.int64),  # advances that wait for a tip, in
         ("pending_length", np.float64, LONGEST_QUEUE),  # [m]
@@ -82,14 +85,15 @@ ESTIMATE = np.dtype(
         ("coordinates", np.float64, 6),  # x, y, z [m], yaw, pitch, roll [rad]
         ("linearized", np.float64, 3),  # mean of the linearized states (6)
         ("uncertainty", np.float64, 3),  # var(x), cov(x, sin(pitch)), var(sin(pitch))
-        ("covariance", np.float64, (6, 6)),  # of tip and rotation vector; where asked for
+        ("covariance", np.float64, (6, 6)),  # of tip and rotation vector
+        ("miss", np.float64),  # probability that the tip is farther from the plane than `NEAR`
         ("curvature", np.float64),  # [1/m]
         ("scale", np.float64),  # insertion scale
         ("noise", np.float64),  # as a multiple of what is claimed
         ("ambiguous", np.float64),  # weight of rolls more than 60 deg from the likeliest
         ("base", np.float64),  # rotation of the base since the start [rad]
         ("wound", np.float64),  # rotation of the base as the joint says it [rad]
-        ("doubts", np.int64),  # bit k: reason k of `DOUBTS`
+        ("warnings", np.int64),  # bit k: number k of `WARNINGS`
     ]
 )
 TORSION = np.dtype(

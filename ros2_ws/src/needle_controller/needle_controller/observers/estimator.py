@@ -55,10 +55,9 @@ class Estimate:
         Covariance of `coordinates`, in their order.
     warnings : tuple of str
         What a user should know of this estimate; empty as a rule.
-    doubtful : bool, optional
-        Whether the estimate cannot be relied on; None from an estimator that never says so.
-    doubts : tuple of str
-        Why not.
+    miss : float, optional
+        Probability that the tip is more than 1 mm from the plane x = 0; None from an estimator that
+        does not judge itself.
     hypotheses : Hypotheses, optional
         Of what it is the mean; None from an estimator that knows one state only.
     """
@@ -68,8 +67,7 @@ class Estimate:
     curvature: float
     covariance: Array
     warnings: tuple[str, ...] = ()
-    doubtful: bool | None = None
-    doubts: tuple[str, ...] = ()
+    miss: float | None = None
     hypotheses: Hypotheses | None = None
 
     @property

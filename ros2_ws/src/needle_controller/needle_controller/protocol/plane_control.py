@@ -9,9 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from needle_controller.filter.bank import MERGE_EVERY
+from needle_controller.filter.records import NEAR
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.model.arrays import Array
-from needle_controller.model.kinematics import X, rotation_from_angles
+from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.model.point_reach import point_reachability
 from needle_controller.model.reachability import Reachability, reachability
 from needle_controller.model.target_motion import TargetMotion
@@ -24,7 +25,7 @@ from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import ONE_SIDED_PRESETS, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.tip_gate import TipCovariance
-from needle_controller.protocol.trust import TARGET_TOLERANCE
+from needle_controller.protocol.trust import point_missed
 
 LARGEST_START_ROLL = np.deg2rad(80.0)
 """Of presets whose coordinates end at roll +-90 deg [rad]."""
@@ -45,8 +46,9 @@ class ControlUpdate:
         Rotation of the base since the first tip [rad].
     reach : Reachability
         Of the plane, or the point.
-    distance : float
-        Of the tip from the plane, or from where the point is expected [m].
+    missed : float, optional
+        Probability that the tip is more than 1 mm from the plane, or from where the point is
+        expected; None where the estimator does not say.
     blocked : bool
         Whether no way on is clear of the obstacles: no further step then.
     """
@@ -55,7 +57,7 @@ class ControlUpdate:
     command: SteeringCommand
     turned: float
     reach: Reachability
-    distance: float
+    missed: float | None
     blocked: bool = False
 
 
@@ -218,11 +220,11 @@ class PlaneControl:
         estimate = self._estimator.estimate()
         turned = joints.rotation - self._first_joints.rotation
         command = self._command(estimate, joints)
-        reach, distance = self._reach(estimate, joints), self._distance(estimate)
+        reach, missed = self._reach(estimate, joints), self._missed(estimate)
         if command is None:
             still = SteeringCommand(0.0, 0.0)
-            return ControlUpdate(estimate, still, turned, reach, distance, blocked=True)
-        return ControlUpdate(estimate, command, turned, reach, distance)
+            return ControlUpdate(estimate, still, turned, reach, missed, blocked=True)
+        return ControlUpdate(estimate, command, turned, reach, missed)
 
     def _advance(self, joints: JointSample) -> None:
         assert self._joints is not None
@@ -270,18 +272,18 @@ class PlaneControl:
         limits = {
             "insertion": joints.insertion,
             "end": self._settings.depth,
-            "tolerance": TARGET_TOLERANCE,
+            "tolerance": NEAR,
         }
         if self._points is None:
             return reachability(estimate.reduced, estimate.curvature, **limits)
         offset = self._plane.from_rig(self._points.aim) - estimate.position
         return point_reachability(estimate.rotation.T @ offset, estimate.curvature, **limits)
 
-    def _distance(self, estimate: Estimate) -> float:
-        if self._points is None:
-            return abs(float(estimate.coordinates[X]))
-        offset = self._plane.from_rig(self._points.aim) - estimate.position
-        return float(np.linalg.norm(offset))
+    def _missed(self, estimate: Estimate) -> float | None:
+        if self._points is None or estimate.miss is None:
+            return estimate.miss
+        off = estimate.position - self._plane.from_rig(self._points.aim)
+        return float(point_missed(off, estimate.covariance[:3, :3]))
 
     def _correct(self, position: Array, known: TipCovariance | None) -> None:
         estimator, settings = self._estimator, self._settings

@@ -345,7 +345,7 @@ class Steering:
         return update, actions
 
     def _end(self, update: ControlUpdate, joints: JointSample) -> list[Action]:
-        self.trust = trust_of(update.estimate, update.distance)
+        self.trust = trust_of(update.estimate, update.missed)
         text = f"insertion {joints.insertion:.6g} m reached; {self.trust.summary}"
         return self._leave(SteeringState.DONE, text, "info")
 

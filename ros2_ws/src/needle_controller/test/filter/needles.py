@@ -18,7 +18,7 @@ from needle_controller.observers.estimator import Estimate
 
 CURVATURE = 1.0 / 0.122
 STEP = 0.001
-RIGID = (TorsionHypothesis(0.0, 0.0, 0.0, 1.0),)
+RIGID = (TorsionHypothesis(0.0, 0.0, 0.0, 1.0, heading_drift=0.03, roll_drift=0.03),)
 ROLL_AS_SET = (RollHypothesis(0.0, np.deg2rad(30.0), 1.0),)
 
 

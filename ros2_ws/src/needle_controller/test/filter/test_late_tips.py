@@ -8,7 +8,7 @@ import pytest
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.filter.late_tips import FIRST, untold_age
-from needle_controller.filter.mixture import DOUBTS, LATE
+from needle_controller.filter.mixture import LATE, WARNINGS
 from needle_controller.many_needles import ManyFilters
 from needle_controller.model.arrays import Array
 
@@ -73,11 +73,11 @@ def many_inserted_by(
 
 
 def called_late(filters: ManyFilters) -> Array:
-    return np.asarray(filters.estimates["doubts"] >> DOUBTS.index(LATE) & 1)
+    return np.asarray(filters.estimates["warnings"] >> WARNINGS.index(LATE) & 1)
 
 
 @pytest.mark.parametrize("late", [3, 5])
-def test_late_tips_are_taken_as_late_and_doubted(late: int) -> None:
+def test_late_tips_are_taken_as_late_and_said(late: int) -> None:
     filters = many_inserted_by(40, late=late)
     np.testing.assert_array_equal(called_late(filters), 1)
     # Where the needle is, not where it was.
@@ -93,7 +93,7 @@ def test_late_tips_are_the_same_in_another_frame() -> None:
         inserted_by(30, late=3, frame=at).estimate(),
         inserted_by(30, late=3).estimate(),
     )
-    assert LATE in elsewhere.doubts
+    assert LATE in elsewhere.warnings
     np.testing.assert_allclose(
         elsewhere.position, here.position @ at[:3, :3].T + at[:3, 3], atol=2e-4
     )
@@ -114,8 +114,8 @@ def test_tips_that_are_taken_again_come_with_their_covariance_in_the_new_frame()
             estimator.advance(STEP, 0.0)
             estimator.correct(r @ tip, r @ known @ r.T)
     here, there = stays.estimate(), goes.estimate()
-    assert LATE in here.doubts
-    assert LATE in there.doubts
+    assert LATE in here.warnings
+    assert LATE in there.warnings
     # Coordinates come in another order, which is all that differs.
     np.testing.assert_allclose(there.position, turn @ here.position, atol=2e-4)
 

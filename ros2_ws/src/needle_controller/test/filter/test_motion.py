@@ -10,6 +10,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from needle_controller.filter.filter_settings import FilterSettings
+from needle_controller.filter.hypotheses import GAIN, LAG, PLAY
 from needle_controller.filter.motion import (
     LARGEST_TURN,
     advance_hypothesis,
@@ -27,20 +28,23 @@ CASES = [
     (0.0, 0.4),
     (0.01, 0.7),
 ]
-TORSIONS = [(0.1, 0.0), (0.25, 0.0), (0.0, 0.004), (0.0, 0.008), (0.1, 0.002)]
+TORSIONS = [(0.1, 0.0), (0.25, 0.0), (0.0, 0.004), (0.0, 0.008), (0.1, 0.002), (0.0, 0.0)]
+SIZES = ("play", "lag", "gain")
 SCALES = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 1.0, 0.1, 0.05])
 NO_DRIFT = FilterSettings(curvature_drift=0.0, scale_drift=0.0, play_drift=0.0, lag_drift=0.0)
 
 
-def hypothesis(play: float = 0.0, lag: float = 0.0, seed: int = 1) -> Any:
-    rng = np.random.default_rng(seed)
+def hypothesis(play: float = 0.0, lag: float = 0.0) -> Any:
+    rng, seed = np.random.default_rng(1), 1
+    sized = LAG if lag else PLAY if play else GAIN
     h = np.zeros(1, HYPOTHESIS)[0]
     h["position"] = rng.normal(0.0, 0.01, 3)
     h["rotation"] = Rotation.random(random_state=seed).as_matrix()
     h["curvature"], h["scale"] = rng.uniform(5.0, 11.0), rng.uniform(0.9, 1.1)
     factor = rng.normal(size=(ERROR, ERROR)) * SCALES[:, None]
     h["covariance"] = factor @ factor.T
-    h["play"], h["lag"] = play, lag
+    h["play"], h["lag"], h["gain"] = play, lag, rng.uniform(0.8, 1.0) if sized == GAIN else 1.0
+    h["sized"] = sized
     return h
 
 
@@ -67,7 +71,7 @@ def test_the_step_is_the_exponential_of_the_twist(length: float, turn: float) ->
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = before["rotation"], before["position"]
     gone = before["scale"] * length
-    x, z = before["curvature"] * gone, turn
+    x, z = before["curvature"] * gone, before["gain"] * turn
     twist = np.array([[0, -z, 0, 0], [z, 0, -x, 0], [0, x, 0, gone], [0, 0, 0, 0.0]])
     wanted = pose @ expm(twist)
     np.testing.assert_allclose(after["position"], wanted[:3, 3], atol=1e-12)
@@ -88,7 +92,7 @@ def test_covariance_goes_by_the_steps_derivative(
         start["rotation"] = Rotation.from_rotvec(error[3:6]).as_matrix() @ before["rotation"]
         start["curvature"] += error[E_KAPPA]
         start["scale"] += error[E_SCALE]
-        start["lag" if lag else "play"] += error[E_SIZE]
+        start[SIZES[before["sized"]]] += error[E_SIZE]
         return moved(start, length, turn)
 
     transition = np.eye(ERROR)
@@ -110,16 +114,17 @@ def test_covariance_goes_by_the_steps_derivative(
 
 def test_torsions_angles_are_kept() -> None:
     for play, lag in TORSIONS:
-        after = moved(hypothesis(play, lag), 0.001, 0.5)
-        assert after["behind_play"] == pytest.approx(0.5 - play)
+        before = hypothesis(play, lag)
+        after = moved(before, 0.001, 0.5)
+        assert after["behind_play"] == pytest.approx(0.5 * before["gain"] - play)
         if lag:
             assert 0.0 < after["tip_angle"] < after["behind_play"]
         else:
             assert after["tip_angle"] == after["behind_play"]
-            assert after["dtip_dsize"] == -1.0
+            assert after["dtip_dsize"] == (-1.0 if play else 0.5)
 
 
-@pytest.mark.parametrize(("play", "lag"), [(0.1, 0.0), (0.0, 0.004)])
+@pytest.mark.parametrize(("play", "lag"), [(0.1, 0.0), (0.0, 0.004), (0.0, 0.0)])
 def test_process_noise_is_added_where_it_belongs(play: float, lag: float) -> None:
     settings = FilterSettings(
         curvature=1.0,
@@ -131,10 +136,15 @@ def test_process_noise_is_added_where_it_belongs(play: float, lag: float) -> Non
     before = hypothesis(play, lag)
     before["covariance"] = 0.0
     before["covariance"][E_SIZE, E_SIZE] = 1e-30
-    before["orientation_drift"] = 2.0
-    added = np.diag(moved(before, 0.001, 0.0, settings)["covariance"]) * 1000.0
-    wanted = [0.0, 0.0, 0.0, 2.0, 2.0, 2.0, 3.0, 5.0 if play else 1.0, 4.0]
-    np.testing.assert_allclose(added, wanted, atol=1e-9)
+    before["heading_drift"], before["roll_drift"] = 2.0, 6.0
+    added = moved(before, 0.001, 0.0, settings)
+    covariance = 1000.0 * added["covariance"]
+    wanted = [0.0, 0.0, 0.0, 3.0, (5.0, 1.0, 0.0)[before["sized"]], 4.0]
+    np.testing.assert_allclose(np.diag(covariance)[[0, 1, 2, 6, 7, 8]], wanted, atol=1e-9)
+    # About the heading, the last column, it is the roll that drifts.
+    axes = added["rotation"]
+    drift = axes.T @ covariance[3:6, 3:6] @ axes
+    np.testing.assert_allclose(drift, np.diag([2.0, 2.0, 6.0]), atol=1e-9)
     # A size that is known exactly stays so.
     before["covariance"][E_SIZE, E_SIZE] = 0.0
     assert moved(before, 0.001, 0.0, settings)["covariance"][E_SIZE, E_SIZE] == 0.0

@@ -36,7 +36,6 @@ def test_an_outlier_is_refused_and_a_jump_is_believed() -> None:
     moved = estimator.estimate()
     np.testing.assert_allclose(moved.position, path(turns)[46, :3, 3] + far, atol=0.0008)
     assert not moved.warnings
-    assert not moved.doubtful
 
 
 def test_what_takes_a_tip_for_an_outlier_comes_back_displaced_with_its_share() -> None:

@@ -26,15 +26,13 @@ SCALES = np.array([3e-4, 3e-4, 3e-4, 0.1, 0.1, 0.3, 1.0, 0.1, 0.05])
 COUNT = 8
 BOUND = 0.001
 MIDDLE = np.array([0.01, 0.02, 0.03])
-PLAIN = FilterSettings(
-    softness=0.0, mistrust=0.0, outlier_share=1e-6, curvature_range=(0.01, 100.0)
-)
+PLAIN = FilterSettings(outlier_share=1e-6, curvature_range=(0.01, 100.0))
 LASTS = dataclasses.replace(
     PLAIN,
     model_error=0.0,
     noise_hypotheses=(NoiseHypothesis(LASTING, (1.0,), (1.0,), 1.0, (0.6,)),),
 )
-WITH_OUTLIERS = FilterSettings(softness=0.0, mistrust=0.0)
+WITH_OUTLIERS = FilterSettings()
 Records = npt.NDArray[np.void]
 
 

@@ -36,7 +36,8 @@ def mixture(rolls: list[float], *, wound: float = 0.0, **first: float) -> Estima
     """
     torsions = np.zeros(len(rolls), TORSION)
     torsions["roll"] = rolls
-    torsions["agreement"], torsions["curvature"] = 1.0, CURVATURE
+    torsions["agreement"] = torsions["gain"] = 1.0
+    torsions["curvature"] = CURVATURE
     torsions["weight"] = 1.0 / len(rolls)
     for name, value in first.items():
         torsions[name][0] = value

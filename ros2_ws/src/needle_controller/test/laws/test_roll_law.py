@@ -34,7 +34,7 @@ def test_turns_to_where_the_needle_bends_towards_the_plane_within_the_limit() ->
     for x in np.linspace(-0.01, 0.01, 50).tolist():
         assert abs(slow(estimate(x)).rotation_rate) <= 100.0
     # What is doubted is demanded less.
-    sure, unsure = (law(far_dead_band=0.0)(estimate(0.003, 0.0, -0.5, std=s)) for s in (0.0, 0.3))
+    sure, unsure = (law(far_dead_band=0.0)(estimate(0.0002, 0.0, -0.1, std=s)) for s in (0.0, 0.3))
     assert abs(unsure.virtual_input) < abs(sure.virtual_input)
 
 
@@ -73,7 +73,7 @@ def test_the_nearer_side_is_taken_unless_it_winds_too_far() -> None:
 
 
 def turned(needle: Estimate, **changes: float) -> float:
-    return float(law(near_dead_band=0.1, **changes)(needle).rotation_rate) * STEP
+    return float(law(near_dead_band=0.1, far_dead_band=0.1, **changes)(needle).rotation_rate) * STEP
 
 
 def test_small_errors_and_rolls_that_disagree_are_left_alone() -> None:
@@ -88,9 +88,12 @@ def test_small_errors_and_rolls_that_disagree_are_left_alone() -> None:
     assert turned(weighed) == pytest.approx(-0.75 * 0.5)
 
 
-def torsion(tip: float = 0.0, behind: float = 0.0, play: float = 0.0, lag: float = 0.0) -> Any:
+def torsion(
+    tip: float = 0.0, behind: float = 0.0, play: float = 0.0, lag: float = 0.0, gain: float = 1.0
+) -> Any:
     t = np.zeros(1, TORSION)[0]
     t["tip_angle"], t["behind_play"], t["play"], t["lag"] = tip, behind, play, lag
+    t["gain"] = gain
     return t
 
 
@@ -101,6 +104,8 @@ def test_play_is_taken_up_and_lag_is_led() -> None:
     assert base_turn(torsion(play=0.5), 0.0, 0.3, STEP) == 0.0
     lead = base_turn(torsion(lag=0.008), 0.1, 0.0, STEP)
     assert lead * (1.0 - np.exp(-1.0 / 8.0)) == pytest.approx(0.1)
+    # Half of what the base turns reaches the tip.
+    assert base_turn(torsion(0.3, 0.3, gain=0.5), 0.1, 0.6, STEP) == pytest.approx(0.2)
     # No more turn wanted: the base goes back to where the tip is.
     assert base_turn(torsion(0.2, 0.9, lag=0.008), 0.0, 0.9, STEP) == pytest.approx(-0.7)
 

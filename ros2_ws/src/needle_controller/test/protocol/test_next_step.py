@@ -15,7 +15,7 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.heard_messages import HeardMessages, heard_messages
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.next_step import next_step
-from needle_controller.protocol.trust import Trust, ends_elsewhere, trust_of
+from needle_controller.protocol.trust import Trust, point_missed, trust_of
 
 SETTINGS = SteeringSettings(depth=0.12)
 
@@ -64,16 +64,25 @@ def test_trust_is_the_interval_of_the_covariance_the_doubts_and_the_end() -> Non
         ends = trust.r1 - trust.low, trust.high - trust.r1
         assert ends == pytest.approx((half, half), rel=1e-4)
         assert (trust.verdict, trust.is_doubtful) == ("trusted", False)
-    there, elsewhere = trust_of(estimate, 0.00099), trust_of(estimate, -0.0072)
+    there, elsewhere = trust_of(estimate, 0.049), trust_of(estimate, 0.72)
     assert (there.verdict, there.is_doubtful) == ("trusted", False)
-    assert elsewhere.verdict == "doubtful: the needle ends -0.0072 m from its target"
+    assert elsewhere.verdict.startswith("doubtful: 72 %")
     assert elsewhere.is_doubtful
-    doubted = dataclasses.replace(estimate, doubtful=True, doubts=("a", "b"))
-    assert trust_of(doubted, 0.01).verdict.startswith("doubtful: a; b; the needle ends")
+    wide = np.diag([1.1e-6, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert trust_of(dataclasses.replace(estimate, covariance=wide)).is_doubtful
     # An estimator that does not judge itself is not judged by its end either.
-    unjudged = trust_of(dataclasses.replace(estimate, doubtful=None, doubts=()), 0.0072)
+    unjudged = trust_of(dataclasses.replace(estimate, miss=None), 0.72)
     assert (unjudged.verdict, unjudged.is_doubtful) == ("", False)
-    assert (ends_elsewhere(1e-3), ends_elsewhere(-1.01e-3)) == (False, True)
+
+
+def test_a_point_is_missed_as_often_as_it_is_said() -> None:
+    rng = np.random.default_rng(2)
+    for spread in (0.0002, 0.0005, 0.0009):
+        off = rng.normal(0.0, 0.0005, 3)
+        root = rng.normal(0.0, spread, (3, 3))
+        drawn = off + rng.normal(size=(40_000, 3)) @ root.T
+        share = float(np.mean(np.linalg.norm(drawn, axis=1) > 1e-3))
+        assert float(point_missed(off, root @ root.T)) == pytest.approx(share, abs=0.03)
 
 
 def test_trust_in_a_line_says_the_distance_its_interval_and_the_verdict() -> None:

@@ -153,19 +153,19 @@ def test_a_change_of_preset_keeps_the_estimated_pose_and_steers_on() -> None:
             assert max(needle.steer(80).track[-20:]) < 1e-3
 
 
-def test_an_update_says_turn_distance_and_reach() -> None:
+def test_an_update_says_turn_miss_and_reach() -> None:
     needle = Needle(PLANE, turned=1.0)
     needle.steer(3)
     # An encoder at rest may read a count less.
     joints = JointSample(9, needle.joints.insertion - 1e-6, 1.5)
     update = needle.control.update(needle.tip, joints)
     assert update.turned == pytest.approx(0.5)
-    assert update.distance == pytest.approx(abs(update.estimate.coordinates[0]))
+    assert update.missed == update.estimate.miss
     assert not update.blocked
     needle.control.target_point = np.array(POINT)
     update = needle.control.update(needle.tip, joints)
-    aside = needle.control.plane.from_rig(np.array(POINT)) - update.estimate.position
-    assert update.distance == pytest.approx(np.linalg.norm(aside))
+    # It is far from there.
+    assert update.missed == pytest.approx(1.0)
     needle.control.restart()
     assert not needle.control.started
     assert needle.control.update(needle.tip, joints).turned == 0.0

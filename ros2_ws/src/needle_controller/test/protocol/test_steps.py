@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from needle_controller.presets.own_parts import OwnPartError
+from needle_controller.protocol import steering
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import (
     Action,
@@ -17,6 +18,7 @@ from needle_controller.protocol.steering_types import (
     SteeringState,
 )
 from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_controller.protocol.trust import Trust
 
 from .rig import FREE, HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
 
@@ -192,14 +194,9 @@ def test_the_last_step_ends_at_the_depth_and_then_it_is_done() -> None:
     assert "at the depth" in rig.start()
 
 
-def test_in_doubt_it_goes_on_at_half_the_speed() -> None:
-    rig = Rig()
-    while not rig.steering.trust.is_doubtful:
-        # This needle does not bend at all.
-        step = sent(rig.expose())
-        rig.run(step)
-        assert rig.steering.step < 119
-    assert step.duration == pytest.approx(1.0)
+def test_in_doubt_it_goes_on_at_half_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(steering, "trust_of", lambda *_: Trust("doubtful", is_doubtful=True))
+    assert sent(Rig().expose()).duration == pytest.approx(1.0)
 
 
 def test_a_recorded_device_may_have_made_another_step() -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import scipy.special
-from numpy.typing import NDArray
 
 from needle_sim.needle.se3 import FloatArray
 
 BAND = 1e-3
 """Half width of what counts as in the plane [m]: the paper's +-1 mm."""
+DOUBT = 0.05
+"""Stated probability of a miss at which an end is called doubtful."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,27 +24,15 @@ class Belief:
         Distance from the plane, and its standard deviation [m].
     sin_pitch, sin_pitch_std : ndarray, shape (N,)
         Sine of the pitch out of the plane, and its standard deviation.
-    doubtful : ndarray of bool, shape (N,), optional
-        Whether it says that it cannot be relied on; None if it never says so.
-    miss_probability : ndarray, shape (N,), optional
-        Probability by its own account that the tip is more than 1 mm from the plane; None where
-        that follows from `x` and `x_std`, as of a normal distribution.
+    missed : ndarray, shape (N,), optional
+        Probability that it is more than `BAND` from plane or point; None if it never says so.
     """
 
     x: FloatArray
     x_std: FloatArray
     sin_pitch: FloatArray
     sin_pitch_std: FloatArray
-    doubtful: NDArray[np.bool_] | None = None
-    miss_probability: FloatArray | None = None
-
-    def stated_misses(self) -> FloatArray:
-        """Return the probability of each tip to be more than `BAND` from the plane, (N,)."""
-        if self.miss_probability is not None:
-            return self.miss_probability
-        sigma = np.maximum(self.x_std, 1e-9)
-        above, below = (self.x - BAND) / sigma, (-BAND - self.x) / sigma
-        return np.asarray(scipy.special.ndtr(above) + scipy.special.ndtr(below))
+    missed: FloatArray | None = None
 
 
 class BeliefTally:
@@ -54,13 +42,17 @@ class BeliefTally:
     ----------
     needles : int
         How many.
+
+    Attributes
+    ----------
+    missed : ndarray, shape (N,)
+        Probability that it gave to a miss after the last step; NaN if nothing is said.
     """
 
     def __init__(self, needles: int) -> None:
         self._within: FloatArray = np.zeros((2, needles))
         self._compared = 0
-        self._doubtful: FloatArray = np.full(needles, np.nan)
-        self._stated_misses: FloatArray = np.full(needles, np.nan)
+        self.missed: FloatArray = np.full(needles, np.nan)
 
     def add(self, belief: Belief | None, x: FloatArray, pitch: FloatArray) -> None:
         """Take one step.
@@ -80,9 +72,8 @@ class BeliefTally:
         ):
             self._within += off <= np.array([[2.0], [3.0]]) * std
             self._compared += 1
-        self._stated_misses = belief.stated_misses()
-        if belief.doubtful is not None:
-            self._doubtful = belief.doubtful.astype(np.float64)
+        if belief.missed is not None:
+            self.missed = belief.missed
 
     @property
     def inside(self) -> FloatArray:
@@ -91,12 +82,7 @@ class BeliefTally:
             return np.full_like(self._within, np.nan)
         return self._within / self._compared
 
-    @property
-    def doubtful(self) -> FloatArray:
-        """1 where the last step was called doubtful, else 0, shape (N,); NaN if nothing is said."""
-        return self._doubtful
 
-    @property
-    def stated_misses(self) -> FloatArray:
-        """Probability of a miss stated after the last step, shape (N,); NaN if nothing is said."""
-        return self._stated_misses
+def doubted(missed: FloatArray) -> FloatArray:
+    """Return 1 where a miss that is stated so probable is doubt, else 0; NaN if nothing is said."""
+    return np.where(np.isnan(missed), np.nan, missed > DOUBT)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import BAND, BeliefTally
+from needle_sim.studies.beliefs import BAND, BeliefTally, doubted
 
 FAR_OFF = 5e-3
 """Distance from plane or point at which an end must not be trusted [m]."""
@@ -39,9 +39,7 @@ class Outcomes:
     inside_2_sigma, inside_3_sigma : ndarray, shape (N,)
         Share of x and pitch after the last steps that lay within so many of the controller's own
         standard deviations from where it took them to be; NaN where it does not say.
-    doubtful : ndarray, shape (N,)
-        Whether the controller called the end doubtful, 0 or 1; NaN where it does not say.
-    stated_misses : ndarray, shape (N,)
+    missed : ndarray, shape (N,)
         Probability that the controller gives at the end to |x| > 1 mm; NaN where it does not say.
     """
 
@@ -51,8 +49,7 @@ class Outcomes:
     rotation: FloatArray
     inside_2_sigma: FloatArray
     inside_3_sigma: FloatArray
-    doubtful: FloatArray
-    stated_misses: FloatArray
+    missed: FloatArray
 
     @property
     def x_end(self) -> FloatArray:
@@ -141,8 +138,7 @@ class Tally:
             rotation=self._rotation,
             inside_2_sigma=inside_2_sigma,
             inside_3_sigma=inside_3_sigma,
-            doubtful=self.beliefs.doubtful,
-            stated_misses=self.beliefs.stated_misses,
+            missed=self.beliefs.missed,
         )
 
 
@@ -171,8 +167,8 @@ def figures(outcomes: Outcomes) -> dict[str, float | None]:
         "diverged": float(np.mean(outcomes.diverged)),
         "inside_2_sigma": mean_of_what_is_said(outcomes.inside_2_sigma),
         "inside_3_sigma": mean_of_what_is_said(outcomes.inside_3_sigma),
-        "doubtful_at_end": mean_of_what_is_said(outcomes.doubtful),
-        "trusted_far_off": trusted_far_off(outcomes.x_end, outcomes.doubtful),
+        "doubtful_at_end": mean_of_what_is_said(doubted(outcomes.missed)),
+        "trusted_far_off": trusted_far_off(outcomes.x_end, outcomes.missed),
     }
 
 
@@ -182,16 +178,17 @@ def mean_of_what_is_said(values: FloatArray) -> float | None:
     return None if np.isnan(mean) else mean
 
 
-def trusted_far_off(distance: FloatArray, doubtful: FloatArray) -> float | None:
+def trusted_far_off(distance: FloatArray, missed: FloatArray) -> float | None:
     """Return how many runs end beyond `FAR_OFF` and are not called doubtful; None: nothing is said.
 
     Parameters
     ----------
     distance : ndarray, shape (N,)
         From plane or point at the end, either side [m].
-    doubtful : ndarray, shape (N,)
+    missed : ndarray, shape (N,)
         See `Outcomes`.
     """
+    doubtful = doubted(missed)
     if np.any(np.isnan(doubtful)):
         return None
     return float(np.sum((np.abs(distance) > FAR_OFF) & (doubtful == 0.0)))

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import BAND, BeliefTally
+from needle_sim.studies.beliefs import BAND, BeliefTally, doubted
 from needle_sim.studies.disturbed_needles import DisturbedNeedles
 from needle_sim.studies.figures_of_merit import (
     BoolArray,
@@ -47,7 +47,7 @@ class PointOutcomes:
         Distance of the tip from its point at the end [m].
     rotation : ndarray, shape (N,)
         Sum of all the base turned, either way [rad].
-    inside_2_sigma, inside_3_sigma, doubtful : ndarray, shape (N,)
+    inside_2_sigma, inside_3_sigma, missed : ndarray, shape (N,)
         As of `figures_of_merit.Outcomes`, of the end alone.
     """
 
@@ -55,7 +55,7 @@ class PointOutcomes:
     rotation: FloatArray
     inside_2_sigma: FloatArray
     inside_3_sigma: FloatArray
-    doubtful: FloatArray
+    missed: FloatArray
 
     @property
     def reached(self) -> BoolArray:
@@ -117,8 +117,8 @@ def point_figures(outcomes: PointOutcomes) -> dict[str, float | None]:
         "rotation_p95_deg": float(np.rad2deg(np.percentile(outcomes.rotation, 95.0))),
         "inside_2_sigma": mean_of_what_is_said(outcomes.inside_2_sigma),
         "inside_3_sigma": mean_of_what_is_said(outcomes.inside_3_sigma),
-        "doubtful_at_end": mean_of_what_is_said(outcomes.doubtful),
-        "trusted_far_off": trusted_far_off(outcomes.error, outcomes.doubtful),
+        "doubtful_at_end": mean_of_what_is_said(doubted(outcomes.missed)),
+        "trusted_far_off": trusted_far_off(outcomes.error, outcomes.missed),
     }
 
 
@@ -133,7 +133,7 @@ def _steer(
     controller.see_targets(0.0, targets.at(0.0))
     rate = controller.start(needles.first_seen())
     inserted, rotation, error = np.zeros(count), np.zeros(count), np.full(count, np.nan)
-    inside, doubtful = np.full((2, count), np.nan), np.full(count, np.nan)
+    inside, missed = np.full((2, count), np.nan), np.full(count, np.nan)
     on_the_way = np.ones(count, dtype=bool)
     begin = 0.0
     while True:
@@ -145,7 +145,7 @@ def _steer(
             said.add(controller.belief(), true.x, true.pitch)
             there = targets.at(inserted / INSERTION_SPEED)
             off = np.linalg.norm(true.tips - there, axis=1)
-            error[arrived], doubtful[arrived] = off[arrived], said.doubtful[arrived]
+            error[arrived], missed[arrived] = off[arrived], said.missed[arrived]
             inside[:, arrived] = said.inside[:, arrived]
             on_the_way &= ~arrived
             if not np.any(on_the_way):
@@ -163,4 +163,4 @@ def _steer(
         controller.see_targets(time, targets.at(time))
         tips, age = needles.seen(inserted)
         rate = controller.step(length, turned, tips, age)
-    return PointOutcomes(error, rotation, inside[0], inside[1], doubtful)
+    return PointOutcomes(error, rotation, inside[0], inside[1], missed)
