@@ -32,13 +32,12 @@ from needle_core.errors import UserError
 from needle_core.settings.bounds import Bounds, check_bounded_fields
 
 TORSION_HYPOTHESES = (
-    TorsionHypothesis(0.0, 0.0, 0.015, 0.52),
-    TorsionHypothesis(math.radians(20.0), 0.0, 0.15, 0.12),
-    TorsionHypothesis(math.radians(40.0), 0.0, 0.15, 0.25),
+    TorsionHypothesis(0.0, 0.0, 0.015, 0.55),
+    TorsionHypothesis(math.radians(35.0), 0.0, 0.25, 0.3),
     TorsionHypothesis(0.0, 0.006, 0.003, 0.11),
     TorsionHypothesis(0.0, 0.0, 0.15, 0.1, heading_drift=0.15, roll_drift=1.2),
 )
-"""None, a small and a large play, lag, and a tip that turns by itself: tissue pushes it aside, it
+"""None, play, lag, and a tip that turns by itself: tissue pushes it aside, it
 rolls, or it follows part of the base's rotation only. Each one's size is estimated."""
 ROLL_HYPOTHESES = tuple(
     RollHypothesis(math.radians(roll), math.radians(std), weight)
@@ -143,7 +142,7 @@ class FilterSettings:
     entry_std: Annotated[float, Bounds(1e-6, 0.1, "m")] = 0.0005
     play_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.2
     lag_drift: Annotated[float, Bounds(0.0, 1.0, "sqrt(m)")] = 0.003
-    prune_ratio: Annotated[float, Bounds(1.0, 1e30, "-")] = 250.0
+    prune_ratio: Annotated[float, Bounds(1.0, 1e30, "-")] = 1000.0
     merge_angle: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.35
     longest_step: Annotated[float, Bounds(1e-5, 1.0, "m")] = 0.002
     play_limit: Annotated[float, Bounds(0.0, math.pi, "rad")] = 1.0

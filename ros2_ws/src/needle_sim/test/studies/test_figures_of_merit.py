@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import Belief, BeliefTally
+from needle_sim.studies.beliefs import Belief, BeliefTally, doubted
 from needle_sim.studies.figures_of_merit import Outcomes, Tally, figures, joined, trusted_far_off
 
 
@@ -76,9 +76,10 @@ def test_shares_within_2_and_3_sigma_count_x_and_pitch_alike() -> None:
     assert np.all(np.isnan(tally.inside))
     tally.add(Belief(level, std, level, 10.0 * std), *truth)
     np.testing.assert_allclose(tally.inside, [[1.0, 0.5, 0.0], [1.0, 1.0, 0.5]])
-    assert np.all(np.isnan(tally.doubtful))
+    assert np.all(np.isnan(tally.missed))
+    assert np.all(np.isnan(doubted(tally.missed)))
     # A second step in which all is as believed; of doubts the last word counts.
-    for doubtful in ([True, False, False], [False, True, False]):
-        tally.add(Belief(level, std, level, std, np.array(doubtful)), level, level)
+    for missed in ([0.9, 0.0, 0.0], [0.05, 0.06, 0.0]):
+        tally.add(Belief(level, std, level, std, np.array(missed)), level, level)
     np.testing.assert_allclose(tally.inside[0], [1.0, 2.5 / 3.0, 2.0 / 3.0])
-    np.testing.assert_array_equal(tally.doubtful, [0.0, 1.0, 0.0])
+    np.testing.assert_array_equal(doubted(tally.missed), [0.0, 1.0, 0.0])
