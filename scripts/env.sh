@@ -19,15 +19,15 @@ _needle_prepend() {
 
 _needle_env() {
     [ -z "${ZSH_VERSION:-}" ] || emulate -L sh
-    local root="$1" mode="" rest="" package="" profiles="" paths="${PYTHONPATH:-}" prefixes="${AMENT_PREFIX_PATH:-}"
+    local root="$1" mode="" rest="" package="" profiles="" prefixes="${AMENT_PREFIX_PATH:-}"
     if [ -r "$root/.venv/.needle-setup" ]; then
         read -r mode rest <"$root/.venv/.needle-setup" || true
     fi
-    if [ -z "$mode" ] || [ ! -d "$root/ros2_ws/install" ]; then
+    if [ -z "$mode" ]; then
         echo "env.sh: this checkout is not set up yet (or only half): run $root/scripts/setup" >&2
         return 1
     fi
-    if [ "$mode" = ros ] && [ "${ROS_DISTRO:-}" != jazzy ]; then
+    if [ "$mode" = apt ] && [ "${ROS_DISTRO:-}" != jazzy ]; then
         echo "env.sh: set up for ROS 2 Jazzy as installed: source its setup.bash first, or run $root/scripts/setup" >&2
         return 1
     fi
@@ -41,15 +41,12 @@ _needle_env() {
         # The message packages of the wheels are found in the environment itself.
         prefixes="$root/.venv"
     fi
-    for package in "$root"/ros2_ws/install/*/share/ament_index/resource_index/packages/*; do
-        [ -e "$package" ] || continue
-        package="${package##*/}"
-        prefixes="$(_needle_prepend "$root/ros2_ws/install/$package" "$prefixes")"
-        paths="$(_needle_prepend "$root/ros2_ws/build/$package" "$paths")"
+    for package in "$root"/ros2_ws/install/*/share; do
+        [ "$mode" = apt ] && [ -d "$package" ] || continue
+        prefixes="$(_needle_prepend "${package%/share}" "$prefixes")"
     done
     unset PYTHONHOME
     export AMENT_PREFIX_PATH="$prefixes"
-    export PYTHONPATH="$paths"
     export VIRTUAL_ENV="$root/.venv"
     PATH="$(_needle_prepend "$root/.venv/bin" "$PATH")"
     export PATH

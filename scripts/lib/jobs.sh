@@ -27,11 +27,15 @@ run() {
     [ -z "$interrupted" ] || exit 130
 }
 
-# Set the checkout up where that is not done, and enter its environment: $here is its folder of scripts.
-# With `tests`, what is in the folder tests can be imported, too.
+# Set the checkout up with these extras where that is not done, and enter its environment: $here is its folder of scripts.
 enter() {
-    run "$here/setup" --quiet
+    run "$here/setup" --quiet "$@"
     [ "$code" = 0 ] || exit "$code"
     . "$here/env.sh" || exit 2
-    [ "${1:-}" != tests ] || export PYTHONPATH="$here/../tests:$PYTHONPATH"
+}
+
+# Likewise, and what is in the folder tests can be imported, too.
+enter_tests() {
+    enter "$@"
+    export PYTHONPATH="$here/../tests${PYTHONPATH:+:$PYTHONPATH}"
 }

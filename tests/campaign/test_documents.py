@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from campaign.typed_pages import PAGES, ROOT, PageError, Session, blocks
 from needle_core.process.ros_domain import own_domain
 from needle_tracker.calibrating.calibration_session import parse_session
-from typed_pages import PAGES, ROOT, PageError, Session, blocks
 
 SHORT_MM = 6
 # From which a curvature is told.
@@ -198,7 +198,7 @@ def test_a_signal_leaves_neither_a_clone_nor_what_was_typed(tmp_path: Path, numb
         f"Type:\n\n    echo $$ > {started}.new; mv {started}.new {started}; exec sleep 600\n"
     )
     typing = subprocess.Popen(
-        [sys.executable, ROOT / "scripts" / "lib" / "typed_pages.py", page],
+        [sys.executable, ROOT / "tests" / "campaign" / "typed_pages.py", page],
         env={**os.environ, "TMPDIR": str(folder)},
         stdout=subprocess.DEVNULL,
     )

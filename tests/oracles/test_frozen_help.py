@@ -10,9 +10,13 @@ from reference.rig_nodes import executables
 HELP = Path(__file__).resolve().parent / "help"
 CHANGED = {
     "identify_curvature": "--forecast-mm says where the tip will be",
+    "recover": "a bag's files are told by their names alone",
     "monte_carlo": "tissue that pushes, a roll that wanders, a bias that walks and more go wrong",
     "rerun": "--viewers takes a bag through live_view and openigtlink",
     "scripts_console": "the rig is in one process, cameras and tracker in a second one",
+    "scripts_dask": "what it installs is an extra of pyproject.toml",
+    "scripts_docs": "Sphinx goes into .venv",
+    "scripts_setup": "it takes the extras to be installed",
     "scripts_train_needle_map": "what draws its patches is in needle_bringup",
     "calibrate_stereo": "no picture of what the corners miss by: what is wrong is said in words",
     "scripts_verify": "interrupts and the open loop are asked of other tests",

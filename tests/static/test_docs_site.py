@@ -14,7 +14,6 @@ import pytest
 from code_lines import ROOT
 from docs_site.navigation import listed, navigation, parts
 
-TOOLS = ROOT / ".docs"
 # Of what a page loads by itself, in place of what a reader may follow.
 LOADS = {"link": "href", "script": "src", "img": "src"}
 
@@ -40,15 +39,14 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if not (TOOLS / ".needle-docs").is_file():
-        pytest.skip("Sphinx is not installed: scripts/docs does it")
+    pytest.importorskip("sphinx", reason="scripts/docs installs it")
     out = tmp_path_factory.mktemp("docs") / "site"
     done = subprocess.run(
         [sys.executable, "-m", "docs_site.build", "--out", out],
         env={
             **os.environ,
             "PYTHONPATH": os.pathsep.join(
-                [*map(str, (TOOLS, ROOT / "scripts/lib", ROOT / "tests")), os.environ["PYTHONPATH"]]
+                [*map(str, (ROOT / "scripts/lib", ROOT / "tests")), os.environ["PYTHONPATH"]]
             ),
         },
         capture_output=True,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from typed_pages import ROOT
+from campaign.typed_pages import ROOT
 
 
 def test_every_pain_is_answered_by_a_test_that_there_is() -> None:

@@ -14,6 +14,8 @@ PACKAGES = sorted(Path(__file__).parents[2].glob("ros2_ws/src/*/package.xml"))
 ROSDEP_KEYS = {
     "can": "python3-can",
     "cv2": "python3-opencv",
+    "jinja2": "python3-jinja2",
+    "markupsafe": "python3-markupsafe",
     "matplotlib": "python3-matplotlib",
     "numba": "python3-numba",
     "numpy": "python3-numpy",

@@ -74,7 +74,7 @@ def test_an_image_gets_nothing_that_git_ignores() -> None:
         text = (ROOT / name).read_text("utf-8")
         return {line.strip("/") for line in text.splitlines() if not line.startswith("#")}
 
-    made = {".venv", ".docs", "site", "ros2_ws/build", "ros2_ws/install", "ros2_ws/log", "bags/*"}
+    made = {".venv", "site", "ros2_ws/build", "ros2_ws/install", "ros2_ws/log", "bags/*"}
     assert made <= lines(".dockerignore")
     assert made <= lines(".gitignore")
 
@@ -84,6 +84,8 @@ def test_one_version_everywhere() -> None:
         manifest.parent.name: ElementTree.parse(manifest).findtext("version")
         for manifest in sorted(ROOT.glob("ros2_ws/src/*/package.xml"))
     }
+    project = (ROOT / "pyproject.toml").read_text("utf-8")
+    versions["pyproject.toml"] = re.findall(r'^version = "(\S+)"', project, re.MULTILINE)[0]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
     versions["CITATION.cff"] = citation["version"]
     changes = (ROOT / "CHANGELOG.md").read_text("utf-8")

@@ -22,6 +22,7 @@ from reference.rig_nodes import RigNode, executables, rig_nodes
 BESIDE_NODES = (
     "needle_core/ros/base_node.py",
     "needle_core/ros/component_node.py",
+    "needle_core/ros/graph_commands.py",
     "needle_tracker/ros/check_calibration.py",
 )
 

@@ -1,16 +1,19 @@
-"""Install script of every package of the workspace: each `setup.py` calls it for its own."""
+"""Contents of an installation: package by package for colcon, or all of it for pip."""
 
 from __future__ import annotations
 
 import ast
+import os
 from pathlib import Path
 from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
+_PACKAGE_DATA = {"": ["py.typed", "*.onnx", "*.xml", "static/*"]}
+
 
 def set_up(script: str) -> None:
-    """Install a package as its package.xml and its `executables.py` say.
+    """Install one package as its package.xml and its `executables.py` say.
 
     Parameters
     ----------
@@ -18,31 +21,77 @@ def set_up(script: str) -> None:
         The package's `setup.py`, or colcon's link to it.
     """
     folder = Path(script).resolve().parent
-    name = folder.name
     manifest = {one.tag: one for one in ElementTree.parse(folder / "package.xml").iter()}
     said = {tag: one.text or "" for tag, one in manifest.items()}
     setup(
-        name=name,
+        name=folder.name,
         version=said["version"],
-        packages=find_packages(include=[name, f"{name}.*"]),
-        package_data={"": ["py.typed", "*.onnx", "*.xml", "static/*"]},
-        data_files=[
-            ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
-            (f"share/{name}", ["package.xml"]),
-            (f"share/{name}/config", list(map(str, Path("config").glob("*")))),
-            (f"share/{name}/launch", list(map(str, Path("launch").glob("*.py")))),
-        ],
+        packages=find_packages(include=[folder.name, f"{folder.name}.*"]),
+        package_data=_PACKAGE_DATA,
+        data_files=data_files(folder, Path()),
         zip_safe=False,
         maintainer=said["maintainer"],
         maintainer_email=manifest["maintainer"].get("email"),
         description=said["description"],
         license=said["license"],
-        entry_points={"console_scripts": executables(folder / name / "executables.py")},
+        entry_points={"console_scripts": executables(folder)},
     )
 
 
-def executables(module: Path) -> list[str]:
+def set_up_all(root: Path) -> None:
+    """Install all packages of a checkout as one distribution, beside what its pyproject.toml says.
+
+    Parameters
+    ----------
+    root : Path
+        The checkout.
+    """
+    folders = sorted(path.parent for path in root.glob("ros2_ws/src/*/package.xml"))
+    scripts = [line for folder in folders for line in executables(folder)]
+    setup(
+        packages=[
+            package
+            for folder in folders
+            for package in find_packages(folder, include=[folder.name, f"{folder.name}.*"])
+        ],
+        package_dir={
+            folder.name: os.path.relpath(folder / folder.name, root) for folder in folders
+        },
+        package_data=_PACKAGE_DATA,
+        data_files=[
+            files for folder in folders for files in data_files(folder, folder.relative_to(root))
+        ],
+        zip_safe=False,
+        entry_points={"console_scripts": ["ros2 = needle_core.commands.small_ros2:main", *scripts]},
+    )
+
+
+def data_files(folder: Path, where: Path) -> list[tuple[str, list[str]]]:
+    """Return the files of a package beside its code, and where ament and ROS look for them.
+
+    Parameters
+    ----------
+    folder : Path
+        The package.
+    where : Path
+        The same from the folder in which the install script runs.
+    """
+    share = f"share/{folder.name}"
+    found = {
+        "share/ament_index/resource_index/packages": folder.glob("resource/*"),
+        share: folder.glob("package.xml"),
+        f"{share}/config": folder.glob("config/*"),
+        f"{share}/launch": folder.glob("launch/*.py"),
+    }
+    return [
+        (place, sorted(str(where / file.relative_to(folder)) for file in files))
+        for place, files in found.items()
+    ]
+
+
+def executables(folder: Path) -> list[str]:
     """Return the entry points that a package's `executables.py` defines; none where it has none."""
+    module = folder / folder.name / "executables.py"
     if not module.exists():
         return []
     names = [
@@ -52,4 +101,4 @@ def executables(module: Path) -> list[str]:
         for target in statement.targets
         if isinstance(target, ast.Name)
     ]
-    return [f"{name} = {module.parent.name}.executables:{name}" for name in names]
+    return [f"{name} = {folder.name}.executables:{name}" for name in names]

@@ -21,7 +21,7 @@ command lines, libraries. It is read from the disk or any web server, without a 
 EPILOG = """\
 exit codes: 0 done; 1 a link leads nowhere, a page is in no section of docs/README.md, or Sphinx
 warns of something else; 2 bad arguments, or something is missing; 130 interrupted. The first call
-installs Sphinx into .docs.
+installs Sphinx.
 """
 OUT = "site"
 _HERE = Path(__file__).parent

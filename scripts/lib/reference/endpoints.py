@@ -122,12 +122,8 @@ def _plain_name(name: str, node: str) -> str:
 def _place(frame: FrameType) -> Place:
     """Return the line that a frame is at; an empty file's where it is none of the packages."""
     file = frame.f_code.co_filename
-    for folder in ("/ros2_ws/build/", "/ros2_ws/src/"):
-        # Executables import from the build folder, whose packages are links.
-        _, below, path = file.partition(folder)
-        if below:
-            return path.partition("/")[2], frame.f_lineno
-    return "", 0
+    path = file.partition("/ros2_ws/src/")[2]
+    return (path.partition("/")[2], frame.f_lineno) if path else ("", 0)
 
 
 def _places(frame: FrameType | None) -> set[Place]:

@@ -76,7 +76,7 @@ def projections(run: Run) -> dict[str, Projection]:
     from needle_tracker.optics.refraction import stereo_views  # noqa: PLC0415
 
     try:
-        calibration = parse_calibration(load_plain(run.calibration, aliases=True))
+        calibration = parse_calibration(load_plain(run.calibration))
     except (UserError, ValueError):
         return {}
     views = stereo_views(calibration)

@@ -5,6 +5,10 @@ from __future__ import annotations
 import html
 import re
 
+from markupsafe import Markup
+
+from needle_analysis.report.html_page import parts
+
 TERMS = {
     "r1": "the tip's distance from the wanted plane, positive on its upper side",
     "pitch": "r2, the angle between the needle at its tip and the wanted plane",
@@ -43,7 +47,7 @@ class Glossary:
     def __init__(self) -> None:
         self._explained: set[str] = set()
 
-    def explain(self, text: str) -> str:
+    def explain(self, text: str) -> Markup:
         """Return a text with marks as a paragraph, and below it what its new terms mean: HTML.
 
         Raises
@@ -58,16 +62,7 @@ class Glossary:
             if term not in self._explained:
                 new[term] = TERMS[term]
                 self._explained.add(term)
-            return f'<a class=term href="#{_anchor(term)}">{shown}</a>'
+            return str(parts.term(shown, term))
 
-        marked = _MARK.sub(link, html.escape(text, quote=False))
-        rows = "".join(
-            f'<div id="{_anchor(term)}"><dt>{html.escape(term)}</dt>'
-            f"<dd>{html.escape(meaning, quote=False)}</dd></div>"
-            for term, meaning in new.items()
-        )
-        return f"<p class=note>{marked}</p>" + (f"<dl class=terms>{rows}</dl>" if rows else "")
-
-
-def _anchor(term: str) -> str:
-    return "term-" + re.sub(r"[^a-z0-9]+", "-", term.lower()).strip("-")
+        marked = Markup(_MARK.sub(link, html.escape(text, quote=False)))
+        return parts.note(marked) + parts.terms(new)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from markupsafe import Markup
+
 from needle_analysis.figures.pair_figures import is_same_needle
-from needle_analysis.report import html_page
 from needle_analysis.report.glossary import Glossary
+from needle_analysis.report.html_page import Section, as_text, number, page, parts
 from needle_analysis.report.report_page import TILE_NOTE, TILES, verdict_text
 from needle_bags.reading.bag_reader import Run
 from needle_core.commands.cli import JsonValue
@@ -56,19 +58,17 @@ def build_pair_page(
     captions = {**_CAPTIONS, "pair_states": _SAME_NEEDLE} if same else _CAPTIONS
     note = "Of one insertion: what the needle did is the same in both. " if same else ""
     glossary = Glossary()
-    return html_page.page(
+    return page(
         f"{names[0]} and {names[1]}",
         _verdict(names, summaries),
         [
-            html_page.Section(
+            Section(
                 "Both runs in figures",
-                html_page.table(("", "A", "B", "B - A"), _figures(summaries))
+                parts.table(("", "A", "B", "B - A"), _figures(summaries))
                 + glossary.explain(note + TILE_NOTE),
             ),
             *(
-                html_page.Section(
-                    title, glossary.explain(text) + html_page.figure(title, images[name])
-                )
+                Section(title, glossary.explain(text) + parts.figure(title, images[name]))
                 for name, (title, text) in captions.items()
                 if name in images
             ),
@@ -90,7 +90,7 @@ def pair_values(summaries: tuple[Summary, Summary]) -> dict[str, JsonValue]:
     return values
 
 
-def _verdict(names: list[str], summaries: tuple[Summary, Summary]) -> str:
+def _verdict(names: list[str], summaries: tuple[Summary, Summary]) -> Markup:
     words = " / ".join(verdict_text(summary)[0] for summary in summaries)
     sentence = " ".join(
         f"{letter}: {verdict_text(summary)[1]}"
@@ -98,7 +98,7 @@ def _verdict(names: list[str], summaries: tuple[Summary, Summary]) -> str:
     )
     steered = [summary for summary in summaries if summary["rerun_of"] is None]
     good = bool(steered) and all(summary["converged"] is True for summary in steered)
-    return html_page.banner(words, sentence, f"A is {names[0]} · B is {names[1]}", good=good)
+    return parts.banner(words, sentence, f"A is {names[0]} · B is {names[1]}", good=good)
 
 
 def _figures(summaries: tuple[Summary, Summary]) -> Iterator[tuple[str, ...]]:
@@ -109,12 +109,12 @@ def _figures(summaries: tuple[Summary, Summary]) -> Iterator[tuple[str, ...]]:
         difference = "-"
         if _is_number(a) and _is_number(b):
             signed = form.replace("{:", "{:+").replace("++", "+")
-            difference = html_page.number(b - a, signed)  # type: ignore[operator]
+            difference = number(b - a, signed)  # type: ignore[operator]
         name = f"{label} [{unit}]" if unit else label
-        yield name, html_page.number(a, form), html_page.number(b, form), difference
+        yield name, number(a, form), number(b, form), difference
 
 
-def _parameters(runs: tuple[Run, Run]) -> Iterator[html_page.Section]:
+def _parameters(runs: tuple[Run, Run]) -> Iterator[Section]:
     """Yield a part for each node; the recorder's place of the bag is no difference."""
     for node in sorted(runs[0].parameters.keys() | runs[1].parameters.keys()):
         if node.endswith("/recorder"):
@@ -124,26 +124,24 @@ def _parameters(runs: tuple[Run, Run]) -> Iterator[html_page.Section]:
             yield _differences(f"Parameters of {node}", there[0], there[1])
         else:
             letter = "B" if there[0] is None else "A"
-            note = html_page.note(f"Ran in {letter} only.")
-            yield html_page.Section(f"Parameters of {node}", note)
+            note = parts.note(f"Ran in {letter} only.")
+            yield Section(f"Parameters of {node}", note)
 
 
 def _versions(run: Run) -> dict[str, str]:
     return {"commit": run.commit.replace(run.commit[12:40], "") or "unknown", **run.versions}
 
 
-def _differences(
-    title: str, first: Mapping[str, Any], second: Mapping[str, Any]
-) -> html_page.Section:
+def _differences(title: str, first: Mapping[str, Any], second: Mapping[str, Any]) -> Section:
     """Return a table of what differs; a line that says so where nothing does."""
     rows = [
-        (str(key), html_page.as_text(first.get(key)), html_page.as_text(second.get(key)))
+        (str(key), as_text(first.get(key)), as_text(second.get(key)))
         for key in dict.fromkeys((*first, *second))
         if first.get(key) != second.get(key)
     ]
     if not rows:
-        return html_page.Section(title, html_page.note("The same in both."))
-    return html_page.Section(title, html_page.table(("", "A", "B"), rows))
+        return Section(title, parts.note("The same in both."))
+    return Section(title, parts.table(("", "A", "B"), rows))
 
 
 def _is_number(value: JsonValue) -> bool:

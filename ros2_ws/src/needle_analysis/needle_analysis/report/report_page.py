@@ -5,13 +5,15 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 
+from markupsafe import Markup
+
 from needle_analysis.figures.event_figure import level_name
 from needle_analysis.figures.film import Frame
 from needle_analysis.figures.film_views import View
 from needle_analysis.figures.step_figures import timing_rows
-from needle_analysis.report import html_page
 from needle_analysis.report.film_page import film_html
 from needle_analysis.report.glossary import Glossary
+from needle_analysis.report.html_page import Section, number, page, parts
 from needle_analysis.run.run_events import troubles
 from needle_analysis.run.run_summary import rerun_of
 from needle_analysis.run.stage_timing import StageTiming
@@ -19,6 +21,7 @@ from needle_bags.reading.bag_reader import Run
 from needle_core.commands.cli import JsonValue
 
 _MOST_EVENTS = 60
+_NOTHING = Markup("")
 CAPTIONS = {
     "states": (
         "State over insertion",
@@ -121,29 +124,29 @@ def build_page(
     """
     glossary = Glossary()
 
-    def shown(name: str) -> str:
+    def shown(name: str) -> Markup:
         text = CAPTIONS[name][1]
         picture = images.get(name)
         if picture is None:
-            return ""
-        kind = {"photo": name == "images"}
-        return glossary.explain(text) + html_page.figure(CAPTIONS[name][0], picture, **kind)
+            return _NOTHING
+        kind = "photo" if name == "images" else "chart"
+        return glossary.explain(text) + parts.figure(CAPTIONS[name][0], picture, kind)
 
-    def section(name: str, more: str = "") -> html_page.Section:
-        return html_page.Section(CAPTIONS[name][0], shown(name) + more)
+    def section(name: str, more: Markup = _NOTHING) -> Section:
+        return Section(CAPTIONS[name][0], shown(name) + more)
 
-    return html_page.page(
+    return page(
         f"Needle steering run {run.path.absolute().name}",
         _verdict(run, summary),
         [
-            html_page.Section(FILM[0], _film(run, film, glossary)),
-            html_page.Section("The run in figures", _tiles(summary, glossary)),
+            Section(FILM[0], _film(run, film, glossary)),
+            Section("The run in figures", _tiles(summary, glossary)),
             *(section(name) for name in CAPTIONS if name not in _AFTER),
             section("timing", _timing(timings)),
             section("events"),
-            html_page.Section("Warnings and faults", _health(run, glossary)),
-            html_page.Section("Repeat it", _repeat(run)),
-            html_page.Section("What was run", _provenance(run, summary)),
+            Section("Warnings and faults", _health(run, glossary)),
+            Section("Repeat it", _repeat(run)),
+            Section("What was run", _provenance(run, summary)),
         ],
     )
 
@@ -158,15 +161,15 @@ def verdict_text(summary: Mapping[str, JsonValue]) -> tuple[str, str]:
             "have said there."
         )
     final = summary["r1_final_mm"]
-    depth = html_page.number(summary["insertion_final_mm"], "{:.0f} mm")
+    depth = number(summary["insertion_final_mm"], "{:.0f} mm")
     if final is None:
         return "No ground truth", (
             f"The bag has no sim/tip_pose, so it cannot tell how far the tip is from the plane. "
             f"Inserted {depth}."
         )
-    target, distance = "plane", html_page.number(final, "{:+.2f} mm")
+    target, distance = "plane", number(final, "{:+.2f} mm")
     if summary["point_error_mm"] is not None:
-        target, distance = "point", html_page.number(summary["point_error_mm"], "{:.2f} mm")
+        target, distance = "point", number(summary["point_error_mm"], "{:.2f} mm")
     distance = f"The tip ended {distance} from the wanted {target}"
     if summary["converged"]:
         return "Converged", f"{distance} (goal: within ±1 mm), {depth} deep."
@@ -176,45 +179,45 @@ def verdict_text(summary: Mapping[str, JsonValue]) -> tuple[str, str]:
     return f"Missed the {target}", f"{distance} (goal: within ±1 mm), {depth} deep."
 
 
-def _verdict(run: Run, summary: Mapping[str, JsonValue]) -> str:
+def _verdict(run: Run, summary: Mapping[str, JsonValue]) -> Markup:
     words, sentence = verdict_text(summary)
     about = [run.path.absolute().name]
     about += [f"{key} {summary[key]}" for key in _SUMMARY_KEYS if summary[key] is not None]
     good = summary["converged"] is True and summary["rerun_of"] is None
-    return html_page.banner(words, sentence, " · ".join(about), good=good)
+    return parts.banner(words, sentence, " · ".join(about), good=good)
 
 
-def _tiles(summary: Mapping[str, JsonValue], glossary: Glossary) -> str:
+def _tiles(summary: Mapping[str, JsonValue], glossary: Glossary) -> Markup:
     """Return the figures, and what their words mean."""
     known = [tile for tile in TILES if summary[tile[1]] is not None]
-    boxes = html_page.tiles(
-        (label, html_page.number(summary[key], form), unit) for label, key, form, unit in known
+    boxes = parts.tiles(
+        (label, number(summary[key], form), unit) for label, key, form, unit in known
     )
     return boxes + glossary.explain(TILE_NOTE)
 
 
-def _film(run: Run, film: tuple[Sequence[Frame], Sequence[View]], glossary: Glossary) -> str:
+def _film(run: Run, film: tuple[Sequence[Frame], Sequence[View]], glossary: Glossary) -> Markup:
     frames, views = film
     if not frames:
-        return ""
+        return _NOTHING
     alone = _TRUE if len(run.truth) else _MEASURED
     over = alone if all(view.is_chart for view in views) else _BOTH
     text = FILM[1].format(over=over, count=len(frames))
     return film_html(frames, views) + glossary.explain(text)
 
 
-def _timing(timings: Sequence[StageTiming]) -> str:
+def _timing(timings: Sequence[StageTiming]) -> Markup:
     if not timings:
-        return ""
-    parts = ("median", "95 %", "99 %", "largest")
-    head = ("stage", "from what to what", "steps", *(f"{part} [ms]" for part in parts))
-    return html_page.table(head, timing_rows(timings))
+        return _NOTHING
+    quantiles = ("median", "95 %", "99 %", "largest")
+    head = ("stage", "from what to what", "steps", *(f"{part} [ms]" for part in quantiles))
+    return parts.table(head, timing_rows(timings))
 
 
-def _health(run: Run, glossary: Glossary) -> str:
+def _health(run: Run, glossary: Glossary) -> Markup:
     events = troubles(run)
     if not events:
-        return html_page.note("None were reported.")
+        return parts.note("None were reported.")
     start = run.first_command or events[0].log_time
     rows = [
         (
@@ -225,9 +228,9 @@ def _health(run: Run, glossary: Glossary) -> str:
         )
         for event in events
     ]
-    shown = html_page.table(("when", "what", "where", "why"), rows[:_MOST_EVENTS])
+    shown = parts.table(("when", "what", "where", "why"), rows[:_MOST_EVENTS])
     more = len(rows) - _MOST_EVENTS
-    rest = html_page.note(f"{more} more are in the bag, on /diagnostics.") if more > 0 else ""
+    rest = parts.note(f"{more} more are in the bag, on /diagnostics.") if more > 0 else _NOTHING
     words = (
         "Seconds of wall time after the first [step]'s command. What was over before it, while "
         "nodes waited for each other, is left out."
@@ -235,34 +238,34 @@ def _health(run: Run, glossary: Glossary) -> str:
     return glossary.explain(words) + shown + rest
 
 
-def _repeat(run: Run) -> str:
+def _repeat(run: Run) -> Markup:
     """Return the command that made the bag, where it tells, and those that read it."""
     command = run.run_info.get("command")
     if isinstance(command, str):
         commit = f", of commit {run.commit[:12]}" if run.commit else ""
-        told = html_page.note(f"The run, with the sources it was made with{commit}:")
-        told += html_page.code(command)
+        told = parts.note(f"The run, with the sources it was made with{commit}:")
+        told += parts.code(command)
     elif rerun_of(run) is not None:
-        told = html_page.note(f"A rerun of {rerun_of(run)}.")
+        told = parts.note(f"A rerun of {rerun_of(run)}.")
     else:
-        told = html_page.note("The bag does not say which command it was recorded by.")
+        told = parts.note("The bag does not say which command it was recorded by.")
     bag = shlex.quote(str(run.path))
     words = "What was recorded, through today's code; and this page:"
     again = f"ros2 run needle_analysis rerun {bag}\nros2 run needle_analysis report {bag}"
-    return told + html_page.note(words) + html_page.code(again)
+    return told + parts.note(words) + parts.code(again)
 
 
-def _provenance(run: Run, summary: Mapping[str, JsonValue]) -> str:
+def _provenance(run: Run, summary: Mapping[str, JsonValue]) -> Markup:
     versions = {"commit": run.commit or "unknown", **run.versions}
     info = {key: value for key, value in run.run_info.items() if key != "command"}
-    parts = [html_page.details("Told to the recorder", html_page.pairs(info))] if info else []
+    shown = [parts.details("Told to the recorder", parts.pairs(info))] if info else []
     if run.recording:
-        parts.append(html_page.note("The recording:") + html_page.pairs(run.recording))
-    parts.append(html_page.details("All figures (summary.json)", html_page.pairs(summary)))
+        shown.append(parts.note("The recording:") + parts.pairs(run.recording))
+    shown.append(parts.details("All figures (summary.json)", parts.pairs(summary)))
     for node, values in sorted(run.parameters.items()):
-        parts.append(html_page.details(f"Parameters of {node}", html_page.pairs(values)))
+        shown.append(parts.details(f"Parameters of {node}", parts.pairs(values)))
     if run.calibration:
-        parts.append(html_page.details("Calibration", html_page.code(run.calibration)))
-    parts.append(html_page.details("Recorded topics", html_page.pairs(run.topics)))
-    parts.append(html_page.details("Versions", html_page.pairs(versions), opened=True))
-    return "\n".join(parts)
+        shown.append(parts.details("Calibration", parts.code(run.calibration)))
+    shown.append(parts.details("Recorded topics", parts.pairs(run.topics)))
+    shown.append(parts.details("Versions", parts.pairs(versions), opened=True))
+    return Markup("\n").join(shown)

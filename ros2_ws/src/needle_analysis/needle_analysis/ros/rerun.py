@@ -255,7 +255,7 @@ def _calibration(run: Run, node: Node) -> str:
 
 def _tracker(run: Run, node: Node, text: str) -> BagStage:
     try:
-        calibration = parse_calibration(load_plain(text, aliases=True))
+        calibration = parse_calibration(load_plain(text))
     except (UserError, ValueError) as error:
         raise UserError(f"{run.path}: the calibration is broken: {error}") from error
     tracker = StereoTipTracker(node.parameters(StereoTrackerParameters), calibration)

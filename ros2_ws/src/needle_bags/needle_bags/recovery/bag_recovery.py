@@ -19,8 +19,7 @@ from typing import Any, Final, NamedTuple
 from tqdm import tqdm
 
 from needle_bags.format.bag_metadata import DataFile, bag_information, write_metadata
-from needle_bags.recovery.mcap_prefix import PrefixCopy, last_time
-from needle_bags.recovery.one_recording import difference, require_one_recording
+from needle_bags.recovery.mcap_prefix import PrefixCopy
 from needle_core.errors import UserError
 from needle_core.files.bag_directory import BagDirectory
 from needle_core.files.bag_path import (
@@ -30,7 +29,7 @@ from needle_core.files.bag_path import (
     recording_files,
 )
 from needle_core.files.bag_records import RUN_RECORD, custom_data_of
-from needle_core.files.file_access import open_regular, sync_directory
+from needle_core.files.file_access import sync_directory
 
 # Key of the custom data that says what was lost.
 _RECOVERED: Final = "recovered"
@@ -51,9 +50,9 @@ class BagRecovery:
     lost : str
         The damage and the time that follows it; empty if no message is lost.
     seconds_lost : float or None
-        Time of the recording behind the damage, a lower bound [s]; None if unknown.
+        Time of the recording behind the damage [s]; None if unknown.
     left_out : list of str
-        MCAP files of its folder that are not in the bag, each with the reason.
+        Names of MCAP files of its folder that are not in the bag.
     kept : list of str
         Names of the previous files.
     """
@@ -90,8 +89,8 @@ def recover_bag(path: Path) -> BagRecovery:
     Raises
     ------
     UserError
-        If there is no MCAP bag, it is still being recorded, it holds several recordings, nothing
-        comes before the damage, or the disk refuses the changes. Nothing is changed then.
+        If there is no MCAP bag, it is still being recorded, nothing comes before the damage, or
+        the disk refuses the changes. Nothing is changed then.
     """
     folder = path if path.is_dir() else path.parent
     told = _information(folder)
@@ -114,7 +113,7 @@ def recover_bag(path: Path) -> BagRecovery:
                 f"`unzstd --rm {folder}/*.mcap.zstd` first"
             ) from error
     else:
-        return BagRecovery(True, bag, "", 0.0, _left_out(bag, listed, ()), [])
+        return BagRecovery(True, bag, "", 0.0, _left_out(bag, listed), [])
     try:
         with tempfile.TemporaryDirectory(prefix=".recover.", dir=folder) as scratch:
             return _Mending(path, files, told, Path(scratch)).run()
@@ -152,10 +151,6 @@ class _Mending:
         parts = self._parts
         if not parts:
             raise UserError(f"{self._path} cannot be recovered: nothing comes before {loss.where}")
-        behind = self._files[len(parts) :]
-        if not self._told:
-            others = [other for file in behind if (other := _opened(file)) is not None]
-            require_one_recording(parts, others)
         kept: list[str] = []
         if self._path.is_dir():
             information = _new_information(parts, self._told, loss.text or _NOTHING_LOST)
@@ -168,25 +163,23 @@ class _Mending:
                 part.path.replace(file)
                 sync_directory(file.parent)
         with BagDirectory(self._path) as bag:  # every tool must be able to open the result
-            left_out = _left_out(bag, self._files[: len(parts)], behind)
+            left_out = _left_out(bag, self._files[: len(parts)])
             return BagRecovery(False, bag, loss.text, loss.seconds, left_out, kept)
 
     def _read(self) -> _Loss:
         """Read the files up to the first damage; return what is lost."""
-        for number, file in enumerate(self._files):
-            behind = [(other, 0) for other in self._files[number + 1 :]]
+        for file in self._files:
             if not os.path.lexists(file):
-                return self._loss(f"{file.name} (it is missing)", self._last, behind)
-            open_regular(file).close()
+                return self._loss(f"{file.name} (it is missing)", self._last)
             try:
                 self._parts.append(_read_through(file))
             except BrokenBagError:
-                loss = self._read_damaged(file, behind)
+                loss = self._read_damaged(file)
                 if loss.where:
                     return loss
         return _Loss()
 
-    def _read_damaged(self, file: Path, behind: list[tuple[Path, int]]) -> _Loss:
+    def _read_damaged(self, file: Path) -> _Loss:
         """Write the records before a file's damage to a new file; return what is lost."""
         if shutil.disk_usage(self._scratch).free < file.stat().st_size:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))
@@ -196,9 +189,8 @@ class _Mending:
             copy = PrefixCopy(file, stream)
             if copy.reason:
                 where = f"byte {copy.end} of {file.name} ({copy.reason})"
-                last = max(copy.last, self._last)
-                loss = self._loss(where, last, [(file, copy.end), *behind], is_cut=copy.is_cut)
-            if not copy.end or (not copy.messages and (self._parts or loss.seconds is not None)):
+                loss = self._loss(where, max(copy.last, self._last))
+            if not copy.end or (copy.reason and not copy.messages):
                 return loss
             copy.writer.add_metadata(RUN_RECORD, {_RECOVERED: loss.text or _NOTHING_LOST})
             copy.writer.finish()  # type: ignore[no-untyped-call]
@@ -213,35 +205,15 @@ class _Mending:
         """Latest log time [ns] so far."""
         return max((part.end for part in self._parts), default=0)
 
-    def _loss(
-        self, where: str, last: int, behind: list[tuple[Path, int]], *, is_cut: bool = False
-    ) -> _Loss:
-        """Return the loss from a damage on.
-
-        Parameters
-        ----------
-        where : str
-            The damage.
-        last : int
-            Latest log time before it [ns].
-        behind : list of (Path, int)
-            The files that follow, each from an offset on [B].
-        is_cut : bool
-            Whether the damaged file seems to end there.
-        """
-        ends = [last_time(*place) if place[0].is_file() else (0, False) for place in behind]
-        is_exact = bool(ends) and all(is_last for _, is_last in ends)
+    def _loss(self, where: str, last: int) -> _Loss:
+        """Return the loss from a damage on; `last` is the latest log time before it [ns]."""
         with contextlib.suppress(LookupError, TypeError):
             begin = self._told["starting_time"]["nanoseconds_since_epoch"]
-            ends.append((begin + self._told["duration"]["nanoseconds"], True))
-            is_exact = True
-        seconds = max([0, *(time - last for time, _ in ends)]) / 1e9
-        if seconds or is_exact:
-            at_least = "" if is_exact else "at least "
-            return _Loss(where, f"all from {where} on: {at_least}{seconds:.1f} s follow", seconds)
-        much = "half a second at most if a kill ended it there, else " if is_cut else ""
-        much += "how much time follows cannot be told"
-        return _Loss(where, f"all from {where} on: {much}", None)
+            end = begin + self._told["duration"]["nanoseconds"]
+            seconds = max(0, end - last) / 1e9
+            return _Loss(where, f"all from {where} on: {seconds:.1f} s follow", seconds)
+        text = f"all from {where} on: half a second at most if a kill ended the recording there"
+        return _Loss(where, text, None)
 
 
 def _information(folder: Path) -> dict[str, Any]:
@@ -283,22 +255,9 @@ def _read_through(path: Path) -> BagDirectory:
     return bag
 
 
-def _opened(file: Path) -> BagDirectory | None:
-    """Return a file, closed, if it can be opened."""
-    with contextlib.suppress(UserError), BagDirectory(file) as bag:
-        return bag
-    return None
-
-
-def _left_out(bag: BagDirectory, taken: Sequence[Path], behind: Sequence[Path]) -> list[str]:
-    """Return which MCAP files of a bag's folder are not in it, and why."""
-    lines = []
-    for file in sorted(set(bag.path.glob("[!.]*.mcap")).difference(taken)):
-        other = _opened(file)
-        details = "not whole" if other is None else difference(bag, other)
-        why = "behind the damage" if file in behind else f"not of this bag ({details})"
-        lines.append(f"{file.name}: {why}")
-    return lines
+def _left_out(bag: BagDirectory, taken: Sequence[Path]) -> list[str]:
+    """Return the names of the MCAP files of a bag's folder that are not in it."""
+    return [file.name for file in sorted(set(bag.path.glob("[!.]*.mcap")).difference(taken))]
 
 
 def _set_aside(path: Path) -> list[str]:

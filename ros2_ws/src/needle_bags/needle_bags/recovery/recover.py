@@ -13,12 +13,12 @@ from needle_core.commands.options import CommandParser, output_file
 _DESCRIPTION = """
 Makes a bag whole again whose recording was cut off (by a crash, kill -9, a power cut or a full
 disk) or that is damaged. It keeps everything before the first damage, and says how many seconds of
-the recording follow it, if they are known. A bag of several files ends at the damage, too.
+the recording follow it, if metadata.yaml tells. A bag of several files ends at the damage, too.
 
-The bag's files are those that metadata.yaml names, or else <stem>_<n>.mcap of one stem if they are
-of one recording. `recover` names other files in the folder and leaves them as they are. The
-previous files stay as FILE.damaged until you delete them, so there must be room for a copy. A bag
-that is whole is left as it is. A single .mcap file is made whole by itself.
+The bag's files are those that metadata.yaml names, or else <stem>_<n>.mcap of one stem. `recover`
+names other files in the folder and leaves them as they are. The previous files stay as FILE.damaged
+until you delete them, so there must be room for a copy. A bag that is whole is left as it is. A
+single .mcap file is made whole by itself.
 """
 _EXAMPLES = """
 examples:
@@ -27,8 +27,8 @@ examples:
   ros2 run needle_bags recover downloads/monday.mcap
 
 exit codes: 0 the bag is whole now (also if something was lost); 2 there is no bag, it
-is still being recorded, it holds two recordings, nothing comes before the damage, or the disk
-refuses the changes; 130 interrupted (run it again)
+is still being recorded, nothing comes before the damage, or the disk refuses the changes; 130
+interrupted (run it again)
 """
 
 

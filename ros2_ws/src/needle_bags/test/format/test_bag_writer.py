@@ -197,8 +197,9 @@ class HeldWorker(list[Job]):
         return len(self)
 
     def finish(self) -> None:
-        for job in (*self, self._end):
+        for job in self:
             self._do(job)
+        self._end()
 
 
 def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(tmp_path: Path) -> None:

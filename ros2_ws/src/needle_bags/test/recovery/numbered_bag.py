@@ -10,7 +10,6 @@ import yaml
 from mcap.reader import make_reader
 from mcap.records import ChunkIndex, Message
 from mcap.stream_reader import StreamReader
-from mcap.writer import Writer
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
@@ -18,10 +17,6 @@ from rosbags.typesys import Stores, get_typestore
 from needle_bags.format.bag_copy import standard_topic
 from needle_bags.format.bag_metadata import (
     USUAL_QOS,
-    DataFile,
-    bag_information,
-    channel_metadata,
-    write_metadata,
 )
 from needle_bags.format.bag_writer import BagWriter
 from needle_core.files.bag_topic import BagTopic
@@ -75,25 +70,6 @@ def write(
         time = START + number * STEP
         bag.write(topics[number % 3], payload(number), time, time - 1000, number // 3 + 1)
     bag.close()
-    return path
-
-
-def write_unchunked(path: Path, count: int = 300) -> Path:
-    """A bag as rosbag2's recorder writes it with config/rosbag2_mcap.yaml."""
-    path.mkdir()
-    content = DataFile(f"{path.name}_0.mcap")
-    with (path / content.name).open("wb") as stream:
-        mcap = Writer(stream, use_chunking=False)
-        mcap.start("ros2")
-        schema = mcap.register_schema(TYPE, "ros2msg", TOPICS[0].definition.encode())
-        told = [(t.name, "cdr", schema, channel_metadata(t)) for t in TOPICS]
-        channels = [mcap.register_channel(*one) for one in told]
-        for number in range(count):
-            time = START + number * STEP
-            mcap.add_message(channels[number % 3], time, payload(number), time)
-            content.add(TOPICS[number % 3].name, time)
-        mcap.finish()  # type: ignore[no-untyped-call]
-    write_metadata(path, bag_information([content], TOPICS, {}, "jazzy"))
     return path
 
 

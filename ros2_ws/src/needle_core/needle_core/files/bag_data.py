@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
-import sqlite3
+import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Final
-from urllib.parse import quote
 
 import zstandard
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import Reader
 
 from needle_core.files.file_access import open_regular
-from needle_core.files.mcap_records import CHUNK_LIMIT, TIME_LIMIT
-
-# A data file that is compressed as a whole may be so large when it is not [B].
-FILE_LIMIT: Final = 2**33
-_BLOCK: Final = 2**20
+from needle_core.files.mcap_file import TIME_LIMIT
 
 
 class SqliteData:
@@ -33,8 +26,6 @@ class SqliteData:
         """Log times of the first and the last message [ns]; None in an empty file."""
         if not self._reader.message_count:
             return None
-        if not 0 <= self._reader.start_time < self._reader.end_time <= TIME_LIMIT:
-            raise ValueError("its times lie beyond the year 2262")
         return self._reader.start_time, self._reader.end_time - 1
 
     def counts(self) -> Mapping[str, int]:
@@ -65,17 +56,6 @@ class SqliteData:
                 yield connection.topic, log_time, log_time, bytes(data)
 
 
-def is_sound_database(file: Path) -> bool:
-    """Return whether SQLite finds a data file's messages, and nothing wrong."""
-    try:
-        address = f"file:{quote(str(file))}?immutable=1"
-        with contextlib.closing(sqlite3.connect(address, uri=True)) as database:
-            database.execute("SELECT id FROM messages LIMIT 1")
-            return bool(database.execute("PRAGMA quick_check(1)").fetchone() == ("ok",))
-    except sqlite3.Error:
-        return False
-
-
 def is_packed(data: bytes) -> bool:
     """Return whether a message was compressed by itself; none in CDR begins so."""
     return data.startswith(zstandard.FRAME_HEADER)
@@ -86,14 +66,11 @@ def unpack(data: bytes) -> bytes:
 
     Raises
     ------
-    ValueError, zstandard.ZstdError
-        If it is damaged, or too large.
+    zstandard.ZstdError
+        If it is damaged.
     """
     with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as stream:
-        plain = stream.read(CHUNK_LIMIT + 1)
-    if len(plain) > CHUNK_LIMIT:
-        raise ValueError(f"a message holds more than {CHUNK_LIMIT} bytes")
-    return plain
+        return bytes(stream.read())
 
 
 def unpack_file(path: Path, folder: Path) -> Path:
@@ -101,16 +78,11 @@ def unpack_file(path: Path, folder: Path) -> Path:
 
     Raises
     ------
-    ValueError, zstandard.ZstdError, OSError
-        If it is damaged, or too large.
+    zstandard.ZstdError, OSError
+        If it is damaged.
     """
     plain = folder / path.stem
-    size = 0
     with open_regular(path) as packed, plain.open("xb") as stream:
         reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-        while block := reader.read(_BLOCK):
-            size += len(block)
-            if size > FILE_LIMIT:
-                raise ValueError(f"{path.name} holds more than {FILE_LIMIT} bytes")
-            stream.write(block)
+        shutil.copyfileobj(reader, stream)
     return plain

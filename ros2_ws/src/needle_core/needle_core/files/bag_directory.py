@@ -20,8 +20,7 @@ from needle_core.files.bag_records import custom_data_of, distribution_of
 from needle_core.files.bag_topic import BagTopic, offered_profiles
 from needle_core.files.bag_types import typestore_of
 from needle_core.files.file_access import open_regular
-from needle_core.files.mcap_file import McapFile
-from needle_core.files.mcap_records import TIME_LIMIT
+from needle_core.files.mcap_file import TIME_LIMIT, McapFile
 
 _NEWEST_VERSION: Final = 9
 

@@ -12,12 +12,10 @@ from pathlib import Path, PurePath
 from typing import Any, Final
 
 from needle_core.errors import UserError
-from needle_core.files.bag_data import is_sound_database
 from needle_core.files.file_access import open_regular
 from needle_core.files.plain_yaml import load_plain
 
 METADATA_FILE: Final = "metadata.yaml"
-METADATA_LIMIT: Final = 2**24
 _DATA_FILE: Final = re.compile(r"([^.].*?)(?:_(\d+))?\.mcap(?:\.zstd)?")
 
 
@@ -46,23 +44,9 @@ def recover_hint(path: Path) -> str:
 
 def repair_hint(path: Path) -> str:
     """Return what to type for a bag that is not whole, by what its folder holds."""
-    databases = sorted(path.glob("*.db3"))
-    kind = "sqlite3" if databases and not any(path.glob("*.mcap")) else "mcap"
-    with contextlib.suppress(OSError, ValueError):
-        kind = read_information(path).get("storage_identifier", kind)
-    if kind != "sqlite3":
-        return recover_hint(path)
-    for file in databases:
-        for journal in (file.with_name(f"{file.name}-{kind}") for kind in ("wal", "journal")):
-            if journal.is_file() and journal.stat().st_size:
-                command = f"sqlite3 {file} 'PRAGMA journal_mode=DELETE'"
-                return f"SQLite has not taken in {journal.name} yet: run `{command}`"
-        if not is_sound_database(file):
-            return (
-                f"{file.name} is damaged, and `recover` mends MCAP only: "
-                f"`sqlite3 {file} .recover` may still read a part"
-            )
-    return f"run `ros2 bag reindex {path}`" if databases else "`recover` mends MCAP only"
+    if any(path.glob("*.db3*")) and not any(path.glob("*.mcap")):
+        return f"`recover` mends MCAP only; SQLite has `ros2 bag reindex {path}`"
+    return recover_hint(path)
 
 
 def recording_files(folder: Path) -> list[Path]:
@@ -156,9 +140,7 @@ def read_information(path: Path) -> dict[str, Any]:
         If it cannot be read, or is not what rosbag2 writes.
     """
     with open_regular(path / METADATA_FILE) as stream:
-        data = stream.read(METADATA_LIMIT + 1)
-    if len(data) > METADATA_LIMIT:
-        raise ValueError(f"{METADATA_FILE} is larger than {METADATA_LIMIT} bytes")
+        data = stream.read()
     try:
         document = load_plain(data.decode())
     except ValueError as error:

@@ -1,9 +1,10 @@
-"""Places of the workspace's executables and files, as `ros2 run` finds them."""
+"""Places of the installed executables and files: in a checkout, from pip, or from colcon."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from needle_core.errors import UserError
@@ -17,32 +18,34 @@ def find_executable(package: str, executable: str) -> str:
     UserError
         If the environment has no such executable.
     """
-    for prefix in _prefixes():
-        path = prefix / "lib" / package / executable
-        if os.access(path, os.X_OK):
-            return str(path)
+    places = [Path(sys.executable).parent, *(one / "lib" / package for one in _prefixes())]
+    for place in places:
+        if os.access(place / executable, os.X_OK):
+            return str(place / executable)
     raise UserError(_advice(f"{package} {executable}"))
 
 
 def find_shared(package: str, file: str) -> Path:
-    """Return the path of a file in a package's share directory.
+    """Return the path of a file that a package has beside its code, as a configuration.
 
     Raises
     ------
     UserError
         If the environment has no such file.
     """
-    for prefix in _prefixes():
-        path = prefix / "share" / package / file
-        if path.is_file():
-            return path
+    places = [prefix / "share" / package for prefix in (*_prefixes(), Path(sys.prefix))]
+    module = find_spec(package)
+    if module is not None and module.origin is not None:
+        # In a checkout an edit counts at once.
+        places.insert(0, Path(module.origin).parents[1])
+    for place in places:
+        if (place / file).is_file():
+            return place / file
     raise UserError(_advice(f"{package}'s {file}"))
 
 
-def _prefixes() -> Iterator[Path]:
-    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
-        if prefix:
-            yield Path(prefix)
+def _prefixes() -> list[Path]:
+    return [Path(one) for one in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if one]
 
 
 def _advice(what: str) -> str:

@@ -22,7 +22,6 @@ COUNT = 60
 TOPICS = ("/a", "/b")
 TYPE = "std_msgs/msg/UInt32"
 ALL = list(range(COUNT))
-MEGABYTE = 10**6
 
 
 def payload(number: int) -> bytes:

@@ -106,7 +106,7 @@ def load_stereo_rig(path: Path | str) -> StereoRig:
     path = Path(path)
     text = read_calibration(path)
     try:
-        document = load_plain(text, aliases=True)
+        document = load_plain(text)
     except ValueError as error:
         raise UserError(f"calibration {path}: {error}") from error
     try:

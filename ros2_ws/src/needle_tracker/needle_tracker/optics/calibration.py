@@ -106,7 +106,7 @@ def load_calibration(path: Path) -> StereoCalibration:
 def calibration_from(text: str, path: Path) -> StereoCalibration:
     """Return what the text of a calibration file says; raises as `load_calibration`."""
     try:
-        return parse_calibration(load_plain(text, aliases=True))
+        return parse_calibration(load_plain(text))
     except (UserError, ValueError) as error:
         raise UserError(f"calibration {path}: {error}") from error
 

@@ -1,4 +1,4 @@
-"""Bags made to harm, before every tool that reads bags: one line, and nothing elsewhere changes."""
+"""Bags with strange files, before every tool that reads bags: one line, no change elsewhere."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from needle_bags.recovery import recover
 from needle_bags.ros import player as player_node
 
 MakeRun = Callable[..., Path]
-BOMB = "a: &a [x, x]\n" + "".join(f"b{n}: &b{n} [*a, *a]\n" for n in range(9))
 TOOLS: dict[str, Callable[[Path], int]] = {
     "report": lambda bag: report.main([str(bag)]),
     "rerun": lambda bag: rerun_node.main([str(bag)]),
@@ -56,13 +55,6 @@ def test_every_tool_says_in_one_line_that_data_are_no_file_of_the_bag(
         said = capsys.readouterr()
         assert said.err.startswith("error: ")
         assert said.err.count("\n") == 1
-
-
-def test_texts_within_metadata_are_bounded_too(make_run: MakeRun) -> None:
-    bag = make_run(steps=3)
-    for text in (BOMB, "[" * 100_000):
-        change(bag, custom_data={"parameters": text, "run_info": text, "versions": text})
-        assert read_run(bag).versions == {"text": text}
 
 
 def test_an_image_of_another_size_than_it_says_is_one_line(

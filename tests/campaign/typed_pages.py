@@ -1,6 +1,6 @@
 """Types what the documents say, word for word and in order, and tells what did not work.
 
-    python scripts/lib/typed_pages.py [PAGE ...]       # in a fresh clone, at full length
+    python tests/campaign/typed_pages.py [PAGE ...]       # in a fresh clone, at full length
 
 Code blocks that are indented, or fenced as `sh`, are commands; `python` is a program; `yaml NAME`,
 `toml NAME` and `python NAME` are files of that name; `text` is not typed. What goes on until

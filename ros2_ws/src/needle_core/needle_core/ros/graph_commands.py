@@ -1,0 +1,329 @@
+"""Commands of the small `ros2` in a running graph: node, topic, service and param."""
+
+from __future__ import annotations
+
+import argparse
+import array
+import importlib
+import itertools
+import os
+import re
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import rclpy
+import yaml
+from rclpy.exceptions import InvalidServiceNameException, InvalidTopicNameException
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.parameter import Parameter, get_parameter_value, parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+# Time for discovery [s]: of all that is there, and of one node or topic that is named.
+DISCOVERY = 1.0
+PATIENCE = 5.0
+# An answer that is lost is lost for good [s].
+ANSWER = 10.0
+# How many elements of an array, and characters of a text, are printed.
+LONGEST = 128
+
+
+class CommandError(Exception):
+    """Error whose one line says what cannot be done."""
+
+
+def spin_until(node: Node, condition: Callable[[], Any], timeout: float) -> bool:
+    """Spin until the condition holds; return whether it does after `timeout` [s]."""
+    end = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() >= end:
+            return False
+        rclpy.spin_once(node, timeout_sec=0.02)
+    return True
+
+
+def never() -> bool:
+    """Return False: the condition of those that spin for a time."""
+    return False
+
+
+# ---- messages ---------------------------------------------------------------------------------
+
+
+def find_type(name: str, kind: str) -> Any:
+    """Return the class of `sensor_msgs/msg/Joy` or `sensor_msgs/Joy`; `kind` is `msg` or `srv`."""
+    package, _, type_name = name.replace(f"/{kind}/", "/").partition("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.{kind}"), type_name)
+    except (AttributeError, ModuleNotFoundError) as error:
+        raise CommandError(f"there is no {kind} type '{name}'") from error
+
+
+def plain(value: Any) -> Any:
+    """Return a message, or a field of one, as plain data; what is long is shortened."""
+    if isinstance(value, (str, bytes)):
+        text = value if isinstance(value, str) else value.decode("latin-1")
+        return text if len(text) <= LONGEST else text[:LONGEST] + "..."
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, (list, tuple, array.array, np.ndarray)):
+        return [plain(item) for item in value[:LONGEST]] + ["..."] * (len(value) > LONGEST)
+    if hasattr(value, "get_fields_and_field_types"):
+        return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
+    return value
+
+
+def fill(message: Any, values: Any) -> list[Any]:
+    """Set a message's fields.
+
+    Parameters
+    ----------
+    message : message
+        What to fill.
+    values : Any
+        Mapping from field name to value, nested as the message is. `now` stands for the time at
+        which a message is sent.
+
+    Returns
+    -------
+    list of builtin_interfaces.msg.Time
+        The fields that were given as `now`.
+
+    Raises
+    ------
+    CommandError
+        If a field does not exist or a value does not fit it.
+    """
+    if not isinstance(values, Mapping):
+        raise CommandError(f"'{values}' is expected to be a dictionary")
+    stamps: list[Any] = []
+    types = message.get_fields_and_field_types()
+    for name, value in values.items():
+        if name not in types:
+            raise CommandError(f"'{type(message).__name__}' has no field '{name}'")
+        field = getattr(message, name)
+        if types[name] == "builtin_interfaces/Time" and value == "now":
+            stamps.append(field)
+        elif hasattr(field, "get_fields_and_field_types"):
+            stamps += fill(field, value)
+        else:
+            try:
+                setattr(message, name, _converted(value, field, types[name], stamps))
+            except (AssertionError, TypeError, ValueError, OverflowError) as error:
+                raise CommandError(f"{name}: {value!r} is no {types[name]}") from error
+    return stamps
+
+
+def _converted(value: Any, field: Any, type_name: str, stamps: list[Any]) -> Any:
+    """Return a value in the type that the field has; add the stamps of messages in it."""
+    if isinstance(field, array.array):
+        return array.array(field.typecode, value)
+    if isinstance(field, np.ndarray):
+        return np.array(value, dtype=field.dtype)
+    if isinstance(field, list) and "/" in type_name:
+        messages = [find_type(re.findall(r"\w+/\w+", type_name)[0], "msg")() for _ in value]
+        for message, entry in zip(messages, value, strict=True):
+            stamps += fill(message, entry)
+        return messages
+    # A text for a number, or a number for a flag, is more likely a slip than a wish.
+    return float(value) if isinstance(field, float) and type(value) is int else value
+
+
+def parse(text: str) -> Any:
+    """Return the values that a command line gives as YAML."""
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise CommandError(f"not YAML: {' '.join(str(error).split())}") from error
+
+
+# ---- commands ---------------------------------------------------------------------------------
+
+
+def node_names(node: Node) -> list[str]:
+    """Return the full names of the nodes; those of this command and its like are hidden."""
+    names = node.get_node_names_and_namespaces()
+    return sorted(f"{space.rstrip('/')}/{name}" for name, space in names if name[0] != "_")
+
+
+def list_nodes(node: Node, options: argparse.Namespace) -> None:
+    """Print the nodes' names."""
+    spin_until(node, never, DISCOVERY)
+    print("\n".join(node_names(node)))
+
+
+def list_topics(node: Node, options: argparse.Namespace) -> None:
+    """Print the topics' names."""
+    spin_until(node, never, DISCOVERY)
+    for name, types in node.get_topic_names_and_types():
+        print(f"{name} [{', '.join(types)}]" if options.show_types else name)
+
+
+def echo(node: Node, options: argparse.Namespace) -> None:
+    """Print a topic's messages."""
+    topic = node.resolve_topic_name(options.topic_name)
+    if not spin_until(node, lambda: node.get_publishers_info_by_topic(topic), PATIENCE):
+        raise CommandError(f"topic [{options.topic_name}] is not published")
+    offered = node.get_publishers_info_by_topic(topic)
+    qos = QoSProfile(depth=10)
+    if any(one.qos_profile.reliability != ReliabilityPolicy.RELIABLE for one in offered):
+        qos.reliability = ReliabilityPolicy.BEST_EFFORT
+    if all(one.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offered):
+        qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+    shown: list[bool] = []
+
+    def show(message: Any) -> None:
+        # As in the real one, the filter is the user's own program.
+        is_wanted = options.filter is None or eval(options.filter, {"m": message})
+        if not is_wanted or (options.once and shown):
+            return
+        for name in options.field.split(".") if options.field else ():
+            if not hasattr(message, name):
+                raise CommandError(f"Invalid field '{options.field}': no '{name}'")
+            message = getattr(message, name)
+        value = plain(message)
+        is_text = not isinstance(value, (dict, list))
+        text = f"{value}\n" if is_text else yaml.safe_dump(value, width=1 << 30, sort_keys=False)
+        print(text, end="---\n", flush=True)
+        shown.append(True)
+
+    node.create_subscription(find_type(offered[0].topic_type, "msg"), topic, show, qos)
+    spin_until(node, lambda: shown and options.once, options.timeout)
+
+
+def pub(node: Node, options: argparse.Namespace) -> None:
+    """Publish a message once, a number of times, or until interrupted."""
+    message = find_type(options.message_type, "msg")()
+    stamps = fill(message, parse(options.values))
+    times = 1 if options.once else options.times
+    # Who wants a topic's last message, as of targets, receives it, and all others do, too.
+    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = node.create_publisher(type(message), options.topic_name, latched)
+    while times and not spin_until(node, publisher.get_subscription_count, 1.0):
+        print("Waiting for at least 1 matching subscription(s)...", flush=True)
+    print("publisher: beginning loop", flush=True)
+    due = time.monotonic()
+    for count in itertools.count(1):
+        now = node.get_clock().now().to_msg()
+        for stamp in stamps:
+            stamp.sec, stamp.nanosec = now.sec, now.nanosec
+        if options.print and count % options.print == 0:
+            print(f"publishing #{count}: {message!r}\n", flush=True)
+        publisher.publish(message)
+        if count == times:
+            break
+        due = max(due + 1.0 / options.rate, time.monotonic())
+        spin_until(node, never, due - time.monotonic())
+    # The last message is on its way.
+    spin_until(node, never, 0.1)
+
+
+def call(node: Node, options: argparse.Namespace) -> None:
+    """Call a service and print its answer."""
+    service = find_type(options.service_type, "srv")
+    request = service.Request()
+    fill(request, parse(options.values))
+    client = node.create_client(service, options.service_name)
+    spin_until(node, client.service_is_ready, float("inf"))
+    print(f"requester: making request: {request!r}\n", flush=True)
+    print(f"response:\n{_answer(node, options.service_name, client.call_async(request))!r}\n")
+
+
+def _answer(node: Node, asked: str, future: Any) -> Any:
+    if not spin_until(node, future.done, ANSWER):
+        raise CommandError(f"no answer from {asked}")
+    return future.result()
+
+
+def _parameters(node: Node, options: argparse.Namespace) -> AsyncParameterClient:
+    name = "/" + options.node_name.lstrip("/")
+    if not spin_until(node, lambda: name in node_names(node), PATIENCE):
+        raise CommandError("Node not found")
+    client = AsyncParameterClient(node, name)
+    if not spin_until(node, client.services_are_ready, PATIENCE):
+        raise CommandError(f"node {name} has no parameter services")
+    return client
+
+
+def get_parameter(node: Node, options: argparse.Namespace) -> None:
+    """Print a parameter's value."""
+    asked = _parameters(node, options).get_parameters([options.parameter_name])
+    values = _answer(node, options.node_name, asked).values
+    kind = Parameter.Type(values[0].type) if values else Parameter.Type.NOT_SET
+    if kind == Parameter.Type.NOT_SET:
+        raise CommandError("Parameter not set")
+    print(f"{kind.name.capitalize()} value is: {parameter_value_to_python(values[0])}")
+
+
+def set_parameter(node: Node, options: argparse.Namespace) -> None:
+    """Set a parameter; the exit code is 1 where the node refuses it."""
+    value = parameter_value_to_python(get_parameter_value(options.value))
+    parameter = Parameter(options.parameter_name, value=value)
+    asked = _parameters(node, options).set_parameters([parameter])
+    (result,) = _answer(node, options.node_name, asked).results
+    if not result.successful:
+        raise CommandError(f"Setting parameter failed: {result.reason}")
+    print("Set parameter successful")
+
+
+# ---- the command line -------------------------------------------------------------------------
+
+
+def command_parser() -> argparse.ArgumentParser:
+    """Return the parser of `ros2 node|topic|service|param ...`."""
+    parser = argparse.ArgumentParser(prog="ros2", allow_abbrev=False)
+    groups = parser.add_subparsers(required=True, metavar="COMMAND")
+    verbs = {
+        group: groups.add_parser(group).add_subparsers(required=True, metavar="VERB")
+        for group in ("node", "topic", "service", "param")
+    }
+
+    def command(group: str, verb: str, action: Callable[..., None], *names: str) -> Any:
+        text = action.__doc__
+        added = verbs[group].add_parser(verb, help=text, description=text)
+        added.set_defaults(action=action)
+        for name in names:
+            added.add_argument(name)
+        return added.add_argument
+
+    command("node", "list", list_nodes)
+    add = command("topic", "list", list_topics)
+    add("-t", "--show-types", action="store_true")
+    add = command("topic", "echo", echo, "topic_name")
+    add("--filter", metavar="EXPR", help="in Python, of the message m")
+    add("--field", help="of the message; sub-fields after a dot")
+    add("--once", action="store_true", help="print one message and end")
+    add("--timeout", type=float, default=float("inf"), metavar="N", help="end after N seconds")
+    add = command("topic", "pub", pub, "topic_name", "message_type")
+    add("values", nargs="?", default="{}", help="YAML; `now` is a time as sent")
+    add("-r", "--rate", type=float, default=1.0, metavar="N", help="[Hz]")
+    add("-p", "--print", type=int, default=1, metavar="N", help="every N-th")
+    add("-1", "--once", action="store_true")
+    add("-t", "--times", type=int, default=0, metavar="N")
+    add = command("service", "call", call, "service_name", "service_type")
+    add("values", nargs="?", default="{}", help="the request as YAML")
+    command("param", "get", get_parameter, "node_name", "parameter_name")
+    command("param", "set", set_parameter, "node_name", "parameter_name", "value")
+    return parser
+
+
+def main(arguments: list[str]) -> int:
+    """Do what the command line says; returns the exit code."""
+    options = command_parser().parse_args(arguments)
+    rclpy.init(args=[])
+    node = Node(f"_ros2cli_{os.getpid()}", start_parameter_services=False)
+    try:
+        options.action(node, options)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 130
+    except (CommandError, InvalidTopicNameException, InvalidServiceNameException) as error:
+        print(str(error).splitlines()[0], file=sys.stderr)
+        return 1
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
