@@ -61,7 +61,7 @@ def paths(count: int, rng: np.random.Generator) -> Array:
     aside = np.cumsum(slope, axis=1) * 0.001
     ahead = np.cumsum(1.0 - 0.5 * np.sum(slope**2, axis=-1), axis=1) * 0.001
     whole = np.concatenate([aside, ahead[..., None]], axis=-1)
-    return whole - whole[:, :1]
+    return np.asarray(whole - whole[:, :1])
 
 
 def test_95_of_100_tips_are_in_the_interval() -> None:
