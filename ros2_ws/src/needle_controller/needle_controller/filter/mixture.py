@@ -12,6 +12,7 @@ import numpy.typing as npt
 from needle_controller.filter.bank import looked_ahead
 from needle_controller.filter.hypotheses import LASTING, NORMAL
 from needle_controller.filter.records import E_TURN, NEAR, NOISES
+from needle_controller.filter.tip_update import SMALLEST_VARIANCE
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes
 from needle_controller.observers.estimator import Estimate, Hypotheses
@@ -34,8 +35,9 @@ LARGEST_NOISE = 3.0
 """Noise as a multiple of what is claimed."""
 LARGEST_SLIP = 0.15
 """Distance of the insertion scale from 1."""
+HIDDEN_SHARE = 0.5
+"""Share of a claimed variance that the tips do not show, which may be an error they all have."""
 _AT_LIMIT = 0.03
-_HIDDEN_SHARE = 0.5
 _AMBIGUOUS_COSINE = math.cos(math.radians(60.0))
 _NO_MEAN_ROLL = 0.1
 
@@ -86,7 +88,7 @@ def estimate_needle(
         scale += w * h.scale
         # A turn w changes sin(pitch), the heading's x, by w_y heading_z - w_z heading_y.
         x, y_y, z_z = h.position[0], p[E_TURN + 1, E_TURN + 1], p[E_TURN + 2, E_TURN + 2]
-        x_x = p[0, 0] + _the_same_in_all(needle, h, 0, known)
+        x_x = p[0, 0] + _common_error(needle, h, 0, known)
         xx += w * (x_x + x * x)
         miss += w * beyond(x, x_x)
         of_both = p[0, E_TURN + 1] * r[2, 2] - p[0, E_TURN + 2] * r[1, 2]
@@ -121,23 +123,24 @@ def estimate_needle(
 
 
 @compiled
-def _the_same_in_all(needle: Any, h: Any, i: int, known: Any) -> float:
+def _common_error(needle: Any, h: Any, i: int, known: Any) -> float:
     """Return the variance of an error that all tips may have in common, in one coordinate [m^2].
 
-    That is what the model leaves out, and part of a claimed error of which the tips show less.
+    No number of tips averages it out: what the model leaves out of a tip, and part of what is
+    claimed of its error beyond what the tips show.
     """
     unseen = 0.0
     if h.shape == NORMAL:
         for m in range(NOISES):
             share = 1.0 - known.noises[NORMAL, 0, m] ** 2
             unseen += h.noise_weights[0, m] * max(share, 0.0)
-    return float(known.model_error + _HIDDEN_SHARE * unseen * needle.claimed[i])
+    return float(known.model_error + HIDDEN_SHARE * unseen * needle.claimed[i])
 
 
 @compiled
 def beyond(x: float, variance: float) -> float:
     """Return the probability that a normal number is farther from 0 than `NEAR`."""
-    per_sqrt_2 = 1.0 / math.sqrt(2.0 * variance)
+    per_sqrt_2 = 1.0 / math.sqrt(2.0 * max(variance, SMALLEST_VARIANCE))
     return 0.5 * (math.erfc((NEAR - x) * per_sqrt_2) + math.erfc((NEAR + x) * per_sqrt_2))
 
 
@@ -249,7 +252,7 @@ def _write_covariance(needle: Any, every: Records, whole: float, estimate: Any, 
                 spread = h.covariance[i, j] + error[i] * error[j]
                 estimate.covariance[i, j] += h.weight / whole * spread
         for i in range(3):
-            hidden = _the_same_in_all(needle, h, i, known)
+            hidden = _common_error(needle, h, i, known)
             estimate.covariance[i, i] += h.weight / whole * hidden
 
 

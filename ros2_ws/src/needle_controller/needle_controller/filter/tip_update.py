@@ -43,6 +43,7 @@ from needle_core.compiled import compiled
 SMALLEST_VARIANCE = 1e-18
 """Of a measured coordinate [m^2]: an exact one would leave nothing to divide by."""
 _SMALLEST_SHARE = 0.02
+_SMALLEST_GAIN, _LARGEST_GAIN = 0.3, 1.5
 _NO_MASS = 1e-30
 _GIVEN_UP = 1e-3
 _REOPENED = 0.2
@@ -341,8 +342,9 @@ def _apply(h: Any, reading: Reading, known: Any, work: Work) -> None:
     h.curvature = min(max(kappa, known.smallest_curvature), known.largest_curvature)
     h.scale += change[E_SCALE]
     if h.sized == GAIN:
-        h.tip_angle += h.dtip_dsize * change[E_SIZE]
-        h.gain, h.behind_play = h.gain + change[E_SIZE], h.tip_angle
+        gain = min(max(h.gain + change[E_SIZE], _SMALLEST_GAIN), _LARGEST_GAIN)
+        h.tip_angle += h.dtip_dsize * (gain - h.gain)
+        h.gain, h.behind_play = gain, h.tip_angle
     elif change[E_SIZE] != 0.0 and h.sized == LAG:
         lag = min(max(h.lag + change[E_SIZE], known.smallest_lag), known.largest_lag)
         h.tip_angle += h.dtip_dsize * (lag - h.lag)
