@@ -10,6 +10,7 @@ from mcap.reader import make_reader
 
 from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag
+from needle_core.errors import UserError
 from needle_core.files.bag_path import METADATA_FILE
 from needle_core.files.plain_yaml import load_plain
 
@@ -50,8 +51,13 @@ class BagWitness:
 
     def losses_of_killed(self, killed_at: float) -> list[str]:
         """Return what the recovered bag of a recorder lacks that it had long enough."""
-        recover_bag(self._bag)
-        kept = _counts(self._bag)
+        try:
+            recover_bag(self._bag)
+        except UserError:
+            # Nothing of it can be recovered.
+            kept = Counter[str]()
+        else:
+            kept = _counts(self._bag)
         wanted = {
             topic: sum(at <= killed_at - _WRITTEN_OUT for at in taken)
             for topic, taken in self._taken.items()

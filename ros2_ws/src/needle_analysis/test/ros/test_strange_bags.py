@@ -14,7 +14,6 @@ from needle_analysis.ros import rerun as rerun_node
 from needle_bags.format.bag_copy import standard_topic
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.reading import small_bag
-from needle_bags.reading.bag_reader import read_run
 from needle_bags.recovery import recover
 from needle_bags.ros import player as player_node
 

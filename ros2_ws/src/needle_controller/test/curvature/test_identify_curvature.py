@@ -245,5 +245,5 @@ def test_bags_without_a_needle_are_one_line(
     next(path.glob("*.mcap")).write_bytes(b"not an mcap file")
     assert command(path) == 2
     error = capsys.readouterr().err
-    assert "the bag is broken (it does not begin as an MCAP file)" in error
+    assert "the bag is broken" in error
     assert error.count("\n") == 1
