@@ -57,7 +57,9 @@ LASTING_NOISE = NoiseHypothesis(
 """Whatever is claimed: some coordinates are worse than others, or errors last for some tips, or for
 so many that they are as good as a bias that wanders."""
 NORMAL_NOISE = (
-    NoiseHypothesis(NORMAL, (1.0, 0.5, 2.0, 4.0, 8.0), (0.5, 0.2, 0.15, 0.1, 0.05), 1.0),
+    NoiseHypothesis(
+        NORMAL, (1.0, 0.5, 0.25, 2.0, 4.0, 8.0), (0.4, 0.15, 0.15, 0.15, 0.1, 0.05), 1.0
+    ),
     LASTING_NOISE,
 )
 """Where a covariance is claimed: normal, smaller than claimed, as claimed or larger."""
