@@ -63,7 +63,7 @@ def test_the_need_of_a_point_is_the_arc_that_leads_there() -> None:
     need, length = np.empty(2), 0.08
     for share in (0.1, 0.9):
         curvature = share * CURVATURE
-        tip_in_start = moved(np.eye(4), length, 0.0, curvature)[:3, 3]
+        tip_in_start = moved(np.eye(4), length, 0.0, curvature)[:3, 3].copy()
         assert write_need(tip_in_start, need) == pytest.approx(length)
         # Towards -y, where a needle bends whose bevel is not turned.
         np.testing.assert_allclose(need, [0.0, -0.5 * curvature * length**2], atol=1e-12)
