@@ -254,7 +254,7 @@ def test_a_late_tip_is_compared_with_where_the_tip_was() -> None:
 
 def test_covariance_is_honest() -> None:
     """Over many noisy runs the spread of the errors is within what the covariance says."""
-    rng, count = default_rng(9), 100
+    rng, count = default_rng(9), 60
     squares = []
     for _ in range(count):
         pitch = rng.normal(0.0, SETTINGS.initial_pitch_std / 2)
