@@ -121,8 +121,8 @@ def _advance_all(needles: Records, length: float, turns: FloatArray) -> None:
 def _advance(needle: Any, length: float, turn: float) -> None:
     # omega = (kappa l, 0, turn): R' = R exp(omega), p' = p + l R exp(omega / 2) e3
     bend = needle.curvature * length
-    middle = needle.rotation @ _rotation(0.5 * bend, 0.5 * turn)
-    needle.rotation[:] = needle.rotation @ _rotation(bend, turn)
+    middle = needle.rotation @ _rotation(0.5 * bend, 0.0, 0.5 * turn)
+    needle.rotation[:] = needle.rotation @ _rotation(bend, 0.0, turn)
     needle.base += turn
     for i in range(3):
         needle.moved[i] = length * middle[i, 2]
@@ -143,12 +143,12 @@ def _advance(needle: Any, length: float, turn: float) -> None:
 
 
 @compiled
-def _rotation(bend: float, turn: float) -> FloatArray:
-    """Return exp of the rotation vector (bend, 0, turn)."""
-    angle = math.sqrt(bend * bend + turn * turn)
+def _rotation(x: float, y: float, z: float) -> FloatArray:
+    """Return exp of a rotation vector, by Rodrigues' formula."""
+    angle = math.sqrt(x * x + y * y + z * z)
     first = math.sin(angle) / angle if angle > 1e-9 else 1.0
     second = (1.0 - math.cos(angle)) / (angle * angle) if angle > 1e-9 else 0.5
-    cross = np.array([[0.0, -turn, 0.0], [turn, 0.0, -bend], [0.0, bend, 0.0]])
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     turned: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
     return turned
 
@@ -171,13 +171,7 @@ def _correct(needle: Any, tip: FloatArray, variance: float) -> None:
     needle.position += error[:3]
     needle.curvature += error[6]
     # R <- exp(dtheta) R
-    angle = math.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2)
-    first = math.sin(angle) / angle if angle > 1e-9 else 1.0
-    second = (1.0 - math.cos(angle)) / (angle * angle) if angle > 1e-9 else 0.5
-    cross = np.array(
-        [[0.0, -error[5], error[4]], [error[5], 0.0, -error[3]], [-error[4], error[3], 0.0]]
-    )
-    needle.rotation[:] = (np.eye(3) + first * cross + second * (cross @ cross)) @ needle.rotation
+    needle.rotation[:] = _rotation(error[3], error[4], error[5]) @ needle.rotation
 
 
 @compiled

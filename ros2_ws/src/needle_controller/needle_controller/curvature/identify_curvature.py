@@ -59,7 +59,7 @@ examples:
       only what was inserted before the base began to turn
   ros2 run needle_controller identify_curvature tips.csv --forecast-mm 98
       where the tip will be at 98 mm, from tips of the first 50 mm, say; for tissue whose curvature
-      varies by 0.5 1/m from place to place
+      varies by 0.4 1/m from place to place
   ros2 run needle_controller identify_curvature tips.csv --entry-std-mm inf --heading-std-deg inf
       nothing is known of the entry but the tips
   ros2 run needle_controller identify_curvature bags/insertion --from-mm 5

@@ -88,7 +88,7 @@ def estimate_needle(
         scale += w * h.scale
         # A turn w changes sin(pitch), the heading's x, by w_y heading_z - w_z heading_y.
         x, y_y, z_z = h.position[0], p[E_TURN + 1, E_TURN + 1], p[E_TURN + 2, E_TURN + 2]
-        x_x = p[0, 0] + _common_error(needle, h, 0, known)
+        x_x = p[0, 0] + known.model_error + _hidden_share(h, known) * needle.claimed[0]
         xx += w * (x_x + x * x)
         miss += w * beyond(x, x_x)
         of_both = p[0, E_TURN + 1] * r[2, 2] - p[0, E_TURN + 2] * r[1, 2]
@@ -123,18 +123,17 @@ def estimate_needle(
 
 
 @compiled
-def _common_error(needle: Any, h: Any, i: int, known: Any) -> float:
-    """Return the variance of an error that all tips may have in common, in one coordinate [m^2].
+def _hidden_share(h: Any, known: Any) -> float:
+    """Return what share of the claimed variance may be an error that all tips have in common.
 
-    No number of tips averages it out: what the model leaves out of a tip, and part of what is
-    claimed of its error beyond what the tips show.
+    No number of tips averages it out, nor what the model leaves out of a tip.
     """
     unseen = 0.0
     if h.shape == NORMAL:
         for m in range(NOISES):
             share = 1.0 - known.noises[NORMAL, 0, m] ** 2
             unseen += h.noise_weights[0, m] * max(share, 0.0)
-    return float(known.model_error + HIDDEN_SHARE * unseen * needle.claimed[i])
+    return HIDDEN_SHARE * unseen
 
 
 @compiled
@@ -251,9 +250,10 @@ def _write_covariance(needle: Any, every: Records, whole: float, estimate: Any, 
             for j in range(6):
                 spread = h.covariance[i, j] + error[i] * error[j]
                 estimate.covariance[i, j] += h.weight / whole * spread
+        hidden = _hidden_share(h, known)
         for i in range(3):
-            hidden = _common_error(needle, h, i, known)
-            estimate.covariance[i, i] += h.weight / whole * hidden
+            common = known.model_error + hidden * needle.claimed[i]
+            estimate.covariance[i, i] += h.weight / whole * common
 
 
 def estimate_from(said: np.void, torsions: Records, warnings: tuple[str, ...] = ()) -> Estimate:
