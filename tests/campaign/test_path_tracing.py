@@ -12,13 +12,12 @@ import pytest
 
 from needle_core.errors import UserError
 from needle_core.files.installed import find_shared
-from needle_sim.camera.projection import project
+from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
 from needle_sim.path_traced.appearance import draw_appearance
 from needle_sim.path_traced.floors import FloorPicture
 from needle_sim.path_traced.insertion import trace_insertion
-from needle_sim.path_traced.path_tracing import PathTracer
-from needle_sim.path_traced.refracted_rays import refracted_rays
+from needle_sim.path_traced.path_tracing import PathTracer, refracted_rays
 from needle_sim.path_traced.scene import Scene
 from needle_sim.path_traced.tracer import MM, Mitsuba, load_mitsuba
 from needle_sim.path_traced.world import make_world

@@ -29,11 +29,9 @@ from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_js
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies import study_noise
-from needle_sim.studies.disturbances import Disturbances
-from needle_sim.studies.needle_batch import NeedleBatch
-from needle_sim.studies.start_grids import GRIDS, StartBounds
-from needle_sim.studies.study import StudySettings, run_study
+from needle_sim.studies.disturbances import NOISE, Disturbances, uniform_numbers
+from needle_sim.studies.needles import NeedleBatch
+from needle_sim.studies.study import GRIDS, StartBounds, StudySettings, run_study
 
 DESCRIPTION = """\
 Measure what is fast enough and what is not, each figure beside a reference in the same run: the
@@ -51,7 +49,7 @@ references:
 
 exit codes: 0 measured, 2 bad input, 130 interrupted.
 """
-NOISE = 0.001
+TIP_NOISE = 0.001
 STEPS = 120
 NEEDLES = 10_000
 PLAIN_NEEDLES = 40
@@ -60,7 +58,9 @@ ALONE_NEEDLES = 20
 UPDATES = 2_000
 SETTINGS = SteeringSettings(**PAPER_NOISE)
 STARTS = GRIDS["endpoint"](StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)), 10, 1)
-STUDY = StudySettings(SETTINGS.curvature, 0.120, SETTINGS.step_length, Disturbances(NOISE), seed=1)
+STUDY = StudySettings(
+    SETTINGS.curvature, 0.120, SETTINGS.step_length, Disturbances(TIP_NOISE), seed=1
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +132,7 @@ def studies() -> Iterator[Row]:
     """10,000 needles x 120 steps."""
     plain, with_control = _plain_study(), _control_study()
     for name, times in (("paper", 5), ("best", 1)):
-        factory = controller_factory(name, NOISE)
+        factory = controller_factory(name, TIP_NOISE)
         run_study(STARTS[:2], factory, STUDY)  # compiles
         chunk = needles_at_a_time(name)
         seconds = _least_time(partial(run_study, STARTS, factory, STUDY, chunk=chunk), times)
@@ -148,7 +148,7 @@ def studies() -> Iterator[Row]:
 def updates() -> Iterator[Row]:
     """One update of the node's controller: estimate with covariance, command, reach."""
     d = design()
-    s, errors = (-0.003, 0.0, 0.0), study_noise.uniform(1, 1, 0, 0, UPDATES)[:, 0] * NOISE
+    s, errors = (-0.003, 0.0, 0.0), uniform_numbers(1, 1, 0, 0, UPDATES)[:, 0] * TIP_NOISE
     plain = _least_time(
         lambda: [
             reference_loop.law_turn(reference_loop.observer_step(s, d, 0.1, error), d)
@@ -239,8 +239,8 @@ BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
 
 def noise_of(needle: int) -> list[float]:
     """Return the noise on x that the study gives one of its needles."""
-    shares = (study_noise.uniform(1, study_noise.NOISE, k, needle, 1)[0, 0] for k in range(STEPS))
-    return [float(NOISE * (2.0 * share - 1.0)) for share in shares]
+    shares = (uniform_numbers(1, NOISE, k, needle, 1)[0, 0] for k in range(STEPS))
+    return [float(TIP_NOISE * (2.0 * share - 1.0)) for share in shares]
 
 
 def _plain_study() -> float:
@@ -249,7 +249,7 @@ def _plain_study() -> float:
     needles = [(STARTS[k].tolist(), noise_of(k)) for k in chosen]
     seconds = _least_time(lambda: [reference_loop.steer(*needle, d) for needle in needles], 2)
     ends = [reference_loop.steer(*needle, d) for needle in needles]
-    seen = run_study(STARTS, controller_factory("paper", NOISE), STUDY).x_end[list(chosen)]
+    seen = run_study(STARTS, controller_factory("paper", TIP_NOISE), STUDY).x_end[list(chosen)]
     _require_agreement("plain Python", seen.tolist(), ends)
     return seconds * NEEDLES / len(needles)
 
@@ -276,7 +276,7 @@ def _require_agreement(name: str, one: Sequence[float], other: Sequence[float]) 
 
 def _peak_memory(name: str, depth: float) -> float:
     settings = dataclasses.replace(STUDY, depth=depth)
-    factory = controller_factory(name, NOISE)
+    factory = controller_factory(name, TIP_NOISE)
     run_study(STARTS[:2], factory, settings)
     tracemalloc.start()
     run_study(STARTS[:1000], factory, settings)
@@ -287,7 +287,7 @@ def _peak_memory(name: str, depth: float) -> float:
 
 def _study_one_by_one(name: str) -> float:
     """Return the time of the study with the same code in a loop over needles, each alone."""
-    factory = controller_factory(name, NOISE)
+    factory = controller_factory(name, TIP_NOISE)
     chosen = range(0, NEEDLES, NEEDLES // ALONE_NEEDLES)
     return (
         _least_time(lambda: [run_study(STARTS[k : k + 1], factory, STUDY) for k in chosen], 1)
@@ -303,8 +303,8 @@ def _tips_of_a_run(preset: str) -> list[tuple[FloatArray, JointSample]]:
     length, rotation = SETTINGS.step_length, 0.0
     taken = []
     for step in range(STEPS + 1):
-        off = study_noise.uniform(1, study_noise.NOISE, step, 0, 1)[0, :3]
-        tip = needle.tips[0] + NOISE * (2.0 * off - 1.0)
+        off = uniform_numbers(1, NOISE, step, 0, 1)[0, :3]
+        tip = needle.tips[0] + TIP_NOISE * (2.0 * off - 1.0)
         taken.append((tip, JointSample(step, step * length, rotation)))
         turn = float(control.update(*taken[-1]).command.rotation_rate) * length
         needle.advance(length, turn, SETTINGS.curvature)

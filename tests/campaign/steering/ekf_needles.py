@@ -20,7 +20,7 @@ from needle_controller.laws.roll_law import RollLawSettings, roll_turn
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.compiled import compiled
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import BAND, Belief
+from needle_sim.studies.figures_of_merit import BAND, Belief
 
 Records = npt.NDArray[np.void]
 

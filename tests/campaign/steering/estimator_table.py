@@ -26,8 +26,7 @@ from needle_bringup.studies.study_parts import StudyPart, parts_of, settings_of
 from needle_core.commands.cli import EXIT_DONE, run_command
 from needle_core.commands.options import CommandParser, output_file, whole_number
 from needle_core.errors import UserError
-from needle_sim.studies.beliefs import doubted
-from needle_sim.studies.figures_of_merit import Outcomes, joined
+from needle_sim.studies.figures_of_merit import Outcomes, doubted, joined
 from needle_sim.studies.study import Controller, run_study
 
 ESTIMATORS = ("best", "ekf", "paper")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from needle_sim.camera.projection import project
+from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_tracker.calibrating.calibration_session import Place
 from needle_tracker.calibrating.charuco import CharucoBoard

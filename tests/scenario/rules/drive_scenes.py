@@ -8,7 +8,7 @@ from needle_core import messages as m
 from needle_core.can_frame import CAN, CanFrame
 from needle_core.component import Publish
 from needle_device_driver.rules import Rule
-from needle_sim.drives.power_state import PowerState
+from needle_sim.drives.cia402 import PowerState
 from scenario.rules.scene import AXES, DRIVER, ESTOP, Scene
 
 ON = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)

@@ -21,10 +21,8 @@ from needle_core.component import (
 )
 from needle_core.errors import UserError
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
-from needle_sim.drives.bus_health import bus_health
-from needle_sim.drives.emulated_bus import EmulatedBus
-from needle_sim.drives.fault_commands import obey
-from needle_sim.drives.power_state import PowerState
+from needle_sim.drives.cia402 import PowerState
+from needle_sim.drives.emulated_bus import EmulatedBus, bus_health, obey
 
 POSITIONS = "sim/drive_positions"
 ADAPTER, COMMAND_LINES = "adapter", "command lines"

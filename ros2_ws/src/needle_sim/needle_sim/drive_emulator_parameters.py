@@ -7,8 +7,8 @@ import math
 
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
+from needle_sim.drives.cia402 import SERVO, STEPPER
 from needle_sim.drives.drive_motion import LimitAction
-from needle_sim.drives.drive_objects import SERVO, STEPPER
 from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.motor import MotorSettings
 

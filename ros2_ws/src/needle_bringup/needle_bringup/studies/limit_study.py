@@ -30,10 +30,21 @@ from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_core.commands.cli import EXIT_DONE
 from needle_sim.studies.disturbances import Disturbances
-from needle_sim.studies.point_study import PointController, run_point_study
-from needle_sim.studies.point_targets import FARTHEST, MovingTargets, random_targets
-from needle_sim.studies.start_grids import GRIDS, POINTS, StartBounds
-from needle_sim.studies.study import Controller, StudySettings, run_study
+from needle_sim.studies.point_study import (
+    FARTHEST,
+    MovingTargets,
+    PointController,
+    random_targets,
+    run_point_study,
+)
+from needle_sim.studies.study import (
+    GRIDS,
+    POINTS,
+    Controller,
+    StartBounds,
+    StudySettings,
+    run_study,
+)
 
 NEEDLES, PARTICLES = 200, 2000
 BOUNDS = StartBounds(x=0.003, pitch=math.radians(10.0), roll=math.radians(30.0))

@@ -20,7 +20,7 @@ from needle_core.commands.options import (
 )
 from needle_core.errors import UserError
 from needle_sim.studies.disturbances import Disturbances
-from needle_sim.studies.start_grids import GRIDS, StartBounds
+from needle_sim.studies.study import GRIDS, StartBounds
 
 DESCRIPTION = """\
 Steer many simulated needles to the plane x = 0 and say how many get there.

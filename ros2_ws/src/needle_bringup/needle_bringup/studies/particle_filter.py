@@ -21,7 +21,7 @@ from needle_controller.model.kinematics import REDUCED, angles_from_rotation, ro
 from needle_controller.observers.estimator import Estimate, Hypotheses
 from needle_sim.needle.tissue import Torsion
 from needle_sim.studies.disturbances import Disturbances
-from needle_sim.studies.start_grids import StartBounds
+from needle_sim.studies.study import StartBounds
 
 _SPREAD = 0.3
 _EDGE = 2e-5

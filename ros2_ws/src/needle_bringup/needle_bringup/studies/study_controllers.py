@@ -43,7 +43,7 @@ from needle_controller.presets.steering_settings import (
 from needle_controller.protocol.trust import point_missed
 from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import Belief
+from needle_sim.studies.figures_of_merit import Belief
 from needle_sim.studies.study import CHUNK
 
 SLIDING_MODE, RRT = "sliding_mode", "rrt"

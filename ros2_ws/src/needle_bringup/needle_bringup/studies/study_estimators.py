@@ -12,7 +12,7 @@ from needle_controller.many_needles import ManyFilters
 from needle_controller.model.arrays import Array
 from needle_controller.observers.estimator import Estimate, Estimator
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import Belief
+from needle_sim.studies.figures_of_merit import Belief
 
 
 class Estimators(Protocol):

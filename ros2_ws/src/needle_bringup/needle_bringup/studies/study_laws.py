@@ -23,9 +23,8 @@ from needle_controller.presets.path_steering import PathSteering, tip_state
 from needle_controller.presets.point_steering import Foresight, prompt_point_law
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.point_targets import INSERTION_SPEED
-from needle_sim.studies.rrt_replanning import SAMPLES, DutyCycle, plan
-from needle_sim.studies.sliding_mode import sliding_mode_rate
+from needle_sim.studies.point_study import INSERTION_SPEED
+from needle_sim.studies.reference_laws import SAMPLES, DutyCycle, plan, sliding_mode_rate
 
 TimedLaw = Callable[[Estimate, float, float, float], SteeringCommand]
 """Takes an estimate, the time [s], the insertion [m], and what the base may still turn [rad]."""

@@ -20,12 +20,15 @@ from needle_bringup.studies.study_controllers import (
 )
 from needle_core.commands.cli import JsonValue
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import doubted
-from needle_sim.studies.figures_of_merit import Outcomes, figures, joined
-from needle_sim.studies.point_study import PointOutcomes, point_figures, run_point_study
-from needle_sim.studies.point_targets import MovingTargets, random_targets
-from needle_sim.studies.start_grids import GRIDS, POINTS
-from needle_sim.studies.study import StudySettings, run_study
+from needle_sim.studies.figures_of_merit import Outcomes, doubted, figures, joined
+from needle_sim.studies.point_study import (
+    MovingTargets,
+    PointOutcomes,
+    point_figures,
+    random_targets,
+    run_point_study,
+)
+from needle_sim.studies.study import GRIDS, POINTS, StudySettings, run_study
 
 # Of the controller's settings, those that a study passes on as they are asked for.
 _OWN = ("estimator", "law", "planner", "seed", "step_length")

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_sim.camera.projection import project
+from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
 from needle_sim.path_traced.appearance import draw_appearance
 from needle_sim.path_traced.insertion import trace_insertion

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from functools import partial
 
 from needle_core.can_frame import CanFrame
-from needle_sim.bus.object_dictionary import Kind, ObjectDictionary
+from needle_sim.bus.object_dictionary import Kind, ObjectDictionary, SdoServer
 from needle_sim.bus.process_data import INVALID, ReceivePdo, TransmitPdo
-from needle_sim.bus.sdo_server import SdoServer
 
 NMT = 0x000
 SYNC = 0x080

@@ -5,11 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from needle_sim.camera.bubbles import BubbleCloud, place_bubbles
-from needle_sim.camera.metal import place_lamp
+from needle_sim.camera.clutter import (
+    BubbleCloud,
+    Event,
+    cable_line,
+    event_at,
+    hand_capsules,
+    paper_lines,
+    place_bubbles,
+    shadow_line,
+)
+from needle_sim.camera.lighting import place_lamp
 from needle_sim.camera.optics import Optics
-from needle_sim.camera.paper import paper_lines
-from needle_sim.camera.passing import Event, cable_line, event_at, hand_capsules, shadow_line
 from needle_sim.camera.scenarios import CLEAN, Scenario
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_sim.camera.view import GreyImage, Moment, StillScene, View

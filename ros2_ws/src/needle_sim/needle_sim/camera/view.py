@@ -9,9 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from needle_sim.camera.bubbles import BubbleCloud, BubbleImage, draw_bubbles
-from needle_sim.camera.lamps import drift, flicker, lamp_light, shine, surface_glints, uneven_light
-from needle_sim.camera.metal import mirrored
+from needle_sim.camera.clutter import BubbleCloud, BubbleImage, draw_bubbles
+from needle_sim.camera.lighting import (
+    drift,
+    flicker,
+    lamp_light,
+    mirrored,
+    shine,
+    surface_glints,
+    uneven_light,
+)
 from needle_sim.camera.optics import SHARP_PX, FloatImage, Optics
 from needle_sim.camera.scenarios import Metal, Scenario
 from needle_sim.camera.stroke import Stroke, stroke

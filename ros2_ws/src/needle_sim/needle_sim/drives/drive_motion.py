@@ -5,15 +5,14 @@ from __future__ import annotations
 import enum
 
 from needle_sim.bus.object_dictionary import Abort, ObjectDictionary, SdoAbortError
-from needle_sim.drives.demand import Demand
-from needle_sim.drives.drive_objects import (
+from needle_sim.drives.cia402 import (
     CYCLIC_SYNCHRONOUS_POSITION,
     HOMING,
     POSITION,
     PROFILE_POSITION,
     TARGET_POSITION,
 )
-from needle_sim.drives.homing import METHODS, Homing
+from needle_sim.drives.motion_profile import METHODS, Demand, Homing
 from needle_sim.drives.motor import Motor
 
 # Motion is computed in steps of so much [s].

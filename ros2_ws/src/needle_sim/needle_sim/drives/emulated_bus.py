@@ -1,11 +1,15 @@
-"""The CAN bus with both drives, and faults on command."""
+"""CAN bus with both emulated drives, their health, and faults on command."""
 
 from __future__ import annotations
 
 import dataclasses
+import enum
 
 from needle_core.can_frame import CanFrame
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.errors import UserError
 from needle_sim.bus.canopen_device import SYNC
+from needle_sim.drives.cia402 import PowerState
 from needle_sim.drives.drive_motion import MOTION_STEP
 from needle_sim.drives.emulated_drive import EmulatedDrive, EmulatedDriveSettings
 
@@ -122,3 +126,100 @@ class EmulatedBus:
             self._moved_until += steps * MOTION_STEP
             for drive in self.drives.values():
                 drive.advance(steps)
+
+
+def bus_health(bus: EmulatedBus) -> Diagnostic:
+    """Return the states of both drives, and what is the matter with them or their bus."""
+    states = {name: drive.state.name for name, drive in bus.drives.items()}
+    faults = [name for name, state in states.items() if state == PowerState.FAULT.name]
+    message = f"fault of {' and '.join(faults)}" if faults else "runs"
+    if bus.is_cut:
+        message += ", the bus is cut"
+    level = Level.WARN if faults or bus.is_cut else Level.OK
+    return Diagnostic(level, message, states)
+
+
+AXES = ("insertion", "rotation")
+COMMANDS = """\
+cut_bus             frames get lost both ways; the adapter stays
+unplug              the adapter disappears
+stall AXIS          the motor is blocked
+reboot AXIS         the drive loses its power for a moment
+emcy AXIS CODE      the drive has a fault of that error code, such as 0x5530
+hang AXIS           the drive's processor hangs: silent, the motor ends at its set-point
+restore             end of cut_bus, unplug, stall and hang; AXIS is insertion or rotation"""
+# Command -> how many words follow.
+_WORDS = {
+    "cut_bus": 0,
+    "unplug": 0,
+    "stall": 1,
+    "reboot": 1,
+    "emcy": 2,
+    "hang": 1,
+    "restore": 0,
+}
+
+
+class PlugOrder(enum.Enum):
+    """Effects of a command on the adapter."""
+
+    OUT = "out"
+    IN = "in"
+
+
+def obey(line: str, bus: EmulatedBus, now: float) -> PlugOrder | None:
+    """Carry out one command at steady time `now` [s].
+
+    Parameters
+    ----------
+    line : str
+        One of `COMMANDS`.
+    bus : EmulatedBus
+        What it happens to.
+    now : float
+        Steady time [s].
+
+    Returns
+    -------
+    PlugOrder or None
+        What is left to do to the adapter.
+
+    Raises
+    ------
+    UserError
+        A line that is no command.
+    """
+    name, *words = line.split()
+    if name not in _WORDS:
+        raise UserError(f"{line!r} is no command; there are\n{COMMANDS}")
+    if len(words) != _WORDS[name]:
+        raise UserError(f"{line!r}: {name} takes {_WORDS[name]} words, not {len(words)}")
+    axis = words[0] if words else ""
+    if words and axis not in AXES:
+        raise UserError(f"{line!r}: {name} wants an axis, {' or '.join(AXES)}")
+    if name == "emcy":
+        bus.emergency(axis, _error_code(line, words[1]))
+    elif name == "stall":
+        bus.stall(axis)
+    elif name == "reboot":
+        bus.reboot(axis, now)
+    elif name == "hang":
+        bus.hang(axis)
+    elif name == "cut_bus":
+        bus.is_cut = True
+    elif name == "unplug":
+        return PlugOrder.OUT
+    else:
+        bus.restore(now)
+        return PlugOrder.IN
+    return None
+
+
+def _error_code(line: str, word: str) -> int:
+    try:
+        code = int(word, 0)
+    except ValueError:
+        raise UserError(f"{line!r}: {word!r} is no error code, such as 0x5530") from None
+    if not 1 <= code <= 0xFFFF:
+        raise UserError(f"{line!r}: the error code must be within 1..0xFFFF")
+    return code

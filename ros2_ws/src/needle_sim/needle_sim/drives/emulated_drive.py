@@ -8,23 +8,27 @@ from collections.abc import Callable
 from needle_core.can_frame import CanFrame
 from needle_sim.bus.canopen_device import HEARTBEAT_LOST, CanopenDevice
 from needle_sim.bus.object_dictionary import Abort, SdoAbortError
+from needle_sim.drives.cia402 import (
+    CONTROLWORD,
+    ERROR_CODE,
+    FAULT_RESET,
+    MODE,
+    MODES,
+    STATUSWORD,
+    Order,
+    PowerState,
+    drive_dictionary,
+    next_state,
+    order_of,
+)
 from needle_sim.drives.drive_motion import (
     MOTION_STEP,
     DriveMotion,
     LimitAction,
     LimitExceededError,
 )
-from needle_sim.drives.drive_objects import (
-    CONTROLWORD,
-    ERROR_CODE,
-    MODE,
-    MODES,
-    STATUSWORD,
-    drive_dictionary,
-)
-from needle_sim.drives.homing import METHODS
+from needle_sim.drives.motion_profile import METHODS
 from needle_sim.drives.motor import Motor, MotorSettings
-from needle_sim.drives.power_state import FAULT_RESET, Order, PowerState, next_state, order_of
 
 FOLLOWING_ERROR = 0x8611
 LIMIT_EXCEEDED = 0x8612

@@ -9,8 +9,7 @@ from needle_sim.camera.optics import FloatImage, Optics
 from needle_sim.camera.stroke import stroke
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.path_traced.block import LENGTH, is_box, sides
-from needle_sim.path_traced.world import World
+from needle_sim.path_traced.world import LENGTH, World, is_box, sides
 
 _STREAM = 32
 _SPACING = 0.0004

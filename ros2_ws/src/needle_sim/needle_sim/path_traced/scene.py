@@ -11,15 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from needle_sim.camera.bubbles import BubbleCloud
+from needle_sim.camera.clutter import BubbleCloud
 from needle_sim.path_traced import floors
 from needle_sim.path_traced.appearance import Metal
-from needle_sim.path_traced.block import LENGTH, Backdrop, is_box, refractive_index, sides
 from needle_sim.path_traced.floors import ALBEDO
-from needle_sim.path_traced.lamps import MIDDLE, apparent_centre
 from needle_sim.path_traced.needle_mesh import Mesh
 from needle_sim.path_traced.tracer import MM, Mitsuba
-from needle_sim.path_traced.world import PANEL_RADIANCE, World, room_light
+from needle_sim.path_traced.world import (
+    LENGTH,
+    MIDDLE,
+    PANEL_RADIANCE,
+    Backdrop,
+    World,
+    apparent_centre,
+    is_box,
+    refractive_index,
+    room_light,
+    sides,
+)
 
 # Steel at 580 nm, against air.
 _STEEL_INDEX = 2.9

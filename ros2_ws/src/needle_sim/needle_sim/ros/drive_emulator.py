@@ -17,7 +17,7 @@ from needle_core.ros.main import run_component
 from needle_sim.bus.pty_can import PtyCan
 from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
-from needle_sim.drives.fault_commands import COMMANDS, PlugOrder
+from needle_sim.drives.emulated_bus import COMMANDS, PlugOrder
 
 HELP = f"""\
 drive_emulator: a stepper (insertion) and a servo (rotation) as CiA 402 drives on one CAN bus.

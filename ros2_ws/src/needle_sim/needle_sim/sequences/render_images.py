@@ -23,9 +23,13 @@ from needle_sim.camera.insertions import CURVATURE, RenderedPair, render_inserti
 from needle_sim.camera.scenarios import CLEAN, SCENARIOS, Scenario, find_scenario
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_sim.path_traced.appearance import APPEARANCES, RANDOM, Appearance, draw_appearance
-from needle_sim.path_traced.insertion import TracedPair, trace_insertion
+from needle_sim.path_traced.insertion import (
+    TRUTH_COLUMNS,
+    TracedPair,
+    trace_insertion,
+    truth_values,
+)
 from needle_sim.path_traced.tracer import load_mitsuba
-from needle_sim.path_traced.truth_columns import TRUTH_COLUMNS, truth_values
 from needle_sim.sequences.boxes import draw_box
 
 RENDERERS = ("quick", "path_traced")

@@ -1,6 +1,6 @@
-"""Disturbances of a study: of the measured tips, of the tissue, and of the needle in it.
+"""Disturbances of a study (measurements, tissue, needle) and the random numbers behind them.
 
-The controller is told of none of it.
+The controller is not told about any of them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,65 @@ from numpy.typing import NDArray
 
 from needle_core.compiled import compiled
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies import study_noise
+
+START, NOISE, OUTLIER, OUTLIER_DIRECTION, MISSED, CURVATURE, BUMP, TARGET, DRIFT, BREATH = range(10)
+PUSH, ROLL, BIAS = range(10, 13)
+"""Purposes of random numbers."""
+PER_NEEDLE = 4
+"""Numbers for each needle and draw: two needles share one block of the generator."""
+
+
+def uniform_numbers(
+    seed: int, purpose: int, step: int, first: int, count: int
+) -> NDArray[np.float32]:
+    """Return four numbers, uniform in [0, 1), for each of some needles.
+
+    Philox counts through its sequence by a number that can be set: needle, step and purpose are
+    that number.
+
+    Parameters
+    ----------
+    seed : int
+        Of the study, >= 0.
+    purpose : int
+        One of `START` ... `BIAS`.
+    step : int
+        Number of the exposure, or of whatever the purpose counts.
+    first, count : int
+        The needles `first` ... `first + count - 1`.
+
+    Returns
+    -------
+    ndarray, shape (count, 4)
+        A row for each needle; single precision, in steps of 2^-24.
+    """
+    block, skip = divmod(first, 2)
+    bits = np.random.Philox(key=seed, counter=[block, step, purpose, 0])
+    rows = np.random.Generator(bits).random((count + skip, PER_NEEDLE), dtype=np.float32)
+    return rows[skip:]
+
+
+def quantile_levels(numbers: NDArray[np.float32]) -> FloatArray:
+    """Return uniform numbers as levels at which a distribution has finite quantiles.
+
+    That is the middle of each of the 2^24 steps that a number has: 0 would be infinitely far off.
+    """
+    return np.asarray(numbers.astype(np.float64) + 0.5**25)
+
+
+def normal_numbers(numbers: NDArray[np.float32]) -> FloatArray:
+    """Return normal numbers of variance 1 from as many uniform ones."""
+    return np.asarray(scipy.special.ndtri(quantile_levels(numbers)))
+
+
+def random_directions(numbers: NDArray[np.float32]) -> FloatArray:
+    """Return unit vectors, uniform on the sphere, from the first two of some uniform numbers."""
+    share = numbers.astype(np.float64)
+    up = 2.0 * share[:, 0] - 1.0
+    across = np.sqrt(1.0 - up * up)
+    around = 2.0 * np.pi * share[:, 1]
+    return np.stack([across * np.cos(around), across * np.sin(around), up], axis=-1)
+
 
 Insertion = TypeVar("Insertion", float, FloatArray)
 """Of all needles, or of each."""
@@ -129,9 +187,9 @@ def measured(
         lasting = disturbances.noise_lasting
         seen[:] = tips + disturbances.noise * _normal_errors(lasting, seed, exposure, first, count)
     else:
-        share = study_noise.uniform(seed, study_noise.NOISE, exposure, first, count)
+        share = uniform_numbers(seed, NOISE, exposure, first, count)
         if disturbances.noise_shape == "student":
-            level = study_noise.quantile_levels(share[:, :3])
+            level = quantile_levels(share[:, :3])
             errors = scipy.special.stdtrit(disturbances.degrees_of_freedom, level)
             seen[:] = tips + disturbances.noise * errors
         else:
@@ -139,25 +197,25 @@ def measured(
     if exposure == 0:
         return seen
     if disturbances.outliers > 0.0:
-        chance = study_noise.uniform(seed, study_noise.OUTLIER, exposure, first, count)[:, 0]
+        chance = uniform_numbers(seed, OUTLIER, exposure, first, count)[:, 0]
         off = tips + _outliers(disturbances.outlier_size, seed, exposure, first, count)
         seen = np.where((chance < disturbances.outliers)[:, np.newaxis], off, seen)
     if disturbances.found < 1.0:
-        chance = study_noise.uniform(seed, study_noise.MISSED, exposure, first, count)[:, 0]
+        chance = uniform_numbers(seed, MISSED, exposure, first, count)[:, 0]
         seen[chance < 1.0 - disturbances.found] = np.nan
     return seen
 
 
 def patch_factors(patches: float, seed: int, patch: int, first: int, count: int) -> FloatArray:
     """Return what multiplies each needle's curvature in one patch, (count,), in 1 +- patches."""
-    share = study_noise.uniform(seed, study_noise.CURVATURE, patch, first, count)[:, 0]
+    share = uniform_numbers(seed, CURVATURE, patch, first, count)[:, 0]
     return np.asarray(1.0 + patches * (2.0 * share.astype(np.float64) - 1.0))
 
 
 def bumps(distance: float, seed: int, first: int, count: int) -> FloatArray:
     """Return by what the phantom of each needle is moved, (count, 3) [m]."""
-    share = study_noise.uniform(seed, study_noise.BUMP, 0, first, count)
-    return np.asarray(distance * study_noise.directions(share))
+    share = uniform_numbers(seed, BUMP, 0, first, count)
+    return np.asarray(distance * random_directions(share))
 
 
 def push_axes(push: float, seed: int, first: int, count: int) -> FloatArray:
@@ -165,14 +223,14 @@ def push_axes(push: float, seed: int, first: int, count: int) -> FloatArray:
 
     It turns a heading along z towards a direction across z, uniform in angle.
     """
-    around = 2.0 * np.pi * study_noise.uniform(seed, study_noise.PUSH, 0, first, count)[:, 0]
+    around = 2.0 * np.pi * uniform_numbers(seed, PUSH, 0, first, count)[:, 0]
     return np.asarray(push * np.stack([-np.sin(around), np.cos(around), 0.0 * around], axis=-1))
 
 
 def roll_steps(spread: float, seed: int, step: int, first: int, count: int) -> FloatArray:
     """Return by what each tip turns by itself in a step, (count,) [rad], normal."""
-    share = study_noise.uniform(seed, study_noise.ROLL, step, first, count)[:, 0]
-    return spread * study_noise.normal(share)
+    share = uniform_numbers(seed, ROLL, step, first, count)[:, 0]
+    return spread * normal_numbers(share)
 
 
 class BiasWalk:
@@ -192,14 +250,14 @@ class BiasWalk:
     def __init__(self, largest: float, seed: int, first: int, count: int) -> None:
         self._largest = largest
         self._key = seed, first, count
-        share = study_noise.uniform(seed, study_noise.BIAS, 0, first, count)[:, :3]
+        share = uniform_numbers(seed, BIAS, 0, first, count)[:, :3]
         self._bias: FloatArray = largest * (2.0 * share.astype(np.float64) - 1.0)
 
     def at(self, exposure: int) -> FloatArray:
         """Return the bias of an exposure, (count, 3) [m]; called for 0, 1, 2 and so on."""
         if exposure > 0:
             seed, first, count = self._key
-            share = study_noise.uniform(seed, study_noise.BIAS, exposure, first, count)[:, :3]
+            share = uniform_numbers(seed, BIAS, exposure, first, count)[:, :3]
             walked = self._bias + 0.1 * self._largest * np.where(share < 0.5, -1.0, 1.0)
             over = np.maximum(np.abs(walked) - self._largest, 0.0)
             self._bias = walked - 2.0 * np.copysign(over, walked)
@@ -266,16 +324,16 @@ def _normal_errors(lasting: float, seed: int, exposure: int, first: int, count: 
             break
         # The first is as large as all others together.
         left *= 1.0 if back == exposure else math.sqrt(1.0 - lasting * lasting)
-        share = study_noise.uniform(seed, study_noise.NOISE, exposure - back, first, count)
-        errors += left * study_noise.normal(share[:, :3])
+        share = uniform_numbers(seed, NOISE, exposure - back, first, count)
+        errors += left * normal_numbers(share[:, :3])
     return errors
 
 
 def _outliers(
     size: tuple[float, float], seed: int, exposure: int, first: int, count: int
 ) -> FloatArray:
-    share = study_noise.uniform(seed, study_noise.OUTLIER_DIRECTION, exposure, first, count)
+    share = uniform_numbers(seed, OUTLIER_DIRECTION, exposure, first, count)
     low, high = size
     return np.asarray(
-        study_noise.directions(share) * (low + (high - low) * share[:, 2:3].astype(np.float64))
+        random_directions(share) * (low + (high - low) * share[:, 2:3].astype(np.float64))
     )

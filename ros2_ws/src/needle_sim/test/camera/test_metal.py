@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from needle_sim.camera.metal import mirrored, place_lamp
-from needle_sim.camera.projection import project
+from needle_sim.camera.lighting import mirrored, place_lamp
+from needle_sim.camera.optics import project
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import Metal
 from needle_sim.camera.stereo_rig import StereoRig

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from needle_sim.camera.projection import project, refraction_point
-from needle_sim.camera.stereo_rig import StereoRig
-from needle_sim.camera.window import SimulatedWindow
+from needle_sim.camera.optics import project, refraction_point
+from needle_sim.camera.stereo_rig import SimulatedWindow, StereoRig
 
 HEIGHT = 0.0175
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from needle_core.errors import OutOfBoundsError, UserError
-from needle_sim.camera.projection import project
+from needle_sim.camera.optics import project
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import CLEAN, Scenario
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig

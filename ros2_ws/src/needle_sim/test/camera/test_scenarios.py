@@ -11,9 +11,8 @@ import pytest
 from scipy.optimize import fsolve
 
 from needle_core.errors import UserError
-from needle_sim.camera.optics import Optics
-from needle_sim.camera.passing import Event, event_at
-from needle_sim.camera.projection import project
+from needle_sim.camera.clutter import Event, event_at
+from needle_sim.camera.optics import Optics, project
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import (
     CLEAN,
@@ -24,8 +23,12 @@ from needle_sim.camera.scenarios import (
     Occlusion,
     find_scenario,
 )
-from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
-from needle_sim.camera.window import SimulatedWindow
+from needle_sim.camera.stereo_rig import (
+    SimulatedCamera,
+    SimulatedWindow,
+    StereoRig,
+    load_stereo_rig,
+)
 from needle_sim.needle.needle_shape import NeedleShape
 
 from .scenes import STILL, TOP_AND_SIDE, needle, render, small, taken

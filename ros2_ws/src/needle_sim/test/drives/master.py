@@ -8,8 +8,8 @@ from typing import Any
 import canopen
 
 from needle_core.can_frame import CanFrame
+from needle_sim.drives.cia402 import SERVO, STEPPER
 from needle_sim.drives.drive_motion import LimitAction
-from needle_sim.drives.drive_objects import SERVO, STEPPER
 from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.motor import MotorSettings

@@ -8,8 +8,8 @@ import canopen
 import pytest
 
 from needle_sim.bus.object_dictionary import Abort
+from needle_sim.drives.cia402 import PowerState, next_state
 from needle_sim.drives.drive_motion import LimitAction
-from needle_sim.drives.power_state import PowerState, next_state
 
 from .master import CSP, INSERTION, MASTER, PP, ROTATION, Master
 

@@ -12,8 +12,7 @@ import pytest
 
 from needle_core.can_frame import CanFrame
 from needle_core.errors import UserError
-from needle_sim.bus.pty_can import PtyCan
-from needle_sim.bus.pty_port import PtyPort
+from needle_sim.bus.pty_can import PtyCan, PtyPort
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from needle_sim.path_traced.appearance import (
     RANDOM,
     draw_appearance,
 )
-from needle_sim.path_traced.sensor import flicker, grey_image
+from needle_sim.path_traced.renderer import flicker, grey_image
 
 
 def test_a_name_fixes_what_it_says_and_the_seed_draws_the_rest_so_that_all_of_it_comes() -> None:

@@ -10,15 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_sim.camera.projection import project
+from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
 from needle_sim.path_traced import insertion
 from needle_sim.path_traced.appearance import LAMPS, RANDOM, draw_appearance
-from needle_sim.path_traced.block import backdrop, refractive_index
 from needle_sim.path_traced.floors import FloorPicture
-from needle_sim.path_traced.lamps import MIDDLE, apparent_centre, place_lamps
 from needle_sim.path_traced.needle_mesh import NeedleEnd, needle_mesh
-from needle_sim.path_traced.refracted_rays import refracted_rays
+from needle_sim.path_traced.path_tracing import refracted_rays
+from needle_sim.path_traced.world import (
+    MIDDLE,
+    apparent_centre,
+    backdrop,
+    place_lamps,
+    refractive_index,
+)
 from needle_sim.sequences.boxes import draw_box
 
 CALIBRATION = Path(__file__).parents[3] / "needle_tracker" / "config" / "calibration.yaml"

@@ -7,8 +7,8 @@ import pytest
 
 from needle_bringup.studies.study_controllers import controller_factory
 from needle_sim.studies.disturbances import Disturbances, measured
-from needle_sim.studies.needle_batch import NeedleBatch
-from needle_sim.studies.rrt_replanning import plan
+from needle_sim.studies.needles import NeedleBatch
+from needle_sim.studies.reference_laws import plan
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -7,8 +7,9 @@ import pytest
 from scipy import stats
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies import study_noise
 from needle_sim.studies.disturbances import (
+    CURVATURE,
+    NOISE,
     BiasWalk,
     DelayLine,
     Disturbances,
@@ -17,6 +18,7 @@ from needle_sim.studies.disturbances import (
     patch_factors,
     push_axes,
     roll_steps,
+    uniform_numbers,
 )
 
 COUNT = 4000
@@ -147,8 +149,8 @@ def test_a_late_measurement_comes_with_its_age(steps: int) -> None:
 
 def test_a_needle_s_numbers_do_not_depend_on_its_company() -> None:
     for first in (40, 41):
-        for purpose in (study_noise.NOISE, study_noise.CURVATURE):
-            whole = study_noise.uniform(3, purpose, 7, 0, 100)
-            some = study_noise.uniform(3, purpose, 7, first, 5)
+        for purpose in (NOISE, CURVATURE):
+            whole = uniform_numbers(3, purpose, 7, 0, 100)
+            some = uniform_numbers(3, purpose, 7, first, 5)
             np.testing.assert_array_equal(some, whole[first : first + 5])
     np.testing.assert_array_equal(bumps(0.002, 1, 40, 5), bumps(0.002, 1, 0, 100)[40:45])

@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import Belief, BeliefTally, doubted
-from needle_sim.studies.figures_of_merit import Outcomes, Tally, figures, joined, trusted_far_off
+from needle_sim.studies.figures_of_merit import (
+    Belief,
+    BeliefTally,
+    Outcomes,
+    Tally,
+    doubted,
+    figures,
+    joined,
+    trusted_far_off,
+)
 
 
 def outcomes(*paths: FloatArray, turns: float = 0.0) -> Outcomes:

@@ -5,7 +5,7 @@ import pytest
 
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.tissue import Torsion
-from needle_sim.studies.needle_batch import NeedleBatch
+from needle_sim.studies.needles import NeedleBatch
 
 
 # Up to 2 rad a step: both the series and the closed form beyond it.

@@ -12,20 +12,20 @@ from needle_bringup.studies.study_controllers import (
     point_controller_factory,
 )
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import Belief
 from needle_sim.studies.disturbances import Disturbances
-from needle_sim.studies.point_study import point_figures, run_point_study
-from needle_sim.studies.point_targets import (
+from needle_sim.studies.figures_of_merit import Belief
+from needle_sim.studies.point_study import (
     BREATHING_RATE,
     CURVATURE_SHARE,
     FARTHEST,
     INSERTION_SPEED,
     NEAREST,
     MovingTargets,
+    point_figures,
     random_targets,
+    run_point_study,
 )
-from needle_sim.studies.start_grids import GRIDS, StartBounds
-from needle_sim.studies.study import StudySettings
+from needle_sim.studies.study import GRIDS, StartBounds, StudySettings
 
 STARTS = GRIDS["random"](StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)), 1, 4)
 STRAIGHT = StudySettings(1e-6, 0.150, STEP_LENGTH, Disturbances(), seed=1)

@@ -9,8 +9,7 @@ import pytest
 
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.rrt_replanning import DutyCycle, is_clear, plan
-from needle_sim.studies.sliding_mode import sliding_mode_rate
+from needle_sim.studies.reference_laws import DutyCycle, is_clear, plan, sliding_mode_rate
 
 CURVATURE = 1.0 / 0.122
 RATE = np.deg2rad(30.0) / 0.001

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_sim.studies.start_grids import GRIDS, StartBounds
+from needle_sim.studies.study import GRIDS, StartBounds
 
 LARGEST = np.array([0.003, np.deg2rad(10.0), np.deg2rad(30.0)])
 BOUNDS = StartBounds(*LARGEST)

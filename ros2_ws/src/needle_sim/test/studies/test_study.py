@@ -9,12 +9,10 @@ import scipy.linalg
 
 from needle_bringup.studies.study_controllers import CURVATURE, STEP_LENGTH, controller_factory
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import Belief
 from needle_sim.studies.disturbances import BiasWalk, Disturbances, push_axes
-from needle_sim.studies.disturbed_needles import DisturbedNeedles
-from needle_sim.studies.figures_of_merit import Outcomes, figures
-from needle_sim.studies.start_grids import GRIDS, StartBounds
-from needle_sim.studies.study import StudySettings, run_study
+from needle_sim.studies.figures_of_merit import Belief, Outcomes, figures
+from needle_sim.studies.needles import DisturbedNeedles
+from needle_sim.studies.study import GRIDS, StartBounds, StudySettings, run_study
 
 STARTS = GRIDS["random"](StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)), 1, 4)[:20]
 # Rolled by 90 deg, a needle bends within one plane.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from needle_sim.camera.projection import project
+from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
 from needle_tracker.calibrating.calibration_session import Place
 from needle_tracker.calibrating.charuco import CharucoBoard

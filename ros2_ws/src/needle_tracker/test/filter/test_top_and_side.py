@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from needle_sim.camera.insertions import render_insertion
-from needle_sim.camera.projection import project
+from needle_sim.camera.optics import project
 from needle_sim.camera.scenarios import find_scenario
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_tracker.answers.tracker_parameters import default_settings

@@ -1,23 +1,33 @@
-"""The published planner that planned paths are held against: RRT, planned anew at every step.
+"""Published laws that serve as references: sliding mode control and RRT replanning."""
 
-S. Patil, R. Alterovitz, "Interactive motion planning for steerable needles in 3D environments with
-obstacles" (BioRob 2010); G. J. Vrooijink et al., "Needle path planning and steering in a
-three-dimensional non-static environment using two-dimensional ultrasound images" (IJRR 2014). A
-tree of arcs, each of any curvature up to the needle's, grows to random points; a point is joined to
-the nearest node from which such an arc leads there (reachability-guided sampling). Curvatures below
-the needle's own are made by spinning it part of the way (duty cycle).
-"""
-
-# Compiled code takes keywords slowly or not at all.
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from needle_core.compiled import compiled
 from needle_sim.needle.se3 import FloatArray
+
+
+def sliding_mode_rate(target: ArrayLike, largest_rate: float) -> FloatArray:
+    """Return the rotation of the base per inserted length, (...) [rad/m].
+
+    Parameters
+    ----------
+    target : array_like, shape (..., 3)
+        In the tip's frame, whose z is the heading and to whose -y the needle bends [m].
+    largest_rate : float
+        What it turns at [rad/m].
+    """
+    x, y, _ = np.moveaxis(np.asarray(target, dtype=float), -1, 0)
+    return np.asarray(largest_rate * np.sign(np.arctan2(x, -y)))
+
+
+# Compiled code takes keywords slowly or not at all.
+# ruff: noqa: PLR0917
+
 
 SAMPLES = 400
 """Random points of a plan."""
