@@ -22,8 +22,8 @@ from needle_core.component import Actions, Moment, Publish
 from needle_core.convert import from_ros
 from needle_core.messages import Image, JointState, Pose
 from needle_core.rotations import quaternion_from_rotation
-from needle_sim.camera_sensor import CameraSensor
-from needle_sim.rig.bench import SimulatedBench
+from needle_sim.cameras import CameraSensor
+from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import calibration_from

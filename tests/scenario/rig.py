@@ -24,8 +24,7 @@ from needle_core.runners.virtual import LOG, VirtualRunner
 from needle_device_driver.device import HOLD
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.parameters import DeviceDriverParameters
-from needle_sim.drive_emulator import DriveEmulator
-from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+from needle_sim.drive_emulator import DriveEmulator, DriveEmulatorParameters
 from scenario.faults import CONSOLE, PAGE, RECORDER
 from scenario.link_faults import LinkFaults
 from scenario.parts.bench import ANSWER, TIP_NOISE, Bench, TrackerStandIn

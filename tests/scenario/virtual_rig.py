@@ -29,8 +29,7 @@ from needle_core.runners.virtual import VirtualRunner
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.parameters import DeviceDriverParameters
-from needle_sim.drive_emulator import POSITIONS, DriveEmulator
-from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+from needle_sim.drive_emulator import POSITIONS, DriveEmulator, DriveEmulatorParameters
 
 FASTEST = 0.005
 """Of a driven needle [m/s]."""

@@ -45,7 +45,7 @@ from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
 from needle_sim.bus.pty_can import PtyPort
-from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+from needle_sim.drive_emulator import DriveEmulatorParameters
 from needle_sim.drives.emulated_bus import EmulatedBus
 
 PERIOD = 0.02

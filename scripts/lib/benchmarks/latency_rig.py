@@ -24,7 +24,7 @@ from needle_core.errors import UserError
 from needle_core.message_types import NANOSECONDS, rclpy_types
 from needle_core.ros.conversions import IMAGES, to_nanoseconds
 from needle_sim.camera.stereo_rig import load_stereo_rig
-from needle_sim.camera_sensor import camera_info_message, image_message
+from needle_sim.cameras import camera_info_message, image_message
 
 IMAGES_FILE, INSERTIONS_FILE = "images.npy", "insertions.npy"
 _PERIOD = 1.0 / 30.0

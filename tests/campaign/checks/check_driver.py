@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from campaign.checking import Check, Finding, Workbench, in_own_process
-from needle_sim.drive_emulator_parameters import COUNTS_PER_RADIAN, DriveEmulatorParameters
+from needle_sim.drive_emulator import COUNTS_PER_RADIAN, DriveEmulatorParameters
 from scenario.faults import Fault, Kind
 from scenario.process_run import PARTS, run_processes
 from scenario.rig_run import RunResult

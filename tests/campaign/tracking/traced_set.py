@@ -155,7 +155,7 @@ def _traced(calibration: Path, scene: TracedScene) -> dict[str, NDArray[np.gener
         "pairs": np.stack([np.stack(pair.images) for pair in pairs]),
         "insertions": np.array([pair.insertion for pair in pairs]),
         "tips": np.stack([nowhere if pair.truth is None else pair.truth.tip for pair in pairs]),
-        "seen": np.array([pair.share_seen for pair in pairs]),
+        "seen": np.array([pair.visible_share for pair in pairs]),
     }
 
 

@@ -84,7 +84,7 @@ def insertion_sequence(
         pose = np.asarray(plant.T_rig_tip)
         path = plant.centreline(SPACING)
         left, right = renderer.render(pose, path, number)
-        seen = renderer.share_seen(pose, path, number)
+        seen = renderer.visible_share(pose, path, number)
         yield Exposure(STEP * (number + 1), pose, left, right, seen)
 
 

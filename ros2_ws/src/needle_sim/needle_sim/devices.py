@@ -3,104 +3,191 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 from needle_core import messages as m
 from needle_core.component import Actions, Input, Moment, Output, Peers, Publish, Service
+from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
 from needle_device_driver.device import EMERGENCY_STOP, DeviceRows
-from needle_device_driver.procedure import run_at_once
+from needle_device_driver.procedure import Procedure, run_at_once
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
-from needle_sim.rig.bench import SimulatedBench
-from needle_sim.rig.simulated_axis import SimulatedAxis
+from needle_sim.needle.bench import SimulatedBench
 
 CYCLE = 0.02
 """Period of the axes' set-points [s]."""
 
 
-class Device(Protocol):
-    """A device that moves the bench.
+class SimulatedAxis(Axis):
+    """Ideal axis: it moves exactly at the commanded speed, in the time given by `advance`.
 
-    Attributes
+    Parameters
     ----------
-    inputs, outputs, services : sequences of rows
-        What it adds to the rig's component.
+    name : str
+        Name of the axis in errors.
+    position : float
+        Initial position, relative to the home switch [m or rad].
     """
 
-    inputs: Sequence[Input]
-    outputs: Sequence[Output]
-    services: Sequence[Service]
+    def __init__(self, name: str, position: float = 0.0) -> None:
+        self._name = name
+        self._position = position
+        self._target: float | None = None
+        self._speed = 0.0
+        self._velocity = 0.0
+        self._powered = False
+        self._homed = False
+        self._homing = False
+        self.fault = ""
 
-    def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note who else is a device here."""
+    @property
+    def position(self) -> float:
+        """True position of the axis [m or rad]."""
+        return self._position
 
-    def move(self, at: Moment) -> Actions:
-        """Let a cycle go by."""
+    def configure(self) -> Procedure[None]:
+        """Do nothing: an ideal axis needs no configuration."""
+        yield from ()
 
-    def report(self, at: Moment) -> Actions:
-        """Tell what came of the cycle."""
+    def power(self, on: bool) -> None:
+        """Switch power on or off, and drop the target."""
+        self.stop()
+        self._powered = on
 
-    def fail(self, why: str) -> Actions:
-        """Stop both axes for good."""
+    def home(self, speed: float) -> Procedure[None]:
+        """Move to position 0 at `speed`."""
+        yield from ()
+        self._require_power("home")
+        self._homed = self._position == 0.0
+        self._homing = not self._homed
+        self._target, self._speed = 0.0, speed
+
+    def start_move(self, target: float, speed: float) -> None:
+        """Start a motion to `target` at `speed`."""
+        self._require_power("move")
+        self._target, self._speed = target, speed
+
+    def stop(self) -> None:
+        """Stop at once."""
+        self._target = None
+        self._velocity = 0.0
+        self._homing = False
+
+    def reset(self) -> Procedure[None]:
+        """Clear the fault."""
+        yield from ()
+        self.fault = ""
+
+    def poll(self, now: float) -> AxisSnapshot:
+        """Return the state of the axis, always up to date."""
+        return AxisSnapshot(
+            time=now,
+            position=self._position,
+            set_point=self._position,
+            velocity=self._velocity,
+            powered=self._powered,
+            homed=self._homed,
+            moving=self._homing or self._target not in (None, self._position),
+            at_home_switch=self._position <= 0.0,
+            fault=self.fault,
+        )
+
+    def close(self) -> Procedure[None]:
+        """Switch power off."""
+        yield from ()
+        self.power(False)
+
+    def advance(self, period: float) -> None:
+        """Advance the motion by `period` [s]."""
+        if self._target is None or not self._powered or self.fault:
+            self._velocity = 0.0
+            return
+        before = self._position
+        distance = self._target - before
+        step = self._speed * period
+        # The tolerance prevents one more period for the rounding error of speed times period.
+        if abs(distance) <= step * (1.0 + 1e-9):
+            self._position = self._target
+        else:
+            self._position += step if distance > 0.0 else -step
+        self._velocity = (self._position - before) / period
+        if self._homing and self._position == 0.0:
+            self._homing = False
+            self._homed = True
+
+    def _require_power(self, command: str) -> None:
+        if not self._powered or self.fault:
+            why = self.fault or "not powered"
+            raise AxisError(f"{self._name} axis cannot {command}: {why}")
 
 
 class IdealDevice:
-    """Levels `tip` and `camera`: ideal axes behind the motion supervisor.
+    """Device of levels `tip` and `camera`: ideal axes behind the motion supervisor.
 
     Parameters
     ----------
     bench : SimulatedBench
-        What is moved.
+        Needle that the axes move.
     name : str
         Name of the component.
     limits : SafetyLimits
-        The supervisor's.
+        Limits of the motion supervisor.
+
+    Attributes
+    ----------
+    inputs, outputs, services : sequences of rows
+        Rows that the device adds to the rig's component.
     """
 
     def __init__(self, bench: SimulatedBench, name: str, limits: SafetyLimits) -> None:
         self._bench = bench
-        self._ended = ""
+        self._failure = ""
         self._axes = (SimulatedAxis("insertion"), SimulatedAxis("rotation"))
         self._supervisor = MotionSupervisor(*self._axes, limits)
         run_at_once(self._supervisor.configure(0.0))
-        self._rows = DeviceRows(self._supervisor, name, simulated=True, refuse=lambda: self._ended)
+        self._rows = DeviceRows(
+            self._supervisor, name, simulated=True, refuse=lambda: self._failure
+        )
         self.inputs: Sequence[Input] = self._rows.inputs
         self.outputs: Sequence[Output] = self._rows.outputs
         self.services: Sequence[Service] = self._rows.services
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note who else is a device here."""
+        """Check for other devices on the graph."""
         return self._rows.on_peers(peers, at)
 
-    def move(self, at: Moment) -> Actions:
-        """Move both axes to their set-points, and the needle with them."""
+    def move(self, at: Moment) -> None:
+        """Advance both axes by one cycle, and the needle with them."""
         self._supervisor.note_time(at.stamp_ns, at.steady)
         self._supervisor.drive(CYCLE, at.steady)
         for axis in self._axes:
             axis.advance(CYCLE)
         self._bench.move_to(*(axis.position for axis in self._axes))
-        return ()
 
     def report(self, at: Moment) -> Actions:
-        """Tell what came of the cycle."""
+        """Publish joint states and device status."""
         self._supervisor.observe(at.steady)
         yield from self._rows.joint_states(at)
         yield from self._rows.report(at)
 
     def fail(self, why: str) -> Actions:
-        """Stop both axes for good."""
-        self._ended = why
+        """Stop both axes permanently."""
+        self._failure = why
         self._supervisor.fail(why)
         return ()
 
 
-class DistantDevice:
-    """Level `drive`: the motors of drive_emulator move the needle, and nobody's word does.
+class MotorFollower:
+    """Device of level `drive`: the needle follows the motors of drive_emulator.
 
     Parameters
     ----------
     bench : SimulatedBench
-        What is moved.
+        Needle that the motors move.
+
+    Attributes
+    ----------
+    inputs, outputs, services : sequences of rows
+        Rows that the device adds to the rig's component.
     """
 
     def __init__(self, bench: SimulatedBench) -> None:
@@ -112,12 +199,11 @@ class DistantDevice:
         self.services: Sequence[Service] = ()
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Do nothing: this is no device for others."""
+        """Do nothing: the driver checks for other devices."""
         return ()
 
-    def move(self, at: Moment) -> Actions:
-        """Do nothing: the motors move by themselves."""
-        return ()
+    def move(self, at: Moment) -> None:
+        """Do nothing: the needle moves when motor positions arrive."""
 
     def report(self, at: Moment) -> Actions:
         """Do nothing: the driver reports."""
@@ -128,11 +214,6 @@ class DistantDevice:
         yield Publish(EMERGENCY_STOP, m.EmergencyStop(pressed=True))
 
     def _on_positions(self, message: m.JointState, at: Moment) -> Actions:
-        places = dict(zip(message.names, message.positions, strict=True))
-        self._bench.move_to(places[m.INSERTION_JOINT], places[m.ROTATION_JOINT])
+        positions = dict(zip(message.names, message.positions, strict=True))
+        self._bench.move_to(positions[m.INSERTION_JOINT], positions[m.ROTATION_JOINT])
         return ()
-
-
-def make_device(bench: SimulatedBench, name: str, *, level: str, limits: SafetyLimits) -> Device:
-    """Return the device of a level."""
-    return DistantDevice(bench) if level == "drive" else IdealDevice(bench, name, limits)

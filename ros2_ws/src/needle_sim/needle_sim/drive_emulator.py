@@ -1,7 +1,9 @@
-"""drive_emulator as a component: two CiA 402 drives behind a CAN port."""
+"""drive_emulator as a component: two CiA 402 drives behind a CAN port, and its parameters."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Sequence
 
 from needle_core import messages as m
@@ -20,9 +22,105 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.errors import UserError
-from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
-from needle_sim.drives.cia402 import PowerState
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
+from needle_sim.drives.cia402 import SERVO, STEPPER, PowerState
+from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.emulated_bus import EmulatedBus, bus_health, obey
+from needle_sim.drives.emulated_drive import EmulatedDriveSettings
+from needle_sim.drives.motor import MotorSettings
+
+# Encoder of the rotation axis: 16 bits a turn, no gear.
+COUNTS_PER_RADIAN = 65536.0 / (2.0 * math.pi)
+# Lead of the insertion axis' screw: its way in one turn of the motor [m].
+_LEAD = 0.001
+_LAST_NODE = 127
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveEmulatorParameters:
+    """Parameters of drive_emulator, fixed at start."""
+
+    pty: str = fixed_parameter(
+        "", "-", "Link to the serial port that appears; empty: the port's own name is logged."
+    )
+    limit_action: str = fixed_parameter(
+        LimitAction.CLAMP.value,
+        "-",
+        "What a drive does with a target beyond 0x607D once it is homed.",
+        choices=tuple(action.value for action in LimitAction),
+    )
+    rpm: bool = fixed_parameter(
+        False, "-", "Both drives take speeds in rpm and ramps in rpm/s, and say so (0x60A9)."
+    )
+    boot_time: float = fixed_parameter(0.5, "s", "From power-up to the boot-up message.", 0.0, 60.0)
+    insertion_node_id: int = fixed_parameter(1, "-", "Of the stepper drive.", 1, _LAST_NODE)
+    insertion_counts_per_unit: float = fixed_parameter(
+        2.0e7, "1/m", "Position counts of the insertion axis.", 1.0, 1e12
+    )
+    insertion_max_speed: float = fixed_parameter(
+        0.01, "m/s", "Fastest that the insertion motor can go.", 1e-6, 1.0
+    )
+    insertion_lag: float = fixed_parameter(
+        0.0, "s", "Time constant with which the insertion motor follows its drive.", 0.0, 1.0
+    )
+    insertion_start: float = fixed_parameter(
+        0.0, "m", "Where the insertion axis stands at power-up, from its home switch.", -0.003, 1.0
+    )
+    insertion_travel: float = fixed_parameter(
+        0.25, "m", "From the home switch to the other limit switch.", 0.001, 2.0
+    )
+    rotation_node_id: int = fixed_parameter(2, "-", "Of the servo drive.", 1, _LAST_NODE)
+    rotation_counts_per_unit: float = fixed_parameter(
+        COUNTS_PER_RADIAN, "1/rad", "Position counts of the rotation axis.", 1.0, 1e12
+    )
+    rotation_max_speed: float = fixed_parameter(
+        20.0, "rad/s", "Fastest that the rotation motor can go.", 1e-3, 1e4
+    )
+    rotation_lag: float = fixed_parameter(
+        0.005, "s", "Time constant with which the rotation motor follows its drive.", 0.0, 1.0
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be emulated.
+
+        Raises
+        ------
+        UserError
+            A parameter out of bounds, two drives of one node id, two ways to the bus.
+        """
+        check_fields(self)
+        if self.insertion_node_id == self.rotation_node_id:
+            raise UserError(f"both drives have node id {self.insertion_node_id}")
+        if self.insertion_start > self.insertion_travel:
+            raise UserError(
+                f"insertion_start = {self.insertion_start:g} m is beyond insertion_travel = "
+                f"{self.insertion_travel:g} m"
+            )
+
+    @property
+    def insertion(self) -> EmulatedDriveSettings:
+        """The insertion axis: a stepper on a screw, with a limit switch at either end."""
+        scale = self.insertion_counts_per_unit
+        ends = {"start": self.insertion_start * scale, "travel": self.insertion_travel * scale}
+        return self._drive("insertion", STEPPER, _LEAD, **ends)
+
+    @property
+    def rotation(self) -> EmulatedDriveSettings:
+        """The rotation axis: a servo that turns without end."""
+        return self._drive("rotation", SERVO, 2.0 * math.pi)
+
+    def _drive(
+        self, axis: str, device_type: int, turn: float, **ends: float
+    ) -> EmulatedDriveSettings:
+        scale, node_id, max_speed, lag = (
+            getattr(self, f"{axis}_{name}")
+            for name in ("counts_per_unit", "node_id", "max_speed", "lag")
+        )
+        motor = MotorSettings(scale, max_speed * scale, lag, **ends)
+        action = LimitAction(self.limit_action)
+        rpm = scale * turn / 60.0 if self.rpm else None
+        return EmulatedDriveSettings(axis, node_id, device_type, motor, action, self.boot_time, rpm)
+
 
 POSITIONS = "sim/drive_positions"
 ADAPTER, COMMAND_LINES = "adapter", "command lines"

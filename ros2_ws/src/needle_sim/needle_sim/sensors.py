@@ -1,4 +1,4 @@
-"""Sensors of the simulated rig: what an exposure of the needle sends."""
+"""Sensors of the simulated rig: the messages that an exposure of the needle causes."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ from typing import Protocol
 
 from needle_core import messages as m
 from needle_core.component import Actions, Output, Port, Publish
-from needle_sim.rig.bench import SimulatedBench
+from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
 
 RIG = "rig"
-# A tip alone says nothing about the heading [rad^2].
+# A tip position does not determine the heading [rad^2].
 _UNKNOWN_ORIENTATION = 1e6
-# A variance of 0 would read as "not known" [m^2].
-_LEAST_POSITION_VARIANCE = 1e-12
+# A variance of 0 would mean "unknown" [m^2].
+_MIN_POSITION_VARIANCE = 1e-12
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 class Sensor(Protocol):
-    """A sensor that sees the needle.
+    """Sensor that measures the needle.
 
     Attributes
     ----------
     outputs : tuple of Output
-        What it sends.
+        Topics that it publishes.
     ports : tuple of Port
-        What it is wired to.
+        Ports that it uses.
     half_sizes : tuple of float
-        Ends of the phantom, either way, along x and y [m].
+        Distance from the needle axis to the phantom's faces, along x and y [m].
     """
 
     outputs: tuple[Output, ...]
@@ -39,18 +39,18 @@ class Sensor(Protocol):
         """Return the messages of an exposure."""
 
     def close(self) -> None:
-        """Complete what it writes."""
+        """Close the files that it writes."""
 
 
 class TipSensor:
-    """Level `tip`: the tip with uniform noise.
+    """Sensor of level `tip`: the tip position with uniform noise.
 
     Parameters
     ----------
     bench : SimulatedBench
-        What is measured.
+        Needle that is measured.
     settings : SimRigParameters
-        The rig's.
+        Parameters of the rig.
     """
 
     half_sizes = (math.inf, math.inf)
@@ -65,9 +65,9 @@ class TipSensor:
         )
 
     def expose(self, number: int, stamp_ns: int) -> Actions:
-        """Return the measured tip, with its covariance first."""
+        """Return the measured tip, first with its covariance."""
         x, y, z = (float(c) for c in self._bench.measure_tip(number))
-        variance = max(self._noise**2 / 3.0, _LEAST_POSITION_VARIANCE)
+        variance = max(self._noise**2 / 3.0, _MIN_POSITION_VARIANCE)
         covariance = [0.0] * 36
         covariance[::7] = [variance] * 3 + [_UNKNOWN_ORIENTATION] * 3
         pose = m.PoseWithCovariance(stamp_ns, RIG, (x, y, z), _UPRIGHT, tuple(covariance))
@@ -75,14 +75,14 @@ class TipSensor:
         yield Publish("needle/tip", m.Point(stamp_ns, RIG, (x, y, z)))
 
     def close(self) -> None:
-        """Do nothing: nothing is open."""
+        """Do nothing: no file is open."""
 
 
 def make_sensor(bench: SimulatedBench, settings: SimRigParameters) -> Sensor:
-    """Return the sensor of a level."""
+    """Return the sensor of the level that the settings name."""
     if settings.level == "tip":
         return TipSensor(bench, settings)
-    # The renderer takes longer to load than all else: not where nothing is drawn.
-    from needle_sim.camera_sensor import CameraSensor  # noqa: PLC0415
+    # Loading the renderer takes long, and level tip does not need it.
+    from needle_sim.cameras import CameraSensor  # noqa: PLC0415
 
     return CameraSensor(bench, settings)

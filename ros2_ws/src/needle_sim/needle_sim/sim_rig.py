@@ -1,4 +1,4 @@
-"""sim_rig as a component: stands in for the rig behind the same topics and services."""
+"""sim_rig as a component: simulates the rig behind the topics and services of the real one."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from needle_core.component import (
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.rotations import quaternion_from_rotation
 from needle_core.status_messages import ControllerStatus
-from needle_sim.devices import CYCLE, make_device
-from needle_sim.rig.bench import SimulatedBench
+from needle_sim.devices import CYCLE, IdealDevice, MotorFollower
+from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sensors import RIG, Sensor, make_sensor
 from needle_sim.sim_rig_parameters import SimRigParameters
 
 _IDLE_EXPOSURE_PERIOD = 1.0
-"""A needle that nobody waits for is exposed so often [s]."""
+"""Time between exposures while the controller does not wait for a tip [s]."""
 
 
 class SimRig(Component):
-    """The simulated rig: the needle, what moves it, and what sees it.
+    """Simulated rig: the needle, a device that moves it, and a sensor that measures it.
 
     Parameters
     ----------
     settings : SimRigParameters
-        The node's parameters.
+        Parameters of the node.
     name : str
         Full name of the node.
-    see : callable
-        Makes what sees the needle, of bench and settings.
+    new_sensor : callable
+        Returns the sensor for a bench and settings.
     now : float
         Steady time [s].
     """
@@ -53,7 +53,7 @@ class SimRig(Component):
         self,
         settings: SimRigParameters,
         name: str = name,
-        see: Callable[[SimulatedBench, SimRigParameters], Sensor] = make_sensor,
+        new_sensor: Callable[[SimulatedBench, SimRigParameters], Sensor] = make_sensor,
         now: float = 0.0,
     ) -> None:
         self.name, self.settings = name, settings
@@ -66,14 +66,16 @@ class SimRig(Component):
             tip_noise=settings.tip_noise,
             seed=settings.seed,
         )
-        self._device = make_device(
-            self._bench, self.name, level=settings.level, limits=settings.limits
-        )
-        self._sensor = see(self._bench, settings)
-        self._ended = ""
-        self._is_tip_wanted = False
+        self._device: IdealDevice | MotorFollower
+        if settings.level == "drive":
+            self._device = MotorFollower(self._bench)
+        else:
+            self._device = IdealDevice(self._bench, name, settings.limits)
+        self._sensor = new_sensor(self._bench, settings)
+        self._failure = ""
+        self._is_tip_awaited = False
         self._exposures = 0
-        self._exposed_at = self._begun = now
+        self._exposed_at = self._started_at = now
         status = Input("needle/controller_status", ControllerStatus, self._on_controller, LATCHED)
         self.inputs = (*self._device.inputs, status)
         self.outputs = (
@@ -88,59 +90,59 @@ class SimRig(Component):
         )
 
     def close(self) -> None:
-        """Complete what the cameras write."""
+        """Close the files that the sensor writes."""
         self._sensor.close()
 
     def on_stop(self, at: Moment) -> Actions:
-        """Complete what the cameras write, and exit."""
+        """Close the files that the sensor writes, and exit."""
         self.close()
         yield Exit(EXIT_DONE)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note who else is a device here."""
+        """Check for other devices on the graph."""
         return self._device.on_peers(peers, at)
 
     def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
         is_continuous = message.insertion == "continuous"
-        is_steered = message.state in ("STEERING", "WAITING_FOR_TIP")
-        self._is_tip_wanted = message.awaiting == "tip" or (is_continuous and is_steered)
+        is_steering = message.state in ("STEERING", "WAITING_FOR_TIP")
+        self._is_tip_awaited = message.awaiting == "tip" or (is_continuous and is_steering)
         return ()
 
     def _cycle(self, at: Moment) -> Actions:
-        yield from self._device.move(at)
-        yield from self._end_outside_phantom()
+        self._device.move(at)
+        yield from self._fail_outside_phantom()
         yield from self._device.report(at)
 
     def _expose_if_due(self, at: Moment) -> Actions:
-        if self._ended:
+        if self._failure:
             return
-        if self._is_tip_wanted or at.steady - self._exposed_at >= _IDLE_EXPOSURE_PERIOD:
+        if self._is_tip_awaited or at.steady - self._exposed_at >= _IDLE_EXPOSURE_PERIOD:
             yield from self._expose(at)
 
     def _expose(self, at: Moment) -> Actions:
         number = self._exposures
         self._exposures += 1
         self._exposed_at = at.steady
-        yield Publish("sim/tip_pose", self._truth(at.stamp_ns))
+        yield Publish("sim/tip_pose", self._true_pose(at.stamp_ns))
         yield from self._sensor.expose(number, at.stamp_ns)
         values = {
             "exposures": str(self._exposures),
-            "simulated_s": f"{at.steady - self._begun:.2f}",
+            "simulated_s": f"{at.steady - self._started_at:.2f}",
         }
         yield Diagnose("simulation", Diagnostic(Level.OK, "running", values))
 
-    def _truth(self, stamp_ns: int) -> m.Pose:
+    def _true_pose(self, stamp_ns: int) -> m.Pose:
         T_rig_tip = self._bench.plant.T_rig_tip  # noqa: N806
         x, y, z = (float(c) for c in T_rig_tip[:3, 3])
         orientation = quaternion_from_rotation(T_rig_tip[:3, :3].tolist())
         return m.Pose(stamp_ns, RIG, (x, y, z), orientation)
 
-    def _end_outside_phantom(self) -> Actions:
+    def _fail_outside_phantom(self) -> Actions:
         for axis, place, end in zip("xy", self._bench.tip, self._sensor.half_sizes, strict=False):
-            if abs(place) > end and not self._ended:
-                self._ended = (
+            if abs(place) > end and not self._failure:
+                self._failure = (
                     f"the tip left the phantom: {axis} = {place * 1e3:.2f} mm is beyond "
                     f"{math.copysign(end, place) * 1e3:.2f} mm"
                 )
-                yield from self._device.fail(self._ended)
-                yield Diagnose("simulation", Diagnostic(Level.ERROR, self._ended))
+                yield from self._device.fail(self._failure)
+                yield Diagnose("simulation", Diagnostic(Level.ERROR, self._failure))

@@ -93,9 +93,9 @@ def _make_rig(parameters: Parameters) -> tuple[list[Component], dict[str, RealPo
         DistantTracker,
         EyesProcess,
     )
-    from needle_sim.camera_sensor import DistantCameras  # noqa: PLC0415
+    from needle_sim.cameras import RemoteCameras  # noqa: PLC0415
 
-    rig = make_rig(parameters, DistantCameras, lambda _: DistantTracker())
+    rig = make_rig(parameters, RemoteCameras, lambda _: DistantTracker())
     return rig, {EYES: EyesProcess(parameters)}
 
 

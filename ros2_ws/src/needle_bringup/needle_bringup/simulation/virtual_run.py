@@ -26,7 +26,7 @@ from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import Parameters
 from needle_core.status_messages import ControllerStatus
-from needle_sim.rig.bench import SimulatedBench
+from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sensors import Sensor, make_sensor
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
@@ -78,7 +78,7 @@ def make_rig(
     UserError
         A parameter that a component does not have, or that is out of its bounds.
     """
-    rig = SimRig(settings_of(SimRigParameters, parameters, "sim_rig"), see=see)
+    rig = SimRig(settings_of(SimRigParameters, parameters, "sim_rig"), new_sensor=see)
     level = rig.settings.level
     return [
         rig,
@@ -92,8 +92,10 @@ def _make_drives(parameters: Parameters) -> list[Component]:
     # Not where nothing is driven: both bring code along.
     from needle_device_driver.device_driver import DeviceDriver  # noqa: PLC0415
     from needle_device_driver.parameters import DeviceDriverParameters  # noqa: PLC0415
-    from needle_sim.drive_emulator import DriveEmulator  # noqa: PLC0415
-    from needle_sim.drive_emulator_parameters import DriveEmulatorParameters  # noqa: PLC0415
+    from needle_sim.drive_emulator import (  # noqa: PLC0415
+        DriveEmulator,
+        DriveEmulatorParameters,
+    )
 
     def settings(kind: type[Any], node: str, **own: str) -> Any:
         given = parameters.get(node, {}).items()

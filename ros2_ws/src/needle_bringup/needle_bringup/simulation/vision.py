@@ -29,7 +29,7 @@ from needle_core.component import (
 )
 from needle_core.process.worker import start_worker
 from needle_core.settings.parameter_files import Parameters
-from needle_sim.camera_sensor import CAMERAS, Exposure, StereoCameras
+from needle_sim.cameras import CAMERAS, Exposure, StereoCameras
 from needle_sim.sim_rig_parameters import SimRigParameters
 from needle_tracker.stereo_tracker import CALIBRATION, TIP, TIP_POSE
 

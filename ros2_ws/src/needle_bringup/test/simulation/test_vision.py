@@ -16,8 +16,8 @@ from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.vision import EYES, DistantTracker, Eyes, EyesProcess
 from needle_core import messages as m
 from needle_core.component import Action, Exit, Moment, PortChange, Publish, Send
-from needle_sim.camera_sensor import CAMERAS, Exposure
-from needle_sim.rig.bench import SimulatedBench
+from needle_sim.cameras import CAMERAS, Exposure
+from needle_sim.needle.bench import SimulatedBench
 
 PARAMETERS = command_line_parameters(parse(["--level", "camera"]), Path())
 STRAIGHT = {"pitch": 0.0, "roll": 0.0, "torsion_play": 0.0, "torsion_lag": 0.0, "tip_noise": 0.0}

@@ -106,7 +106,7 @@ class ImageFolder:
         images: tuple[GreyImage, GreyImage],
         insertion: float,
         truth: Truth | None,
-        share_seen: tuple[float, float],
+        visible_share: tuple[float, float],
         *,
         more: Sequence[float | str] = (),
     ) -> str:
@@ -122,7 +122,7 @@ class ImageFolder:
             What the stage says [m].
         truth : Truth or None
             None where there is no needle: empty fields.
-        share_seen : pair of float
+        visible_share : pair of float
             Of the needle's last 10 mm, by the left and the right camera.
         more : sequence of float or str
             For the further columns of truth.csv.
@@ -147,7 +147,7 @@ class ImageFolder:
             angles = (truth.pitch, truth.yaw, truth.shaft_pitch, truth.shaft_yaw)
             values = [*truth.tip.tolist(), *angles]
         self._add(self._insertions, name, [float(insertion)])
-        seen = [round(share, 3) for share in share_seen]
+        seen = [round(share, 3) for share in visible_share]
         self._add(self._truths, name, [*values, *seen, *more])
         return name
 

@@ -64,7 +64,7 @@ class RenderedPair:
         What the stage says [m].
     truth : Truth or None
         None where there is no needle in the phantom.
-    share_seen : pair of float
+    visible_share : pair of float
         Of the needle's last 10 mm, by the left and the right camera.
     """
 
@@ -72,7 +72,7 @@ class RenderedPair:
     images: tuple[GreyImage, GreyImage]
     insertion: float
     truth: Truth | None
-    share_seen: tuple[float, float]
+    visible_share: tuple[float, float]
 
 
 def random_path(
@@ -180,7 +180,7 @@ def render_insertion(
                 renderer.render(pose, line, number),
                 insertion,
                 truth_of(pose) if scenario.needle and insertion > 0.0 else None,
-                renderer.share_seen(pose, line, number),
+                renderer.visible_share(pose, line, number),
             )
 
     return pairs()

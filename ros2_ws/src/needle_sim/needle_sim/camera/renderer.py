@@ -135,7 +135,7 @@ class StereoRenderer:
         )
         return left, right
 
-    def share_seen(
+    def visible_share(
         self,
         T_rig_tip: ArrayLike,  # noqa: N803
         centreline: ArrayLike,
@@ -152,7 +152,7 @@ class StereoRenderer:
         left, right = (
             0.0
             if event is not None and event.covered and event.blocks[side]
-            else view.share_seen(distal, moment)
+            else view.visible_share(distal, moment)
             for side, view in enumerate(self._views)
         )
         return left, right

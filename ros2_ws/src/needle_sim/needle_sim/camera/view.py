@@ -176,7 +176,7 @@ class View:
         # Rounds and saturates.
         return np.asarray(cv2.convertScaleAbs(cv2.max(image, 0.0)), dtype=np.uint8)
 
-    def share_seen(self, points: FloatArray, moment: Moment) -> float:
+    def visible_share(self, points: FloatArray, moment: Moment) -> float:
         """Return the share of points (M, 3) in `rig` that are in the image and under no hand."""
         width, height = self._optics.image_size
         pixels = self._optics.project(points)

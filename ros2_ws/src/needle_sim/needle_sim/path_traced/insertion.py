@@ -47,7 +47,7 @@ class TracedPair:
     meshes : pair of NeedleMesh or None
         The needle that left and right saw, with its extreme point and the middle of its face; the
         right one is farther in where its camera exposes later.
-    share_seen : pair of float
+    visible_share : pair of float
         Of the needle's last 10 mm, by the left and the right camera.
     """
 
@@ -56,7 +56,7 @@ class TracedPair:
     insertion: float
     truth: Truth | None
     meshes: tuple[NeedleMesh, NeedleMesh] | None
-    share_seen: tuple[float, float]
+    visible_share: tuple[float, float]
 
 
 def trace_insertion(
@@ -127,7 +127,7 @@ def trace_insertion(
                     right = _mesh(later, look)
                 meshes = left, right
                 distal = [mesh.line[-int(_DISTAL_LENGTH / _SPACING) :] for mesh in meshes]
-                seen = (_share_seen(distal[0], optics[0]), _share_seen(distal[1], optics[1]))
+                seen = (_visible_share(distal[0], optics[0]), _visible_share(distal[1], optics[1]))
             images = renderer.render(meshes, number)
             yield TracedPair(number, images, insertion, truth, meshes, seen)
 
@@ -173,7 +173,7 @@ def _middle_line(plant: NeedlePlant, look: Appearance) -> FloatArray:
     return np.concatenate([line[0] + before * back, line])
 
 
-def _share_seen(points: FloatArray, optics: Optics) -> float:
+def _visible_share(points: FloatArray, optics: Optics) -> float:
     """Return the share of points (N, 3) in `rig` that are in a camera's image."""
     pixels = optics.project(points)
     seen = np.all((pixels >= 0.0) & (pixels <= np.subtract(optics.image_size, 1.0)), axis=1)

@@ -15,8 +15,7 @@ from needle_core.can_frame import CAN
 from needle_core.component import RealPort
 from needle_core.ros.main import run_component
 from needle_sim.bus.pty_can import PtyCan
-from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator
-from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator, DriveEmulatorParameters
 from needle_sim.drives.emulated_bus import COMMANDS, PlugOrder
 
 HELP = f"""\

@@ -1,4 +1,4 @@
-"""The `sim_rig` executable: stands in for the rig behind the same topics and services."""
+"""The `sim_rig` executable."""
 
 from __future__ import annotations
 
@@ -30,17 +30,16 @@ Services    levels tip and camera: device/{home,retract,stop,reset},
 def _make(settings: SimRigParameters, name: str) -> SimRig:
     if settings.level == "tip":
         return SimRig(settings, name, now=time.monotonic())
-    # The renderer takes longer to load than all else: not where nothing is drawn.
-    from needle_sim.rendering import RenderedCameras  # noqa: PLC0415
+    # Loading the renderer takes long, and level tip does not need it.
+    from needle_sim.cameras import PublishedRemoteCameras  # noqa: PLC0415
 
-    return SimRig(settings, name, RenderedCameras, time.monotonic())
+    return SimRig(settings, name, PublishedRemoteCameras, time.monotonic())
 
 
 def _ports(settings: SimRigParameters) -> Mapping[str, RealPort]:
     if settings.level == "tip":
         return {}
-    from needle_sim.camera_sensor import CAMERAS  # noqa: PLC0415
-    from needle_sim.rendering import RenderingProcess  # noqa: PLC0415
+    from needle_sim.cameras import CAMERAS, RenderingProcess  # noqa: PLC0415
 
     return {CAMERAS: RenderingProcess(settings)}
 

@@ -195,7 +195,7 @@ def _write(
             more: Sequence[float | str] = ()
             if isinstance(look, Appearance) and isinstance(pair, TracedPair):
                 more = truth_values(look, pair)
-            seen = pair.share_seen
+            seen = pair.visible_share
             folder.write(pair.number, pair.images, pair.insertion, pair.truth, seen, more=more)
             yield
 

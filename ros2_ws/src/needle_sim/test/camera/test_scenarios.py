@@ -186,7 +186,7 @@ def test_an_event_blocks_whom_it_says(
         event = Event(blocks, covered, 0.5)
         monkeypatch.setattr("needle_sim.camera.renderer.event_at", lambda *_, e=event: e)
         seen = tuple(float(not blocked) for blocked in blocks)
-        assert renderer.share_seen(pose, line, 0) == seen
+        assert renderer.visible_share(pose, line, 0) == seen
         empty = renderer.render(pose, np.zeros((1, 3)), 0)
         dark = taken(renderer.render(pose, line, 0), empty)
         for image, camera, blocked in zip(dark, cameras(rig), blocks, strict=True):

@@ -8,8 +8,7 @@ import pytest
 
 from needle_core.component import Action, Log, Moment, Send
 from needle_core.errors import UserError
-from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator
-from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator, DriveEmulatorParameters
 from needle_sim.drives.emulated_bus import EmulatedBus, PlugOrder
 
 AT = Moment(1.0, 1_000_000_000)

@@ -136,7 +136,7 @@ def test_an_insertion_is_the_empty_phantom_then_a_needle_that_stops_at_its_depth
     way: dict[str, Any] = {"frames": 4, "depth": 0.05, "step": 0.02, "begin": 0.01}
     pairs = list(insertion.trace_insertion(None, RIG, look, **way, empty_first=True))  # type: ignore[arg-type]
     assert [pair.number for pair in pairs] == [0, 1, 2, 3, 4]
-    assert (pairs[0].truth, pairs[0].meshes, pairs[0].share_seen) == (None, None, (0.0, 0.0))
+    assert (pairs[0].truth, pairs[0].meshes, pairs[0].visible_share) == (None, None, (0.0, 0.0))
     assert [pair.insertion for pair in pairs] == pytest.approx([0.0, 0.01, 0.03, 0.05, 0.05])
     for pair in pairs[1:]:
         assert pair.truth is not None

@@ -6,7 +6,7 @@ import pytest
 
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.procedure import run_at_once
-from needle_sim.rig.simulated_axis import SimulatedAxis
+from needle_sim.devices import SimulatedAxis
 
 PERIOD = 0.02
 

@@ -1,1 +1,0 @@
-"""The simulated bench and the time it runs on."""
