@@ -20,8 +20,7 @@ from needle_bags.reading.bag_order import messages_as_sent
 from needle_bags.reading.bag_reader import Run, read_run
 from needle_core.component import Actions, Moment, Publish
 from needle_core.convert import from_ros
-from needle_core.messages import Image, JointState, Pose
-from needle_core.rotations import quaternion_from_rotation
+from needle_core.messages import Image, JointState, Pose, quaternion_from_rotation
 from needle_sim.cameras import CameraSensor
 from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters

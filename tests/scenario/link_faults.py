@@ -7,7 +7,7 @@ import random
 from typing import Any
 
 from needle_core.can_frame import CAN
-from needle_core.runners.faults import Arrival, Arrivals, Link
+from needle_core.runners.transport import Arrival, Arrivals, Link
 from scenario.faults import BUS, PAGE_LINE, TOPICS
 
 # From sending what was lost to sending it again [s]: a reliable topic, and TCP.

@@ -22,7 +22,7 @@ from needle_core.convert import from_ros
 from needle_core.errors import UserError
 from needle_core.messages import HoldState
 from needle_core.process.ros_domain import own_domain
-from needle_core.ros.conversions import RELIABLE, to_qos, values_of
+from needle_core.ros.base_node import RELIABLE, to_qos, values_of
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.device import HOLDS
 from needle_device_driver.supervisor.limits import SafetyLimits

@@ -18,8 +18,8 @@ from needle_core.can_frame import CAN
 from needle_core.component import Component, Output
 from needle_core.errors import UserError
 from needle_core.messages import HoldState, LogLine
-from needle_core.runners.faults import Arrivals, Link
 from needle_core.runners.process import uniform
+from needle_core.runners.transport import Arrivals, Link
 from needle_core.runners.virtual import LOG, VirtualRunner
 from needle_device_driver.device import HOLD
 from needle_device_driver.device_driver import DeviceDriver

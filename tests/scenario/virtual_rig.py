@@ -23,8 +23,8 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.errors import UserError
-from needle_core.hold_session import HoldSession
-from needle_core.runners.faults import Fault
+from needle_core.messages import HoldSession
+from needle_core.runners.transport import Fault
 from needle_core.runners.virtual import VirtualRunner
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 from needle_device_driver.device_driver import DeviceDriver

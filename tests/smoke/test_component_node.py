@@ -43,7 +43,7 @@ from needle_core.component import (
 )
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import own_domain
-from needle_core.ros import conversions
+from needle_core.ros import base_node
 from needle_core.ros.component_node import ComponentNode
 from needle_core.ros.main import run_component
 from needle_core.settings.parameter_fields import check_fields, parameter
@@ -160,9 +160,9 @@ class Bench:
         self.health: dict[str, str] = {}
         self.hear("said")
         self.other.create_subscription(
-            DiagnosticArray, "/diagnostics", self._on_health, conversions.RELIABLE
+            DiagnosticArray, "/diagnostics", self._on_health, base_node.RELIABLE
         )
-        self.words = self.other.create_publisher(String, "word", conversions.RELIABLE)
+        self.words = self.other.create_publisher(String, "word", base_node.RELIABLE)
         self._executor = SingleThreadedExecutor(context=context)
         for node in (self.node, self.other):
             self._executor.add_node(node)
@@ -180,7 +180,7 @@ class Bench:
             parameter_overrides=given,
         )
 
-    def hear(self, topic: str, delivery: Any = conversions.RELIABLE) -> None:
+    def hear(self, topic: str, delivery: Any = base_node.RELIABLE) -> None:
         self.other.create_subscription(
             String, topic, lambda text: self.heard.append(text.data), delivery
         )
@@ -260,9 +260,9 @@ def test_services_ports_and_calls_are_answered(bench: Bench) -> None:
 
 def test_latched_messages_lazy_inputs_and_peers_and_a_qos_that_does_not_fit(bench: Bench) -> None:
     bench.say("keep")
-    bench.hear("echo/kept", conversions.LATCHED)
+    bench.hear("echo/kept", base_node.LATCHED)
     bench.until(lambda: "kept" in bench.heard)
-    whisper = bench.other.create_publisher(String, "whisper", conversions.RELIABLE)
+    whisper = bench.other.create_publisher(String, "whisper", base_node.RELIABLE)
     for word, listeners in (("listen", 1), ("leave", 0)):
         bench.say(word)
         bench.until(lambda n=listeners: whisper.get_subscription_count() == n)  # type: ignore[misc]
@@ -270,7 +270,7 @@ def test_latched_messages_lazy_inputs_and_peers_and_a_qos_that_does_not_fit(benc
     assert bench.node.peers.publishers["word"] == ("other",)
     assert "echo/later" in bench.node.peers.services
     assert {"echo", "other"} <= bench.node.peers.nodes
-    bench.other.create_publisher(String, "plan", conversions.RELIABLE)
+    bench.other.create_publisher(String, "plan", base_node.RELIABLE)
     bench.until(lambda: "--qos-durability transient_local" in bench.health.get("echo: input", ""))
 
 

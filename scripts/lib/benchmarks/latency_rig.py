@@ -21,8 +21,8 @@ from std_srvs.srv import Trigger
 from campaign.trials.rig_hand import CONTROLLER_START, RigHand
 from needle_core.convert import Converter
 from needle_core.errors import UserError
-from needle_core.message_types import NANOSECONDS, rclpy_types
-from needle_core.ros.conversions import IMAGES, to_nanoseconds
+from needle_core.message_types import NANOSECONDS, rclpy_types, to_nanoseconds
+from needle_core.ros.base_node import IMAGES
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.cameras import camera_info_message, image_message
 

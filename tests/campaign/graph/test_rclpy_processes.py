@@ -17,9 +17,8 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from needle_core.errors import UserError
-from needle_core.process.claim import Claim
 from needle_core.process.end_request import ENDING_SIGNALS
-from needle_core.process.ros_domain import FIRST_PARTICIPANT, own_domain, ports_of
+from needle_core.process.ros_domain import FIRST_PARTICIPANT, Claim, own_domain, ports_of
 from needle_core.process.shared_memory import SHARED_MEMORY
 from needle_core.process.worker import start_worker
 from needle_core.settings.parameter_files import values_for
@@ -29,7 +28,7 @@ def test_a_node_begins_where_the_maker_of_a_port_ended_half_way() -> None:
     code = """
 import sys
 from rclpy.node import Node
-from needle_core.ros.base_node import run_node
+from needle_core.ros.main import run_node
 node = lambda: Node("one")
 spin = lambda node, end: 7
 sys.exit(run_node(node, help_text="", parameters=object, args=["one"], spin=spin))
@@ -49,8 +48,8 @@ import sys
 import time
 from rclpy.node import Node
 from std_msgs.msg import String
-from needle_core.ros.base_node import run_node
-from needle_core.ros.conversions import RELIABLE
+from needle_core.ros.main import run_node
+from needle_core.ros.base_node import RELIABLE
 
 class Says(Node):
     def __init__(self):
@@ -78,8 +77,8 @@ import sys
 from rclpy.node import Node
 from std_msgs.msg import String
 from rclpy.executors import SingleThreadedExecutor
-from needle_core.ros.base_node import run_node
-from needle_core.ros.conversions import RELIABLE
+from needle_core.ros.main import run_node
+from needle_core.ros.base_node import RELIABLE
 
 def spin(node, end):
     heard = []
@@ -131,7 +130,7 @@ def test_a_node_goes_when_what_it_said_has_reached_a_subscriber_that_stood_still
 
 CLAIMS = """
 import sys
-from needle_core.process.claim import Claim
+from needle_core.process.ros_domain import Claim
 claim = Claim(sys.argv[1], "/first")
 print("has it", flush=True)
 sys.stdin.read()

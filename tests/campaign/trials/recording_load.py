@@ -24,9 +24,14 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
 from needle_core.process.reach import keep_to_this_machine
-from needle_core.ros.conversions import HOLD, IMAGES, JOINT_STATES, RELIABLE
-from needle_core.ros.node_names import subscribers_of
-from needle_core.ros.whole_node import WholeNode
+from needle_core.ros.base_node import (
+    HOLD,
+    IMAGES,
+    JOINT_STATES,
+    RELIABLE,
+    WholeNode,
+    subscribers_of,
+)
 
 # (topic, type, rate [Hz], quality of service)
 STREAMS: Final = (

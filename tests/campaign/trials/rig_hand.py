@@ -17,12 +17,17 @@ from std_srvs.srv import SetBool, Trigger
 
 from needle_core.convert import Converter
 from needle_core.errors import UserError
-from needle_core.hold_session import HoldSession
 from needle_core.message_types import rclpy_types
+from needle_core.messages import HoldSession
 from needle_core.process.reach import keep_to_this_machine
-from needle_core.ros.base_node import STEADY_CLOCK
-from needle_core.ros.conversions import HOLD, JOINT_STATES, LATCHED, values_of
-from needle_core.ros.whole_node import WholeNode
+from needle_core.ros.base_node import (
+    HOLD,
+    JOINT_STATES,
+    LATCHED,
+    STEADY_CLOCK,
+    WholeNode,
+    values_of,
+)
 
 PATIENCE = 20.0
 CONTROLLER_START = "plane_controller/start"

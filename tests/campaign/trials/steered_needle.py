@@ -12,7 +12,7 @@ import numpy as np
 from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.component import Actions, Moment
-from needle_core.runners.faults import delay
+from needle_core.runners.transport import delay
 from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sensors import Sensor, TipSensor
 from needle_sim.sim_rig import SimRig

@@ -20,7 +20,7 @@ from needle_core.component import (
     Publish,
     Timer,
 )
-from needle_core.runners.faults import Arrival, Arrivals, Link
+from needle_core.runners.transport import Arrival, Arrivals, Link
 from needle_core.runners.virtual import LOG
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.rules import Rule

@@ -12,7 +12,7 @@ import pytest
 from needle_core.can_frame import CAN, CanFrame
 from needle_core.component import Publish
 from needle_core.messages import EmergencyStop
-from needle_core.runners.faults import Arrival, Arrivals, Link, delay
+from needle_core.runners.transport import Arrival, Arrivals, Link, delay
 from scenario.rules.scene import ESTOP, Scene
 from scenario.virtual_rig import DRIVER, VirtualRig
 

@@ -40,7 +40,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
-from needle_core.hold_session import HoldSession
+from needle_core.messages import HoldSession
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 from needle_tracker.optics.calibration import rotation_matrix
 from needle_tracker.sources.image_encodings import ENCODINGS, bytes_per_pixel, grey_image

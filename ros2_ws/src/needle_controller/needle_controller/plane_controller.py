@@ -51,7 +51,7 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
-from needle_core.rotations import quaternion_from_rotation
+from needle_core.messages import quaternion_from_rotation
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"

@@ -1,9 +1,10 @@
-"""Health of a part of the rig, as data."""
+"""Diagnostics as data, and sanitised text of other nodes for logs and messages."""
 
 from __future__ import annotations
 
 import dataclasses
 import enum
+from collections.abc import Sequence
 
 
 class Level(enum.IntEnum):
@@ -32,3 +33,40 @@ class Diagnostic:
     level: Level
     message: str
     values: dict[str, str] = dataclasses.field(default_factory=dict)
+
+
+def plain(text: str, longest: int = 64) -> str:
+    """Return foreign text in one line of bounded length.
+
+    Parameters
+    ----------
+    text : str
+        What somebody sent.
+    longest : int
+        How many characters of it are kept; `...` stands for the rest.
+
+    Returns
+    -------
+    str
+        The text, `?` for each character that does not print.
+    """
+    kept = text[:longest]
+    if not kept.isprintable():
+        kept = "".join(sign if sign.isprintable() else "?" for sign in kept)
+    return kept if len(text) <= longest else kept + "..."
+
+
+def plain_list(names: Sequence[str], most: int = 4) -> str:
+    """Return foreign names one after the other, how many more there are, or `none`.
+
+    Parameters
+    ----------
+    names : sequence of str
+        What somebody sent.
+    most : int
+        How many of them are told.
+    """
+    told = [plain(name) for name in names[:most]]
+    if len(names) > most:
+        told.append(f"and {len(names) - most} more")
+    return ", ".join(told) or "none"

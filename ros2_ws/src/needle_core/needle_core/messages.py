@@ -1,8 +1,9 @@
-"""Messages on the graph as small dataclasses, SI units; `convert` maps them to ROS."""
+"""Messages on the graph as small dataclasses, in SI units; `convert` maps them to ROS."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from needle_core.diagnostics import Diagnostic, Level
@@ -302,3 +303,60 @@ class LogLine:
     severity: str
     source: str
     text: str
+
+
+class HoldSession:
+    """Makes a source's hold messages.
+
+    They are numbered, so that a late one shows, and told from those of an earlier process of the
+    same name by the session.
+
+    Parameters
+    ----------
+    source : str
+        Name by which the device knows whose hold it is.
+    lifetime : float
+        How long a message promises the hold [s]; infinite: the device's own time-out.
+    """
+
+    def __init__(self, source: str, lifetime: float = HOLD_LIFETIME) -> None:
+        self._source, self._lifetime = source, lifetime
+        self._session = ""
+        self._count = 0
+
+    def say(self, stamp_ns: int, *, pressed: bool, speed: float = 1.0) -> HoldState:
+        """Return the next message.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Present time [ns]. That of the first message names the session: no other process of
+            this source begins in the same nanosecond, whatever its clock shows.
+        pressed : bool
+            Whether hold to run is pressed.
+        speed : float
+            Share of the nominal speed, 0..1.
+        """
+        self._session = self._session or f"{stamp_ns:x}"
+        self._count += 1
+        speed = speed if pressed else 0.0
+        return HoldState(self._source, self._session, self._count, pressed, speed, self._lifetime)
+
+
+def quaternion_from_rotation(rotation: Sequence[Sequence[float]]) -> Quaternion:
+    """Return the unit quaternion (x, y, z, w) of a rotation matrix, given as three rows.
+
+    Of the four formulas the one with the largest divisor. scipy does the same, but takes a process
+    that needs no more of it a quarter of a second to import.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    trace = xx + yy + zz
+    _, (x, y, z, w) = max(
+        (xx, (1.0 - trace + 2.0 * xx, yx + xy, zx + xz, zy - yz)),
+        (yy, (xy + yx, 1.0 - trace + 2.0 * yy, zy + yz, xz - zx)),
+        (zz, (xz + zx, yz + zy, 1.0 - trace + 2.0 * zz, yx - xy)),
+        (trace, (zy - yz, xz - zx, yx - xy, 1.0 + trace)),
+        key=lambda way: way[0],
+    )
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    return (x / norm, y / norm, z / norm, w / norm)

@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 from needle_core import messages as m
 from needle_core.convert import TABLE, Converter, from_ros, ros_type
 from needle_core.diagnostics import Level
-from needle_core.message_types import rclpy_types, rosbags_types
-from needle_core.ros.conversions import to_nanoseconds, to_stamp
+from needle_core.message_types import rclpy_types, rosbags_types, to_nanoseconds
+from needle_core.ros.base_node import to_stamp
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STAMP = 1_234_567_890_123

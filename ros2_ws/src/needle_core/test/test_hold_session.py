@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from needle_core.hold_session import HoldSession
-from needle_core.messages import HOLD_LIFETIME, HoldState
+from needle_core.messages import HOLD_LIFETIME, HoldSession, HoldState
 
 
 def test_a_session_counts_whatever_the_clock_does() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from needle_core.rotations import quaternion_from_rotation
+from needle_core.messages import quaternion_from_rotation
 
 AXES = np.eye(3)
 

@@ -25,7 +25,7 @@ from needle_core.component import (
     Service,
 )
 from needle_core.component import Reply as ServiceReply
-from needle_core.process.claim import WAY_OUT
+from needle_core.process.ros_domain import WAY_OUT
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.procedure import Procedure, Running
 from needle_device_driver.supervisor.command import Command, CommandPoint

@@ -25,8 +25,8 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
-from needle_core.files.calibration_text import read_calibration
 from needle_core.files.installed import find_shared
+from needle_core.files.plain_yaml import read_calibration
 from needle_tracker.answers.annotation import annotate
 from needle_tracker.answers.health import Health
 from needle_tracker.answers.pair_answers import Answer, PairAnswers

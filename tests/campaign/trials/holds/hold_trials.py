@@ -23,8 +23,7 @@ from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_core.errors import UserError
 from needle_core.process.reach import DISCOVERY_RANGE, PROFILES, keep_to_this_machine
 from needle_core.process.ros_domain import own_domain
-from needle_core.ros.base_node import STEADY_CLOCK
-from needle_core.ros.conversions import RELIABLE
+from needle_core.ros.base_node import RELIABLE, STEADY_CLOCK
 from needle_core.settings.parameter_files import Parameters
 
 CABLE = "cable_cut"

@@ -11,7 +11,7 @@ from needle_analysis.live.live_needle import LiveNeedle, SeenTip
 from needle_analysis.live.spread import ellipsoid
 from needle_controller.model.target_plane import RIG
 from needle_core import messages as m
-from needle_core.rotations import quaternion_from_rotation
+from needle_core.messages import quaternion_from_rotation
 from needle_tracker.optics.refraction import RefractedCamera
 
 Array = NDArray[np.float64]

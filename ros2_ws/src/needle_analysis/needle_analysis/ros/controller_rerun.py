@@ -27,7 +27,7 @@ from needle_core.convert import from_ros
 from needle_core.errors import UserError
 from needle_core.message_types import to_nanoseconds
 from needle_core.messages import JointState
-from needle_core.ros.conversions import values_of
+from needle_core.ros.base_node import values_of
 
 _STEERING = (SteeringState.STEERING.value, SteeringState.WAITING_FOR_TIP.value)
 _LONGER_THAN_ANY_TIMEOUT = 1e6

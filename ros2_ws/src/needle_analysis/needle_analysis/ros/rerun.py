@@ -34,8 +34,7 @@ from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.component import Moment
 from needle_core.errors import UserError
-from needle_core.files.calibration_text import read_calibration
-from needle_core.files.plain_yaml import load_plain
+from needle_core.files.plain_yaml import load_plain, read_calibration
 from needle_core.messages import Text
 from needle_core.ros.parameters import OF_EVERY_NODE
 from needle_core.settings.parameter_files import Sections, none_for, read_sections, values_for

@@ -21,8 +21,8 @@ from needle_bags.format.bag_metadata import (
 from needle_bags.format.mcap_ending import NO_ROOM, McapEnding
 from needle_core.errors import UserError
 from needle_core.files.bag_path import METADATA_FILE
-from needle_core.files.bag_records import DISTRO_KEY, METADATA_KEY, METADATA_RECORD
 from needle_core.files.bag_topic import BagTopic
+from needle_core.files.mcap_file import DISTRO_KEY, METADATA_KEY, METADATA_RECORD
 
 LIBRARY: Final = "needle_bags"
 COMPRESSIONS: Final = ("none", "zstd")

@@ -9,7 +9,7 @@ from typing import Any
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from needle_core.errors import UserError
-from needle_core.files.bag_types import parsed_types
+from needle_core.files.bag_topic import parsed_types
 from needle_core.files.installed import find_shared
 
 _SEPARATOR = "=" * 80

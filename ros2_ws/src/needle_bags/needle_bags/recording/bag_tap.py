@@ -22,8 +22,8 @@ from needle_bags.format.bag_writer import BagWriter
 from needle_bags.recording.provenance import commit, distribution, versions
 from needle_core.component import Component, Delivery, Input, Output
 from needle_core.convert import Converter, ros_type
-from needle_core.files.bag_records import RUN_RECORD
 from needle_core.files.bag_topic import BagTopic
+from needle_core.files.mcap_file import RUN_RECORD
 from needle_core.message_types import rosbags_types
 
 

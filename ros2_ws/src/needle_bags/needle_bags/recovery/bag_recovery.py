@@ -28,8 +28,8 @@ from needle_core.files.bag_path import (
     read_information,
     recording_files,
 )
-from needle_core.files.bag_records import RUN_RECORD, custom_data_of
 from needle_core.files.file_access import sync_directory
+from needle_core.files.mcap_file import RUN_RECORD, custom_data_of
 
 # Key of the custom data that says what was lost.
 _RECOVERED: Final = "recovered"

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
 from needle_bags.ros.question import Question
-from needle_core.ros import node_names
+from needle_core.ros import base_node
 
 
 def plain_value(value: ParameterValue) -> Any:
@@ -94,7 +94,7 @@ class ParameterSnapshots:
         for name, namespace in self._node.get_node_names_and_namespaces():
             if name.startswith("_"):
                 continue
-            full_name = node_names.full_name(namespace, name)
+            full_name = base_node.full_name(namespace, name)
             there.add(full_name)
             if full_name == self._node.get_fully_qualified_name():
                 self._take_own(full_name)

@@ -39,10 +39,9 @@ from needle_core.errors import UserError
 from needle_core.files.bag_directory import BagDirectory
 from needle_core.files.bag_topic import BagTopic
 from needle_core.process.end_request import EndRequest
-from needle_core.ros.base_node import DiagnosticsPublisher, run_node
-from needle_core.ros.conversions import RELIABLE, to_stamp
+from needle_core.ros.base_node import RELIABLE, DiagnosticsPublisher, WholeNode, to_stamp
+from needle_core.ros.main import run_node
 from needle_core.ros.parameters import NodeParameters
-from needle_core.ros.whole_node import WholeNode
 from needle_core.settings.parameter_fields import check_fields, parameter
 
 CLOCK: Final = "/clock"

@@ -28,13 +28,13 @@ from needle_bags.ros.recorder_parameters import RecorderParameters
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.files.bag_path import recover_hint
-from needle_core.files.bag_records import RUN_RECORD
 from needle_core.files.bag_topic import BagTopic
-from needle_core.files.calibration_text import read_calibration
+from needle_core.files.mcap_file import RUN_RECORD
+from needle_core.files.plain_yaml import read_calibration
 from needle_core.process.end_request import EndRequest
-from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, WholeNode
+from needle_core.ros.main import run_node
 from needle_core.ros.parameters import NodeParameters
-from needle_core.ros.whole_node import WholeNode
 
 HELP = """
 recorder: records every topic of the graph into a bag (a rosbag2 directory with MCAP data).

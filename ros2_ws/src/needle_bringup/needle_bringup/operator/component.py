@@ -31,7 +31,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
-from needle_core.hold_session import HoldSession
+from needle_core.messages import HoldSession
 from needle_core.status_messages import DeviceStatus
 
 HOLD, INPUT_DEVICE = "device/hold", "input device"

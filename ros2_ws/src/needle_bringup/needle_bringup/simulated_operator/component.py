@@ -32,7 +32,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
-from needle_core.hold_session import HoldSession
+from needle_core.messages import HoldSession
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 HOLD, PROGRESS = "device/hold", "progress"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from needle_core.process.claim import WAY_OUT
+from needle_core.process.ros_domain import WAY_OUT
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 

@@ -16,8 +16,7 @@ from needle_console.view.camera_feed import CameraFeed
 from needle_console.view.snapshot import Array, Snapshot
 from needle_core.component import Batch, Log
 from needle_core.files.installed import find_shared
-from needle_core.messages import HOLD_LIFETIME, Point, Pose
-from needle_core.rotations import quaternion_from_rotation
+from needle_core.messages import HOLD_LIFETIME, Point, Pose, quaternion_from_rotation
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.optics.refraction import stereo_views
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from needle_console.view.snapshot import Array, CoursePoint, SeenTip, Snapshot, trouble_of
-from needle_core.foreign_text import plain
+from needle_core.diagnostics import plain
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 # Estimates that are closer together are drawn as one [m].

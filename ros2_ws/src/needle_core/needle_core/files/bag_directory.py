@@ -16,11 +16,9 @@ from rosbags.typesys.store import Typestore
 from needle_core.errors import UserError
 from needle_core.files.bag_data import SqliteData, is_packed, unpack, unpack_file
 from needle_core.files.bag_path import METADATA_FILE, read_information, readable, require_bag
-from needle_core.files.bag_records import custom_data_of, distribution_of
-from needle_core.files.bag_topic import BagTopic, offered_profiles
-from needle_core.files.bag_types import typestore_of
+from needle_core.files.bag_topic import BagTopic, offered_profiles, typestore_of
 from needle_core.files.file_access import open_regular
-from needle_core.files.mcap_file import TIME_LIMIT, McapFile
+from needle_core.files.mcap_file import TIME_LIMIT, McapFile, custom_data_of, distribution_of
 
 _NEWEST_VERSION: Final = 9
 

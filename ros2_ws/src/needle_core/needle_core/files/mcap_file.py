@@ -1,22 +1,25 @@
-"""An MCAP file, read with mcap's own reader: all that was recorded, or an error.
+"""MCAP file, read with the mcap library: all that was recorded, or an error.
 
 The format: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
+import yaml
 from mcap.reader import SeekingReader
 from mcap.records import Metadata, Statistics
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from needle_core.files.file_access import open_regular
+from needle_core.files.plain_yaml import load_plain
 
 # Times [ns] are signed in ROS 2.
 TIME_LIMIT: Final = 2**63
@@ -132,3 +135,41 @@ class McapFile:
                 f"it holds {seen.total()} messages of these topics, its index tells of "
                 f"{sum(told.values())}, or of others"
             )
+
+
+# Name of the records that rosbag2 writes, and their keys.
+METADATA_RECORD: Final = "rosbag2"
+DISTRO_KEY: Final = "ROS_DISTRO"
+METADATA_KEY: Final = "serialized_metadata"
+RUN_RECORD: Final = "needle_run"
+
+
+def custom_data_of(records: Iterable[Metadata]) -> dict[str, str]:
+    """Return the `custom_data` of a recording, as far as the records in its files have them."""
+    custom: dict[str, str] = {}
+    parameters: dict[str, Any] = {}
+    changes: list[Any] = []
+    whole: dict[str, Any] = {}
+    for record in records:
+        values = record.metadata
+        if record.name == RUN_RECORD:
+            custom.update(values)
+        # A text that is no YAML says nothing.
+        with contextlib.suppress(ValueError, TypeError, AttributeError):
+            if record.name == "parameters":
+                parameters.update(load_plain(values.get("yaml", "")))
+            elif record.name == "parameter_change":
+                changes.append({key: load_plain(text) for key, text in values.items()})
+            elif record.name == METADATA_RECORD and METADATA_KEY in values:
+                whole = load_plain(values[METADATA_KEY]).get("custom_data") or whole
+    if parameters:
+        custom["parameters"] = yaml.safe_dump(parameters)
+    if changes:
+        custom["parameter_changes"] = yaml.safe_dump(changes)
+    return custom | {str(key): str(value) for key, value in whole.items()}
+
+
+def distribution_of(records: Iterable[Metadata]) -> str:
+    """Return the ROS distribution that the records name; empty where they name none."""
+    told = (r.metadata.get(DISTRO_KEY, "") for r in records if r.name == METADATA_RECORD)
+    return next(filter(None, told), "")

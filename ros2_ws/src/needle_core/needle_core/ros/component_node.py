@@ -41,13 +41,19 @@ from needle_core.component import (
 from needle_core.convert import Converter, from_ros, ros_type
 from needle_core.errors import UserError
 from needle_core.message_types import rclpy_types
-from needle_core.process.claim import WAY_OUT, Claim
-from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
-from needle_core.ros.conversions import to_qos
-from needle_core.ros.node_names import full_name, publishers_of, signature, subscribers_of
+from needle_core.process.ros_domain import WAY_OUT, Claim
+from needle_core.ros.base_node import (
+    STEADY_CLOCK,
+    DiagnosticsPublisher,
+    WholeNode,
+    full_name,
+    publishers_of,
+    signature,
+    subscribers_of,
+    to_qos,
+)
 from needle_core.ros.parameters import NodeParameters
-from needle_core.ros.whole_node import WholeNode
-from needle_core.runners.handlers import Handlers
+from needle_core.runners.process import Handlers
 
 LOG_PERIOD = 2.0
 """Time between two lines of log of one kind [s]."""
@@ -173,7 +179,7 @@ class ComponentNode(WholeNode):
             cure = "transient_local" if row.delivery.latched else "reliable"
             option = "durability" if row.delivery.latched else "reliability"
             why = f"a publisher's QoS does not fit: --qos-{option} {cure} does"
-            self._diagnostics.refuse(row.topic, "incompatible QoS", why)
+            self._diagnostics.reject(row.topic, "incompatible QoS", why)
 
         kind = self._types.make(ros_type(row.message))
         # Raw: what cannot be decoded must not raise out of the executor.
@@ -197,13 +203,13 @@ class ComponentNode(WholeNode):
     def _on_bytes(self, row: Input, kind: type[Any], data: bytes, info: Mapping[str, int]) -> None:
         if len(data) > row.longest:
             why = f"{len(data)} bytes, at most {row.longest}"
-            self._diagnostics.refuse(row.topic, "too long", why)
+            self._diagnostics.reject(row.topic, "too long", why)
             return
         try:
             message = from_ros(row.message, deserialize_message(data, kind))
         except Exception as error:  # noqa: BLE001 - whatever the middleware raises
             why = f"{len(data)} bytes: {type(error).__name__}: {error}"
-            self._diagnostics.refuse(row.topic, "undecodable", why)
+            self._diagnostics.reject(row.topic, "undecodable", why)
             return
         sent_ns = info["source_timestamp"]
         self._handle(lambda: row.handler(message, self._moment(sent_ns)))

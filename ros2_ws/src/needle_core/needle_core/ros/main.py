@@ -1,20 +1,100 @@
-"""Run of a component as a ROS node: what the executables call."""
+"""Runs a node, or a component as a node, until a signal ends it: called by the executables."""
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import rclpy
+from rclpy.duration import Duration
+from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
-from needle_core.commands.cli import EXIT_DONE
+from needle_core.commands.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_DONE,
+    EXIT_INTERNAL_ERROR,
+    internal_error,
+    run_command,
+)
 from needle_core.component import Component, RealPort
+from needle_core.errors import UserError
 from needle_core.process.end_request import EndRequest
-from needle_core.ros.base_node import LOOK_PERIOD, run_node
+from needle_core.process.reach import keep_to_this_machine
+from needle_core.process.shared_memory import remove_half_made_ports
 from needle_core.ros.component_node import ComponentNode
+from needle_core.settings.parameter_fields import describe
+from needle_core.settings.parameter_files import given_sections
+
+_ROS_OPTIONS = ("-p", "--param", "--params-file", "-r", "--remap", "--log-level")
+# A waiting executor does not notice signals, so it wakes up with this period [s].
+_WAKE_UP_PERIOD = 0.1
+# Time that the node's end waits for acknowledgements of its last messages [s]: after an end by
+# itself (a recorder that was suspended for 4 s acknowledged within 3 s), and after a signal.
+_ACKNOWLEDGED_WITHIN, _ACKNOWLEDGED_AFTER_SIGNAL = 5.0, 0.5
+
+
+def run_node(
+    create: Callable[[], Node],
+    *,
+    help_text: str,
+    parameters: type,
+    args: list[str] | None = None,
+    spin: Callable[[Node, EndRequest], int] | None = None,
+    shared_memory: bool = True,
+) -> int:
+    """Run a node until a signal ends it, or explain it if the command line has `--help`.
+
+    Parameters
+    ----------
+    create : callable
+        Returns the node; called after rclpy is initialised.
+    help_text : str
+        Purpose, topics and services of the node: the first part of `--help`.
+    parameters : type
+        Parameter dataclass of the node: the second part of `--help`.
+    args : list of str, optional
+        Command line with the program's name; sys.argv by default.
+    spin : callable, optional
+        Runs the node until the shutdown flag is set and returns the exit code; by default it
+        only spins.
+    shared_memory : bool
+        Whether messages may use shared memory, as images must: see `keep_to_this_machine`.
+
+    Returns
+    -------
+    int
+        0 after a clean end (also by SIGINT, SIGTERM or SIGHUP), 2 after bad parameters or
+        arguments, 3 after an internal error.
+    """
+    argv = list(sys.argv if args is None else args)
+    with EndRequest() as end:
+        try:
+            # rclpy reads the files as well, but its errors do not explain the problem.
+            given_sections(argv)
+            own = remove_ros_args(argv)[1:]
+            if own in (["--help"], ["-h"]):
+                return run_command(lambda: _explain(help_text, parameters))
+            # rcl would accept NAME:=VALUE as a remapping and set no parameter.
+            before = argv[1 : argv.index("--ros-args")] if "--ros-args" in argv else argv[1:]
+            own = own or [argument for argument in before if ":=" in argument]
+            if own:
+                raise UserError(f"unknown argument {own[0]!r}; {_hint(own[0])}")
+            keep_to_this_machine(shared_memory=shared_memory)
+            remove_half_made_ports()
+            # rclpy's own handlers would shut the context down in the middle of a callback.
+            rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+        # rclpy raises private exception types for a bad command line.
+        except Exception as error:  # noqa: BLE001
+            return _reject(error)
+        return _run(create, spin or _spin, end)
 
 
 def run_component(
@@ -27,24 +107,22 @@ def run_component(
     interrupted: int = EXIT_DONE,
     shared_memory: bool = True,
 ) -> int:
-    """Run a component as a node until it or a signal ends it; `--help` explains it instead.
+    """Run a component as a node until it or a signal ends it; see `run_node`.
 
     Parameters
     ----------
     name : str
         Name of the node.
     parameters : type
-        The component's settings dataclass: the node's parameters.
+        Settings dataclass of the component: the parameters of the node.
     make : callable
-        Makes the component from its settings and the node's full name.
-    help_text : str
-        What the node does, its topics and services: the first part of `--help`.
+        Returns the component for its settings and the node's full name.
+    help_text, shared_memory
+        As for `run_node`.
     ports : callable
         Returns the real ports of the component for its settings.
     interrupted : int
-        Exit code where a signal ended what was not done yet.
-    shared_memory : bool
-        Whether messages may go through shared memory, as images must.
+        Exit code if a signal ended unfinished work.
 
     Returns
     -------
@@ -55,26 +133,101 @@ def run_component(
         lambda: ComponentNode(name, parameters, make, ports),
         help_text=help_text,
         parameters=parameters,
-        spin=partial(_spin, interrupted),
+        spin=partial(_spin_component, interrupted),
         shared_memory=shared_memory,
     )
 
 
-def _spin(interrupted: int, node: Node, end: EndRequest) -> int:
-    assert isinstance(node, ComponentNode)
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
-    asked = False
+def _hint(argument: str) -> str:
+    if ":=" in argument:
+        return f"a parameter is set by --ros-args -p {argument}"
+    return "it goes after --ros-args" if argument in _ROS_OPTIONS else "see --help"
+
+
+def _run(
+    create: Callable[[], Node], spin: Callable[[Node, EndRequest], int], end: EndRequest
+) -> int:
+    node: Node | None = None
+    code = EXIT_INTERNAL_ERROR
     try:
-        while node.exit is None:
-            if end.wanted and not asked:
-                asked = True
-                node.stop()
-            executor.spin_once(timeout_sec=LOOK_PERIOD)
+        node = create()
+        code = spin(node, end)
+    except (UserError, ParameterException) as error:
+        code = _reject(error)
+        if end.wanted:
+            # Other nodes end on the same signal, so their absence is not a bad input.
+            code = EXIT_DONE
+    except Exception as error:  # noqa: BLE001
+        # If rclpy cannot make the node, its name or namespace is bad.
+        is_bad_input = node is None and isinstance(error, rclpy_implementation.RCLError)
+        code = _reject(error) if is_bad_input else internal_error(error)
+    finally:
+        if node is not None and node.context.ok():
+            _wait_for_acknowledgements(
+                node, _ACKNOWLEDGED_AFTER_SIGNAL if end.wanted else _ACKNOWLEDGED_WITHIN
+            )
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return code
+
+
+def _wait_for_acknowledgements(node: Node, seconds: float) -> None:
+    """Wait until all reliable subscribers have received the node's messages.
+
+    Without this wait, a busy recorder would miss the end of a run unnoticed.
+    """
+    until = time.monotonic() + seconds
+    for publisher in node.publishers:
+        left = max(until - time.monotonic(), 0.0)
+        publisher.wait_for_all_acked(Duration(seconds=left))
+
+
+def _explain(help_text: str, parameters: type) -> int:
+    print(f"{help_text.strip()}\n\nParameters (--ros-args -p NAME:=VALUE):")
+    print(describe(parameters))
+    return EXIT_DONE
+
+
+def _spin(node: Node, end: EndRequest) -> int:
+    _spin_until(node, lambda: end.wanted)
+    return EXIT_DONE
+
+
+def _spin_component(interrupted: int, node: Node, end: EndRequest) -> int:
+    assert isinstance(node, ComponentNode)
+    is_stopping = False
+
+    def is_done() -> bool:
+        nonlocal is_stopping
+        if end.wanted and not is_stopping:
+            is_stopping = True
+            node.stop()
+        return node.exit is not None
+
+    try:
+        _spin_until(node, is_done)
     finally:
         node.close()
-        executor.shutdown()
+    assert node.exit is not None
     if node.exit.text:
         print(f"{node.get_name()}: {node.exit.text}", file=sys.stderr)
-    # Others end on the same signal: what failed for want of them was interrupted.
+    # Other nodes end on the same signal, so a failure for lack of them counts as interrupted.
     return interrupted if end.wanted and node.exit.code else node.exit.code
+
+
+def _spin_until(node: Node, is_done: Callable[[], bool]) -> None:
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    try:
+        while not is_done():
+            executor.spin_once(timeout_sec=_WAKE_UP_PERIOD)
+    finally:
+        # An executor that outlives the context raises when it is collected.
+        executor.shutdown()
+
+
+def _reject(error: Exception) -> int:
+    lines = str(error).strip().splitlines()
+    print(f"error: {lines[0] if lines else type(error).__name__}", file=sys.stderr)
+    return EXIT_BAD_INPUT

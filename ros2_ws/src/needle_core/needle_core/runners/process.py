@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,13 +12,46 @@ from needle_core.component import (
     Action,
     Actions,
     Component,
+    Diagnose,
     Input,
+    Log,
     Moment,
+    Output,
+    Publish,
 )
-from needle_core.diagnostics import Diagnostic
-from needle_core.runners.faults import Link
-from needle_core.runners.handlers import Handlers
+from needle_core.diagnostics import Diagnostic, Level
 from needle_core.runners.timeline import Timeline
+from needle_core.runners.transport import Link
+
+
+class Handlers:
+    """Runs the handlers of a component.
+
+    Parameters
+    ----------
+    outputs : iterable of Output
+        The component's.
+    """
+
+    def __init__(self, outputs: Iterable[Output]) -> None:
+        self._topics = {output.topic for output in outputs}
+        self._failures = 0
+
+    def run(self, work: Callable[[], Actions]) -> list[Action]:
+        """Return the actions of a handler; what it did before it failed is done."""
+        actions: list[Action] = []
+        try:
+            for action in work():
+                if isinstance(action, Publish) and action.topic not in self._topics:
+                    raise ValueError(f"{action.topic} is not among its outputs")
+                actions.append(action)
+        except Exception as error:  # noqa: BLE001 - whatever a message may lead to
+            self._failures += 1
+            text = f"internal error: {type(error).__name__}: {error}"
+            failed = Diagnostic(Level.ERROR, text, {"failures": str(self._failures)})
+            actions += [Log("error", text, kind=text), Diagnose("handlers", failed)]
+        return actions
+
 
 Compute = Callable[[Sequence[Action], random.Random], float]
 """Compute time of a handler [s], from its actions and a random stream."""

@@ -35,10 +35,9 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic
 from needle_core.messages import Diagnostics, LogLine, Status
-from needle_core.runners.faults import Fault, Link
 from needle_core.runners.process import Compute, Process, uniform
 from needle_core.runners.timeline import Timeline
-from needle_core.runners.transport import Transport
+from needle_core.runners.transport import Fault, Link, Transport
 
 DIAGNOSTICS = Output("/diagnostics", Diagnostics)
 LOG = Output("/rosout", LogLine)

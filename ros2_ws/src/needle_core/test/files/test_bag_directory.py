@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from needle_core.files.bag_directory import BagDirectory
-from needle_core.files.bag_types import parsed_types
+from needle_core.files.bag_topic import parsed_types
 
 from .made_bags import (
     ALL,

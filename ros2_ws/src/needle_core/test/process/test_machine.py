@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from needle_core.errors import UserError
-from needle_core.process.claim import Claim
-from needle_core.process.ros_domain import own_domain, ports_of
+from needle_core.process.ros_domain import Claim, own_domain, ports_of
 from needle_core.process.shared_memory import dead_ports, remove_dead_ports, remove_half_made_ports
 
 PORTS = range(7400, 7410)

@@ -11,9 +11,9 @@ import pytest
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from needle_core.errors import UserError
-from needle_core.ros import base_node
-from needle_core.ros.base_node import run_node
-from needle_core.ros.whole_node import WholeNode
+from needle_core.ros import main
+from needle_core.ros.base_node import WholeNode
+from needle_core.ros.main import run_node
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Middleware:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.done: list[str] = []
         for name in ("keep_to_this_machine", "remove_half_made_ports"):
-            monkeypatch.setattr(base_node, name, lambda **_: None)
-        monkeypatch.setattr(base_node, "rclpy", self)
+            monkeypatch.setattr(main, name, lambda **_: None)
+        monkeypatch.setattr(main, "rclpy", self)
 
     def init(self, **_: Any) -> None:
         self.done.append("init")

@@ -27,7 +27,8 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.messages import EmergencyStop
-from needle_core.runners.faults import (
+from needle_core.runners.timeline import START_NS
+from needle_core.runners.transport import (
     Arrival,
     Arrivals,
     Fault,
@@ -37,7 +38,6 @@ from needle_core.runners.faults import (
     duplicate,
     silence,
 )
-from needle_core.runners.timeline import START_NS
 from needle_core.runners.virtual import DISCOVERY, LEASE, VirtualRunner
 
 from .runner_scene import Once, Receiver, Sender, Server, Wired, run

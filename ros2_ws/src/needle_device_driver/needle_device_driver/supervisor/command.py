@@ -11,7 +11,7 @@ import dataclasses
 import itertools
 import math
 
-from needle_core.foreign_text import plain_list
+from needle_core.diagnostics import plain_list
 from needle_device_driver.axes.motion import Leg
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.limits import HARD_STEP_TIME_CAP, SafetyLimits

@@ -6,7 +6,7 @@ import collections
 import dataclasses
 import math
 
-from needle_core.foreign_text import plain
+from needle_core.diagnostics import plain
 from needle_core.messages import HoldState
 from needle_device_driver.rules import Rule
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from needle_core.diagnostics import Level
-from needle_core.foreign_text import plain
+from needle_core.diagnostics import Level, plain
 from needle_core.messages import HoldState
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.axes.axis import Axis

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from needle_core.errors import UserError
-from needle_core.files.calibration_text import read_calibration
-from needle_core.files.plain_yaml import load_plain
+from needle_core.files.plain_yaml import load_plain, read_calibration
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_sim.needle.se3 import FloatArray
 

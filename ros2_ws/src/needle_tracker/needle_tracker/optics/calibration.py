@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
-from needle_core.files.calibration_text import read_calibration
-from needle_core.files.plain_yaml import load_plain
+from needle_core.files.plain_yaml import load_plain, read_calibration
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_tracker.optics.window import Layer, Window, common_surface, surface_from_above
 

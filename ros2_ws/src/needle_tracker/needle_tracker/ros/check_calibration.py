@@ -17,10 +17,10 @@ from sensor_msgs.msg import Image
 
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_core.errors import UserError
+from needle_core.message_types import to_nanoseconds
 from needle_core.process.reach import keep_to_this_machine
 from needle_core.process.shared_memory import remove_half_made_ports
-from needle_core.ros.conversions import IMAGES_BEST_EFFORT, to_nanoseconds
-from needle_core.ros.whole_node import WholeNode
+from needle_core.ros.base_node import IMAGES_BEST_EFFORT, WholeNode
 from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.answers.tracker_messages import frame_of
 from needle_tracker.calibrating.board_views import averaged_view, views_in_folders
