@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from campaign.typed_pages import PAGES, ROOT, PageError, Session, blocks
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.ros_domain import reserve_domain_id
 from needle_tracker.calibrating.calibration_session import parse_session
 
 SHORT_MM = 6
@@ -112,7 +112,7 @@ def test_every_block_works_as_written(
 ) -> None:
     scratch = tmp_path / "t"
     scratch.mkdir()
-    with own_domain() as domain:
+    with reserve_domain_id() as domain:
         # What a page has installed is there for the page alone.
         own = f"{scratch}/own"
         environment = {

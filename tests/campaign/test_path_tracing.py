@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from needle_core.errors import UserError
-from needle_core.files.installed import find_shared
+from needle_core.files.installed import find_shared_file
 from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
 from needle_sim.path_traced.appearance import draw_appearance
@@ -24,7 +24,7 @@ from needle_sim.path_traced.world import make_world
 from needle_sim.sequences.boxes import draw_box
 from needle_sim.sequences.render_images import main
 
-CALIBRATION = Path(find_shared("needle_tracker", "config/calibration.yaml"))
+CALIBRATION = Path(find_shared_file("needle_tracker", "config/calibration.yaml"))
 TOP_AND_SIDE = CALIBRATION.with_name("calibration_top_and_side.yaml")
 POINTS = np.array([[0.0, 0.0, 0.03], [0.012, 0.03, 0.09], [-0.014, -0.035, 0.12]])
 

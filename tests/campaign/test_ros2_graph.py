@@ -20,7 +20,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 
 from needle_core.files.installed import find_executable
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.ros_domain import reserve_domain_id
 
 LIMIT = 60.0
 
@@ -51,7 +51,7 @@ class Partner(Node):
 
 @pytest.fixture(scope="module")
 def domain() -> Iterator[int]:
-    with own_domain() as domain:
+    with reserve_domain_id() as domain:
         yield domain
 
 

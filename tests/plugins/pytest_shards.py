@@ -24,7 +24,7 @@ import compile_ahead
 from cpu_budget import CpuBudget
 from left_processes import end_left_processes
 from needle_bringup.studies import monte_carlo
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.ros_domain import reserve_domain_id
 
 SHARDS = os.cpu_count() or 1
 # What takes longest is begun first, or one of them would hold up the end of the run.
@@ -39,7 +39,7 @@ _budget = CpuBudget()
 
 def pytest_configure(config: pytest.Config) -> None:
     """Reserve a ROS domain, and end as Ctrl-C does: with all cleaning up."""
-    os.environ["ROS_DOMAIN_ID"] = str(_reserved.enter_context(own_domain()))
+    os.environ["ROS_DOMAIN_ID"] = str(_reserved.enter_context(reserve_domain_id()))
     # A shell that runs this in the background ignores SIGINT, and all below would, too.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)

@@ -21,7 +21,7 @@ from campaign.trials.trial_processes import TrialProcesses, graph_in_real_time
 from needle_core.convert import from_ros
 from needle_core.errors import UserError
 from needle_core.messages import HoldState
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.ros_domain import reserve_domain_id
 from needle_core.ros.base_node import RELIABLE, to_qos, values_of
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.device import HOLDS
@@ -167,7 +167,7 @@ def run_processes(seed: int, folder: Path, faults: Sequence[Fault] | None = None
     """
     happened = tuple(processes_schedule_of(seed) if faults is None else faults)
     with (
-        own_domain() as domain,
+        reserve_domain_id() as domain,
         ros(domain),
         closing(Witness()) as witness,
         closing(TrialProcesses(folder, domain, graph_in_real_time(seed))) as graph,

@@ -148,7 +148,7 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
     def see_motors(now: float, at: Motors) -> None:
         rig.digest.update(_rounded((at.insertion, at.rotation)))
         watch.see_hand(now, holds=rig.hand_presses)
-        watch.see_driver(now, speaks=rig.runner.is_up("device_driver"))
+        watch.see_driver(now, speaks=rig.runner.is_responsive("device_driver"))
         watch.see_motors(now, at.insertion, at.rotation)
         if rig.recorders:
             watch.see_waiting(now, rig.recorders[-1].recording.bytes_waiting)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drawn_needles import arc, draw_line, tracker_settings
-from needle_core.files.installed import find_shared
+from needle_core.files.installed import find_shared_file
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
 from needle_tracker.optics.refraction import RefractedCamera, stereo_views
@@ -19,7 +19,7 @@ __all__ = ["calibration", "calibration_path", "make_arc", "make_line", "settings
 
 @pytest.fixture(scope="session")
 def calibration_path() -> Path:
-    return find_shared("needle_tracker", "config/calibration.yaml")
+    return find_shared_file("needle_tracker", "config/calibration.yaml")
 
 
 @pytest.fixture(scope="session")

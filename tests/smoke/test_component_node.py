@@ -42,7 +42,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.errors import UserError
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.ros_domain import reserve_domain_id
 from needle_core.ros import base_node
 from needle_core.ros.component_node import ComponentNode
 from needle_core.ros.main import run_component
@@ -310,7 +310,7 @@ def test_a_node_ends_on_sigterm_as_its_component_wishes(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wire = Wire(("end",))
-    with own_domain() as domain:
+    with reserve_domain_id() as domain:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         monkeypatch.setattr(sys, "argv", ["echo"])
         code = run_component(

@@ -28,7 +28,7 @@ from needle_bags.reading.bag_reader import read_run
 from needle_bringup.simulation.rig_configuration import GRAPH_WATCHDOG, can_adapter
 from needle_core.component import Actions
 from needle_core.errors import UserError
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.ros_domain import reserve_domain_id
 from needle_core.settings.parameter_files import Parameters
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
@@ -121,7 +121,7 @@ def _run(folder: Path, depth: float) -> None:
     }
     rig = [sys.executable, latency_rig.__file__, str(folder), str(CALIBRATION), str(depth)]
     with (
-        own_domain() as domain,
+        reserve_domain_id() as domain,
         closing(TrialProcesses(folder, domain, parameters)) as graph,
     ):
         done = subprocess.run(

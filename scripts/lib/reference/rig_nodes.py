@@ -30,7 +30,7 @@ from needle_console.view.advice import Button
 from needle_core.component import Call
 from needle_core.convert import from_ros, ros_type
 from needle_core.message_types import rclpy_types
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.ros_domain import reserve_domain_id
 from needle_core.ros.component_node import ComponentNode
 from reference.endpoints import SOURCES, Endpoint, Noted, noting
 
@@ -123,7 +123,7 @@ def executables(kind: str) -> Iterator[tuple[str, str, str]]:
 def rig_nodes() -> list[RigNode]:
     """Make every node of the rig in all its ways, and return what was noted."""
     found = []
-    with own_domain() as domain, tempfile.TemporaryDirectory() as scratch:
+    with reserve_domain_id() as domain, tempfile.TemporaryDirectory() as scratch:
         for package, name, module_name in executables("node"):
             module = importlib.import_module(module_name)
             ways = [

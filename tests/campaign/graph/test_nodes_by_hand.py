@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Reader
 
 from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
 from needle_core.files.installed import find_executable
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.ros_domain import reserve_domain_id
 
 PATIENCE = 120.0  # [s]
 STAND_IN = "simulated_operator"
@@ -56,7 +56,7 @@ class Hand:
 
 @contextmanager
 def hand_at(folder: Path) -> Iterator[Hand]:
-    with own_domain() as domain:
+    with reserve_domain_id() as domain:
         hand = Hand(folder, domain)
         try:
             yield hand

@@ -17,9 +17,9 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from needle_core.errors import UserError
-from needle_core.process.end_request import ENDING_SIGNALS
-from needle_core.process.ros_domain import FIRST_PARTICIPANT, Claim, own_domain, ports_of
+from needle_core.process.ros_domain import FIRST_PARTICIPANT, Claim, ports_of, reserve_domain_id
 from needle_core.process.shared_memory import SHARED_MEMORY
+from needle_core.process.shutdown import ENDING_SIGNALS
 from needle_core.process.worker import start_worker
 from needle_core.settings.parameter_files import values_for
 
@@ -33,7 +33,7 @@ node = lambda: Node("one")
 spin = lambda node, end: 7
 sys.exit(run_node(node, help_text="", parameters=object, args=["one"], spin=spin))
 """
-    with own_domain() as domain:
+    with reserve_domain_id() as domain:
         # Of what the rig says to each other; discovery has the one before.
         port = ports_of(domain)[FIRST_PARTICIPANT + 1]
         (SHARED_MEMORY / f"fastrtps_port{port}").write_bytes(b"")
@@ -96,7 +96,7 @@ sys.exit(run_node(node, help_text="", parameters=object, args=["hears"], spin=sp
 
 
 def test_a_node_goes_when_what_it_said_has_reached_a_subscriber_that_stood_still() -> None:
-    with own_domain() as domain, contextlib.ExitStack() as ends:
+    with reserve_domain_id() as domain, contextlib.ExitStack() as ends:
 
         def start(code: str) -> subprocess.Popen[bytes]:
             process = subprocess.Popen(
@@ -197,7 +197,7 @@ def test_the_same_sections_reach_a_node_as_rcl_gives_it(tmp_path: Path, node: st
     sections = {name: {f"p{i}": i, "last": i} for i, name in enumerate(NAMES)}
     file = tmp_path / "p.yaml"
     file.write_text("".join(f"'{n}': {{ros__parameters: {v}}}\n" for n, v in sections.items()))
-    with own_domain() as domain:
+    with reserve_domain_id() as domain:
         context = Context()
         words = ["--ros-args", "--params-file", str(file), *REMAPPINGS[node]]
         context.init(["node", *words], domain_id=domain)

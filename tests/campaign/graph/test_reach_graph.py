@@ -17,8 +17,8 @@ import pytest
 from campaign.trials.holds.computers import ADDRESSES, two_computers
 from needle_bringup.simulation.node_process import NodeProcess, stop
 from needle_core.files.installed import find_executable
-from needle_core.process.reach import DISCOVERY_RANGE, PROFILES
-from needle_core.process.ros_domain import own_domain, ports_of
+from needle_core.process.discovery import DISCOVERY_RANGE, PROFILES
+from needle_core.process.ros_domain import ports_of, reserve_domain_id
 
 LIMIT = 30.0
 OPEN = {DISCOVERY_RANGE: "SUBNET"}
@@ -63,7 +63,7 @@ Start = Callable[..., NodeProcess]
 
 @pytest.fixture
 def domain() -> Iterator[int]:
-    with own_domain() as one:
+    with reserve_domain_id() as one:
         yield one
 
 

@@ -12,7 +12,7 @@ from needle_bringup.training.patches import patch
 from needle_bringup.training.samples import SIZE
 from needle_bringup.training.traced_scenes import trace_scene
 from needle_core.errors import UserError
-from needle_core.files.installed import find_shared
+from needle_core.files.installed import find_shared_file
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.path_traced.tracer import load_mitsuba
 from sample_pool import CONTEXT, Batch, batch_of, read_shard, write_shard
@@ -65,7 +65,7 @@ def test_a_traced_scene_says_where_its_shaft_is() -> None:
         mitsuba = load_mitsuba()
     except UserError as error:
         pytest.skip(str(error))
-    calibration = Path(find_shared("needle_tracker", "config/calibration.yaml"))
+    calibration = Path(find_shared_file("needle_tracker", "config/calibration.yaml"))
     scene = trace_scene(mitsuba, load_stereo_rig(calibration), 20001)
     assert scene.images.shape == scene.shares.shape
     assert not scene.shares[:2].any()

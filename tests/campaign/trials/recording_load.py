@@ -23,7 +23,7 @@ from sensor_msgs.msg import CameraInfo, Image, JointState, Joy
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_core.process.reach import keep_to_this_machine
+from needle_core.process.discovery import restrict_discovery
 from needle_core.ros.base_node import (
     HOLD,
     IMAGES,
@@ -54,7 +54,7 @@ _STAMP: Final = 4  # behind the four bytes that say how CDR is encoded
 
 def main(duration: float, *, images: bool) -> None:
     """Send for so long [s]; print how much of each topic."""
-    keep_to_this_machine()
+    restrict_discovery()
     rclpy.init(args=[])
     node = WholeNode("recording_load")
     chosen = [stream for stream in STREAMS if images or stream[1] is not Image]

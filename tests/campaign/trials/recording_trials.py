@@ -21,7 +21,7 @@ from needle_bags.reading.bag_files import read_contents
 from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_core.errors import UserError
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.ros_domain import reserve_domain_id
 
 # The first bytes of every message: the encoding, then the stamp's seconds; its nanoseconds are the
 # message's number.
@@ -42,7 +42,7 @@ def record_full_rate(folder: Path, duration: float, others: int = 2) -> dict[str
     """
     bag = folder / "full_rate"
     with (
-        own_domain() as domain,
+        reserve_domain_id() as domain,
         recorder(domain, bag) as recording,
         busy(others),
         _process(domain, _LOAD, str(duration)) as load,
@@ -91,7 +91,7 @@ def record_and_kill(folder: Path, moments: int, *words: str) -> Iterator[tuple[s
         # A domain for each: what a killed process leaves in shared memory may keep the next one
         # from hearing the same partners.
         with (
-            own_domain() as domain,
+            reserve_domain_id() as domain,
             recorder(domain, bag) as recording,
             _process(domain, _LOAD, "3600", *words),
         ):

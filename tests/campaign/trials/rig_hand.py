@@ -19,7 +19,7 @@ from needle_core.convert import Converter
 from needle_core.errors import UserError
 from needle_core.message_types import rclpy_types
 from needle_core.messages import HoldSession
-from needle_core.process.reach import keep_to_this_machine
+from needle_core.process.discovery import restrict_discovery
 from needle_core.ros.base_node import (
     HOLD,
     JOINT_STATES,
@@ -44,7 +44,7 @@ _SERVICES = {
 def ros(domain: int) -> Iterator[None]:
     """Start ROS in this process and in this domain, and shut it down in the end."""
     # Its hold must not lapse where a node appears.
-    keep_to_this_machine(shared_memory=False)
+    restrict_discovery(shared_memory=False)
     rclpy.init(args=[], domain_id=domain)
     try:
         yield

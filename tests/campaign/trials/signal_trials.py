@@ -16,7 +16,7 @@ from needle_bringup.simulation.node_process import NodeProcess
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_core.errors import UserError
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.ros_domain import reserve_domain_id
 
 # From the start-up to the middle of the insertion [s].
 _LATEST = 12.0
@@ -65,7 +65,7 @@ def signal_trials(folder: Path, count: int, burners: int) -> Iterator[Ended]:
             place = folder / f"signals_{number}"
             place.mkdir()
             kind, moment = _KINDS[number % len(_KINDS)], rng.uniform(0.0, _LATEST)
-            with own_domain() as domain:
+            with reserve_domain_id() as domain:
                 yield from _trial(place, domain, kind, moment, rng)
 
 

@@ -12,7 +12,7 @@ from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_core.errors import UserError
 from needle_core.files.bag_path import METADATA_FILE
-from needle_core.files.plain_yaml import load_plain
+from needle_core.files.yaml_files import load_yaml
 
 WAITING_LIMIT = 400_000
 """What waits for the soak's disk at most [B]; a real recorder may keep far more."""
@@ -81,6 +81,6 @@ def _counts(bag: Path) -> Counter[str]:
 
 def _said_lost(bag: Path) -> Counter[str]:
     """Return what metadata.yaml says of messages that are not in the bag."""
-    content = load_plain((bag / METADATA_FILE).read_text(encoding="utf-8"))
+    content = load_yaml((bag / METADATA_FILE).read_text(encoding="utf-8"))
     custom = content["rosbag2_bagfile_information"]["custom_data"] or {}
     return Counter(json.loads(custom.get(MESSAGES_LOST, "{}")))

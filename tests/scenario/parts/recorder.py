@@ -40,7 +40,7 @@ class Disk:
         What is said to be left [B].
     error : int
         What every write meets, as `errno` has it; 0: nothing.
-    stands_still : bool
+    is_frozen : bool
         Whether no write ends.
     slowness : float
         What each job takes longer [s].
@@ -49,7 +49,7 @@ class Disk:
     def __init__(self) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="needle_soak_"))
         self.room, self.error = _ROOM, 0
-        self.stands_still = False
+        self.is_frozen = False
         self.slowness = 0.0
         self._count = 0
 
@@ -61,7 +61,7 @@ class Disk:
     def spoil(self, fault: Fault) -> Callable[[], None]:
         """Let a fault begin; returns what ends it."""
         if fault.kind is Kind.STUCK:
-            self.stands_still = True
+            self.is_frozen = True
         elif fault.kind is Kind.SLOW:
             self.slowness = fault.size * _SLOWEST_JOB
         elif fault.kind is Kind.OFF and fault.size < 0.5:
@@ -72,7 +72,7 @@ class Disk:
         return self._mend
 
     def _mend(self) -> None:
-        self.room, self.error, self.stands_still, self.slowness = _ROOM, 0, False, 0.0
+        self.room, self.error, self.is_frozen, self.slowness = _ROOM, 0, False, 0.0
 
     def close(self) -> None:
         """Remove all that is on it."""
@@ -215,7 +215,7 @@ class RecorderStandIn(Component):
 
     def _work(self, at: Moment) -> Actions:
         self._now = at.steady
-        if not self._disk.stands_still:
+        if not self._disk.is_frozen:
             draw, slowness = self._chance.uniform, self._disk.slowness
             self._jobs.work(at.steady, _WORK, lambda: draw(*_JOB) + slowness)
         return ()

@@ -11,12 +11,12 @@ node starts, and a node that ends ends the others.
 from launch import LaunchDescription
 from needle_bringup.ros.launching import describe
 from needle_bringup.simulation.launch_nodes import nodes_beside_rig
-from needle_core.files.installed import find_shared
+from needle_core.files.installed import find_shared_file
 
 
 def generate_launch_description() -> LaunchDescription:
     """Return the graph beside a rig."""
-    calibration = str(find_shared("needle_tracker", "config/calibration.yaml"))
+    calibration = str(find_shared_file("needle_tracker", "config/calibration.yaml"))
     arguments = {
         "calibration": (calibration, "the stereo calibration"),
         "drives": ("", "the drives' parameter file; empty: none"),

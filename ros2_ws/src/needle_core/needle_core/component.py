@@ -307,7 +307,7 @@ class Component:
         The node's name.
     settings : object
         Its settings dataclass, the parameters of the node; None without any.
-    takes_simulated_time : bool
+    accepts_simulated_time : bool
         Whether its stamps may come from a player's clock: of viewers, which move nothing.
     inputs, outputs, services, timers, ports : sequences of rows
         What it receives, sends, offers, does by itself and is wired to; none by default.
@@ -315,7 +315,7 @@ class Component:
 
     name: str
     settings: Any = None
-    takes_simulated_time: bool = False
+    accepts_simulated_time: bool = False
     inputs: Sequence[Input] = ()
     outputs: Sequence[Output] = ()
     services: Sequence[Service] = ()

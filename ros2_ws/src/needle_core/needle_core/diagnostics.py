@@ -35,7 +35,7 @@ class Diagnostic:
     values: dict[str, str] = dataclasses.field(default_factory=dict)
 
 
-def plain(text: str, longest: int = 64) -> str:
+def sanitize(text: str, longest: int = 64) -> str:
     """Return foreign text in one line of bounded length.
 
     Parameters
@@ -56,7 +56,7 @@ def plain(text: str, longest: int = 64) -> str:
     return kept if len(text) <= longest else kept + "..."
 
 
-def plain_list(names: Sequence[str], most: int = 4) -> str:
+def sanitize_list(names: Sequence[str], most: int = 4) -> str:
     """Return foreign names one after the other, how many more there are, or `none`.
 
     Parameters
@@ -66,7 +66,7 @@ def plain_list(names: Sequence[str], most: int = 4) -> str:
     most : int
         How many of them are told.
     """
-    told = [plain(name) for name in names[:most]]
+    told = [sanitize(name) for name in names[:most]]
     if len(names) > most:
         told.append(f"and {len(names) - most} more")
     return ", ".join(told) or "none"

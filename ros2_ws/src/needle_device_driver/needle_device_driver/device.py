@@ -25,7 +25,7 @@ from needle_core.component import (
     Service,
 )
 from needle_core.component import Reply as ServiceReply
-from needle_core.process.ros_domain import WAY_OUT
+from needle_core.process.ros_domain import CONFLICT_HINT
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.procedure import Procedure, Running
 from needle_device_driver.supervisor.command import Command, CommandPoint
@@ -173,7 +173,9 @@ class DeviceRows:
         others = [name for name in peers.publishers.get(STATUS, ()) if name != self._name]
         names = ", ".join(others)
         self.others = (
-            f"another device is there: {names} publishes {STATUS}; {WAY_OUT}" if others else ""
+            f"another device is there: {names} publishes {STATUS}; {CONFLICT_HINT}"
+            if others
+            else ""
         )
         self._supervisor.see_others(self.others)
         return self.report(at)

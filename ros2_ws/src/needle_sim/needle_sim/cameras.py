@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from needle_core import messages as m
 from needle_core.component import IMAGES, Actions, Moment, Output, Port, Publish, Send
-from needle_core.files.installed import find_shared
+from needle_core.files.installed import find_shared_file
 from needle_core.process.worker import start_worker
 from needle_sim.camera.image_folder import ImageFolder, truth_of
 from needle_sim.camera.renderer import StereoRenderer
@@ -245,7 +245,7 @@ class RenderingProcess:
 def _load_calibration(settings: SimRigParameters) -> tuple[Path, StereoRig]:
     """Return the calibration file and its content."""
     name = settings.calibration_file
-    file = Path(name) if name else find_shared("needle_tracker", "config/calibration.yaml")
+    file = Path(name) if name else find_shared_file("needle_tracker", "config/calibration.yaml")
     return file, load_stereo_rig(str(file))
 
 

@@ -25,7 +25,7 @@ from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_sim.drives.cia402 import SERVO, STEPPER, PowerState
 from needle_sim.drives.drive_motion import LimitAction
-from needle_sim.drives.emulated_bus import EmulatedBus, bus_health, obey
+from needle_sim.drives.emulated_bus import EmulatedBus, bus_health, execute_command
 from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.motor import MotorSettings
 
@@ -174,7 +174,7 @@ class DriveEmulator(Component):
         for line in lines:
             axes = self.bus.axes(at.steady)
             try:
-                order = obey(line, self.bus, at.steady)
+                order = execute_command(line, self.bus, at.steady)
             except UserError as error:
                 yield Log("error", str(error))
                 continue

@@ -30,7 +30,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
-from needle_core.files.installed import find_shared
+from needle_core.files.installed import find_shared_file
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration, load_calibration
 from needle_tracker.sources.pair_port import Event, PairPort
@@ -76,7 +76,7 @@ class StereoCameraParameters:
     def calibration(self) -> StereoCalibration:
         """Return the cameras' calibration, the installed one by default."""
         installed = "needle_tracker", "config/calibration.yaml"
-        return load_calibration(Path(self.calibration_file or find_shared(*installed)))
+        return load_calibration(Path(self.calibration_file or find_shared_file(*installed)))
 
 
 class StereoCamera(Component):

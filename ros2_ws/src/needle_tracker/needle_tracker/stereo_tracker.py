@@ -25,8 +25,8 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
-from needle_core.files.installed import find_shared
-from needle_core.files.plain_yaml import read_calibration
+from needle_core.files.installed import find_shared_file
+from needle_core.files.yaml_files import read_calibration
 from needle_tracker.answers.annotation import annotate
 from needle_tracker.answers.health import Health
 from needle_tracker.answers.pair_answers import Answer, PairAnswers
@@ -199,7 +199,7 @@ def make_tracker(
     UserError
         A bad calibration file.
     """
-    installed = partial(find_shared, "needle_tracker", "config/calibration.yaml")
+    installed = partial(find_shared_file, "needle_tracker", "config/calibration.yaml")
     path = Path(settings.calibration_file or installed())
     text = read_calibration(path)
     return StereoTipTracker(settings, calibration_from(text, path), text, name)

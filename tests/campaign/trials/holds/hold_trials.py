@@ -21,8 +21,8 @@ from campaign.trials.rig_hand import CONTROLLER_START, RigHand, ros
 from campaign.trials.trial_processes import TrialProcesses, without_recorder
 from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_core.errors import UserError
-from needle_core.process.reach import DISCOVERY_RANGE, PROFILES, keep_to_this_machine
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.discovery import DISCOVERY_RANGE, PROFILES, restrict_discovery
+from needle_core.process.ros_domain import reserve_domain_id
 from needle_core.ros.base_node import RELIABLE, STEADY_CLOCK
 from needle_core.settings.parameter_files import Parameters
 
@@ -70,7 +70,7 @@ def hold_trials(kind: str, count: int, seed: int = 1) -> list[dict[str, Any]]:
     outcomes: list[dict[str, Any]] = []
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="needle_trial_")))
-        domain = stack.enter_context(own_domain())
+        domain = stack.enter_context(reserve_domain_id())
         cable: tuple[Callable[[], None], ...] = ()
         persons: Sequence[str] = ()
         if kind == CABLE:
@@ -80,7 +80,7 @@ def hold_trials(kind: str, count: int, seed: int = 1) -> list[dict[str, Any]]:
             # What a person sets on both computers; the rest follows from it.
             os.environ[DISCOVERY_RANGE] = "SUBNET"
             os.environ.pop(PROFILES, None)
-            keep_to_this_machine()
+            restrict_discovery()
             persons, cable = one.inside, (wire.cut, wire.mend)
         stack.enter_context(ros(domain))
         while len(outcomes) < count:

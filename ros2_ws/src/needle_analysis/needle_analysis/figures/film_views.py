@@ -27,7 +27,7 @@ from needle_analysis.run.run_summary import GOAL, finite_tips, target_offset
 from needle_bags.reading.bag_images import SIDES, images_at
 from needle_bags.reading.bag_reader import Run
 from needle_core.errors import UserError
-from needle_core.files.plain_yaml import load_plain
+from needle_core.files.yaml_files import load_yaml
 from needle_tracker.optics.calibration import parse_calibration
 
 Floats = npt.NDArray[np.float64]
@@ -76,7 +76,7 @@ def projections(run: Run) -> dict[str, Projection]:
     from needle_tracker.optics.refraction import stereo_views  # noqa: PLC0415
 
     try:
-        calibration = parse_calibration(load_plain(run.calibration))
+        calibration = parse_calibration(load_yaml(run.calibration))
     except (UserError, ValueError):
         return {}
     views = stereo_views(calibration)

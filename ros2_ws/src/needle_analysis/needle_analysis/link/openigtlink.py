@@ -49,7 +49,7 @@ class OpenIGTLink(Component):
     """
 
     name = "openigtlink"
-    takes_simulated_time = True
+    accepts_simulated_time = True
 
     def __init__(self, settings: OpenIGTLinkParameters) -> None:
         self.settings = settings

@@ -74,7 +74,7 @@ class LiveView(Component):
     """
 
     name = "live_view"
-    takes_simulated_time = True
+    accepts_simulated_time = True
 
     def __init__(self, settings: LiveViewParameters, *, transforms: bool) -> None:
         self.settings = settings

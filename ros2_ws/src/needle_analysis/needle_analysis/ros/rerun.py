@@ -34,10 +34,15 @@ from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.component import Moment
 from needle_core.errors import UserError
-from needle_core.files.plain_yaml import load_plain, read_calibration
+from needle_core.files.yaml_files import load_yaml, read_calibration
 from needle_core.messages import Text
 from needle_core.ros.parameters import OF_EVERY_NODE
-from needle_core.settings.parameter_files import Sections, none_for, read_sections, values_for
+from needle_core.settings.parameter_files import (
+    Sections,
+    missing_section_warning,
+    read_sections,
+    values_for,
+)
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import parse_calibration
 from needle_tracker.stereo_tracker import CALIBRATION, TIP_POSE, StereoTipTracker
@@ -139,7 +144,7 @@ def _run(words: Sequence[str]) -> int:
     controller_node = _node(run, CONTROLLER, params, asked)
     reached = controller_node.given.difference(asked) or (tracker_node and tracker_node.given)
     if given.params is not None and not reached:
-        print(f"warning: {none_for(*params, controller_node.name)}", file=sys.stderr)
+        print(f"warning: {missing_section_warning(*params, controller_node.name)}", file=sys.stderr)
     calibration = run.calibration if tracker_node is None else _calibration(run, tracker_node)
     tracker = None if tracker_node is None else _tracker(run, tracker_node, calibration)
     ends = step_ends(run.path, run.namespace)
@@ -254,7 +259,7 @@ def _calibration(run: Run, node: Node) -> str:
 
 def _tracker(run: Run, node: Node, text: str) -> BagStage:
     try:
-        calibration = parse_calibration(load_plain(text))
+        calibration = parse_calibration(load_yaml(text))
     except (UserError, ValueError) as error:
         raise UserError(f"{run.path}: the calibration is broken: {error}") from error
     tracker = StereoTipTracker(node.parameters(StereoTrackerParameters), calibration)

@@ -76,11 +76,11 @@ def bag_information(
     custom_data: Mapping[str, str],
     distribution: str,
     *,
-    is_packed: bool = False,
+    is_compressed: bool = False,
 ) -> dict[str, Any]:
     """Return the content of metadata.yaml below `rosbag2_bagfile_information`.
 
-    Messages that were compressed one by one (`is_packed`) are read so by every tool.
+    Messages that were compressed one by one (`is_compressed`) are read so by every tool.
     """
     starts = [file.first for file in files if file.first is not None]
     start = min(starts, default=0)
@@ -98,8 +98,8 @@ def bag_information(
             }
             for topic in topics
         ],
-        "compression_format": "zstd" if is_packed else "",
-        "compression_mode": "message" if is_packed else "",
+        "compression_format": "zstd" if is_compressed else "",
+        "compression_mode": "message" if is_compressed else "",
         "relative_file_paths": [file.name for file in files],
         "files": [
             {

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from needle_core.errors import UserError
 from needle_core.files.bag_topic import parsed_types
-from needle_core.files.installed import find_shared
+from needle_core.files.installed import find_shared_file
 
 _SEPARATOR = "=" * 80
 _BUILT_IN_TEXT = """
@@ -80,7 +80,7 @@ def message_class(type_name: str) -> Any:
 def _read(type_name: str) -> str:
     try:
         package, kind, name = type_name.split("/")
-        return find_shared(package, f"{kind}/{name}.msg").read_text(encoding="utf-8")
+        return find_shared_file(package, f"{kind}/{name}.msg").read_text(encoding="utf-8")
     except ValueError:
         raise UserError(f"{type_name!r} is not a message type: wants package/msg/Name") from None
     except UserError:

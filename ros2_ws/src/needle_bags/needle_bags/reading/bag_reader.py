@@ -14,7 +14,7 @@ import numpy.typing as npt
 from needle_bags.reading.bag_files import read_contents, read_messages
 from needle_bags.reading.bag_rigs import CALIBRATION, namespace_of, namespaces, require_types
 from needle_core.errors import UserError
-from needle_core.files.plain_yaml import load_plain
+from needle_core.files.yaml_files import load_yaml
 
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
@@ -361,7 +361,7 @@ def _parameters(text: str) -> dict[str, dict[str, Any]]:
 def _mapping(text: str) -> dict[str, Any]:
     """Return YAML or JSON text as a mapping; other text under the key `text`."""
     try:
-        value = json.loads(text) if text.lstrip().startswith("{") else load_plain(text)
+        value = json.loads(text) if text.lstrip().startswith("{") else load_yaml(text)
     except ValueError:
         value = text
     if value is None:

@@ -241,8 +241,10 @@ def _new_information(
     if note not in before:
         custom = {**custom, _RECOVERED: "; ".join(filter(None, (before, note)))}
     distribution = parts[0].distribution or str(told.get("ros_distro") or "")
-    is_packed = any(part.is_packed for part in parts)
-    return bag_information(files, list(topics.values()), custom, distribution, is_packed=is_packed)
+    is_compressed = any(part.is_compressed for part in parts)
+    return bag_information(
+        files, list(topics.values()), custom, distribution, is_compressed=is_compressed
+    )
 
 
 def _read_through(path: Path) -> BagDirectory:

@@ -38,7 +38,7 @@ from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.files.bag_directory import BagDirectory
 from needle_core.files.bag_topic import BagTopic
-from needle_core.process.end_request import EndRequest
+from needle_core.process.shutdown import ShutdownFlag
 from needle_core.ros.base_node import RELIABLE, DiagnosticsPublisher, WholeNode, to_stamp
 from needle_core.ros.main import run_node
 from needle_core.ros.parameters import NodeParameters
@@ -125,13 +125,13 @@ class Player(WholeNode):
             raise UserError(f"{options.bag}: none of its topics can be played here")
         return playable
 
-    def prepare(self, spin: partial[None], end: EndRequest) -> bool:
+    def prepare(self, spin: partial[None], end: ShutdownFlag) -> bool:
         """Look for a rig, make the publishers, and wait for who listens already.
 
         Returns
         -------
         bool
-            False where `end` was wanted meanwhile: then nothing is to be played.
+            False where `end` was requested meanwhile: then nothing is to be played.
 
         Raises
         ------
@@ -140,18 +140,18 @@ class Player(WholeNode):
         """
         self._make_publishers()
         begin = time.monotonic()
-        while time.monotonic() < begin + DISCOVERY and not (self.beside_rig or end.wanted):
+        while time.monotonic() < begin + DISCOVERY and not (self.beside_rig or end.requested):
             spin()
             if self._rig() is not None:
                 self.get_logger().warning(f"a rig is on this graph: all is played under {REPLAY}")
                 self.beside_rig = True
                 self._make_publishers()
                 begin = time.monotonic()
-        while time.monotonic() < begin + DISCOVERY + MATCHING and not end.wanted:
+        while time.monotonic() < begin + DISCOVERY + MATCHING and not end.requested:
             if self._all_matched():
                 break
             spin()
-        if end.wanted:
+        if end.requested:
             return False
         self._publish_latched(self.start)
         self.clock.restart(self.start, time.monotonic())
@@ -290,7 +290,7 @@ class Player(WholeNode):
         return response
 
 
-def _play(player: Player, loop: bool, end: EndRequest) -> int:
+def _play(player: Player, loop: bool, end: ShutdownFlag) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(player)
     bar = tqdm(
@@ -317,7 +317,7 @@ def _play(player: Player, loop: bool, end: EndRequest) -> int:
                             wait = player.clock.wait(message[1], time.monotonic())
                     executor.spin_once(min(wait, PATIENCE))
                     player.look_around()
-                    if end.wanted:
+                    if end.requested:
                         return EXIT_DONE
                     for key in keys.pressed():
                         player.press(key)
@@ -340,7 +340,7 @@ def main(args: list[str] | None = None) -> int:
         contents = read_contents(options.bag)
         require_fits(options, contents)
 
-        def spin(node: Node, end: EndRequest) -> int:
+        def spin(node: Node, end: ShutdownFlag) -> int:
             player = cast(Player, node)
             try:
                 code = _play(player, options.loop, end)

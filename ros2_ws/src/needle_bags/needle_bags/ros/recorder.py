@@ -30,8 +30,8 @@ from needle_core.diagnostics import Diagnostic, Level
 from needle_core.files.bag_path import recover_hint
 from needle_core.files.bag_topic import BagTopic
 from needle_core.files.mcap_file import RUN_RECORD
-from needle_core.files.plain_yaml import read_calibration
-from needle_core.process.end_request import EndRequest
+from needle_core.files.yaml_files import read_calibration
+from needle_core.process.shutdown import ShutdownFlag
 from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, WholeNode
 from needle_core.ros.main import run_node
 from needle_core.ros.parameters import NodeParameters
@@ -282,12 +282,12 @@ def main(args: list[str] | None = None) -> int:
     """Run the recorder; returns the exit code."""
     keep_freed_memory()
 
-    def spin(node: Node, end: EndRequest) -> int:
+    def spin(node: Node, end: ShutdownFlag) -> int:
         recorder = cast(Recorder, node)
         executor = SingleThreadedExecutor()
         executor.add_node(recorder)
         try:
-            while not end.wanted:
+            while not end.requested:
                 _spin_once(executor, recorder, 0.1)
             limit = time.monotonic() + LAST_WORDS_LIMIT
             quiet = time.monotonic() + LAST_WORDS

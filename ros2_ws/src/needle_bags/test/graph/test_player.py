@@ -180,7 +180,7 @@ def test_paused_a_latched_message_is_there_and_loops_go_on_until_the_end(scene: 
         assert scene.pause(False) == "playing"
 
     def stop() -> None:
-        scene.ended.wanted = True
+        scene.ended.requested = True
 
     scene.at(9.0, begin)
     scene.at(9.0 + 2.5 * (COUNT - 5), stop)

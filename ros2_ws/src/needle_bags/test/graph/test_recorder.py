@@ -74,7 +74,7 @@ class Scene(PlayedGraph):
 
         def act_and_end() -> None:
             act()
-            ended.wanted = True
+            ended.requested = True
 
         self.at(0.3, act_and_end)
 

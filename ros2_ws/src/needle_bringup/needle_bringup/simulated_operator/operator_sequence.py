@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from needle_core.process.ros_domain import WAY_OUT
+from needle_core.process.ros_domain import CONFLICT_HINT
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 
@@ -194,7 +194,7 @@ class OperatorSequence:
         """Take who publishes device/status: with more than one, nobody knows what would move."""
         self._devices = names
         if len(names) > 1 and (self._prepared or self._asked):
-            self._end(f"there is more than one device: {', '.join(names)}; {WAY_OUT}")
+            self._end(f"there is more than one device: {', '.join(names)}; {CONFLICT_HINT}")
 
     def see_device(self, status: DeviceStatus, now: float) -> None:
         """Take device/status."""

@@ -13,7 +13,7 @@ from needle_bringup.simulation.console_graph import run_console_graph
 from needle_bringup.simulation.console_options import LOOPBACK, ConsoleOptions, parse_console
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_core.commands.cli import EXIT_INTERRUPTED, EXIT_MISSED, run_command
-from needle_core.process.end_request import EndRequest
+from needle_core.process.shutdown import ShutdownFlag
 from needle_core.settings.parameter_files import Parameters
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def console(options: ConsoleOptions) -> int:
         Where something is missing or a port is taken.
     """
     if options.rig.graph:
-        with EndRequest() as end:
+        with ShutdownFlag() as end:
             return run_console_graph(options, rig_parameters(options), end)
     # Small matrices: threads only get in each other's way. It counts for what is loaded from here.
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
@@ -59,14 +59,14 @@ def console(options: ConsoleOptions) -> int:
     from needle_core.runners.paced import PacedRunner  # noqa: PLC0415
 
     settings = ConsoleParameters(address=LOOPBACK, port=options.port, hold_port=options.port + 1)
-    with EndRequest() as end:
+    with ShutdownFlag() as end:
         desk = ServedDesk(settings)
         rig, ports = _make_rig(rig_parameters(options))
         components = [*rig, Console(settings)]
         runner = PacedRunner(components, options.rig.seed, ports={PAGE: desk, **ports})
         with contextlib.closing(runner):
             print(f"http://{LOOPBACK}:{options.port}/   (Ctrl-C ends all)", flush=True)
-            while not end.wanted:
+            while not end.requested:
                 if runner.run(_SLICE):
                     (name, ended), *_ = runner.exits.items()
                     print(f"error: {name} ended: {ended.text}", file=sys.stderr)

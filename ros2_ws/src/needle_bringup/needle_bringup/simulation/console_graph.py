@@ -11,8 +11,8 @@ from needle_bringup.simulation.launch_nodes import LAUNCHED_PACKAGES
 from needle_bringup.simulation.node_graph import NodeGraph
 from needle_bringup.simulation.node_process import wait_for
 from needle_core.commands.cli import EXIT_INTERRUPTED
-from needle_core.process.end_request import EndRequest
-from needle_core.process.reach import settle_environment
+from needle_core.process.discovery import clean_environment
+from needle_core.process.shutdown import ShutdownFlag
 from needle_core.settings.parameter_files import Parameters
 
 # What stands in for the person, and what records.
@@ -20,7 +20,7 @@ _LEFT_OUT = ("simulated_operator", "recorder")
 _POLL = 0.1
 
 
-def run_console_graph(options: ConsoleOptions, rig: Parameters, end: EndRequest) -> int:
+def run_console_graph(options: ConsoleOptions, rig: Parameters, end: ShutdownFlag) -> int:
     """Run the rig, its page and its live view as nodes in this shell's ROS domain.
 
     Parameters
@@ -29,7 +29,7 @@ def run_console_graph(options: ConsoleOptions, rig: Parameters, end: EndRequest)
         What to run.
     rig : Parameters
         Node to its parameters.
-    end : EndRequest
+    end : ShutdownFlag
         When to end.
 
     Returns
@@ -42,7 +42,7 @@ def run_console_graph(options: ConsoleOptions, rig: Parameters, end: EndRequest)
     NodeFailedError
         If a node ended before.
     """
-    settle_environment()
+    clean_environment()
     nodes = {name: values for name, values in rig.items() if name not in _LEFT_OUT}
     nodes["console"] = {"port": options.port, "hold_port": options.port + 1}
     packages = {**LAUNCHED_PACKAGES, "console": "needle_console"}
@@ -52,7 +52,7 @@ def run_console_graph(options: ConsoleOptions, rig: Parameters, end: EndRequest)
         for name in (*nodes, "live_view"):
             graph.start(packages[name], name)
         print(f"http://{LOOPBACK}:{options.port}/   (Ctrl-C ends all)", flush=True)
-        while not end.wanted:
+        while not end.requested:
             graph.check()
             wait_for([graph.nodes["console"]], _POLL)
     finally:

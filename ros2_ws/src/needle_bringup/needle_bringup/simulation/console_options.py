@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 from needle_bringup.simulation.simulate_options import SimulateOptions, parse
-from needle_core.commands.options import CommandParser, join_start, whole_number
+from needle_core.commands.options import CommandParser, join_signed_values, whole_number
 
 DESCRIPTION = """\
 Steer a simulated needle by hand, in a browser, in real time.
@@ -84,7 +84,7 @@ def parse_console(arguments: Sequence[str]) -> ConsoleOptions:
     parser.add_argument("--graph", action="store_true", help="run ROS nodes, for RViz and Foxglove")
     for option, (metavar, text) in _SHARED.items():
         parser.add_argument(option, metavar=metavar, help=text)
-    given = parser.parse_args(join_start(arguments))
+    given = parser.parse_args(join_signed_values(arguments))
     # Who steers by hand decides how fast the needle goes, and not where it stops in between.
     words = ["--graph"] if given.graph else ["--real-time-factor", "1"]
     words += ["--insertion", "continuous"]

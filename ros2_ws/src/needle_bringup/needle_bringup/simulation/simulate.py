@@ -43,9 +43,9 @@ from needle_core.commands.cli import (
 )
 from needle_core.commands.executables import loaded
 from needle_core.errors import UserError
-from needle_core.process.end_request import EndRequest
-from needle_core.process.reach import settle_environment
-from needle_core.process.ros_domain import own_domain
+from needle_core.process.discovery import clean_environment
+from needle_core.process.ros_domain import reserve_domain_id
+from needle_core.process.shutdown import ShutdownFlag
 from needle_core.settings.parameter_files import Parameters, read_parameters
 
 METADATA = "metadata.yaml"
@@ -87,14 +87,14 @@ def simulate(options: SimulateOptions) -> int:
         After an interrupt, when everything has ended.
     """
     if options.graph:
-        settle_environment(own_graph=True)
+        clean_environment(own_graph=True)
     started_at = float(os.environ.get(STARTED_AT) or time.time())
     given: Parameters = {}
     if options.params is not None:
         given = read_parameters(options.params, nodes_of(options))
         refuse_reserved(options.params, given, options)
     # A signal is looked at between steps from here on; in the report it raises wherever it comes.
-    end = EndRequest()
+    end = ShutdownFlag()
     bag = _make_folder(options)
     try:
         parameters = merge(command_line_parameters(options, bag), given)
@@ -120,13 +120,13 @@ def simulate(options: SimulateOptions) -> int:
         raise
 
 
-def _check(end: EndRequest) -> None:
-    if end.wanted:
+def _check(end: ShutdownFlag) -> None:
+    if end.requested:
         raise KeyboardInterrupt
 
 
 def _run_components(
-    options: SimulateOptions, parameters: Parameters, bag: Path, end: EndRequest
+    options: SimulateOptions, parameters: Parameters, bag: Path, end: ShutdownFlag
 ) -> None:
     """Run the rig in this process until the operator ends."""
     # The controller's compiled code takes a while to load: not where other processes do that.
@@ -146,10 +146,10 @@ def _run_components(
 
 
 def _run_graph(
-    options: SimulateOptions, parameters: Parameters, bag: Path, end: EndRequest
+    options: SimulateOptions, parameters: Parameters, bag: Path, end: ShutdownFlag
 ) -> None:
     """Run the rig as ROS nodes until the operator ends."""
-    with own_domain() as domain:
+    with reserve_domain_id() as domain:
         print(f"recording into {shown(bag)} (ROS_DOMAIN_ID {domain})", file=sys.stderr)
         # Nodes write into their log files; only the operator's progress goes to the terminal.
         progress = os.dup(sys.stderr.fileno())
@@ -165,7 +165,7 @@ def _run_graph(
             graph.stop()
 
 
-def _await_operator(graph: NodeGraph, end: EndRequest) -> None:
+def _await_operator(graph: NodeGraph, end: ShutdownFlag) -> None:
     operator, begin = graph.nodes[OPERATOR], time.monotonic()
     while operator.exit_code is None:
         _check(end)

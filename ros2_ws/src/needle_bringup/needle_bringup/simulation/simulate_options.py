@@ -10,7 +10,7 @@ from typing import Any
 
 from needle_core.commands.options import (
     CommandParser,
-    join_start,
+    join_signed_values,
     number,
     output_file,
     start,
@@ -116,7 +116,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
     UserError
         Anything that cannot be run as asked.
     """
-    given = _parser().parse_args(join_start(arguments))
+    given = _parser().parse_args(join_signed_values(arguments))
     _one_of("--level", given.level, LEVELS)
     _one_of("--controller", given.controller, CONTROLLERS)
     _one_of("--insertion", given.insertion, INSERTIONS)

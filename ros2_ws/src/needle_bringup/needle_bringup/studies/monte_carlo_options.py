@@ -12,7 +12,7 @@ from needle_bringup.studies.disturbance_options import add_disturbance_options, 
 from needle_controller.presets.steering_settings import PRESETS
 from needle_core.commands.options import (
     CommandParser,
-    join_start,
+    join_signed_values,
     number,
     output_file,
     start,
@@ -120,7 +120,7 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
     UserError
         Anything that cannot be run as asked.
     """
-    given = _parser().parse_args(join_start(arguments))
+    given = _parser().parse_args(join_signed_values(arguments))
     if given.grid not in GRIDS:
         raise UserError(f"--grid {given.grid!r} is not one of {', '.join(GRIDS)}")
     if given.targets != "0" and given.turn_delay_mm != "0":

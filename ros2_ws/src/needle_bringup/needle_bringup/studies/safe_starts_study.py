@@ -21,7 +21,7 @@ from needle_controller.planning.safe_starts import SafeStarts, safe_starts
 from needle_controller.presets.path_steering import path_planner
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
-from needle_core.commands.options import CommandParser, join_start, number, output_file
+from needle_core.commands.options import CommandParser, join_signed_values, number, output_file
 from needle_core.errors import UserError
 
 OFFSETS = np.linspace(-0.024, 0.024, 17)
@@ -68,7 +68,7 @@ def _run(words: Sequence[str]) -> int:
     add("--obstacles", metavar="FILE", help="YAML file of spheres and capsules")
     add("--output", metavar="FILE.png", help="write the picture there")
     add("--json", metavar="FILE", help="write the figures there")
-    given = parser.parse_args(join_start(words))
+    given = parser.parse_args(join_signed_values(words))
     if given.target is None:
         raise UserError("--target X_MM,Y_MM,Z_MM is missing")
     parts = given.target.split(",")

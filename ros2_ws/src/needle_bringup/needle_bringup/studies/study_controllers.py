@@ -164,7 +164,7 @@ class NeedlesToPoints(SteeredNeedles):
         self._left: FloatArray = np.full((), np.nan)
         super().__init__(new_estimators, self._command, covariance)
 
-    def see_targets(self, time: float, targets: FloatArray) -> None:
+    def set_targets(self, time: float, targets: FloatArray) -> None:
         """Take where the targets are; see `point_study.PointController`."""
         self._motion.see(time, targets)
 

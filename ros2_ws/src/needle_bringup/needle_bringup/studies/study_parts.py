@@ -20,7 +20,7 @@ from needle_bringup.studies.study_controllers import (
 )
 from needle_core.commands.cli import JsonValue
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.figures_of_merit import Outcomes, doubted, figures, joined
+from needle_sim.studies.figures_of_merit import Outcomes, is_doubtful, figures, concatenate
 from needle_sim.studies.point_study import (
     MovingTargets,
     PointOutcomes,
@@ -116,7 +116,7 @@ def results_of(parts: Sequence[StudyPart], outcomes: Sequence[Outcomes | PointOu
     """Return the results of a study from what became of its parts, in their order."""
     x, pitch, roll = np.concatenate([part.starts for part in parts]).T
     begun = {"x_mm": x * 1e3, "pitch_deg": np.rad2deg(pitch), "roll_deg": np.rad2deg(roll)}
-    whole = joined(outcomes)
+    whole = concatenate(outcomes)
     if isinstance(whole, PointOutcomes):
         ended = _of_points(whole, np.concatenate([part.places for part in parts]))
     else:
@@ -193,7 +193,7 @@ def _of_plane(outcomes: Outcomes) -> Results:
             "diverged": outcomes.diverged.astype(float),
             "inside_3_sigma": outcomes.inside_3_sigma,
             "x_inside_3_sigma": outcomes.x_inside_3_sigma,
-            "doubtful": doubted(outcomes.missed),
+            "doubtful": is_doubtful(outcomes.missed),
             "stated_miss": outcomes.missed,
         },
     )
@@ -210,6 +210,6 @@ def _of_points(outcomes: PointOutcomes, places: FloatArray) -> Results:
             "error_mm": outcomes.error * 1e3,
             "rotation_deg": np.rad2deg(outcomes.rotation),
             "inside_3_sigma": outcomes.inside_3_sigma,
-            "doubtful": doubted(outcomes.missed),
+            "doubtful": is_doubtful(outcomes.missed),
         },
     )

@@ -16,7 +16,7 @@ from needle_bringup.simulation.launch_nodes import (
     simulated_nodes,
 )
 from needle_core.errors import UserError
-from needle_core.files.installed import find_shared
+from needle_core.files.installed import find_shared_file
 from needle_core.settings.parameter_files import Parameters
 
 
@@ -27,7 +27,7 @@ def simulated(**arguments: str) -> Parameters:
 
 
 def beside_rig(**arguments: str) -> Parameters:
-    calibration = str(find_shared("needle_tracker", "config/calibration.yaml"))
+    calibration = str(find_shared_file("needle_tracker", "config/calibration.yaml"))
     return nodes_beside_rig(
         {"calibration": calibration, "drives": "", "bag": "", "params": "", **arguments}
     )

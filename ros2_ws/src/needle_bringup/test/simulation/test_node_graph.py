@@ -20,7 +20,7 @@ from needle_bringup.simulation.node_process import NodeProcess, stop
 from needle_bringup.simulation.rig_configuration import PACKAGES
 from needle_bringup.simulation.simulate_options import parse
 from needle_core.errors import UserError
-from needle_core.process.end_request import EndRequest
+from needle_core.process.shutdown import ShutdownFlag
 from needle_core.settings.parameter_files import NODES, read_parameters
 from reference.rig_nodes import executables
 
@@ -191,10 +191,10 @@ def test_an_interrupt_while_nodes_start_ends_them(
 def test_the_console_s_graph_has_the_page_and_a_live_view_and_no_stand_in(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    end = EndRequest()
+    end = ShutdownFlag()
 
     def wait(nodes: Sequence[NodeProcess], _: float) -> None:
-        end.wanted = True
+        end.requested = True
 
     monkeypatch.setattr(console_graph, "wait_for", wait)
     options = parse_console(["--graph", "--port", "9000"])

@@ -137,7 +137,7 @@ def test_needles_that_are_not_where_they_are_to_be_say_so() -> None:
     needles.start(tips)
     # What counts is the point, not the plane x = 0.
     to_points = point_controller_factory("best", 0.001)()
-    to_points.see_targets(0.0, tips[::-1] + np.array([[0.0, 0.0009, 0.0], [0.0, 0.0, 0.06]]))
+    to_points.set_targets(0.0, tips[::-1] + np.array([[0.0, 0.0009, 0.0], [0.0, 0.0, 0.06]]))
     to_points.start(tips[::-1])
     for belief in (needles.belief(), to_points.belief()):
         assert belief is not None

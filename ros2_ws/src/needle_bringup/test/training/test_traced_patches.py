@@ -12,11 +12,11 @@ from needle_bringup.training import traced_scenes
 from needle_bringup.training.samples import CANVAS, SIZE
 from needle_bringup.training.traced_patches import Cut, traced_patch
 from needle_bringup.training.traced_scenes import TracedScene, shaft_share, trace_scene
-from needle_core.files.installed import find_shared
+from needle_core.files.installed import find_shared_file
 from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import load_stereo_rig
 
-RIG = load_stereo_rig(find_shared("needle_tracker", "config/calibration_top_and_side.yaml"))
+RIG = load_stereo_rig(find_shared_file("needle_tracker", "config/calibration_top_and_side.yaml"))
 
 
 def bars(width_px: float) -> TracedScene:

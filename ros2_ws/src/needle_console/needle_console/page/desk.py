@@ -15,7 +15,7 @@ from needle_console.view.advice import Button
 from needle_console.view.camera_feed import CameraFeed
 from needle_console.view.snapshot import Array, Snapshot
 from needle_core.component import Batch, Log
-from needle_core.files.installed import find_shared
+from needle_core.files.installed import find_shared_file
 from needle_core.messages import HOLD_LIFETIME, Point, Pose, quaternion_from_rotation
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.optics.refraction import stereo_views
@@ -152,7 +152,7 @@ def _cameras(file: str) -> dict[str, Any]:
     path = (
         Path(file).expanduser()
         if file
-        else find_shared("needle_tracker", "config/calibration.yaml")
+        else find_shared_file("needle_tracker", "config/calibration.yaml")
     )
     left, right = stereo_views(load_calibration(path))
     return {"left": left, "right": right}

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from needle_console.view.snapshot import Array, CoursePoint, SeenTip, Snapshot, trouble_of
-from needle_core.diagnostics import plain
+from needle_core.diagnostics import sanitize
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 # Estimates that are closer together are drawn as one [m].
@@ -144,13 +144,13 @@ class RigPicture:
         """Take one line of /diagnostics: `node: part`, whether it warns, and what it says."""
         self._troubles.pop(name, None)
         if bad:
-            self._troubles[name] = (f"{plain(name)}: {plain(message, 160)}", now)
+            self._troubles[name] = (f"{sanitize(name)}: {sanitize(message, 160)}", now)
         while len(self._troubles) > MOST_POINTS:
             del self._troubles[next(iter(self._troubles))]
 
     def see_answer(self, text: str) -> None:
         """Take what a service call was answered."""
-        self._tell(answer=plain(text, 200))
+        self._tell(answer=sanitize(text, 200))
 
     def _tell(self, **news: object) -> None:
         self._told = dataclasses.replace(self._told, **news)  # type: ignore[arg-type]

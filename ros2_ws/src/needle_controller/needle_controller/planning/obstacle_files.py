@@ -15,7 +15,7 @@ from typing import Any
 from needle_controller.model.target_plane import RIG
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_core.errors import UserError
-from needle_core.files.plain_yaml import read_yaml
+from needle_core.files.yaml_files import read_yaml
 
 _KINDS = {"spheres": ("center", "center"), "capsules": ("start", "end")}
 

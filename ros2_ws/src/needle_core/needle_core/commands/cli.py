@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from needle_core.errors import UserError
-from needle_core.process.end_request import interruptible
+from needle_core.process.shutdown import interruptible
 
 EXIT_DONE = 0
 EXIT_MISSED = 1

@@ -16,8 +16,8 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import NoReturn
 
-from needle_core.process.end_request import LeaveAtOnce
-from needle_core.process.reach import use_fast_dds
+from needle_core.process.discovery import use_fast_dds
+from needle_core.process.shutdown import ExitOnSignal
 
 _EXIT_DONE = 0
 _EXIT_INTERRUPTED = 130
@@ -33,7 +33,7 @@ def node(module: str) -> Callable[[], NoReturn]:
     """
 
     def enter() -> NoReturn:
-        LeaveAtOnce(_EXIT_DONE)
+        ExitOnSignal(_EXIT_DONE)
         use_fast_dds()
         code: int = loaded(module).main()
         # No way back through the interpreter: what DDS and numerical code left there has its own
@@ -57,7 +57,7 @@ def command(module: str) -> Callable[[], NoReturn]:
     """
 
     def enter() -> NoReturn:
-        LeaveAtOnce(_EXIT_INTERRUPTED)
+        ExitOnSignal(_EXIT_INTERRUPTED)
         use_fast_dds()
         sys.exit(loaded(module).main())
 

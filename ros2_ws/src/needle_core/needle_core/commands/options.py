@@ -106,7 +106,7 @@ def output_file(name: str, text: str | Path | None) -> Path | None:
 _STARTS = ("--initial", "--target")
 
 
-def join_start(arguments: Sequence[str]) -> list[str]:
+def join_signed_values(arguments: Sequence[str]) -> list[str]:
     """Write `--initial -3,2,15` as `--initial=-3,2,15`: argparse takes the former for an option.
 
     Likewise `--target`.

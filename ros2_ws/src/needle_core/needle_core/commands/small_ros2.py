@@ -14,7 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import NoReturn
 
 from needle_core.errors import UserError
-from needle_core.process.reach import settle_environment
+from needle_core.process.discovery import clean_environment
 
 HELP = """\
 usage: ros2 run PACKAGE EXECUTABLE [arguments]
@@ -41,7 +41,7 @@ def main() -> int:
                 for package in given or sorted(executables()):
                     print("\n".join(f"{package} {name}" for name in of_package(package)))
             case ["node" | "topic" | "service" | "param", *_] as words:
-                settle_environment()
+                clean_environment()
                 commands = importlib.import_module("needle_core.ros.graph_commands")
                 return int(commands.main(words))
             case words:

@@ -56,7 +56,7 @@ class SqliteData:
                 yield connection.topic, log_time, log_time, bytes(data)
 
 
-def is_packed(data: bytes) -> bool:
+def is_compressed(data: bytes) -> bool:
     """Return whether a message was compressed by itself; none in CDR begins so."""
     return data.startswith(zstandard.FRAME_HEADER)
 

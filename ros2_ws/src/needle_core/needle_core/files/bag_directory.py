@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys.store import Typestore
 
 from needle_core.errors import UserError
-from needle_core.files.bag_data import SqliteData, is_packed, unpack, unpack_file
+from needle_core.files.bag_data import SqliteData, is_compressed, unpack, unpack_file
 from needle_core.files.bag_path import METADATA_FILE, read_information, readable, require_bag
 from needle_core.files.bag_topic import BagTopic, offered_profiles, typestore_of
 from needle_core.files.file_access import open_regular
@@ -72,14 +72,14 @@ class BagDirectory:
         Log times of the first and the last message [ns]; 0 in an empty bag.
     records : list of Metadata
         Of a file that is read alone: its metadata records.
-    is_packed : bool
+    is_compressed : bool
         Whether messages were compressed one by one, by those that were read.
     """
 
     def __init__(self, path: Path) -> None:
         require_bag(path)
         self.path = path
-        self.is_packed = False
+        self.is_compressed = False
         self.records: list[Metadata] = []
         self._stack = contextlib.ExitStack()
         try:
@@ -115,8 +115,8 @@ class BagDirectory:
         with readable(self.path):
             for file in self._files:
                 for topic, log_time, sent, data in file.read(topics, start, stop):
-                    self.is_packed |= is_packed(data)
-                    plain = unpack(data) if is_packed(data) else data
+                    self.is_compressed |= is_compressed(data)
+                    plain = unpack(data) if is_compressed(data) else data
                     type_name = self.topics[topic].type_name
                     yield SentMessage(sent, log_time, topic, type_name, plain)
 

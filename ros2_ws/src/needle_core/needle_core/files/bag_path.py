@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from needle_core.errors import UserError
 from needle_core.files.file_access import open_regular
-from needle_core.files.plain_yaml import load_plain
+from needle_core.files.yaml_files import load_yaml
 
 METADATA_FILE: Final = "metadata.yaml"
 _DATA_FILE: Final = re.compile(r"([^.].*?)(?:_(\d+))?\.mcap(?:\.zstd)?")
@@ -142,7 +142,7 @@ def read_information(path: Path) -> dict[str, Any]:
     with open_regular(path / METADATA_FILE) as stream:
         data = stream.read()
     try:
-        document = load_plain(data.decode())
+        document = load_yaml(data.decode())
     except ValueError as error:
         raise ValueError(f"{METADATA_FILE}: {error}") from error
     information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else 0

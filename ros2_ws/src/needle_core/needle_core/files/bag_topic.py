@@ -14,7 +14,7 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from needle_core.files.plain_yaml import load_plain
+from needle_core.files.yaml_files import load_yaml
 
 
 def offered_profiles(profiles: Sequence[Mapping[str, Any]] | str) -> tuple[Qos, ...]:
@@ -26,7 +26,7 @@ def offered_profiles(profiles: Sequence[Mapping[str, Any]] | str) -> tuple[Qos, 
         As they are from version 9 on, or as YAML text.
     """
     try:
-        found: Any = load_plain(profiles) or [] if isinstance(profiles, str) else profiles
+        found: Any = load_yaml(profiles) or [] if isinstance(profiles, str) else profiles
         return tuple(
             qos._replace(
                 depth=int(qos.depth),

@@ -25,7 +25,7 @@ def find_executable(package: str, executable: str) -> str:
     raise UserError(_advice(f"{package} {executable}"))
 
 
-def find_shared(package: str, file: str) -> Path:
+def find_shared_file(package: str, file: str) -> Path:
     """Return the path of a file that a package has beside its code, as a configuration.
 
     Raises

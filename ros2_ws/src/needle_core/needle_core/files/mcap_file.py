@@ -19,7 +19,7 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from needle_core.files.file_access import open_regular
-from needle_core.files.plain_yaml import load_plain
+from needle_core.files.yaml_files import load_yaml
 
 # Times [ns] are signed in ROS 2.
 TIME_LIMIT: Final = 2**63
@@ -157,11 +157,11 @@ def custom_data_of(records: Iterable[Metadata]) -> dict[str, str]:
         # A text that is no YAML says nothing.
         with contextlib.suppress(ValueError, TypeError, AttributeError):
             if record.name == "parameters":
-                parameters.update(load_plain(values.get("yaml", "")))
+                parameters.update(load_yaml(values.get("yaml", "")))
             elif record.name == "parameter_change":
-                changes.append({key: load_plain(text) for key, text in values.items()})
+                changes.append({key: load_yaml(text) for key, text in values.items()})
             elif record.name == METADATA_RECORD and METADATA_KEY in values:
-                whole = load_plain(values[METADATA_KEY]).get("custom_data") or whole
+                whole = load_yaml(values[METADATA_KEY]).get("custom_data") or whole
     if parameters:
         custom["parameters"] = yaml.safe_dump(parameters)
     if changes:

@@ -12,10 +12,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from needle_core.errors import UserError
-from needle_core.process.shared_memory import remove_dead_ports, remove_half_made_ports
+from needle_core.process.shared_memory import remove_dead_ports, remove_incomplete_ports
 
 # What to do about two that may not be in one graph.
-WAY_OUT = "end one of the two, or give one a ROS_DOMAIN_ID of its own"
+CONFLICT_HINT = "end one of the two, or give one a ROS_DOMAIN_ID of its own"
 # Of an abstract socket's name [bytes].
 _LONGEST = 107
 _NAMES = Path("/proc/net/unix")
@@ -88,7 +88,7 @@ PARTICIPANTS = 40
 
 
 @contextmanager
-def own_domain() -> Iterator[int]:
+def reserve_domain_id() -> Iterator[int]:
     """Reserve a ROS_DOMAIN_ID for as long as the context lasts.
 
     Two holders never get the same: each binds a socket name for its domain, which the kernel frees
@@ -106,7 +106,7 @@ def own_domain() -> Iterator[int]:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as lock:
             if _binds(lock, f"\0needle_ros_domain_{domain}") and _is_silent(domain):
                 remove_dead_ports(ports_of(domain))
-                remove_half_made_ports()
+                remove_incomplete_ports()
                 try:
                     yield domain
                 finally:

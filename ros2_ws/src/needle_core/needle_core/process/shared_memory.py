@@ -59,7 +59,7 @@ def remove_dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> Non
                 path.unlink()
 
 
-def remove_half_made_ports(folder: Path = SHARED_MEMORY) -> None:
+def remove_incomplete_ports(folder: Path = SHARED_MEMORY) -> None:
     """Remove the ports that were half made when their maker ended; what is being made is awaited.
 
     Parameters

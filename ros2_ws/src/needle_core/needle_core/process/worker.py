@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
-from needle_core.process.end_request import ENDING_SIGNALS
+from needle_core.process.shutdown import ENDING_SIGNALS
 
 _PR_SET_PDEATHSIG = 1
 

@@ -41,7 +41,7 @@ from needle_core.component import (
 from needle_core.convert import Converter, from_ros, ros_type
 from needle_core.errors import UserError
 from needle_core.message_types import rclpy_types
-from needle_core.process.ros_domain import WAY_OUT, Claim
+from needle_core.process.ros_domain import CONFLICT_HINT, Claim
 from needle_core.ros.base_node import (
     STEADY_CLOCK,
     DiagnosticsPublisher,
@@ -107,7 +107,7 @@ class ComponentNode(WholeNode):
         self._group = ReentrantCallbackGroup()
         settings = NodeParameters(self, parameters, self._on_parameters).values
         self.component = make(settings, signature(self))
-        if self.get_parameter("use_sim_time").value and not self.component.takes_simulated_time:
+        if self.get_parameter("use_sim_time").value and not self.component.accepts_simulated_time:
             raise UserError(
                 f"{self.get_fully_qualified_name()}: use_sim_time = true: this node runs in real "
                 "time; only viewers of a replay take simulated time"
@@ -169,7 +169,7 @@ class ComponentNode(WholeNode):
             try:
                 self._claims.append(Claim(name, self.get_fully_qualified_name()))
             except UserError as error:
-                raise UserError(f"another {row.topic} is there: {error}; {WAY_OUT}") from None
+                raise UserError(f"another {row.topic} is there: {error}; {CONFLICT_HINT}") from None
             self.context.on_shutdown(self._claims[-1].release)
         kind = self._types.make(ros_type(row.message))
         return self.create_publisher(kind, self._name_of(row.topic), to_qos(row.delivery))

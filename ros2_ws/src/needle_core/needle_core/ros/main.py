@@ -26,12 +26,12 @@ from needle_core.commands.cli import (
 )
 from needle_core.component import Component, RealPort
 from needle_core.errors import UserError
-from needle_core.process.end_request import EndRequest
-from needle_core.process.reach import keep_to_this_machine
-from needle_core.process.shared_memory import remove_half_made_ports
+from needle_core.process.discovery import restrict_discovery
+from needle_core.process.shared_memory import remove_incomplete_ports
+from needle_core.process.shutdown import ShutdownFlag
 from needle_core.ros.component_node import ComponentNode
 from needle_core.settings.parameter_fields import describe
-from needle_core.settings.parameter_files import given_sections
+from needle_core.settings.parameter_files import command_line_sections
 
 _ROS_OPTIONS = ("-p", "--param", "--params-file", "-r", "--remap", "--log-level")
 # A waiting executor does not notice signals, so it wakes up with this period [s].
@@ -47,7 +47,7 @@ def run_node(
     help_text: str,
     parameters: type,
     args: list[str] | None = None,
-    spin: Callable[[Node, EndRequest], int] | None = None,
+    spin: Callable[[Node, ShutdownFlag], int] | None = None,
     shared_memory: bool = True,
 ) -> int:
     """Run a node until a signal ends it, or explain it if the command line has `--help`.
@@ -66,7 +66,7 @@ def run_node(
         Runs the node until the shutdown flag is set and returns the exit code; by default it
         only spins.
     shared_memory : bool
-        Whether messages may use shared memory, as images must: see `keep_to_this_machine`.
+        Whether messages may use shared memory, as images must: see `restrict_discovery`.
 
     Returns
     -------
@@ -75,10 +75,10 @@ def run_node(
         arguments, 3 after an internal error.
     """
     argv = list(sys.argv if args is None else args)
-    with EndRequest() as end:
+    with ShutdownFlag() as end:
         try:
             # rclpy reads the files as well, but its errors do not explain the problem.
-            given_sections(argv)
+            command_line_sections(argv)
             own = remove_ros_args(argv)[1:]
             if own in (["--help"], ["-h"]):
                 return run_command(lambda: _explain(help_text, parameters))
@@ -87,8 +87,8 @@ def run_node(
             own = own or [argument for argument in before if ":=" in argument]
             if own:
                 raise UserError(f"unknown argument {own[0]!r}; {_hint(own[0])}")
-            keep_to_this_machine(shared_memory=shared_memory)
-            remove_half_made_ports()
+            restrict_discovery(shared_memory=shared_memory)
+            remove_incomplete_ports()
             # rclpy's own handlers would shut the context down in the middle of a callback.
             rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
         # rclpy raises private exception types for a bad command line.
@@ -145,7 +145,7 @@ def _hint(argument: str) -> str:
 
 
 def _run(
-    create: Callable[[], Node], spin: Callable[[Node, EndRequest], int], end: EndRequest
+    create: Callable[[], Node], spin: Callable[[Node, ShutdownFlag], int], end: ShutdownFlag
 ) -> int:
     node: Node | None = None
     code = EXIT_INTERNAL_ERROR
@@ -154,7 +154,7 @@ def _run(
         code = spin(node, end)
     except (UserError, ParameterException) as error:
         code = _reject(error)
-        if end.wanted:
+        if end.requested:
             # Other nodes end on the same signal, so their absence is not a bad input.
             code = EXIT_DONE
     except Exception as error:  # noqa: BLE001
@@ -164,7 +164,7 @@ def _run(
     finally:
         if node is not None and node.context.ok():
             _wait_for_acknowledgements(
-                node, _ACKNOWLEDGED_AFTER_SIGNAL if end.wanted else _ACKNOWLEDGED_WITHIN
+                node, _ACKNOWLEDGED_AFTER_SIGNAL if end.requested else _ACKNOWLEDGED_WITHIN
             )
         if node is not None:
             node.destroy_node()
@@ -189,18 +189,18 @@ def _explain(help_text: str, parameters: type) -> int:
     return EXIT_DONE
 
 
-def _spin(node: Node, end: EndRequest) -> int:
-    _spin_until(node, lambda: end.wanted)
+def _spin(node: Node, end: ShutdownFlag) -> int:
+    _spin_until(node, lambda: end.requested)
     return EXIT_DONE
 
 
-def _spin_component(interrupted: int, node: Node, end: EndRequest) -> int:
+def _spin_component(interrupted: int, node: Node, end: ShutdownFlag) -> int:
     assert isinstance(node, ComponentNode)
     is_stopping = False
 
     def is_done() -> bool:
         nonlocal is_stopping
-        if end.wanted and not is_stopping:
+        if end.requested and not is_stopping:
             is_stopping = True
             node.stop()
         return node.exit is not None
@@ -213,7 +213,7 @@ def _spin_component(interrupted: int, node: Node, end: EndRequest) -> int:
     if node.exit.text:
         print(f"{node.get_name()}: {node.exit.text}", file=sys.stderr)
     # Other nodes end on the same signal, so a failure for lack of them counts as interrupted.
-    return interrupted if end.wanted and node.exit.code else node.exit.code
+    return interrupted if end.requested and node.exit.code else node.exit.code
 
 
 def _spin_until(node: Node, is_done: Callable[[], bool]) -> None:

@@ -121,7 +121,7 @@ class Process:
         self._handlers = Handlers(component.outputs)
 
     @property
-    def stands_still(self) -> bool:
+    def is_frozen(self) -> bool:
         """Tell whether it is frozen."""
         return self._timeline.now < self._frozen_until
 
@@ -183,7 +183,7 @@ class Process:
             self._timeline.call_at(self._free_at, partial(self._finish, actions))
 
     def _finish(self, actions: Sequence[Action]) -> None:
-        if self.stands_still:
+        if self.is_frozen:
             self._timeline.call_at(self._frozen_until, partial(self._finish, actions))
             return
         for action in actions:

@@ -188,9 +188,9 @@ class VirtualRunner:
         """Tell whether a component runs, even if it stands still."""
         return name in self._processes
 
-    def is_up(self, name: str) -> bool:
+    def is_responsive(self, name: str) -> bool:
         """Tell whether a component runs and does not stand still."""
-        return self.runs(name) and not self._processes[name].stands_still
+        return self.runs(name) and not self._processes[name].is_frozen
 
     def _named(self, name: str) -> Process:
         if name not in self._processes:

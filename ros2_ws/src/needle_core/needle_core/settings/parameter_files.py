@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from needle_core.errors import UserError
-from needle_core.files.plain_yaml import read_yaml
+from needle_core.files.yaml_files import read_yaml
 
 NODES = (
     *("recorder", "sim_rig", "drive_emulator", "device_driver", "stereo_camera", "stereo_tracker"),
@@ -47,7 +47,7 @@ def read_sections(path: Path) -> Sections:
     return {name: _unique(f"{path}: {name}", _flat(values)) for name, values in sections}
 
 
-def sections_for(source: object, sections: Sections, node: str, kind: str) -> Sections:
+def matching_sections(source: object, sections: Sections, node: str, kind: str) -> Sections:
     """Return the sections that reach a node; none where none is meant for a node of its kind.
 
     Parameters
@@ -85,22 +85,22 @@ def sections_for(source: object, sections: Sections, node: str, kind: str) -> Se
 
 
 def values_for(source: object, sections: Sections, node: str, kind: str) -> dict[str, Any] | None:
-    """Return what sections set in a node; arguments and errors as of `sections_for`.
+    """Return what sections set in a node; arguments and errors as of `matching_sections`.
 
     None where no section is meant for a node of its kind.
     """
-    reached = sections_for(source, sections, node, kind)
+    reached = matching_sections(source, sections, node, kind)
     if not reached:
         return None
     return {name: value for values in reached.values() for name, value in values.items()}
 
 
-def none_for(source: object, sections: Sections, node: str) -> str:
+def missing_section_warning(source: object, sections: Sections, node: str) -> str:
     """Return the warning that a source has no section for a node of its kind."""
     return f"{source}: no section for {node}: it has {', '.join(sections) or 'none'}"
 
 
-def given_sections(words: Sequence[str]) -> list[tuple[str, Sections]]:
+def command_line_sections(words: Sequence[str]) -> list[tuple[str, Sections]]:
     """Return what a node's command line has of parameters: (file or `-p` as given, sections).
 
     Raises
@@ -137,16 +137,16 @@ def check_command_line(words: Sequence[str], node: str) -> list[str]:
     Raises
     ------
     UserError
-        As `read_sections` and `sections_for`, and if a section of a file wins over a `-p`.
+        As `read_sections` and `matching_sections`, and if a section of a file wins over a `-p`.
     """
     warnings = []
     overrides: dict[str, str] = {}
     # As rcl keeps them: a section stays where it is first named, and the last section wins.
     kept: dict[str, dict[str, str]] = {}
-    for source, sections in given_sections(words):
-        reached = sections_for(source, sections, node, Path(words[0]).stem)
+    for source, sections in command_line_sections(words):
+        reached = matching_sections(source, sections, node, Path(words[0]).stem)
         if not reached:
-            warnings.append(none_for(source, sections, node))
+            warnings.append(missing_section_warning(source, sections, node))
         for section, values in reached.items():
             setter = source
             if source.startswith(_OVERRIDE):
@@ -184,7 +184,7 @@ def read_parameters(path: Path, nodes: Sequence[str], namespace: str = "") -> Pa
     Raises
     ------
     UserError
-        As `read_sections` and `sections_for`, and for a section of another node.
+        As `read_sections` and `matching_sections`, and for a section of another node.
     """
     sections = read_sections(path)
     if not sections:

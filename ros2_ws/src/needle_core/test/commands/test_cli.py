@@ -19,8 +19,8 @@ from needle_core.commands import cli, executables
 from needle_core.commands.cli import internal_error, run_command, write_json
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
-from needle_core.process import end_request
-from needle_core.process.end_request import ENDING_SIGNALS, EndRequest, interruptible
+from needle_core.process import shutdown
+from needle_core.process.shutdown import ENDING_SIGNALS, ShutdownFlag, interruptible
 
 
 class LeftError(BaseException):
@@ -113,19 +113,19 @@ def test_json_goes_into_a_file_or_says_why_not(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", ENDING_SIGNALS)
 def test_a_signal_sets_the_flag_and_ends_nothing(number: signal.Signals) -> None:
     before = signal.getsignal(number)
-    with EndRequest() as end:
-        assert not end.wanted
+    with ShutdownFlag() as end:
+        assert not end.requested
         for _ in range(2):
             signal.raise_signal(number)
-            assert end.wanted
+            assert end.requested
     assert signal.getsignal(number) is before
 
 
 def test_a_hangup_that_is_ignored_stays_so() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    with EndRequest() as end:
+    with ShutdownFlag() as end:
         signal.raise_signal(signal.SIGHUP)
-        assert not end.wanted
+        assert not end.requested
     with interruptible():
         signal.raise_signal(signal.SIGHUP)
 
@@ -136,7 +136,7 @@ def test_a_command_cleans_up_undisturbed_by_a_repeated_wish(
 ) -> None:
     done: list[str] = []
     now = 100.0
-    monkeypatch.setattr(end_request, "time", types.SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(shutdown, "time", types.SimpleNamespace(monotonic=lambda: now))
 
     def work() -> int:
         nonlocal now

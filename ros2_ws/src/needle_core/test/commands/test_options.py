@@ -9,7 +9,7 @@ import pytest
 
 from needle_core.commands.options import (
     CommandParser,
-    join_start,
+    join_signed_values,
     number,
     output_file,
     start,
@@ -60,7 +60,7 @@ def test_a_start_may_begin_with_a_minus_and_lies_within_its_bounds() -> None:
     parser = CommandParser("study", "", "")
     parser.add_argument("--initial")
     for text in ("-3,2,15", "-.5,2,15", "50,-45,-180"):
-        given = parser.parse_args(join_start(["--initial", text])).initial
+        given = parser.parse_args(join_signed_values(["--initial", text])).initial
         assert start(given, 50.0, 45.0) == tuple(float(part) for part in text.split(","))
     for text in ("-3,2", "-51,0,0", "0,46,0", "0,0,181", "-inf,0,0", "x,0,0"):
         with pytest.raises(UserError, match="--initial"):

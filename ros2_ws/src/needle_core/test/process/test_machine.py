@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from needle_core.errors import UserError
-from needle_core.process.ros_domain import Claim, own_domain, ports_of
-from needle_core.process.shared_memory import dead_ports, remove_dead_ports, remove_half_made_ports
+from needle_core.process.ros_domain import Claim, ports_of, reserve_domain_id
+from needle_core.process.shared_memory import dead_ports, remove_dead_ports, remove_incomplete_ports
 
 PORTS = range(7400, 7410)
 
@@ -57,7 +57,7 @@ def test_dead_ports_go_and_others_stay(tmp_path: Path) -> None:
 
 
 def test_a_domain_is_one_holders_and_left_as_clean_as_it_is_found() -> None:
-    with own_domain() as domain, own_domain() as another:
+    with reserve_domain_id() as domain, reserve_domain_id() as another:
         assert domain != another
         assert dead_ports(ports_of(domain)) == []
         port = Path("/dev/shm") / f"fastrtps_port{ports_of(domain)[11]}"
@@ -91,6 +91,6 @@ def test_ports_whose_maker_ended_half_way_go_and_others_stay(
     monkeypatch.setattr("needle_core.process.shared_memory.time.sleep", go_on_making)
     with make_port(tmp_path, 7005).open("rb") as listener:
         fcntl.flock(listener, fcntl.LOCK_SH)
-        remove_half_made_ports(tmp_path)
+        remove_incomplete_ports(tmp_path)
     left = {path.name for path in tmp_path.iterdir() if not path.name.endswith(("_el", "_mutex"))}
     assert left == {*made, "fastrtps_port7005", ready.name, renewed.name}

@@ -26,7 +26,7 @@ class Middleware:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.done: list[str] = []
-        for name in ("keep_to_this_machine", "remove_half_made_ports"):
+        for name in ("restrict_discovery", "remove_incomplete_ports"):
             monkeypatch.setattr(main, name, lambda **_: None)
         monkeypatch.setattr(main, "rclpy", self)
 
@@ -70,7 +70,7 @@ def fail(error: Exception, *, signalled: bool = False) -> Any:
 def test_a_node_goes_when_what_it_said_is_acknowledged(middleware: Middleware) -> None:
     def end_by_signal(_: Any, end: Any) -> int:
         signal.raise_signal(signal.SIGINT)
-        return int(end.wanted)
+        return int(end.requested)
 
     for spin, code, seconds in ((lambda node, end: 7, 7, 5.0), (end_by_signal, 1, 0.5)):
         middleware.done.clear()

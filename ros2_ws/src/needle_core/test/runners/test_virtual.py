@@ -281,7 +281,7 @@ def test_who_stood_still_has_what_its_queue_holds_and_a_timer_fires_once(
     runner.run(1.0)
     before = len(receiver.received)
     runner.freeze("receiver", 1.0)
-    assert not runner.is_up("receiver")
+    assert not runner.is_responsive("receiver")
     runner.run(0.999)
     assert len(receiver.received) == before
     runner.run(0.05)

@@ -9,9 +9,9 @@ import pytest
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import (
     check_command_line,
+    matching_sections,
     read_parameters,
     read_sections,
-    sections_for,
 )
 
 DRIVES = "device_driver: {ros__parameters: {max_depth: 0.08}}"
@@ -131,5 +131,5 @@ REACHED = {
 @pytest.mark.parametrize("node", REACHED)
 def test_the_sections_reach_a_node_that_rcl_gives_it(node: str) -> None:
     sections: dict[str, dict[str, int]] = {name: {} for name in SECTIONS}
-    reached = sections_for("", sections, node, "device_driver")
+    reached = matching_sections("", sections, node, "device_driver")
     assert [SECTIONS.index(name) for name in reached] == list(REACHED[node])

@@ -7,7 +7,7 @@ import sys
 import time
 
 from needle_core.can_frame import CAN
-from needle_core.process.reach import DISCOVERY, is_open
+from needle_core.process.discovery import DISCOVERY, is_open
 from needle_core.ros.main import run_component
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.link.can_port import CanPort

@@ -11,7 +11,7 @@ import dataclasses
 import itertools
 import math
 
-from needle_core.diagnostics import plain_list
+from needle_core.diagnostics import sanitize_list
 from needle_device_driver.axes.motion import Leg
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.limits import HARD_STEP_TIME_CAP, SafetyLimits
@@ -150,7 +150,7 @@ def check_form(command: Command) -> Refusal | None:
     if set(names) != {INSERTION_JOINT, ROTATION_JOINT} or len(names) != 2:
         return Refusal(
             Rule.COMMAND_FORM,
-            f"joints {plain_list(names)}, wanted {INSERTION_JOINT}, {ROTATION_JOINT}",
+            f"joints {sanitize_list(names)}, wanted {INSERTION_JOINT}, {ROTATION_JOINT}",
         )
     if not 0 < len(points) <= MOST_POINTS:
         return Refusal(Rule.COMMAND_FORM, f"{len(points)} points, wanted 1 to {MOST_POINTS}")

@@ -6,7 +6,7 @@ import collections
 import dataclasses
 import math
 
-from needle_core.diagnostics import plain
+from needle_core.diagnostics import sanitize
 from needle_core.messages import HoldState
 from needle_device_driver.rules import Rule
 
@@ -209,4 +209,4 @@ class HoldRefusals:
         if rule is None:
             return ""
         way_out = "; device/reset ends this" if ignored and not message.session else ""
-        return f"hold of '{plain(message.sender)}' does not count ({rule.value}){way_out}"
+        return f"hold of '{sanitize(message.sender)}' does not count ({rule.value}){way_out}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from needle_core.diagnostics import Level, plain
+from needle_core.diagnostics import Level, sanitize
 from needle_core.messages import HoldState
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.axes.axis import Axis
@@ -125,8 +125,8 @@ class MotionSupervisor:
             state=state.value,
             activity=self._core.activity.value,
             homed=self._core.snapshot is not None and self._core.snapshot.homed,
-            hold_owner=plain(self._hold.owner or ""),
-            press_again=plain(self._hold.unheeded(now) or ""),
+            hold_owner=sanitize(self._hold.owner or ""),
+            press_again=sanitize(self._hold.unheeded(now) or ""),
             speed_scale=self._hold.speed_scale,
             insertion_m=None if joints is None else joints.insertion.position,
             rotation_rad=None if joints is None else joints.rotation.position,

@@ -211,7 +211,7 @@ def shadow_line(
 
 
 @dataclasses.dataclass(frozen=True)
-class Event:
+class OcclusionEvent:
     """Something that blocks the view at one exposure.
 
     Attributes
@@ -229,7 +229,7 @@ class Event:
     progress: float
 
 
-def event_at(occlusion: Occlusion, seed: int, exposure_number: int) -> Event | None:
+def occlusion_at(occlusion: Occlusion, seed: int, exposure_number: int) -> OcclusionEvent | None:
     """Return what blocks the view at an exposure; None where nothing does."""
     if exposure_number < occlusion.first:
         return None
@@ -244,11 +244,11 @@ def event_at(occlusion: Occlusion, seed: int, exposure_number: int) -> Event | N
     covered = bool(rng.random() < 0.4)
     if not begin <= within < begin + length:
         return None
-    return Event(blocks, covered, (within - begin + 0.5) / length)
+    return OcclusionEvent(blocks, covered, (within - begin + 0.5) / length)
 
 
 def hand_capsules(
-    event: Event, target: FloatArray, rig: StereoRig
+    event: OcclusionEvent, target: FloatArray, rig: StereoRig
 ) -> list[tuple[FloatArray, FloatArray, float]]:
     """Return a hand on its way over the target and back.
 
@@ -257,7 +257,7 @@ def hand_capsules(
 
     Parameters
     ----------
-    event : Event
+    event : OcclusionEvent
         Whom the hand blocks, and how far it is.
     target : ndarray, shape (3,)
         What it passes over, in `rig` [m].

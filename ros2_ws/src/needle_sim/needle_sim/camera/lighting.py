@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from needle_sim.camera.optics import FloatImage, Optics
-from needle_sim.camera.scenarios import Glints, Lighting, Metal
+from needle_sim.camera.scenarios import Glints, Lighting, MetalShaft
 from needle_sim.camera.stereo_rig import SimulatedCamera
 from needle_sim.needle.se3 import FloatArray
 
@@ -66,14 +66,14 @@ def flicker(glints: Glints, exposure_number: int, phase: float) -> float:
 
 
 def surface_glints(glints: Glints, optics: Optics, rng: np.random.Generator) -> FloatImage:
-    """Return what lamps add to one camera's image, mirrored in the surface's unevenness."""
+    """Return what lamps add to one camera's image, lamp_reflection in the surface's unevenness."""
     width, height = optics.image_size
     count = glints.on_surface + glints.over_needle
     over = np.arange(count) >= glints.on_surface
     aside, along = rng.uniform(-_SIDE, _SIDE, count), rng.uniform(*_LENGTHS, count)
     aside[over] = rng.uniform(-_WAY_SIDE, _WAY_SIDE, glints.over_needle)
     along[over] = rng.uniform(*_WAY_LENGTHS, glints.over_needle)
-    place = optics.on_face(aside, along)
+    place = optics.points_on_face(aside, along)
     half = glints.largest / 2.0 * rng.uniform(0.15, 1.0, count) ** 1.5
     half[over] = glints.largest / 2.0 * rng.uniform(0.5, 1.0, glints.over_needle)
     half_px = optics.radius_px(place, half)
@@ -97,7 +97,7 @@ def surface_glints(glints: Glints, optics: Optics, rng: np.random.Generator) -> 
     return image
 
 
-def shine(glints: Glints, length: FloatArray, rng: np.random.Generator) -> FloatArray:
+def shaft_glints(glints: Glints, length: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return what the lamp adds to the middle of the needle at places along `rig`'s z, (M,).
 
     The needle follows its own path, so that a stretch which shines once does so ever after.
@@ -118,8 +118,8 @@ def place_lamp(rng: np.random.Generator) -> FloatArray:
     return np.array([_LAMP_HEIGHT, side, rng.uniform(*_LAMP_ALONG)])
 
 
-def mirrored(
-    line: FloatArray, camera: FloatArray, lamp: FloatArray, metal: Metal
+def lamp_reflection(
+    line: FloatArray, camera: FloatArray, lamp: FloatArray, metal: MetalShaft
 ) -> tuple[FloatArray, FloatArray]:
     """Return how much of the lamp a shaft mirrors, and where across it.
 
@@ -129,7 +129,7 @@ def mirrored(
         Its middle line in `rig` [m].
     camera, lamp : ndarray, shape (3,)
         Where they are in `rig` [m].
-    metal : Metal
+    metal : MetalShaft
         Of the shaft.
 
     Returns

@@ -127,7 +127,7 @@ class Optics:
         """Return the pixels (..., 2) of points (..., 3) in `rig` [m]."""
         return project(points, self.camera)
 
-    def on_face(self, aside: FloatArray, along: FloatArray) -> FloatArray:
+    def points_on_face(self, aside: FloatArray, along: FloatArray) -> FloatArray:
         """Return points (N, 3) of the window's outer face in `rig` [m].
 
         Parameters

@@ -7,10 +7,10 @@ from numpy.typing import ArrayLike
 
 from needle_sim.camera.clutter import (
     BubbleCloud,
-    Event,
+    OcclusionEvent,
     cable_line,
-    event_at,
     hand_capsules,
+    occlusion_at,
     paper_lines,
     place_bubbles,
     shadow_line,
@@ -19,7 +19,7 @@ from needle_sim.camera.lighting import place_lamp
 from needle_sim.camera.optics import Optics
 from needle_sim.camera.scenarios import CLEAN, Scenario
 from needle_sim.camera.stereo_rig import StereoRig
-from needle_sim.camera.view import GreyImage, Moment, StillScene, View
+from needle_sim.camera.view import GreyImage, SceneState, StaticScene, View
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.se3 import FloatArray
 
@@ -81,7 +81,7 @@ class StereoRenderer:
         if scenario.bubbles is not None:
             self.bubbles = place_bubbles(scenario.bubbles, rig, rng)
         paper = scenario.paper
-        still = StillScene(
+        still = StaticScene(
             bubbles=self.bubbles,
             lamp=place_lamp(self._rng(_LAMP_KEY)),
             lines=[]
@@ -157,31 +157,31 @@ class StereoRenderer:
         )
         return left, right
 
-    def _event(self, exposure_number: int) -> Event | None:
+    def _event(self, exposure_number: int) -> OcclusionEvent | None:
         if self._scenario.occlusion is None:
             return None
-        return event_at(self._scenario.occlusion, self._seed, exposure_number)
+        return occlusion_at(self._scenario.occlusion, self._seed, exposure_number)
 
     def _moment(
         self,
         T_rig_tip: ArrayLike,  # noqa: N803
         centreline: ArrayLike,
         exposure_number: int,
-        event: Event | None,
-    ) -> Moment:
+        event: OcclusionEvent | None,
+    ) -> SceneState:
         scenario, height = self._scenario, self._rig.half_height
         pose = np.asarray(T_rig_tip, dtype=np.float64)
         needle = shadow = cable = _NOTHING
         fall = np.empty(0)
         if scenario.needle:
             path = np.asarray(centreline, dtype=np.float64)
-            needle = self._needle.middle_line(pose, path, _LINE_SPACING)
+            needle = self._needle.shaft_centreline(pose, path, _LINE_SPACING)
         if scenario.shadow is not None and len(needle):
             part = needle[_SHADOW_PART]
             shadow, fall = shadow_line(scenario.shadow, height, part, self._rng(_SHADOW_KEY))
         if scenario.cable is not None:
             cable = cable_line(scenario.cable, height, exposure_number, self._rng(_CABLE_KEY))
-        return Moment(
+        return SceneState(
             number=exposure_number,
             needle=needle,
             diameter=self._needle.diameter,

@@ -39,7 +39,7 @@ class Glints:
     over_needle : int
         How many streaks on the surface, more, that lie over the needle's way.
     on_needle : int
-        How many stretches of the shaft shine.
+        How many stretches of the shaft shaft_glints.
     largest : float
         Longest streak [m].
     brightness : float
@@ -123,7 +123,7 @@ class FloorShadow:
 
 
 @dataclasses.dataclass(frozen=True)
-class Metal:
+class MetalShaft:
     """A needle that is not painted: it mirrors a lamp along part of its shaft.
 
     Attributes
@@ -133,7 +133,7 @@ class Metal:
     core : float
         Where it mirrors the lamp [grey levels].
     core_width : float
-        Of the mirrored lamp, over the needle's.
+        Of the lamp_reflection lamp, over the needle's.
     spread : float
         How far the shaft may turn until the lamp has faded to a third [rad].
     """
@@ -239,7 +239,7 @@ class Scenario:
     shadow: FloorShadow | None = None
     occlusion: Occlusion | None = None
     lens: Lens | None = None
-    metal: Metal | None = None
+    metal: MetalShaft | None = None
     paper: GraphPaper | None = None
 
     def __post_init__(self) -> None:
@@ -292,13 +292,13 @@ _ALL = (
     Scenario(
         "steel",
         "a bare needle that mirrors a lamp along part of its shaft, dark where it bends away",
-        metal=Metal(),
+        metal=MetalShaft(),
         lighting=Lighting(0.04, 0.1, 0.03),
     ),
     Scenario(
         "steel_on_graph_paper",
         "the same over ruled paper that lies askew",
-        metal=Metal(),
+        metal=MetalShaft(),
         lighting=Lighting(0.04, 0.1, 0.03),
         paper=GraphPaper(),
     ),

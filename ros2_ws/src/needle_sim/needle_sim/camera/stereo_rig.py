@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from needle_core.errors import UserError
-from needle_core.files.plain_yaml import load_plain, read_calibration
+from needle_core.files.yaml_files import load_yaml, read_calibration
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_sim.needle.se3 import FloatArray
 
@@ -152,7 +152,7 @@ def load_stereo_rig(path: Path | str) -> StereoRig:
     path = Path(path)
     text = read_calibration(path)
     try:
-        document = load_plain(text)
+        document = load_yaml(text)
     except ValueError as error:
         raise UserError(f"calibration {path}: {error}") from error
     try:

@@ -14,13 +14,13 @@ from needle_sim.camera.lighting import (
     drift,
     flicker,
     lamp_light,
-    mirrored,
-    shine,
+    lamp_reflection,
+    shaft_glints,
     surface_glints,
     uneven_light,
 )
 from needle_sim.camera.optics import SHARP_PX, FloatImage, Optics
-from needle_sim.camera.scenarios import Metal, Scenario
+from needle_sim.camera.scenarios import MetalShaft, Scenario
 from needle_sim.camera.stroke import Stroke, stroke
 from needle_sim.needle.se3 import FloatArray
 
@@ -55,7 +55,7 @@ _HAND_ROUND_PX = 45.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Moment:
+class SceneState:
     """Content of one exposure, in `rig`; the same for both cameras.
 
     Attributes
@@ -83,7 +83,7 @@ class Moment:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class StillScene:
+class StaticScene:
     """Content that never moves, in `rig`; the same for both cameras.
 
     Attributes
@@ -110,7 +110,7 @@ class View:
         The camera.
     scenario : Scenario
         What troubles it.
-    scene : StillScene
+    scene : StaticScene
         What it looks at.
     still : numpy.random.Generator
         For the phantom's mottle.
@@ -122,7 +122,7 @@ class View:
         self,
         optics: Optics,
         scenario: Scenario,
-        scene: StillScene,
+        scene: StaticScene,
         still: np.random.Generator,
         trouble_key: list[int],
     ) -> None:
@@ -146,13 +146,13 @@ class View:
             self._glints = surface_glints(scenario.glints, optics, rng)
 
     def exposure(
-        self, moment: Moment, covered: bool, drift_phase: float, rng: np.random.Generator
+        self, moment: SceneState, covered: bool, drift_phase: float, rng: np.random.Generator
     ) -> GreyImage:
         """Return the image of one exposure.
 
         Parameters
         ----------
-        moment : Moment
+        moment : SceneState
             What there is to see.
         covered : bool
             Whether something covers the lens.
@@ -176,7 +176,7 @@ class View:
         # Rounds and saturates.
         return np.asarray(cv2.convertScaleAbs(cv2.max(image, 0.0)), dtype=np.uint8)
 
-    def visible_share(self, points: FloatArray, moment: Moment) -> float:
+    def visible_share(self, points: FloatArray, moment: SceneState) -> float:
         """Return the share of points (M, 3) in `rig` that are in the image and under no hand."""
         width, height = self._optics.image_size
         pixels = self._optics.project(points)
@@ -187,7 +187,7 @@ class View:
             seen[seen] = hidden[row, column] < 0.5
         return float(seen.mean()) if len(points) else 0.0
 
-    def _draw_moment(self, image: FloatImage, moment: Moment) -> None:
+    def _draw_moment(self, image: FloatImage, moment: SceneState) -> None:
         if len(moment.shadow):
             self._draw_shadow(image, moment)
         if len(moment.needle):
@@ -217,7 +217,7 @@ class View:
         )
         image += _MOTTLE * mottle / mottle.std()
         # The bench before the phantom's front face, up to the upper edge of that face.
-        edge = self._optics.on_face(np.array([-0.1, 0.1]), np.zeros(2))
+        edge = self._optics.points_on_face(np.array([-0.1, 0.1]), np.zeros(2))
         beside = edge - [0.0, 0.0, 0.1]
         outline = np.rint(self._optics.project(np.concatenate([edge, beside[::-1]])))
         bench = cv2.fillPoly(np.zeros_like(image), [outline.astype(np.int32)], 1.0)
@@ -260,7 +260,7 @@ class View:
         if is_needle:
             glints = self._scenario.glints
             if glints is not None:
-                bright = shine(glints, line[:, 2], np.random.default_rng(self._shine_key))
+                bright = shaft_glints(glints, line[:, 2], np.random.default_rng(self._shine_key))
                 colour += bright[tube.sample] * np.exp(-((tube.across / 0.45) ** 2))
             if self._bubbles is not None:
                 above = self._bubbles.height[pixels] > self._optics.window.height(line)[tube.sample]
@@ -269,10 +269,10 @@ class View:
         image[pixels] += tube.coverage * (colour - image[pixels])
 
     def _mirroring(
-        self, line: FloatArray, diameter: float, tube: Stroke, metal: Metal
+        self, line: FloatArray, diameter: float, tube: Stroke, metal: MetalShaft
     ) -> FloatArray:
         """Return what a bare needle mirrors at a stroke's pixels [grey levels]."""
-        share, place = mirrored(line, self._optics.centre, self._scene.lamp, metal)
+        share, place = lamp_reflection(line, self._optics.centre, self._scene.lamp, metal)
         # A stroke counts to the left of its way as the image has it, a shaft as the camera does.
         edge = self._optics.project(line + self._optics.sideways(line, diameter / 2.0))
         middle = self._optics.project(line)
@@ -281,7 +281,7 @@ class View:
         core = np.exp(-(((tube.across - (side * place)[tube.sample]) / metal.core_width) ** 2))
         return np.asarray(metal.rim + (metal.core - metal.rim) * share[tube.sample] * core)
 
-    def _draw_shadow(self, image: FloatImage, moment: Moment) -> None:
+    def _draw_shadow(self, image: FloatImage, moment: SceneState) -> None:
         trouble = self._scenario.shadow
         assert trouble is not None
         line = moment.shadow
@@ -304,7 +304,7 @@ class View:
         half_width = np.linalg.norm(edge - other_edge, axis=1) / 2.0
         return stroke(middle, half_width, blur, self._optics.image_size)
 
-    def _hand_mask(self, moment: Moment) -> FloatImage:
+    def _hand_mask(self, moment: SceneState) -> FloatImage:
         """Return which share of each pixel a hand takes."""
         width, height = self._optics.image_size
         small = np.zeros((-(-height // _HAND_COARSE), -(-width // _HAND_COARSE)), dtype=np.float32)

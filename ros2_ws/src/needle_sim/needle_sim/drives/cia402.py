@@ -21,7 +21,7 @@ class PowerState(enum.Enum):
     FAULT = 0x08
 
 
-class Order(enum.Enum):
+class PowerCommand(enum.Enum):
     """Orders of a controlword to the power state: (mask, value)."""
 
     DISABLE_VOLTAGE = (0x02, 0x00)
@@ -33,9 +33,9 @@ class Order(enum.Enum):
 
 FAULT_RESET = 0x80
 
-_S, _O = PowerState, Order
+_S, _O = PowerState, PowerCommand
 # The numbers are those of the standard's figure.
-TRANSITIONS: dict[tuple[PowerState, Order], PowerState] = {
+TRANSITIONS: dict[tuple[PowerState, PowerCommand], PowerState] = {
     (_S.SWITCH_ON_DISABLED, _O.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 2
     (_S.READY_TO_SWITCH_ON, _O.SWITCH_ON): _S.SWITCHED_ON,  # 3
     # As most drives do: 3 and 4 in one.
@@ -55,9 +55,9 @@ TRANSITIONS: dict[tuple[PowerState, Order], PowerState] = {
 }
 
 
-def order_of(controlword: int) -> Order | None:
+def decode_command(controlword: int) -> PowerCommand | None:
     """Return what a controlword asks for; None for a pattern that asks for nothing."""
-    for order in Order:
+    for order in PowerCommand:
         mask, value = order.value
         if controlword & mask == value:
             return order
@@ -66,7 +66,7 @@ def order_of(controlword: int) -> Order | None:
 
 def next_state(state: PowerState, controlword: int) -> PowerState:
     """Return the state that a controlword leads to; most lead nowhere."""
-    order = order_of(controlword)
+    order = decode_command(controlword)
     return state if order is None else TRANSITIONS.get((state, order), state)
 
 

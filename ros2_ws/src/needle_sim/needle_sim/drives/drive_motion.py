@@ -103,7 +103,7 @@ class DriveMotion:
             self.forget()
             self._objects.set(0x6061, 0, mode)
 
-    def take_word(self, word: int, *, enabled: bool) -> None:
+    def apply_controlword(self, word: int, *, enabled: bool) -> None:
         """Take the controlword's bits for the mode, `enabled` or not.
 
         Raises
@@ -122,7 +122,7 @@ class DriveMotion:
         elif self._mode == HOMING and not word & HOMING_START:
             self._homing = None
 
-    def take_set_point(self) -> None:
+    def apply_set_point(self) -> None:
         """Take the target of cyclic synchronous position mode; the way to it ends there.
 
         Raises

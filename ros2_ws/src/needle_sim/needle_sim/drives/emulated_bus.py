@@ -160,14 +160,14 @@ _WORDS = {
 }
 
 
-class PlugOrder(enum.Enum):
+class PlugCommand(enum.Enum):
     """Effects of a command on the adapter."""
 
     OUT = "out"
     IN = "in"
 
 
-def obey(line: str, bus: EmulatedBus, now: float) -> PlugOrder | None:
+def execute_command(line: str, bus: EmulatedBus, now: float) -> PlugCommand | None:
     """Carry out one command at steady time `now` [s].
 
     Parameters
@@ -181,7 +181,7 @@ def obey(line: str, bus: EmulatedBus, now: float) -> PlugOrder | None:
 
     Returns
     -------
-    PlugOrder or None
+    PlugCommand or None
         What is left to do to the adapter.
 
     Raises
@@ -208,10 +208,10 @@ def obey(line: str, bus: EmulatedBus, now: float) -> PlugOrder | None:
     elif name == "cut_bus":
         bus.is_cut = True
     elif name == "unplug":
-        return PlugOrder.OUT
+        return PlugCommand.OUT
     else:
         bus.restore(now)
-        return PlugOrder.IN
+        return PlugCommand.IN
     return None
 
 

@@ -15,11 +15,11 @@ from needle_sim.drives.cia402 import (
     MODE,
     MODES,
     STATUSWORD,
-    Order,
+    PowerCommand,
     PowerState,
+    decode_command,
     drive_dictionary,
     next_state,
-    order_of,
 )
 from needle_sim.drives.drive_motion import (
     MOTION_STEP,
@@ -137,7 +137,7 @@ class EmulatedDrive:
         self._show()
         self.device.sync()
         if self.state is PowerState.OPERATION_ENABLED and self._leaving is None:
-            self._try(self._motion.take_set_point)
+            self._try(self._motion.apply_set_point)
         self._stale = True
 
     def tick(self, now: float) -> None:
@@ -223,7 +223,7 @@ class EmulatedDrive:
         elif self._leaving is None:
             self._change(next_state(self.state, word))
         enabled = self.state is PowerState.OPERATION_ENABLED and self._leaving is None
-        self._try(lambda: self._motion.take_word(word, enabled=enabled))
+        self._try(lambda: self._motion.apply_controlword(word, enabled=enabled))
 
     def _change(self, state: PowerState) -> None:
         before = self.state
@@ -239,7 +239,7 @@ class EmulatedDrive:
 
     def _slows_down_before(self, state: PowerState) -> bool:
         """Tell whether the motor brakes before it gets no more power."""
-        at_once = order_of(self._word) is Order.DISABLE_VOLTAGE or self._motion.at_rest
+        at_once = decode_command(self._word) is PowerCommand.DISABLE_VOLTAGE or self._motion.at_rest
         if state in _ON or at_once:
             return False
         index = 0x605B if state is PowerState.READY_TO_SWITCH_ON else 0x605C

@@ -73,7 +73,7 @@ class NeedleShape:
         behind = at_bend * (1.0 - behind_bend) ** 2
         return np.asarray(np.where(distance < self.bend_distance, distal, behind))
 
-    def middle_line(
+    def shaft_centreline(
         self,
         T_rig_tip: FloatArray,  # noqa: N803
         centreline: FloatArray,

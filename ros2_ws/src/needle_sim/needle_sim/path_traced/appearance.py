@@ -130,7 +130,7 @@ class Appearance:
 
 
 @dataclasses.dataclass(frozen=True)
-class Fixed:
+class NamedAppearance:
     """Part of an appearance that a name fixes; the rest is drawn.
 
     Attributes
@@ -153,21 +153,39 @@ class Fixed:
 RANDOM = "random"
 
 APPEARANCES = {
-    RANDOM: Fixed("everything is drawn by the seed"),
-    "drawn_on_grey": Fixed("drawn steel under two softboxes", "drawn", "softboxes", "grey"),
-    "drawn_on_dark": Fixed("drawn steel under two softboxes", "drawn", "softboxes", "dark"),
-    "drawn_on_light": Fixed("drawn steel under a softbox", "drawn", "softbox", "light"),
-    "drawn_on_graph_paper": Fixed("drawn steel under a strip", "drawn", "strip", "graph"),
-    "drawn_on_brushed": Fixed("drawn steel over brushed metal", "drawn", "softbox", "brushed"),
-    "polished_over_cloth": Fixed("polished steel over cloth", "polished", "softboxes", "cloth"),
-    "polished_in_a_room": Fixed("polished steel in even light", "polished", "room", "grey"),
-    "oxide_on_grey": Fixed("dark oxide under two softboxes", "oxide", "softboxes", "grey"),
-    "oxide_over_lit_panel": Fixed("dark oxide against a lit panel", "oxide", "softbox", "panel"),
-    "painted_on_print": Fixed("black paint over printed paper", "painted", "softbox", "print"),
-    "drawn_before_clutter": Fixed(
+    RANDOM: NamedAppearance("everything is drawn by the seed"),
+    "drawn_on_grey": NamedAppearance(
+        "drawn steel under two softboxes", "drawn", "softboxes", "grey"
+    ),
+    "drawn_on_dark": NamedAppearance(
+        "drawn steel under two softboxes", "drawn", "softboxes", "dark"
+    ),
+    "drawn_on_light": NamedAppearance("drawn steel under a softbox", "drawn", "softbox", "light"),
+    "drawn_on_graph_paper": NamedAppearance("drawn steel under a strip", "drawn", "strip", "graph"),
+    "drawn_on_brushed": NamedAppearance(
+        "drawn steel over brushed metal", "drawn", "softbox", "brushed"
+    ),
+    "polished_over_cloth": NamedAppearance(
+        "polished steel over cloth", "polished", "softboxes", "cloth"
+    ),
+    "polished_in_a_room": NamedAppearance(
+        "polished steel in even light", "polished", "room", "grey"
+    ),
+    "oxide_on_grey": NamedAppearance(
+        "dark oxide under two softboxes", "oxide", "softboxes", "grey"
+    ),
+    "oxide_over_lit_panel": NamedAppearance(
+        "dark oxide against a lit panel", "oxide", "softbox", "panel"
+    ),
+    "painted_on_print": NamedAppearance(
+        "black paint over printed paper", "painted", "softbox", "print"
+    ),
+    "drawn_before_clutter": NamedAppearance(
         "drawn steel, screws and cables behind", "drawn", None, "clutter"
     ),
-    "absent": Fixed("no needle: bubbles, lint, print; all drawn by the seed", needle=False),
+    "absent": NamedAppearance(
+        "no needle: bubbles, lint, print; all drawn by the seed", needle=False
+    ),
 }
 """The names, and what each fixes."""
 

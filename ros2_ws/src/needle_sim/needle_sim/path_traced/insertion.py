@@ -166,7 +166,7 @@ def _middle_line(plant: NeedlePlant, look: Appearance) -> FloatArray:
     """Return the needle's middle line from before the phantom to the end, (M, 3) [m]."""
     line = plant.centreline(_SPACING)
     if look.lean > 0.0:
-        line = _shape(look).middle_line(plant.T_rig_tip, line, _SPACING)
+        line = _shape(look).shaft_centreline(plant.T_rig_tip, line, _SPACING)
     back = line[0] - line[1]
     back /= np.linalg.norm(back)
     before = np.arange(int(_OUTSIDE / _SPACING), 0, -1)[:, np.newaxis] * _SPACING

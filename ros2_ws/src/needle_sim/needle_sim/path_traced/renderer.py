@@ -237,7 +237,7 @@ class PathTracedRenderer:
         row, column = np.mgrid[: size[0], : size[1]]
         pixels = np.stack([column, row], axis=-1)
         rays = refracted_rays(pixels, camera, rig)
-        points = behind.met_by(rays.origin, rays.direction)
+        points = behind.intersect(rays.origin, rays.direction)
         blank = np.zeros(size, dtype=np.float32)
         view = _View(optics, behind, points, rays.in_air, 0.0, blank, blank.copy(), blank.copy())
         floor = view.on_grid(self._light[behind])

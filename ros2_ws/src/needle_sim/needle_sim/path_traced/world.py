@@ -74,7 +74,7 @@ class Backdrop:
             - self.depth * self.normal
         )
 
-    def met_by(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
+    def intersect(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
         """Return where rays, each (..., 3), meet the plane, (..., 3) in `rig` [m]."""
         length = -(self.depth + origin @ self.normal) / (direction @ self.normal)
         return np.asarray(origin + length[..., np.newaxis] * direction)

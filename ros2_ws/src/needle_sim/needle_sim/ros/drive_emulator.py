@@ -16,7 +16,7 @@ from needle_core.component import RealPort
 from needle_core.ros.main import run_component
 from needle_sim.bus.pty_can import PtyCan
 from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator, DriveEmulatorParameters
-from needle_sim.drives.emulated_bus import COMMANDS, PlugOrder
+from needle_sim.drives.emulated_bus import COMMANDS, PlugCommand
 
 HELP = f"""\
 drive_emulator: a stepper (insertion) and a servo (rotation) as CiA 402 drives on one CAN bus.
@@ -83,9 +83,9 @@ class _Plug:
     def open(self, arrive: Callable[[Any], None]) -> None:
         """Do nothing: a plug says nothing."""
 
-    def send(self, batch: tuple[PlugOrder, ...]) -> None:
+    def send(self, batch: tuple[PlugCommand, ...]) -> None:
         for order in batch:
-            self._adapter.plug(plugged_in=order is PlugOrder.IN)
+            self._adapter.plug(plugged_in=order is PlugCommand.IN)
 
     def close(self) -> None:
         """Do nothing: the bus takes the adapter away."""

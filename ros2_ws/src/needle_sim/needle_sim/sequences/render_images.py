@@ -17,7 +17,7 @@ from tqdm import tqdm
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser, number, output_file, whole_number
 from needle_core.errors import UserError
-from needle_core.files.installed import find_shared
+from needle_core.files.installed import find_shared_file
 from needle_sim.camera.image_folder import ImageFolder
 from needle_sim.camera.insertions import CURVATURE, RenderedPair, render_insertion
 from needle_sim.camera.scenarios import CLEAN, SCENARIOS, Scenario, find_scenario
@@ -97,7 +97,7 @@ def _render(options: RenderOptions) -> int:
     begin = time.perf_counter()
     calibration = options.calibration
     if calibration is None:
-        calibration = find_shared("needle_tracker", "config/calibration.yaml")
+        calibration = find_shared_file("needle_tracker", "config/calibration.yaml")
     rig = load_stereo_rig(calibration)
     look = options.look
     for _ in tqdm(

@@ -279,7 +279,7 @@ class DelayLine:
         self._steps = steps
         self._under_way: collections.deque[tuple[FloatArray, Any]] = collections.deque()
 
-    def pass_on(self, tips: FloatArray, insertion: Insertion) -> tuple[FloatArray, Insertion]:
+    def push(self, tips: FloatArray, insertion: Insertion) -> tuple[FloatArray, Insertion]:
         """Take what was exposed now; return what arrives now.
 
         Parameters

@@ -38,7 +38,7 @@ class Belief:
     missed: FloatArray | None = None
 
 
-class BeliefTally:
+class ConsistencyTally:
     """Compares what a controller says of some needles with the truth, step after step.
 
     Parameters
@@ -95,7 +95,7 @@ class BeliefTally:
         return 2.0 * self._x_within_3 / self._compared
 
 
-def doubted(missed: FloatArray) -> FloatArray:
+def is_doubtful(missed: FloatArray) -> FloatArray:
     """Return 1 where a miss that is stated so probable is doubt, else 0; NaN if nothing is said."""
     return np.where(np.isnan(missed), np.nan, missed > DOUBT)
 
@@ -165,7 +165,7 @@ class Outcomes:
         return np.asarray(~self.converged_at_end & away)
 
 
-def joined(parts: Sequence[_Rows]) -> _Rows:
+def concatenate(parts: Sequence[_Rows]) -> _Rows:
     """Return the outcomes of all parts as one; a dataclass of arrays, one row for each run."""
     kind: Any = type(parts[0])
     names = [field.name for field in dataclasses.fields(kind)]
@@ -191,7 +191,7 @@ class Tally:
         self._step = 0
         self._settled: FloatArray = np.where(np.abs(x) <= BAND, 0.0, np.inf)
         self._rotation: FloatArray = np.zeros(len(x))
-        self.beliefs = BeliefTally(len(x))
+        self.beliefs = ConsistencyTally(len(x))
 
     @property
     def in_last_steps(self) -> bool:
@@ -257,15 +257,15 @@ def figures(outcomes: Outcomes) -> dict[str, float | None]:
         "final_max_mm": float(np.max(end)),
         "missed_runs": float(np.sum(~at_end)),
         "diverged": float(np.mean(outcomes.diverged)),
-        "inside_2_sigma": mean_of_what_is_said(outcomes.inside_2_sigma),
-        "inside_3_sigma": mean_of_what_is_said(outcomes.inside_3_sigma),
-        "x_inside_3_sigma": mean_of_what_is_said(outcomes.x_inside_3_sigma),
-        "doubtful_at_end": mean_of_what_is_said(doubted(outcomes.missed)),
+        "inside_2_sigma": mean_or_none(outcomes.inside_2_sigma),
+        "inside_3_sigma": mean_or_none(outcomes.inside_3_sigma),
+        "x_inside_3_sigma": mean_or_none(outcomes.x_inside_3_sigma),
+        "doubtful_at_end": mean_or_none(is_doubtful(outcomes.missed)),
         "trusted_far_off": trusted_far_off(outcomes.x_end, outcomes.missed),
     }
 
 
-def mean_of_what_is_said(values: FloatArray) -> float | None:
+def mean_or_none(values: FloatArray) -> float | None:
     """Return the mean; None where nothing is said, which is NaN."""
     mean = float(np.mean(values))
     return None if np.isnan(mean) else mean
@@ -281,7 +281,7 @@ def trusted_far_off(distance: FloatArray, missed: FloatArray) -> float | None:
     missed : ndarray, shape (N,)
         See `Outcomes`.
     """
-    doubtful = doubted(missed)
+    doubtful = is_doubtful(missed)
     if np.any(np.isnan(doubtful)):
         return None
     return float(np.sum((np.abs(distance) > FAR_OFF) & (doubtful == 0.0)))

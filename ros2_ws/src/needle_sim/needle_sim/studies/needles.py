@@ -264,7 +264,7 @@ class DisturbedNeedles:
         self._untold_delay = DelayLine(wrong.untold_delay)
         self._delay = DelayLine(wrong.delay)
 
-    def first_seen(self) -> FloatArray:
+    def measure_first(self) -> FloatArray:
         """Return what is measured of the tips before they move, (N, 3) [m]."""
         return self._measured()
 
@@ -323,8 +323,8 @@ class DisturbedNeedles:
         """
         self._exposure += 1
         tips = self._measured()
-        as_new, _ = self._untold_delay.pass_on(tips, insertion)
-        return self._delay.pass_on(as_new, insertion)
+        as_new, _ = self._untold_delay.push(tips, insertion)
+        return self._delay.push(as_new, insertion)
 
     def _measured(self) -> FloatArray:
         seed, first = self._key

@@ -18,11 +18,11 @@ from needle_sim.studies.disturbances import (
 )
 from needle_sim.studies.figures_of_merit import (
     BAND,
-    BeliefTally,
     BoolArray,
-    doubted,
-    joined,
-    mean_of_what_is_said,
+    ConsistencyTally,
+    concatenate,
+    is_doubtful,
+    mean_or_none,
     trusted_far_off,
 )
 from needle_sim.studies.needles import DisturbedNeedles
@@ -119,7 +119,7 @@ class PointController(Controller, Protocol):
     It is told where the targets are before its start and before each step.
     """
 
-    def see_targets(self, time: float, targets: FloatArray) -> None:
+    def set_targets(self, time: float, targets: FloatArray) -> None:
         """Take where the targets are, (N, 3) [m], at a time [s]."""
 
     def insertion_left(self) -> FloatArray:
@@ -191,7 +191,7 @@ def run_point_study(
     for place, needles in chunks:
         some = targets.part(place, len(needles.true.x))
         parts.append(_steer(needles, some, new_controller(), settings, on_progress))
-    return joined(parts)
+    return concatenate(parts)
 
 
 def point_figures(outcomes: PointOutcomes) -> dict[str, float | None]:
@@ -204,9 +204,9 @@ def point_figures(outcomes: PointOutcomes) -> dict[str, float | None]:
         "max_point_mm": float(np.max(error)),
         "rotation_mean_deg": float(np.rad2deg(np.mean(outcomes.rotation))),
         "rotation_p95_deg": float(np.rad2deg(np.percentile(outcomes.rotation, 95.0))),
-        "inside_2_sigma": mean_of_what_is_said(outcomes.inside_2_sigma),
-        "inside_3_sigma": mean_of_what_is_said(outcomes.inside_3_sigma),
-        "doubtful_at_end": mean_of_what_is_said(doubted(outcomes.missed)),
+        "inside_2_sigma": mean_or_none(outcomes.inside_2_sigma),
+        "inside_3_sigma": mean_or_none(outcomes.inside_3_sigma),
+        "doubtful_at_end": mean_or_none(is_doubtful(outcomes.missed)),
         "trusted_far_off": trusted_far_off(outcomes.error, outcomes.missed),
     }
 
@@ -219,8 +219,8 @@ def _steer(
     on_progress: Callable[[int], None],
 ) -> PointOutcomes:
     count, true = len(targets.places), needles.true
-    controller.see_targets(0.0, targets.at(0.0))
-    rate = controller.start(needles.first_seen())
+    controller.set_targets(0.0, targets.at(0.0))
+    rate = controller.start(needles.measure_first())
     inserted, rotation, error = np.zeros(count), np.zeros(count), np.full(count, np.nan)
     inside, missed = np.full((2, count), np.nan), np.full(count, np.nan)
     on_the_way = np.ones(count, dtype=bool)
@@ -230,7 +230,7 @@ def _steer(
         # Not "left <= ARRIVED": who does not know how far it has to go stays where it is.
         arrived = on_the_way & ~(left > ARRIVED)
         if np.any(arrived):
-            said = BeliefTally(count)
+            said = ConsistencyTally(count)
             said.add(controller.belief(), true.x, true.pitch)
             there = targets.at(inserted / INSERTION_SPEED)
             off = np.linalg.norm(true.tips - there, axis=1)
@@ -249,7 +249,7 @@ def _steer(
         begin = end
         on_progress(int(np.sum(on_the_way)))
         time = end / INSERTION_SPEED
-        controller.see_targets(time, targets.at(time))
+        controller.set_targets(time, targets.at(time))
         tips, age = needles.seen(inserted)
         rate = controller.step(length, turned, tips, age)
     return PointOutcomes(error, rotation, inside[0], inside[1], missed)

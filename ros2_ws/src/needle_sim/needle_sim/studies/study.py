@@ -11,7 +11,7 @@ import numpy as np
 
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.disturbances import START, Disturbances, uniform_numbers
-from needle_sim.studies.figures_of_merit import Belief, Outcomes, Tally, joined
+from needle_sim.studies.figures_of_merit import Belief, Outcomes, Tally, concatenate
 from needle_sim.studies.needles import DisturbedNeedles
 
 POINTS = 10
@@ -172,7 +172,7 @@ def run_study(
         In the order of the starts.
     """
     chunks = needle_chunks(starts, settings, bump_at=0.5 * settings.depth, chunk=chunk, begin=first)
-    return joined(
+    return concatenate(
         [_steer(needles, new_controller(), settings, on_progress) for _, needles in chunks]
     )
 
@@ -207,7 +207,7 @@ def _steer(
 ) -> Outcomes:
     steps, true = settings.steps, needles.true
     tally = Tally(true.x, steps)
-    rate = controller.start(needles.first_seen())
+    rate = controller.start(needles.measure_first())
     insertion = 0.0
     for step in range(1, steps + 1):
         reached = min(step * settings.step_length, settings.depth)

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from needle_sim.camera.lighting import mirrored, place_lamp
+from needle_sim.camera.lighting import lamp_reflection, place_lamp
 from needle_sim.camera.optics import project
 from needle_sim.camera.renderer import StereoRenderer
-from needle_sim.camera.scenarios import Metal
+from needle_sim.camera.scenarios import MetalShaft
 from needle_sim.camera.stereo_rig import StereoRig
 
 from .scenes import STILL, needle, render
@@ -21,7 +21,7 @@ def test_a_shaft_mirrors_where_its_normal_halves_the_angle_and_is_dark_where_it_
 ):
     camera, lamp = np.array([0.5, 0.0, 0.05]), np.array([0.4, 0.25, 0.05])
     line = np.linspace(0.0, 0.1, 200)[:, np.newaxis] * [0.0, 0.0, 1.0]
-    share, place = mirrored(line, camera, lamp, Metal())
+    share, place = lamp_reflection(line, camera, lamp, MetalShaft())
     # Abreast of both, and nowhere else as much.
     middle = int(np.argmax(share))
     assert line[middle, 2] == pytest.approx(0.05, abs=2e-3)
@@ -32,15 +32,15 @@ def test_a_shaft_mirrors_where_its_normal_halves_the_angle_and_is_dark_where_it_
     side = np.cross([0.0, 0.0, 1.0], camera - line[middle])[1]
     assert place[middle] == pytest.approx(np.sign(side) * np.sin(turn), abs=0.02)
     # From the other side it is the other half.
-    _, other = mirrored(line, camera, lamp * [1.0, -1.0, 1.0], Metal())
+    _, other = lamp_reflection(line, camera, lamp * [1.0, -1.0, 1.0], MetalShaft())
     assert other[middle] == pytest.approx(-place[middle], abs=1e-9)
     up = line + np.linspace(0.0, 1.0, 200)[:, np.newaxis] ** 2 * [0.03, 0.0, 0.0]
-    assert mirrored(up, camera, lamp, Metal(spread=0.1))[0][-1] < 0.02
+    assert lamp_reflection(up, camera, lamp, MetalShaft(spread=0.1))[0][-1] < 0.02
 
 
 def test_the_core_lies_on_the_lamp_s_side_in_the_image(rig: StereoRig) -> None:
     plant = needle(0.1, 0.0, 0.0, curvature=1e-3)
-    scenario = dataclasses.replace(STILL, metal=Metal(spread=0.5, core=250.0))
+    scenario = dataclasses.replace(STILL, metal=MetalShaft(spread=0.5, core=250.0))
     checked = set()
     for seed in (1, 2, 3):
         lamp = place_lamp(np.random.default_rng([seed, 0, 5, 3]))

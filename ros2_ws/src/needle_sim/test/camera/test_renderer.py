@@ -137,7 +137,7 @@ def test_the_bend_turns_by_its_angle_and_ends_at_the_tip() -> None:
     plant = NeedlePlant(initial_pose(0.1, 0.7), curvature=0.0)
     plant.advance(0.08, 0.4)
     pose = plant.T_rig_tip
-    line = NeedleShape().middle_line(pose, plant.centreline(0.001), 0.0001)
+    line = NeedleShape().shaft_centreline(pose, plant.centreline(0.001), 0.0001)
     np.testing.assert_array_equal(line[-1], pose[:3, 3])
     local = (line - pose[:3, 3]) @ pose[:3, :3]
     # Distal segment: leaning towards -y, straight, 9 mm.
@@ -157,12 +157,12 @@ def test_the_bend_turns_by_its_angle_and_ends_at_the_tip() -> None:
 
 def test_a_short_path_draws_only_what_is_inside() -> None:
     plant = needle(0.004, 0.0, 0.0)
-    line = NeedleShape().middle_line(plant.T_rig_tip, plant.centreline(0.001), 0.0003)
+    line = NeedleShape().shaft_centreline(plant.T_rig_tip, plant.centreline(0.001), 0.0003)
     # As far as the bend lies beside the path.
     assert line[0, 2] == pytest.approx(0.0, abs=5e-5)
     for length in (0.0, 1e-16, 1e-9):
         point = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, length]])
-        assert NeedleShape().middle_line(np.eye(4), point, 0.0003).shape == (0, 3)
+        assert NeedleShape().shaft_centreline(np.eye(4), point, 0.0003).shape == (0, 3)
 
 
 def test_a_needle_may_be_straight_but_not_lean_farther_than_it_bends() -> None:

@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import fsolve
 
 from needle_core.errors import UserError
-from needle_sim.camera.clutter import Event, event_at
+from needle_sim.camera.clutter import OcclusionEvent, occlusion_at
 from needle_sim.camera.optics import Optics, project
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import (
@@ -160,7 +160,7 @@ def test_blur_is_a_thin_lens_s_and_keeps_the_needle_s_darkness(rig: StereoRig) -
 
 def test_events_come_in_every_stretch_and_in_every_kind() -> None:
     occlusion = Occlusion(first=20, every=40, length=14, length_both=6)
-    events = [event_at(occlusion, 3, number) for number in range(20 + 40 * 30)]
+    events = [occlusion_at(occlusion, 3, number) for number in range(20 + 40 * 30)]
     assert all(event is None for event in events[:20])
     kinds = set()
     for stretch in range(30):
@@ -183,8 +183,8 @@ def test_an_event_blocks_whom_it_says(
     for blocks, covered in itertools.product(
         ((True, False), (False, True), (True, True)), (False, True)
     ):
-        event = Event(blocks, covered, 0.5)
-        monkeypatch.setattr("needle_sim.camera.renderer.event_at", lambda *_, e=event: e)
+        event = OcclusionEvent(blocks, covered, 0.5)
+        monkeypatch.setattr("needle_sim.camera.renderer.occlusion_at", lambda *_, e=event: e)
         seen = tuple(float(not blocked) for blocked in blocks)
         assert renderer.visible_share(pose, line, 0) == seen
         empty = renderer.render(pose, np.zeros((1, 3)), 0)

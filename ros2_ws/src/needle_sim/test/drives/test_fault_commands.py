@@ -9,7 +9,7 @@ import pytest
 from needle_core.component import Action, Log, Moment, Send
 from needle_core.errors import UserError
 from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator, DriveEmulatorParameters
-from needle_sim.drives.emulated_bus import EmulatedBus, PlugOrder
+from needle_sim.drives.emulated_bus import EmulatedBus, PlugCommand
 
 AT = Moment(1.0, 1_000_000_000)
 
@@ -56,7 +56,7 @@ def test_a_drive_that_is_rebooted_on_command_says_so(drives: DriveEmulator) -> N
 def test_an_adapter_is_unplugged_and_plugged_in_by_whoever_has_it(drives: DriveEmulator) -> None:
     said = typed(drives, "unplug", "restore")
     orders = [action.batch for action in said if isinstance(action, Send)]
-    assert orders == [(PlugOrder.OUT,), (PlugOrder.IN,)]
+    assert orders == [(PlugCommand.OUT,), (PlugCommand.IN,)]
     assert {action.port for action in said if isinstance(action, Send)} == {ADAPTER}
 
 

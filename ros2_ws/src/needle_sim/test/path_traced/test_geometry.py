@@ -152,7 +152,7 @@ def test_a_box_stands_before_what_is_behind_it(boxes: list[StereoRig]) -> None:
         behind = backdrop(camera, rig, look, picture)
         assert behind.depth == pytest.approx(camera.window.inner + look.behind)
         rays = refracted_rays(camera.camera_matrix[:2, 2], camera, rig)
-        place = behind.met_by(rays.origin, rays.direction)
+        place = behind.intersect(rays.origin, rays.direction)
         assert place @ camera.window.normal == pytest.approx(-behind.depth, abs=0.003)
         aside = behind.points(place @ behind.sideways, place[2])
         np.testing.assert_allclose(aside, place, atol=1e-12)

@@ -109,7 +109,7 @@ def test_truth_s_angles_give_the_directions_back() -> None:
         return [np.sin(pitch), -np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch)]
 
     np.testing.assert_allclose(direction(truth.pitch, truth.yaw), pose[:3, 2], atol=1e-12)
-    line = NeedleShape().middle_line(pose, plant.centreline(0.001), 0.0003)
+    line = NeedleShape().shaft_centreline(pose, plant.centreline(0.001), 0.0003)
     # The path itself bends a little under the shaft's last 0.3 mm.
     end = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
     np.testing.assert_allclose(direction(truth.shaft_pitch, truth.shaft_yaw), end, atol=0.006)

@@ -139,7 +139,7 @@ def test_a_bias_walks_by_tenths_within_its_bounds_and_stays_spread_evenly() -> N
 def test_a_late_measurement_comes_with_its_age(steps: int) -> None:
     line = DelayLine(steps)
     for exposure in range(1, 8):
-        tips, age = line.pass_on(np.full((2, 3), float(exposure)), 0.001 * exposure)
+        tips, age = line.push(np.full((2, 3), float(exposure)), 0.001 * exposure)
         if exposure <= steps:
             assert np.all(np.isnan(tips))
         else:

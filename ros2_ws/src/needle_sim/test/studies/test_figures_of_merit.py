@@ -6,12 +6,12 @@ import pytest
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.figures_of_merit import (
     Belief,
-    BeliefTally,
+    ConsistencyTally,
     Outcomes,
     Tally,
-    doubted,
+    concatenate,
     figures,
-    joined,
+    is_doubtful,
     trusted_far_off,
 )
 
@@ -65,7 +65,7 @@ def test_figures_of_known_runs() -> None:
     assert seen["inside_2_sigma"] is None
     assert figures(outcomes(known[1]))["settle_p95_mm"] is None
     parts = [outcomes(path((0, 0.001 * k))) for k in range(3)]
-    np.testing.assert_allclose(joined(parts).x_end, [0.0, 0.001, 0.002])
+    np.testing.assert_allclose(concatenate(parts).x_end, [0.0, 0.001, 0.002])
 
 
 def test_ends_that_are_far_off_and_trusted_are_counted_on_both_sides() -> None:
@@ -77,7 +77,7 @@ def test_ends_that_are_far_off_and_trusted_are_counted_on_both_sides() -> None:
 
 def test_shares_within_2_and_3_sigma_count_x_and_pitch_alike() -> None:
     # Off by 1, 2.5 and 4 standard deviations in x; by none, none and 2.5 in sin(pitch).
-    tally = BeliefTally(3)
+    tally = ConsistencyTally(3)
     truth = np.array([0.001, 0.0025, 0.004]), np.arcsin([0.0, 0.0, 0.025])
     level, std = np.zeros(3), np.full(3, 0.001)
     tally.add(None, *truth)
@@ -87,9 +87,9 @@ def test_shares_within_2_and_3_sigma_count_x_and_pitch_alike() -> None:
     # Of x alone
     np.testing.assert_allclose(tally.x_inside, [1.0, 1.0, 0.0])
     assert np.all(np.isnan(tally.missed))
-    assert np.all(np.isnan(doubted(tally.missed)))
+    assert np.all(np.isnan(is_doubtful(tally.missed)))
     # A second step in which all is as believed; of doubts the last word counts.
     for missed in ([0.9, 0.0, 0.0], [0.05, 0.06, 0.0]):
         tally.add(Belief(level, std, level, std, np.array(missed)), level, level)
     np.testing.assert_allclose(tally.inside[0], [1.0, 2.5 / 3.0, 2.0 / 3.0])
-    np.testing.assert_array_equal(doubted(tally.missed), [0.0, 1.0, 0.0])
+    np.testing.assert_array_equal(is_doubtful(tally.missed), [0.0, 1.0, 0.0])

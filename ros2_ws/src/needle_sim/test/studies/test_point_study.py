@@ -77,7 +77,7 @@ class Straight:
         self._targets = self._left = np.zeros(0)
         self.lengths: list[FloatArray] = []
 
-    def see_targets(self, time: float, targets: FloatArray) -> None:
+    def set_targets(self, time: float, targets: FloatArray) -> None:
         self._targets = targets
         if not self.lengths:
             self._left = targets[:, 2]

@@ -148,7 +148,7 @@ def test_the_roll_wanders_by_the_root_of_the_insertion_and_a_bias_is_seen_alone(
         np.zeros((count, 3)), wrong, curvature=0.0, bump_at=1.0, seed=3, first=0
     )
     bias = BiasWalk(0.0003, 3, 0, count)
-    np.testing.assert_allclose(needles.first_seen() - needles.true.tips, bias.at(0), atol=1e-15)
+    np.testing.assert_allclose(needles.measure_first() - needles.true.tips, bias.at(0), atol=1e-15)
     for step in range(20):
         needles.insert(step * 1e-3, (step + 1) * 1e-3, 1e-3, np.zeros(count))
         seen, _ = needles.seen((step + 1) * 1e-3)

@@ -18,7 +18,7 @@ import numpy as np
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser, number, output_file
 from needle_core.errors import UserError
-from needle_core.settings.parameter_files import none_for, read_sections, values_for
+from needle_core.settings.parameter_files import missing_section_warning, read_sections, values_for
 from needle_tracker.answers.annotation import Image, annotate
 from needle_tracker.answers.seen import SeenCounts, missing
 from needle_tracker.answers.swapped_images import SUSPICION, SwapWatch
@@ -163,7 +163,7 @@ def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
         sections = read_sections(Path(given.params))
         values = values_for(given.params, sections, f"/{_NODE}", _NODE)
         if values is None:
-            _warn(none_for(given.params, sections, f"/{_NODE}"))
+            _warn(missing_section_warning(given.params, sections, f"/{_NODE}"))
         changes |= values or {}
         known = {field.name for field in dataclasses.fields(StereoTrackerParameters)}
         if unknown := sorted(set(changes) - known):

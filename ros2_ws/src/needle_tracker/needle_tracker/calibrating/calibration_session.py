@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
-from needle_core.files.plain_yaml import read_yaml
+from needle_core.files.yaml_files import read_yaml
 from needle_core.settings.bounds import check_bounds
 from needle_tracker.calibrating.charuco import CharucoBoard
 from needle_tracker.optics.calibration import (

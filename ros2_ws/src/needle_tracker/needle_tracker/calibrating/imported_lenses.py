@@ -12,7 +12,7 @@ import yaml
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
-from needle_core.files.plain_yaml import KALIBR, OPENCV, ROS, foreign_format, read_text
+from needle_core.files.yaml_files import KALIBR, OPENCV, ROS, foreign_format, read_text
 from needle_tracker.optics.calibration import (
     SIDES,
     Camera,

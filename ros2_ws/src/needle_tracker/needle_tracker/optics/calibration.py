@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
-from needle_core.files.plain_yaml import load_plain, read_calibration
+from needle_core.files.yaml_files import load_yaml, read_calibration
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_tracker.optics.window import Layer, Window, common_surface, surface_from_above
 
@@ -105,7 +105,7 @@ def load_calibration(path: Path) -> StereoCalibration:
 def calibration_from(text: str, path: Path) -> StereoCalibration:
     """Return what the text of a calibration file says; raises as `load_calibration`."""
     try:
-        return parse_calibration(load_plain(text))
+        return parse_calibration(load_yaml(text))
     except (UserError, ValueError) as error:
         raise UserError(f"calibration {path}: {error}") from error
 

@@ -18,8 +18,8 @@ from sensor_msgs.msg import Image
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_core.errors import UserError
 from needle_core.message_types import to_nanoseconds
-from needle_core.process.reach import keep_to_this_machine
-from needle_core.process.shared_memory import remove_half_made_ports
+from needle_core.process.discovery import restrict_discovery
+from needle_core.process.shared_memory import remove_incomplete_ports
 from needle_core.ros.base_node import IMAGES_BEST_EFFORT, WholeNode
 from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.answers.tracker_messages import frame_of
@@ -66,8 +66,8 @@ def _live_view(
     if session.place_of(name) is None:
         raise UserError(f"--live {name} is none of the session's places")
     context = Context()
-    keep_to_this_machine()
-    remove_half_made_ports()
+    restrict_discovery()
+    remove_incomplete_ports()
     rclpy.init(args=words, context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
         pairs = _Capture(context, calibration, options).take()

@@ -27,7 +27,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 def read_yaml(path: Path) -> Any:
     """Return the content of a user's file; a `UserError` says why it cannot be read."""
     try:
-        return load_plain(path.read_text(encoding="utf-8"))
+        return load_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
         raise UserError(f"{path}: cannot be read: {reason}") from error
@@ -35,7 +35,7 @@ def read_yaml(path: Path) -> Any:
         raise UserError(f"{path}: {error}") from error
 
 
-def load_plain(text: str) -> Any:
+def load_yaml(text: str) -> Any:
     """Return a document's content.
 
     Raises

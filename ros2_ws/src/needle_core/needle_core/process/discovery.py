@@ -34,7 +34,7 @@ def use_fast_dds(environment: MutableMapping[str, str] = os.environ) -> None:
         environment[_RMW] = _FAST_DDS
 
 
-def settle_environment(
+def clean_environment(
     environment: MutableMapping[str, str] = os.environ, *, own_graph: bool = False
 ) -> None:
     """Name the variables of other set-ups that decide who is reached; drop those that must not.
@@ -82,14 +82,14 @@ def settle_environment(
                 del environment[name]
 
 
-def keep_to_this_machine(
+def restrict_discovery(
     environment: MutableMapping[str, str] = os.environ, *, shared_memory: bool = True
 ) -> None:
     """Set what is not set, so that a node started from here reaches this machine only.
 
     Where the user's discovery range asks for a network, the node is open to it. A file of profiles
     of the user's own stays; one that is not there would leave everything open, and does not. Before
-    that, `settle_environment`.
+    that, `clean_environment`.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def keep_to_this_machine(
         Whether messages may go through shared memory, if the profiles are ours: opening that of a
         process which appears may hold this one up for 0.33 s.
     """
-    settle_environment(environment)
+    clean_environment(environment)
     given = Path(environment.get(PROFILES) or THIS_MACHINE)
     if given.name == THIS_MACHINE_UDP.name:
         # Of a process without shared memory that has started this one.

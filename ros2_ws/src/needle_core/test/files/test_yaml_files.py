@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from needle_core.errors import UserError
-from needle_core.files.plain_yaml import load_plain, read_yaml
+from needle_core.files.yaml_files import load_yaml, read_yaml
 
 KEYS = st.text("ab1", min_size=1, max_size=2)
 VALUES = st.recursive(
@@ -23,7 +23,7 @@ VALUES = st.recursive(
 @settings(deadline=None, max_examples=15, derandomize=True)
 @given(VALUES, st.sampled_from([None, True, False]))
 def test_what_has_no_key_twice_is_read_as_it_was_written(value: object, flow: bool | None) -> None:
-    assert load_plain(yaml.safe_dump(value, default_flow_style=flow)) == value
+    assert load_yaml(yaml.safe_dump(value, default_flow_style=flow)) == value
 
 
 def test_a_key_that_stands_twice_is_named_with_its_line() -> None:
@@ -34,7 +34,7 @@ def test_a_key_that_stands_twice_is_named_with_its_line() -> None:
         ("? [a]\n: 1\nb: 2\n? b\n: 3", "b", 4),
     ):
         with pytest.raises(ValueError, match=f"^duplicate key '{key}' in line {line}$"):
-            load_plain(text)
+            load_yaml(text)
 
 
 def test_what_cannot_be_read_is_one_line(tmp_path: Path) -> None:

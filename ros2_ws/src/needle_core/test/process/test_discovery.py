@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 
 from needle_core.errors import UserError
-from needle_core.process.reach import (
+from needle_core.process.discovery import (
     DISCOVERY_RANGE,
     NETWORK,
     NETWORK_UDP,
     PROFILES,
     THIS_MACHINE,
     THIS_MACHINE_UDP,
+    clean_environment,
     is_open,
-    keep_to_this_machine,
-    settle_environment,
+    restrict_discovery,
 )
 
 _NAMES = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"
@@ -25,7 +25,7 @@ SERVER, LOCALHOST_ONLY = "ROS_DISCOVERY_SERVER", "ROS_LOCALHOST_ONLY"
 
 
 def kept(**environment: str) -> dict[str, str]:
-    keep_to_this_machine(environment)
+    restrict_discovery(environment)
     return environment
 
 
@@ -55,11 +55,11 @@ def test_the_discovery_range_decides_with_and_without_shared_memory(
         assert environment == {DISCOVERY_RANGE: asked or "LOCALHOST", PROFILES: str(profiles)}
         assert is_open(environment) is opened
     environment = {DISCOVERY_RANGE: asked}
-    keep_to_this_machine(environment, shared_memory=False)
+    restrict_discovery(environment, shared_memory=False)
     assert environment[PROFILES] == str(without_shared_memory)
     assert is_open(environment) is opened
     # What such a node starts has shared memory again.
-    keep_to_this_machine(environment)
+    restrict_discovery(environment)
     assert environment == kept(**{DISCOVERY_RANGE: asked})
     assert kept() == {DISCOVERY_RANGE: "LOCALHOST", PROFILES: str(THIS_MACHINE)}
 
@@ -69,7 +69,7 @@ def test_profiles_of_the_users_own_stay_and_are_named(
 ) -> None:
     for shared_memory in (True, False):
         environment = {PROFILES: own}
-        keep_to_this_machine(environment, shared_memory=shared_memory)
+        restrict_discovery(environment, shared_memory=shared_memory)
         assert environment == {DISCOVERY_RANGE: "LOCALHOST", PROFILES: own}
         assert capsys.readouterr().err == f"{PROFILES}={own}: it decides who is reached\n"
 
@@ -121,17 +121,17 @@ def test_what_does_not_exist_or_contradicts_itself_is_refused(
             kept(ROS_DOMAIN_ID=domain)
         # Nodes that are started together have a domain of their own.
         environment = {"ROS_DOMAIN_ID": domain}
-        settle_environment(environment, own_graph=True)
+        clean_environment(environment, own_graph=True)
         assert environment == {}
         assert capsys.readouterr().err.startswith(f"ROS_DOMAIN_ID={domain} ignored: ")
 
 
 def test_nodes_that_are_started_together_find_each_other() -> None:
     environment = {DISCOVERY_RANGE: "OFF", SERVER: "a:1", "CYCLONEDDS_URI": "x"}
-    settle_environment(environment, own_graph=True)
+    clean_environment(environment, own_graph=True)
     assert environment == {"CYCLONEDDS_URI": "x"}
     environment = {DISCOVERY_RANGE: "SUBNET", SERVER: "a:1", "ROS_STATIC_PEERS": "b"}
-    settle_environment(environment, own_graph=True)
+    clean_environment(environment, own_graph=True)
     assert environment == {DISCOVERY_RANGE: "SUBNET", "ROS_STATIC_PEERS": "b"}
 
 

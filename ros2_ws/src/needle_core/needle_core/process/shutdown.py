@@ -17,7 +17,7 @@ _Handler = Callable[[int, FrameType | None], None]
 _DEFAULTS = (signal.SIG_DFL, signal.default_int_handler)
 
 
-class EndRequest:
+class ShutdownFlag:
     """SIGINT, SIGTERM and SIGHUP as a flag, within a `with` block.
 
     No exception is raised and no context is shut down by a signal, so none can come in the middle
@@ -26,15 +26,15 @@ class EndRequest:
 
     Attributes
     ----------
-    wanted : bool
+    requested : bool
         Whether a signal has come.
     """
 
     def __init__(self) -> None:
-        self.wanted = False
+        self.requested = False
         self._before = _handle(self._take)
 
-    def __enter__(self) -> EndRequest:
+    def __enter__(self) -> ShutdownFlag:
         return self
 
     def __exit__(
@@ -44,10 +44,10 @@ class EndRequest:
             signal.signal(number, handler)
 
     def _take(self, _number: int, _frame: FrameType | None) -> None:
-        self.wanted = True
+        self.requested = True
 
 
-class LeaveAtOnce:
+class ExitOnSignal:
     """Handler that ends the process with this exit code when a signal of `ENDING_SIGNALS` comes.
 
     For the time while modules are loaded: nothing has begun that must be ended in order.
@@ -89,7 +89,7 @@ def interruptible() -> Iterator[None]:
     before = {
         number: signal.signal(number, take)
         for number in ENDING_SIGNALS
-        if (now := signal.getsignal(number)) in _DEFAULTS or isinstance(now, LeaveAtOnce)
+        if (now := signal.getsignal(number)) in _DEFAULTS or isinstance(now, ExitOnSignal)
     }
     try:
         yield
