@@ -110,9 +110,9 @@ def at_once(ros2: type[Ros2], *commands: str) -> list[Ros2]:
 
 def test_lists_nodes_and_topics(ros2: type[Ros2]) -> None:
     # Another command's node is in the graph, too, but hidden.
-    nodes, topics = at_once(ros2, "node list", "topic list -t")
+    nodes, topics = at_once(ros2, "node list", "topic list")
     assert nodes.out == "/rig/partner\n"
-    assert "/rig/hold [sensor_msgs/msg/Joy]" in topics.out.splitlines()
+    assert "/rig/hold" in topics.out.splitlines()
 
 
 def test_echo_hears_what_was_said_before_it_came_and_shortens_arrays(ros2: type[Ros2]) -> None:

@@ -127,7 +127,9 @@ class Hand(Component):
 
     def _act(self, at: Moment) -> Actions:
         pressed, speed, _ = self.held
-        yield Publish("device/hold", self.session.say(at.stamp_ns, pressed=pressed, speed=speed))
+        yield Publish(
+            "device/hold", self.session.next_message(at.stamp_ns, pressed=pressed, speed=speed)
+        )
         yield from self.actions
         self.actions = []
 

@@ -74,7 +74,7 @@ class Echo(Component):
         self.answers: list[Answer] = []
         self.waiting: int | None = None
         self.inputs = (
-            Input("word", m.Text, self._on_word, longest=LONGEST),
+            Input("word", m.Text, self._on_word, max_bytes=LONGEST),
             Input("plan", m.Text, self._on_word, LATCHED),
             Input("whisper", m.Text, self._on_word, lazy=True),
         )

@@ -218,11 +218,11 @@ def _look_at_page(node: Any, noted: Noted) -> None:
         if button in OF_BUTTON:
             desk.press(button)
     desk.hold(HoldState(True, 1.0, Mode.RETRACT))
-    node._take_arrived()
+    node._handle_arrived()
     for timer in node.component.timers:
         node._handle(lambda timer=timer: timer.handler(node._moment()))
     for service in ("device/retract", "plane_controller/stop"):
-        node._do(Call(service))
+        node._execute(Call(service))
 
 
 def _player(module: ModuleType, *more: str) -> Node:

@@ -26,7 +26,7 @@ from needle_bringup.studies.study_parts import StudyPart, parts_of, settings_of
 from needle_core.commands.cli import EXIT_DONE, run_command
 from needle_core.commands.options import CommandParser, output_file, whole_number
 from needle_core.errors import UserError
-from needle_sim.studies.figures_of_merit import Outcomes, doubted, joined
+from needle_sim.studies.figures_of_merit import Outcomes, concatenate, is_doubtful
 from needle_sim.studies.study import Controller, run_study
 
 ESTIMATORS = ("best", "ekf", "paper")
@@ -86,7 +86,7 @@ def steer(study: Study, estimator: str, needles: int) -> Row:
     options = parse([*words, "--draws", str(needles // _STARTS)])
     begin = time.process_time()
     outcomes = [_steered(part, estimator) for part in parts_of(options)]
-    return figures(joined(outcomes), time.process_time() - begin)
+    return figures(concatenate(outcomes), time.process_time() - begin)
 
 
 def _steered(part: StudyPart, estimator: str) -> Outcomes:
@@ -107,7 +107,7 @@ def _steered(part: StudyPart, estimator: str) -> Outcomes:
 def figures(outcomes: Outcomes, cpu: float) -> Row:
     """Return the figures of some needles."""
     missed = ~outcomes.converged_at_end
-    doubtful, stated = doubted(outcomes.missed), outcomes.missed
+    doubtful, stated = is_doubtful(outcomes.missed), outcomes.missed
     says = not np.any(np.isnan(stated))
     return Row(
         within=float(1.0 - np.mean(missed)),

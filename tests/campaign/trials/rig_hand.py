@@ -165,7 +165,7 @@ class RigHand(WholeNode):
 
     def send_hold(self) -> None:
         """Say what the hold is."""
-        message = self._session.say(time.time_ns(), pressed=self.pressed)
+        message = self._session.next_message(time.time_ns(), pressed=self.pressed)
         self._hold.publish(self._converter.to_ros(message))
 
     # ---- seeing -------------------------------------------------------------------------------

@@ -212,7 +212,7 @@ class Console(Component):
             yield from self._check(at)
 
     def _hold(self, at: Moment, *, pressed: bool, speed: float = 0.0) -> Publish:
-        return Publish(_HOLD, self._session.say(at.stamp_ns, pressed=pressed, speed=speed))
+        return Publish(_HOLD, self._session.next_message(at.stamp_ns, pressed=pressed, speed=speed))
 
     def _on_lag(self, seconds: float, at: Moment) -> None:
         if seconds - self._lag >= _LAG_GROWS:

@@ -1,1 +1,1 @@
-"""Common ground of all nodes and commands of the rig: parameters, diagnostics, error exits."""
+"""Basis of all nodes and commands of the rig: components, messages, runners, settings, errors."""

@@ -1,4 +1,4 @@
-"""A CAN frame."""
+"""CAN frames and errors, as they pass through the port `can`."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ CAN = "can"
 
 @dataclasses.dataclass(frozen=True)
 class CanFrame:
-    """A classic CAN frame with an 11-bit identifier.
+    """Classic CAN frame with an 11-bit identifier.
 
     Attributes
     ----------
     identifier : int
-        0..0x7FF; CANopen calls it COB-ID.
+        0..0x7FF; the COB-ID of CANopen.
     data : bytes
         0..8 bytes.
     remote : bool
-        A request for the frame of that identifier; it has no data.
+        Whether it requests the frame with this identifier; it has no data.
     time : float or None
-        Steady time of its arrival, where its port knows it [s].
+        Steady time of arrival, if the port measures it [s].
     """
 
     identifier: int
@@ -32,14 +32,14 @@ class CanFrame:
 
 @dataclasses.dataclass(frozen=True)
 class CanErrors:
-    """Count of what a port could not hand on since the last batch.
+    """Errors of a port since the last batch.
 
     Attributes
     ----------
     frames : int
-        Error frames, and lines that are none.
+        Number of error frames and malformed lines.
     refusals : int
-        Commands and frames that the adapter did not take.
+        Number of commands and frames that the adapter rejected.
     """
 
     frames: int

@@ -1,4 +1,4 @@
-"""Functions compiled by numba at their first call and kept on disk, with their types intact."""
+"""Decorators that compile functions with numba at their first call and cache them on disk."""
 
 from __future__ import annotations
 
@@ -20,43 +20,41 @@ _COMPILED = re.compile(rb"^(@compiled|@inlined|@parallel|# Read by compiled code
 def compiled(function: Function) -> Function:
     """Compile a function of numbers and arrays at its first call; a decorator.
 
-    All follows IEEE 754, as Python's floats do: nothing is reordered, and a product and a sum stay
-    two roundings. So results depend neither on how many elements a call has nor on what the
-    compiler put into the caller, which is not the same where a function is compiled and where it
-    comes from the cache.
+    The code follows IEEE 754 like Python's floats: no reordering, no fused multiply-add. Therefore
+    the results depend neither on the number of elements of a call nor on inlining, which differs
+    between freshly compiled and cached functions.
 
-    What was compiled is kept in the user's cache, in a folder named after all files of the
-    function's package, from its root down, that hold compiled functions or are marked as read by
-    such: numba itself looks at the file of the called function only, and would go on using old code
-    of what that function calls in another file.
+    The cache folder is named after a hash of all files of the package that contain compiled
+    functions or the marker comment below. numba itself checks only the file of the called function,
+    so it would reuse stale code of functions in other files.
 
     Parameters
     ----------
     function : callable
-        What to compile; it must be one that numba's nopython mode understands.
+        Function in the subset of numba's nopython mode.
 
     Returns
     -------
     callable
-        The same, compiled.
+        The compiled function.
     """
     return _compile(function)
 
 
 def parallel(function: Function) -> Function:
-    """Compile like `compiled` what loops with `numba.prange` over what does not share anything.
+    """Compile like `compiled` a function that loops with `numba.prange` over independent items.
 
-    The rounds are divided among NUMBA_NUM_THREADS threads; each comes out the same in any of them.
+    NUMBA_NUM_THREADS threads share the iterations; the results do not depend on their number.
     """
-    # Threads that sleep between two calls, and bear a fork.
+    # This threading layer sleeps between calls and survives a fork.
     numba.config.THREADING_LAYER = "workqueue"
     return _compile(function, parallel=True)
 
 
 def inlined(function: Function) -> Function:
-    """Compile like `compiled` what loops of other compiled functions call; a decorator.
+    """Compile like `compiled` a function that loops of other compiled functions call.
 
-    Its code becomes part of the caller's: only so can a loop be done for several elements at once.
+    Its code is inlined into the caller, so that the compiler can vectorise the loop.
     """
     return _compile(function, forceinline=True)
 
@@ -77,7 +75,7 @@ def _compile(function: Function, **options: bool) -> Function:
 
 
 def _package_root(module: Path) -> Path:
-    """Return the topmost folder of the package that a module's file is in."""
+    """Return the root folder of the package that contains a module."""
     folder = module.parent
     while (folder.parent / "__init__.py").exists():
         folder = folder.parent
@@ -86,7 +84,7 @@ def _package_root(module: Path) -> Path:
 
 @functools.cache
 def _cache_directory(package: Path) -> str:
-    """Return a folder for this state of a package's sources, or "" where none can be made."""
+    """Return the cache folder for the present sources of a package; "" if none is writable."""
     digest = hashlib.sha256(numba.__version__.encode())
     for path in [Path(__file__), *sorted(package.rglob("*.py"))]:
         source = path.read_bytes()
@@ -102,10 +100,10 @@ def _cache_directory(package: Path) -> str:
 
 
 def _places() -> list[Path]:
-    """Return where a cache may be, the first choice first."""
+    """Return the candidates for the cache's place, best first."""
     named = (os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"))
     places = [Path(place) for place in named if place]
-    # HOME, or else the home that the password database has; without either there is none.
+    # Path.home() fails if neither HOME nor the password database names a home.
     with contextlib.suppress(RuntimeError):
         places.append(Path.home() / ".cache")
     return [place for place in places if place.is_absolute()]

@@ -1,8 +1,8 @@
-"""The component model: what a node is, without saying how it runs.
+"""Component model: the behaviour of a node, independent of the runner that executes it.
 
-A component declares its inputs, outputs, services and timers as rows. A handler gets an event and
-the moment, and returns actions. It reads no clock, starts no thread, opens no socket and waits for
-nothing: a runner delivers messages and time, and carries out the actions.
+A component declares its inputs, outputs, services and timers as rows. A handler receives an event
+and its moment, and returns actions. It reads no clock, starts no thread, opens no socket and never
+blocks: a runner delivers messages and time, and executes the actions.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Moment:
     stamp_ns : int
         Time for message headers [ns].
     sent_ns : int
-        When the message that is handled was sent, on its sender's clock [ns]; 0 for other events.
+        Send time of the handled message, on its sender's clock [ns]; 0 for other events.
     """
 
     steady: float
@@ -35,16 +35,16 @@ class Moment:
 
 @dataclass(frozen=True)
 class Delivery:
-    """Delivery of a topic; in ROS: the QoS profile.
+    """Quality of service of a topic; in ROS the QoS profile.
 
     Attributes
     ----------
     depth : int
-        Messages that wait while the receiver is busy; where there is no room the oldest goes.
+        Length of the receiver's queue; a full queue drops its oldest message.
     reliable : bool
-        Whether a message that is sent arrives.
+        Whether delivery is guaranteed.
     latched : bool
-        Whether a receiver that comes late gets the last message.
+        Whether a late subscriber receives the last message.
     """
 
     depth: int = 10
@@ -56,17 +56,17 @@ RELIABLE = Delivery()
 LATCHED = Delivery(depth=1, latched=True)
 BEST_EFFORT = Delivery(depth=1, reliable=False)
 JOINT_STATES = Delivery(depth=200)
-"""Four seconds of them, at 50 a second, for a receiver that stands still meanwhile."""
+"""Four seconds at 50 Hz, for a receiver that is suspended meanwhile."""
 IMAGES = Delivery(depth=5)
 IMAGES_BEST_EFFORT = Delivery(depth=2, reliable=False)
 
 
-# ---- Actions: all that a handler can bring about ---------------------------------------------
+# ---- Actions that a handler returns ----------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Publish:
-    """Send a message on one of the component's outputs."""
+    """Publish a message on one of the component's outputs."""
 
     topic: str
     message: Any
@@ -85,7 +85,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Reply:
-    """Answer the service request of this number, now or in a later handler."""
+    """Answer the service request with this number, in its handler or in a later one."""
 
     request: int
     success: bool
@@ -94,7 +94,7 @@ class Reply:
 
 @dataclass(frozen=True)
 class Send:
-    """Send a batch, in its order, through one of the component's ports."""
+    """Send an ordered batch through one of the component's ports."""
 
     port: str
     batch: tuple[Any, ...]
@@ -102,7 +102,7 @@ class Send:
 
 @dataclass(frozen=True)
 class Log:
-    """Log a line; `severity` is info, warning or error, `kind` throttles repetitions."""
+    """Log a line; `severity` is info, warning or error; lines of one `kind` are throttled."""
 
     severity: str
     text: str
@@ -111,7 +111,7 @@ class Log:
 
 @dataclass(frozen=True)
 class Listen:
-    """Receive a lazy input from now on, or no longer."""
+    """Subscribe to a lazy input, or unsubscribe from it."""
 
     topic: str
     on: bool
@@ -119,7 +119,7 @@ class Listen:
 
 @dataclass(frozen=True)
 class Diagnose:
-    """Report the health of one part of the component."""
+    """Report the diagnostic of one part of the component."""
 
     part: str
     diagnostic: Diagnostic
@@ -127,7 +127,7 @@ class Diagnose:
 
 @dataclass(frozen=True)
 class Exit:
-    """End the component's process with an exit code and one line for a person."""
+    """End the component's process with an exit code and one line for the user."""
 
     code: int
     text: str = ""
@@ -137,42 +137,42 @@ Action = Publish | Send | Call | Reply | Log | Listen | Diagnose | Exit
 Actions = Iterable[Action]
 
 
-# ---- Rows: all that a component is asked to handle -------------------------------------------
+# ---- Rows that a component declares ----------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Input:
-    """A topic that the component receives; what has more than `longest` bytes is refused.
+    """Topic that the component receives; messages longer than `max_bytes` are rejected.
 
-    A lazy one need not be received before the component listens.
+    A lazy input is subscribed by a `Listen` action only.
     """
 
     topic: str
     message: type[Any]
     handler: Callable[[Any, Moment], Actions]
     delivery: Delivery = RELIABLE
-    longest: int = 1 << 26
+    max_bytes: int = 1 << 26
     lazy: bool = False
 
 
 @dataclass(frozen=True)
 class Output:
-    """A topic that the component sends; `alone`: that one process of a machine may send."""
+    """Topic that the component publishes; `exclusive`: only one process of a machine may do so."""
 
     topic: str
     message: type[Any]
     delivery: Delivery = RELIABLE
-    alone: bool = False
+    exclusive: bool = False
 
 
 @dataclass(frozen=True)
 class PortChange:
-    """A port is lost, or open again: its runner opens it by itself.
+    """Loss of a port, or its recovery: the runner reopens ports by itself.
 
     Attributes
     ----------
     lost : str
-        Why nothing passes: not there, unplugged, its send buffer is full; empty: it is open.
+        Reason of the loss: missing, unplugged, send buffer full; empty if the port is open.
     """
 
     lost: str = ""
@@ -184,10 +184,10 @@ def _ignore(change: PortChange, at: Moment) -> Actions:
 
 @dataclass(frozen=True)
 class Port:
-    """An edge to the world other than topics, such as a CAN bus; the handler gets whole batches.
+    """Connection other than topics, such as a CAN bus; the handler receives whole batches.
 
-    Ports of one name are wired together: what goes out of one arrives at the others, in order.
-    A port is open until `on_change` hears that it is not.
+    Ports of the same name are connected: a batch sent by one arrives at the others, in order.
+    A port counts as open until `on_change` reports its loss.
     """
 
     name: str
@@ -196,27 +196,27 @@ class Port:
 
 
 Batch = tuple[Any, ...] | Callable[[], tuple[Any, ...]]
-"""What comes in at a port, or what returns it when it is handled: it may have aged until then."""
+"""Input of a port, or a function that returns it at handling time, so that it is not outdated."""
 
 
 class RealPort(Protocol):
-    """The real implementation of a component's port; it may have a reader thread."""
+    """Real implementation of a component's port; it may have a reader thread."""
 
     def open(self, arrive: Callable[[Batch | PortChange], None]) -> None:
-        """Begin; `arrive` takes what has come in, from any thread."""
+        """Start; `arrive` accepts input from any thread."""
 
     def send(self, batch: tuple[Any, ...]) -> None:
-        """Send a batch; never waits."""
+        """Send a batch; never block."""
 
     def close(self) -> None:
-        """End, after what was sent is out."""
+        """Stop, after all sent batches have left."""
 
 
 @dataclass(frozen=True)
 class Service:
-    """A service that the component offers: a SetBool if `has_argument`, else a Trigger.
+    """Service that the component offers: a SetBool if `has_argument`, else a Trigger.
 
-    The handler gets the request's Boolean (None of a Trigger), the request's number and the moment.
+    The handler receives the request's Boolean (None for a Trigger), its number and the moment.
     """
 
     name: str
@@ -226,14 +226,14 @@ class Service:
 
 @dataclass(frozen=True)
 class Timer:
-    """A handler that runs every `period` seconds."""
+    """Handler that runs every `period` seconds."""
 
     period: float
     handler: Callable[[Moment], Actions]
 
 
 ANSWER_TIMEOUT = 5.0
-"""A call without an answer is given up after this time [s]."""
+"""Time after which a call without an answer has failed [s]."""
 
 
 @dataclass(frozen=True)
@@ -245,11 +245,11 @@ class Answer:
     service : str
         Name of the service.
     success : bool
-        Whether the server did what was asked.
+        Whether the server succeeded.
     text : str
-        The server's message, or why there is none.
+        Message of the server, or the reason why there is none.
     answered : bool
-        False if there was no server, or it did not answer in time.
+        False if no server existed, or it did not answer in time.
     """
 
     service: str
@@ -260,16 +260,16 @@ class Answer:
 
 @dataclass(frozen=True)
 class Peers:
-    """Knowledge that a component has of the others.
+    """Other components on the graph, as one component has discovered them.
 
     Attributes
     ----------
     publishers : mapping of str to tuple of str
         Topic to the names of the nodes that publish it.
     subscribers : mapping of str to tuple of str
-        Topic to the names of the nodes that receive it.
+        Topic to the names of the nodes that subscribe to it.
     services : frozenset of str
-        Services that somebody offers.
+        Services with a server.
     nodes : frozenset of str
         Full names of all nodes.
     """
@@ -281,7 +281,7 @@ class Peers:
 
     @staticmethod
     def of(components: Iterable[Component]) -> Peers:
-        """Return what is known to one that knows these, its own rows included."""
+        """Return the peers of a component that has discovered these, itself included."""
         publishers: dict[str, tuple[str, ...]] = {}
         subscribers: dict[str, tuple[str, ...]] = {}
         services: list[str] = []
@@ -304,13 +304,13 @@ class Component:
     Attributes
     ----------
     name : str
-        The node's name.
+        Name of the node.
     settings : object
-        Its settings dataclass, the parameters of the node; None without any.
+        Settings dataclass: the parameters of the node; None without parameters.
     accepts_simulated_time : bool
-        Whether its stamps may come from a player's clock: of viewers, which move nothing.
+        Whether its stamps may come from a player's clock: for viewers, which move nothing.
     inputs, outputs, services, timers, ports : sequences of rows
-        What it receives, sends, offers, does by itself and is wired to; none by default.
+        Declarations of the component; empty by default.
     """
 
     name: str
@@ -323,17 +323,17 @@ class Component:
     ports: Sequence[Port] = ()
 
     def on_answer(self, answer: Answer, at: Moment) -> Actions:
-        """Handle the outcome of a call."""
+        """Handle the outcome of a service call."""
         return ()
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Handle a change of what is known of other components."""
+        """Handle a change of the discovered peers."""
         return ()
 
     def on_settings(self, settings: Any, at: Moment) -> Actions:
-        """Take changed settings."""
+        """Apply changed settings."""
         return ()
 
     def on_stop(self, at: Moment) -> Actions:
-        """Handle the wish to end: bring everything to rest and exit."""
+        """Handle a shutdown request: stop all motion and exit."""
         return (Exit(0),)

@@ -1,7 +1,7 @@
-"""Table between the messages of `messages` and their ROS types.
+"""Conversion between the messages of `messages` and their ROS types.
 
-It works on rclpy's classes and on rosbags' alike, which have the same fields: so CDR is written and
-read with and without ROS.
+It works on the classes of rclpy and of rosbags, which have the same fields, so that CDR can be
+written and read with and without ROS.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ _LOG_LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40, "fatal": 50}
 
 
 class Converter:
-    """The table on one family of message classes.
+    """Converts messages to one family of ROS classes.
 
     Parameters
     ----------
     types : MessageTypes
-        The family.
+        Family of classes.
     """
 
     def __init__(self, types: MessageTypes) -> None:
         self._types = types
 
     def to_ros(self, message: Any) -> Any:
-        """Return a message as its ROS message."""
+        """Return a message as a ROS message."""
         row = TABLE[type(message)]
         return self._types.make(row.ros_type)(**row.to_fields(message, self._types))
 
 
 def ros_type(kind: type[Any]) -> str:
-    """Return the name of the ROS type of a kind of message."""
+    """Return the name of the ROS type of a message class."""
     return TABLE[kind].ros_type
 
 
 def from_ros(kind: type[Any], message: Any) -> Any:
-    """Return a ROS message of either family as a `kind` of message.
+    """Return a ROS message of either family as a message of class `kind`.
 
-    Nothing is checked but its form: that is the receiver's business.
+    Only the form is checked; the receiver checks the values.
     """
     return TABLE[kind].from_ros(message)
 
@@ -111,7 +111,7 @@ def _hold_fields(message: m.HoldState, t: MessageTypes) -> dict[str, Any]:
 
 
 def _hold(message: Any) -> m.HoldState:
-    """Return the hold of a Joy; one without a button or an axis is a release."""
+    """Return the hold of a Joy message; without a button or an axis it is a release."""
     axes, buttons = message.axes, message.buttons
     return m.HoldState(
         *m.HoldState.split_sender(message.header.frame_id),
@@ -248,4 +248,4 @@ TABLE: dict[type[Any], Row] = {
     **VIEW_ROWS,
     m.LogLine: Row("rcl_interfaces/msg/Log", _log_fields, _log),
 }
-"""Kind of message to its row."""
+"""Message class to its row."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 
 class Level(enum.IntEnum):
-    """Severity, with diagnostic_msgs/DiagnosticStatus's numbers."""
+    """Severity, with the numbers of diagnostic_msgs/DiagnosticStatus."""
 
     OK = 0
     WARN = 1
@@ -18,12 +18,12 @@ class Level(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True)
 class Diagnostic:
-    """One line of health.
+    """Health of one part of a node.
 
     Attributes
     ----------
     level : Level
-        How bad it is.
+        Severity.
     message : str
         One sentence with value, unit and bound.
     values : dict of str to str
@@ -35,38 +35,38 @@ class Diagnostic:
     values: dict[str, str] = dataclasses.field(default_factory=dict)
 
 
-def sanitize(text: str, longest: int = 64) -> str:
-    """Return foreign text in one line of bounded length.
+def sanitize(text: str, max_length: int = 64) -> str:
+    """Return text of another node as one line of bounded length.
 
     Parameters
     ----------
     text : str
-        What somebody sent.
-    longest : int
-        How many characters of it are kept; `...` stands for the rest.
+        Text to sanitise.
+    max_length : int
+        Maximum number of characters; `...` replaces the rest.
 
     Returns
     -------
     str
-        The text, `?` for each character that does not print.
+        The text with `?` for each character that is not printable.
     """
-    kept = text[:longest]
+    kept = text[:max_length]
     if not kept.isprintable():
         kept = "".join(sign if sign.isprintable() else "?" for sign in kept)
-    return kept if len(text) <= longest else kept + "..."
+    return kept if len(text) <= max_length else kept + "..."
 
 
-def sanitize_list(names: Sequence[str], most: int = 4) -> str:
-    """Return foreign names one after the other, how many more there are, or `none`.
+def sanitize_list(names: Sequence[str], max_count: int = 4) -> str:
+    """Return names of other nodes as a list of bounded length, or `none`.
 
     Parameters
     ----------
     names : sequence of str
-        What somebody sent.
-    most : int
-        How many of them are told.
+        Names to sanitise.
+    max_count : int
+        Maximum number of names; the rest is counted.
     """
-    told = [sanitize(name) for name in names[:most]]
-    if len(names) > most:
-        told.append(f"and {len(names) - most} more")
-    return ", ".join(told) or "none"
+    shown = [sanitize(name) for name in names[:max_count]]
+    if len(names) > max_count:
+        shown.append(f"and {len(names) - max_count} more")
+    return ", ".join(shown) or "none"

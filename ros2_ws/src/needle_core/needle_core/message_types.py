@@ -1,4 +1,4 @@
-"""Families of ROS message classes: rclpy's, and those of rosbags' type stores."""
+"""Families of ROS message classes: those of rclpy, and those of rosbags' type stores."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ import numpy as np
 from needle_core.messages import Quaternion, Vector3
 
 NANOSECONDS = 1_000_000_000
-# A stamp's fields: int32 and uint32, also where more than a second is told in nanoseconds.
-_FIRST_SEC, _LAST_SEC, _LAST_NANOSEC = -(2**31), 2**31 - 1, 2**32 - 1
+# Range of a stamp's fields: int32 and uint32.
+_MIN_SEC, _MAX_SEC, _MAX_NANOSEC = -(2**31), 2**31 - 1, 2**32 - 1
 
 
 class MessageTypes:
-    """One family of message classes, found by name.
+    """Family of message classes, looked up by name.
 
     Parameters
     ----------
     lookup : callable
         Returns the class of a type name such as `geometry_msgs/msg/Point`.
     array : callable
-        Makes a numeric sequence field from numpy type and values.
+        Returns a numeric sequence field from numpy type and values.
     byte : callable
-        Makes a `byte` field.
+        Returns a `byte` field.
     octets : callable
-        Makes a `uint8[]` field, without a loop over its elements.
+        Returns a `uint8[]` field, without a loop over its elements.
     """
 
     def __init__(
@@ -51,13 +51,13 @@ class MessageTypes:
         return self.make("std_msgs/msg/Header")(stamp=self.time(stamp_ns), frame_id=frame_id)
 
     def header_of(self, message: Any) -> Any:
-        """Return the header of one of our messages that has a stamp and a frame."""
+        """Return the header of a message with a stamp and a frame."""
         return self.header(message.stamp_ns, message.frame_id)
 
     def time(self, stamp_ns: int) -> Any:
-        """Return a builtin_interfaces/Time; beyond its range the nearest that it can tell."""
-        sec = min(max(stamp_ns // NANOSECONDS, _FIRST_SEC), _LAST_SEC)
-        nanosec = min(max(stamp_ns - sec * NANOSECONDS, 0), _LAST_NANOSEC)
+        """Return a builtin_interfaces/Time, clipped to its range."""
+        sec = min(max(stamp_ns // NANOSECONDS, _MIN_SEC), _MAX_SEC)
+        nanosec = min(max(stamp_ns - sec * NANOSECONDS, 0), _MAX_NANOSEC)
         return self.make("builtin_interfaces/msg/Time")(sec=sec, nanosec=nanosec)
 
     def duration(self, seconds: float) -> Any:
@@ -88,7 +88,7 @@ class MessageTypes:
 
 @dataclass(frozen=True)
 class Row:
-    """A message's ROS type, the fields of its ROS message, and the way back."""
+    """ROS type of a message class, and the conversions to its fields and back."""
 
     ros_type: str
     to_fields: Callable[[Any, MessageTypes], dict[str, Any]]
@@ -101,22 +101,22 @@ def to_nanoseconds(stamp: Any) -> int:
 
 
 def head(message: Any) -> tuple[int, str]:
-    """Return stamp [ns] and frame of a message's header."""
+    """Return stamp [ns] and frame of a ROS message with a header."""
     return to_nanoseconds(message.header.stamp), message.header.frame_id
 
 
 def floats(values: Any) -> tuple[float, ...]:
-    """Return numbers as Python's floats."""
+    """Return numbers as Python floats."""
     return tuple(float(value) for value in values)
 
 
 def xyz(v: Any) -> Vector3:
-    """Return the numbers of a geometry_msgs/Point or Vector3."""
+    """Return the components of a geometry_msgs/Point or Vector3."""
     return (float(v.x), float(v.y), float(v.z))
 
 
 def xyzw(q: Any) -> Quaternion:
-    """Return the numbers of a geometry_msgs/Quaternion."""
+    """Return the components of a geometry_msgs/Quaternion."""
     return (float(q.x), float(q.y), float(q.z), float(q.w))
 
 
@@ -128,7 +128,7 @@ def rclpy_types() -> MessageTypes:
         return getattr(importlib.import_module(f"{package}.{kind}"), short)
 
     def octets(data: bytes | memoryview) -> array.array[int]:
-        # Anything but an array of bytes is copied element by element.
+        # rclpy copies everything but an array of bytes element by element.
         field = array.array("B")
         field.frombytes(data)
         return field

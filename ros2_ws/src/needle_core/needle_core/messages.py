@@ -10,7 +10,7 @@ from needle_core.diagnostics import Diagnostic, Level
 
 INSERTION_JOINT, ROTATION_JOINT = "insertion_joint", "rotation_joint"
 HOLD_LIFETIME = 0.1
-"""So long does a message promise a person's hold: who stands still holds no longer [s]."""
+"""Lifetime of a hold message: a source that freezes loses its hold after this time [s]."""
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -38,7 +38,7 @@ class TrajectoryPoint:
     time_from_start : float
         Nominal time at which it is reached [s].
     others : tuple of float
-        Every other number that the point carries: velocities, accelerations, effort.
+        All other numbers of the point: velocities, accelerations, effort.
     """
 
     positions: tuple[float, ...]
@@ -48,7 +48,7 @@ class TrajectoryPoint:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A command; its stamp is that of the tip that caused it."""
+    """Command; its stamp is that of the tip that caused it."""
 
     stamp_ns: int
     joint_names: tuple[str, ...]
@@ -57,7 +57,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class CommandResult:
-    """The end of a command: its stamp, and `succeeded`, `replaced` or `aborted: reason`."""
+    """Result of a command: its stamp, and `succeeded`, `replaced` or `aborted: reason`."""
 
     stamp_ns: int
     outcome: str
@@ -65,22 +65,22 @@ class CommandResult:
 
 @dataclass(frozen=True)
 class HoldState:
-    """State of a person's hold.
+    """State of an operator's hold.
 
     Attributes
     ----------
     source : str
-        Whose hand.
+        Name of the source.
     session : str
-        Of the source's process, made once at its start; empty where it does not say.
+        Identifier of the source's process, fixed at its start; empty if not given.
     count : int
-        Of the session's messages; increases.
+        Increasing number of the message within its session.
     pressed : bool
         Whether hold to run is pressed.
     speed_scale : float
         Share of the nominal speed, 0 to 1.
     lifetime : float
-        How long the message counts [s]; infinite where it does not say.
+        Time for which the message is valid [s]; infinite if not given.
     """
 
     source: str
@@ -92,15 +92,15 @@ class HoldState:
 
     @property
     def sender(self) -> str:
-        """Source and session in one word; a source without a session stands alone."""
+        """Source and session joined by a slash; the source alone if it has no session."""
         has_slash = self.session or "/" in self.source
         return f"{self.source}/{self.session}" if has_slash else self.source
 
     @staticmethod
     def split_sender(sender: str) -> tuple[str, str]:
-        """Return source and session; a source in a namespace has slashes of its own."""
+        """Return source and session; the source may contain slashes of its namespace."""
         before, _, after = sender.rpartition("/")
-        # No source is empty: "/me" is a source that somebody typed as nodes are named.
+        # A source is never empty: "/me" is a source with a leading slash and no session.
         return (before, after) if before else (sender, "")
 
 
@@ -161,7 +161,7 @@ class PoseWithCovariance:
 
 @dataclass(frozen=True)
 class Path:
-    """Positions [m], one after the other."""
+    """Sequence of positions [m]."""
 
     stamp_ns: int
     frame_id: str
@@ -170,7 +170,7 @@ class Path:
 
 @dataclass(frozen=True)
 class Transform:
-    """Place of a frame in another one: the child's origin [m] and axes in `frame_id`."""
+    """Pose of a frame in another one: origin [m] and axes of the child in `frame_id`."""
 
     stamp_ns: int
     frame_id: str
@@ -188,7 +188,7 @@ class Transforms:
 
 @dataclass(frozen=True)
 class Image:
-    """An image; `data` has `height` rows of `step` bytes."""
+    """Image; `data` has `height` rows of `step` bytes."""
 
     stamp_ns: int
     frame_id: str
@@ -201,7 +201,7 @@ class Image:
 
 @dataclass(frozen=True)
 class CompressedImage:
-    """An image as the bytes of a file; `format` is jpeg or png."""
+    """Image as the bytes of a file; `format` is jpeg or png."""
 
     stamp_ns: int
     frame_id: str
@@ -211,7 +211,7 @@ class CompressedImage:
 
 @dataclass(frozen=True)
 class RegionOfInterest:
-    """Part of the sensor that an image shows [px]; 0x0: all of it."""
+    """Part of the sensor in the image [px]; 0x0 is the whole sensor."""
 
     x_offset: int = 0
     y_offset: int = 0
@@ -221,7 +221,7 @@ class RegionOfInterest:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """A camera's calibration, with the names of sensor_msgs/CameraInfo."""
+    """Calibration of a camera, with the names of sensor_msgs/CameraInfo."""
 
     stamp_ns: int
     frame_id: str
@@ -246,9 +246,9 @@ class Text:
 
 @dataclass(frozen=True)
 class Marker:
-    """A shape of visualization_msgs; `colour` is red, green, blue and opacity, 0 to 1.
+    """Marker of visualization_msgs; `colour` is red, green, blue and opacity, 0 to 1.
 
-    Without a stamp it is shown where its frame is now; its default colour is that of an obstacle.
+    Without a stamp it moves with its frame; the default colour is that of obstacles.
     """
 
     frame_id: str
@@ -273,7 +273,7 @@ class Markers:
 
 @dataclass(frozen=True)
 class Status:
-    """A DiagnosticStatus: the health of `part` of the node `source`, with key-value pairs."""
+    """DiagnosticStatus: health of `part` of the node `source`, with key-value pairs."""
 
     source: str
     part: str
@@ -283,13 +283,13 @@ class Status:
 
     @staticmethod
     def of(source: str, part: str, diagnostic: Diagnostic) -> Status:
-        """Return a component's diagnostic as a message."""
+        """Return a diagnostic of a component as a message."""
         return Status(source, part, diagnostic.level, diagnostic.message, diagnostic.values)
 
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Health of a node's parts, as on /diagnostics."""
+    """Health of the parts of a node, as on /diagnostics."""
 
     stamp_ns: int
     statuses: tuple[Status, ...]
@@ -297,7 +297,7 @@ class Diagnostics:
 
 @dataclass(frozen=True)
 class LogLine:
-    """A line of /rosout."""
+    """Log line of /rosout."""
 
     stamp_ns: int
     severity: str
@@ -306,17 +306,17 @@ class LogLine:
 
 
 class HoldSession:
-    """Makes a source's hold messages.
+    """Creates the hold messages of one source.
 
-    They are numbered, so that a late one shows, and told from those of an earlier process of the
-    same name by the session.
+    Their number reveals late messages; the session separates them from an earlier process of the
+    same name.
 
     Parameters
     ----------
     source : str
-        Name by which the device knows whose hold it is.
+        Name of the source, unique on the graph.
     lifetime : float
-        How long a message promises the hold [s]; infinite: the device's own time-out.
+        Time for which a message is valid [s]; infinite: the device's own time-out applies.
     """
 
     def __init__(self, source: str, lifetime: float = HOLD_LIFETIME) -> None:
@@ -324,14 +324,14 @@ class HoldSession:
         self._session = ""
         self._count = 0
 
-    def say(self, stamp_ns: int, *, pressed: bool, speed: float = 1.0) -> HoldState:
+    def next_message(self, stamp_ns: int, *, pressed: bool, speed: float = 1.0) -> HoldState:
         """Return the next message.
 
         Parameters
         ----------
         stamp_ns : int
-            Present time [ns]. That of the first message names the session: no other process of
-            this source begins in the same nanosecond, whatever its clock shows.
+            Present time [ns]. The time of the first message becomes the session, because no other
+            process of this source starts in the same nanosecond.
         pressed : bool
             Whether hold to run is pressed.
         speed : float
@@ -346,8 +346,8 @@ class HoldSession:
 def quaternion_from_rotation(rotation: Sequence[Sequence[float]]) -> Quaternion:
     """Return the unit quaternion (x, y, z, w) of a rotation matrix, given as three rows.
 
-    Of the four formulas the one with the largest divisor. scipy does the same, but takes a process
-    that needs no more of it a quarter of a second to import.
+    Of the four formulas it uses the one with the largest divisor, like scipy, whose import would
+    cost each process a quarter of a second.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
     trace = xx + yy + zz

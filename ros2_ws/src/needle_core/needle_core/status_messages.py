@@ -1,7 +1,7 @@
-"""device/status and needle/controller_status as dataclasses: their key-values are read only here.
+"""Key-value messages device/status and needle/controller_status as dataclasses.
 
-A field is named after its key, which ends in its unit. What a message lacks, and what cannot be
-read, keeps the field's default: a status is foreign data.
+A field is named after its key, which ends in its unit. A missing or malformed value keeps the
+field's default, because another node may have sent it.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ _IN_STATUS = ("source", "level", "text")
 
 @dataclass(frozen=True, kw_only=True)
 class KeyValues:
-    """A DiagnosticStatus whose keys are the fields of a subclass.
+    """DiagnosticStatus whose keys are the fields of a subclass.
 
     Attributes
     ----------
     part : str
-        Which part of the node it is about.
+        Part of the node that it describes.
     source : str
-        Full name of the node that says it.
+        Full name of the node that sent it.
     level : Level
-        How bad it is.
+        Severity.
     text : str
-        One line for a person.
+        One line for the user.
     """
 
     part: ClassVar[str]
@@ -41,7 +41,7 @@ class KeyValues:
 
     @classmethod
     def parse(cls: type[_Kind], values: Mapping[str, str]) -> _Kind:
-        """Return what key-values say, of an unnamed node."""
+        """Return the status of an unnamed node from key-value pairs."""
         read: dict[str, Any] = {}
         for key, reader in _KEYS[cls]:
             if key in values:
@@ -53,13 +53,13 @@ class KeyValues:
 
     @classmethod
     def of(cls: type[_Kind], status: Status) -> _Kind:
-        """Return a DiagnosticStatus by its fields."""
-        said = {"source": status.source, "level": status.level, "text": status.text}
-        return cls(**(vars(cls.parse(status.values)) | said))
+        """Return the status from a DiagnosticStatus."""
+        fixed = {"source": status.source, "level": status.level, "text": status.text}
+        return cls(**(vars(cls.parse(status.values)) | fixed))
 
     @property
     def values(self) -> dict[str, str]:
-        """Key-values, in the order of the fields."""
+        """Key-value pairs, in the order of the fields."""
         return {
             row.name: _text(getattr(self, row.name), row.metadata.get("format", ""))
             for row in fields(self)
@@ -68,12 +68,12 @@ class KeyValues:
 
     @property
     def status(self) -> Status:
-        """The same as a DiagnosticStatus."""
+        """The status as a DiagnosticStatus."""
         return Status(self.source, self.part, self.level, self.text, self.values)
 
     @property
     def diagnostic(self) -> Diagnostic:
-        """The same as a line of health."""
+        """The status as a diagnostic."""
         return Diagnostic(self.level, self.text, self.values)
 
 
@@ -84,29 +84,29 @@ class DeviceStatus(KeyValues):
     Attributes
     ----------
     state, activity : str
-        What the device may do, and what moves (docs/safety.md).
+        State of the device and present motion (docs/safety.md).
     homed : bool
         Whether both axes are homed.
     hold_owner, press_again : str
-        Whose hold counts; who presses without that it counts, and has to release first.
+        Source of the valid hold; source of an ignored press, which must release first.
     speed_scale : float
-        The owner's share of the nominal speed.
+        Share of the nominal speed, set by the hold owner.
     insertion_m, rotation_rad : float or None
-        Where the joints are; None where that is not known.
+        Joint positions; None if unknown.
     fault, reason : str
-        Why the state is FAULT or ESTOPPED; why the device last stopped, refused or waits.
+        Reason of FAULT or ESTOPPED; reason of the last stop, rejection or wait.
     needle_out_confirmed : bool
-        Whether a person said that the needle is out.
+        Whether the operator has confirmed that the needle is out.
     watchdog_trips, commands_refused : int
-        How often a hold, tip or reply was too old; how many commands were refused.
+        Number of holds, tips or replies that were too old; number of rejected commands.
     holds_ignored : int
-        How many hold messages came late, twice, or from a session that is over.
+        Number of hold messages that were late, duplicate, or of an old session.
     command_ns : int
-        Stamp of the newest command, whatever became of it; 0: none yet.
+        Stamp of the newest command, whatever its result; 0: none yet.
     rotation_owed_rad : float
-        How far the rotation is behind a needle that a hand pushes too fast for it.
+        Lag of the rotation behind the insertion while a hand pushes the needle.
     simulated : bool or None
-        Whether no real needle can move; None while that is not known.
+        Whether the device is simulated; None while unknown.
     """
 
     part = "device"
@@ -130,7 +130,7 @@ class DeviceStatus(KeyValues):
 
     @property
     def why(self) -> str:
-        """Fault, else reason, else the line for a person."""
+        """Fault, else reason, else the line for the user."""
         return self.fault or self.reason or self.text
 
 
@@ -143,39 +143,39 @@ class ControllerStatus(KeyValues):
     state : str
         IDLE, STEERING, WAITING_FOR_TIP, DONE or FAULT.
     starts, step : int or None, int
-        How often it was started (None where it does not say); steps done.
+        Number of starts (None if not given); number of completed steps.
     insertion_m : float
-        At the last used tip.
+        Insertion at the last used tip.
     target_offset_m : float or None
         Offset of the target plane.
     target_point_m : tuple of float, or None
-        In `rig`; None where the plane is the target.
+        Target point in `rig`; None if the target is a plane.
     obstacles : int
-        How many there are.
+        Number of obstacles.
     reachable, reachable_depth_m : bool or None, float or None
-        Whether plane or point can be reached, and the least depth that any law needs for it.
+        Whether the target is reachable, and the smallest depth that any law needs for it.
     trusted : str
-        "trusted", "doubtful: " and why, or empty.
+        "trusted", "doubtful: " with the reason, or empty.
     r1_low_m, r1_high_m : float or None
-        The interval that holds r1 with 95 %.
+        95 % interval of r1.
     reason : str
-        Why the state is what it is, or what is amiss.
+        Reason of the state, or a warning.
     awaiting : str
-        What the next action needs: nothing, hold, tip, device or result.
+        Input that the next action needs: nothing, hold, tip, device or result.
     insertion : str
         stepwise or continuous.
     command_ns, tip_after_ns : int
-        Stamp of the newest command; a tip that was exposed after this is wanted.
+        Stamp of the newest command; earliest exposure of the next useful tip.
     tips_rejected, tips_rejected_for : int, str
-        How many tips were refused, and why.
+        Number of rejected tips, and the reason of the last rejection.
     watchdog_trips : int
-        How often the steady clock, not data, decided.
+        Number of expired watchdogs.
     preset : str
-        Estimator and law.
+        Names of estimator and law.
     depth_m : float or None
-        Where steering ends.
+        Insertion at which steering ends.
     heard : str
-        What was heard since the status before, in order (`heard_messages`).
+        Messages received since the previous status, in order (`heard_messages`).
     """
 
     part = "steering"
@@ -255,7 +255,7 @@ def _keys(kind: type[KeyValues]) -> list[tuple[str, Callable[[str], Any]]]:
     return [(name, _READERS[types[name]]) for name in names]
 
 
-# Kind of status to its keys, each with what reads its value.
+# Status class to its keys, each with the reader of its value.
 _KEYS: dict[type[KeyValues], list[tuple[str, Callable[[str], Any]]]] = {
     kind: _keys(kind) for kind in (DeviceStatus, ControllerStatus)
 }

@@ -1,4 +1,4 @@
-"""Rows of the table of messages for what cameras see and what viewers draw."""
+"""Rows of the conversion table for images and for what viewers draw."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 def _path_fields(message: m.Path, t: MessageTypes) -> dict[str, Any]:
-    header, make = (
-        t.header_of(message),
-        t.make("geometry_msgs/msg/PoseStamped"),
-    )
+    header, make = t.header_of(message), t.make("geometry_msgs/msg/PoseStamped")
     poses = [make(header=header, pose=t.pose(at, _UPRIGHT)) for at in message.positions]
     return {"header": header, "poses": poses}
 
@@ -59,7 +56,7 @@ def _image(message: Any) -> m.Image:
         int(message.width),
         message.encoding,
         int(message.step),
-        # Not copied: images are large, and come 60 a second.
+        # Not copied, because images are large and arrive at 60 Hz.
         memoryview(message.data),
     )
 
@@ -174,4 +171,4 @@ VIEW_ROWS: dict[type[Any], Row] = {
         lambda r: m.Markers(tuple(_marker(marker) for marker in r.markers)),
     ),
 }
-"""Kind of message to its row."""
+"""Message class to its row."""

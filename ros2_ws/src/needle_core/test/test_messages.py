@@ -9,7 +9,7 @@ from needle_core.messages import HOLD_LIFETIME, HoldSession, HoldState
 
 def test_a_session_counts_whatever_the_clock_does() -> None:
     session = HoldSession("operator")
-    said = [session.say(stamp, pressed=stamp > 5, speed=0.5) for stamp in (255, 7, 3)]
+    said = [session.next_message(stamp, pressed=stamp > 5, speed=0.5) for stamp in (255, 7, 3)]
     assert said == [
         HoldState("operator", "ff", 1, True, 0.5, HOLD_LIFETIME),
         HoldState("operator", "ff", 2, True, 0.5, HOLD_LIFETIME),
@@ -18,6 +18,8 @@ def test_a_session_counts_whatever_the_clock_does() -> None:
 
 
 def test_a_process_that_starts_anew_has_another_session() -> None:
-    before, after = (HoldSession("operator", math.inf).say(at, pressed=True) for at in (16, 0))
+    before, after = (
+        HoldSession("operator", math.inf).next_message(at, pressed=True) for at in (16, 0)
+    )
     assert (before.session, after.session) == ("10", "0")
     assert (after.count, after.lifetime) == (1, math.inf)

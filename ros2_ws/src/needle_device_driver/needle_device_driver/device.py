@@ -102,7 +102,7 @@ class DeviceRows:
         self._notices = NoticeLimit()
         self._order: _Order | None = None
         self.inputs: Sequence[Input] = (
-            Input(COMMANDS, m.Trajectory, self._on_command, longest=_LONGEST),
+            Input(COMMANDS, m.Trajectory, self._on_command, max_bytes=_LONGEST),
             Input(HOLD, m.HoldState, self._on_hold, HOLDS, _LONGEST),
             Input(
                 EMERGENCY_STOP,
@@ -115,7 +115,7 @@ class DeviceRows:
         self.outputs: Sequence[Output] = (
             Output(JOINTS, m.JointState, JOINT_STATES),
             Output(RESULT, m.CommandResult),
-            Output(STATUS, DeviceStatus, LATCHED, alone=True),
+            Output(STATUS, DeviceStatus, LATCHED, exclusive=True),
         )
         call = supervisor
         self.services: Sequence[Service] = (

@@ -92,7 +92,7 @@ class Scene(PlayedGraph):
     def __init__(self, monkeypatch: pytest.MonkeyPatch, bag: Path) -> None:
         super().__init__(monkeypatch, node)
         self.bag = bag
-        self.ended = SimpleNamespace(wanted=False)
+        self.ended = SimpleNamespace(requested=False)
         self.pressed: list[str] = []
 
         def run_node(create: Any, *, spin: Any, args: list[str], **_: object) -> int:

@@ -70,7 +70,7 @@ class Scene(PlayedGraph):
         """Run the executable; `act` is what happens between its start and the signal."""
         values = RecorderParameters(bag=str(self.bag), reserve=0, **settings)
         self._patch("NodeParameters", lambda *_: SimpleNamespace(values=values))
-        ended = SimpleNamespace(wanted=False)
+        ended = SimpleNamespace(requested=False)
 
         def act_and_end() -> None:
             act()

@@ -113,7 +113,7 @@ class Operator(Component):
         yield Exit(EXIT_DONE)
 
     def _hold(self, at: Moment, *, pressed: bool, speed: float = 0.0) -> Publish:
-        return Publish(HOLD, self._session.say(at.stamp_ns, pressed=pressed, speed=speed))
+        return Publish(HOLD, self._session.next_message(at.stamp_ns, pressed=pressed, speed=speed))
 
     def _on_joy(self, message: m.Joystick, at: Moment) -> Actions:
         stamp = message.stamp_ns / 1e9

@@ -179,7 +179,7 @@ class SimulatedOperator(Component):
 
     def _hold(self, at: Moment, *, pressed: bool) -> Publish:
         speed = self.settings.speed_scale
-        return Publish(HOLD, self._session.say(at.stamp_ns, pressed=pressed, speed=speed))
+        return Publish(HOLD, self._session.next_message(at.stamp_ns, pressed=pressed, speed=speed))
 
     def _report(self) -> Diagnose:
         if self._sequence.steering:

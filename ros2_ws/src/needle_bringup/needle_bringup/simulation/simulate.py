@@ -41,7 +41,7 @@ from needle_core.commands.cli import (
     run_command,
     write_json,
 )
-from needle_core.commands.executables import loaded
+from needle_core.commands.executables import load
 from needle_core.errors import UserError
 from needle_core.process.discovery import clean_environment
 from needle_core.process.ros_domain import reserve_domain_id
@@ -204,7 +204,7 @@ def _import_report() -> tuple[ModuleType, ...]:
         "needle_bags.reading.bag_reader",
         "needle_analysis.run.run_summary",
     )
-    return tuple(loaded(name) for name in names)
+    return tuple(load(name) for name in names)
 
 
 def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:

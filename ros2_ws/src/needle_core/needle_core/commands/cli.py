@@ -1,4 +1,4 @@
-"""Exit codes, one-line errors and the flat JSON result of every command line."""
+"""Exit codes, one-line errors and flat JSON results of all commands."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ EXIT_MISSED = 1
 EXIT_BAD_INPUT = 2
 EXIT_INTERNAL_ERROR = 3
 EXIT_INTERRUPTED = 130
-# In place of a file's name.
+# File name that stands for standard output.
 STANDARD_OUTPUT = "-"
 
 JsonValue = str | int | float | bool | None
 
 
 def run_command(command: Callable[[], int]) -> int:
-    """Run a command and turn what a user can cause into an exit code and one line.
+    """Run a command; turn every error into an exit code and one line.
 
     Parameters
     ----------
     command : callable
-        Does the work and returns its exit code.
+        The command; returns its exit code.
 
     Returns
     -------
@@ -42,7 +42,7 @@ def run_command(command: Callable[[], int]) -> int:
     try:
         with interruptible(), contextlib.redirect_stdout(sys.stdout):
             code = command()
-            # a reader that has left shows here, and not when the interpreter ends
+            # A closed pipe raises here instead of at the interpreter's exit.
             sys.stdout.flush()
         return code
     except UserError as error:
@@ -52,7 +52,7 @@ def run_command(command: Callable[[], int]) -> int:
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        # The reader of our output left (`| head`): not an error, but nothing more can be printed.
+        # The reader closed the pipe (`| head`): not an error, but printing must stop.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_DONE
     except Exception as error:  # noqa: BLE001
@@ -60,38 +60,38 @@ def run_command(command: Callable[[], int]) -> int:
 
 
 def internal_error(error: Exception) -> int:
-    """Say in one line what this software did wrong and where; return the exit code for it.
+    """Print an internal error and its place in one line; return its exit code.
 
-    In Python's development mode (PYTHONDEVMODE=1) the traceback comes before it.
+    Python's development mode (PYTHONDEVMODE=1) prints the traceback as well.
     """
     if sys.flags.dev_mode:
         traceback.print_exception(error)
     frames = traceback.extract_tb(error.__traceback__)
     where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
-    words = " ".join(f"{type(error).__name__}: {error}".split())
+    message = " ".join(f"{type(error).__name__}: {error}".split())
     print(
-        f"error: internal error, please report it: {words}{where}; PYTHONDEVMODE=1 shows more",
+        f"error: internal error, please report it: {message}{where}; PYTHONDEVMODE=1 shows more",
         file=sys.stderr,
     )
     return EXIT_INTERNAL_ERROR
 
 
 def finite_or_none(value: JsonValue) -> JsonValue:
-    """Return `value`, or None for a float that JSON cannot carry (NaN, infinities)."""
+    """Return `value`, or None for a float that JSON does not support (NaN, infinities)."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
 
 
 def write_json(path: Path, values: Mapping[str, JsonValue]) -> None:
-    """Write a flat JSON object; a figure that does not exist becomes null, never NaN.
+    """Write a flat JSON object; missing values become null, never NaN.
 
     Parameters
     ----------
     path : Path
-        File to write; its folder must exist. `-` is standard output.
+        File to write, in an existing folder; `-` is standard output.
     values : mapping
-        Flat key to value; keys end in their unit.
+        Key to value; keys end in their unit.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Entry points: what a package's executables do before and after their modules' `main`.
+"""Entry points of a package's executables: signals, environment and import before `main`.
 
-Loading ROS, numerical code and image processing takes up to seconds, and a signal may come then,
-too. Hence nothing is imported here that takes time, and modules are given by name.
+Loading ROS, numerical code and image processing takes up to seconds, and a signal may arrive
+meanwhile. Therefore this module imports nothing slow, and modules are given by name.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ _EXIT_INTERRUPTED = 130
 
 
 def node(module: str) -> Callable[[], NoReturn]:
-    """Return the entry point of a node: a signal while it is loaded ends it with exit code 0.
+    """Return the entry point of a node; a signal during loading means exit code 0.
 
     Parameters
     ----------
     module : str
-        Full name of a module whose `main` takes nothing and returns the exit code.
+        Full name of a module; its `main` has no arguments and returns the exit code.
     """
 
     def enter() -> NoReturn:
         ExitOnSignal(_EXIT_DONE)
         use_fast_dds()
-        code: int = loaded(module).main()
-        # No way back through the interpreter: what DDS and numerical code left there has its own
-        # ideas of an end, and a signal finds no handler any more.
+        code: int = load(module).main()
+        # Skip the interpreter's shutdown: clean-up of DDS and numerical libraries may hang or
+        # crash there, and signals are not handled any more.
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError):
                 stream.flush()
@@ -48,27 +48,27 @@ def node(module: str) -> Callable[[], NoReturn]:
 
 
 def command(module: str) -> Callable[[], NoReturn]:
-    """Return the entry point of a command: a signal while it is loaded is exit code 130.
+    """Return the entry point of a command; a signal during loading means exit code 130.
 
     Parameters
     ----------
     module : str
-        Full name of a module whose `main` takes nothing and returns the exit code.
+        Full name of a module; its `main` has no arguments and returns the exit code.
     """
 
     def enter() -> NoReturn:
         ExitOnSignal(_EXIT_INTERRUPTED)
         use_fast_dds()
-        sys.exit(loaded(module).main())
+        sys.exit(load(module).main())
 
     return enter
 
 
-def loaded(module: str) -> ModuleType:
-    """Return a module, imported with all that it needs.
+def load(module: str) -> ModuleType:
+    """Import a module with garbage collection switched off, and return it.
 
-    What is made meanwhile is there to stay: to look for garbage in it would take a tenth of the
-    time now, and every later search would go through all of it again.
+    The imported objects stay alive. Collecting them would take a tenth of the loading time, and
+    without freezing them every later collection would traverse them again.
     """
     gc.disable()
     try:

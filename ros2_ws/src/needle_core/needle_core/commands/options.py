@@ -1,4 +1,4 @@
-"""Options of command lines: how all commands parse them, and refuse what cannot be in one line."""
+"""Command-line options: parsing, and one-line errors for invalid values."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from needle_core.settings.bounds import check_bounds
 
 
 class CommandParser(argparse.ArgumentParser):
-    """Raises `UserError` for words that it does not understand; options are written in full.
+    """Parser that raises `UserError` for invalid arguments; options cannot be abbreviated.
 
     Parameters
     ----------
     name : str
-        The command's.
+        Name of the command.
     description, epilog : str
-        Texts of `--help` before and after the options, shown line by line as they are.
+        Texts of `--help` before and after the options, printed unchanged.
     """
 
     def __init__(self, name: str, description: str, epilog: str) -> None:
@@ -35,33 +35,33 @@ class CommandParser(argparse.ArgumentParser):
         )
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse; with `--json -`, standard output is for the JSON alone, words go to stderr."""
+        """Parse; with `--json -`, all text goes to stderr and only JSON to standard output."""
         given = super().parse_known_args(args, namespace)
         if str(getattr(given[0], "json", None)) == STANDARD_OUTPUT:
             sys.stdout = sys.stderr
         return given
 
     def error(self, message: str) -> NoReturn:
-        """Raise what argparse would print before it ends the process."""
+        """Raise the error that argparse would print before exiting."""
         raise UserError(f"{message}; see --help")
 
 
 def number(name: str, text: str, lower: float, upper: float, unit: str) -> float:
-    """Return the number that an option was given.
+    """Return the number given to an option.
 
     Parameters
     ----------
     name, text : str
-        The option, and what stands behind it.
+        Name of the option, and its argument.
     lower, upper : float
-        Inclusive bounds, in `unit`; infinity counts where it is a bound.
+        Inclusive bounds, in `unit`; infinity is valid if it is a bound.
     unit : str
-        What it is given in, "-" for none.
+        Unit of the argument, "-" for none.
 
     Raises
     ------
     UserError
-        If it is no number or not within the bounds.
+        If it is not a number or out of bounds.
     """
     try:
         value = float(text)
@@ -72,7 +72,7 @@ def number(name: str, text: str, lower: float, upper: float, unit: str) -> float
 
 
 def whole_number(name: str, text: str, lower: int, upper: int) -> int:
-    """Return the whole number that an option was given; arguments and errors as of `number`."""
+    """Return the integer given to an option; arguments and errors are those of `number`."""
     try:
         value = int(text)
     except ValueError:
@@ -86,12 +86,12 @@ def output_file(name: str, text: None) -> None: ...
 @overload
 def output_file(name: str, text: str | Path) -> Path: ...
 def output_file(name: str, text: str | Path | None) -> Path | None:
-    """Return the file that an option names to be written; None where it was not given, `-` as is.
+    """Return the output file given to an option; None if it was not given, `-` unchanged.
 
     Raises
     ------
     UserError
-        If it is a folder, or in one that does not exist: better told before the work than after.
+        If it is a folder, or its folder does not exist.
     """
     if text is None:
         return None
@@ -107,9 +107,9 @@ _STARTS = ("--initial", "--target")
 
 
 def join_signed_values(arguments: Sequence[str]) -> list[str]:
-    """Write `--initial -3,2,15` as `--initial=-3,2,15`: argparse takes the former for an option.
+    """Join `--initial -3,2,15` to `--initial=-3,2,15`, as argparse would reject the former.
 
-    Likewise `--target`.
+    The same applies to `--target`.
     """
     joined: list[str] = []
     for argument in arguments:

@@ -1,7 +1,7 @@
-"""A small `ros2` for environments without ROS 2's own command line: PyPI has none.
+"""Small `ros2` for environments without ROS 2's own command line, which PyPI does not have.
 
-It has what the documents of this project use, in the syntax of the real one.
-`needle_core.ros.graph_commands` has the commands that need a graph.
+It contains the verbs of this project's documents, in the syntax of the original.
+`needle_core.ros.graph_commands` contains the verbs that need a graph.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 import difflib
 import importlib
 import sys
-from collections.abc import Iterable
+from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
-from typing import NoReturn
+from typing import TypeVar
 
 from needle_core.errors import UserError
 from needle_core.process.discovery import clean_environment
@@ -29,32 +29,39 @@ project and speaks to a running graph; `ros2 topic pub --help` and the like say 
 everything else (bag, launch, ...) install ROS 2 Jazzy, source it and run scripts/setup again.
 """
 _MODULE = ".executables"
+T = TypeVar("T")
 
 
 def main() -> int:
-    """Do what the command line says; returns the exit code."""
+    """Run the command line; return the exit code."""
     try:
         match sys.argv[1:]:
-            case ["run", package, executable, *rest]:
-                run(package, executable, rest)
+            case ["run", package, executable, *arguments]:
+                found = _find("package", package, _executables())
+                entry = _find(f"executable of {package}", executable, found)
+                # In this process, so that signals reach it and its exit code is that of `ros2`.
+                sys.argv = [executable, *arguments]
+                sys.exit(entry.load()())
             case ["pkg", "executables", *given]:
-                for package in given or sorted(executables()):
-                    print("\n".join(f"{package} {name}" for name in of_package(package)))
-            case ["node" | "topic" | "service" | "param", *_] as words:
+                known = _executables()
+                for package in given or sorted(known):
+                    for name in _find("package", package, known):
+                        print(package, name)
+            case ["node" | "topic" | "service" | "param", *_] as arguments:
                 clean_environment()
                 commands = importlib.import_module("needle_core.ros.graph_commands")
-                return int(commands.main(words))
-            case words:
+                return int(commands.main(arguments))
+            case arguments:
                 print(HELP, end="")
-                return 0 if words in ([], ["-h"], ["--help"]) else 2
+                return 0 if arguments in ([], ["-h"], ["--help"]) else 2
     except UserError as error:
         print(f"ros2: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-def executables() -> dict[str, dict[str, EntryPoint]]:
-    """Return the installed executables for `ros2 run`, by package and name."""
+def _executables() -> dict[str, dict[str, EntryPoint]]:
+    """Return the installed executables by package and name."""
     found: dict[str, dict[str, EntryPoint]] = {}
     for one in sorted(entry_points(group="console_scripts"), key=lambda point: point.name):
         if one.module.endswith(_MODULE):
@@ -62,39 +69,12 @@ def executables() -> dict[str, dict[str, EntryPoint]]:
     return found
 
 
-def of_package(package: str) -> dict[str, EntryPoint]:
-    """Return a package's executables by name.
-
-    Raises
-    ------
-    UserError
-        If there is no such package.
-    """
-    found = executables()
-    if package not in found:
-        raise UserError(f"package '{package}' not found{suggest(package, found)}")
-    return found[package]
-
-
-def run(package: str, executable: str, arguments: list[str]) -> NoReturn:
-    """Run an executable in this process: signals reach it, and its exit code is that of `ros2`.
-
-    Raises
-    ------
-    UserError
-        If there is no such package or executable.
-    """
-    found = of_package(package)
-    if executable not in found:
-        hint = suggest(executable, found)
-        raise UserError(f"package '{package}' has no executable '{executable}'{hint}")
-    sys.argv = [executable, *arguments]
-    sys.exit(found[executable].load()())
-
-
-def suggest(name: str, known: Iterable[str]) -> str:
-    """Return a hint at what may have been meant."""
+def _find(kind: str, name: str, known: Mapping[str, T]) -> T:
+    """Return a known package or executable; raise a `UserError` with a suggestion otherwise."""
+    if name in known:
+        return known[name]
     close = difflib.get_close_matches(name, known, n=3)
-    if close:
-        return f"; did you mean {' or '.join(close)}?"
-    return f"; there is {', '.join(sorted(known))}"
+    hint = f"did you mean {' or '.join(close)}?"
+    if not close:
+        hint = f"there is {', '.join(sorted(known))}"
+    raise UserError(f"{kind} '{name}' not found; {hint}")

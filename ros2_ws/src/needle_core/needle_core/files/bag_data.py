@@ -1,4 +1,4 @@
-"""A bag's data beside plain MCAP: SQLite, and what was compressed as a whole or by message."""
+"""Data files of a bag other than plain MCAP: SQLite, and compression by file or by message."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from needle_core.files.mcap_file import TIME_LIMIT
 
 
 class SqliteData:
-    """An SQLite file, read as `McapFile` reads; it does not tell when messages were sent."""
+    """SQLite file with the interface of `McapFile`; it has no send times."""
 
     def __init__(self, reader: Reader) -> None:
         self._reader = reader
@@ -29,14 +29,14 @@ class SqliteData:
         return self._reader.start_time, self._reader.end_time - 1
 
     def counts(self) -> Mapping[str, int]:
-        """Return messages by topic."""
+        """Return the number of messages by topic."""
         found: Counter[str] = Counter()
         for connection in self._reader.connections:
             found[connection.topic] += connection.msgcount
         return found
 
     def definitions(self) -> dict[str, tuple[str, str]]:
-        """Return encoding and text of each type's definition."""
+        """Return encoding and text of the definition of each type."""
         kinds = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
         return {
             connection.msgtype: (kinds[connection.msgdef.format], connection.msgdef.data)
@@ -49,7 +49,7 @@ class SqliteData:
     ) -> Iterator[tuple[str, int, int, bytes]]:
         """Yield topic, log time, publish time [ns] and data, in order of log time."""
         connections = [c for c in self._reader.connections if c.topic in topics]
-        # The limit itself is no number of SQLite's.
+        # TIME_LIMIT exceeds SQLite's integers.
         end = stop if stop < TIME_LIMIT else None
         if connections:
             for connection, log_time, data in self._reader.messages(connections, start, end):
@@ -57,12 +57,12 @@ class SqliteData:
 
 
 def is_compressed(data: bytes) -> bool:
-    """Return whether a message was compressed by itself; none in CDR begins so."""
+    """Return whether a message is compressed; CDR never starts with these bytes."""
     return data.startswith(zstandard.FRAME_HEADER)
 
 
 def unpack(data: bytes) -> bytes:
-    """Return a message that was compressed by itself.
+    """Return the data of a compressed message.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def unpack(data: bytes) -> bytes:
 
 
 def unpack_file(path: Path, folder: Path) -> Path:
-    """Write what a compressed data file holds into a folder; return where.
+    """Decompress a data file into a folder; return its path.
 
     Raises
     ------

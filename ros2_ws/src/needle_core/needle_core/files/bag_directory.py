@@ -1,4 +1,4 @@
-"""Opens a rosbag2 directory: what it says is in it is what is read, or an error."""
+"""Rosbag2 directory: its content agrees with its metadata, or opening it is an error."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _NEWEST_VERSION: Final = 9
 
 
 class SentMessage(NamedTuple):
-    """A message as it is in the bag.
+    """Message of a bag.
 
     Attributes
     ----------
     time, log_time : int
-        When it was sent (received, where the bag does not tell) and received [ns].
+        Send time (receive time if the bag has none) and receive time [ns].
     topic, type_name : str
-        Its topic and type.
+        Topic and type.
     data : bytes
         The message as CDR.
     """
@@ -44,36 +44,36 @@ class SentMessage(NamedTuple):
 
 
 class BagDirectory:
-    """A bag open for reading; what it says about itself stays known when it is closed.
+    """Bag open for reading; the attributes stay valid after it is closed.
 
     Parameters
     ----------
     path : Path
-        A rosbag2 directory, MCAP or SQLite; or an MCAP file, which is read alone.
+        Rosbag2 directory (MCAP or SQLite), or a single MCAP file.
 
     Raises
     ------
     BrokenBagError
-        If it is not whole.
+        If it is damaged or incomplete.
     UserError
-        If there is none, or it holds what is not read here.
+        If it does not exist, or its format is not supported.
 
     Attributes
     ----------
     topics : dict of str to BagTopic
         By name.
     counts : dict of str to int
-        Messages for each topic.
+        Number of messages by topic.
     custom_data : dict of str to str
-        What the recorder left in metadata.yaml, or in the file.
+        Custom data of the recorder, from metadata.yaml or the file.
     distribution : str
-        ROS distribution it was recorded with; empty where not known.
+        ROS distribution of the recording; empty if unknown.
     start, end : int
         Log times of the first and the last message [ns]; 0 in an empty bag.
     records : list of Metadata
-        Of a file that is read alone: its metadata records.
+        Metadata records of a single MCAP file.
     is_compressed : bool
-        Whether messages were compressed one by one, by those that were read.
+        Whether any message read so far was compressed by itself.
     """
 
     def __init__(self, path: Path) -> None:
@@ -102,16 +102,16 @@ class BagDirectory:
         self._stack.close()
 
     def messages(
-        self, wanted: Callable[[str], bool], start: int = 0, stop: int = TIME_LIMIT
+        self, is_selected: Callable[[str], bool], start: int = 0, stop: int = TIME_LIMIT
     ) -> Iterator[SentMessage]:
-        """Yield the messages of wanted topics with start <= log time < stop [ns], in order.
+        """Yield the messages of selected topics with start <= log time < stop [ns], in order.
 
         Raises
         ------
         UserError
-            If the bag holds other messages than it says.
+            If the messages do not agree with the metadata.
         """
-        topics = {name for name in self.topics if wanted(name)}
+        topics = {name for name in self.topics if is_selected(name)}
         with readable(self.path):
             for file in self._files:
                 for topic, log_time, sent, data in file.read(topics, start, stop):
@@ -121,7 +121,7 @@ class BagDirectory:
                     yield SentMessage(sent, log_time, topic, type_name, plain)
 
     def typestore(self) -> Typestore:
-        """Return the types that the bag defines, to be read; Jazzy's if it defines none."""
+        """Return the types that the bag defines; those of Jazzy if it defines none."""
         return typestore_of(
             tuple(
                 (topic.encoding, topic.definition, topic.type_name, topic.type_hash)
@@ -131,7 +131,7 @@ class BagDirectory:
         )
 
     def deserialize(self, store: Typestore, message: SentMessage) -> Any:
-        """Return a message's content.
+        """Return the content of a message.
 
         Raises
         ------
@@ -140,7 +140,7 @@ class BagDirectory:
         """
         try:
             return store.deserialize_cdr(message.data, message.type_name)
-        # whatever rosbags' generated code meets in bytes of another type
+        # rosbags' generated code raises all kinds of errors for bytes of another type.
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
             raise UserError(
@@ -155,7 +155,7 @@ class BagDirectory:
             raise ValueError(f"{METADATA_FILE} is of version {version!r}")
         try:
             kind = self._require_known(information)
-            # Old versions put the bag's own name first.
+            # Old versions put the bag's name in front.
             names = [PurePath(name).name for name in information["relative_file_paths"]]
             self._files = [self._open(self.path / name, kind) for name in names]
             custom = information.get("custom_data") or {}
@@ -182,7 +182,7 @@ class BagDirectory:
         self._read_topics(file.topics())
 
     def _require_known(self, information: Mapping[str, Any]) -> str:
-        """Return the kind of storage; refuse what is not broken and not read here."""
+        """Return the storage type; raise a `UserError` for unsupported formats."""
         kind = str(information["storage_identifier"])
         mode = str(information.get("compression_mode") or "none").lower()
         packing = str(information.get("compression_format") or "zstd").lower()
@@ -211,9 +211,9 @@ class BagDirectory:
         self.counts: Counter[str] = Counter()
         self.topics: dict[str, BagTopic] = {}
         for entry in entries:
-            told = entry["topic_metadata"]
-            name, type_name = str(told["name"]), str(told["type"])
-            if told.get("serialization_format", "cdr") != "cdr":
+            metadata = entry["topic_metadata"]
+            name, type_name = str(metadata["name"]), str(metadata["type"])
+            if metadata.get("serialization_format", "cdr") != "cdr":
                 raise UserError(f"{self.path}: {name} is not in CDR, which alone is read here")
             known = self.topics.get(name)
             if known is not None and known.type_name != type_name:
@@ -222,17 +222,17 @@ class BagDirectory:
                     f"{type_name}: record them under two names"
                 )
             self.counts[name] += int(entry["message_count"])
-            type_hash = str(told.get("type_description_hash") or "")
-            qos = offered_profiles(told.get("offered_qos_profiles") or [])
+            type_hash = str(metadata.get("type_description_hash") or "")
+            qos = offered_profiles(metadata.get("offered_qos_profiles") or [])
             encoding, text = definitions.get(type_name, ("ros2msg", ""))
             self.topics[name] = BagTopic(name, type_name, text, type_hash, qos, encoding)
 
     def _compare(self, total: int) -> None:
-        there: Counter[str] = Counter()
+        found: Counter[str] = Counter()
         for file in self._files:
-            there.update(file.counts())
-        if +self.counts != +there or total != there.total():
+            found.update(file.counts())
+        if +self.counts != +found or total != found.total():
             raise ValueError(
                 f"{METADATA_FILE} tells of {self.counts.total()} messages, the data of "
-                f"{there.total()}, or of others"
+                f"{found.total()}, or of others"
             )

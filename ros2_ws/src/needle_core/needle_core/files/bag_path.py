@@ -1,4 +1,4 @@
-"""Paths of bags: a bag or a file of one, whether it can be read, and what to type if it cannot."""
+"""Paths of bags: recognises bags and their files, and explains why one cannot be read."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DATA_FILE: Final = re.compile(r"([^.].*?)(?:_(\d+))?\.mcap(?:\.zstd)?")
 
 
 class BrokenBagError(UserError):
-    """A bag that is damaged or was not completed; the message names the remedy.
+    """Bag that is damaged or was not completed; the message names the remedy.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class BrokenBagError(UserError):
     reason : str
         The fault.
     state : str
-        The bag's state in a few words.
+        State of the bag in a few words.
     """
 
     def __init__(self, path: Path, reason: str, state: str = "is broken") -> None:
@@ -38,12 +38,12 @@ class BrokenBagError(UserError):
 
 
 def recover_hint(path: Path) -> str:
-    """Return what to type for an MCAP bag that is not whole."""
+    """Return the command that repairs an MCAP bag."""
     return f"run `ros2 run needle_bags recover {path}`"
 
 
 def repair_hint(path: Path) -> str:
-    """Return what to type for a bag that is not whole, by what its folder holds."""
+    """Return the command that repairs a bag, by the type of its files."""
     if any(path.glob("*.db3*")) and not any(path.glob("*.mcap")):
         return f"`recover` mends MCAP only; SQLite has `ros2 bag reindex {path}`"
     return recover_hint(path)
@@ -52,13 +52,13 @@ def repair_hint(path: Path) -> str:
 def recording_files(folder: Path) -> list[Path]:
     """Return the files of a folder's only MCAP recording: `<stem>.mcap` or `<stem>_<n>.mcap`.
 
-    Of several stems, the one with the folder's name is the recording's. If numbers are missing
-    between others, the first of them is returned, too: that file does not exist.
+    Of several stems, the one with the folder's name is the recording. If numbers are missing in
+    the sequence, the result includes the first missing file, which does not exist.
 
     Raises
     ------
     UserError
-        If there are several, and none has the folder's name.
+        If there are several recordings and none has the folder's name.
     """
     stems: dict[str, dict[tuple[int, str], Path]] = {}
     for file in sorted(folder.iterdir()):
@@ -102,7 +102,7 @@ def require_bag(path: Path) -> None:
 
 
 def is_being_recorded(file: Path) -> bool:
-    """Return whether a recorder is writing a data file right now."""
+    """Return whether a recorder is writing a data file."""
     try:
         with open_regular(file) as stream:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -115,12 +115,12 @@ def is_being_recorded(file: Path) -> bool:
 
 @contextlib.contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Turn whatever a bag's content makes a reader raise into one line."""
+    """Turn every error of a reader into a `BrokenBagError` of one line."""
     try:
         yield
     except (UserError, GeneratorExit):
         raise
-    # Readers meet broken bags with all kinds of exceptions: assertions, struct errors, KeyError...
+    # Broken bags cause all kinds of exceptions: assertions, struct errors, KeyError...
     except Exception as error:
         lines = str(error).splitlines()
         reason = lines[0].rstrip(".")[:200] if lines else type(error).__name__
@@ -132,12 +132,12 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def read_information(path: Path) -> dict[str, Any]:
-    """Return metadata.yaml's content.
+    """Return the content of metadata.yaml.
 
     Raises
     ------
     OSError, ValueError
-        If it cannot be read, or is not what rosbag2 writes.
+        If it cannot be read, or does not have the form of rosbag2.
     """
     with open_regular(path / METADATA_FILE) as stream:
         data = stream.read()

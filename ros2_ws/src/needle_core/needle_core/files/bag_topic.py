@@ -18,12 +18,12 @@ from needle_core.files.yaml_files import load_yaml
 
 
 def offered_profiles(profiles: Sequence[Mapping[str, Any]] | str) -> tuple[Qos, ...]:
-    """Return the profiles that metadata.yaml or an MCAP channel has; none if it has other things.
+    """Return the QoS profiles of metadata.yaml or an MCAP channel; none if they are malformed.
 
     Parameters
     ----------
     profiles : sequence of mapping or str
-        As they are from version 9 on, or as YAML text.
+        A list (from version 9 on), or its YAML text.
     """
     try:
         found: Any = load_yaml(profiles) or [] if isinstance(profiles, str) else profiles
@@ -42,7 +42,7 @@ def offered_profiles(profiles: Sequence[Mapping[str, Any]] | str) -> tuple[Qos, 
 
 @dataclasses.dataclass(frozen=True)
 class BagTopic:
-    """A topic of a bag, beside its messages.
+    """Topic of a bag.
 
     Attributes
     ----------
@@ -51,13 +51,13 @@ class BagTopic:
     type_name : str
         `package/msg/Name`.
     definition : str
-        Full definition text; empty if the data do not define the type.
+        Full definition of the type; empty if the bag has none.
     type_hash : str
-        `RIHS01_...` as the publishers announce it, or an empty text.
+        `RIHS01_...` as announced by the publishers, or empty.
     offered_qos : tuple of Qos
-        One for each publisher.
+        QoS of each publisher.
     encoding : str
-        The definition's: `ros2msg` or `ros2idl`.
+        Encoding of the definition: `ros2msg` or `ros2idl`.
     """
 
     name: str
@@ -69,18 +69,18 @@ class BagTopic:
 
     @property
     def is_latched(self) -> bool:
-        """Tell whether late joiners get a publisher's last messages."""
+        """Whether late subscribers receive a publisher's last messages."""
         return any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in self.offered_qos)
 
 
-# A rig's definitions take 0.2 s to be understood, and a bag is read several times.
+# Parsing the definitions of a rig takes 0.2 s, and a bag is read several times.
 _STORES_KEPT: Final = 4
 _PARTS_KEPT: Final = 256
 _NEXT_TYPE: Final = re.compile(r"^={80}\nMSG: ", re.MULTILINE)
 
 
 def parsed_types(encoding: str, definition: str, type_name: str) -> dict[str, Any]:
-    """Return the types that a schema's text defines; none for a text that is none."""
+    """Return the types that a schema defines; none for an unknown encoding."""
     found: dict[str, Any] = {}
     if encoding == "ros2msg":
         head, *others = _NEXT_TYPE.split(definition)
@@ -100,23 +100,23 @@ def parsed_types(encoding: str, definition: str, type_name: str) -> dict[str, An
 
 @functools.lru_cache(maxsize=_PARTS_KEPT)
 def _types_of_part(text: str, type_name: str) -> dict[str, Any]:
-    """Return the type that a part of a definition describes; nearly all have Header in them."""
+    """Return the type of one part of a definition; cached, as nearly all contain Header."""
     return dict(get_types_from_msg(text, type_name))
 
 
 @functools.lru_cache(maxsize=_STORES_KEPT)
 def typestore_of(definitions: tuple[tuple[str, str, str, str], ...]) -> Typestore:
-    """Return the types of definitions, each its encoding, text, type and hash."""
+    """Return the type store of definitions, each given by encoding, text, type and hash."""
     if not definitions:
         return get_typestore(Stores.ROS2_JAZZY)
     store = get_typestore(Stores.EMPTY)
     for encoding, text, type_name, type_hash in definitions:
-        # A text that is no definition, or another type's, makes its own messages unreadable.
+        # A malformed definition makes only its own messages unreadable.
         with contextlib.suppress(Exception):
             types = parsed_types(encoding, text, type_name)
             alone = get_typestore(Stores.EMPTY)
             alone.fielddefs.update(types)
             if type_hash in ("", alone.hash_rihs01(type_name)):
-                # A class is made of each: not of Header twenty times.
+                # Registering creates a class, so skip types that are known.
                 store.register({n: t for n, t in types.items() if store.fielddefs.get(n) != t})
     return store

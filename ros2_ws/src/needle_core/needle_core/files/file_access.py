@@ -1,4 +1,4 @@
-"""Reads regular files only, and replaces files whole: neither follows a link in the last place."""
+"""Access to regular files: reading without blocking, and atomic replacement; links are refused."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import BinaryIO
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading, without waiting for anything.
+    """Open a regular file for reading, without blocking.
 
     Raises
     ------
     OSError
-        If there is none, or it is a link, a pipe or a device.
+        If it does not exist, or is a link, a pipe or a device.
     """
     try:
         number = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -32,12 +32,12 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all, and onto the disk; a link of that name is replaced.
+    """Write a file atomically and flush it to the disk; a link of that name is replaced.
 
     Raises
     ------
     OSError
-        If the disk refuses it; a file that was there stays as it is.
+        If writing fails; an existing file stays as it is.
     """
     number, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
@@ -55,7 +55,7 @@ def replace_file(path: Path, data: bytes) -> None:
 
 
 def sync_directory(directory: Path) -> None:
-    """Have the disk keep what a directory's files are called."""
+    """Flush a directory's entries to the disk."""
     number = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(number)
@@ -64,7 +64,7 @@ def sync_directory(directory: Path) -> None:
 
 
 def _umask() -> int:
-    """Return the mask for new files' modes, without the moment that `os.umask` changes it for."""
+    """Return the file mode mask without changing it for a moment, as `os.umask` does."""
     for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
         if line.startswith("Umask:"):
             return int(line.split()[1], 8)

@@ -1,4 +1,4 @@
-"""Places of the installed executables and files: in a checkout, from pip, or from colcon."""
+"""Paths of installed executables and files: in a checkout, from pip, or from colcon."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from needle_core.errors import UserError
 
 
 def find_executable(package: str, executable: str) -> str:
-    """Return the path of a package's executable.
+    """Return the path of an executable of a package.
 
     Raises
     ------
@@ -26,7 +26,7 @@ def find_executable(package: str, executable: str) -> str:
 
 
 def find_shared_file(package: str, file: str) -> Path:
-    """Return the path of a file that a package has beside its code, as a configuration.
+    """Return the path of a file in a package's share folder, such as a configuration.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def find_shared_file(package: str, file: str) -> Path:
     places = [prefix / "share" / package for prefix in (*_prefixes(), Path(sys.prefix))]
     module = find_spec(package)
     if module is not None and module.origin is not None:
-        # In a checkout an edit counts at once.
+        # In a checkout, edits take effect without a new installation.
         places.insert(0, Path(module.origin).parents[1])
     for place in places:
         if (place / file).is_file():

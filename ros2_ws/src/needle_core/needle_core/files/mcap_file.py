@@ -26,11 +26,11 @@ TIME_LIMIT: Final = 2**63
 
 
 class BrokenMcapError(Exception):
-    """A file is not what its index says, or has none; the message says how."""
+    """MCAP file without an index, or with other content than its index."""
 
 
 class McapFile:
-    """A whole MCAP file, open for reading.
+    """Complete MCAP file, open for reading.
 
     Parameters
     ----------
@@ -40,16 +40,16 @@ class McapFile:
     Raises
     ------
     BrokenMcapError
-        If it was cut off, or has no index. A damaged one makes mcap's reader raise other errors.
+        If it was cut off, or has no index. For damaged files mcap's reader raises other errors.
     OSError
         If it cannot be read.
 
     Attributes
     ----------
     summary : Summary
-        The index.
+        Index of the file.
     statistics : Statistics
-        Its counts and times.
+        Counts and times in the index.
     """
 
     summary: Summary
@@ -77,23 +77,24 @@ class McapFile:
     @property
     def span(self) -> tuple[int, int] | None:
         """Log times of the first and the last message [ns]; None in an empty file."""
-        told = self.statistics
-        return (told.message_start_time, told.message_end_time) if told.message_count else None
+        counts = self.statistics
+        span = counts.message_start_time, counts.message_end_time
+        return span if counts.message_count else None
 
     def counts(self) -> Counter[str]:
-        """Return messages by topic."""
+        """Return the number of messages by topic."""
         found: Counter[str] = Counter()
         for number, count in self.statistics.channel_message_counts.items():
             found[self.summary.channels[number].topic] += count
         return found
 
     def definitions(self) -> dict[str, tuple[str, str]]:
-        """Return encoding and text of each type's definition."""
+        """Return encoding and text of the definition of each type."""
         schemas = self.summary.schemas.values()
         return {schema.name: (schema.encoding, schema.data.decode()) for schema in schemas}
 
     def topics(self) -> list[dict[str, Any]]:
-        """Return what metadata.yaml has of each topic below `topics_with_message_count`."""
+        """Return the entries of metadata.yaml's `topics_with_message_count`."""
         counts, schemas = self.statistics.channel_message_counts, self.summary.schemas
         return [
             {
@@ -121,7 +122,7 @@ class McapFile:
         Raises
         ------
         BrokenMcapError
-            If the file has not as many messages as its index says.
+            If the file does not contain the messages that its index lists.
         """
         seen: Counter[str] = Counter()
         found = self._reader.iter_messages(topics, starting_at=start, ending_before=stop)
@@ -129,15 +130,15 @@ class McapFile:
             seen[channel.topic] += 1
             yield channel.topic, message.log_time, message.publish_time, message.data
         first, last = self.span or (start, start)
-        told = {topic: n for topic, n in self.counts().items() if n and topic in topics}
-        if start <= first and last < stop and seen != told:
+        listed = {topic: n for topic, n in self.counts().items() if n and topic in topics}
+        if start <= first and last < stop and seen != listed:
             raise BrokenMcapError(
                 f"it holds {seen.total()} messages of these topics, its index tells of "
-                f"{sum(told.values())}, or of others"
+                f"{sum(listed.values())}, or of others"
             )
 
 
-# Name of the records that rosbag2 writes, and their keys.
+# Name and keys of the records that rosbag2 writes.
 METADATA_RECORD: Final = "rosbag2"
 DISTRO_KEY: Final = "ROS_DISTRO"
 METADATA_KEY: Final = "serialized_metadata"
@@ -145,7 +146,11 @@ RUN_RECORD: Final = "needle_run"
 
 
 def custom_data_of(records: Iterable[Metadata]) -> dict[str, str]:
-    """Return the `custom_data` of a recording, as far as the records in its files have them."""
+    """Return the `custom_data` of a recording from the metadata records in its files.
+
+    Our recorder writes one record of the run at its start, one for every node's parameters and for
+    every change of them, and, like rosbag2, the whole metadata.yaml at the end.
+    """
     custom: dict[str, str] = {}
     parameters: dict[str, Any] = {}
     changes: list[Any] = []
@@ -154,7 +159,7 @@ def custom_data_of(records: Iterable[Metadata]) -> dict[str, str]:
         values = record.metadata
         if record.name == RUN_RECORD:
             custom.update(values)
-        # A text that is no YAML says nothing.
+        # Ignore texts that are not YAML.
         with contextlib.suppress(ValueError, TypeError, AttributeError):
             if record.name == "parameters":
                 parameters.update(load_yaml(values.get("yaml", "")))
@@ -170,6 +175,6 @@ def custom_data_of(records: Iterable[Metadata]) -> dict[str, str]:
 
 
 def distribution_of(records: Iterable[Metadata]) -> str:
-    """Return the ROS distribution that the records name; empty where they name none."""
-    told = (r.metadata.get(DISTRO_KEY, "") for r in records if r.name == METADATA_RECORD)
-    return next(filter(None, told), "")
+    """Return the ROS distribution in the records; empty if there is none."""
+    names = (r.metadata.get(DISTRO_KEY, "") for r in records if r.name == METADATA_RECORD)
+    return next(filter(None, names), "")

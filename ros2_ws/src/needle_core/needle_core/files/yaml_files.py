@@ -12,7 +12,7 @@ from needle_core.errors import UserError
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Refuses a mapping with a key that stands twice: the second value would replace the first."""
+    """Rejects duplicate keys, whose second value would silently replace the first."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
         keys: set[str] = set()
@@ -25,23 +25,20 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 
 
 def read_yaml(path: Path) -> Any:
-    """Return the content of a user's file; a `UserError` says why it cannot be read."""
+    """Return the content of a YAML file; raise a `UserError` with the reason if that fails."""
     try:
-        return load_yaml(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise UserError(f"{path}: cannot be read: {reason}") from error
+        return load_yaml(read_text(path))
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
 
 
 def load_yaml(text: str) -> Any:
-    """Return a document's content.
+    """Return the content of a YAML text.
 
     Raises
     ------
     ValueError
-        If it is not YAML, or repeats a key.
+        If the text is not YAML, or a key is duplicate.
     """
     try:
         return yaml.load(text, Loader=_Loader)
@@ -66,7 +63,7 @@ _SIGNS = {
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file; a `UserError` says why it cannot be read."""
+    """Return the text of a file; raise a `UserError` with the reason if that fails."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -75,9 +72,9 @@ def read_text(path: Path) -> str:
 
 
 def foreign_format(text: str) -> str:
-    """Return which other tool's calibration a text is: ROS, KALIBR, OPENCV or empty."""
-    signs = _SIGNS.items()
-    return next((kind for kind, sign in signs if re.search(sign, text, re.MULTILINE)), "")
+    """Return the other tool that wrote a calibration: ROS, KALIBR, OPENCV or empty."""
+    found = (kind for kind, sign in _SIGNS.items() if re.search(sign, text, re.MULTILINE))
+    return next(found, "")
 
 
 def read_calibration(path: Path) -> str:
@@ -86,7 +83,7 @@ def read_calibration(path: Path) -> str:
     Raises
     ------
     UserError
-        Unreadable, or the calibration of another tool.
+        If it cannot be read, or is the calibration of another tool.
     """
     text = read_text(path)
     if kind := foreign_format(text):

@@ -1,1 +1,1 @@
-"""A process' share of the machine: its end, its names, its folders, its ROS domain."""
+"""Resources of a process: signals, names, ROS domain, discovery, shared memory, workers."""

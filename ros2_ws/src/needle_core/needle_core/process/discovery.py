@@ -1,4 +1,4 @@
-"""Reach of a node: the processes of this machine, unless the user asks for a network."""
+"""Discovery range of a node: this machine, unless the user asks for a network."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ THIS_MACHINE = Path(__file__).with_name("needle_fastdds.xml")
 NETWORK = Path(__file__).with_name("needle_fastdds_network.xml")
 THIS_MACHINE_UDP = Path(__file__).with_name("needle_fastdds_udp.xml")
 NETWORK_UDP = Path(__file__).with_name("needle_fastdds_network_udp.xml")
-# How long a device on another machine has to show itself before anything begins here [s].
+# Time to discover a device on another machine before anything starts [s].
 DISCOVERY = 2.0
 
 _LOCALHOST, _OFF = "LOCALHOST", "OFF"
 _RANGES = (_LOCALHOST, "SUBNET", "SYSTEM_DEFAULT", _OFF)
 _OURS = [file.name for file in (THIS_MACHINE, NETWORK, THIS_MACHINE_UDP, NETWORK_UDP)]
-_LAST_DOMAIN = 232  # port numbers end there
+_LAST_DOMAIN = 232  # limited by the range of port numbers
 _RMW, _FAST_DDS = "RMW_IMPLEMENTATION", "rmw_fastrtps_cpp"
 
 
 def use_fast_dds(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Replace another middleware's name, and say so; before ROS is loaded, which would end."""
+    """Replace another middleware and print a warning; call it before ROS is loaded."""
     given = environment.get(_RMW) or _FAST_DDS
     if given != _FAST_DDS:
         print(f"{_RMW}={given} ignored: the rig's nodes run on {_FAST_DDS}", file=sys.stderr)
@@ -37,25 +37,25 @@ def use_fast_dds(environment: MutableMapping[str, str] = os.environ) -> None:
 def clean_environment(
     environment: MutableMapping[str, str] = os.environ, *, own_graph: bool = False
 ) -> None:
-    """Name the variables of other set-ups that decide who is reached; drop those that must not.
+    """Print warnings for environment variables that change discovery, and remove invalid ones.
 
     Parameters
     ----------
     environment : mutable mapping
-        Read by ROS and Fast DDS when the first node is made.
+        Environment that ROS and Fast DDS read when the first node is created.
     own_graph : bool
-        Whether all nodes are started from here, in a domain of their own.
+        Whether this process starts all nodes, in their own domain.
 
     Raises
     ------
     UserError
-        A domain or discovery range that does not exist, or variables that contradict each other.
+        If the domain or discovery range does not exist, or variables contradict each other.
     """
     use_fast_dds(environment)
     reach = environment.get(DISCOVERY_RANGE) or _LOCALHOST
     if reach not in _RANGES:
         raise UserError(f"{DISCOVERY_RANGE}={reach} is not one of {', '.join(_RANGES)}")
-    closed = not is_open(environment)
+    closed = not is_network_enabled(environment)
     local_only = environment.get("ROS_LOCALHOST_ONLY", "").startswith("1")
     if local_only and not closed:
         raise UserError(f"ROS_LOCALHOST_ONLY=1 contradicts {DISCOVERY_RANGE}={reach}: unset one")
@@ -65,8 +65,8 @@ def clean_environment(
         raise UserError(f"ROS_DOMAIN_ID={domain} is not a number from 0 to {_LAST_DOMAIN}")
     profiles = Path(environment.get(PROFILES) or THIS_MACHINE)
     decides = "it decides who is reached" if profiles.is_file() else ""
-    # Variable, whether it is to be named, whether it is dropped, effect.
-    for name, is_named, is_dropped, effect in (
+    # Variable, whether to warn, whether to remove it, effect.
+    for name, is_reported, is_removed, effect in (
         ("ROS_DOMAIN_ID", no_domain, True, f"it is not a number from 0 to {_LAST_DOMAIN}"),
         (DISCOVERY_RANGE, reach == _OFF, own_graph, "with it, no node finds another"),
         ("ROS_DISCOVERY_SERVER", True, closed or own_graph, "with it, nodes meet at a server only"),
@@ -75,50 +75,49 @@ def clean_environment(
         ("FASTDDS_DEFAULT_PROFILES_FILE", True, True, f"Fast DDS reads {PROFILES}"),
         (PROFILES, profiles.name not in _OURS, not decides, decides or "no such file"),
     ):
-        if is_named and environment.get(name):
-            ignored = " ignored" if is_dropped else ""
+        if is_reported and environment.get(name):
+            ignored = " ignored" if is_removed else ""
             print(f"{name}={environment[name]}{ignored}: {effect}", file=sys.stderr)
-            if is_dropped:
+            if is_removed:
                 del environment[name]
 
 
 def restrict_discovery(
     environment: MutableMapping[str, str] = os.environ, *, shared_memory: bool = True
 ) -> None:
-    """Set what is not set, so that a node started from here reaches this machine only.
+    """Limit discovery to this machine, unless the user's discovery range asks for a network.
 
-    Where the user's discovery range asks for a network, the node is open to it. A file of profiles
-    of the user's own stays; one that is not there would leave everything open, and does not. Before
-    that, `clean_environment`.
+    A profile file of the user stays, unless it does not exist, which would enable the network. The
+    function calls `clean_environment` first.
 
     Parameters
     ----------
     environment : mutable mapping
-        Read by ROS and Fast DDS when the first node is made.
+        Environment that ROS and Fast DDS read when the first node is created.
     shared_memory : bool
-        Whether messages may go through shared memory, if the profiles are ours: opening that of a
-        process which appears may hold this one up for 0.33 s.
+        Whether messages may use shared memory, if the profiles are ours. Opening the shared memory
+        of a new process may block this one for 0.33 s.
     """
     clean_environment(environment)
     given = Path(environment.get(PROFILES) or THIS_MACHINE)
     if given.name == THIS_MACHINE_UDP.name:
-        # Of a process without shared memory that has started this one.
+        # Inherited from a parent process without shared memory.
         environment[DISCOVERY_RANGE] = _LOCALHOST
     reach = environment[DISCOVERY_RANGE] = environment.get(DISCOVERY_RANGE) or _LOCALHOST
     if given.name not in _OURS and given.is_file():
         return
-    if is_open(environment):
+    if is_network_enabled(environment):
         environment[PROFILES] = str(NETWORK if shared_memory else NETWORK_UDP)
     elif shared_memory or reach != _LOCALHOST:
         environment[PROFILES] = str(THIS_MACHINE)
     else:
         environment[PROFILES] = str(THIS_MACHINE_UDP)
-        # For LOCALHOST rmw_fastrtps adds shared memory; these profiles keep to it by themselves.
+        # With LOCALHOST, rmw_fastrtps adds shared memory; these profiles stay local by themselves.
         environment[DISCOVERY_RANGE] = "SYSTEM_DEFAULT"
 
 
-def is_open(environment: Mapping[str, str] = os.environ) -> bool:
-    """Return whether the user has asked for a network."""
+def is_network_enabled(environment: Mapping[str, str] = os.environ) -> bool:
+    """Return whether the user asks for a network."""
     if environment.get(PROFILES) == str(THIS_MACHINE_UDP):
         return False
     return (environment.get(DISCOVERY_RANGE) or _LOCALHOST) not in (_LOCALHOST, _OFF)

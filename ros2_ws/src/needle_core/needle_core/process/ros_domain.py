@@ -14,27 +14,30 @@ from pathlib import Path
 from needle_core.errors import UserError
 from needle_core.process.shared_memory import remove_dead_ports, remove_incomplete_ports
 
-# What to do about two that may not be in one graph.
+# Hint shown when two devices conflict.
 CONFLICT_HINT = "end one of the two, or give one a ROS_DOMAIN_ID of its own"
-# Of an abstract socket's name [bytes].
-_LONGEST = 107
+# Length of an abstract socket's name [bytes].
+_MAX_NAME = 107
 _NAMES = Path("/proc/net/unix")
 
 
 class Claim:
-    """Holds a name until it is released or collected, or the process ends.
+    """Exclusive name on this machine, until it is released or collected, or the process ends.
+
+    Discovery takes up to seconds, and two processes that start together do not know each other
+    yet. A name in the kernel is exclusive at once, and free as soon as its process ends.
 
     Parameters
     ----------
     name : str
-        What is claimed.
+        Name to claim.
     holder : str
-        Who claims it, for whoever comes second.
+        Name of the holder, for the error message of others.
 
     Raises
     ------
     UserError
-        If another has it: says who.
+        If another process holds it; the message names the holder.
     """
 
     def __init__(self, name: str, holder: str) -> None:
@@ -42,20 +45,20 @@ class Claim:
         claimed = _bound(key)
         if claimed is None:
             raise UserError(f"{_holder_of(key)} has {name}")
-        # The kernel lists the names of all sockets: this one says who it is.
+        # The kernel lists the names of all sockets, so this one can name the holder.
         label = _bound(f"{key}:{holder} (process {os.getpid()})")
         self._release = weakref.finalize(self, _close, claimed, label)
 
     def release(self) -> None:
-        """Let go of the name; more than once does no harm."""
+        """Release the name; repeated calls have no effect."""
         self._release()
 
 
 def _bound(name: str) -> int | None:
-    """Return an open file that has the name; None where another has it."""
+    """Return a bound socket's file descriptor; None if another process holds the name."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as one:
         try:
-            one.bind(b"\0" + name.encode()[: _LONGEST - 1])
+            one.bind(b"\0" + name.encode()[: _MAX_NAME - 1])
         except OSError:
             return None
         return one.detach()
@@ -76,29 +79,28 @@ def _holder_of(key: str) -> str:
     return next(filter(None, labels), "another process")
 
 
-# Above 101 the ports reach into the range that Linux gives out to outgoing connections; 0 is where
-# everything runs that was not told otherwise.
+# Above 101 the ports overlap with those of outgoing connections in Linux; 0 is the default domain.
 DOMAINS = range(1, 100)
-# RTPS: port of the first participant's discovery in a domain.
+# RTPS: discovery port of the first participant in domain 0.
 PORT_BASE = 7400
 PORTS_PER_DOMAIN = 250
 FIRST_PARTICIPANT = 10
-# Of a domain's participants, those that are looked for: the first may have gone, others not.
+# Number of participants to look for: the first ones may have ended before the others.
 PARTICIPANTS = 40
 
 
 @contextmanager
 def reserve_domain_id() -> Iterator[int]:
-    """Reserve a ROS_DOMAIN_ID for as long as the context lasts.
+    """Reserve a ROS_DOMAIN_ID within a `with` block.
 
-    Two holders never get the same: each binds a socket name for its domain, which the kernel frees
-    whatever becomes of the holder. A domain where a foreign node listens is passed over.
-    Shared-memory ports that killed processes left in it are taken away before and after.
+    Each holder binds a socket name for its domain, which the kernel frees when the process ends. A
+    domain with a listening node is skipped. Shared-memory ports that killed processes left in the
+    domain are removed before and after.
 
     Raises
     ------
     UserError
-        If all are taken.
+        If all domains are in use.
     """
     candidates = list(DOMAINS)
     random.shuffle(candidates)
@@ -116,7 +118,7 @@ def reserve_domain_id() -> Iterator[int]:
 
 
 def ports_of(domain: int) -> range:
-    """Return the ports that a domain's participants listen on."""
+    """Return the port numbers of a domain."""
     first = PORT_BASE + PORTS_PER_DOMAIN * domain
     return range(first, first + PORTS_PER_DOMAIN)
 

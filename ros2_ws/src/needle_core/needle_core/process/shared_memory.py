@@ -1,10 +1,10 @@
-"""Fast DDS's shared memory, taken away where a process was killed.
+"""Clean-up of Fast DDS's shared memory after a process was killed.
 
-A port is a file that every process of a domain opens. Who is killed never closes it: the count of
-its users stays wrong for good, and the next run in that domain inherits the file. Who is killed
-while making one leaves a file for which whoever opens it waits for ever, as every node of this
-machine does for that of port 7000. Without this module one of 36 restarts after `kill -9` heard
-nothing any more.
+A port is a file that every process of a domain opens. A killed process never closes it: its user
+count stays wrong, and the next run in that domain inherits the file. A process that is killed while
+it creates a port leaves an incomplete file, and every process that opens it waits forever (all
+nodes of a machine open port 7000). Without this module, one of 36 restarts after `kill -9` received
+no messages.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from pathlib import Path
 SHARED_MEMORY = Path("/dev/shm")
 _PREFIX = "fastrtps_"
 _PORT = re.compile(rf"{_PREFIX}port\d+")
-# Boost's first word of a segment: not begun, under way. What is made is neither.
-_HALF_MADE = (0, 1)
-# Making one takes less than a millisecond; on a busy machine its maker may have to wait [s].
-_MAKING = 1.0
+# First word of a segment (Boost) that is not initialised, or being initialised.
+_INCOMPLETE = (0, 1)
+# Creation takes less than a millisecond, but the process may have to wait for the CPU [s].
+_CREATION_TIME = 1.0
 
 
 def dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:
@@ -44,12 +44,12 @@ def dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:
 
 
 def remove_dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> None:
-    """Remove the ports on which no living process listens; another user's stay.
+    """Remove the ports on which no living process listens, except those of other users.
 
     Parameters
     ----------
     ports : iterable of int
-        Port numbers of a domain that has ended, or not begun.
+        Port numbers of a domain that is not in use.
     folder : Path
         Where shared memory is mounted.
     """
@@ -60,38 +60,38 @@ def remove_dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> Non
 
 
 def remove_incomplete_ports(folder: Path = SHARED_MEMORY) -> None:
-    """Remove the ports that were half made when their maker ended; what is being made is awaited.
+    """Remove incomplete ports of killed processes; wait first for ports under construction.
 
     Parameters
     ----------
     folder : Path
         Where shared memory is mounted.
     """
-    found = _half_made_ports(folder)
+    found = _incomplete_ports(folder)
     if not found:
         return
-    time.sleep(_MAKING)
-    for path, inode in _half_made_ports(folder).items():
+    time.sleep(_CREATION_TIME)
+    for path, inode in _incomplete_ports(folder).items():
         if found.get(path) == inode:
             with contextlib.suppress(OSError):
                 path.unlink()
 
 
-def _half_made_ports(folder: Path) -> dict[Path, int]:
-    """Return the inodes of half-made ports on which nobody listens."""
+def _incomplete_ports(folder: Path) -> dict[Path, int]:
+    """Return the inodes of incomplete ports on which no process listens."""
     found = {}
     for path in folder.glob(f"{_PREFIX}port*"):
-        # Another user's, or gone.
+        # The port may belong to another user, or be gone.
         with contextlib.suppress(OSError):
-            if _PORT.fullmatch(path.name) and _is_half_made(path):
+            if _PORT.fullmatch(path.name) and _is_incomplete(path):
                 found[path] = path.stat().st_ino
     return found
 
 
-def _is_half_made(port: Path) -> bool:
+def _is_incomplete(port: Path) -> bool:
     with port.open("rb") as file:
         state = file.read(4)
-    unwritten = len(state) < 4 or int.from_bytes(state, sys.byteorder) in _HALF_MADE
+    unwritten = len(state) < 4 or int.from_bytes(state, sys.byteorder) in _INCOMPLETE
     return unwritten and not _is_held(port.parent, port.name)
 
 
@@ -104,7 +104,7 @@ def _name(port: int) -> str:
 
 
 def _is_held(folder: Path, name: str) -> bool:
-    """Return whether a process listens: it holds this lock until it ends, however it ends."""
+    """Return whether a process listens; the kernel frees its lock when it ends."""
     _, lock, _ = _files(folder, name)
     try:
         with lock.open("rb") as file:

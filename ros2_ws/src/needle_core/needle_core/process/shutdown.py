@@ -1,4 +1,4 @@
-"""The wish that a process ends, heard whatever it is doing."""
+"""Shutdown of a process by signals."""
 
 from __future__ import annotations
 
@@ -12,27 +12,26 @@ from types import FrameType, TracebackType
 from typing import Any
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_SAME_WISH = 1.0
+_REPEAT_WINDOW = 1.0
 _Handler = Callable[[int, FrameType | None], None]
 _DEFAULTS = (signal.SIG_DFL, signal.default_int_handler)
 
 
 class ShutdownFlag:
-    """SIGINT, SIGTERM and SIGHUP as a flag, within a `with` block.
+    """Flag that SIGINT, SIGTERM and SIGHUP set within a `with` block.
 
-    No exception is raised and no context is shut down by a signal, so none can come in the middle
-    of compiled code or before last messages are out; a second one changes nothing. A SIGHUP that is
-    ignored, as below nohup, stays so.
+    A signal raises no exception and shuts no context down, so it interrupts neither compiled code
+    nor the last messages; further signals have no effect. An ignored SIGHUP (nohup) stays ignored.
 
     Attributes
     ----------
     requested : bool
-        Whether a signal has come.
+        Whether a signal has arrived.
     """
 
     def __init__(self) -> None:
         self.requested = False
-        self._before = _handle(self._take)
+        self._before = _handle(self._on_signal)
 
     def __enter__(self) -> ShutdownFlag:
         return self
@@ -43,14 +42,14 @@ class ShutdownFlag:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
-    def _take(self, _number: int, _frame: FrameType | None) -> None:
+    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         self.requested = True
 
 
 class ExitOnSignal:
-    """Handler that ends the process with this exit code when a signal of `ENDING_SIGNALS` comes.
+    """Handler that ends the process at once when a signal of `ENDING_SIGNALS` arrives.
 
-    For the time while modules are loaded: nothing has begun that must be ended in order.
+    It is used while modules are loaded, when there is nothing to clean up.
     """
 
     def __init__(self, code: int) -> None:
@@ -58,14 +57,14 @@ class ExitOnSignal:
         _handle(self)
 
     def __call__(self, _number: int, _frame: FrameType | None) -> None:
-        """Take a signal."""
+        """End the process."""
         os._exit(self._code)
 
 
-def _handle(take: _Handler) -> dict[signal.Signals, Any]:
-    """Take the signals, also a SIGINT that a shell's background ignores; return who did before."""
+def _handle(handler: _Handler) -> dict[signal.Signals, Any]:
+    """Set the handler, also for a SIGINT that a background job ignores; return the old ones."""
     return {
-        number: signal.signal(number, take)
+        number: signal.signal(number, handler)
         for number in ENDING_SIGNALS
         if not (number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN)
     }
@@ -73,21 +72,21 @@ def _handle(take: _Handler) -> dict[signal.Signals, Any]:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Let a signal of `ENDING_SIGNALS` raise KeyboardInterrupt within a `with` block.
+    """Raise KeyboardInterrupt within a `with` block when a signal of `ENDING_SIGNALS` arrives.
 
-    Others within a second are the same wish (a terminal and a script both pass it on) and do not
-    disturb the cleaning up. Handlers that somebody has set before stay.
+    Further signals within a second are ignored, because a terminal and a script may both forward
+    the same signal during the clean-up. Handlers that were set before stay.
     """
     raised = -math.inf
 
-    def take(_number: int, _frame: FrameType | None) -> None:
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
         nonlocal raised
-        if time.monotonic() - raised > _SAME_WISH:
+        if time.monotonic() - raised > _REPEAT_WINDOW:
             raised = time.monotonic()
             raise KeyboardInterrupt
 
     before = {
-        number: signal.signal(number, take)
+        number: signal.signal(number, interrupt)
         for number in ENDING_SIGNALS
         if (now := signal.getsignal(number)) in _DEFAULTS or isinstance(now, ExitOnSignal)
     }

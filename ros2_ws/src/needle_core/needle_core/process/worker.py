@@ -1,4 +1,4 @@
-"""A process that works for this one, beside it: for what takes long, as images do."""
+"""Worker process for computations that would block this process, such as rendering."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ _PR_SET_PDEATHSIG = 1
 
 
 def start_worker(prepare: Callable[..., None], *arguments: Any) -> ProcessPoolExecutor:
-    """Start a process that works off what is submitted, one after the other.
+    """Start a process that executes submitted calls one after the other.
 
-    It ends when it is told to or when this process ends; signals alone do not end it.
+    It ends with its pool or with this process; signals alone do not end it.
 
     Parameters
     ----------
     prepare : callable
-        Called first, in that process.
+        Called first in the new process.
     arguments : tuple
         Its arguments.
     """
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(1, context, _begin, (prepare, *arguments))
-    # The process has from its first moment on what its parent blocks: signals to the whole group,
-    # by which its parent ends in order, and then ends it.
+    # The worker inherits the blocked signals from its first moment: a signal to the process group
+    # ends the parent in an orderly way, which then ends the worker.
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
     pool.submit(int)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)

@@ -1,1 +1,1 @@
-"""Common ground of the rig's nodes in ROS."""
+"""ROS nodes of components, and the graph commands of the small `ros2`."""

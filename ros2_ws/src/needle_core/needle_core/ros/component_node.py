@@ -1,4 +1,4 @@
-"""A component as a ROS node: the one node class behind the executables of components."""
+"""Component as a ROS node: the node class of all executables with components."""
 
 from __future__ import annotations
 
@@ -56,41 +56,41 @@ from needle_core.ros.parameters import NodeParameters
 from needle_core.runners.process import Handlers
 
 LOG_PERIOD = 2.0
-"""Time between two lines of log of one kind [s]."""
+"""Minimum time between two log lines of one kind [s]."""
 _PEERS_PERIOD = 0.2
 
 
 class ComponentNode(WholeNode):
-    """Delivers messages and time to a component, and carries out its actions.
+    """Delivers messages and time to a component, and executes its actions.
 
     Parameters
     ----------
     name : str
         Name of the node.
     parameters : type
-        The component's settings dataclass, the node's parameters.
+        Settings dataclass of the component: the parameters of the node.
     make : callable
-        Makes the component from its settings and the node's full name.
+        Returns the component for its settings and the node's full name.
     ports : callable
         Returns the real ports of the component for its settings, by name.
     node_arguments : dict
-        Passed on to rclpy's Node (a context of its own, parameter overrides).
+        Further arguments of rclpy's Node (context, parameter overrides).
 
     Attributes
     ----------
     component : Component
-        What runs here.
+        The component.
     outputs : dict of str to Publisher
-        By topic.
+        Publishers by topic.
     peers : Peers
-        What is known of other nodes.
+        Discovered nodes.
     exit : Exit or None
-        The component's wish to end.
+        Exit action of the component, once it has exited.
 
     Raises
     ------
     UserError
-        A parameter that is unknown, of the wrong type, out of bounds, or part of a bad whole.
+        A parameter that is unknown, of the wrong type, out of bounds or inconsistent with others.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class ComponentNode(WholeNode):
     ) -> None:
         super().__init__(name, **node_arguments)
         self._own = name
-        # A service that answers later keeps no other callback from running.
+        # A service that answers later must not block other callbacks.
         self._group = ReentrantCallbackGroup()
         settings = NodeParameters(self, parameters, self._on_parameters).values
         self.component = make(settings, signature(self))
@@ -126,27 +126,27 @@ class ComponentNode(WholeNode):
         self._ports = dict(ports(settings))
         self._arrived: deque[tuple[str, Any]] = deque()
         self._claims: list[Claim] = []
-        self._bell = self.create_guard_condition(self._take_arrived)
+        self._arrival_signal = self.create_guard_condition(self._handle_arrived)
         self.outputs = {row.topic: self._advertise(row) for row in self.component.outputs}
         self._lazy: dict[str, Subscription[Any]] = {}
         for row in self.component.inputs:
             if not row.lazy:
-                self._hear(row)
+                self._subscribe(row)
         for service in self.component.services:
             self._offer(service)
         for timer in self.component.timers:
             self._repeat(timer)
-        self.create_timer(_PEERS_PERIOD, self._look_around, clock=STEADY_CLOCK)
+        self.create_timer(_PEERS_PERIOD, self._update_peers, clock=STEADY_CLOCK)
         for port_name, port in self._ports.items():
             port.open(partial(self._arrive, port_name))
         self.get_logger().info(f"runs (ROS_DOMAIN_ID {self.context.get_domain_id()})")
 
     def stop(self) -> None:
-        """Ask the component to end."""
+        """Request the shutdown of the component."""
         self._handle(lambda: self.component.on_stop(self._moment()))
 
     def close(self) -> None:
-        """Close the ports, and let go of what one process alone may have."""
+        """Close the ports and release the exclusive topics."""
         for claim in self._claims:
             claim.release()
         for port in self._ports.values():
@@ -156,14 +156,14 @@ class ComponentNode(WholeNode):
         return Moment(time.monotonic(), self.get_clock().now().nanoseconds, sent_ns)
 
     def _name_of(self, topic: str) -> str:
-        """Return a row's name as rclpy resolves it: below the node's own where it says so."""
+        """Return the name of a row for rclpy: private if it starts with the node's own name."""
         prefix = f"{self._own}/"
         return f"~/{topic.removeprefix(prefix)}" if topic.startswith(prefix) else topic
 
     # ---- rows ---------------------------------------------------------------------------------
 
     def _advertise(self, row: Output) -> Any:
-        if row.alone:
+        if row.exclusive:
             topic = self.resolve_topic_name(self._name_of(row.topic))
             name = f"{topic} of ROS_DOMAIN_ID {self.context.get_domain_id()}"
             try:
@@ -174,15 +174,15 @@ class ComponentNode(WholeNode):
         kind = self._types.make(ros_type(row.message))
         return self.create_publisher(kind, self._name_of(row.topic), to_qos(row.delivery))
 
-    def _hear(self, row: Input) -> Subscription[Any]:
+    def _subscribe(self, row: Input) -> Subscription[Any]:
         def on_incompatible(_: Any) -> None:
-            cure = "transient_local" if row.delivery.latched else "reliable"
+            policy = "transient_local" if row.delivery.latched else "reliable"
             option = "durability" if row.delivery.latched else "reliability"
-            why = f"a publisher's QoS does not fit: --qos-{option} {cure} does"
+            why = f"a publisher's QoS does not fit: --qos-{option} {policy} does"
             self._diagnostics.reject(row.topic, "incompatible QoS", why)
 
         kind = self._types.make(ros_type(row.message))
-        # Raw: what cannot be decoded must not raise out of the executor.
+        # Raw, because an undecodable message must not raise inside the executor.
         return self.create_subscription(
             kind,
             self._name_of(row.topic),
@@ -196,18 +196,18 @@ class ComponentNode(WholeNode):
     def _listen(self, topic: str, on: bool) -> None:
         if on and topic not in self._lazy:
             row = next(row for row in self.component.inputs if row.topic == topic)
-            self._lazy[topic] = self._hear(row)
+            self._lazy[topic] = self._subscribe(row)
         elif not on and topic in self._lazy:
             self.destroy_subscription(self._lazy.pop(topic))
 
     def _on_bytes(self, row: Input, kind: type[Any], data: bytes, info: Mapping[str, int]) -> None:
-        if len(data) > row.longest:
-            why = f"{len(data)} bytes, at most {row.longest}"
+        if len(data) > row.max_bytes:
+            why = f"{len(data)} bytes, at most {row.max_bytes}"
             self._diagnostics.reject(row.topic, "too long", why)
             return
         try:
             message = from_ros(row.message, deserialize_message(data, kind))
-        except Exception as error:  # noqa: BLE001 - whatever the middleware raises
+        except Exception as error:  # noqa: BLE001 - the middleware raises all kinds
             why = f"{len(data)} bytes: {type(error).__name__}: {error}"
             self._diagnostics.reject(row.topic, "undecodable", why)
             return
@@ -216,8 +216,8 @@ class ComponentNode(WholeNode):
 
     def _repeat(self, timer: Timer) -> None:
         def run() -> None:
-            # What has come at a port came before the time that goes by now.
-            self._take_arrived()
+            # Input of ports precedes the timer.
+            self._handle_arrived()
             self._handle(lambda: timer.handler(self._moment()))
 
         self.create_timer(timer.period, run, clock=STEADY_CLOCK, callback_group=self._group)
@@ -229,8 +229,8 @@ class ComponentNode(WholeNode):
             self._requests[number] = reply
             argument = request.data if service.has_argument else None
             self._handle(lambda: service.handler(argument, number, self._moment()))
-            told = await reply
-            response.success, response.message = told.success, told.text
+            result = await reply
+            response.success, response.message = result.success, result.text
             return response
 
         kind = SetBool if service.has_argument else Trigger
@@ -240,32 +240,32 @@ class ComponentNode(WholeNode):
     # ---- ports --------------------------------------------------------------------------------
 
     def _arrive(self, port: str, batch: Any) -> None:
-        """Take a batch, or what has become of the port, from a port's thread."""
+        """Queue a batch or a port change, from a port's thread."""
         self._arrived.append((port, batch))
-        self._bell.trigger()
+        self._arrival_signal.trigger()
 
-    def _take_arrived(self) -> None:
+    def _handle_arrived(self) -> None:
         while self._arrived:
             name, batch = self._arrived.popleft()
             batch = batch() if callable(batch) else batch
             for row in self.component.ports:
                 if row.name == name:
                     handler = row.handler if isinstance(batch, tuple) else row.on_change
-                    self._handle(partial(self._pass_on, handler, batch))
+                    self._handle(partial(self._call_handler, handler, batch))
 
-    def _pass_on(self, handler: Callable[[Any, Moment], Actions], batch: Any) -> Actions:
+    def _call_handler(self, handler: Callable[[Any, Moment], Actions], batch: Any) -> Actions:
         return handler(batch, self._moment())
 
     # ---- actions ------------------------------------------------------------------------------
 
     def _handle(self, work: Callable[[], Actions]) -> None:
-        """Carry out the actions of a handler, unless the component has ended."""
+        """Execute the actions of a handler, unless the component has exited."""
         if self.exit is not None:
             return
         for action in self._handlers.run(work):
-            self._do(action)
+            self._execute(action)
 
-    def _do(self, action: Action) -> None:
+    def _execute(self, action: Action) -> None:
         match action:
             case Publish(topic, message):
                 self.outputs[topic].publish(self._converter.to_ros(message))
@@ -292,7 +292,7 @@ class ComponentNode(WholeNode):
             if now - self._logged.get(line.kind, -LOG_PERIOD) < LOG_PERIOD:
                 return
             self._logged[line.kind] = now
-        # Not one call through a variable: rclpy knows a line by where it is called from.
+        # Three calls, because rclpy identifies a line by its call site.
         if line.severity == "error":
             self.get_logger().error(line.text)
         elif line.severity == "warning":
@@ -332,7 +332,7 @@ class ComponentNode(WholeNode):
             answer = Answer(call.service, success, text, answered)
             self._handle(lambda: self.component.on_answer(answer, self._moment()))
 
-    def _give_up_calls(self) -> None:
+    def _fail_late_calls(self) -> None:
         now = time.monotonic()
         for number, (call, deadline, future) in list(self._calls.items()):
             if future is None or now >= deadline:
@@ -341,10 +341,10 @@ class ComponentNode(WholeNode):
                 why = "no server" if future is None else "no answer"
                 self._end_call(number, False, why, answered=False)
 
-    # ---- others -------------------------------------------------------------------------------
+    # ---- discovery and parameters -------------------------------------------------------------
 
-    def _look_around(self) -> None:
-        self._give_up_calls()
+    def _update_peers(self) -> None:
+        self._fail_late_calls()
         rows: list[Input | Output] = [*self.component.inputs, *self.component.outputs]
         topics = {row.topic: self._name_of(row.topic) for row in rows}
         namespace = self.get_namespace().rstrip("/") + "/"
@@ -360,7 +360,7 @@ class ComponentNode(WholeNode):
             self._handle(lambda: self.component.on_peers(peers, self._moment()))
 
     def _nodes(self) -> list[tuple[str, str]]:
-        """Return names and namespaces of all nodes but hidden ones."""
+        """Return names and namespaces of all nodes except hidden ones."""
         known = self.get_node_names_and_namespaces()
         return [(name, space) for name, space in known if not name.startswith("_")]
 
@@ -369,6 +369,6 @@ class ComponentNode(WholeNode):
 
 
 def _known(names: Mapping[str, Iterable[str]]) -> dict[str, tuple[str, ...]]:
-    """Return the topics with names, as `Peers` has them: without the first slash."""
+    """Return the topics with endpoints, and the node names without the first slash."""
     found = {topic: tuple(sorted(n.lstrip("/") for n in some)) for topic, some in names.items()}
     return {topic: some for topic, some in found.items() if some}

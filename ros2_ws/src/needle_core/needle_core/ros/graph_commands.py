@@ -1,4 +1,4 @@
-"""Commands of the small `ros2` in a running graph: node, topic, service and param."""
+"""Graph commands of the small `ros2`: node, topic, service and param."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Mapping
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -23,21 +24,20 @@ from rclpy.parameter import Parameter, get_parameter_value, parameter_value_to_p
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-# Time for discovery [s]: of all that is there, and of one node or topic that is named.
-DISCOVERY = 1.0
-PATIENCE = 5.0
-# An answer that is lost is lost for good [s].
-ANSWER = 10.0
-# How many elements of an array, and characters of a text, are printed.
-LONGEST = 128
+from needle_core.ros.base_node import full_name
+
+# Time to discover all endpoints, and to discover a given node or topic [s].
+DISCOVERY, SEARCH_TIMEOUT = 1.0, 5.0
+ANSWER_TIMEOUT = 10.0  # [s]
+MAX_LENGTH = 128  # of a printed array or text
 
 
 class CommandError(Exception):
-    """Error whose one line says what cannot be done."""
+    """Error of one line, printed for the user."""
 
 
 def spin_until(node: Node, condition: Callable[[], Any], timeout: float) -> bool:
-    """Spin until the condition holds; return whether it does after `timeout` [s]."""
+    """Spin until the condition holds; return whether it holds before the timeout [s]."""
     end = time.monotonic() + timeout
     while not condition():
         if time.monotonic() >= end:
@@ -46,9 +46,9 @@ def spin_until(node: Node, condition: Callable[[], Any], timeout: float) -> bool
     return True
 
 
-def never() -> bool:
-    """Return False: the condition of those that spin for a time."""
-    return False
+def spin_for(node: Node, seconds: float) -> None:
+    """Spin for some time."""
+    spin_until(node, lambda: False, seconds)
 
 
 # ---- messages ---------------------------------------------------------------------------------
@@ -63,41 +63,30 @@ def find_type(name: str, kind: str) -> Any:
         raise CommandError(f"there is no {kind} type '{name}'") from error
 
 
-def plain(value: Any) -> Any:
-    """Return a message, or a field of one, as plain data; what is long is shortened."""
+def to_plain(value: Any) -> Any:
+    """Return a message, or a field of one, as plain data; long texts and arrays are shortened."""
     if isinstance(value, (str, bytes)):
         text = value if isinstance(value, str) else value.decode("latin-1")
-        return text if len(text) <= LONGEST else text[:LONGEST] + "..."
+        return text if len(text) <= MAX_LENGTH else text[:MAX_LENGTH] + "..."
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, (list, tuple, array.array, np.ndarray)):
-        return [plain(item) for item in value[:LONGEST]] + ["..."] * (len(value) > LONGEST)
+        return [to_plain(item) for item in value[:MAX_LENGTH]] + ["..."] * (len(value) > MAX_LENGTH)
     if hasattr(value, "get_fields_and_field_types"):
-        return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
+        return {name: to_plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
     return value
 
 
-def fill(message: Any, values: Any) -> list[Any]:
-    """Set a message's fields.
+def fill(message: Any, text: str) -> list[Any]:
+    """Set the fields of a message from YAML; return the stamps that were given as `now`."""
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise CommandError(f"not YAML: {' '.join(str(error).split())}") from error
+    return _fill(message, values)
 
-    Parameters
-    ----------
-    message : message
-        What to fill.
-    values : Any
-        Mapping from field name to value, nested as the message is. `now` stands for the time at
-        which a message is sent.
 
-    Returns
-    -------
-    list of builtin_interfaces.msg.Time
-        The fields that were given as `now`.
-
-    Raises
-    ------
-    CommandError
-        If a field does not exist or a value does not fit it.
-    """
+def _fill(message: Any, values: Any) -> list[Any]:
     if not isinstance(values, Mapping):
         raise CommandError(f"'{values}' is expected to be a dictionary")
     stamps: list[Any] = []
@@ -109,7 +98,7 @@ def fill(message: Any, values: Any) -> list[Any]:
         if types[name] == "builtin_interfaces/Time" and value == "now":
             stamps.append(field)
         elif hasattr(field, "get_fields_and_field_types"):
-            stamps += fill(field, value)
+            stamps += _fill(field, value)
         else:
             try:
                 setattr(message, name, _converted(value, field, types[name], stamps))
@@ -119,7 +108,7 @@ def fill(message: Any, values: Any) -> list[Any]:
 
 
 def _converted(value: Any, field: Any, type_name: str, stamps: list[Any]) -> Any:
-    """Return a value in the type that the field has; add the stamps of messages in it."""
+    """Return a value in the type of the field; add the stamps of nested messages."""
     if isinstance(field, array.array):
         return array.array(field.typecode, value)
     if isinstance(field, np.ndarray):
@@ -127,46 +116,32 @@ def _converted(value: Any, field: Any, type_name: str, stamps: list[Any]) -> Any
     if isinstance(field, list) and "/" in type_name:
         messages = [find_type(re.findall(r"\w+/\w+", type_name)[0], "msg")() for _ in value]
         for message, entry in zip(messages, value, strict=True):
-            stamps += fill(message, entry)
+            stamps += _fill(message, entry)
         return messages
-    # A text for a number, or a number for a flag, is more likely a slip than a wish.
+    # Other conversions, such as a text to a number, would rather hide a mistake.
     return float(value) if isinstance(field, float) and type(value) is int else value
-
-
-def parse(text: str) -> Any:
-    """Return the values that a command line gives as YAML."""
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise CommandError(f"not YAML: {' '.join(str(error).split())}") from error
 
 
 # ---- commands ---------------------------------------------------------------------------------
 
 
-def node_names(node: Node) -> list[str]:
-    """Return the full names of the nodes; those of this command and its like are hidden."""
-    names = node.get_node_names_and_namespaces()
-    return sorted(f"{space.rstrip('/')}/{name}" for name, space in names if name[0] != "_")
-
-
 def list_nodes(node: Node, options: argparse.Namespace) -> None:
-    """Print the nodes' names."""
-    spin_until(node, never, DISCOVERY)
-    print("\n".join(node_names(node)))
+    """Print the full names of the nodes, except hidden ones, such as that of this command."""
+    spin_for(node, DISCOVERY)
+    names = node.get_node_names_and_namespaces()
+    print("\n".join(sorted(full_name(space, name) for name, space in names if name[0] != "_")))
 
 
 def list_topics(node: Node, options: argparse.Namespace) -> None:
-    """Print the topics' names."""
-    spin_until(node, never, DISCOVERY)
-    for name, types in node.get_topic_names_and_types():
-        print(f"{name} [{', '.join(types)}]" if options.show_types else name)
+    """Print the names of the topics."""
+    spin_for(node, DISCOVERY)
+    print("\n".join(name for name, _ in node.get_topic_names_and_types()))
 
 
 def echo(node: Node, options: argparse.Namespace) -> None:
-    """Print a topic's messages."""
+    """Print the messages of a topic."""
     topic = node.resolve_topic_name(options.topic_name)
-    if not spin_until(node, lambda: node.get_publishers_info_by_topic(topic), PATIENCE):
+    if not spin_until(node, lambda: node.get_publishers_info_by_topic(topic), SEARCH_TIMEOUT):
         raise CommandError(f"topic [{options.topic_name}] is not published")
     offered = node.get_publishers_info_by_topic(topic)
     qos = QoSProfile(depth=10)
@@ -174,33 +149,32 @@ def echo(node: Node, options: argparse.Namespace) -> None:
         qos.reliability = ReliabilityPolicy.BEST_EFFORT
     if all(one.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offered):
         qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-    shown: list[bool] = []
+    printed: list[bool] = []
 
     def show(message: Any) -> None:
-        # As in the real one, the filter is the user's own program.
-        is_wanted = options.filter is None or eval(options.filter, {"m": message})
-        if not is_wanted or (options.once and shown):
+        # As in the original command, the filter is Python code of the user.
+        is_selected = options.filter is None or eval(options.filter, {"m": message})
+        if not is_selected or (options.once and printed):
             return
-        for name in options.field.split(".") if options.field else ():
-            if not hasattr(message, name):
-                raise CommandError(f"Invalid field '{options.field}': no '{name}'")
-            message = getattr(message, name)
-        value = plain(message)
+        try:
+            value = to_plain(attrgetter(options.field)(message) if options.field else message)
+        except AttributeError as error:
+            raise CommandError(f"Invalid field '{options.field}': {error}") from error
         is_text = not isinstance(value, (dict, list))
         text = f"{value}\n" if is_text else yaml.safe_dump(value, width=1 << 30, sort_keys=False)
         print(text, end="---\n", flush=True)
-        shown.append(True)
+        printed.append(True)
 
     node.create_subscription(find_type(offered[0].topic_type, "msg"), topic, show, qos)
-    spin_until(node, lambda: shown and options.once, options.timeout)
+    spin_until(node, lambda: printed and options.once, options.timeout)
 
 
 def pub(node: Node, options: argparse.Namespace) -> None:
     """Publish a message once, a number of times, or until interrupted."""
     message = find_type(options.message_type, "msg")()
-    stamps = fill(message, parse(options.values))
+    stamps = fill(message, options.values)
     times = 1 if options.once else options.times
-    # Who wants a topic's last message, as of targets, receives it, and all others do, too.
+    # Transient local matches every subscriber, including those of targets.
     latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     publisher = node.create_publisher(type(message), options.topic_name, latched)
     while times and not spin_until(node, publisher.get_subscription_count, 1.0):
@@ -217,42 +191,39 @@ def pub(node: Node, options: argparse.Namespace) -> None:
         if count == times:
             break
         due = max(due + 1.0 / options.rate, time.monotonic())
-        spin_until(node, never, due - time.monotonic())
-    # The last message is on its way.
-    spin_until(node, never, 0.1)
+        spin_for(node, due - time.monotonic())
+    spin_for(node, 0.1)  # until the last message has left
 
 
 def call(node: Node, options: argparse.Namespace) -> None:
     """Call a service and print its answer."""
     service = find_type(options.service_type, "srv")
     request = service.Request()
-    fill(request, parse(options.values))
+    fill(request, options.values)
     client = node.create_client(service, options.service_name)
     spin_until(node, client.service_is_ready, float("inf"))
     print(f"requester: making request: {request!r}\n", flush=True)
     print(f"response:\n{_answer(node, options.service_name, client.call_async(request))!r}\n")
 
 
-def _answer(node: Node, asked: str, future: Any) -> Any:
-    if not spin_until(node, future.done, ANSWER):
-        raise CommandError(f"no answer from {asked}")
+def _answer(node: Node, server: str, future: Any) -> Any:
+    if not spin_until(node, future.done, ANSWER_TIMEOUT):
+        raise CommandError(f"no answer from {server}")
     return future.result()
 
 
-def _parameters(node: Node, options: argparse.Namespace) -> AsyncParameterClient:
+def _parameter_client(node: Node, options: argparse.Namespace) -> AsyncParameterClient:
     name = "/" + options.node_name.lstrip("/")
-    if not spin_until(node, lambda: name in node_names(node), PATIENCE):
-        raise CommandError("Node not found")
     client = AsyncParameterClient(node, name)
-    if not spin_until(node, client.services_are_ready, PATIENCE):
-        raise CommandError(f"node {name} has no parameter services")
+    if not spin_until(node, client.services_are_ready, SEARCH_TIMEOUT):
+        raise CommandError("Node not found")
     return client
 
 
 def get_parameter(node: Node, options: argparse.Namespace) -> None:
-    """Print a parameter's value."""
-    asked = _parameters(node, options).get_parameters([options.parameter_name])
-    values = _answer(node, options.node_name, asked).values
+    """Print the value of a parameter."""
+    future = _parameter_client(node, options).get_parameters([options.parameter_name])
+    values = _answer(node, options.node_name, future).values
     kind = Parameter.Type(values[0].type) if values else Parameter.Type.NOT_SET
     if kind == Parameter.Type.NOT_SET:
         raise CommandError("Parameter not set")
@@ -260,21 +231,20 @@ def get_parameter(node: Node, options: argparse.Namespace) -> None:
 
 
 def set_parameter(node: Node, options: argparse.Namespace) -> None:
-    """Set a parameter; the exit code is 1 where the node refuses it."""
+    """Set a parameter; the exit code is 1 if the node rejects it."""
     value = parameter_value_to_python(get_parameter_value(options.value))
     parameter = Parameter(options.parameter_name, value=value)
-    asked = _parameters(node, options).set_parameters([parameter])
-    (result,) = _answer(node, options.node_name, asked).results
+    future = _parameter_client(node, options).set_parameters([parameter])
+    (result,) = _answer(node, options.node_name, future).results
     if not result.successful:
         raise CommandError(f"Setting parameter failed: {result.reason}")
     print("Set parameter successful")
 
 
-# ---- the command line -------------------------------------------------------------------------
+# ---- command line -----------------------------------------------------------------------------
 
 
-def command_parser() -> argparse.ArgumentParser:
-    """Return the parser of `ros2 node|topic|service|param ...`."""
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="ros2", allow_abbrev=False)
     groups = parser.add_subparsers(required=True, metavar="COMMAND")
     verbs = {
@@ -291,17 +261,16 @@ def command_parser() -> argparse.ArgumentParser:
         return added.add_argument
 
     command("node", "list", list_nodes)
-    add = command("topic", "list", list_topics)
-    add("-t", "--show-types", action="store_true")
+    command("topic", "list", list_topics)
     add = command("topic", "echo", echo, "topic_name")
-    add("--filter", metavar="EXPR", help="in Python, of the message m")
-    add("--field", help="of the message; sub-fields after a dot")
-    add("--once", action="store_true", help="print one message and end")
-    add("--timeout", type=float, default=float("inf"), metavar="N", help="end after N seconds")
+    add("--filter", metavar="EXPR", help="Python expression of the message m")
+    add("--field", help="field of the message; sub-fields after a dot")
+    add("--once", action="store_true", help="print one message and exit")
+    add("--timeout", type=float, default=float("inf"), metavar="N", help="exit after N seconds")
     add = command("topic", "pub", pub, "topic_name", "message_type")
-    add("values", nargs="?", default="{}", help="YAML; `now` is a time as sent")
+    add("values", nargs="?", default="{}", help="YAML; `now` is the time of sending")
     add("-r", "--rate", type=float, default=1.0, metavar="N", help="[Hz]")
-    add("-p", "--print", type=int, default=1, metavar="N", help="every N-th")
+    add("-p", "--print", type=int, default=1, metavar="N", help="print every N-th message")
     add("-1", "--once", action="store_true")
     add("-t", "--times", type=int, default=0, metavar="N")
     add = command("service", "call", call, "service_name", "service_type")
@@ -312,8 +281,8 @@ def command_parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str]) -> int:
-    """Do what the command line says; returns the exit code."""
-    options = command_parser().parse_args(arguments)
+    """Run the command; return the exit code."""
+    options = _parser().parse_args(arguments)
     rclpy.init(args=[])
     node = Node(f"_ros2cli_{os.getpid()}", start_parameter_services=False)
     try:

@@ -1,4 +1,4 @@
-"""A parameter dataclass, declared on a node and kept valid while it runs."""
+"""Declares a parameter dataclass on a node, and keeps it valid while the node runs."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ _SIM_TIME = "use_sim_time"
 _TYPES = frozenset(kind.value for kind in Parameter.Type)
 _LONGEST_NAME = 100
 OF_EVERY_NODE = (_SIM_TIME, "start_type_description_service", "qos_overrides.")
-"""Beginnings of the names of parameters that every rclpy node declares for itself."""
+"""Prefixes of the parameters that every rclpy node declares itself."""
 
 
 class NodeParameters(Generic[P]):
-    """The parameters of one node: declared, checked as a whole, changed only to valid wholes.
+    """Parameters of a node: declared, and changed only to valid combinations.
 
     Parameters
     ----------
     node : Node
-        The node that gets the parameters.
+        Node to declare them on.
     parameters : type
         Frozen dataclass whose fields come from `parameter_fields.parameter`.
     on_change : callable, optional
-        Called with the new instance after an accepted change.
+        Called with the new instance after a change.
 
     Raises
     ------
     UserError
-        A given parameter that is unknown, of the wrong type, or out of bounds, or that is meant for
-        the node and does not reach it.
+        A given parameter that is unknown, of the wrong type, out of bounds, or that is meant for
+        the node and does not take effect.
     """
 
     def __init__(
@@ -55,11 +55,11 @@ class NodeParameters(Generic[P]):
         known = {name: (spec, default) for name, spec, default in specs(parameters)}
         for line in check_command_line(sys.argv, node.get_fully_qualified_name()):
             node.get_logger().warning(line)
-        _refuse_unknown(node, list(known))
+        _reject_unknown(node, list(known))
         values: dict[str, Any] = {}
         for name, (spec, default) in known.items():
             value = list(default) if isinstance(default, tuple) else default
-            # An empty list has no type of its own in ROS: one of texts takes what is given.
+            # ROS cannot infer the type of an empty list; lists of texts are dynamically typed.
             empty = value == [] and not spec.texts
             if empty:
                 value = Parameter.Type.DOUBLE_ARRAY
@@ -117,7 +117,7 @@ class NodeParameters(Generic[P]):
 
 
 def _answer_if_typed(answer: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
-    """Refuse a request whole that holds a value of no type; rclpy would end the node."""
+    """Reject a request that contains an invalid parameter type, which would end the node."""
     for given in request.parameters:
         if given.value.type not in _TYPES:
             name = given.name[:_LONGEST_NAME]
@@ -133,12 +133,12 @@ def _answer_if_typed(answer: Callable[[Any, Any], Any], request: Any, response: 
 
 
 def _plain(value: Any) -> Any:
-    """Return lists (rclpy's arrays among them) as tuples, all else as it is."""
+    """Return lists and arrays as tuples, other values unchanged."""
     return value if isinstance(value, (str, int, float, bool)) else tuple(value)
 
 
-def _refuse_unknown(node: Node, known: list[str]) -> None:
-    # rclpy drops overrides that nobody declares without a word: a misspelt gain would do nothing.
+def _reject_unknown(node: Node, known: list[str]) -> None:
+    # rclpy silently drops undeclared overrides: a misspelt gain would have no effect.
     for name in node._parameter_overrides:
         if name in known or name.startswith(OF_EVERY_NODE):
             continue

@@ -1,7 +1,7 @@
-"""Run a component on a bag: recorded messages in, at the times at which they were sent.
+"""Runs a component on a bag: it receives the recorded messages at their send times.
 
-Nobody calls its services and nothing comes in at its ports: no bag has either. Its timers tick on
-the bag's clock.
+Its services are not called and its ports stay silent, because bags contain neither. Its timers tick
+on the bag's clock.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from needle_core.component import Actions, Component, Moment, Peers, Publish, Se
 
 
 class BagRunner:
-    """A component on recorded messages.
+    """Runs a component on recorded messages.
 
     Parameters
     ----------
     component : Component
-        It runs as it is.
+        Component to run.
     received : iterable of str
-        Its topics that somebody receives; what it publishes on others is dropped.
+        Topics whose publications are returned; others are dropped.
 
     Attributes
     ----------
     counts : Counter of str
-        What it has sent: messages by topic, batches by port.
+        Number of messages sent by topic, and of batches by port.
     """
 
     def __init__(self, component: Component, received: Iterable[str]) -> None:
@@ -38,33 +38,33 @@ class BagRunner:
         self.counts: Counter[str] = Counter()
 
     def deliver(self, topic: str, message: Any, at: Moment) -> Iterator[Publish]:
-        """Let the timers tick that are due, then handle a message; yield what is published.
+        """Run the due timers, then handle a message; yield the publications.
 
-        A timer that was missed ticks once, not once for each period.
+        A timer that missed several periods ticks once.
         """
         if not self._is_started:
             self._is_started = True
             self._due = [at.steady + timer.period for timer in self._component.timers]
             peers = Peers(subscribers=dict.fromkeys(self._received, ("bag",)))
-            yield from self._carried_out(self._component.on_peers(peers, at))
+            yield from self._publications(self._component.on_peers(peers, at))
         for number, timer in enumerate(self._component.timers):
             late = at.steady - self._due[number]
             if late >= 0.0:
                 self._due[number] += timer.period * (1 + late // timer.period)
-                yield from self._carried_out(timer.handler(at))
-        yield from self._carried_out(self._handlers[topic](message, at))
+                yield from self._publications(timer.handler(at))
+        yield from self._publications(self._handlers[topic](message, at))
 
     def arrive(self, port: str, batch: tuple[Any, ...], at: Moment) -> list[Publish]:
-        """Let a batch come in at a port; return what is published."""
+        """Handle a batch that arrives at a port; return the publications."""
         rows = [row for row in self._component.ports if row.name == port]
-        return [action for row in rows for action in self._carried_out(row.handler(batch, at))]
+        return [action for row in rows for action in self._publications(row.handler(batch, at))]
 
     def finish(self, at: Moment) -> Iterator[Publish]:
-        """Let every timer tick once more; yield what is published."""
+        """Run every timer once more; yield the publications."""
         for timer in self._component.timers:
-            yield from self._carried_out(timer.handler(at))
+            yield from self._publications(timer.handler(at))
 
-    def _carried_out(self, actions: Actions) -> Iterator[Publish]:
+    def _publications(self, actions: Actions) -> Iterator[Publish]:
         for action in actions:
             match action:
                 case Publish(topic) if topic in self._received:

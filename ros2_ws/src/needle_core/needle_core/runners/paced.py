@@ -1,4 +1,4 @@
-"""The virtual runner at the pace of the wall clock, with events from outside: pages, processes."""
+"""Virtual runner at the pace of the wall clock, with events from pages and other processes."""
 
 from __future__ import annotations
 
@@ -14,53 +14,53 @@ from needle_core.runners.process import Process
 from needle_core.runners.virtual import VirtualRunner
 
 SLACK = 0.05
-"""So far behind the clock the runner catches up; what is more is lost [s]."""
+"""Delay behind the wall clock that the runner catches up; a longer delay is lost [s]."""
 
 
 class Bell(Protocol):
-    """Part of a `threading.Event` that is used here; tests have one on a clock of their own."""
+    """Used part of `threading.Event`; tests replace it by one on a simulated clock."""
 
     def set(self) -> None:
-        """Ring, from any thread."""
+        """Signal new input, from any thread."""
 
     def clear(self) -> None:
-        """Take note."""
+        """Acknowledge the signal."""
 
     def is_set(self) -> bool:
-        """Return whether it has rung."""
+        """Return whether input was signalled."""
 
     def wait(self, timeout: float) -> bool:
-        """Wait until it rings, for `timeout` seconds at most; return whether it has."""
+        """Wait at most `timeout` seconds for a signal; return whether there was one."""
 
 
 class PacedRunner(VirtualRunner):
-    """Runs components no faster than the wall clock, and hands over what comes from outside.
+    """Runs components no faster than the wall clock, and delivers input of real ports.
 
-    An outside event is handled at the virtual moment that the wall clock shows, or at once where
-    the computer has fallen behind. Virtual time that is lost is not made up for: a needle under a
-    person's hand must not run ahead.
+    External input is handled at the virtual time that corresponds to the wall clock, or at once if
+    the computer has fallen behind. Lost time is not caught up: the needle must not run ahead of the
+    operator's hand.
 
     Parameters
     ----------
     components : iterable of Component
-        Each is a process of its own.
+        Components, each run as its own process.
     seed : int
-        Keys latencies and compute times.
+        Seed of latencies and compute times.
     pace : float
-        Virtual over real time.
+        Ratio of virtual to real time.
     ports : mapping of str to RealPort
-        What is outside, by the name of the component's port.
+        Real ports, by the name of the component's port.
     bell : Bell, optional
-        Rung when something has come in.
+        Signals new input.
     clock : callable, optional
         Returns the wall clock's steady time [s].
     more : dict
-        Passed on to `VirtualRunner`.
+        Further arguments of `VirtualRunner`.
 
     Attributes
     ----------
     lag : float
-        Time by which the run is behind the wall clock for good [s].
+        Lost time with respect to the wall clock [s].
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class PacedRunner(VirtualRunner):
         self._arrived: deque[tuple[str, Batch | PortChange]] = deque()
         self._ports = dict(ports or {})
         for name, port in self._ports.items():
-            port.open(partial(self._come_in, name))
+            port.open(partial(self._on_input, name))
 
     def close(self) -> None:
         """Close the ports."""
@@ -90,40 +90,40 @@ class PacedRunner(VirtualRunner):
             port.close()
 
     def run(self, seconds: float) -> bool:
-        """Run until another component exits, or for `seconds`; return whether one did."""
-        # The end is an event, too: it is waited for.
+        """Run until a component exits, or for `seconds`; return whether one exited."""
+        # The end is an event as well, so that the runner waits for it.
         self.timeline.call_after(seconds, lambda: None)
-        return self.timeline.run(seconds, self._reach)
+        return self.timeline.run(seconds, self._wait_for)
 
-    def _reach(self, due: float) -> bool:
-        behind = self._shown() - due
+    def _wait_for(self, due: float) -> bool:
+        behind = self._wall_time() - due
         if behind > SLACK * self._pace:
             self.lag += behind / self._pace
             self._anchor = (due, self._clock())
         if not (self._bell.is_set() or self._bell.wait(max(-behind / self._pace, 0.0))):
             return True
         self._bell.clear()
-        self.timeline.now = max(self.now, min(self._shown(), due))
+        self.timeline.now = max(self.now, min(self._wall_time(), due))
         while self._arrived:
-            self._take(*self._arrived.popleft())
+            self._deliver_input(*self._arrived.popleft())
         return False
 
-    def _come_in(self, port: str, batch: Batch | PortChange) -> None:
-        """Take what has come in at a port, from any thread."""
+    def _on_input(self, port: str, batch: Batch | PortChange) -> None:
+        """Queue input of a port, from any thread."""
         self._arrived.append((port, batch))
         self._bell.set()
 
-    def _take(self, port: str, batch: Batch | PortChange) -> None:
+    def _deliver_input(self, port: str, batch: Batch | PortChange) -> None:
         items = batch() if callable(batch) else batch
         for process in self._processes.values():
             for row in process.component.ports:
                 if row.name == port and isinstance(items, PortChange):
-                    process.offer(port, partial(row.on_change, items))
+                    process.enqueue(port, partial(row.on_change, items))
                 elif row.name == port and not isinstance(items, PortChange) and items:
                     self._arrive(process, row, items)
 
-    def _shown(self) -> float:
-        """Return the virtual time that the wall clock shows [s]."""
+    def _wall_time(self) -> float:
+        """Return the virtual time that corresponds to the wall clock [s]."""
         wall = self._clock()
         if self._anchor is None:
             self._anchor = (self.now, wall)

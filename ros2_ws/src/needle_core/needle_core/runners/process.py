@@ -25,12 +25,12 @@ from needle_core.runners.transport import Link
 
 
 class Handlers:
-    """Runs the handlers of a component.
+    """Runs the handlers of a component; an exception in one becomes a diagnostic.
 
     Parameters
     ----------
     outputs : iterable of Output
-        The component's.
+        Outputs of the component.
     """
 
     def __init__(self, outputs: Iterable[Output]) -> None:
@@ -38,14 +38,14 @@ class Handlers:
         self._failures = 0
 
     def run(self, work: Callable[[], Actions]) -> list[Action]:
-        """Return the actions of a handler; what it did before it failed is done."""
+        """Return the actions of a handler, up to its failure if it fails."""
         actions: list[Action] = []
         try:
             for action in work():
                 if isinstance(action, Publish) and action.topic not in self._topics:
                     raise ValueError(f"{action.topic} is not among its outputs")
                 actions.append(action)
-        except Exception as error:  # noqa: BLE001 - whatever a message may lead to
+        except Exception as error:  # noqa: BLE001 - a message may cause any error
             self._failures += 1
             text = f"internal error: {type(error).__name__}: {error}"
             failed = Diagnostic(Level.ERROR, text, {"failures": str(self._failures)})
@@ -59,40 +59,40 @@ Work = Callable[[Moment], Actions]
 
 
 def uniform(shortest: float, longest: float) -> Compute:
-    """Return a compute time that is the same for all handlers, between two bounds [s]."""
+    """Return compute times that are uniform between two bounds, for all handlers [s]."""
     return lambda actions, rng: rng.uniform(shortest, longest)
 
 
 class Process:
-    """A component with its queue.
+    """Component with its event queue.
 
     Parameters
     ----------
     component : Component
-        What runs.
+        Component to run.
     compute : Compute
         Compute times of its handlers.
     timeline : Timeline
-        Its time.
-    carry_out : callable
-        Carries out each action of a handler that has ended.
+        Virtual time.
+    execute : callable
+        Executes each action of a finished handler.
 
     Attributes
     ----------
     is_alive : bool
-        Whether it runs; what has ended never does anything again.
+        Whether it runs; an ended process does nothing any more.
     slowness : float
-        What each handler takes longer than usual [s].
+        Additional compute time of each handler [s].
     known : list of Process
-        Those that it knows.
+        Processes that it has discovered.
     routes : dict of str to list
-        Topic to those of them that receive it, each with its row and the link; made when needed.
+        Topic to its receivers among them, each with row and link; built on demand.
     batches : dict of str to list
-        Port to what waits there.
+        Port to its waiting items.
     latched : dict of str to object
-        Topic to its last message, for those that come late.
+        Topic to its last message, for late subscribers.
     health : dict of str to Diagnostic
-        Part to what it last said of it.
+        Part to its last diagnostic.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Process:
         component: Component,
         compute: Compute,
         timeline: Timeline,
-        carry_out: Callable[[Process, Action], None],
+        execute: Callable[[Process, Action], None],
     ) -> None:
         self.component = component
         self.name = component.name
@@ -112,7 +112,7 @@ class Process:
         self.batches: dict[str, list[Any]] = {}
         self.latched: dict[str, Any] = {}
         self.health: dict[str, Diagnostic] = {}
-        self._compute, self._timeline, self._carry_out = compute, timeline, carry_out
+        self._compute, self._timeline, self._execute = compute, timeline, execute
         self._is_busy = False
         self._free_at = self._frozen_until = 0.0
         self._queue: deque[tuple[str, Work, int]] = deque()
@@ -122,11 +122,13 @@ class Process:
 
     @property
     def is_frozen(self) -> bool:
-        """Tell whether it is frozen."""
+        """Whether it is frozen."""
         return self._timeline.now < self._frozen_until
 
-    def offer(self, source: str, work: Work, *, depth: int | None = None, sent_ns: int = 0) -> None:
-        """Queue an event; of one source only the newest `depth` wait."""
+    def enqueue(
+        self, source: str, work: Work, *, depth: int | None = None, sent_ns: int = 0
+    ) -> None:
+        """Queue an event; at most the newest `depth` events of one source wait."""
         if not self.is_alive:
             return
         now = self._timeline.now
@@ -139,35 +141,35 @@ class Process:
             self._waiting[source] -= 1
         self._waiting[source] += 1
         self._queue.append((source, work, sent_ns))
-        self._go_on()
+        self._handle_queue()
 
     def freeze(self, seconds: float) -> None:
-        """Stand still from now on, as a stopped process does."""
+        """Freeze for some time, like a process after SIGSTOP."""
         self._frozen_until = max(self._frozen_until, self._timeline.now + seconds)
 
     def end(self) -> None:
-        """Do nothing any more."""
+        """End the process and drop its queue."""
         self.is_alive = False
         self._queue.clear()
 
-    def _go_on(self) -> None:
-        """Handle what waits as soon as the handler before has taken its time."""
+    def _handle_queue(self) -> None:
+        """Handle waiting events as soon as the previous handler has finished."""
         while self._queue and not self._is_busy:
             if self._due > self._timeline.now:
                 self._is_busy = True
-                self._timeline.call_at(self._due, self._get_free)
+                self._timeline.call_at(self._due, self._become_free)
             else:
                 source, work, sent_ns = self._queue.popleft()
                 self._waiting[source] -= 1
                 self._handle_now(source, work, sent_ns)
 
-    def _get_free(self) -> None:
+    def _become_free(self) -> None:
         self._is_busy = False
-        self._go_on()
+        self._handle_queue()
 
     @property
     def _due(self) -> float:
-        """Time at which the next event may be handled [s]."""
+        """Time at which the next event can be handled [s]."""
         return max(self._free_at, self._frozen_until)
 
     def _handle_now(self, source: str, work: Work, sent_ns: int) -> None:
@@ -188,5 +190,5 @@ class Process:
             return
         for action in actions:
             if self.is_alive:
-                self._carry_out(self, action)
-        self._get_free()
+                self._execute(self, action)
+        self._become_free()

@@ -1,4 +1,4 @@
-"""Virtual time: an event heap, and a random stream for each thing that is drawn."""
+"""Virtual time: an event heap, and a random stream for each random quantity."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from collections.abc import Callable
 from needle_core.component import Moment
 
 START_NS = 1_000_000_000
-"""Stamp at the begin of a run [ns]; ROS takes 0 for no time yet."""
+"""Stamp at the start of a run [ns]; in ROS, 0 means that no time is known."""
 
 
 class Timeline:
-    """Events in the order in which they are due, then in that in which they were planned.
+    """Events in the order of their time, then of their scheduling.
 
     Parameters
     ----------
     seed : int
-        Keys every random stream.
+        Seed of all random streams.
 
     Attributes
     ----------
     now : float
-        Virtual time since the begin [s].
+        Virtual time since the start [s].
     clock_offset_ns : int
-        What the clock of the stamps is ahead of where it would be without jumps [ns].
+        Offset of the stamp clock due to injected jumps [ns].
     """
 
     def __init__(self, seed: int) -> None:
@@ -39,14 +39,14 @@ class Timeline:
         self._is_interrupted = False
 
     def stream(self, name: str) -> random.Random:
-        """Return the random stream of one thing: a draw for one shifts nothing of another."""
+        """Return the random stream of this name, independent of all others."""
         stream = self._streams.get(name)
         if stream is None:
             stream = self._streams[name] = random.Random(f"{self._seed}/{name}")
         return stream
 
     def draw(self, name: str, bounds: tuple[float, float]) -> float:
-        """Return a number between two bounds out of a stream."""
+        """Return a uniform number between two bounds from a stream."""
         return self.stream(name).uniform(*bounds)
 
     def call_at(self, when: float, event: Callable[[], None]) -> None:
@@ -58,33 +58,33 @@ class Timeline:
         self.call_at(self.now + seconds, event)
 
     def moment(self, sent_ns: int = 0) -> Moment:
-        """Return the times of a handler that runs now."""
+        """Return the moment of a handler that runs now."""
         return Moment(self.now, self.stamp_ns, sent_ns)
 
     @property
     def stamp_ns(self) -> int:
-        """Stamp of now [ns]."""
+        """Present stamp [ns]."""
         return START_NS + self.clock_offset_ns + round(self.now * 1e9)
 
     def interrupt(self) -> None:
-        """Let `run` return after the present event."""
+        """Make `run` return after the present event."""
         self._is_interrupted = True
 
-    def run(self, seconds: float, reach: Callable[[float], bool] | None = None) -> bool:
-        """Run what is due, for some time [s] or until an interrupt; return whether there was one.
+    def run(self, seconds: float, wait_for: Callable[[float], bool] | None = None) -> bool:
+        """Run events for some time [s] or until an interrupt; return whether it was interrupted.
 
         Parameters
         ----------
         seconds : float
-            How long at most [s].
-        reach : callable, optional
-            Takes the time of the next event [s], may wait for it, and returns False where another
-            may have come before it.
+            Maximum duration [s].
+        wait_for : callable, optional
+            Called with the time of the next event [s]; may wait, and returns False if an earlier
+            event may have been added meanwhile.
         """
         end = self.now + seconds
         heap, self._is_interrupted = self._heap, False
         while heap and heap[0][0] <= end:
-            if reach is not None and not reach(heap[0][0]):
+            if wait_for is not None and not wait_for(heap[0][0]):
                 continue
             self.now, _, event = heapq.heappop(heap)
             event()

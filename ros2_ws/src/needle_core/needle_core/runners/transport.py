@@ -11,7 +11,7 @@ from needle_core.runners.timeline import Timeline
 
 
 class Link(NamedTuple):
-    """The way of a topic's messages, a service's calls or a port's batches between components."""
+    """Connection of two components: by a topic, a service or a port."""
 
     sender: str
     topic: str
@@ -19,16 +19,16 @@ class Link(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """One arrival of a message.
+    """Arrival of a message.
 
     Attributes
     ----------
     late : float
-        How much later than usual [s].
+        Additional delay [s].
     message : object
-        What arrives.
+        Message that arrives.
     overtakes : bool
-        Whether it may arrive before what was sent earlier.
+        Whether it may overtake earlier messages.
     """
 
     late: float
@@ -38,11 +38,11 @@ class Arrival(NamedTuple):
 
 Arrivals = Sequence[Arrival]
 Fault = Callable[[Link, Any, float, random.Random], Arrivals | None]
-"""(link, message, time [s], random stream) to what arrives, if anything; None: what was sent."""
+"""Maps (link, message, time [s], random stream) to the arrivals; None: the message unchanged."""
 
 
 def drop(topic: str, share: float) -> Fault:
-    """Return a fault that loses a share of a topic's messages."""
+    """Return a fault that drops a share of a topic's messages."""
 
     def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
         lost = link.topic == topic and rng.random() < share
@@ -61,7 +61,7 @@ def delay(topic: str, seconds: float) -> Fault:
 
 
 def duplicate(topic: str, seconds: float) -> Fault:
-    """Return a fault that delivers each message of a topic once more after some time."""
+    """Return a fault that delivers each message of a topic again after some time."""
 
     def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
         once = Arrival(0.0, message)
@@ -71,7 +71,7 @@ def duplicate(topic: str, seconds: float) -> Fault:
 
 
 def silence(sender: str, begin: float, end: float) -> Fault:
-    """Return a fault that loses all that a component sends for some time."""
+    """Return a fault that drops all messages of a component for some time."""
 
     def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
         lost = link.sender == sender and begin <= now < end
@@ -81,14 +81,14 @@ def silence(sender: str, begin: float, end: float) -> Fault:
 
 
 class Transport:
-    """Lets what is sent arrive, in order but for what a fault lets overtake.
+    """Delivers messages with latency, in order unless a fault lets one overtake.
 
     Parameters
     ----------
     timeline : Timeline
-        Its time and chance: every link has a random stream of its own.
+        Virtual time and random streams, one per link.
     faults : sequence of Fault
-        Applied to each message, one after the other.
+        Faults, applied to each message in order.
     """
 
     def __init__(self, timeline: Timeline, faults: Sequence[Fault]) -> None:
@@ -104,7 +104,7 @@ class Transport:
         latency: tuple[float, float],
         arrive: Callable[[Any], None],
     ) -> None:
-        """Send a message; `arrive` is called with whatever arrives in its place."""
+        """Send a message; `arrive` is called for each resulting arrival."""
         stream = self._streams.get(link)
         if stream is None:
             stream = self._streams[link] = self._timeline.stream("/".join(link))
@@ -113,12 +113,12 @@ class Transport:
         arrivals = [Arrival(stream.uniform(*latency), message)]
         for fault in self._faults:
             for sent in tuple(arrivals):
-                spoilt = fault(link, sent.message, now, stream)
-                if spoilt is not None:
+                faulty = fault(link, sent.message, now, stream)
+                if faulty is not None:
                     arrivals.remove(sent)
                     arrivals += [
                         Arrival(sent.late + late, changed, sent.overtakes or overtakes)
-                        for late, changed, overtakes in spoilt
+                        for late, changed, overtakes in faulty
                     ]
         for late, arrived, overtakes in arrivals:
             when = now + late

@@ -1,9 +1,9 @@
-"""Run components in one process on a virtual clock: the same seed gives the same run, bit for bit.
+"""Runs components in one process on a virtual clock: the same seed gives bit-identical runs.
 
-An event heap holds deliveries, timers and answers. Each delivery takes a latency, each handler a
-compute time, both drawn from the seed: every link and every handler has a random stream of its own,
-so that adding a component changes no other draw. While a component computes, its inputs wait
-in a queue, as deep as their delivery says.
+An event heap holds deliveries, timers and answers. Each delivery has a latency and each handler a
+compute time, both random. Every link and every handler has its own random stream, so that adding a
+component changes no other draw. While a component computes, its inputs wait in queues of the depth
+given by their delivery.
 """
 
 from __future__ import annotations
@@ -46,39 +46,39 @@ LATENCY = (0.3e-3, 1.5e-3)
 PORT_LATENCY = (0.15e-3, 0.6e-3)
 """Delay of a batch between ports, adapter included [s]."""
 COMPUTE = (0.1e-3, 0.3e-3)
-"""Compute time of a handler where none is given [s]."""
+"""Default compute time of a handler [s]."""
 DISCOVERY = (0.02, 0.2)
-"""Time until one component knows another [s]."""
+"""Time until one component discovers another [s]."""
 LEASE = 8.0
-"""So long others still count a component that was killed [s]."""
+"""Time after which the others drop a killed component [s]."""
 _DIAGNOSTICS_PERIOD = 1.0
 
 Tap = Callable[[int, str, Any, Output], None]
-"""Told of each publication before any fault: stamp [ns], sender, message, output."""
+"""Called for each publication, before any fault, with stamp [ns], sender, message, output."""
 
 
 class VirtualRunner:
-    """Event heap over components.
+    """Runs components on an event heap.
 
     Parameters
     ----------
     components : iterable of Component
-        Each is a process of its own.
+        Components, each run as its own process.
     seed : int
-        Keys every latency and compute time.
+        Seed of latencies and compute times.
     compute : mapping of str to Compute
-        Component to the compute times of its handlers; `COMPUTE` where not given.
+        Component to the compute times of its handlers; `COMPUTE` by default.
     faults : sequence of Fault
-        Applied to each delivery, in order.
+        Faults, applied to each delivery in order.
     taps : sequence of Tap
-        Told of every publication.
+        Callbacks for every publication.
 
     Attributes
     ----------
     timeline : Timeline
-        Its time and chance.
+        Virtual time and random streams.
     exits : dict of str to Exit
-        Components that have ended by themselves.
+        Components that have exited.
     """
 
     def __init__(
@@ -104,33 +104,33 @@ class VirtualRunner:
 
     @property
     def now(self) -> float:
-        """Virtual time since the begin [s]."""
+        """Virtual time since the start [s]."""
         return self.timeline.now
 
     def run(self, seconds: float) -> bool:
-        """Run until another component exits, or for `seconds`; return whether one did."""
+        """Run until a component exits, or for `seconds`; return whether one exited."""
         return self.timeline.run(seconds)
 
-    # ---- what befalls components ----------------------------------------------------------------
+    # ---- life of components and faults ----------------------------------------------------------
 
     def start(self, component: Component) -> None:
-        """Start a component; one of its name that was killed, or ended, is made anew by this.
+        """Start a component, or restart one that was killed or has exited.
 
         Raises
         ------
         ValueError
-            If one of its name runs.
+            If a component of this name is running.
         """
         name = component.name
         if name in self._processes:
             raise ValueError(f"component {name!r} runs already")
         self.exits.pop(name, None)
         compute = self._compute.get(name, uniform(*COMPUTE))
-        process = Process(component, compute, self.timeline, self._do)
+        process = Process(component, compute, self.timeline, self._execute)
         for number, timer in enumerate(component.timers):
             phase = self.timeline.draw(f"{name}/timer {number}/phase", (0.0, timer.period))
             self.timeline.call_after(phase, self._ticking(process, f"timer {number}", timer))
-        self.timeline.call_after(_DIAGNOSTICS_PERIOD, partial(self._tell_health, process))
+        self.timeline.call_after(_DIAGNOSTICS_PERIOD, partial(self._report_health, process))
         for other in self._processes.values():
             for pair in ((process, other), (other, process)):
                 found = self.timeline.draw(f"discovery/{pair[0].name}/{pair[1].name}", DISCOVERY)
@@ -140,56 +140,56 @@ class VirtualRunner:
             self._wires.setdefault(row.name, []).append((process, row))
         for owner, port in self._lost_ports:
             if owner == name:
-                self._tell_port(name, port)
+                self._report_port(name, port)
 
     def kill(self, name: str) -> None:
-        """End a component at once, as SIGKILL does: others count it for `LEASE`."""
+        """End a component at once, like SIGKILL: the others drop it after `LEASE`."""
         process = self._named(name)
         self._remove(process)
         self.timeline.call_after(LEASE, partial(self._forget, process))
 
     def stop(self, name: str) -> None:
-        """Ask a component to end."""
+        """Request the shutdown of a component."""
         process = self._named(name)
-        process.offer("stop", process.component.on_stop)
+        process.enqueue("stop", process.component.on_stop)
 
     def freeze(self, name: str, seconds: float) -> None:
-        """Let a component stand still from now on, as a stopped process does."""
+        """Freeze a component for some time, like SIGSTOP."""
         self._named(name).freeze(seconds)
 
     def slow_down(self, name: str, seconds: float, extra: float) -> None:
-        """Let each handler of a component take `extra` seconds longer for some time."""
+        """Increase the compute time of a component's handlers by `extra` for some time [s]."""
         process = self._named(name)
         process.slowness = extra
         self.timeline.call_after(seconds, partial(setattr, process, "slowness", 0.0))
 
     def lose_port(self, name: str, port: str, why: str) -> None:
-        """Let nothing pass a component's port any more, and tell it why."""
+        """Interrupt a component's port, and report the reason to the component."""
         self._lost_ports[name, port] = why
-        self._tell_port(name, port)
+        self._report_port(name, port)
 
     def open_port(self, name: str, port: str) -> None:
-        """Open a port that was lost, and tell its component."""
+        """Reopen an interrupted port, and report this to its component."""
         if self._lost_ports.pop((name, port), None) is not None:
-            self._tell_port(name, port)
+            self._report_port(name, port)
 
-    def _tell_port(self, name: str, port: str) -> None:
+    def _report_port(self, name: str, port: str) -> None:
         change = PortChange(self._lost_ports.get((name, port), ""))
         for row in self._processes[name].component.ports if self.runs(name) else ():
             if row.name == port:
-                self._processes[name].offer(port, partial(row.on_change, change))
+                self._processes[name].enqueue(port, partial(row.on_change, change))
 
     def configure(self, name: str, settings: Any) -> None:
         """Change a component's settings."""
         process = self._named(name)
-        process.offer("settings", partial(process.component.on_settings, settings))
+        process.enqueue("settings", partial(process.component.on_settings, settings))
 
     def runs(self, name: str) -> bool:
-        """Tell whether a component runs, even if it stands still."""
+        """Return whether a component runs, even if it is frozen."""
         return name in self._processes
 
     def is_responsive(self, name: str) -> bool:
-        """Tell whether a component runs and does not stand still."""
+        """Return whether a component runs and is not frozen."""
         return self.runs(name) and not self._processes[name].is_frozen
 
     def _named(self, name: str) -> Process:
@@ -205,7 +205,7 @@ class VirtualRunner:
 
     # ---- actions --------------------------------------------------------------------------------
 
-    def _do(self, process: Process, action: Action) -> None:
+    def _execute(self, process: Process, action: Action) -> None:
         match action:
             case Publish(topic, message):
                 self._publish(process, process.outputs[topic], message)
@@ -229,8 +229,8 @@ class VirtualRunner:
     def _ticking(self, process: Process, source: str, timer: Timer) -> Callable[[], None]:
         def tick() -> None:
             if process.is_alive:
-                # A timer that was missed fires once, not once for each period.
-                process.offer(source, timer.handler, depth=1)
+                # A timer that missed several periods fires once.
+                process.enqueue(source, timer.handler, depth=1)
                 self.timeline.call_after(timer.period, tick)
 
         return tick
@@ -258,7 +258,7 @@ class VirtualRunner:
 
     def _deliver(self, receiver: Process, row: Input, sent_ns: int, message: Any) -> None:
         depth = row.delivery.depth
-        receiver.offer(row.topic, partial(row.handler, message), depth=depth, sent_ns=sent_ns)
+        receiver.enqueue(row.topic, partial(row.handler, message), depth=depth, sent_ns=sent_ns)
 
     def _send_through(self, sender: Process, port: str, batch: tuple[Any, ...]) -> None:
         lost = self._lost_ports
@@ -274,34 +274,34 @@ class VirtualRunner:
         waiting = receiver.batches.setdefault(row.name, [])
         waiting += batch
         if len(waiting) == len(batch):
-            # What comes until it is handled goes with it.
-            receiver.offer(row.name, lambda at: row.handler(receiver.batches.pop(row.name), at))
+            # Batches that arrive before the handler runs are handled together.
+            receiver.enqueue(row.name, lambda at: row.handler(receiver.batches.pop(row.name), at))
 
-    # ---- who knows whom -------------------------------------------------------------------------
+    # ---- discovery ------------------------------------------------------------------------------
 
     def _discover(self, process: Process, other: Process) -> None:
-        """Let one component know another: from now on its messages get there."""
+        """Connect one component to another: from now on its messages arrive there."""
         if not (process.is_alive and other.is_alive):
             return
         process.known.append(other)
         for topic, message in process.latched.items():
             for route in _routes(process, topic, other):
                 self._send(route, message)
-        self._tell_peers(process)
+        self._report_peers(process)
 
     def _forget(self, gone: Process) -> None:
-        """Let all others know that a component is gone."""
+        """Remove an ended component from the peers of all others."""
         for process in self._processes.values():
             if gone in process.known:
                 process.known.remove(gone)
-                self._tell_peers(process)
+                self._report_peers(process)
 
-    def _tell_peers(self, process: Process) -> None:
+    def _report_peers(self, process: Process) -> None:
         process.routes.clear()
         peers = Peers.of(p.component for p in (process, *process.known))
-        process.offer("peers", partial(process.component.on_peers, peers))
+        process.enqueue("peers", partial(process.component.on_peers, peers))
 
-    # ---- health ---------------------------------------------------------------------------------
+    # ---- diagnostics ----------------------------------------------------------------------------
 
     def _diagnose(self, process: Process, part: str, diagnostic: Diagnostic) -> None:
         before = process.health.get(part)
@@ -310,11 +310,11 @@ class VirtualRunner:
         if before is None or (before.level, before.message) != now:
             self._publish_health(process, (part,))
 
-    def _tell_health(self, process: Process) -> None:
+    def _report_health(self, process: Process) -> None:
         if process.is_alive:
             if process.health:
                 self._publish_health(process, tuple(process.health))
-            self.timeline.call_after(_DIAGNOSTICS_PERIOD, partial(self._tell_health, process))
+            self.timeline.call_after(_DIAGNOSTICS_PERIOD, partial(self._report_health, process))
 
     def _publish_health(self, process: Process, parts: Sequence[str]) -> None:
         statuses = tuple(Status.of(process.name, part, process.health[part]) for part in parts)
@@ -344,7 +344,7 @@ class VirtualRunner:
     def _request(
         self, process: Process, service: Service, number: int, argument: bool | None
     ) -> None:
-        process.offer(service.name, partial(service.handler, argument, number))
+        process.enqueue(service.name, partial(service.handler, argument, number))
 
     def _reply(self, process: Process, reply: Reply) -> None:
         if reply.request in self._calls:
@@ -354,14 +354,14 @@ class VirtualRunner:
             self._transport.send(link, answer, LATENCY, partial(self._answer, reply.request))
 
     def _answer(self, number: int, answer: Answer) -> None:
-        """Hand a call's outcome to its caller; only the first counts."""
+        """Deliver the outcome of a call to its caller; only the first one counts."""
         if number in self._calls:
             caller, _ = self._calls.pop(number)
-            caller.offer("answer", partial(caller.component.on_answer, answer))
+            caller.enqueue("answer", partial(caller.component.on_answer, answer))
 
 
 def _routes(sender: Process, topic: str, receiver: Process) -> list[tuple[Process, Input, Link]]:
-    """Return how a topic's messages get from one component to another."""
+    """Return the routes of a topic from one component to another."""
     link = Link(sender.name, topic, receiver.name)
     rows = receiver.component.inputs
     return [(receiver, row, link) for row in rows if row.topic == topic]

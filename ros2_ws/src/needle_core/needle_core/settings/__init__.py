@@ -1,1 +1,1 @@
-"""Parameters as plain data."""
+"""Parameters of nodes as plain data."""

@@ -1,4 +1,4 @@
-"""Bounds of numbers: one check for parameters, settings and options."""
+"""Bounds of numbers: one check for parameters, settings and command-line options."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, get_type_hints
 from needle_core.errors import OutOfBoundsError, UserError
 
 ABOVE_0 = math.nextafter(0.0, 1.0)
-"""The least number that is not 0: a lower bound."""
+"""Smallest positive number, as an exclusive lower bound of 0."""
 
 
 class Bounds(NamedTuple):
@@ -18,11 +18,11 @@ class Bounds(NamedTuple):
     Attributes
     ----------
     lower, upper : float
-        Inclusive; where `upper` is infinite, the number may still not be, unless `unlimited`.
+        Inclusive bounds; an infinite value is rejected even if `upper` is infinite.
     unit : str
         "-" for none.
     unlimited : bool
-        Whether infinity is a value.
+        Whether infinity is a valid value.
     """
 
     lower: float
@@ -34,14 +34,14 @@ class Bounds(NamedTuple):
 def check_bounds(
     name: str, value: float, lower: float, upper: float, unit: str, *, unlimited: bool = False
 ) -> None:
-    """Raise what names the value and the bound unless the value is finite and within bounds.
+    """Check that a value is finite and within its bounds.
 
     Raises
     ------
     UserError
-        A value that is not finite.
+        If the value is not finite.
     OutOfBoundsError
-        A value out of bounds.
+        If the value is out of bounds.
     """
     if not math.isfinite(value) and not (unlimited and value == math.inf):
         raise UserError(f"{name} = {value}{'' if unit == '-' else f' {unit}'} is not finite")
@@ -50,7 +50,7 @@ def check_bounds(
 
 
 def check_bounded_fields(settings: Any) -> None:
-    """Check every field that is annotated with `Bounds`, unless it is None."""
+    """Check every field annotated with `Bounds`, unless it is None."""
     for name, bounds in _bounded_fields(settings.__class__):
         value = getattr(settings, name)
         if value is not None:

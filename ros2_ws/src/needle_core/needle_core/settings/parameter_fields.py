@@ -1,4 +1,4 @@
-"""Node parameters as frozen dataclasses: one declaration gives default, unit, range and text."""
+"""Node parameters as frozen dataclasses: one declaration with default, unit, range and text."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _METADATA_KEY = "needle_parameter"
 
 @dataclasses.dataclass(frozen=True)
 class ParameterSpec:
-    """Description of a parameter, beside its value.
+    """Description of a parameter.
 
     Attributes
     ----------
@@ -28,11 +28,11 @@ class ParameterSpec:
     lower, upper : float
         Inclusive bounds of a number, or of each element of a list.
     choices : tuple of str
-        The allowed texts; empty: any text.
+        Allowed texts; empty: any text.
     read_only : bool
-        Whether the value is fixed once the node runs.
+        Whether the value is fixed after the start.
     texts : bool
-        Whether the elements of a list are texts; numbers otherwise.
+        Whether the elements of a list are texts; otherwise they are numbers.
     """
 
     unit: str
@@ -50,7 +50,7 @@ def parameter(default: Any, **spec: Any) -> Any:
 
 
 def fixed_parameter(default: Any, *spec: Any, **more: Any) -> Any:
-    """Declare a field whose value is fixed once the node runs, by the arguments of the spec."""
+    """Declare a field whose value is fixed after the start; the arguments are those of the spec."""
     fixed = dataclasses.replace(ParameterSpec(*spec, **more), read_only=True)
     return dataclasses.field(default=default, metadata={_METADATA_KEY: fixed})
 
@@ -69,8 +69,8 @@ def check_fields(parameters: Any) -> None:
     OutOfBoundsError
         A number that is outside its bounds.
     UserError
-        A number that is not finite, a text that is not one of the choices, or another type than
-        the default's.
+        A number that is not finite, a text that is not one of the choices, or a type other than
+        that of the default.
     """
     for name, spec, default in specs(parameters):
         value = getattr(parameters, name)
@@ -94,14 +94,14 @@ def from_values(kind: type[P], values: Mapping[str, Any], node: str) -> P:
     kind : type
         The dataclass.
     values : mapping of str to object
-        Parameter to value; lists stand for tuples.
+        Parameter to value; lists become tuples.
     node : str
-        Whose parameters they are, for errors.
+        Name of the node, for errors.
 
     Raises
     ------
     UserError
-        An unknown parameter, or a value that the dataclass refuses.
+        An unknown parameter, or a value that the dataclass rejects.
     """
     known = {name: default for name, _, default in specs(kind)}
     for name, value in values.items():
@@ -117,14 +117,14 @@ def from_values(kind: type[P], values: Mapping[str, Any], node: str) -> P:
 
 
 def unknown_parameter(name: str, known: Collection[str]) -> str:
-    """Return what is said of a parameter that a node does not have."""
+    """Return the error text for an unknown parameter, with a suggestion."""
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
     return f"unknown parameter '{name}' ({hint})"
 
 
 def describe(parameters: type) -> str:
-    """Return the parameter table of a dataclass as `--help` shows it, one parameter a line."""
+    """Return the parameter table of a dataclass for `--help`."""
     lines = []
     for name, spec, default in specs(parameters):
         shown = list(default) if isinstance(default, tuple) else default

@@ -1,4 +1,4 @@
-"""Parameter files: which of their sections reach a node, as ROS matches them with its full name."""
+"""Parameter files: matches their sections with the full names of nodes, like ROS."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _SECTION = "ros__parameters"
 _FORM = "NODE: {ros__parameters: ...}"
 _WILDCARDS = ("*", "**")
 _OVERRIDE = "-p "
-_CLOSE = 0.7  # names that have so much in common are one, misspelt
+_SIMILARITY = 0.7  # a name this similar to a known one is a misspelling
 
 Parameters = dict[str, dict[str, Any]]
 """Node -> parameter -> value."""
 Sections = dict[str, dict[str, Any]]
-"""Section as the file names it -> parameter -> value."""
+"""Section name in the file -> parameter -> value."""
 T = TypeVar("T")
 
 
@@ -37,7 +37,7 @@ def read_sections(path: Path) -> Sections:
     Raises
     ------
     UserError
-        If it cannot be read, is no such file, or has a section or a parameter twice.
+        If it cannot be read, is not a parameter file, or repeats a section or a parameter.
     """
     document = read_yaml(path)
     if not isinstance(document or {}, Mapping):
@@ -48,29 +48,29 @@ def read_sections(path: Path) -> Sections:
 
 
 def matching_sections(source: object, sections: Sections, node: str, kind: str) -> Sections:
-    """Return the sections that reach a node; none where none is meant for a node of its kind.
+    """Return the sections that match a node; empty if none is meant for a node of this kind.
 
     Parameters
     ----------
     source : object
-        Where they stand, for errors.
+        File or option, for errors.
     sections : mapping
-        All that stand there.
+        All sections of the source.
     node : str
         Full name of the node, after remapping.
     kind : str
-        Name of its executable, which is its own name without remapping.
+        Name of its executable: its name without remapping.
 
     Raises
     ------
     UserError
-        If some are meant for such a node but none of them reaches this one, which would run on its
-        defaults, or if one has a name that is close to a node of this rig.
+        If sections for such a node exist but none matches this one, which would then run with its
+        defaults, or if the name of a section is similar to that of a node.
     """
     own = (kind, _last(node))
     for name in sections:
         if _last(name) not in (*NODES, *own, *_WILDCARDS):
-            close = difflib.get_close_matches(_last(name), NODES, n=1, cutoff=_CLOSE)
+            close = difflib.get_close_matches(_last(name), NODES, n=1, cutoff=_SIMILARITY)
             if close:
                 raise UserError(f"{source}: unknown node '{name}', did you mean '{close[0]}'?")
     meant = [name for name in sections if _last(name) in own]
@@ -85,9 +85,9 @@ def matching_sections(source: object, sections: Sections, node: str, kind: str) 
 
 
 def values_for(source: object, sections: Sections, node: str, kind: str) -> dict[str, Any] | None:
-    """Return what sections set in a node; arguments and errors as of `matching_sections`.
+    """Return the parameters that sections set in a node; None without a matching section.
 
-    None where no section is meant for a node of its kind.
+    Arguments and errors are those of `matching_sections`.
     """
     reached = matching_sections(source, sections, node, kind)
     if not reached:
@@ -96,12 +96,12 @@ def values_for(source: object, sections: Sections, node: str, kind: str) -> dict
 
 
 def missing_section_warning(source: object, sections: Sections, node: str) -> str:
-    """Return the warning that a source has no section for a node of its kind."""
+    """Return the warning that a source has no section for a node of this kind."""
     return f"{source}: no section for {node}: it has {', '.join(sections) or 'none'}"
 
 
 def command_line_sections(words: Sequence[str]) -> list[tuple[str, Sections]]:
-    """Return what a node's command line has of parameters: (file or `-p` as given, sections).
+    """Return the parameters on a node's command line: (file or `-p` as given, sections).
 
     Raises
     ------
@@ -120,7 +120,7 @@ def command_line_sections(words: Sequence[str]) -> list[tuple[str, Sections]]:
 
 
 def check_command_line(words: Sequence[str], node: str) -> list[str]:
-    """Check that the parameters on a node's command line reach it.
+    """Check that the parameters on a node's command line take effect.
 
     Parameters
     ----------
@@ -132,16 +132,16 @@ def check_command_line(words: Sequence[str], node: str) -> list[str]:
     Returns
     -------
     list of str
-        A warning for each file or `-p` that has nothing for a node of this kind.
+        A warning for each file or `-p` without a section for a node of this kind.
 
     Raises
     ------
     UserError
-        As `read_sections` and `matching_sections`, and if a section of a file wins over a `-p`.
+        As `read_sections` and `matching_sections`, and if a file overrides a `-p`.
     """
     warnings = []
     overrides: dict[str, str] = {}
-    # As rcl keeps them: a section stays where it is first named, and the last section wins.
+    # Order of rcl: a section keeps the place of its first occurrence, and the last section wins.
     kept: dict[str, dict[str, str]] = {}
     for source, sections in command_line_sections(words):
         reached = matching_sections(source, sections, node, Path(words[0]).stem)
@@ -165,21 +165,21 @@ def check_command_line(words: Sequence[str], node: str) -> list[str]:
 
 
 def read_parameters(path: Path, nodes: Sequence[str], namespace: str = "") -> Parameters:
-    """Return what a ROS parameter file sets in nodes that are started together.
+    """Return the parameters that a ROS parameter file sets in nodes that are started together.
 
     Parameters
     ----------
     path : Path
         The file.
     nodes : sequence of str
-        The nodes that are started: the file may name no other.
+        Names of the started nodes; the file may contain no others.
     namespace : str
-        Theirs.
+        Namespace of the nodes.
 
     Returns
     -------
     dict
-        Node -> parameter -> value, without nodes that the file has nothing for.
+        Node -> parameter -> value, only for nodes in the file.
 
     Raises
     ------
@@ -202,10 +202,10 @@ def read_parameters(path: Path, nodes: Sequence[str], namespace: str = "") -> Pa
 
 
 def _sections(path: Path, content: Mapping[Any, Any], above: str = "") -> Iterator[Any]:
-    """Yield (section, what is below ros__parameters)."""
+    """Yield (section, mapping below ros__parameters)."""
     for key, value in content.items():
         name = f"{above}/{key}".replace("//", "/") if above else str(key)
-        # rcl compares no more of the key.
+        # rcl compares only the beginning of the key.
         is_section = str(key).startswith(_SECTION)
         if not isinstance(value, Mapping):
             wrong = "wants NAME: VALUE pairs" if is_section else f"stands outside {_SECTION}"
@@ -231,7 +231,7 @@ def _unique(where: object, pairs: Iterable[tuple[str, T]]) -> dict[str, T]:
 
 
 def _matches(section: str, node: str) -> bool:
-    # rcl's pattern: /* is one name, /** any number of them.
+    # Pattern of rcl: /* is one name, /** is any number of names.
     pattern = re.escape(_absolute(section)).replace(r"/\*", r"(/\w+)").replace(r"\*", "*")
     return re.fullmatch(pattern, node) is not None
 

@@ -16,7 +16,7 @@ from needle_core.process.discovery import (
     THIS_MACHINE,
     THIS_MACHINE_UDP,
     clean_environment,
-    is_open,
+    is_network_enabled,
     restrict_discovery,
 )
 
@@ -53,11 +53,11 @@ def test_the_discovery_range_decides_with_and_without_shared_memory(
     for before in ("", str(THIS_MACHINE), str(NETWORK), "/another/checkout.xml"):
         environment = kept(**{DISCOVERY_RANGE: asked, PROFILES: before})
         assert environment == {DISCOVERY_RANGE: asked or "LOCALHOST", PROFILES: str(profiles)}
-        assert is_open(environment) is opened
+        assert is_network_enabled(environment) is opened
     environment = {DISCOVERY_RANGE: asked}
     restrict_discovery(environment, shared_memory=False)
     assert environment[PROFILES] == str(without_shared_memory)
-    assert is_open(environment) is opened
+    assert is_network_enabled(environment) is opened
     # What such a node starts has shared memory again.
     restrict_discovery(environment)
     assert environment == kept(**{DISCOVERY_RANGE: asked})

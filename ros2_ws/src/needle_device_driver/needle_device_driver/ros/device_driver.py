@@ -7,7 +7,7 @@ import sys
 import time
 
 from needle_core.can_frame import CAN
-from needle_core.process.discovery import DISCOVERY, is_open
+from needle_core.process.discovery import DISCOVERY, is_network_enabled
 from needle_core.ros.main import run_component
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.link.can_port import CanPort
@@ -35,7 +35,7 @@ _LOOK_AROUND = 0.3
 
 def make_driver(settings: DriverParameters, name: str) -> DeviceDriver:
     """Return the driver, which gives another device time to show itself."""
-    look_around = DISCOVERY if is_open() else _LOOK_AROUND
+    look_around = DISCOVERY if is_network_enabled() else _LOOK_AROUND
     return DeviceDriver(settings, name, search_from=time.monotonic() + look_around)
 
 
