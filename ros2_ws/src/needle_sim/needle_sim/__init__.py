@@ -1,1 +1,1 @@
-"""Stands in for the rig: needle plant, tissue, stereo renderer, simulated axes."""
+"""Simulation of the rig: needle plant, tissue, stereo renderers, axes and drives."""

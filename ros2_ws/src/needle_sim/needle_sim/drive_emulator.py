@@ -29,16 +29,16 @@ from needle_sim.drives.emulated_bus import EmulatedBus, bus_health, execute_comm
 from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.motor import MotorSettings
 
-# Encoder of the rotation axis: 16 bits a turn, no gear.
+# Encoder of the rotation axis: 16 bits per turn, no gear.
 COUNTS_PER_RADIAN = 65536.0 / (2.0 * math.pi)
-# Lead of the insertion axis' screw: its way in one turn of the motor [m].
+# Lead of the insertion axis' screw: travel per turn of the motor [m].
 _LEAD = 0.001
 _LAST_NODE = 127
 
 
 @dataclasses.dataclass(frozen=True)
 class DriveEmulatorParameters:
-    """Parameters of drive_emulator, fixed at start."""
+    """Parameters of drive_emulator, fixed at the start."""
 
     pty: str = fixed_parameter(
         "", "-", "Link to the serial port that appears; empty: the port's own name is logged."
@@ -81,12 +81,12 @@ class DriveEmulatorParameters:
     )
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be emulated.
+        """Check the parameters.
 
         Raises
         ------
         UserError
-            A parameter out of bounds, two drives of one node id, two ways to the bus.
+            If a parameter is out of bounds, or both drives have the same node id.
         """
         check_fields(self)
         if self.insertion_node_id == self.rotation_node_id:
@@ -99,14 +99,14 @@ class DriveEmulatorParameters:
 
     @property
     def insertion(self) -> EmulatedDriveSettings:
-        """The insertion axis: a stepper on a screw, with a limit switch at either end."""
+        """Insertion axis: a stepper on a screw, with a limit switch at either end."""
         scale = self.insertion_counts_per_unit
         ends = {"start": self.insertion_start * scale, "travel": self.insertion_travel * scale}
         return self._drive("insertion", STEPPER, _LEAD, **ends)
 
     @property
     def rotation(self) -> EmulatedDriveSettings:
-        """The rotation axis: a servo that turns without end."""
+        """Rotation axis: a servo with unlimited travel."""
         return self._drive("rotation", SERVO, 2.0 * math.pi)
 
     def _drive(
@@ -124,26 +124,26 @@ class DriveEmulatorParameters:
 
 POSITIONS = "sim/drive_positions"
 ADAPTER, COMMAND_LINES = "adapter", "command lines"
-# How often the drives look at their clocks, and tell where their motors are [s].
-_LOOK, _PERIOD = 0.005, 0.02
+# Periods of the drives' timers, and of the motor positions [s].
+_TIMER_PERIOD, _POSITION_PERIOD = 0.005, 0.02
 
 
 class DriveEmulator(Component):
-    """Both drives with their motors, from the moment when their power comes.
+    """Both drives with their motors, from power-up on.
 
     Parameters
     ----------
     settings : DriveEmulatorParameters
-        The node's parameters.
+        Parameters of the node.
     name : str
         Full name of the node.
     now : float
-        Steady time at which the power comes [s].
+        Steady time of power-up [s].
 
     Attributes
     ----------
     bus : EmulatedBus
-        The drives; faults are planted there.
+        Bus with the drives; tests inject faults there.
     """
 
     name = "drive_emulator"
@@ -154,38 +154,41 @@ class DriveEmulator(Component):
         self.name, self.settings = name, settings
         self.bus = EmulatedBus(settings.insertion, settings.rotation, now)
         self._states = dict.fromkeys(self.bus.drives, PowerState.NOT_READY)
-        self._is_heard = False
+        self._has_subscriber = False
         self.outputs = (Output(POSITIONS, m.JointState),)
         self.ports = (Port(CAN, self._on_frames), Port(COMMAND_LINES, self._on_commands))
-        self.timers = (Timer(_LOOK, self._look), Timer(_PERIOD, self._tell_positions))
+        self.timers = (
+            Timer(_TIMER_PERIOD, self._poll),
+            Timer(_POSITION_PERIOD, self._publish_positions),
+        )
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note whether anybody wants to hear where the motors are."""
-        self._is_heard = POSITIONS in peers.subscribers
+        """Note whether the motor positions have a subscriber."""
+        self._has_subscriber = POSITIONS in peers.subscribers
         return ()
 
     def _on_frames(self, frames: Sequence[CanFrame], at: Moment) -> Actions:
         for frame in frames:
             self.bus.receive(frame, at.steady)
-        return self._send(self.bus.take_sent())
+        return self._send(self.bus.drain_outboxes())
 
     def _on_commands(self, lines: Sequence[str], at: Moment) -> Actions:
-        """Carry out faults on command, and say where they came; complain about what is none."""
+        """Execute fault commands and log the motor positions; log invalid commands."""
         for line in lines:
             axes = self.bus.axes(at.steady)
             try:
-                order = execute_command(line, self.bus, at.steady)
+                adapter_command = execute_command(line, self.bus, at.steady)
             except UserError as error:
                 yield Log("error", str(error))
                 continue
-            places = [axes[name].position for name in ("insertion", "rotation")]
-            where = f"{places[0] * 1e3:.6f} mm, {places[1]:.6f} rad"
+            insertion, rotation = (axes[name].position for name in ("insertion", "rotation"))
+            where = f"{insertion * 1e3:.6f} mm, {rotation:.6f} rad"
             yield Log("warning", f"on command: {line.strip()}, at {where}")
-            if order is not None:
-                yield Send(ADAPTER, (order,))
+            if adapter_command is not None:
+                yield Send(ADAPTER, (adapter_command,))
             yield Diagnose("drives", bus_health(self.bus))
 
-    def _look(self, at: Moment) -> Actions:
+    def _poll(self, at: Moment) -> Actions:
         yield from self._send(self.bus.poll(at.steady))
         states = {name: drive.state for name, drive in self.bus.drives.items()}
         if states == self._states:
@@ -201,8 +204,8 @@ class DriveEmulator(Component):
         if frames:
             yield Send(CAN, tuple(frames))
 
-    def _tell_positions(self, at: Moment) -> Actions:
-        if not self._is_heard:
+    def _publish_positions(self, at: Moment) -> Actions:
+        if not self._has_subscriber:
             return
         axes = self.bus.axes(at.steady)
         positions = tuple(axis.position for axis in axes.values())

@@ -1,4 +1,4 @@
-"""The parameters of sim_rig."""
+"""Parameters of sim_rig."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LEVELS = ("tip", "camera", "drive")
 
 @dataclasses.dataclass(frozen=True)
 class SimRigParameters:
-    """Parameters of sim_rig, fixed at start; `check` in `__post_init__` refuses what cannot be."""
+    """Parameters of sim_rig, fixed at the start."""
 
     level: str = fixed_parameter(
         "camera",
@@ -95,13 +95,13 @@ class SimRigParameters:
     retraction_speed: float = limit_parameter("retraction_speed")
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be simulated.
+        """Check the parameters.
 
         Raises
         ------
         UserError
-            A parameter out of bounds, a bend that cannot be, or images wanted of a level that has
-            none.
+            If a parameter is out of bounds, the needle's bend is invalid, or a level without
+            images has image parameters.
         """
         check_fields(self)
         _ = self.needle
@@ -119,5 +119,5 @@ class SimRigParameters:
 
     @property
     def limits(self) -> SafetyLimits:
-        """The motion supervisor's limits."""
+        """Limits of the motion supervisor."""
         return SafetyLimits.of(self)

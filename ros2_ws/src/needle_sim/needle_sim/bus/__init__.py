@@ -1,1 +1,1 @@
-"""CANopen (CiA 301) as a device speaks it, and the emulated bus's adapters."""
+"""CANopen devices (CiA 301), and the CAN adapter of the emulated drives."""

@@ -1,4 +1,4 @@
-"""A CANopen device (CiA 301): network states, heartbeats both ways, SDO, PDOs and emergencies."""
+"""CANopen device (CiA 301): NMT states, heartbeats both ways, SDO, PDOs and emergencies."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _ERRORS_KEPT = 4
 HEARTBEAT_LOST = 0x8130
 _COMMUNICATION_ERROR = 0x10
 _GENERIC_ERROR = 0x01
-# 0x1029: what a lost heartbeat does to the network state.
-_STAY, _STOP = 1, 2
+# 0x1029: reaction of the network state to a lost heartbeat.
+_KEEP_STATE, _STOP = 1, 2
 
 
 class NetworkState(enum.IntEnum):
-    """NMT states, as heartbeats carry them."""
+    """NMT states, with the codes of heartbeats."""
 
     BOOTING = 0x00
     STOPPED = 0x04
@@ -38,24 +38,24 @@ class NetworkState(enum.IntEnum):
 
 
 class CanopenDevice:
-    """Behaviour of every device; what it is for is in `dictionary` and the callbacks.
+    """Generic CANopen device; its profile is in `dictionary` and the callbacks.
 
-    Frames that it sends collect in `outbox`. All times are readings of one steady clock [s].
+    Sent frames collect in `outbox`. All times are readings of one steady clock [s].
 
     Parameters
     ----------
     node_id : int
         1..127.
     dictionary : ObjectDictionary
-        Objects from 0x2000 up; those of the communication are added here.
+        Objects from 0x2000 up; the device adds the communication objects.
     default_receive, default_transmit : tuple of int
-        What the first PDO of each direction carries after power-up.
+        Mapping of the first PDO of each direction after power-up.
     boot_time : float
         From power-up to the boot-up message [s].
     on_power_up, on_boot : callable
-        Called when the power comes (also by an NMT reset), and at the boot-up message.
+        Called at power-up (also by an NMT reset), and at the boot-up message.
     on_connection_lost : callable
-        Called when a monitored heartbeat stays away or the device is told to stop.
+        Called when a monitored heartbeat is lost, or NMT stops the device.
     """
 
     def __init__(
@@ -80,13 +80,13 @@ class CanopenDevice:
         self._on_connection_lost = on_connection_lost
         self._boots_at = 0.0
         self._heartbeat_at = 0.0
-        self._heard: dict[int, float] = {}
+        self._last_heartbeats: dict[int, float] = {}
         self._errors: list[int] = []
         self._sdo = SdoServer(dictionary)
         self._add_communication_objects()
 
         def cob_ids(codes: tuple[int, ...]) -> list[int]:
-            """Return what they are after power-up: only the first of a direction is on."""
+            """Return the identifiers after power-up, when only the first PDO is enabled."""
             return [code + node_id | (INVALID if k else 0) for k, code in enumerate(codes)]
 
         self._receive = [
@@ -99,38 +99,38 @@ class CanopenDevice:
         ]
 
     def power_up(self, now: float) -> None:
-        """Start as if the power had just come: everything written is forgotten."""
+        """Power up: all written values return to their defaults."""
         self.dictionary.power_up()
         self.state = NetworkState.BOOTING
         self._boots_at = now + self._boot_time
-        self._heard.clear()
+        self._last_heartbeats.clear()
         self._errors.clear()
-        self._forget()
+        self._reset_pdos()
         self._on_power_up()
 
-    def reads(self, frame: CanFrame) -> bool:
-        """Tell whether a frame asks this device for the content of an object."""
+    def is_read_request(self, frame: CanFrame) -> bool:
+        """Return whether a frame requests the value of an object of this device."""
         return frame.identifier == SDO_REQUEST + self.node_id or frame.remote
 
     def receive(self, frame: CanFrame, now: float) -> bool:
-        """Take a frame from the bus, SYNC excepted; returns whether it was for this device."""
+        """Handle a frame other than SYNC; return whether it was for this device."""
         if self.state is NetworkState.BOOTING:
             return False
         identifier = frame.identifier
         if identifier == NMT:
-            self._obey(frame.data, now)
+            self._handle_nmt(frame.data, now)
         elif identifier == SDO_REQUEST + self.node_id:
             self._answer(frame)
         elif identifier > HEARTBEAT and identifier & 0x7F != self.node_id:
             if identifier & ~0x7F == HEARTBEAT:
-                self._heard[identifier & 0x7F] = now
+                self._last_heartbeats[identifier & 0x7F] = now
             return False
         else:
-            return self.state is NetworkState.OPERATIONAL and self._take_process_data(frame)
+            return self.state is NetworkState.OPERATIONAL and self._handle_pdo(frame)
         return True
 
     def sync(self) -> None:
-        """Take a SYNC: sample what goes out with it, then apply what waited for it."""
+        """Handle a SYNC: send the synchronous PDOs, then apply the received ones."""
         if self.state is not NetworkState.OPERATIONAL:
             return
         for transmit in self._transmit:
@@ -139,7 +139,7 @@ class CanopenDevice:
             receive.sync()
 
     def tick(self, now: float) -> None:
-        """Do what is due by the clock: booting, heartbeats, watchdogs, event timers."""
+        """Handle timers: booting, heartbeats, watchdogs, event timers."""
         if self.state is NetworkState.BOOTING:
             if now >= self._boots_at:
                 self.state = NetworkState.PRE_OPERATIONAL
@@ -149,16 +149,16 @@ class CanopenDevice:
             return
         period = self.dictionary.value(0x1017) * 1e-3
         if period > 0.0 and now - self._heartbeat_at >= period:
-            # On a starved machine late heartbeats are not made up for.
+            # If the process was suspended, missed heartbeats are not sent later.
             self._heartbeat_at = max(self._heartbeat_at + period, now - period)
             self._send(HEARTBEAT, bytes([self.state]))
-        self._watch(now)
+        self._check_heartbeats(now)
         if self.state is NetworkState.OPERATIONAL:
             for pdo in self._transmit:
                 self._send_pdo(pdo, pdo.event(now))
 
     def emergency(self, code: int, register: int = 0) -> None:
-        """Tell an error, or with code 0 that there is none left."""
+        """Send an emergency; code 0 means that no error is left."""
         if code:
             self._errors = [code, *self._errors][:_ERRORS_KEPT]
             register |= _GENERIC_ERROR
@@ -182,26 +182,26 @@ class CanopenDevice:
         add(0x1016, 0, Kind.U8, _HEARTBEAT_CONSUMERS)
         for k in range(1, _HEARTBEAT_CONSUMERS + 1):
             writable(0x1016, k, Kind.U32, 0)
-            # What was heard before it was monitored says nothing.
-            self.dictionary.on_write(0x1016, k, then=self._forget_heard)
+            # Monitoring starts with the first heartbeat after the configuration.
+            self.dictionary.on_write(0x1016, k, then=self._restart_monitoring)
         writable(0x1017, 0, Kind.U16, 0)
         add(0x1029, 0, Kind.U8, 1)
         writable(0x1029, 1, Kind.U8, 0)
         self.dictionary.on_write(0x1003, 0, then=lambda _: self._errors.clear())
 
-    def _take_process_data(self, frame: CanFrame) -> bool:
+    def _handle_pdo(self, frame: CanFrame) -> bool:
         if frame.remote:
             self._answer_remote(frame.identifier)
             return False
-        taken = [pdo for pdo in self._receive if pdo.cob_id == frame.identifier]
-        for pdo in taken:
-            pdo.take(frame.data)
-        return bool(taken)
+        matching = [pdo for pdo in self._receive if pdo.cob_id == frame.identifier]
+        for pdo in matching:
+            pdo.receive(frame.data)
+        return bool(matching)
 
-    def _forget_heard(self, consumer: int) -> None:
-        self._heard.pop(consumer >> 16 & 0x7F, None)
+    def _restart_monitoring(self, consumer: int) -> None:
+        self._last_heartbeats.pop(consumer >> 16 & 0x7F, None)
 
-    def _obey(self, data: bytes, now: float) -> None:
+    def _handle_nmt(self, data: bytes, now: float) -> None:
         if len(data) != 2 or data[1] not in (0, self.node_id):
             return
         command = data[0]
@@ -211,22 +211,22 @@ class CanopenDevice:
             0x80: NetworkState.PRE_OPERATIONAL,
         }
         if command in states:
-            self._enter(states[command])
+            self._set_state(states[command])
             if command == 0x02:
                 self._on_connection_lost()
         elif command in (0x81, 0x82):
             self.power_up(now)
 
-    def _enter(self, state: NetworkState) -> None:
+    def _set_state(self, state: NetworkState) -> None:
         if state is not self.state:
             self.state = state
-            self._forget()
+            self._reset_pdos()
 
-    def _forget(self) -> None:
+    def _reset_pdos(self) -> None:
         for receive in self._receive:
-            receive.forget()
+            receive.reset()
         for transmit in self._transmit:
-            transmit.forget()
+            transmit.reset()
 
     def _answer(self, frame: CanFrame) -> None:
         if self.state is NetworkState.STOPPED or frame.remote:
@@ -240,24 +240,24 @@ class CanopenDevice:
             if pdo.cob_id == identifier:
                 self._send_pdo(pdo, pdo.data())
 
-    def _watch(self, now: float) -> None:
+    def _check_heartbeats(self, now: float) -> None:
         for k in range(1, _HEARTBEAT_CONSUMERS + 1):
             consumer = self.dictionary.value(0x1016, k)
             if not consumer:
                 continue
             node, limit = consumer >> 16 & 0x7F, (consumer & 0xFFFF) * 1e-3
             # Monitoring begins with the first heartbeat.
-            heard = self._heard.get(node)
-            if limit == 0.0 or heard is None or now - heard <= limit:
+            last = self._last_heartbeats.get(node)
+            if limit == 0.0 or last is None or now - last <= limit:
                 continue
-            del self._heard[node]
+            del self._last_heartbeats[node]
             self.emergency(HEARTBEAT_LOST, _COMMUNICATION_ERROR)
             self._on_connection_lost()
             behaviour = self.dictionary.value(0x1029, 1)
             if behaviour == _STOP:
-                self._enter(NetworkState.STOPPED)
-            elif behaviour != _STAY and self.state is NetworkState.OPERATIONAL:
-                self._enter(NetworkState.PRE_OPERATIONAL)
+                self._set_state(NetworkState.STOPPED)
+            elif behaviour != _KEEP_STATE and self.state is NetworkState.OPERATIONAL:
+                self._set_state(NetworkState.PRE_OPERATIONAL)
 
     def _send_pdo(self, pdo: TransmitPdo, data: bytes | None) -> None:
         if data is not None and pdo.cob_id is not None:

@@ -27,7 +27,7 @@ class Abort(enum.IntEnum):
 
 
 class SdoAbortError(Exception):
-    """An access that the device refuses."""
+    """SDO access that the device rejects."""
 
     def __init__(self, code: Abort) -> None:
         super().__init__(f"{code.name} (0x{code:08X})")
@@ -35,14 +35,14 @@ class SdoAbortError(Exception):
 
 
 class Kind(enum.Enum):
-    """A numeric type.
+    """Numeric type.
 
     Attributes
     ----------
     size : int
-        In bytes.
+        Size in bytes.
     signed : bool
-        Whether it has a sign.
+        Whether it is signed.
     bounds : tuple of int
         Smallest and largest value.
     """
@@ -62,20 +62,20 @@ class Kind(enum.Enum):
 
 @dataclasses.dataclass
 class StoredObject:
-    """One value.
+    """Value of the dictionary.
 
     Attributes
     ----------
     kind : Kind or None
-        Its type; None for a text.
+        Type of the number; None for a text.
     value : int
         The number; 0 for a text.
     writable : bool
         Whether a client may write it.
     mappable : bool
-        Whether a PDO may carry it.
+        Whether a PDO may contain it.
     text : bytes
-        The text, if it is one.
+        The text; empty for a number.
     default : int
         The number after power-up.
     """
@@ -88,12 +88,12 @@ class StoredObject:
     default: int = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
-        """Keep the value after power-up."""
+        """Store the power-up value."""
         self.default = self.value
 
 
 class ObjectDictionary:
-    """Values, what may be done with them, and what happens when a client writes one."""
+    """Values by index and sub-index, with access rights and callbacks for writing."""
 
     def __init__(self) -> None:
         self._entries: dict[Key, StoredObject] = {}
@@ -112,7 +112,7 @@ class ObjectDictionary:
         mappable: bool = False,
         text: bytes = b"",
     ) -> None:
-        """Add an entry; the arguments are those of `StoredObject`."""
+        """Add an entry with the attributes of `StoredObject`."""
         self._entries[index, subindex] = StoredObject(kind, value, writable, mappable, text)
         self._indices.add(index)
 
@@ -124,16 +124,16 @@ class ObjectDictionary:
         check: Callable[[int], None] | None = None,
         then: Callable[[int], None] | None = None,
     ) -> None:
-        """React to what a client writes.
+        """Set callbacks for writing an entry.
 
         Parameters
         ----------
         index, subindex : int
-            The entry.
+            Address of the entry.
         check : callable, optional
-            Called before the value is taken; raises `SdoAbortError` to refuse it.
+            Called with the value before it is stored; raises `SdoAbortError` to reject it.
         then : callable, optional
-            Called after it was taken.
+            Called with the value after it is stored.
         """
         if check is not None:
             self._checks[index, subindex] = check
@@ -146,7 +146,7 @@ class ObjectDictionary:
         Raises
         ------
         SdoAbortError
-            If there is none.
+            If the entry does not exist.
         """
         entry = self._entries.get((index, subindex))
         if entry is None:
@@ -158,19 +158,19 @@ class ObjectDictionary:
         return self._entries[index, subindex].value
 
     def set(self, index: int, subindex: int, value: int) -> None:
-        """Set a number from inside the device: unchecked, but cut to its type's range."""
+        """Set a number from inside the device: without checks, but clipped to its type."""
         entry = self._entries[index, subindex]
         assert entry.kind is not None
         lower, upper = entry.kind.bounds
         entry.value = value if lower <= value <= upper else min(max(value, lower), upper)
 
     def read(self, index: int, subindex: int) -> bytes:
-        """Return a value as bytes, lowest first.
+        """Return a value as bytes, little-endian.
 
         Raises
         ------
         SdoAbortError
-            If there is none.
+            If the entry does not exist.
         """
         entry = self.entry(index, subindex)
         if entry.kind is None:
@@ -178,12 +178,12 @@ class ObjectDictionary:
         return entry.value.to_bytes(entry.kind.size, "little", signed=entry.kind.signed)
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Write a value as a client.
+        """Write a value for a client.
 
         Raises
         ------
         SdoAbortError
-            If the device refuses it; the value stays as it was.
+            If the device rejects it; the value stays unchanged.
         """
         entry = self.entry(index, subindex)
         if not entry.writable or entry.kind is None:
@@ -199,7 +199,7 @@ class ObjectDictionary:
             self._reactions[key](value)
 
     def power_up(self) -> None:
-        """Forget everything that was written."""
+        """Reset all values to their defaults."""
         for entry in self._entries.values():
             entry.value = entry.default
 
@@ -213,17 +213,17 @@ _ABORT = 4
 _TOGGLE = 0x10
 _SEGMENT = 7
 _EXPEDITED = 4
-# No object here is longer; a download beyond is refused.
-_LONGEST = 128
+# Longest object; longer downloads are rejected [bytes].
+_MAX_LENGTH = 128
 
 
 class SdoServer:
-    """Answers the requests of one client.
+    """SDO server for one client: expedited and segmented transfers, no blocks.
 
     Parameters
     ----------
     dictionary : ObjectDictionary
-        What is read and written.
+        Object dictionary of the device.
     """
 
     def __init__(self, dictionary: ObjectDictionary) -> None:
@@ -240,7 +240,7 @@ class SdoServer:
         }
 
     def answer(self, request: bytes) -> bytes | None:
-        """Return the answer to a request of 8 bytes; None to what wants none."""
+        """Return the answer to a request; None if it needs none or has not 8 bytes."""
         if len(request) != 8:
             return None
         specifier = request[0] >> 5
@@ -251,12 +251,12 @@ class SdoServer:
             self._upload = self._download = None
             self._key = (int.from_bytes(request[1:3], "little"), request[3])
         try:
-            return self._handlers.get(specifier, self._refuse)(request)
+            return self._handlers.get(specifier, self._reject)(request)
         except SdoAbortError as error:
             self._upload = self._download = None
             return b"\x80" + self._multiplexer + int(error.code).to_bytes(4, "little")
 
-    def _refuse(self, _: bytes) -> bytes:
+    def _reject(self, _: bytes) -> bytes:
         raise SdoAbortError(Abort.COMMAND)
 
     @property
@@ -281,7 +281,7 @@ class SdoServer:
         self._check_toggle(request[0])
         unused = request[0] >> 1 & 7
         self._download += request[1 : 8 - unused]
-        if len(self._download) > _LONGEST:
+        if len(self._download) > _MAX_LENGTH:
             raise SdoAbortError(Abort.WRONG_LENGTH)
         answer = bytes([0x20 | self._toggle]) + bytes(7)
         self._toggle ^= _TOGGLE

@@ -1,4 +1,4 @@
-"""PDOs of a CANopen device (CiA 301): communication parameters, mapping, and when they go."""
+"""PDOs of a CANopen device (CiA 301): communication parameters, mapping and triggers."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ _EVENT_DRIVEN = 254
 
 
 class _Pdo:
-    """Common part of both directions: COB-ID, transmission type, mapping.
+    """PDO of either direction: COB-ID, transmission type, mapping.
 
     Parameters
     ----------
     dictionary : ObjectDictionary
-        The device's, where the parameters live.
+        Object dictionary of the device, which holds the parameters.
     number : int
-        0 is the first of its direction.
+        Number within its direction, from 0.
     cob_id : int
-        Identifier after power-up, with bit 31 where the PDO is off.
+        Identifier after power-up; bit 31 disables the PDO.
     mapped : tuple of int
         Mapping after power-up: index << 16 | subindex << 8 | bits.
     """
 
-    # Of each direction: indices of the first communication and mapping parameters, and what the
-    # former have beside COB-ID and transmission type.
+    # For each direction: indices of the first communication and mapping parameters, and further
+    # sub-indices of the former.
     _first_parameters: int
     _first_mapping: int
     _more_parameters: tuple[int, ...] = ()
@@ -59,7 +59,7 @@ class _Pdo:
             dictionary.on_write(mapping, entry, check=self._check_entry)
         dictionary.on_write(parameters, 1, check=self._check_cob_id)
         dictionary.on_write(mapping, 0, check=self._check_count)
-        # Asked for at every frame and every tick: kept at hand.
+        # Cached, because they are read at every frame and every tick.
         self._mapping_entries = [dictionary.entry(mapping, k) for k in range(_MOST_ENTRIES + 1)]
         self._mapped_by: tuple[int, list[int]] | None = None
         self._mapped: list[tuple[int, int, int]] = []
@@ -68,18 +68,18 @@ class _Pdo:
 
     @property
     def cob_id(self) -> int | None:
-        """Identifier; None while the PDO is off."""
+        """Identifier; None while the PDO is disabled."""
         value = self._cob_id.value
         return None if value & INVALID else value & 0x7FF
 
     @property
     def transmission_type(self) -> int:
-        """Transmission type: 0..240 with SYNC, 254 and 255 at once."""
+        """Transmission type: 0..240 with SYNC, 254 and 255 event-driven."""
         return self._transmission_type.value
 
     @property
     def mapped(self) -> list[tuple[int, int, int]]:
-        """(index, subindex, bytes) of each object that it carries."""
+        """(index, subindex, bytes) of each mapped object."""
         count, *values = (entry.value for entry in self._mapping_entries)
         if (count, values) != self._mapped_by:
             self._mapped_by = count, values
@@ -88,25 +88,25 @@ class _Pdo:
 
     def _check_cob_id(self, value: int) -> None:
         changed = (value ^ self._dictionary.value(self._parameters, 1)) & 0x1FFFFFFF
-        # An identifier may change only while the PDO is off.
+        # The identifier may change only while the PDO is disabled.
         if changed and self.cob_id is not None and not value & INVALID:
             raise SdoAbortError(Abort.VALUE_RANGE)
         if value & 0x1FFFF800:
             raise SdoAbortError(Abort.VALUE_RANGE)
 
-    def _check_off(self) -> None:
+    def _check_disabled(self) -> None:
         if self.cob_id is not None:
             raise SdoAbortError(Abort.DEVICE_STATE)
 
     def _check_entry(self, value: int) -> None:
-        self._check_off()
+        self._check_disabled()
         if self._dictionary.value(self._mapping, 0) != 0:
             raise SdoAbortError(Abort.DEVICE_STATE)
         if value:
             self._size(value)
 
     def _check_count(self, count: int) -> None:
-        self._check_off()
+        self._check_disabled()
         if count > _MOST_ENTRIES:
             raise SdoAbortError(Abort.VALUE_RANGE)
         values = [self._dictionary.value(self._mapping, k) for k in range(1, count + 1)]
@@ -121,45 +121,45 @@ class _Pdo:
 
 
 class ReceivePdo(_Pdo):
-    """Takes values from the bus; parameters as of `_Pdo`."""
+    """Receives values from the bus; the parameters are those of `_Pdo`."""
 
     _first_parameters, _first_mapping = 0x1400, 0x1600
     _waiting: bytes | None = None
 
-    def take(self, data: bytes) -> None:
-        """Take a frame's data: applied now or with the next SYNC."""
+    def receive(self, data: bytes) -> None:
+        """Apply the data of a frame, now or with the next SYNC."""
         if self.transmission_type <= _LAST_SYNCHRONOUS:
             self._waiting = data
         else:
             self._apply(data)
 
     def sync(self) -> None:
-        """Apply what waits for a SYNC."""
+        """Apply the data that waits for a SYNC."""
         if self._waiting is not None:
             data, self._waiting = self._waiting, None
             self._apply(data)
 
-    def forget(self) -> None:
-        """Drop what waits for a SYNC."""
+    def reset(self) -> None:
+        """Drop the data that waits for a SYNC."""
         self._waiting = None
 
     def _apply(self, data: bytes) -> None:
         mapped = self.mapped
-        # A shorter frame must not be taken for half a command.
+        # A shorter frame must not be applied in part.
         if sum(size for _, _, size in mapped) > len(data):
             return
         begin = 0
         for index, subindex, size in mapped:
-            # A PDO has no answer: a value that is refused is just not taken.
+            # A PDO has no answer, so an invalid value is just ignored.
             with contextlib.suppress(SdoAbortError):
                 self._dictionary.write(index, subindex, data[begin : begin + size])
             begin += size
 
 
 class TransmitPdo(_Pdo):
-    """Puts values on the bus: with every n-th SYNC, on change, by timer or on request.
+    """Sends values to the bus: with every n-th SYNC, on change, by timer or on request.
 
-    Parameters as of `_Pdo`.
+    The parameters are those of `_Pdo`.
     """
 
     _first_parameters, _first_mapping = 0x1800, 0x1A00
@@ -170,11 +170,11 @@ class TransmitPdo(_Pdo):
     _sent_at = 0.0
 
     def data(self) -> bytes:
-        """Return the values as they are now."""
+        """Return the present values."""
         return b"".join(self._dictionary.read(index, sub) for index, sub, _ in self.mapped)
 
     def sync(self) -> bytes | None:
-        """Return what goes out with this SYNC, if anything."""
+        """Return the data to send with this SYNC, if any."""
         kind = self.transmission_type
         if self.cob_id is None or kind > _LAST_SYNCHRONOUS:
             return None
@@ -189,7 +189,7 @@ class TransmitPdo(_Pdo):
         return data
 
     def event(self, now: float) -> bytes | None:
-        """Return what goes out now for a change or the event timer, if anything; `now` in s."""
+        """Return the data to send because of a change or the event timer, if any; `now` in s."""
         if self._transmission_type.value < _EVENT_DRIVEN or self._cob_id.value & INVALID:
             return None
         data = self.data()
@@ -202,7 +202,7 @@ class TransmitPdo(_Pdo):
         self._sent, self._sent_at = data, now
         return data
 
-    def forget(self) -> None:
-        """Send the next one whatever was sent before."""
+    def reset(self) -> None:
+        """Forget the data sent last, so that the next event sends it again."""
         self._sent = None
         self._syncs = 0

@@ -1,6 +1,6 @@
-"""The device side of a serial CAN adapter: the LAWICEL protocol ("slcan") of USB adapters.
+"""Serial CAN adapter, device side: the LAWICEL protocol ("slcan") of USB adapters.
 
-Commands end with CR; an adapter answers CR for done, BEL for refused, `z` CR for a frame taken.
+Commands end with CR; the adapter answers CR for success, BEL for failure, `z` CR for a sent frame.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ _SENT_EXTENDED = b"Z\r"
 _VERSION = b"V1013\r"
 _SERIAL_NUMBER = b"NSIM1\r"
 _NO_ERRORS = b"F00\r"
-# The longest command is an extended frame of 8 bytes.
-_LONGEST = 64
-_MOST_DATA = 8
+# Bound of the buffer; the longest command is an extended frame of 8 bytes.
+_MAX_COMMAND = 64
+_MAX_DATA = 8
 
 
 @dataclasses.dataclass(frozen=True)
 class SlcanInput:
-    """Outcome of a stretch of bytes from the computer.
+    """Result of some bytes from the computer.
 
     Attributes
     ----------
     frames : tuple of CanFrame
         Frames for the bus, in order.
     reply : bytes
-        What the adapter answers.
+        Answer of the adapter.
     closed : bool
-        Whether the channel was closed: what waits for the computer is obsolete.
+        Whether the channel was closed, so that waiting output is obsolete.
     """
 
     frames: tuple[CanFrame, ...]
@@ -41,7 +41,7 @@ class SlcanInput:
 
 
 class SlcanAdapter:
-    """Turns bytes into frames and frames into bytes; frames pass only while the channel is open."""
+    """Converts bytes to frames and back; frames pass only while the channel is open."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -49,7 +49,7 @@ class SlcanAdapter:
         self._listens_only = False
 
     def feed(self, data: bytes) -> SlcanInput:
-        """Take bytes from the computer, complete commands or not."""
+        """Process bytes from the computer; incomplete commands are buffered."""
         self._buffer += data
         frames: list[CanFrame] = []
         reply = bytearray()
@@ -58,14 +58,14 @@ class SlcanAdapter:
             command = bytes(self._buffer[:end])
             del self._buffer[: end + 1]
             closed = closed or command == b"C"
-            reply += self._obey(command, frames)
-        if len(self._buffer) > _LONGEST:
+            reply += self._execute(command, frames)
+        if len(self._buffer) > _MAX_COMMAND:
             self._buffer.clear()
             reply += REFUSED
         return SlcanInput(tuple(frames), bytes(reply), closed)
 
     def encode(self, frame: CanFrame) -> bytes:
-        """Return a frame as the computer reads it; nothing while the channel is closed."""
+        """Return the bytes of a frame for the computer; empty while the channel is closed."""
         if not self._open:
             return b""
         kind = "r" if frame.remote else "t"
@@ -73,7 +73,7 @@ class SlcanAdapter:
             f"{kind}{frame.identifier:03X}{len(frame.data):d}{frame.data.hex().upper()}\r".encode()
         )
 
-    def _obey(self, command: bytes, frames: list[CanFrame]) -> bytes:  # noqa: PLR0911 - one a kind
+    def _execute(self, command: bytes, frames: list[CanFrame]) -> bytes:  # noqa: PLR0911 - one a kind
         kind, rest = command[:1], command[1:]
         if kind == b"":
             return DONE
@@ -93,7 +93,7 @@ class SlcanAdapter:
         answers = {b"V": _VERSION, b"N": _SERIAL_NUMBER, b"F": _NO_ERRORS}
         if kind in answers:
             return answers[kind]
-        # Time stamps, polling, filters: nothing to switch here.
+        # Time stamps, polling and filters are accepted without effect.
         return DONE if kind in b"ZXMmQWUY" else REFUSED
 
     def _send(self, kind: bytes, rest: bytes, frames: list[CanFrame]) -> bytes:
@@ -108,10 +108,10 @@ class SlcanAdapter:
         except ValueError:
             return REFUSED
         remote = kind in b"rR"
-        if len(rest) < digits + 1 or length > _MOST_DATA or len(data) != (0 if remote else length):
+        if len(rest) < digits + 1 or length > _MAX_DATA or len(data) != (0 if remote else length):
             return REFUSED
         if extended:
-            # No drive listens to 29 bits.
+            # The drives ignore 29-bit identifiers.
             return _SENT_EXTENDED
         if identifier > 0x7FF:
             return REFUSED

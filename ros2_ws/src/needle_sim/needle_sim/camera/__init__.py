@@ -1,1 +1,1 @@
-"""Stereo images of a needle in a clear phantom."""
+"""Quick stereo renderer: images of a needle in a clear phantom."""

@@ -12,11 +12,11 @@ from needle_sim.camera.scenarios import Bubbles, Cable, FloorShadow, GraphPaper,
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_sim.needle.se3 import FloatArray
 
-# Where bubbles are: below the top by, to both sides of the needle by at most, along it [m].
+# Range of the bubbles: depth below the top, maximum offset to the sides, length [m].
 _DEPTHS = (0.0012, 0.0345)
 _BUBBLE_SIDE = 0.055
 _BUBBLE_LENGTHS = (0.006, 0.150)
-# A bubble in a denser medium: total reflection makes its rim dark, the lamp a spot on it.
+# Total reflection makes the rim of a bubble dark; the lamp causes a bright spot.
 _RIM_SHARE = 0.62
 _RIM_GAIN = 0.42
 _MIDDLE_GAIN = 0.93
@@ -27,14 +27,14 @@ _SPOT_SIZE = 0.2
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BubbleCloud:
-    """Spheres of air.
+    """Air bubbles in the phantom.
 
     Attributes
     ----------
     centre : ndarray, shape (N, 3)
-        In `rig` [m].
+        Centres in `rig` [m].
     radius : ndarray, shape (N,)
-        [m].
+        Radii [m].
     """
 
     centre: FloatArray
@@ -43,14 +43,14 @@ class BubbleCloud:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BubbleImage:
-    """Effect of bubbles on one camera's image; all of the image's shape.
+    """Effect of bubbles on a camera's image; all arrays have the shape of the image.
 
     Attributes
     ----------
     gain, added : ndarray of float32
-        The light behind times `gain` plus `added` [grey levels].
+        The bubbles change the light behind them to light * `gain` + `added` [grey levels].
     height : ndarray of float32
-        Of the highest bubble at the pixel, towards the camera; -inf where there is none [m].
+        Height of the highest bubble at the pixel, towards the camera; -inf without bubble [m].
     """
 
     gain: FloatImage
@@ -59,14 +59,14 @@ class BubbleImage:
 
 
 def place_bubbles(bubbles: Bubbles, rig: StereoRig, rng: np.random.Generator) -> BubbleCloud:
-    """Return where the bubbles are, uniform in the phantom, twice the size half as frequent."""
+    """Return random bubbles, uniform in the phantom and in the logarithm of their radius."""
     side = min(_BUBBLE_SIDE, rig.half_width)
     low = [rig.half_height - _DEPTHS[1], -side, _BUBBLE_LENGTHS[0]]
     high = [rig.half_height - _DEPTHS[0], side, _BUBBLE_LENGTHS[1]]
     centre = rng.uniform(low, high, (bubbles.count, 3))
     size = rng.uniform(np.log(bubbles.smallest), np.log(bubbles.largest), bubbles.count)
     radius = np.exp(size)
-    # None sticks out of a window.
+    # Keep the bubbles behind the windows.
     for camera in (rig.left, rig.right):
         window = camera.window
         out = np.maximum(window.height(centre) - (window.inner - 1.2 * radius), 0.0)
@@ -75,28 +75,28 @@ def place_bubbles(bubbles: Bubbles, rig: StereoRig, rng: np.random.Generator) ->
 
 
 def draw_bubbles(cloud: BubbleCloud, optics: Optics) -> BubbleImage:
-    """Return what one camera sees of the bubbles."""
+    """Return the image of the bubbles in a camera."""
     width, height = optics.image_size
     image = BubbleImage(
         np.ones((height, width), dtype=np.float32),
         np.zeros((height, width), dtype=np.float32),
         np.full((height, width), -np.inf, dtype=np.float32),
     )
-    middles = optics.project(cloud.centre)
+    centres = optics.project(cloud.centre)
     radii = optics.radius_px(cloud.centre, cloud.radius)
     blurs = np.broadcast_to(optics.blur_px(cloud.centre), radii.shape)
     heights = optics.window.height(cloud.centre)
-    # From the bottom up: higher ones hide what is under them.
+    # From the bottom up, because higher bubbles hide lower ones.
     for i in np.argsort(heights):
         radius, blur = float(radii[i]), float(blurs[i])
         reach = int(np.ceil(radius + 3.0 * blur))
-        column, row = (round(float(part)) for part in middles[i])
+        column, row = (round(float(part)) for part in centres[i])
         rows = slice(max(row - reach, 0), min(row + reach + 1, height))
         columns = slice(max(column - reach, 0), min(column + reach + 1, width))
         if rows.start >= rows.stop or columns.start >= columns.stop:
             continue
-        u = np.arange(columns.start, columns.stop) - middles[i, 0]
-        v = (np.arange(rows.start, rows.stop) - middles[i, 1])[:, np.newaxis]
+        u = np.arange(columns.start, columns.stop) - centres[i, 0]
+        v = (np.arange(rows.start, rows.stop) - centres[i, 1])[:, np.newaxis]
         gain, added = _one_bubble(u, v, radius, blur)
         part = (rows, columns)
         image.gain[part] *= gain
@@ -111,7 +111,7 @@ def _one_bubble(
 ) -> tuple[FloatArray, FloatArray]:
     distance = np.hypot(u, v)
     scale = 1.0 / (np.sqrt(2.0) * blur)
-    # Of a disk no larger than its blur, only part is left.
+    # A disk of the size of its blur loses contrast.
     strength = 1.0 - np.exp(-((radius / blur) ** 2) / 2.0)
     disk = 0.5 * strength * (1.0 - erf((distance - radius) * scale))
     middle = 0.5 * strength * (1.0 - erf((distance - _RIM_SHARE * radius) * scale))
@@ -126,7 +126,7 @@ _CABLE_POINTS = 120
 _CABLE_HALF_LENGTH = 0.075
 _CABLE_MIDDLE = 0.07
 
-# A hand as capsules in a level plane, pointing along +a: (a0, b0, a1, b1, radius), palm at 0 [m].
+# Hand as capsules in a plane, pointing along +a: (a0, b0, a1, b1, radius), palm at 0 [m].
 _HAND = (
     (-0.30, 0.01, -0.06, 0.0, 0.034),
     (-0.06, 0.0, 0.0, 0.0, 0.036),
@@ -144,23 +144,23 @@ _LOW = 0.03
 def cable_line(
     cable: Cable, surface_height: float, exposure_number: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Return where the cable lies at one exposure.
+    """Return the line of the cable at an exposure.
 
     Parameters
     ----------
     cable : Cable
-        The cable.
+        Properties of the cable.
     surface_height : float
         x of the phantom's surface in `rig` [m].
     exposure_number : int
-        When.
+        Number of the exposure.
     rng : numpy.random.Generator
-        In the same state for every exposure of a run.
+        Generator in the same state for every exposure of a run.
 
     Returns
     -------
     ndarray, shape (M, 3)
-        Its middle line in `rig`, with both ends [m].
+        Centreline in `rig` [m].
     """
     phases = rng.uniform(0.0, 2.0 * np.pi, 4)
     paces = rng.uniform(0.8, 1.25, 4)
@@ -181,47 +181,47 @@ def cable_line(
 def shadow_line(
     shadow: FloorShadow, surface_height: float, line: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return where parallel light throws a line's shadow on the phantom's floor.
+    """Return the shadow of a line on the phantom's floor in parallel light.
 
     Parameters
     ----------
     shadow : FloorShadow
-        The shadow.
+        Properties of the shadow.
     surface_height : float
         x of the phantom's surface in `rig` [m].
     line : ndarray, shape (M, 3)
-        What throws it, in `rig` [m].
+        Line that casts the shadow, in `rig` [m].
     rng : numpy.random.Generator
-        In the same state for every exposure of a run.
+        Generator in the same state for every exposure of a run.
 
     Returns
     -------
-    thrown : ndarray, shape (M, 3)
-        The shadow's middle line in `rig` [m].
+    shadow_line : ndarray, shape (M, 3)
+        Centreline of the shadow in `rig` [m].
     fall : ndarray, shape (M,)
-        How high above the floor each point of the line is [m].
+        Height of each point of the line above the floor [m].
     """
     slant = rng.uniform(-shadow.largest_slant, shadow.largest_slant, 2)
     floor = surface_height - shadow.floor_depth
     fall = np.maximum(line[:, 0] - floor, 0.0)
-    thrown = np.empty_like(line)
-    thrown[:, 0] = floor
-    thrown[:, 1:] = line[:, 1:] + fall[:, np.newaxis] * slant
-    return thrown, fall
+    cast = np.empty_like(line)
+    cast[:, 0] = floor
+    cast[:, 1:] = line[:, 1:] + fall[:, np.newaxis] * slant
+    return cast, fall
 
 
 @dataclasses.dataclass(frozen=True)
 class OcclusionEvent:
-    """Something that blocks the view at one exposure.
+    """Obstruction of the view at an exposure.
 
     Attributes
     ----------
     blocks : pair of bool
-        Whether the left and the right camera are meant.
+        Whether it affects the left and the right camera.
     covered : bool
-        Whether the cameras meant see nothing at all; a hand passes otherwise.
+        Whether it covers the lens; otherwise it is a passing hand.
     progress : float
-        How far the event is, between 0 and 1.
+        Progress of the event, 0 to 1.
     """
 
     blocks: tuple[bool, bool]
@@ -230,14 +230,14 @@ class OcclusionEvent:
 
 
 def occlusion_at(occlusion: Occlusion, seed: int, exposure_number: int) -> OcclusionEvent | None:
-    """Return what blocks the view at an exposure; None where nothing does."""
+    """Return the obstruction at an exposure; None without one."""
     if exposure_number < occlusion.first:
         return None
-    stretch, within = divmod(exposure_number - occlusion.first, occlusion.every)
-    # Every three stretches each of the three: left, right, both; a hand or a cover by chance.
-    round_, place = divmod(stretch, 3)
+    period, within = divmod(exposure_number - occlusion.first, occlusion.every)
+    # Each group of three periods has left, right and both in random order, by hand or cover.
+    round_, place = divmod(period, 3)
     order = np.random.default_rng([seed, round_, 8]).permutation(3)
-    rng = np.random.default_rng([seed, stretch, 9])
+    rng = np.random.default_rng([seed, period, 9])
     blocks = ((True, False), (False, True), (True, True))[int(order[place])]
     length = occlusion.length_both if all(blocks) else occlusion.length
     begin = int(rng.integers(0, max(occlusion.every - length, 0) + 1))
@@ -250,24 +250,23 @@ def occlusion_at(occlusion: Occlusion, seed: int, exposure_number: int) -> Occlu
 def hand_capsules(
     event: OcclusionEvent, target: FloatArray, rig: StereoRig
 ) -> list[tuple[FloatArray, FloatArray, float]]:
-    """Return a hand on its way over the target and back.
+    """Return a hand that passes over the target and back.
 
-    High before a window it stands in the line of sight of one camera and beside the other's; for
-    both it is low.
+    High above the window it blocks the line of sight of one camera; low, that of both.
 
     Parameters
     ----------
     event : OcclusionEvent
-        Whom the hand blocks, and how far it is.
+        Affected cameras, and progress.
     target : ndarray, shape (3,)
-        What it passes over, in `rig` [m].
+        Point that it passes over, in `rig` [m].
     rig : StereoRig
-        Whose cameras it blocks.
+        Rig with the cameras.
 
     Returns
     -------
     list of (ndarray (3,), ndarray (3,), float)
-        Capsules from point to point, in `rig`, and their radii [m].
+        Capsules: end points in `rig`, and radius [m].
     """
     middle = (rig.left.centre + rig.right.centre) / 2.0
     if all(event.blocks):
@@ -281,10 +280,10 @@ def hand_capsules(
         normal, sideways = camera.window.normal, camera.window.sideways
     side = 0.0 if all(event.blocks) else float(np.sign((centre - middle) @ sideways))
     over = target + height / float((centre - target) @ normal) * (centre - target)
-    # From the blocked camera's side, so that the arm is in nobody else's way.
+    # From the side of the blocked camera, so that the arm does not block the other one.
     forward = -side * sideways if side else sideways
     aside = np.array([0.0, 0.0, 1.0])
-    # In and out fast, a while over the target.
+    # Fast in and out, with a pause over the target.
     there = min(1.0, 1.6 * np.sin(np.pi * event.progress))
     over = over - (1.0 - there) * _FAR * forward
     return [
@@ -305,16 +304,16 @@ _LARGEST_TURN = 0.35
 def paper_lines(
     paper: GraphPaper, half_height: float, rng: np.random.Generator
 ) -> list[FloatArray]:
-    """Return the lines of a paper that lies askew, each (M, 3) in `rig` [m].
+    """Return the lines of graph paper under the phantom, each (M, 3) in `rig` [m].
 
     Parameters
     ----------
     paper : GraphPaper
-        How it is ruled.
+        Properties of the paper.
     half_height : float
-        Of the phantom, from the needle's entry to its surface [m].
+        Distance from the needle's entry to the phantom's surface [m].
     rng : numpy.random.Generator
-        For how it lies.
+        Generator of its random pose.
     """
     turn, aside, ahead = rng.uniform(-_LARGEST_TURN, _LARGEST_TURN), *rng.uniform(0.0, 1.0, 2)
     along = np.array([0.0, np.sin(turn), np.cos(turn)])

@@ -1,4 +1,4 @@
-"""A folder of rendered pairs with calibration, insertions and truth, as `track_images` reads it."""
+"""Folder of rendered pairs with calibration, insertions and ground truth, for `track_images`."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ _TRUTH_COLUMNS = (
     *("name", "x_m", "y_m", "z_m", "pitch_rad", "yaw_rad", "shaft_pitch_rad", "shaft_yaw_rad"),
     *("left_seen", "right_seen"),
 )
-# Noise does not compress: more effort takes time and saves nothing.
+# A higher compression level saves nothing, because noise does not compress.
 _PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Truth:
-    """True place of the needle's end; angles as everywhere: asin(d_x), atan2(-d_y, d_z).
+    """Ground truth of the needle's end; pitch = asin(d_x), yaw = atan2(-d_y, d_z).
 
     Attributes
     ----------
     tip : ndarray, shape (3,)
-        In `rig` [m].
+        Tip in `rig` [m].
     pitch, yaw : float
-        Of the heading [rad].
+        Direction of the heading [rad].
     shaft_pitch, shaft_yaw : float
-        Of the visible shaft's end, which the pre-bend leans away from the heading [rad].
+        Direction of the visible distal segment, which the pre-bend tilts off the heading [rad].
     """
 
     tip: FloatArray
@@ -50,7 +50,7 @@ class Truth:
 
 
 def truth_of(T_rig_tip: FloatArray, needle: NeedleShape | None = None) -> Truth:  # noqa: N803
-    """Return the truth about a needle whose tip has a pose, shape (4, 4) [m]."""
+    """Return the ground truth of a needle from the pose of its tip, shape (4, 4) [m]."""
     needle = NeedleShape() if needle is None else needle
     heading = T_rig_tip[:3, 2]
     shaft = T_rig_tip[:3, :3] @ [0.0, -np.sin(needle.lean), np.cos(needle.lean)]
@@ -71,16 +71,16 @@ class ImageFolder:
     Parameters
     ----------
     folder : Path
-        New or empty.
+        New or empty folder.
     calibration_file : Path
-        Copied.
+        Calibration to copy.
     more_columns : tuple of str
-        Of truth.csv, behind those that are always there.
+        Additional columns of truth.csv.
 
     Raises
     ------
     UserError
-        If the folder has something in it, or cannot be written.
+        If the folder is not empty, or cannot be written.
     """
 
     def __init__(
@@ -110,27 +110,27 @@ class ImageFolder:
         *,
         more: Sequence[float | str] = (),
     ) -> str:
-        """Add one exposure; return its name.
+        """Add an exposure; return its name.
 
         Parameters
         ----------
         number : int
-            Of the exposure; names the files.
+            Number of the exposure, which names the files.
         images : pair of ndarray of uint8
             Left and right.
         insertion : float
-            What the stage says [m].
+            Insertion of the stage [m].
         truth : Truth or None
-            None where there is no needle: empty fields.
+            Ground truth; None without a needle, for empty fields.
         visible_share : pair of float
-            Of the needle's last 10 mm, by the left and the right camera.
+            Visible share of the needle's last 10 mm, in the left and the right image.
         more : sequence of float or str
-            For the further columns of truth.csv.
+            Values of the additional columns.
 
         Raises
         ------
         UserError
-            If something cannot be written.
+            If a file cannot be written.
         """
         name = f"{number:06d}.png"
         for side, image in zip(("left", "right"), images, strict=True):
@@ -147,12 +147,12 @@ class ImageFolder:
             angles = (truth.pitch, truth.yaw, truth.shaft_pitch, truth.shaft_yaw)
             values = [*truth.tip.tolist(), *angles]
         self._add(self._insertions, name, [float(insertion)])
-        seen = [round(share, 3) for share in visible_share]
-        self._add(self._truths, name, [*values, *seen, *more])
+        visible = [round(share, 3) for share in visible_share]
+        self._add(self._truths, name, [*values, *visible, *more])
         return name
 
     def close(self) -> None:
-        """Close the tables; they are complete up to the last exposure at any time."""
+        """Close the tables, which are complete up to the last exposure at any time."""
         self._insertions.close()
         self._truths.close()
 
@@ -164,7 +164,7 @@ class ImageFolder:
 
     def _add(self, stream: TextIO, name: str, values: Sequence[float | str]) -> None:
         try:
-            # repr: what is read back is what was written, to the last bit.
+            # repr() keeps all digits.
             csv.writer(stream, lineterminator="\n").writerow(
                 [name, *(value if isinstance(value, str) else repr(value) for value in values)]
             )

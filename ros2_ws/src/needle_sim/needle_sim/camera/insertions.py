@@ -1,4 +1,4 @@
-"""Random insertions as a steered needle makes them, and their images, without any graph."""
+"""Random insertions, similar to steered ones, and their images, without a ROS graph."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
 
 CURVATURE = 1.0 / 0.122
-"""Of the needle in the phantom [1/m], as sim_rig has it by default."""
+"""Curvature of the needle in the phantom [1/m]: the default of sim_rig."""
 
 _STREAM = 10
 _CANDIDATES = 256
@@ -28,21 +28,21 @@ _WAVE_LENGTHS = (0.025, 0.090)
 _WAVE_ANGLES = (0.3, 1.2)
 _TURNS_PER_M = 17.0
 _LARGEST_PITCH = np.deg2rad(5.0)
-# How far the tip keeps from the phantom's faces, and from the sides of the cameras' view [m].
+# Clearance of the tip from the phantom's faces, and bound from the sides of the view [m].
 _CLEARANCE = 0.004
 _SIDE = 0.025
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RandomPath:
-    """An insertion that stays in the phantom, by 1 mm.
+    """Insertion that stays in the phantom, in pieces of 1 mm.
 
     Attributes
     ----------
     pitch, roll : float
-        Of the tip at the entry point [rad].
+        Pitch and roll of the tip at the entry point [rad].
     rotation : ndarray, shape (N,)
-        Of the base, over each of the path's pieces [rad].
+        Rotation of the base over each piece [rad].
     """
 
     pitch: float
@@ -52,20 +52,20 @@ class RandomPath:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RenderedPair:
-    """One exposure of an insertion.
+    """Exposure of an insertion.
 
     Attributes
     ----------
     number : int
-        Of the exposure.
+        Number of the exposure.
     images : pair of ndarray of uint8
-        Left and right.
+        Left and right image.
     insertion : float
-        What the stage says [m].
+        Insertion of the stage [m].
     truth : Truth or None
-        None where there is no needle in the phantom.
+        Ground truth; None without a needle in the phantom.
     visible_share : pair of float
-        Of the needle's last 10 mm, by the left and the right camera.
+        Visible share of the needle's last 10 mm, in the left and the right image.
     """
 
     number: int
@@ -78,23 +78,23 @@ class RenderedPair:
 def random_path(
     seed: int, depth: float, half_sizes: tuple[float, float], curvature: float
 ) -> RandomPath:
-    """Return a random path with smooth rotations, as a controller turns the needle.
+    """Return a random path with smooth rotations, similar to those of a controller.
 
     Parameters
     ----------
     seed : int
-        Same seed, same path.
+        Seed of the path.
     depth : float
-        How far the needle goes in [m].
+        Insertion at the end [m].
     half_sizes : pair of float
-        How far the phantom reaches from the needle's axis, along x and y [m].
+        Distance from the needle's axis to the phantom's faces, along x and y [m].
     curvature : float
-        Of the needle's path [1/m].
+        Curvature of the needle's path [1/m].
 
     Raises
     ------
     UserError
-        If no such path was found.
+        If no path stays inside the phantom.
     """
     high, wide = half_sizes[0] - _CLEARANCE, min(_SIDE, half_sizes[1] - _CLEARANCE)
     rng = np.random.default_rng([seed, 0, _STREAM])
@@ -135,31 +135,31 @@ def render_insertion(
     curvature: float = CURVATURE,
     begin: float = 0.0,
 ) -> Iterator[RenderedPair]:
-    """Render a random insertion; the stage rests at its end if more frames are wanted.
+    """Render a random insertion; further frames show the stage at rest at its end.
 
     Parameters
     ----------
     rig : StereoRig
         Cameras and phantom.
     scenario : Scenario
-        What troubles the cameras.
+        Disturbances of the images.
     seed : int
-        Keys path and images.
+        Seed of path and images.
     frames : int
-        How many exposures.
+        Number of exposures.
     depth : float
-        Where the stage stops [m].
+        Insertion at which the stage stops [m].
     step : float
-        Insertion from one exposure to the next [m].
+        Insertion between exposures [m].
     curvature : float
-        Of the needle's path [1/m].
+        Curvature of the needle's path [1/m].
     begin : float
         Insertion of the first exposure [m].
 
     Returns
     -------
     iterator of RenderedPair
-        One exposure after the other.
+        The exposures.
 
     Raises
     ------
@@ -187,16 +187,16 @@ def render_insertion(
 
 
 def advance_to(plant: NeedlePlant, insertion: float, rotation: FloatArray) -> None:
-    """Push a needle along a random path's pieces.
+    """Insert a needle along the pieces of a random path.
 
     Parameters
     ----------
     plant : NeedlePlant
-        A single needle on that path.
+        Single needle on that path.
     insertion : float
-        How far in it is to be, at least as far as it is [m].
+        New insertion, not less than the present one [m].
     rotation : ndarray, shape (N,)
-        Of the base over each piece, as `RandomPath` has it [rad].
+        Rotation of the base over each piece, see `RandomPath` [rad].
     """
     while True:
         now = float(plant.insertion)

@@ -24,7 +24,7 @@ _BEND = 0.25
 
 
 def lamp_light(camera: SimulatedCamera) -> FloatImage:
-    """Return the light over the image: a lamp to one side, and the lens's fall-off."""
+    """Return the light over the image: a lamp to one side, and vignetting of the lens."""
     u = np.linspace(-1.0, 1.0, camera.image_width, dtype=np.float32)
     v = np.linspace(-1.0, 1.0, camera.image_height, dtype=np.float32)[:, np.newaxis]
     return np.asarray(1.0 + 0.09 * u - 0.06 * v - 0.05 * (u * u + v * v), dtype=np.float32)
@@ -33,7 +33,7 @@ def lamp_light(camera: SimulatedCamera) -> FloatImage:
 def uneven_light(
     lighting: Lighting, camera: SimulatedCamera, rng: np.random.Generator
 ) -> FloatImage:
-    """Return what multiplies the lamp's light: wide blotches, and one side in a soft shade."""
+    """Return the factor of the lamp's light: wide blotches, and one side in a soft shade."""
     size = (camera.image_width, camera.image_height)
     small = (-(-size[0] // _COARSE), -(-size[1] // _COARSE))
     field = cv2.GaussianBlur(
@@ -54,19 +54,19 @@ def uneven_light(
 
 
 def drift(lighting: Lighting, exposure_number: int, phase: float) -> float:
-    """Return what multiplies all light of one exposure; `phase` is where it starts [rad]."""
+    """Return the factor of all light in an exposure; `phase` is the initial phase [rad]."""
     angle = 2.0 * np.pi * exposure_number / lighting.drift_period + phase
     return float(1.0 + lighting.drift * np.sin(angle))
 
 
 def flicker(glints: Glints, exposure_number: int, phase: float) -> float:
-    """Return what multiplies the surface's glints in one exposure."""
+    """Return the factor of the surface glints in an exposure."""
     angle = 2.0 * np.pi * exposure_number / _FLICKER_PERIOD + phase
     return float(1.0 - glints.flicker * (0.5 + 0.5 * np.sin(angle)))
 
 
 def surface_glints(glints: Glints, optics: Optics, rng: np.random.Generator) -> FloatImage:
-    """Return what lamps add to one camera's image, lamp_reflection in the surface's unevenness."""
+    """Return the glints of lamps on the uneven surface in a camera's image."""
     width, height = optics.image_size
     count = glints.on_surface + glints.over_needle
     over = np.arange(count) >= glints.on_surface
@@ -90,7 +90,7 @@ def surface_glints(glints: Glints, optics: Optics, rng: np.random.Generator) -> 
         u = np.arange(columns.start, columns.stop) - u0
         v = (np.arange(rows.start, rows.stop) - v0)[:, np.newaxis]
         along = (np.cos(angle[i]) * u + np.sin(angle[i]) * v) / np.hypot(half_px[i], blur[i])
-        # A little bent, as water's ripples make them.
+        # Slightly bent, as by ripples.
         across = np.cos(angle[i]) * v - np.sin(angle[i]) * u + bend[i] * half_px[i] * along**2
         across /= np.hypot(slim[i] * half_px[i] / 2.0, blur[i])
         image[rows, columns] += peak[i] * np.exp(-(along**4) - across**2)
@@ -98,9 +98,9 @@ def surface_glints(glints: Glints, optics: Optics, rng: np.random.Generator) -> 
 
 
 def shaft_glints(glints: Glints, length: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return what the lamp adds to the middle of the needle at places along `rig`'s z, (M,).
+    """Return the glints on the middle of the shaft at positions along `rig`'s z, (M,).
 
-    The needle follows its own path, so that a stretch which shines once does so ever after.
+    The glints are fixed in space, because the needle follows its own path.
     """
     middle = rng.uniform(*_LENGTHS, glints.on_needle)
     half = rng.uniform(*_SHINE_LENGTHS, glints.on_needle) / 2.0
@@ -113,7 +113,7 @@ _LAMP_SIDE, _LAMP_HEIGHT, _LAMP_ALONG = (0.1, 0.3), 0.4, (0.02, 0.1)
 
 
 def place_lamp(rng: np.random.Generator) -> FloatArray:
-    """Return where a run's lamp stands: to either side above the phantom, shape (3,) [m]."""
+    """Return the position of a run's lamp, to either side above the phantom, shape (3,) [m]."""
     side = float(rng.choice([-1.0, 1.0])) * rng.uniform(*_LAMP_SIDE)
     return np.array([_LAMP_HEIGHT, side, rng.uniform(*_LAMP_ALONG)])
 
@@ -121,23 +121,28 @@ def place_lamp(rng: np.random.Generator) -> FloatArray:
 def lamp_reflection(
     line: FloatArray, camera: FloatArray, lamp: FloatArray, metal: MetalShaft
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how much of the lamp a shaft mirrors, and where across it.
+    """Return the reflection of the lamp on a bare metal shaft: its strength, and its place across.
+
+    A cylinder mirrors the lamp along the line where its normal halves the angle between lamp and
+    camera. Where the shaft bends away from that, the bright core fades and the needle is dark up to
+    its end, in one view sooner than in the other. Refraction is neglected, which moves the place of
+    fading but not its look.
 
     Parameters
     ----------
     line : ndarray, shape (M, 3)
-        Its middle line in `rig` [m].
+        Centreline of the shaft in `rig` [m].
     camera, lamp : ndarray, shape (3,)
-        Where they are in `rig` [m].
+        Positions in `rig` [m].
     metal : MetalShaft
-        Of the shaft.
+        Properties of the shaft.
 
     Returns
     -------
     share : ndarray, shape (M,)
-        Of the lamp's light, 0 to 1.
+        Share of the lamp's light, 0 to 1.
     place : ndarray, shape (M,)
-        Of the core, over the shaft's radius, positive towards `cross(ahead, to camera)`.
+        Place of the core over the shaft's radius, positive towards `cross(ahead, to camera)`.
     """
     ahead = np.gradient(line, axis=0)
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)

@@ -9,7 +9,7 @@ from needle_sim.camera.scenarios import Lens
 from needle_sim.camera.stereo_rig import SimulatedCamera, SimulatedWindow
 from needle_sim.needle.se3 import FloatArray
 
-# The slope's equation is concave and increasing: Newton is at the last digit after 3 steps.
+# The equation of the slope is concave and increasing: Newton converges in 3 steps.
 _NEWTON_STEPS = 4
 
 
@@ -22,12 +22,12 @@ def refraction_point(points: ArrayLike, centre: ArrayLike, window: SimulatedWind
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Points in `rig`, below the camera [m]. Above the face the ray is straight, and the
-        crossing is that of its extension.
+        Points in `rig`, below the camera [m]. Above the face the ray is straight, and its extension
+        crosses the face.
     centre : array_like, shape (3,)
         Centre of projection in `rig`, above the face [m].
     window : SimulatedWindow
-        What the camera looks through.
+        Window of the camera.
 
     Returns
     -------
@@ -41,8 +41,8 @@ def refraction_point(points: ArrayLike, centre: ArrayLike, window: SimulatedWind
     foot = centre - window.height(centre) * window.normal
     along = points - level[..., np.newaxis] * window.normal - foot
     distance = np.linalg.norm(along, axis=-1)
-    lengths = window.passed(level)
-    # What is above the face shortens the way in air.
+    lengths = window.layer_lengths(level)
+    # A point above the face shortens the path in air.
     straight = height - np.maximum(level - window.outer, 0.0)
 
     slope = distance / (straight + sum(t / n for t, n in zip(lengths, window.indices, strict=True)))
@@ -60,7 +60,7 @@ def refraction_point(points: ArrayLike, centre: ArrayLike, window: SimulatedWind
 
 
 def project(points: ArrayLike, camera: SimulatedCamera) -> FloatArray:
-    """Return the pixels at which a camera sees points through its window.
+    """Return the pixels of points that a camera sees through its window.
 
     Parameters
     ----------
@@ -97,19 +97,19 @@ def _distorted_pixel(x: FloatArray, y: FloatArray, camera: SimulatedCamera) -> F
 
 FloatImage = NDArray[np.float32]
 
-# Lens and pixel: an edge rises over about 2 px, as with a well focused 16 mm lens.
+# Blur of lens and pixel: an edge rises over about 2 px, as with a well focused 16 mm lens.
 SHARP_PX = 0.7
 
 
 class Optics:
-    """A camera, the window it looks through and its lens.
+    """Camera with its window and its lens.
 
     Parameters
     ----------
     camera : SimulatedCamera
-        One of the rig's.
+        Camera of the rig.
     lens : Lens or None
-        None is in focus everywhere.
+        Lens; None is in focus everywhere.
     """
 
     def __init__(self, camera: SimulatedCamera, lens: Lens | None) -> None:
@@ -133,31 +133,31 @@ class Optics:
         Parameters
         ----------
         aside, along : ndarray, shape (N,)
-            How far they are beside the needle's axis, as this camera sees it, and along it [m].
+            Offset from the needle's axis across the view of this camera, and along the axis [m].
         """
         points = aside[:, np.newaxis] * self.window.sideways
         points[:, 2] += along
         off = self.window.outer - self.window.height(points)
         return np.asarray(points + off[:, np.newaxis] * self.window.normal)
 
-    def sideways(self, line: FloatArray, half_width: float) -> FloatArray:
-        """Return the way from a line's points to its edge as this camera sees it, (M, 3) [m]."""
+    def lateral_vectors(self, line: FloatArray, half_width: float) -> FloatArray:
+        """Return vectors from a line's points to its edge in this camera's view, (M, 3) [m]."""
         sideways = np.cross(np.gradient(line, axis=0), self.centre - line)
         sideways *= half_width / np.linalg.norm(sideways, axis=1)[:, np.newaxis]
         return sideways
 
     def radius_px(self, points: FloatArray, radius: FloatArray | float) -> FloatArray:
-        """Return the radius in the image, (N,), of spheres about points, (N, 3) [px]."""
+        """Return the radii in the image, (N,), of spheres around points, (N, 3) [px]."""
         aside = np.zeros_like(points)
         aside[:, 2] = radius
         ends = self.project(np.stack([points + aside, points - aside]))
         return np.asarray(np.linalg.norm(ends[0] - ends[1], axis=-1) / 2.0)
 
     def blur_px(self, points: FloatArray) -> float | FloatArray:
-        """Return the blur's standard deviation at points (..., 3): one for all if in focus [px].
+        """Return the blur's standard deviation at points (..., 3), a single one if in focus [px].
 
-        A disk of confusion of diameter c blurs like a Gaussian of c / 4. Refraction lifts what is
-        in a layer or the phantom: its distance counts 1 / n.
+        A circle of confusion of diameter c blurs like a Gaussian of c / 4. Refraction scales the
+        apparent depth in a medium by 1 / n.
         """
         if self._lens is None:
             return SHARP_PX
@@ -170,7 +170,7 @@ class Optics:
         return np.asarray(np.hypot(SHARP_PX, confusion / 4.0))
 
     def _apparent_height(self, height: FloatArray) -> FloatArray:
-        lengths = self.window.passed(height)
+        lengths = self.window.layer_lengths(height)
         for length, index in zip(lengths, self.window.indices, strict=True):
             height = height + length * (1.0 - 1.0 / index)
         return height

@@ -1,4 +1,4 @@
-"""Stereo images of a needle in a clear phantom, as the cameras see it through its windows."""
+"""Quick renderer: stereo images of a needle in a clear phantom, refracted by its windows."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.se3 import FloatArray
 
 _LINE_SPACING = 0.0003
-# What is judged when one asks whether a camera saw the needle's end.
+# Length of the distal end for which visibility is reported [m].
 _DISTAL_LENGTH = 0.01
-# A blurred shadow needs fewer points, the last one among them.
+# A blurred shadow needs fewer points, including the last one.
 _SHADOW_PART = slice(None, None, -4)
 _NOTHING: FloatArray = np.empty((0, 3))
 
-# Streams of a seed's randomness at exposure 0: the mottle of either view, what both share (bubbles,
-# cable, light), the troubles of either view. The sensor's noise takes 0 and 1 of each exposure.
+# Random streams at exposure 0: mottle of each view, common objects (bubbles, cable, light), light
+# of each view. The sensor noise uses the streams 0 and 1 of each exposure.
 _MOTTLE_STREAMS = (2, 3)
 _SCENE_STREAM = 5
-_TROUBLE_STREAMS = (6, 7)
+_LIGHT_STREAMS = (6, 7)
 _CABLE_KEY = 1
 _SHADOW_KEY = 2
 _LAMP_KEY = 3
@@ -42,25 +42,25 @@ _PAPER_KEY = 4
 
 
 class StereoRenderer:
-    """Draws the needle as both cameras see it, refracted by their windows.
+    """Renders the needle in both cameras, refracted by their windows.
 
-    Seen are the shaft inside the phantom, dark on bright plastisol in uneven light, the entry
-    hole's rim at rig's origin and the support sheath before it, which hides the shaft outside; and
-    the scenario's troubles.
-    Refraction is that of an endless window: what little is seen before the phantom's front face is
-    drawn as if it were inside. Two renderers of one rig, seed and scenario draw the same images,
-    bit for bit, in whatever order: an image depends on the exposure's number, not on those before.
+    The images show the shaft inside the phantom, dark on bright plastisol in uneven light, the rim
+    of the entry hole at rig's origin, the support sheath in front of it, which hides the shaft
+    outside, and the disturbances of the scenario. Windows are infinite: the few objects in front of
+    the phantom's front face are drawn as if they were inside. Renderers with the same rig, seed and
+    scenario produce bit-identical images in any order, because an image depends only on the number
+    of its exposure.
 
     Parameters
     ----------
     rig : StereoRig
         Cameras and phantom.
     seed : int
-        Not negative.
+        Seed, not negative.
     needle : NeedleShape
-        What is drawn along the tip's path.
+        Shape of the needle along the tip's path.
     scenario : Scenario
-        What troubles the cameras; nothing by default.
+        Disturbances of the images; none by default.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class StereoRenderer:
                 scenario,
                 still,
                 np.random.default_rng([seed, 0, _MOTTLE_STREAMS[side]]),
-                [seed, 0, _TROUBLE_STREAMS[side]],
+                [seed, 0, _LIGHT_STREAMS[side]],
             )
             for side in (0, 1)
         )
@@ -112,10 +112,10 @@ class StereoRenderer:
         T_rig_tip : array_like, shape (4, 4)
             Pose of the tip in `rig` [m].
         centreline : array_like, shape (N, 3)
-            Path of the tip from the entry point, at distances of 1 mm or less, the tip last [m];
-            a single point draws no needle.
+            Path of the tip from the entry point, with a spacing of 1 mm or less, the tip last [m];
+            a single point means no needle.
         exposure_number : int
-            Keys the sensor's noise and all that moves or changes; not negative.
+            Key of the sensor noise and of moving objects; not negative.
 
         Returns
         -------
@@ -141,10 +141,10 @@ class StereoRenderer:
         centreline: ArrayLike,
         exposure_number: int,
     ) -> tuple[float, float]:
-        """Return which share of the needle's last 10 mm the left and the right camera see.
+        """Return the visible share of the needle's last 10 mm in the left and the right image.
 
-        What counts is hands, covers and the image's bounds: 0 is hidden, 1 is in full view; 0 too
-        where there is no needle. The arguments are those of `render`.
+        Hands, covers and the image's bounds hide the needle: 0 is hidden or absent, 1 is in full
+        view. The arguments are those of `render`.
         """
         event = self._event(exposure_number)
         moment = self._moment(T_rig_tip, centreline, exposure_number, event)
@@ -195,5 +195,5 @@ class StereoRenderer:
         )
 
     def _rng(self, key: int) -> np.random.Generator:
-        """Return randomness that is the same at every exposure."""
+        """Return a generator in the same state for every exposure."""
         return np.random.default_rng([self._seed, 0, _SCENE_STREAM, key])

@@ -1,6 +1,6 @@
-"""Troubles of the simulated cameras: named scenarios, from clean images to blocked cameras.
+"""Scenarios: named disturbances of the simulated images, from clean to blocked cameras.
 
-A scenario is data. What stands where and when follows from it, the seed and the exposure's number.
+A scenario is data; positions and times follow from it, the seed and the number of the exposure.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ class Bubbles:
     Attributes
     ----------
     count : int
-        How many.
+        Number of bubbles.
     smallest, largest : float
-        Bounds of their radii; small ones are the more frequent [m].
+        Bounds of the radii; small bubbles are more frequent [m].
     """
 
     count: int
@@ -30,22 +30,22 @@ class Bubbles:
 
 @dataclasses.dataclass(frozen=True)
 class Glints:
-    """Reflections of lamps; each camera sees others.
+    """Reflections of lamps, different in each camera.
 
     Attributes
     ----------
     on_surface : int
-        How many on the phantom's surface.
+        Number of glints on the phantom's surface.
     over_needle : int
-        How many streaks on the surface, more, that lie over the needle's way.
+        Number of additional streaks on the surface over the needle's path.
     on_needle : int
-        How many stretches of the shaft shaft_glints.
+        Number of glints on the shaft.
     largest : float
-        Longest streak [m].
+        Maximum length of a streak [m].
     brightness : float
-        Largest peak above what is there [grey levels].
+        Maximum peak above the background [grey levels].
     flicker : float
-        By which share the surface's glints come and go.
+        Relative change of the surface glints over time.
     """
 
     on_surface: int
@@ -58,18 +58,18 @@ class Glints:
 
 @dataclasses.dataclass(frozen=True)
 class Lighting:
-    """Unevenness and unsteadiness of the light.
+    """Uneven and changing light.
 
     Attributes
     ----------
     blotches : float
-        Standard deviation of the light over the phantom, as a share.
+        Relative standard deviation of the light over the phantom.
     shade : float
-        By which share one side of the image lies in something's soft shade.
+        Relative darkness of a soft shade on one side.
     drift : float
-        By which share the light swells and fades.
+        Relative amplitude of the light's drift.
     drift_period : float
-        Of the drift [exposures].
+        Period of the drift [exposures].
     """
 
     blotches: float
@@ -80,18 +80,18 @@ class Lighting:
 
 @dataclasses.dataclass(frozen=True)
 class Cable:
-    """A thin dark line, such as a cable, that moves to and fro over the phantom.
+    """Thin dark cable that moves over the phantom.
 
     Attributes
     ----------
     diameter : float
-        About the needle's, so that it looks like one [m].
+        Diameter, similar to the needle's [m].
     height : float
-        Above the phantom's surface [m].
+        Height above the phantom's surface [m].
     sway : float
-        How far it goes either way across the needle [m].
+        Amplitude of the motion across the needle [m].
     period : float
-        Of its motion [exposures].
+        Period of the motion [exposures].
     """
 
     diameter: float = 0.0007
@@ -102,18 +102,18 @@ class Cable:
 
 @dataclasses.dataclass(frozen=True)
 class FloorShadow:
-    """The needle's shadow on the phantom's floor.
+    """Shadow of the needle on the phantom's floor.
 
     Attributes
     ----------
     floor_depth : float
-        Of the floor under the surface [m].
+        Depth of the floor under the surface [m].
     darkness : float
-        Share of the light it takes.
+        Share of the light that it removes.
     largest_slant : float
-        Largest tangent of the light's angle from the vertical, across and along the needle.
+        Maximum tangent of the light's angle from the vertical, across and along the needle.
     penumbra : float
-        Width of its edge for each length of fall: a lamp is no point.
+        Width of its edge per height above the floor, due to the size of the lamp.
     """
 
     floor_depth: float = 0.035
@@ -124,18 +124,18 @@ class FloorShadow:
 
 @dataclasses.dataclass(frozen=True)
 class MetalShaft:
-    """A needle that is not painted: it mirrors a lamp along part of its shaft.
+    """Bare metal needle, which mirrors a lamp along part of its shaft.
 
     Attributes
     ----------
     rim : float
-        Where it mirrors the room [grey levels].
+        Brightness where it mirrors the room [grey levels].
     core : float
-        Where it mirrors the lamp [grey levels].
+        Brightness where it mirrors the lamp [grey levels].
     core_width : float
-        Of the lamp_reflection lamp, over the needle's.
+        Width of the mirrored lamp over that of the needle.
     spread : float
-        How far the shaft may turn until the lamp has faded to a third [rad].
+        Rotation of the shaft at which the lamp has faded to a third [rad].
     """
 
     rim: float = 70.0
@@ -151,13 +151,13 @@ class GraphPaper:
     Attributes
     ----------
     floor_depth : float
-        Of the floor under the surface [m].
+        Depth of the floor under the surface [m].
     pitch : float
-        From line to line [m].
+        Distance of the lines [m].
     line_width : float
-        Of each [m].
+        Width of the lines [m].
     grey : float
-        Of the lines [grey levels].
+        Brightness of the lines [grey levels].
     """
 
     floor_depth: float = 0.035
@@ -168,18 +168,18 @@ class GraphPaper:
 
 @dataclasses.dataclass(frozen=True)
 class Occlusion:
-    """Hands over the phantom and covered cameras, one event in every so many exposures.
+    """Hands over the phantom and covered cameras, as periodic events.
 
     Attributes
     ----------
     first : int
-        Exposures without any at the beginning.
+        Number of exposures before the first event.
     every : int
-        One event in each stretch of so many exposures [exposures].
+        Period of the events [exposures].
     length : int
-        Of an event that leaves one camera its view [exposures].
+        Duration of an event that affects one camera [exposures].
     length_both : int
-        Of an event that leaves none [exposures].
+        Duration of an event that affects both cameras [exposures].
     """
 
     first: int = 20
@@ -190,13 +190,13 @@ class Occlusion:
 
 @dataclasses.dataclass(frozen=True)
 class Lens:
-    """A lens that is not focused on the needle; a thin lens's circle of confusion.
+    """Defocused thin lens, with its circle of confusion.
 
     Attributes
     ----------
     focus_height : float
-        Of what is sharp: from the needle's entry towards the camera, along its window's normal; x
-        in `rig` for cameras above [m].
+        Height of the focal plane above the needle's entry, along the window's normal towards the
+        camera; x in `rig` for cameras above [m].
     aperture : float
         Diameter of the entrance pupil [m].
     """
@@ -207,20 +207,20 @@ class Lens:
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """All troubles of the images of one run.
+    """Disturbances of the images of a run.
 
     Attributes
     ----------
     name : str
-        As in `SCENARIOS`.
+        Name in `SCENARIOS`.
     summary : str
-        One line for a person.
+        One line for the user.
     noise : float
-        Standard deviation of the sensor's noise [grey levels].
+        Standard deviation of the sensor noise [grey levels].
     needle : bool
-        Whether there is a needle to be seen.
+        Whether the images show a needle.
     bubbles, glints, lighting, cable, shadow, occlusion, lens, metal, paper
-        The troubles; None where there are none.
+        The disturbances; None if absent.
 
     Raises
     ------
@@ -310,7 +310,7 @@ _ALL = (
     ),
 )
 SCENARIOS = {scenario.name: scenario for scenario in _ALL}
-"""The named scenarios."""
+"""Name to scenario."""
 
 
 def find_scenario(name: str) -> Scenario:
@@ -319,7 +319,7 @@ def find_scenario(name: str) -> Scenario:
     Raises
     ------
     UserError
-        If there is none of this name.
+        If the name is unknown.
     """
     try:
         return SCENARIOS[name]

@@ -18,18 +18,18 @@ from needle_sim.needle.se3 import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class SimulatedWindow:
-    """Parallel faces, with a layer between each and the next, and the phantom behind the last.
+    """Window: parallel faces with a layer between each pair, and the phantom behind the last one.
 
     Parameters
     ----------
     normal : ndarray, shape (3,)
         Unit vector in `rig`, towards the camera.
     outer : float
-        Of the outer face: the coordinate along the normal, from `rig`'s origin [m].
+        Coordinate of the outer face along the normal, from `rig`'s origin [m].
     thicknesses : tuple of float
-        Of the layers, from outside inwards [m].
+        Thicknesses of the layers, from outside inwards [m].
     indices : tuple of float
-        Refractive indices of the layers, and last of the phantom.
+        Refractive indices of the layers, the last one of the phantom.
     """
 
     normal: FloatArray
@@ -46,8 +46,8 @@ class SimulatedWindow:
         """Return the coordinates (...,) along the normal of points (..., 3) in `rig` [m]."""
         return np.asarray(points, dtype=np.float64) @ self.normal
 
-    def passed(self, height: FloatArray) -> list[FloatArray]:
-        """Return how much of each layer, and of the phantom, is above points of that height [m]."""
+    def layer_lengths(self, height: FloatArray) -> list[FloatArray]:
+        """Return the thickness of each layer, and of the phantom, above points of a height [m]."""
         left = np.maximum(self.outer - height, 0.0)
         lengths = []
         for thickness in self.thicknesses:
@@ -62,21 +62,21 @@ class SimulatedWindow:
         return np.asarray(across / np.linalg.norm(across))
 
 
-_LARGEST_SIDE_PX = 20_000
+_MAX_SIDE_PX = 20_000
 _INDICES = (1.0, 3.0)  # refractive
-_HALF_HEIGHT = 0.0175  # of a phantom that no window ends above [m]
-_FACING = 0.75  # of a window's normal: the part along the axis that it faces
-_LEAST_ACROSS = 0.3  # of a window's normal: the part across the needle
+_HALF_HEIGHT = 0.0175  # of a phantom without a window above [m]
+_FACING = 0.75  # minimum component of a window's normal along the axis that it faces
+_MIN_ACROSS = 0.3  # minimum component of a window's normal across the needle
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCamera:
-    """One calibrated camera.
+    """Calibrated camera.
 
     Parameters
     ----------
     image_width, image_height : int
-        Size of its images [px].
+        Size of the images [px].
     camera_matrix : ndarray, shape (3, 3)
         Pinhole matrix [px].
     distortion : ndarray, shape (5,)
@@ -84,7 +84,7 @@ class SimulatedCamera:
     T_optical_rig : ndarray, shape (4, 4)
         Rig to optical frame (REP 103) [m].
     window : SimulatedWindow
-        What it looks through.
+        Window of the camera.
     """
 
     image_width: int
@@ -103,12 +103,12 @@ class SimulatedCamera:
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
-    """Two cameras that look at a phantom, each through its window.
+    """Two cameras that look into a phantom, each through its window.
 
     Parameters
     ----------
     left, right : SimulatedCamera
-        The pair.
+        Left and right camera.
     """
 
     left: SimulatedCamera
@@ -116,19 +116,19 @@ class StereoRig:
 
     @property
     def half_height(self) -> float:
-        """Reach of the phantom up and down from the needle's axis, along x [m]."""
+        """Distance from the needle's axis to the phantom's top and bottom, along x [m]."""
         return self._reach(0, _HALF_HEIGHT)
 
     @property
     def half_width(self) -> float:
-        """Reach of the phantom to both sides, along y [m]."""
+        """Distance from the needle's axis to the phantom's sides, along y [m]."""
         return self._reach(1, math.inf)
 
-    def _reach(self, axis: int, unseen: float) -> float:
-        """Return how far a window that faces this way is, or what is taken without one."""
+    def _reach(self, axis: int, default: float) -> float:
+        """Return the distance of the nearest window that faces this axis, or the default."""
         windows = (self.left.window, self.right.window)
         facing = [w for w in windows if abs(w.normal[axis]) >= _FACING]
-        return min((w.inner / abs(float(w.normal[axis])) for w in facing), default=unseen)
+        return min((w.inner / abs(float(w.normal[axis])) for w in facing), default=default)
 
 
 def load_stereo_rig(path: Path | str) -> StereoRig:
@@ -142,12 +142,12 @@ def load_stereo_rig(path: Path | str) -> StereoRig:
     Returns
     -------
     StereoRig
-        What it says.
+        Content of the file.
 
     Raises
     ------
     UserError
-        If it cannot be read or says something that cannot be, naming file, key and value.
+        If it cannot be read or a value is invalid; the message has file, key and value.
     """
     path = Path(path)
     text = read_calibration(path)
@@ -162,7 +162,7 @@ def load_stereo_rig(path: Path | str) -> StereoRig:
 
 
 class _Entries:
-    """Entries of the file, or of a part of it, which complain by the name that they have there."""
+    """Entries of the file or of a part of it, whose errors contain the full key."""
 
     def __init__(self, value: object, name: str = "") -> None:
         if not isinstance(value, Mapping):
@@ -198,7 +198,7 @@ class _Entries:
         return value
 
     def pixels(self, key: str) -> int:
-        value = self.number(key, 1, _LARGEST_SIDE_PX, "px")
+        value = self.number(key, 1, _MAX_SIDE_PX, "px")
         if not value.is_integer():
             raise UserError(f"{self.name(key)} = {value:g} px is no whole number")
         return int(value)
@@ -239,7 +239,7 @@ def _stereo_rig(top: _Entries) -> StereoRig:
 
 
 def _window_of(top: _Entries, own: _Entries) -> SimulatedWindow:
-    """Return what a camera looks through: its own window, or the phantom's surface."""
+    """Return the window of a camera: its own one, or the phantom's surface."""
     if ("phantom" in top) == ("window" in own):
         what = "beside phantom" if "phantom" in top else "is missing, and so phantom is missing"
         raise UserError(
@@ -257,7 +257,7 @@ def _window_of(top: _Entries, own: _Entries) -> SimulatedWindow:
     if abs(length - 1.0) > 0.01:
         raise UserError(f"{window.name('normal')} has length {length:g}, not 1")
     normal = normal / length
-    if np.linalg.norm(normal[:2]) < _LEAST_ACROSS:
+    if np.linalg.norm(normal[:2]) < _MIN_ACROSS:
         raise UserError(f"{window.name('normal')} = {normal.tolist()} lies along the needle")
     layers = window.parts("layers")
     thicknesses = tuple(layer.number("thickness", ABOVE_0, unit="m") for layer in layers)

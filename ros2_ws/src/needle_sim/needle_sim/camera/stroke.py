@@ -1,4 +1,4 @@
-"""A blurred stroke of exact width and ends, as a lens shows a thin tube: pixels and coverage."""
+"""Blurred stroke with exact width and ends, as the image of a thin tube: pixels and coverage."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ _OVERLAP_PX = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Stroke:
-    """The pixels a stroke touches.
+    """Pixels covered by a stroke.
 
     Parameters
     ----------
     row, column : ndarray of int, shape (N,)
-        The pixels; one may be named twice, with all but the same values.
+        Pixels; a pixel may occur twice, with nearly the same values.
     sample : ndarray of int, shape (N,)
-        Which point of the middle line answers for the pixel.
+        Index of the centreline point that belongs to the pixel.
     across : ndarray, shape (N,)
-        Distance from the middle line over the half width; 1 is the edge.
+        Distance from the centreline over the half width; 1 is the edge.
     coverage : ndarray, shape (N,)
         Share of the pixel's light that comes from the stroke, 0..1.
     """
@@ -41,19 +41,19 @@ def stroke(
     blur: float | FloatArray,
     image_size: tuple[int, int],
 ) -> Stroke:
-    """Return what a line of given width with square ends covers under a Gaussian blur.
+    """Return the coverage of a line with square ends under a Gaussian blur.
 
-    The blurred edge is exact for a straight stroke, so that half coverage lies on the true edge
-    and on the true end, to a few thousandths of a pixel.
+    The blurred edge is exact for a straight stroke: the contour of half coverage agrees with the
+    true edge and end within a few thousandths of a pixel.
 
     Parameters
     ----------
     line : ndarray, shape (M, 2)
-        Middle line u, v, at distances of a few px [px].
+        Centreline u, v, with a spacing of a few px [px].
     half_width : ndarray, shape (M,)
-        Half the width along it [px].
+        Half width along it [px].
     blur : float or ndarray, shape (M,)
-        Standard deviation of the blur, the pixel's own area included [px].
+        Standard deviation of the blur, including the pixel's area [px].
     image_size : tuple of int
         Width and height of the image [px].
 
@@ -65,7 +65,7 @@ def stroke(
     step = np.linalg.norm(np.diff(line, axis=0), axis=1)
     tangent = np.gradient(line, np.concatenate([[0.0], np.cumsum(step)]), axis=0)
     tangent /= np.linalg.norm(tangent, axis=1)[:, np.newaxis]
-    # How far along its tangent each sample answers for pixels; the end samples for what is beyond.
+    # Range along its tangent in which pixels belong to a sample; it is longer at the ends.
     blurs = np.broadcast_to(np.asarray(blur, dtype=np.float64), half_width.shape)
     reach = int(np.ceil(half_width.max() + 3.5 * blurs.max() + step.max() / 2.0 + _OVERLAP_PX))
     ahead = np.append(step / 2.0 + _OVERLAP_PX, 4.0 * blurs[-1])

@@ -1,4 +1,4 @@
-"""One camera's image: what never moves in it, and what one exposure draws over that."""
+"""Image of one camera: a static background, and the moving objects of each exposure."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ _CABLE = 40.0
 _HAND = 118.0
 _HAND_EDGE = 62.0
 _COVER = 24.0
-# The sensor's noise at 65536 equally likely levels: one 16-bit draw a pixel takes a third of the
-# time of a normal one.
+# Sensor noise at 65536 equally likely levels: a 16-bit draw takes a third of the time of a normal
+# one.
 _NORMAL_TABLE = ndtri((np.arange(65536) + 0.5) / 65536.0)
 _NOISE_BAND_ROWS = 32
 _MOTTLE = 1.5
@@ -48,7 +48,7 @@ _SHEATH_LENGTH = 0.04
 _SHEATH_DIAMETER = 0.003
 _RIM_LENGTH = 0.0044
 _RIM_DIAMETER = 0.0012
-# Hands are near the lens and drawn this much coarser.
+# Hands are near the lens and drawn at this coarser resolution.
 _HAND_COARSE = 4
 _HAND_EDGE_PX = 7.0
 _HAND_ROUND_PX = 45.0
@@ -56,20 +56,20 @@ _HAND_ROUND_PX = 45.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SceneState:
-    """Content of one exposure, in `rig`; the same for both cameras.
+    """Moving objects of an exposure, in `rig`; the same for both cameras.
 
     Attributes
     ----------
     number : int
-        Of the exposure.
+        Number of the exposure.
     needle, shadow, cable : ndarray, shape (M, 3)
-        Middle lines [m]; empty where there is none.
+        Centrelines [m]; empty if absent.
     diameter, cable_diameter : float
-        Of needle and cable [m].
+        Diameters of needle and cable [m].
     shadow_fall : ndarray, shape (M,)
-        How high above the floor what throws the shadow is [m].
+        Height above the floor of the point that casts each shadow point [m].
     hand : list of (ndarray (3,), ndarray (3,), float)
-        Capsules: from, to, radius [m].
+        Capsules of a hand: end points, radius [m].
     """
 
     number: int
@@ -84,16 +84,16 @@ class SceneState:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StaticScene:
-    """Content that never moves, in `rig`; the same for both cameras.
+    """Static objects, in `rig`; the same for both cameras.
 
     Attributes
     ----------
     bubbles : BubbleCloud or None
-        In the phantom.
+        Bubbles in the phantom.
     lamp : ndarray, shape (3,)
-        What a metal needle mirrors [m].
+        Position of the lamp that a metal needle mirrors [m].
     lines : list of ndarray, shape (M, 3)
-        On the paper under the phantom [m].
+        Lines of the paper under the phantom [m].
     """
 
     bubbles: BubbleCloud | None
@@ -102,20 +102,20 @@ class StaticScene:
 
 
 class View:
-    """One camera's light, what never moves in its image, and what is drawn over it.
+    """Renders the images of one camera.
 
     Parameters
     ----------
     optics : Optics
-        The camera.
+        Optics of the camera.
     scenario : Scenario
-        What troubles it.
+        Disturbances of the images.
     scene : StaticScene
-        What it looks at.
-    still : numpy.random.Generator
-        For the phantom's mottle.
-    trouble_key : list of int
-        Keys the randomness of this camera's light and glints.
+        Static objects.
+    mottle_rng : numpy.random.Generator
+        Generator of the phantom's mottle.
+    light_seed : list of int
+        Seed of this camera's light and glints.
     """
 
     def __init__(
@@ -123,14 +123,14 @@ class View:
         optics: Optics,
         scenario: Scenario,
         scene: StaticScene,
-        still: np.random.Generator,
-        trouble_key: list[int],
+        mottle_rng: np.random.Generator,
+        light_seed: list[int],
     ) -> None:
         self._optics = optics
         self._scenario = scenario
         self._noise_table = (scenario.noise * _NORMAL_TABLE).astype(np.float32)
-        rng = np.random.default_rng(trouble_key)
-        self._shine_key = [*trouble_key, 1]
+        rng = np.random.default_rng(light_seed)
+        self._glint_seed = [*light_seed, 1]
         self._phase = float(rng.uniform(0.0, 2.0 * np.pi))
         self._light = lamp_light(optics.camera)
         if scenario.lighting is not None:
@@ -140,7 +140,7 @@ class View:
         if scene.bubbles is not None:
             self._bubbles = draw_bubbles(scene.bubbles, optics)
             self._bubbles.added[:] *= self._light
-        self._background = self._still_scene(still)
+        self._background = self._draw_background(mottle_rng)
         self._glints: FloatImage | None = None
         if scenario.glints is not None:
             self._glints = surface_glints(scenario.glints, optics, rng)
@@ -153,13 +153,13 @@ class View:
         Parameters
         ----------
         moment : SceneState
-            What there is to see.
+            Moving objects.
         covered : bool
-            Whether something covers the lens.
+            Whether the lens is covered.
         drift_phase : float
-            Where the light's drift starts [rad].
+            Initial phase of the light's drift [rad].
         rng : numpy.random.Generator
-            For the sensor's noise.
+            Generator of the sensor noise.
         """
         if covered:
             image = np.asarray(_COVER * self._light, dtype=np.float32)
@@ -169,15 +169,15 @@ class View:
         lighting = self._scenario.lighting
         if lighting is not None:
             image *= np.float32(drift(lighting, moment.number, drift_phase))
-        # In bands that stay in the cache: large temporaries cost more than the noise itself.
+        # In bands that fit into the cache, because large temporaries cost more than the noise.
         for top in range(0, len(image), _NOISE_BAND_ROWS):
             band = image[top : top + _NOISE_BAND_ROWS]
             band += self._noise_table.take(rng.integers(0, 65536, band.shape, dtype=np.uint16))
-        # Rounds and saturates.
+        # convertScaleAbs rounds and saturates.
         return np.asarray(cv2.convertScaleAbs(cv2.max(image, 0.0)), dtype=np.uint8)
 
     def visible_share(self, points: FloatArray, moment: SceneState) -> float:
-        """Return the share of points (M, 3) in `rig` that are in the image and under no hand."""
+        """Return the share of points (M, 3) in `rig` that are in the image and not under a hand."""
         width, height = self._optics.image_size
         pixels = self._optics.project(points)
         seen = np.all((pixels >= 0.0) & (pixels <= [width - 1, height - 1]), axis=1)
@@ -210,13 +210,13 @@ class View:
             )
             image += mask * (skin * self._light - image)
 
-    def _still_scene(self, rng: np.random.Generator) -> FloatImage:
+    def _draw_background(self, rng: np.random.Generator) -> FloatImage:
         image = np.full(self._light.shape, _PHANTOM, dtype=np.float32)
         mottle = cv2.GaussianBlur(
             rng.standard_normal(image.shape, dtype=np.float32), (0, 0), _MOTTLE_SIZE_PX
         )
         image += _MOTTLE * mottle / mottle.std()
-        # The bench before the phantom's front face, up to the upper edge of that face.
+        # The bench in front of the phantom, up to the upper edge of its front face.
         edge = self._optics.points_on_face(np.array([-0.1, 0.1]), np.zeros(2))
         beside = edge - [0.0, 0.0, 0.1]
         outline = np.rint(self._optics.project(np.concatenate([edge, beside[::-1]])))
@@ -247,20 +247,20 @@ class View:
         grey: float,
         is_needle: bool = False,
     ) -> None:
-        """Draw a tube, over what lies behind it and under the bubbles above it."""
+        """Draw a tube in front of the background and behind the bubbles above it."""
         tube = self._stroke(line, diameter, self._optics.blur_px(line))
         pixels = (tube.row, tube.column)
         metal = self._scenario.metal
         if is_needle and metal is not None:
             colour = self._mirroring(line, diameter, tube, metal) * self._light[pixels]
         else:
-            # Dark at its edges, a soft reflection of the light along its middle.
+            # Dark edges, and a soft reflection along the middle.
             colour = grey * (0.8 + 0.6 * np.exp(-((tube.across / 0.5) ** 2)))
             colour *= self._light[pixels]
         if is_needle:
             glints = self._scenario.glints
             if glints is not None:
-                bright = shaft_glints(glints, line[:, 2], np.random.default_rng(self._shine_key))
+                bright = shaft_glints(glints, line[:, 2], np.random.default_rng(self._glint_seed))
                 colour += bright[tube.sample] * np.exp(-((tube.across / 0.45) ** 2))
             if self._bubbles is not None:
                 above = self._bubbles.height[pixels] > self._optics.window.height(line)[tube.sample]
@@ -271,10 +271,10 @@ class View:
     def _mirroring(
         self, line: FloatArray, diameter: float, tube: Stroke, metal: MetalShaft
     ) -> FloatArray:
-        """Return what a bare needle mirrors at a stroke's pixels [grey levels]."""
+        """Return the grey levels of a bare metal needle at a stroke's pixels."""
         share, place = lamp_reflection(line, self._optics.centre, self._scene.lamp, metal)
-        # A stroke counts to the left of its way as the image has it, a shaft as the camera does.
-        edge = self._optics.project(line + self._optics.sideways(line, diameter / 2.0))
+        # The sign across a stroke is defined in the image, that across a shaft in space.
+        edge = self._optics.project(line + self._optics.lateral_vectors(line, diameter / 2.0))
         middle = self._optics.project(line)
         ahead, beside = np.gradient(middle, axis=0), edge - middle
         side = np.sign(ahead[:, 0] * beside[:, 1] - ahead[:, 1] * beside[:, 0])
@@ -282,22 +282,22 @@ class View:
         return np.asarray(metal.rim + (metal.core - metal.rim) * share[tube.sample] * core)
 
     def _draw_shadow(self, image: FloatImage, moment: SceneState) -> None:
-        trouble = self._scenario.shadow
-        assert trouble is not None
+        shadow = self._scenario.shadow
+        assert shadow is not None
         line = moment.shadow
         px_per_m = self._optics.radius_px(line, 1e-3) / 1e-3
-        penumbra = trouble.penumbra * moment.shadow_fall * px_per_m
+        penumbra = shadow.penumbra * moment.shadow_fall * px_per_m
         seen = self._stroke(line, moment.diameter, np.hypot(self._optics.blur_px(line), penumbra))
         pixels = (seen.row, seen.column)
-        dark = image[pixels] * (1.0 - trouble.darkness * seen.coverage)
+        dark = image[pixels] * (1.0 - shadow.darkness * seen.coverage)
         if self._bubbles is not None:
-            # What a bubble above reflects is in no shadow.
+            # The reflection of a bubble above is not in the shadow.
             added = self._bubbles.added[pixels]
-            dark = added + (image[pixels] - added) * (1.0 - trouble.darkness * seen.coverage)
+            dark = added + (image[pixels] - added) * (1.0 - shadow.darkness * seen.coverage)
         image[pixels] = dark
 
     def _stroke(self, line: FloatArray, diameter: float, blur: float | FloatArray) -> Stroke:
-        sideways = self._optics.sideways(line, diameter / 2.0)
+        sideways = self._optics.lateral_vectors(line, diameter / 2.0)
         middle, edge, other_edge = self._optics.project(
             np.stack([line, line + sideways, line - sideways])
         )
@@ -305,7 +305,7 @@ class View:
         return stroke(middle, half_width, blur, self._optics.image_size)
 
     def _hand_mask(self, moment: SceneState) -> FloatImage:
-        """Return which share of each pixel a hand takes."""
+        """Return the share of each pixel that a hand covers."""
         width, height = self._optics.image_size
         small = np.zeros((-(-height // _HAND_COARSE), -(-width // _HAND_COARSE)), dtype=np.float32)
         for begin, end, radius in moment.hand:

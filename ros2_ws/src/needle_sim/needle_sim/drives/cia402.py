@@ -9,7 +9,7 @@ from needle_sim.bus.object_dictionary import Kind, ObjectDictionary
 
 
 class PowerState(enum.Enum):
-    """A state, with its bits of the statusword (bits 0..3, 5 and 6)."""
+    """Power state, with its bits of the statusword (bits 0..3, 5 and 6)."""
 
     NOT_READY = 0x00
     SWITCH_ON_DISABLED = 0x40
@@ -22,7 +22,7 @@ class PowerState(enum.Enum):
 
 
 class PowerCommand(enum.Enum):
-    """Orders of a controlword to the power state: (mask, value)."""
+    """Commands of a controlword to the power state machine: (mask, value)."""
 
     DISABLE_VOLTAGE = (0x02, 0x00)
     QUICK_STOP = (0x06, 0x02)
@@ -34,11 +34,11 @@ class PowerCommand(enum.Enum):
 FAULT_RESET = 0x80
 
 _S, _O = PowerState, PowerCommand
-# The numbers are those of the standard's figure.
+# The numbers are those of the figure in the standard.
 TRANSITIONS: dict[tuple[PowerState, PowerCommand], PowerState] = {
     (_S.SWITCH_ON_DISABLED, _O.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 2
     (_S.READY_TO_SWITCH_ON, _O.SWITCH_ON): _S.SWITCHED_ON,  # 3
-    # As most drives do: 3 and 4 in one.
+    # Transitions 3 and 4 at once, like most drives.
     (_S.READY_TO_SWITCH_ON, _O.ENABLE_OPERATION): _S.OPERATION_ENABLED,
     (_S.SWITCHED_ON, _O.ENABLE_OPERATION): _S.OPERATION_ENABLED,  # 4
     (_S.OPERATION_ENABLED, _O.SWITCH_ON): _S.SWITCHED_ON,  # 5
@@ -56,18 +56,18 @@ TRANSITIONS: dict[tuple[PowerState, PowerCommand], PowerState] = {
 
 
 def decode_command(controlword: int) -> PowerCommand | None:
-    """Return what a controlword asks for; None for a pattern that asks for nothing."""
-    for order in PowerCommand:
-        mask, value = order.value
+    """Return the command of a controlword; None if it has none."""
+    for command in PowerCommand:
+        mask, value = command.value
         if controlword & mask == value:
-            return order
+            return command
     return None
 
 
 def next_state(state: PowerState, controlword: int) -> PowerState:
-    """Return the state that a controlword leads to; most lead nowhere."""
-    order = decode_command(controlword)
-    return state if order is None else TRANSITIONS.get((state, order), state)
+    """Return the next state after a controlword."""
+    command = decode_command(controlword)
+    return state if command is None else TRANSITIONS.get((state, command), state)
 
 
 PROFILE_POSITION = 1
@@ -92,20 +92,20 @@ _VERSION = b"1.0"
 def drive_dictionary(
     name: str, device_type: int, number: int, *, counts_per_unit: float, rpm: float | None
 ) -> ObjectDictionary:
-    """Return the dictionary of one drive.
+    """Return the object dictionary of a drive.
 
     Parameters
     ----------
     name : str
-        Its axis; part of the device's name.
+        Name of the axis, part of the device name.
     device_type : int
         Object 0x1000.
     number : int
-        Its serial number.
+        Serial number.
     counts_per_unit : float
-        Sets speeds and ramps after power-up to something slow.
+        Scale of the slow speeds and ramps after power-up.
     rpm : float or None
-        One rpm of the motor [counts/s], for a drive that takes speeds in it; None: counts/s.
+        One rpm of the motor [counts/s], for a drive with speeds in rpm; None: counts/s.
     """
     objects = ObjectDictionary()
     add = objects.add

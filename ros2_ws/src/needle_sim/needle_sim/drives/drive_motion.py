@@ -15,9 +15,9 @@ from needle_sim.drives.cia402 import (
 from needle_sim.drives.motion_profile import METHODS, Demand, Homing
 from needle_sim.drives.motor import Motor
 
-# Motion is computed in steps of so much [s].
+# Time step of the motion [s].
 MOTION_STEP = 0.001
-# Bits of the controlword and of the statusword that belong to the mode.
+# Mode-specific bits of the controlword and of the statusword.
 NEW_SET_POINT = HOMING_START = 1 << 4
 _AT_ONCE, _RELATIVE = 1 << 5, 1 << 6
 HALT = 1 << 8
@@ -28,7 +28,7 @@ _NO_WINDOW = 0xFFFFFFFF
 
 
 class LimitAction(enum.Enum):
-    """Answers of a drive to a target beyond its software limits (0x607D)."""
+    """Reactions of a drive to a target beyond its software limits (0x607D)."""
 
     CLAMP = "clamp"
     FAULT = "fault"
@@ -36,22 +36,24 @@ class LimitAction(enum.Enum):
 
 
 class LimitExceededError(Exception):
-    """A target beyond the software limits, and the drive is set to fail for it."""
+    """Target beyond the software limits, for which the drive is configured to fault."""
 
 
 class DriveMotion:
-    """Moves a motor as the objects of its drive say. Positions are the motor's true counts.
+    """Motion of a powered drive: modes, ramps, limits and following error.
+
+    Positions are true counts of the motor.
 
     Parameters
     ----------
     objects : ObjectDictionary
-        The drive's.
+        Objects of the drive.
     motor : Motor
-        What moves.
+        Motor to move.
     limit_action : LimitAction
-        For a target beyond the software limits; they act once the drive is homed.
+        Reaction to a target beyond the software limits, which act once the drive is homed.
     speed_unit : float
-        Counts/s in one unit of the drive's speeds, counts/s^2 in one of its ramps.
+        Unit of the drive's speeds [counts/s] and ramps [counts/s^2].
     """
 
     def __init__(
@@ -77,86 +79,86 @@ class DriveMotion:
     # ---- power --------------------------------------------------------------------------------
 
     def power_up(self) -> None:
-        """Begin un-homed and count from where the motor stands."""
+        """Power up: un-homed, and counting from the present position."""
         self.switch_off()
         self._zero = self._motor.position
         self._mode = self._word = 0
         self._homed = self._homing_failed = self._limited = False
 
     def switch_off(self) -> None:
-        """Let go of the motor: the friction of screw and gear holds it at once."""
+        """Switch the motor off; the friction of screw and gear holds it."""
         self._motor.rest()
         self._demand.hold(self._motor.position)
-        self.forget()
+        self.clear_targets()
 
-    def forget(self) -> None:
-        """Drop every order to move; what moves needs a ramp still."""
+    def clear_targets(self) -> None:
+        """Drop all targets; a present motion still needs a ramp."""
         self._target = self._next_target = self._homing = None
         self._late = 0.0
 
-    # ---- orders -------------------------------------------------------------------------------
+    # ---- commands -----------------------------------------------------------------------------
 
     def set_mode(self, mode: int) -> None:
-        """Take the mode of operation."""
+        """Set the mode of operation."""
         if mode != self._mode:
             self._mode = mode
-            self.forget()
+            self.clear_targets()
             self._objects.set(0x6061, 0, mode)
 
     def apply_controlword(self, word: int, *, enabled: bool) -> None:
-        """Take the controlword's bits for the mode, `enabled` or not.
+        """Apply the mode-specific bits of the controlword, if operation is enabled.
 
         Raises
         ------
         LimitExceededError
-            If they order a target beyond the limits.
+            If they start a motion to a target beyond the limits.
         """
         rising = word & ~self._word
         self._word = word
         if not enabled:
             return
         if self._mode == PROFILE_POSITION and rising & NEW_SET_POINT:
-            self._take_profile_target(word)
+            self._start_profile_motion(word)
         elif self._mode == HOMING and rising & HOMING_START:
-            self._begin_homing()
+            self._start_homing()
         elif self._mode == HOMING and not word & HOMING_START:
             self._homing = None
 
     def apply_set_point(self) -> None:
-        """Take the target of cyclic synchronous position mode; the way to it ends there.
+        """Apply the target of cyclic synchronous position mode; the motion ends there.
 
         Raises
         ------
         LimitExceededError
-            If it is beyond the limits.
+            If the target is beyond the limits.
         """
         if self._mode != CYCLIC_SYNCHRONOUS_POSITION or self._halted:
             return
         target = self._within_limits(self._objects.value(TARGET_POSITION))
         if target is None:
             return
-        way = target + self._zero - self._demand.position
-        if self._is_blocked(way):
+        distance = target + self._zero - self._demand.position
+        if self._is_blocked(distance):
             self._limited = True
-        elif way != 0.0:
+        elif distance != 0.0:
             self._demand.begin_segment(target + self._zero, self.interpolation_period)
 
     # ---- time ---------------------------------------------------------------------------------
 
     @property
     def interpolation_period(self) -> float:
-        """Time that the way to a cyclic set-point takes, 0x60C2 [s]."""
+        """Duration of the motion to a cyclic set-point, 0x60C2 [s]."""
         period = self._objects.value(0x60C2, 1) * 10.0 ** self._objects.value(0x60C2, 2)
         return float(max(period, MOTION_STEP))
 
     @property
     def at_rest(self) -> bool:
-        """Tell whether the demand stands, whatever the motor does."""
+        """Whether the demand rests, independent of the motor."""
         return self._demand.at_rest
 
     @property
     def settled(self) -> bool:
-        """Tell whether time alone would change nothing."""
+        """Whether the state stays constant without further commands."""
         return (
             self._demand.at_rest
             and self._motor.position == self._demand.position
@@ -165,14 +167,14 @@ class DriveMotion:
         )
 
     def rest(self) -> bool:
-        """Let time go by while nothing moves; returns whether something did until now."""
+        """Rest for one step; return whether the motor moved before."""
         moved = self._motor.velocity != 0.0 or self._late != 0.0
         self._motor.rest()
         self._late = 0.0
         return moved
 
     def operate(self, period: float) -> None:
-        """Move the demand on for `period` [s] in the present mode."""
+        """Advance the demand by `period` [s] in the present mode."""
         demand = self._demand
         if self._homing is None and self._is_blocked(demand.velocity):
             self.brake(0x6085, period)
@@ -191,21 +193,21 @@ class DriveMotion:
             self.brake(0x6084, period)
 
     def brake(self, ramp: int, period: float) -> None:
-        """Slow the demand down along the ramp in object `ramp`."""
+        """Decelerate the demand along the ramp in object `ramp`."""
         self._demand.brake(self._speed(ramp), period)
 
     def follow(self, period: float) -> bool:
-        """Move the motor for `period` [s]; returns whether it is too far off for too long."""
+        """Move the motor for `period` [s]; return whether the following error lasts too long."""
         self._motor.follow(self._demand.position, period)
         window = self._objects.value(0x6065)
-        off = abs(self._demand.position - self._motor.position)
-        self._late = self._late + period if off > window and window != _NO_WINDOW else 0.0
+        error = abs(self._demand.position - self._motor.position)
+        self._late = self._late + period if error > window and window != _NO_WINDOW else 0.0
         return self._late > self._objects.value(0x6066) * 1e-3
 
-    # ---- what a master reads ------------------------------------------------------------------
+    # ---- objects for the master ---------------------------------------------------------------
 
-    def show(self, *, enabled: bool) -> int:
-        """Bring the objects up to date; returns the statusword's bits of the mode."""
+    def update_objects(self, *, enabled: bool) -> int:
+        """Update the objects; return the mode-specific bits of the statusword."""
         put, motor = self._objects.set, self._motor
         position = round(motor.position - self._zero)
         demanded = round(self._demand.position - self._zero)
@@ -219,35 +221,35 @@ class DriveMotion:
         return self._status_bits(enabled=enabled)
 
     def _status_bits(self, *, enabled: bool) -> int:
-        rests = self._demand.at_rest
+        at_rest = self._demand.at_rest
         reached = bit_12 = bit_13 = False
         if self._mode == PROFILE_POSITION:
-            reached = self._target is None and rests
+            reached = self._target is None and at_rest
             bit_12, bit_13 = bool(self._word & NEW_SET_POINT), self._late > 0.0
         elif self._mode == HOMING:
-            reached = self._homing is None and rests
+            reached = self._homing is None and at_rest
             bit_12, bit_13 = self._homed, self._homing_failed
         elif self._mode == CYCLIC_SYNCHRONOUS_POSITION:
             bit_12, bit_13 = enabled, self._late > 0.0
         return self._limited * _LIMITED | reached * _REACHED | bit_12 * _BIT_12 | bit_13 * _BIT_13
 
-    # ---- inside -------------------------------------------------------------------------------
+    # ---- details ------------------------------------------------------------------------------
 
     def _speed(self, index: int, subindex: int = 0) -> float:
-        """Return an object that holds a speed [counts/s] or a ramp [counts/s^2]."""
+        """Return a speed object in counts/s, or a ramp object in counts/s^2."""
         return self._objects.value(index, subindex) * self._speed_unit
 
     @property
     def _halted(self) -> bool:
         return bool(self._word & HALT)
 
-    def _is_blocked(self, way: float) -> bool:
-        """Tell whether a limit switch lies in that direction."""
-        return (way < 0.0 and self._motor.at_negative_switch) or (
-            way > 0.0 and self._motor.at_positive_switch
+    def _is_blocked(self, direction: float) -> bool:
+        """Return whether a limit switch blocks a direction."""
+        return (direction < 0.0 and self._motor.at_negative_switch) or (
+            direction > 0.0 and self._motor.at_positive_switch
         )
 
-    def _take_profile_target(self, word: int) -> None:
+    def _start_profile_motion(self, word: int) -> None:
         value = self._objects.value
         start = value(POSITION) if word & _RELATIVE else 0
         target = self._within_limits(start + value(TARGET_POSITION))
@@ -258,7 +260,7 @@ class DriveMotion:
         else:
             self._next_target = target + self._zero
 
-    def _begin_homing(self) -> None:
+    def _start_homing(self) -> None:
         value = self._objects.value
         self._homing_failed = value(0x6098) not in METHODS
         if self._homing_failed:
@@ -280,7 +282,7 @@ class DriveMotion:
             self._homing = None
 
     def _within_limits(self, target: int) -> int | None:
-        """Return the target as the software limits leave it; None for one that is not taken."""
+        """Return the target after the software limits; None if it is rejected."""
         lower, upper = self._objects.value(0x607D, 1), self._objects.value(0x607D, 2)
         self._limited = self._homed and not lower <= target <= upper
         if not self._limited:

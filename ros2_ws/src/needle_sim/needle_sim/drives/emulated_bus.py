@@ -16,14 +16,14 @@ from needle_sim.drives.emulated_drive import EmulatedDrive, EmulatedDriveSetting
 
 @dataclasses.dataclass(frozen=True)
 class AxisState:
-    """True place of a motor.
+    """True state of a motor.
 
     Attributes
     ----------
     position : float
-        From the edge of the home switch [m or rad], whatever the drive counts.
+        Distance from the edge of the home switch [m or rad], independent of the drive's count.
     velocity : float
-        [m/s or rad/s].
+        Velocity [m/s or rad/s].
     """
 
     position: float
@@ -36,9 +36,9 @@ class EmulatedBus:
     Parameters
     ----------
     insertion, rotation : EmulatedDriveSettings
-        The drives.
+        Settings of the drives.
     now : float
-        Steady time at which the power comes [s].
+        Steady time of power-up [s].
     """
 
     def __init__(
@@ -48,17 +48,17 @@ class EmulatedBus:
         now: float,
     ) -> None:
         self.drives = {"insertion": EmulatedDrive(insertion), "rotation": EmulatedDrive(rotation)}
-        self._moved_until = now
+        self._advanced_to = now
         self.syncs = 0
         self.is_cut = False
         for drive in self.drives.values():
             drive.power_up(now)
 
     def receive(self, frame: CanFrame, now: float) -> None:
-        """Take a frame from the master at steady time `now` [s]."""
+        """Handle a frame of the master at steady time `now` [s]."""
         if self.is_cut:
             return
-        self._move_until(now)
+        self._advance_to(now)
         if frame.identifier == SYNC and not frame.remote:
             self.syncs += 1
             for drive in self.drives.values():
@@ -68,14 +68,14 @@ class EmulatedBus:
             drive.receive(frame, now)
 
     def poll(self, now: float) -> list[CanFrame]:
-        """Let time go by until `now` [s]; return what the drives put on the bus."""
-        self._move_until(now)
+        """Advance the drives to steady time `now` [s]; return the frames that they sent."""
+        self._advance_to(now)
         for drive in self.drives.values():
             drive.tick(now)
-        return self.take_sent()
+        return self.drain_outboxes()
 
-    def take_sent(self) -> list[CanFrame]:
-        """Return what the drives have put on the bus since it was last taken."""
+    def drain_outboxes(self) -> list[CanFrame]:
+        """Return the frames that the drives sent since the last call."""
         frames: list[CanFrame] = []
         for drive in self.drives.values():
             frames += drive.device.outbox
@@ -83,8 +83,8 @@ class EmulatedBus:
         return [] if self.is_cut else frames
 
     def axes(self, now: float) -> dict[str, AxisState]:
-        """Return where both motors really are at steady time `now` [s]."""
-        self._move_until(now)
+        """Return the true states of both motors at steady time `now` [s]."""
+        self._advance_to(now)
         states = {}
         for name, drive in self.drives.items():
             scale = drive.settings.motor.counts_per_unit
@@ -98,38 +98,38 @@ class EmulatedBus:
         self.drives[axis].motor.stalled = True
 
     def reboot(self, axis: str, now: float) -> None:
-        """Take a drive's power away for a moment."""
+        """Interrupt the power of a drive."""
         self.drives[axis].power_up(now)
 
     def emergency(self, axis: str, code: int) -> None:
-        """Let a drive have a fault of that error code."""
+        """Cause a fault with this error code in a drive."""
         self.drives[axis].fail(code)
 
     def hang(self, axis: str) -> None:
-        """Let a drive's processor hang: silent, while its motor ends at its set-point."""
+        """Hang the processor of a drive: it is silent, and its motor ends at the set-point."""
         self.drives[axis].hung = True
 
     def restore(self, now: float) -> None:
-        """End what goes on: cut bus, stalled motors, hung processors. Faults stay until reset."""
+        """End cut bus, stalled motors and hung processors; drive faults stay until reset."""
         self.is_cut = False
         for drive in self.drives.values():
             drive.motor.stalled = False
             if drive.hung:
                 drive.hung = False
-                # Its timers went on: what it missed meanwhile is seen before what comes now.
+                # Its timers kept running: handle expired ones before new frames.
                 drive.tick(now)
 
-    def _move_until(self, now: float) -> None:
-        # Times are rounded; what is a whole number of steps but for that is one.
-        steps = int((now - self._moved_until) / MOTION_STEP + 1e-6)
+    def _advance_to(self, now: float) -> None:
+        # The tolerance compensates the rounding of times.
+        steps = int((now - self._advanced_to) / MOTION_STEP + 1e-6)
         if steps > 0:
-            self._moved_until += steps * MOTION_STEP
+            self._advanced_to += steps * MOTION_STEP
             for drive in self.drives.values():
                 drive.advance(steps)
 
 
 def bus_health(bus: EmulatedBus) -> Diagnostic:
-    """Return the states of both drives, and what is the matter with them or their bus."""
+    """Return the states of both drives, and the faults of drives and bus, as a diagnostic."""
     states = {name: drive.state.name for name, drive in bus.drives.items()}
     faults = [name for name, state in states.items() if state == PowerState.FAULT.name]
     message = f"fault of {' and '.join(faults)}" if faults else "runs"
@@ -148,8 +148,8 @@ reboot AXIS         the drive loses its power for a moment
 emcy AXIS CODE      the drive has a fault of that error code, such as 0x5530
 hang AXIS           the drive's processor hangs: silent, the motor ends at its set-point
 restore             end of cut_bus, unplug, stall and hang; AXIS is insertion or rotation"""
-# Command -> how many words follow.
-_WORDS = {
+# Command -> number of arguments.
+_ARGUMENT_COUNTS = {
     "cut_bus": 0,
     "unplug": 0,
     "stall": 1,
@@ -161,39 +161,39 @@ _WORDS = {
 
 
 class PlugCommand(enum.Enum):
-    """Effects of a command on the adapter."""
+    """Commands to the adapter."""
 
     OUT = "out"
     IN = "in"
 
 
 def execute_command(line: str, bus: EmulatedBus, now: float) -> PlugCommand | None:
-    """Carry out one command at steady time `now` [s].
+    """Execute a fault command at steady time `now` [s].
 
     Parameters
     ----------
     line : str
         One of `COMMANDS`.
     bus : EmulatedBus
-        What it happens to.
+        Bus with the drives.
     now : float
         Steady time [s].
 
     Returns
     -------
     PlugCommand or None
-        What is left to do to the adapter.
+        Remaining command to the adapter.
 
     Raises
     ------
     UserError
-        A line that is no command.
+        If the line is not a valid command.
     """
     name, *words = line.split()
-    if name not in _WORDS:
+    if name not in _ARGUMENT_COUNTS:
         raise UserError(f"{line!r} is no command; there are\n{COMMANDS}")
-    if len(words) != _WORDS[name]:
-        raise UserError(f"{line!r}: {name} takes {_WORDS[name]} words, not {len(words)}")
+    if len(words) != _ARGUMENT_COUNTS[name]:
+        raise UserError(f"{line!r}: {name} takes {_ARGUMENT_COUNTS[name]} words, not {len(words)}")
     axis = words[0] if words else ""
     if words and axis not in AXES:
         raise UserError(f"{line!r}: {name} wants an axis, {' or '.join(AXES)}")

@@ -1,4 +1,4 @@
-"""One emulated CiA 402 drive with its motor: what it does on the bus, with its power, and when."""
+"""Emulated CiA 402 drive with its motor: bus, power state machine and timing."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LIMIT_EXCEEDED = 0x8612
 _MOTION_ERROR = 0x20
 _ON = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION)
 _VOLTAGE, _REMOTE = 1 << 4, 1 << 9
-# Ramps.
+# Ramp objects.
 _SLOW_DOWN, _QUICK = 0x6084, 0x6085
 # Option codes (0x6007, 0x605A, 0x605B, 0x605C, 0x605E).
 _AT_ONCE = 0
@@ -51,19 +51,19 @@ class EmulatedDriveSettings:
     Attributes
     ----------
     name : str
-        Its axis.
+        Name of the axis.
     node_id : int
         1..127.
     device_type : int
         Object 0x1000: stepper or servo.
     motor : MotorSettings
-        The mechanics behind it.
+        Mechanics of the axis.
     limit_action : LimitAction
-        For a target beyond the software limits.
+        Reaction to a target beyond the software limits.
     boot_time : float
         From power-up to the boot-up message [s].
     rpm : float or None
-        One rpm of the motor [counts/s], for a drive that takes speeds in rpm and ramps in rpm/s.
+        One rpm of the motor [counts/s], for a drive with speeds in rpm and ramps in rpm/s.
     """
 
     name: str
@@ -76,12 +76,12 @@ class EmulatedDriveSettings:
 
 
 class EmulatedDrive:
-    """A drive on the bus. Times are readings of one steady clock [s]; motion has its own.
+    """Drive on the bus. Times are readings of one steady clock [s]; motion counts its own steps.
 
     Parameters
     ----------
     settings : EmulatedDriveSettings
-        What it is.
+        Settings of the drive.
     """
 
     def __init__(self, settings: EmulatedDriveSettings) -> None:
@@ -110,63 +110,63 @@ class EmulatedDrive:
         objects.on_write(MODE, 0, check=_one_of(MODES), then=self._motion.set_mode)
         objects.on_write(0x6098, 0, check=_one_of((0, *METHODS)))
         self.state = PowerState.NOT_READY
-        # Where a ramp leads that has to end first.
-        self._leaving: PowerState | None = None
+        # Power state after the present ramp.
+        self._pending_state: PowerState | None = None
         self._word = 0
         self.hung = False
-        # Whether something has changed since a master could last read it.
+        # Whether the objects need an update before the master reads them.
         self._stale = True
 
     # ---- the bus ------------------------------------------------------------------------------
 
     def power_up(self, now: float) -> None:
-        """Start as if the power had just come."""
+        """Power up."""
         self.device.power_up(now)
 
     def receive(self, frame: CanFrame, now: float) -> None:
-        """Take a frame from the bus, SYNC excepted."""
+        """Handle a frame other than SYNC."""
         if not self.hung:
-            if self.device.reads(frame):
-                self._show()
+            if self.device.is_read_request(frame):
+                self._update_objects()
             self._stale |= self.device.receive(frame, now)
 
     def sync(self) -> None:
-        """Take a SYNC: tell where the motor is, then take the set-point that came before it."""
+        """Handle a SYNC: send the state of the motor, then apply the set-point received before."""
         if self.hung:
             return
-        self._show()
+        self._update_objects()
         self.device.sync()
-        if self.state is PowerState.OPERATION_ENABLED and self._leaving is None:
+        if self.state is PowerState.OPERATION_ENABLED and self._pending_state is None:
             self._try(self._motion.apply_set_point)
         self._stale = True
 
     def tick(self, now: float) -> None:
-        """Do what is due by the clock."""
+        """Handle timers."""
         if not self.hung:
-            self._show()
+            self._update_objects()
             self.device.tick(now)
 
     def fail(self, code: int) -> None:
-        """Have a fault of that error code: brake, then FAULT."""
+        """Enter a fault with this error code: brake, then FAULT."""
         if self.state in (PowerState.FAULT, PowerState.FAULT_REACTION, PowerState.NOT_READY):
             return
-        self._leaving = None
+        self._pending_state = None
         self._objects.set(ERROR_CODE, 0, code)
         self.state = PowerState.FAULT_REACTION if self.state in _ON else PowerState.FAULT
-        # A lost heartbeat was told when it was missed.
+        # The CANopen device reports a lost heartbeat itself.
         if code != HEARTBEAT_LOST:
             self.device.emergency(code, _MOTION_ERROR)
         self._stale = True
 
     @property
     def error_code(self) -> int:
-        """Code of the fault, 0x603F; 0 without."""
+        """Error code, 0x603F; 0 without a fault."""
         return self._objects.value(ERROR_CODE)
 
     # ---- motion -------------------------------------------------------------------------------
 
     def advance(self, steps: int) -> None:
-        """Let `steps` of `MOTION_STEP` go by."""
+        """Advance by a number of `MOTION_STEP`."""
         for _ in range(steps):
             if self.state not in _ON or self._settled:
                 self._stale |= self._motion.rest()
@@ -176,8 +176,8 @@ class EmulatedDrive:
 
     @property
     def _settled(self) -> bool:
-        """Tell whether time alone would change nothing."""
-        if self._leaving is not None or self.state is PowerState.FAULT_REACTION:
+        """Whether the state stays constant without further commands."""
+        if self._pending_state is not None or self.state is PowerState.FAULT_REACTION:
             return False
         if self.state is PowerState.QUICK_STOP_ACTIVE and self._quick_stop_option in _THEN_DISABLE:
             return False
@@ -195,10 +195,10 @@ class EmulatedDrive:
             motion.brake(_SLOW_DOWN if option == 1 else _QUICK, period)
             if option == _AT_ONCE or motion.at_rest:
                 self.state = PowerState.FAULT
-        elif self._leaving is not None:
+        elif self._pending_state is not None:
             motion.brake(_SLOW_DOWN, period)
             if motion.at_rest:
-                self.state, self._leaving = self._leaving, None
+                self.state, self._pending_state = self._pending_state, None
         else:
             motion.operate(period)
         if self.state not in _ON:
@@ -220,40 +220,40 @@ class EmulatedDrive:
                 self._objects.set(ERROR_CODE, 0, 0)
                 self.device.emergency(0)
                 self.state = PowerState.SWITCH_ON_DISABLED
-        elif self._leaving is None:
+        elif self._pending_state is None:
             self._change(next_state(self.state, word))
-        enabled = self.state is PowerState.OPERATION_ENABLED and self._leaving is None
+        enabled = self.state is PowerState.OPERATION_ENABLED and self._pending_state is None
         self._try(lambda: self._motion.apply_controlword(word, enabled=enabled))
 
     def _change(self, state: PowerState) -> None:
         before = self.state
         if state is before:
             return
-        self._motion.forget()
-        if before is PowerState.OPERATION_ENABLED and self._slows_down_before(state):
-            self._leaving = state
+        self._motion.clear_targets()
+        if before is PowerState.OPERATION_ENABLED and self._brakes_before(state):
+            self._pending_state = state
             return
         self.state = state
         if state not in _ON:
             self._motion.switch_off()
 
-    def _slows_down_before(self, state: PowerState) -> bool:
-        """Tell whether the motor brakes before it gets no more power."""
+    def _brakes_before(self, state: PowerState) -> bool:
+        """Return whether the motor brakes before its power is switched off."""
         at_once = decode_command(self._word) is PowerCommand.DISABLE_VOLTAGE or self._motion.at_rest
         if state in _ON or at_once:
             return False
         index = 0x605B if state is PowerState.READY_TO_SWITCH_ON else 0x605C
         return self._objects.value(index) != _AT_ONCE
 
-    def _try(self, order: Callable[[], None]) -> None:
+    def _try(self, command: Callable[[], None]) -> None:
         try:
-            order()
+            command()
         except LimitExceededError:
             self.fail(LIMIT_EXCEEDED)
 
     def _on_power_up(self) -> None:
         self.state = PowerState.NOT_READY
-        self._leaving = None
+        self._pending_state = None
         self._word = 0
         self._motion.power_up()
         self._stale = True
@@ -273,12 +273,12 @@ class EmulatedDrive:
         elif option == _LOST_QUICK_STOP and self.state is PowerState.OPERATION_ENABLED:
             self._change(PowerState.QUICK_STOP_ACTIVE)
 
-    def _show(self) -> None:
-        """Bring up to date what a master can read."""
+    def _update_objects(self) -> None:
+        """Update the objects that a master can read."""
         if not self._stale:
             return
         self._stale = False
-        bits = self._motion.show(enabled=self.state is PowerState.OPERATION_ENABLED)
+        bits = self._motion.update_objects(enabled=self.state is PowerState.OPERATION_ENABLED)
         self._objects.set(STATUSWORD, 0, self.state.value | _VOLTAGE | _REMOTE | bits)
 
 

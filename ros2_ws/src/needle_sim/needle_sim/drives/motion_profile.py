@@ -9,12 +9,12 @@ from needle_sim.drives.motor import Motor
 
 
 class Demand:
-    """The demanded position and velocity, advanced in small steps of time.
+    """Demanded position and velocity, advanced in small time steps.
 
     Parameters
     ----------
     position : float
-        Where it starts, at rest [counts].
+        Initial position, at rest [counts].
     """
 
     def __init__(self, position: float) -> None:
@@ -25,27 +25,27 @@ class Demand:
 
     @property
     def at_rest(self) -> bool:
-        """Tell whether nothing is under way."""
+        """Whether no motion is under way."""
         return self.velocity == 0.0 and self._segment_left <= 0.0
 
     def hold(self, position: float) -> None:
-        """Be at rest at `position`."""
+        """Rest at `position`."""
         self.position = position
         self.velocity = 0.0
         self._segment_left = 0.0
 
     def begin_segment(self, end: float, duration: float) -> None:
-        """Go to `end` at constant velocity within `duration`, and stop there."""
+        """Start a motion to `end` at constant velocity within `duration`."""
         self._segment_end = end
         self._segment_left = duration
         self.velocity = (end - self.position) / duration
 
     def interpolate(self, period: float) -> None:
-        """Go on along the segment."""
+        """Advance along the segment."""
         if self._segment_left <= 0.0:
             self.velocity = 0.0
             return
-        # Rounding must not leave a remainder of a segment.
+        # The tolerance prevents one more step for a rounding error.
         if period >= self._segment_left * (1.0 - 1e-9):
             self.position = self._segment_end
             self._segment_left = 0.0
@@ -55,10 +55,10 @@ class Demand:
         self._segment_left -= period
 
     def brake(self, deceleration: float, period: float) -> None:
-        """Slow down along a ramp."""
+        """Decelerate along a ramp."""
         self._segment_left = 0.0
         slower = max(abs(self.velocity) - deceleration * period, 0.0)
-        # The mean of the velocities before and after, as a ramp has it.
+        # Mean velocity of the ramp.
         mean = (abs(self.velocity) + slower) / 2.0
         if slower == 0.0 and deceleration > 0.0:
             mean *= min(abs(self.velocity) / (deceleration * period), 1.0)
@@ -66,11 +66,11 @@ class Demand:
         self.velocity = math.copysign(slower, self.velocity) if slower > 0.0 else 0.0
 
     def run(self, velocity: float, acceleration: float, period: float) -> None:
-        """Change towards a velocity, and move."""
+        """Accelerate towards a velocity, and move."""
         self._segment_left = 0.0
         change = velocity - self.velocity
-        most = acceleration * period
-        self.velocity += min(max(change, -most), most)
+        limit = acceleration * period
+        self.velocity += min(max(change, -limit), limit)
         self.position += self.velocity * period
 
     def approach(
@@ -81,7 +81,7 @@ class Demand:
         deceleration: float,
         period: float,
     ) -> bool:
-        """Go to `target` along a trapezoid of velocity; returns whether it is there.
+        """Move towards `target` on a trapezoidal profile; return whether it is reached.
 
         The speed of a step is the largest from which the ramp still ends at the target:
         v^2 / (2 a) + v dt / 2 = distance.
@@ -89,12 +89,12 @@ class Demand:
         distance = target - self.position
         ramp = deceleration * period
         fastest = (math.sqrt(ramp * ramp + 8.0 * deceleration * abs(distance)) - ramp) / 2.0
-        wanted = math.copysign(min(speed, fastest), distance)
+        velocity = math.copysign(min(speed, fastest), distance)
         close = abs(distance) <= max(abs(self.velocity) * period, 0.5)
         if close and abs(self.velocity) <= 2.0 * ramp:
             self.hold(target)
             return True
-        self.run(wanted, max(acceleration, deceleration), period)
+        self.run(velocity, max(acceleration, deceleration), period)
         return False
 
 
@@ -113,20 +113,20 @@ class _Phase(enum.Enum):
 
 
 class Homing:
-    """One run towards a home position.
+    """Homing run: methods 17 and 18 (limit switch), 35 and 37 (present position).
 
     Parameters
     ----------
     method : int
         One of `METHODS`.
     motor : Motor
-        Whose switches are looked at.
+        Motor with the switches.
     speed : float
-        Towards the switch [counts/s]; no faster than the motor can.
+        Speed towards the switch, limited by the motor [counts/s].
     edge_speed : float
-        Off the switch, whose edge is the home position [counts/s].
+        Speed away from the switch, whose edge is the home position [counts/s].
     acceleration : float
-        [counts/s^2].
+        Acceleration [counts/s^2].
     """
 
     def __init__(
@@ -141,18 +141,18 @@ class Homing:
         if method in CURRENT_POSITION:
             self._phase = _Phase.DONE
         else:
-            self._phase = _Phase.LEAVE if self._touched else _Phase.SEARCH
+            self._phase = _Phase.LEAVE if self._is_switch_active else _Phase.SEARCH
 
     @property
     def done(self) -> bool:
-        """Tell whether the axis stands and `home_position` (true counts) is known."""
+        """Whether the axis rests and `home_position` (true counts) is known."""
         return self._phase is _Phase.DONE
 
     def advance(self, demand: Demand, period: float) -> None:
-        """Move the demand on for `period` [s]."""
+        """Advance the demand by `period` [s]."""
         if self._phase is _Phase.SEARCH:
             demand.run(self._direction * self._speed, self._acceleration, period)
-            if self._touched:
+            if self._is_switch_active:
                 self._phase = _Phase.TURN
         elif self._phase is _Phase.TURN:
             demand.brake(self._acceleration, period)
@@ -160,8 +160,8 @@ class Homing:
                 self._phase = _Phase.LEAVE
         elif self._phase is _Phase.LEAVE:
             demand.run(-self._direction * self._edge_speed, self._acceleration, period)
-            if not self._touched:
-                # The drive latches the encoder at the edge itself.
+            if not self._is_switch_active:
+                # The drive latches the encoder position at the edge.
                 self.home_position = self._motor.travel if self._direction > 0.0 else 0.0
                 self._phase = _Phase.STOP
         elif self._phase is _Phase.STOP:
@@ -170,6 +170,6 @@ class Homing:
                 self._phase = _Phase.DONE
 
     @property
-    def _touched(self) -> bool:
+    def _is_switch_active(self) -> bool:
         motor = self._motor
         return motor.at_positive_switch if self._direction > 0.0 else motor.at_negative_switch

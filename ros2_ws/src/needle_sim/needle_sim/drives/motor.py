@@ -1,31 +1,30 @@
-"""The motor and the stage behind a drive: where things really are, switches and stops included."""
+"""Motor and stage of a drive: true position, limit switches and mechanical stops."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 
-# From a limit switch's edge to the mechanical stop [m].
-_BEYOND = 0.003
+# From the edge of a limit switch to the mechanical stop [m].
+_STOP_DISTANCE = 0.003
 
 
 @dataclasses.dataclass(frozen=True)
 class MotorSettings:
-    """Mechanics of an axis; counts and seconds.
+    """Mechanics of an axis, in counts and seconds.
 
     Attributes
     ----------
     counts_per_unit : float
         Encoder counts per m or rad.
     max_speed : float
-        Fastest that the motor can turn [counts/s].
+        Maximum speed [counts/s].
     lag : float
-        Time constant with which it follows the drive's demand [s]; 0 follows at once.
+        Time constant of following the demand [s]; 0: no lag.
     start : float
         Position at power-up, from the home switch's edge [counts].
     travel : float
-        From the edge of the negative to that of the positive limit switch [counts]; infinite for
-        an axis without switches.
+        Distance of the edges of both limit switches [counts]; infinite without switches.
     """
 
     counts_per_unit: float
@@ -36,16 +35,16 @@ class MotorSettings:
 
 
 class Motor:
-    """One motor. Positions are true ones in counts from the edge of the negative limit switch.
+    """Motor; true positions count from the edge of the negative limit switch [counts].
 
     Parameters
     ----------
     settings : MotorSettings
-        The mechanics.
+        Mechanics of the axis.
     """
 
-    # Closer to the demand than this, a lagging motor is there [counts].
-    _CLOSE = 0.01
+    # Distance at which a lagging motor has reached the demand [counts].
+    _TOLERANCE = 0.01
 
     def __init__(self, settings: MotorSettings) -> None:
         self._settings = settings
@@ -56,12 +55,12 @@ class Motor:
 
     @property
     def at_negative_switch(self) -> bool:
-        """Tell whether the negative limit switch is touched; its edge is position 0."""
+        """Whether the negative limit switch is active; its edge is position 0."""
         return self._has_switches and self.position < 0.0
 
     @property
     def at_positive_switch(self) -> bool:
-        """Tell whether the positive limit switch is touched."""
+        """Whether the positive limit switch is active."""
         return self._has_switches and self.position > self._settings.travel
 
     @property
@@ -72,23 +71,23 @@ class Motor:
     def follow(self, demand: float, period: float) -> None:
         """Move towards the demanded position for `period` [s]."""
         before = self.position
-        way = demand - before
-        if self.stalled or way == 0.0:
+        step = demand - before
+        if self.stalled or step == 0.0:
             self.velocity = 0.0
             return
         lag = self._settings.lag
-        if lag > 0.0 and abs(way) > self._CLOSE:
-            way *= -math.expm1(-period / lag)
-        most = self.max_speed * period
-        way = min(max(way, -most), most)
-        self.position = demand if way == demand - before else before + way
+        if lag > 0.0 and abs(step) > self._TOLERANCE:
+            step *= -math.expm1(-period / lag)
+        limit = self.max_speed * period
+        step = min(max(step, -limit), limit)
+        self.position = demand if step == demand - before else before + step
         if self._has_switches:
-            beyond = _BEYOND * self._settings.counts_per_unit
-            self.position = min(max(self.position, -beyond), self._settings.travel + beyond)
+            margin = _STOP_DISTANCE * self._settings.counts_per_unit
+            self.position = min(max(self.position, -margin), self._settings.travel + margin)
         self.velocity = (self.position - before) / period
 
     def rest(self) -> None:
-        """Stand still: without power the friction of screw and gear holds at once."""
+        """Stop at once: without power, the friction of screw and gear holds the axis."""
         self.velocity = 0.0
 
     @property

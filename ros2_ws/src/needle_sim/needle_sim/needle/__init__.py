@@ -1,1 +1,1 @@
-"""The needle on SE(3), in tissue."""
+"""Needle on SE(3) in tissue."""

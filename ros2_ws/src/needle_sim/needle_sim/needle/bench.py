@@ -1,4 +1,4 @@
-"""The simulated bench: the needle that two axes move, and what a measurement of it says."""
+"""Simulated bench: a needle moved by two axes, and its measured tip."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.needle.tissue import Torsion, measured_tip
 
-# Streams of the noise of one exposure; 0 and 1 are the left and the right image's.
+# Random stream of the tip noise; streams 0 and 1 belong to the left and the right image.
 _TIP_STREAM = 4
 
 
 class SimulatedBench:
-    """Moves the plant by where the axes went, and by nothing else.
+    """Needle plant that follows the positions of the axes.
 
     Parameters
     ----------
     curvature : float
-        Of the needle's path [1/m].
+        Curvature of the needle's path [1/m].
     pitch, roll : float
-        Of the tip at the entry point [rad].
+        Pitch and roll of the tip at the entry point [rad].
     torsion_play : float
-        Dead band between base and tip angle, either way [rad].
+        Dead band between base and tip angle, in either direction [rad].
     torsion_lag : float
-        First-order lag of the tip's angle in inserted length [m].
+        First-order lag of the tip angle over inserted length [m].
     tip_noise : float
-        Largest error of a measured coordinate [m].
+        Maximum error of a measured coordinate [m].
     seed : int
-        Keys the noise.
+        Seed of the noise.
     """
 
     def __init__(
@@ -54,10 +54,10 @@ class SimulatedBench:
 
     def move_to(self, insertion: float, rotation: float) -> None:
         """Move the axes to these positions [m], [rad], and the needle with them."""
-        moved = (insertion - self.insertion, rotation - self.rotation)
+        step = (insertion - self.insertion, rotation - self.rotation)
         self.insertion, self.rotation = insertion, rotation
-        if moved != (0.0, 0.0):
-            self.plant.advance(*moved)
+        if step != (0.0, 0.0):
+            self.plant.advance(*step)
 
     @property
     def tip(self) -> FloatArray:
@@ -65,6 +65,6 @@ class SimulatedBench:
         return self.plant.T_rig_tip[:3, 3]
 
     def measure_tip(self, exposure_number: int) -> FloatArray:
-        """Return the tip with the noise of that exposure, frame `rig`, shape (3,) [m]."""
+        """Return the tip with the noise of an exposure, in `rig`, shape (3,) [m]."""
         rng = np.random.default_rng([self._seed, exposure_number, _TIP_STREAM])
         return measured_tip(self.tip, self._tip_noise, rng)

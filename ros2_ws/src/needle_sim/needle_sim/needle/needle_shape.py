@@ -1,4 +1,4 @@
-"""The visible needle: the path of the tip with the pre-bent distal end laid over it."""
+"""Visible shape of the needle: the path of the tip, with the pre-bent distal end."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ import numpy as np
 from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 
-# A path that is shorter than this is a point in any image [m].
-_SHORTEST = 1e-6
+# A shorter path is a single point in any image [m].
+_MIN_LENGTH = 1e-6
 
 
 @dataclass(frozen=True)
 class NeedleShape:
-    """A bevel-tip needle with a pre-bent distal end ([KC09] section II: 0.7 mm, 10 deg at 9 mm).
+    """Bevel-tip needle with a pre-bent distal end ([KC09] section II: 0.7 mm, 10 deg at 9 mm).
 
-    The bevel leans the distal segment by `lean` towards -y of the tip's frame, so that the bend
-    lies beside the tip's path; behind the bend the shaft comes back onto the path, on a parabola.
+    The bevel force tilts the distal segment by `lean` towards -y of the tip frame, so that the bend
+    lies beside the tip's path; behind the bend, the shaft returns to the path on a parabola.
 
     Parameters
     ----------
     diameter : float
-        Of the shaft [m].
+        Diameter of the shaft [m].
     bend_angle : float
         Angle between shaft and distal segment, above `lean` [rad].
     bend_distance : float
-        From the bend to the tip [m].
+        Distance from the bend to the tip [m].
     lean : float
-        Angle between distal segment and heading at the tip; less than `bend_angle`, or as that 0:
-        a straight needle [rad].
+        Angle between distal segment and heading, less than `bend_angle`; both are 0 for a straight
+        needle [rad].
 
     Raises
     ------
     UserError
-        A lean that is not.
+        If `lean` is out of its range.
     """
 
     diameter: float = 0.0007
@@ -51,8 +51,8 @@ class NeedleShape:
                 f"{self.bend_angle:g} rad, or 0 as that"
             )
 
-    def sideways(self, distance: FloatArray) -> FloatArray:
-        """Return how far the shaft lies beside the tip's path, towards +y of the tip's frame.
+    def lateral_offset(self, distance: FloatArray) -> FloatArray:
+        """Return the offset of the shaft from the tip's path, towards +y of the tip frame.
 
         Parameters
         ----------
@@ -62,7 +62,7 @@ class NeedleShape:
         Returns
         -------
         ndarray, shape (...)
-            Offset [m]: 0.88 mm at the bend, 0 from 32 mm on, with the default figures.
+            Offset [m]: by default 0.88 mm at the bend, 0 beyond 32 mm.
         """
         if self.lean == 0.0:
             return np.zeros_like(distance)
@@ -79,21 +79,21 @@ class NeedleShape:
         centreline: FloatArray,
         spacing: float,
     ) -> FloatArray:
-        """Return the middle line of the visible shaft.
+        """Return the centreline of the visible shaft.
 
         Parameters
         ----------
         T_rig_tip : ndarray, shape (4, 4)
             Pose of the tip [m].
         centreline : ndarray, shape (N, 3)
-            Path of the tip in `rig`, from the entry point; the tip last [m].
+            Path of the tip in `rig`, from the entry point to the tip [m].
         spacing : float
-            Largest distance of neighbours [m].
+            Maximum distance of neighbouring points [m].
 
         Returns
         -------
         ndarray, shape (M, 3)
-            Points in `rig`, the tip last and exactly; empty where the path has no length [m].
+            Points in `rig`, the last one exactly the tip; empty if the path has no length [m].
         """
         if len(centreline) < 2:
             return np.empty((0, 3))
@@ -101,12 +101,12 @@ class NeedleShape:
         steps = np.linalg.norm(np.diff(from_tip, axis=0), axis=1)
         distance_known = np.concatenate([[0.0], np.cumsum(steps)])
         length = distance_known[-1]
-        if length < _SHORTEST:
+        if length < _MIN_LENGTH:
             return np.empty((0, 3))
         distance = np.linspace(length, 0.0, int(np.ceil(length / spacing)) + 1)
         line = np.stack(
             [np.interp(distance, distance_known, from_tip[:, axis]) for axis in range(3)], axis=-1
         )
-        line += self.sideways(distance)[:, np.newaxis] * T_rig_tip[:3, 1]
+        line += self.lateral_offset(distance)[:, np.newaxis] * T_rig_tip[:3, 1]
         line[-1] = T_rig_tip[:3, 3]
         return line

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from needle_sim.needle.se3 import FloatArray, exp_twist, rotation_about_y, rotation_about_z
 from needle_sim.needle.tissue import Torsion
 
-_STRETCH = np.dtype(
+_SEGMENT = np.dtype(
     [
         *(("start", np.float64), ("length", np.float64), ("pose", np.float64, (4, 4))),
         *(("twist", np.float64, 6), ("angle", np.float64), ("turned", np.float64)),
@@ -17,14 +17,14 @@ _STRETCH = np.dtype(
 
 
 class Channel:
-    """Poses of one needle's tip frame along the path it cut, by inserted length.
+    """Path that the tip of a needle has cut: a chain of constant twists, exact at any length.
 
     Parameters
     ----------
     T_rig_entry : ndarray, shape (4, 4)
         Pose of the tip frame in `rig` at inserted length 0.
     entry_angle : float
-        The tip's angle there [rad].
+        Angle of the tip there [rad].
     """
 
     def __init__(self, T_rig_entry: FloatArray, entry_angle: float) -> None:  # noqa: N803
@@ -32,7 +32,7 @@ class Channel:
         self._entry_angle = entry_angle
         self.length = 0.0
         self._count = 0
-        self._stretches = np.empty(64, _STRETCH)
+        self._segments = np.empty(64, _SEGMENT)
 
     def append(
         self,
@@ -42,29 +42,29 @@ class Channel:
         angle: float,
         turned: float,
     ) -> None:
-        """Add a stretch cut with a constant twist.
+        """Append a segment cut with a constant twist.
 
         Parameters
         ----------
         T_rig_start : ndarray, shape (4, 4)
-            Pose of the tip frame where the stretch begins.
+            Pose of the tip frame at the start of the segment.
         twist : ndarray, shape (6,)
-            Body twist over the whole stretch.
+            Body twist over the whole segment.
         length : float
-            Insertion over the stretch, above 0 [m].
+            Length of the segment, above 0 [m].
         angle, turned : float
-            The tip's angle where the stretch begins, and its rotation over the stretch [rad].
+            Angle of the tip at the start of the segment, and its rotation over the segment [rad].
         """
-        if self._count == len(self._stretches):
-            self._stretches = np.concatenate([self._stretches, np.empty_like(self._stretches)])
-        self._stretches[self._count] = self.length, length, T_rig_start, twist, angle, turned
+        if self._count == len(self._segments):
+            self._segments = np.concatenate([self._segments, np.empty_like(self._segments)])
+        self._segments[self._count] = self.length, length, T_rig_start, twist, angle, turned
         self._count += 1
         self.length += length
 
     def at(self, insertion: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the tip frame's poses and angles as the path was cut.
+        """Return the poses and angles of the tip frame along the path.
 
-        Before the entry the path goes on straight along the entry's heading.
+        Before the entry, the path continues straight along the heading of the entry.
 
         Parameters
         ----------
@@ -76,14 +76,14 @@ class Channel:
         T_rig_tip : ndarray, shape (..., 4, 4)
             Poses in `rig`.
         angle : ndarray, shape (...)
-            Rotation of the tip about its axis when it passed there [rad].
+            Rotation of the tip about its axis when it cut the path there [rad].
         """
         insertion = np.asarray(insertion, dtype=np.float64)
         if self._count == 0:
             return self._before_entry(insertion), np.full(insertion.shape, self._entry_angle)
-        starts = self._stretches["start"][: self._count]
-        cut = self._stretches[np.clip(np.searchsorted(starts, insertion, "right") - 1, 0, None)]
-        # A share, since a rate over the shortest of stretches is beyond numbers.
+        starts = self._segments["start"][: self._count]
+        cut = self._segments[np.clip(np.searchsorted(starts, insertion, "right") - 1, 0, None)]
+        # A share, because the rate over a very short segment may overflow.
         share = np.clip(insertion - cut["start"], 0.0, cut["length"]) / cut["length"]
         path = np.ascontiguousarray(cut["pose"])
         poses = path @ exp_twist(share[..., np.newaxis] * cut["twist"])
@@ -98,8 +98,8 @@ class Channel:
         return np.asarray(self._entry_pose @ exp_twist(straight))
 
 
-# Insertion at which the needle counts as out [m].
-_OUT = 1e-6
+# Insertion below which the needle counts as withdrawn [m].
+_WITHDRAWN = 1e-6
 
 
 def initial_pose(pitch: float, roll: float) -> FloatArray:
@@ -108,7 +108,7 @@ def initial_pose(pitch: float, roll: float) -> FloatArray:
     Parameters
     ----------
     pitch : float
-        Pitch of the heading out of the wanted plane, towards +x [rad].
+        Pitch of the heading out of the desired plane, towards +x [rad].
     roll : float
         Rotation about the heading [rad].
 
@@ -121,32 +121,31 @@ def initial_pose(pitch: float, roll: float) -> FloatArray:
 
 
 class NeedlePlant:
-    """An exact plant for [KC09] eqs (1)-(2), one needle or many over leading axes.
+    """Exact plant for [KC09] eqs (1)-(2), for one needle, or many over leading axes.
 
-    A call of `advance` is one combined twist, T <- T exp((V1 dl + V2 dtheta)^): the rotation runs
-    along with the insertion in proportion, as the drives do it. With torsion, dtheta is the tip's
-    rotation over the call, spread evenly over it.
+    A call of `advance` is one combined twist, T <- T exp((V1 dl + V2 dtheta)^): the rotation is
+    proportional to the insertion, as with the drives. With torsion, dtheta is the rotation of the
+    tip over the call, spread evenly.
 
-    A needle drawn back follows its path in reverse, for nothing is cut: position and heading are
-    the path's, and about its axis the tip is turned by what the base (through the torsion) turned
-    since it passed there on the way in. Pushed again, it follows the same channel to its end and
-    cuts on from there. Fully drawn out (to 1 um, for increments add up
-    no better) it leaves the channel behind: the next
-    insertion is a new one at the same entry point. Outside it moves straight along its heading.
+    A retracted needle follows its path in reverse: position and heading are those of the path, and
+    the tip is rotated about its axis by the base rotation (after torsion) since it cut the path
+    there. Pushed again, the needle follows the same channel to its end and cuts on from there. A
+    withdrawn needle (within 1 um, the accuracy of summed increments) leaves the channel: the next
+    insertion cuts a new one at the same entry point. Outside, it moves straight along its heading.
 
     Parameters
     ----------
     T_rig_tip : array_like, shape (..., 4, 4)
-        Pose of the tip at insertion 0, frame `rig` [m].
+        Pose of the tip at insertion 0, in `rig` [m].
     curvature : array_like, shape (...)
-        kappa, the curvature of the path under pure insertion [1/m]; may be set later on.
+        kappa, the curvature of the path under pure insertion [1/m]; may be changed later.
     torsion : Torsion, optional
         Torsion of the shaft; none by default.
 
     Raises
     ------
     ValueError
-        If `T_rig_tip` has no shape (..., 4, 4) or something is not finite.
+        If the shape of `T_rig_tip` is not (..., 4, 4), or a value is not finite.
     """
 
     def __init__(
@@ -174,7 +173,7 @@ class NeedlePlant:
 
     @property
     def insertion(self) -> FloatArray:
-        """Inserted length, shape (...) [m]; 0 is the tip at its start, below 0 is outside."""
+        """Inserted length, shape (...) [m]; negative outside of the tissue."""
         return np.array(self._insertion)
 
     @property
@@ -188,14 +187,14 @@ class NeedlePlant:
         Parameters
         ----------
         d_insertion : array_like, shape (...)
-            Insertion of the base [m]; negative draws the needle back (one needle only).
+            Insertion of the base [m]; negative retracts the needle (one needle only).
         d_rotation : array_like, shape (...)
             Rotation of the base over that insertion [rad].
 
         Raises
         ------
         ValueError
-            If an input is not finite, or many needles are to be drawn back.
+            If an input is not finite, or many needles are retracted.
         """
         length = np.asarray(d_insertion, dtype=np.float64)
         turned = np.asarray(d_rotation, dtype=np.float64)
@@ -209,22 +208,22 @@ class NeedlePlant:
             self._advance_one(self._channel, float(length), float(turned))
 
     def centreline(self, spacing: float) -> FloatArray:
-        """Return the path of the tip from the entry point to where it is.
+        """Return the path of the tip from the entry point to its present position.
 
         Parameters
         ----------
         spacing : float
-            Largest distance between neighbours, along the path [m].
+            Maximum distance of neighbouring points along the path [m].
 
         Returns
         -------
         ndarray, shape (N, 3)
-            Positions in `rig`, the tip last [m]; the tip alone when it is outside.
+            Positions in `rig`, the tip last [m]; only the tip if it is outside.
 
         Raises
         ------
         ValueError
-            If `spacing` is not above 0, or there are many needles.
+            If `spacing` is not positive, or there are many needles.
         """
         if self._channel is None:
             raise ValueError("only a single needle keeps its path")
@@ -257,12 +256,12 @@ class NeedlePlant:
             channel.append(before, twist, length, angle, tip_turned)
 
     def _follow(self, channel: Channel, insertion: float) -> None:
-        """Put the tip at a place on the path it cut, turned by what it turned since."""
+        """Move the tip along its path, rotated by its rotation since it cut the path there."""
         path, angle = channel.at(insertion)
         tip_angle = float(self._torsion.tip_angle)
         self._pose = np.asarray(path @ rotation_about_z(tip_angle - angle))
         self._insertion = np.asarray(insertion)
-        if insertion <= _OUT:
+        if insertion <= _WITHDRAWN:
             entry, angle = channel.at(0.0)
             entry = np.asarray(entry @ rotation_about_z(tip_angle - angle))
             self._channel = Channel(entry, tip_angle)
@@ -271,7 +270,7 @@ class NeedlePlant:
                 self._channel.append(entry, straight, insertion, tip_angle, 0.0)
 
     def _cut(self, length: FloatArray, tip_turned: FloatArray) -> FloatArray:
-        """Move the tip by V1 dl + V2 dtheta of [KC09] eq. (2), and return that twist."""
+        """Move the tip by the twist V1 dl + V2 dtheta of [KC09] eq. (2), and return the twist."""
         shape = np.broadcast_shapes(self._insertion.shape, length.shape, tip_turned.shape)
         twist = np.zeros((*shape, 6))
         # V1 = [0, 0, 1, kappa, 0, 0] of the unicycle, whose tip is frame B's origin (l2 = 0).

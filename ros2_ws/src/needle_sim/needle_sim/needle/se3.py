@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 
-# Below this angle (theta - sin theta) / theta^3 loses digits, and its series to theta^8 loses none.
+# Below this angle (theta - sin theta) / theta^3 loses digits; its series to theta^8 does not.
 _SERIES_BELOW = 0.3
 
 
@@ -61,7 +61,7 @@ def rotation_about_y(angle: ArrayLike) -> FloatArray:
 
 
 def _rotation(angle: ArrayLike, first: int, second: int) -> FloatArray:
-    """Return the transform that turns one axis towards another."""
+    """Return the transform that rotates one axis towards another."""
     angle = np.asarray(angle, dtype=np.float64)
     result = np.zeros((*angle.shape, 4, 4))
     result[..., range(4), range(4)] = 1.0

@@ -1,4 +1,4 @@
-"""Effects of the tissue on the needle and of the imaging on its tip: torsion, measurement noise."""
+"""Torsion of the needle in tissue, and noise of the measured tip."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ class Torsion:
     """Torsion of the shaft between base and tip: play, then a lag in inserted length.
 
     [KC09] neglects torsional compliance and names friction along the shaft as the likely cause of
-    its "sluggish response"; this is the simplest model of it. Play: the tip's angle stays until the
-    base is `play` ahead of it, then follows at that distance. Lag: what comes through the play
+    its "sluggish response"; this is the simplest model of it. Play: the tip angle is constant until
+    the base is `play` ahead of it, then it follows at that distance. Lag: the output of the play
     reaches the tip over the inserted length, d(tip)/dl = (input - tip) / lag_length; without
-    insertion the tip does not turn. Both are integrated exactly for base rotation in proportion to
-    insertion within a call, so splitting a call changes nothing.
+    insertion the tip does not rotate. Both are integrated exactly for a base rotation proportional
+    to the insertion within a call, so that splitting a call changes nothing.
 
     Parameters
     ----------
     play : array_like, shape (...)
-        Half width of the dead band [rad]; 0 is none.
+        Half width of the dead band [rad]; 0: no play.
     lag_length : array_like, shape (...)
-        Inserted length over which the difference falls to 1/e [m]; 0 is none.
+        Inserted length over which the difference falls to 1/e [m]; 0: no lag.
 
     Raises
     ------
@@ -35,13 +35,13 @@ class Torsion:
         self._play = _not_negative("play", play)
         self._lag_length = _not_negative("lag_length", lag_length)
         self._base: FloatArray = np.zeros(())
-        self._behind_play: FloatArray = np.zeros(())
+        self._play_output: FloatArray = np.zeros(())
         self._tip: FloatArray = np.zeros(())
 
     @property
     def behind_play(self) -> FloatArray:
-        """Rotation of what follows the play so far [rad], shape (...)."""
-        return self._behind_play
+        """Output of the play so far [rad], shape (...)."""
+        return self._play_output
 
     @property
     def tip_angle(self) -> FloatArray:
@@ -49,12 +49,12 @@ class Torsion:
         return self._tip
 
     def advance(self, d_insertion: ArrayLike, d_rotation: ArrayLike) -> FloatArray:
-        """Turn the base while the needle moves, and return how far the tip turned.
+        """Rotate the base while the needle moves, and return the rotation of the tip.
 
         Parameters
         ----------
         d_insertion : array_like, shape (...)
-            Length moved [m]; the shaft rubs in either direction, so only its size counts.
+            Length moved [m]; only its absolute value matters, as the shaft rubs in both directions.
         d_rotation : array_like, shape (...)
             Rotation of the base over that length [rad].
 
@@ -66,10 +66,10 @@ class Torsion:
         length = np.abs(np.asarray(d_insertion, dtype=np.float64))
         turned = np.asarray(d_rotation, dtype=np.float64)
         self._base = self._base + turned
-        input_before = self._behind_play
-        self._behind_play = np.clip(input_before, self._base - self._play, self._base + self._play)
+        input_before = self._play_output
+        self._play_output = np.clip(input_before, self._base - self._play, self._base + self._play)
         if not np.any(self._lag_length):
-            tip = self._behind_play
+            tip = self._play_output
         else:
             tip = self._lagged_tip(length, turned, input_before)
         tip_turned = np.asarray(tip - self._tip)
@@ -79,17 +79,17 @@ class Torsion:
     def _lagged_tip(
         self, length: FloatArray, turned: FloatArray, input_before: FloatArray
     ) -> FloatArray:
-        """Integrate the lag exactly: first the stretch in which the play closes, then the ramp."""
-        change = self._behind_play - input_before
+        """Integrate the lag exactly: first the part in which the play closes, then the ramp."""
+        change = self._play_output - input_before
         share = np.where(turned == 0.0, 0.0, change / np.where(turned == 0.0, 1.0, turned))
         lag_length = np.where(self._lag_length > 0.0, self._lag_length, 1.0)
         still = length * (1.0 - share) / lag_length
         ramp = length * share / lag_length
         tip = input_before + (self._tip - input_before) * np.exp(-(still + ramp))
-        # Mean of exp(-l / lag_length) over the ramp: 1 where there is a turn but no length.
+        # Mean of exp(-l / lag_length) over the ramp: 1 for a rotation without insertion.
         mean_decay = np.where(ramp > 0.0, -np.expm1(-ramp) / np.where(ramp > 0.0, ramp, 1.0), 1.0)
         tip = tip + change * (1.0 - mean_decay)
-        return np.where(self._lag_length > 0.0, tip, self._behind_play)
+        return np.where(self._lag_length > 0.0, tip, self._play_output)
 
 
 def measured_tip(tip: ArrayLike, amplitude: float, rng: np.random.Generator) -> FloatArray:
@@ -98,9 +98,9 @@ def measured_tip(tip: ArrayLike, amplitude: float, rng: np.random.Generator) -> 
     Parameters
     ----------
     tip : array_like, shape (..., 3)
-        True position of the tip, frame `rig` [m].
+        True position of the tip, in `rig` [m].
     amplitude : float
-        Largest error of a coordinate [m].
+        Maximum error of a coordinate [m].
     rng : numpy.random.Generator
         Source of the noise.
 

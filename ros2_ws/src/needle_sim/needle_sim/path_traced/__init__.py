@@ -1,1 +1,1 @@
-"""A needle of metal in a clear phantom as a path tracer shows it: stereo pairs with their truth."""
+"""Path-traced renderer: stereo images of a metal needle in a clear phantom, with ground truth."""

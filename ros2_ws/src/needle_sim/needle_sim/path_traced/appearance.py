@@ -1,4 +1,4 @@
-"""Appearance of a sequence: metal, light, floor and dirt, drawn at random or by name."""
+"""Appearance of a sequence: metal, light, floor and dirt, random or by name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FLOORS: tuple[Floor, ...] = get_args(Floor)
 
 _STREAM = 20
 _PLAIN_DIAMETER = 0.0007
-# Grey level of the floor under full light, by kind.
+# Range of the floor's grey level under full light, by kind.
 _LEVELS: dict[Floor, tuple[float, float]] = {
     "grey": (95.0, 165.0),
     "dark": (22.0, 60.0),
@@ -42,60 +42,60 @@ _ROUGHNESS: dict[Metal, tuple[tuple[float, float], ...]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Appearance:
-    """Look of a sequence; what stands where follows from `seed`.
+    """Appearance of a sequence; positions follow from `seed`.
 
     Attributes
     ----------
     name : str
-        `random`, or as in `APPEARANCES`.
+        Name in `APPEARANCES`.
     seed : int
-        Keys lamps' places, texture, bubbles, lint and noise.
+        Seed of lamp positions, texture, bubbles, lint and noise.
     needle : bool
-        Whether there is one.
+        Whether the images show a needle.
     metal : str
-        Of the shaft: one of `METALS`; none that is dark over a dark floor.
+        Surface of the shaft: one of `METALS`; never dark on a dark floor.
     roughness_along, roughness_across, face_roughness : float
-        GGX alpha of the shaft, along and across, 0.05 to 0.45, and of the ground face, 0.05 to 0.4.
+        GGX alpha of the shaft, along and across, 0.05 to 0.45, and of the bevel, 0.05 to 0.4.
     diameter : float
-        Of the shaft: 0.7 mm three times in five, else 0.5 to 1.3 mm [m].
+        Diameter of the shaft: 0.7 mm in 60 % of the draws, else 0.5 to 1.3 mm [m].
     bevel_angle : float
-        Between ground face and axis, 18 to 45 deg [rad].
+        Angle between bevel and axis, 18 to 45 deg [rad].
     hollow : bool
-        Whether the needle is a tube inside, too.
+        Whether the needle is hollow.
     lean : float
-        Of the pre-bent last 9 mm against the heading, 0 or 2 to 6 deg [rad].
+        Angle between the pre-bent last 9 mm and the heading, 0 or 2 to 6 deg [rad].
     lamps : str
         One of `LAMPS`.
     room_light : float
-        Light of the room over that of the lamps, 0.04 to 0.6.
+        Light of the room relative to the lamps, 0.04 to 0.6.
     floor : str
-        One of `FLOORS`: under the phantom, or behind a clear box, for each camera another.
+        One of `FLOORS`: under the phantom, or one behind a clear box for each camera.
     floor_height : float
         x of the floor in `rig`, -35 to -18 mm [m].
     behind : float
-        How far behind a clear box there is what a camera sees through it, 5 to 120 mm [m].
+        Distance of the background behind a clear box, 5 to 120 mm [m].
     floor_level : float
         Median of the image without needle [grey levels].
     floor_blur_px : float
-        How much less sharp the floor is than the needle, 0 to 2.5 px [px].
+        Additional blur of the floor, 0 to 2.5 px [px].
     bubbles, lint, tracks : int
-        How many: 0 to 90, 0 to 25, 0 to 4 (paths of older needles).
+        Numbers: 0 to 90, 0 to 25, 0 to 4 (paths of earlier needles).
     track_strength : float
-        Contrast of the strongest path of an older needle, 0.03 to 0.35.
+        Contrast of the strongest path of an earlier needle, 0.03 to 0.35.
     haze : float
-        Share of the light that the phantom scatters on the way through it, 0 to 0.35.
+        Share of the light that the phantom scatters, 0 to 0.35.
     blur_px : float
         Standard deviation of the lens's blur at the needle, 0.3 to 1.1 px [px].
     bloom : float
-        Share of what is above full scale that spreads around, 0 to 0.05.
+        Share of the light above full scale that spreads to neighbours, 0 to 0.05.
     noise : float
-        Standard deviation of the sensor's noise in the dark, 0.4 to 4 [grey levels].
+        Standard deviation of the sensor noise in the dark, 0.4 to 4 [grey levels].
     shot_noise : float
-        Of the noise at full scale, from the light itself, 0.5 to 5 [grey levels].
+        Standard deviation of the shot noise at full scale, 0.5 to 5 [grey levels].
     flicker : float
         Standard deviation of the exposure from pair to pair, 0 to 0.03.
     lag : float
-        How much farther in the needle is when the right camera exposes, 0 to 0.2 mm [m].
+        Insertion between the exposures of left and right, 0 to 0.2 mm [m].
     """
 
     name: str
@@ -131,16 +131,16 @@ class Appearance:
 
 @dataclasses.dataclass(frozen=True)
 class NamedAppearance:
-    """Part of an appearance that a name fixes; the rest is drawn.
+    """Named appearance: fixes some properties, the others are drawn.
 
     Attributes
     ----------
     summary : str
-        One line for a person.
+        One line for the user.
     metal, lamps, floor : str or None
-        None is drawn.
+        Fixed value; None is drawn.
     needle : bool
-        Whether there is one.
+        Whether the images show a needle.
     """
 
     summary: str
@@ -187,23 +187,23 @@ APPEARANCES = {
         "no needle: bubbles, lint, print; all drawn by the seed", needle=False
     ),
 }
-"""The names, and what each fixes."""
+"""Name to fixed properties."""
 
 
 def draw_appearance(name: str, seed: int) -> Appearance:
-    """Return the look of a name; the same seed gives the same.
+    """Return a random appearance with the fixed properties of a name.
 
     Parameters
     ----------
     name : str
         A key of `APPEARANCES`.
     seed : int
-        Not negative.
+        Seed, not negative.
 
     Raises
     ------
     UserError
-        If there is no such name.
+        If the name is unknown.
     """
     fixed = APPEARANCES.get(name)
     if fixed is None:
@@ -213,8 +213,8 @@ def draw_appearance(name: str, seed: int) -> Appearance:
     def between(lower: float, upper: float) -> float:
         return float(rng.uniform(lower, upper))
 
-    def some(share: float, lower: float, upper: float) -> float:
-        """Draw between the bounds in a share of all cases, else 0."""
+    def sometimes(share: float, lower: float, upper: float) -> float:
+        """Return a number between the bounds in a share of all cases, else 0."""
         value = between(lower, upper)
         return value if rng.random() < share else 0.0
 
@@ -223,7 +223,7 @@ def draw_appearance(name: str, seed: int) -> Appearance:
     floor = FLOORS[rng.integers(len(FLOORS))]
     lamps, floor = fixed.lamps or lamps, fixed.floor or floor
     if floor == "dark" and metal in ("oxide", "painted"):
-        # Nobody would see it.
+        # A dark needle on a dark floor is invisible.
         metal = "drawn"
     metal = fixed.metal or metal
     along, across, face = (between(*bounds) for bounds in _ROUGHNESS[metal])
@@ -235,26 +235,26 @@ def draw_appearance(name: str, seed: int) -> Appearance:
         roughness_along=along,
         roughness_across=across,
         face_roughness=face,
-        diameter=some(0.4, 0.0005, 0.0013) or _PLAIN_DIAMETER,
+        diameter=sometimes(0.4, 0.0005, 0.0013) or _PLAIN_DIAMETER,
         bevel_angle=float(np.deg2rad(between(18.0, 45.0))),
         hollow=bool(rng.random() < 0.35),
-        lean=float(np.deg2rad(some(0.4, 2.0, 6.0))),
+        lean=float(np.deg2rad(sometimes(0.4, 2.0, 6.0))),
         lamps=lamps,
         room_light=between(0.2, 1.0) ** 2 * 0.6,
         floor=floor,
         floor_height=between(-0.035, -0.018),
         floor_level=between(*_LEVELS[floor]),
-        floor_blur_px=some(0.7, 0.2, 2.5),
-        bubbles=round(some(0.8, 3.0, 90.0)),
-        lint=round(some(0.7, 1.0, 25.0)),
-        tracks=round(some(0.5, 0.51, 4.49)),
-        haze=some(0.4, 0.05, 0.35),
+        floor_blur_px=sometimes(0.7, 0.2, 2.5),
+        bubbles=round(sometimes(0.8, 3.0, 90.0)),
+        lint=round(sometimes(0.7, 1.0, 25.0)),
+        tracks=round(sometimes(0.5, 0.51, 4.49)),
+        haze=sometimes(0.4, 0.05, 0.35),
         blur_px=between(0.3, 1.1),
-        bloom=some(0.6, 0.005, 0.05),
+        bloom=sometimes(0.6, 0.005, 0.05),
         noise=between(0.4, 4.0),
         shot_noise=between(0.5, 5.0),
-        flicker=some(0.6, 0.003, 0.03),
-        lag=some(0.3, 0.00002, 0.0002),
+        flicker=sometimes(0.6, 0.003, 0.03),
+        lag=sometimes(0.3, 0.00002, 0.0002),
         behind=between(0.005, 0.12),
         track_strength=between(0.03, 0.35),
     )

@@ -1,4 +1,4 @@
-"""Floors under the phantom: how much light each place gives back, as a picture."""
+"""Floors under the phantom: pictures of their reflectance."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from needle_sim.camera.optics import FloatImage
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.path_traced.appearance import Floor
 
-# What the picture covers: what is across the needle over its rows, z over its columns [m].
+# Extent of the picture: across the needle over its rows, z over its columns [m].
 SIDE = 0.1
 BEGIN = -0.06
 END = 0.2
 SPACING = 0.0001
-"""Of its pixels [m]."""
+"""Spacing of the pixels [m]."""
 
 ALBEDO: dict[Floor, float] = {
     "grey": 0.35,
@@ -30,7 +30,7 @@ ALBEDO: dict[Floor, float] = {
     "panel": 0.6,
     "clutter": 0.4,
 }
-"""Share of the light that the plain floor gives back."""
+"""Mean reflectance by kind of floor."""
 
 _SHAPE = (round(2.0 * SIDE / SPACING), round((END - BEGIN) / SPACING))
 _WORDS = ("needle", "phantom", "gel 35 mm", "sample 04", "do not shake", "lot 2.1", "top", "up")
@@ -38,18 +38,18 @@ _WORDS = ("needle", "phantom", "gel 35 mm", "sample 04", "do not shake", "lot 2.
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FloorPicture:
-    """A floor's reflectance.
+    """Reflectance of a floor.
 
     Attributes
     ----------
     reflectance : ndarray of float32, shape (rows, columns)
-        Share of the light that each place gives back; of a lit panel, its brightness.
+        Reflectance at each pixel; brightness of a lit panel.
     """
 
     reflectance: FloatImage
 
     def at(self, aside: FloatArray, along: FloatArray) -> FloatImage:
-        """Return the reflectance, (rows, columns), at places, both (rows, columns) [m]."""
+        """Return the reflectance, (rows, columns), at lateral and z coordinates [m]."""
         column = ((along - BEGIN) / SPACING - 0.5).astype(np.float32)
         row = ((aside + SIDE) / SPACING - 0.5).astype(np.float32)
         sampled = cv2.remap(
@@ -59,14 +59,14 @@ class FloorPicture:
 
 
 def floor_picture(floor: Floor, rng: np.random.Generator) -> FloorPicture:
-    """Return a floor of a kind.
+    """Return a random floor of a kind.
 
     Parameters
     ----------
     floor : str
         One of `FLOORS`.
     rng : numpy.random.Generator
-        For what differs from one to the next.
+        Generator of the texture.
     """
     picture = np.full(_SHAPE, ALBEDO[floor], dtype=np.float32)
     if floor == "panel":
@@ -90,9 +90,9 @@ def floor_picture(floor: Floor, rng: np.random.Generator) -> FloorPicture:
 
 
 def _noise(rng: np.random.Generator, size: float, size_z: float | None = None) -> FloatImage:
-    """Return Gaussian noise of spread 1 with blotches of a size (along y; along z) [m]."""
+    """Return Gaussian noise of unit variance with blotches of a size (along y; along z) [m]."""
     sizes = [max(one / SPACING, 0.5) for one in (size, size if size_z is None else size_z)]
-    # Wide blotches are made small and enlarged: it costs less and looks the same.
+    # Wide blotches are computed at low resolution and enlarged, which is faster.
     coarse = [max(int(one / 4.0), 1) for one in sizes]
     shape = [-(-full // small) for full, small in zip(_SHAPE, coarse, strict=True)]
     noise = rng.standard_normal(shape, dtype=np.float32)
@@ -103,7 +103,7 @@ def _noise(rng: np.random.Generator, size: float, size_z: float | None = None) -
 
 
 def _turned(rng: np.random.Generator, largest: float) -> tuple[FloatImage, FloatImage]:
-    """Return coordinates along two axes that are turned by up to an angle [rad], in m."""
+    """Return coordinates along two axes, rotated by a random angle up to a maximum [rad], in m."""
     angle, shift = rng.uniform(-largest, largest), rng.uniform(0.0, 0.1, 2)
     y = (np.arange(_SHAPE[0], dtype=np.float32) * np.float32(SPACING))[:, np.newaxis]
     z = np.arange(_SHAPE[1], dtype=np.float32) * np.float32(SPACING)
@@ -112,7 +112,7 @@ def _turned(rng: np.random.Generator, largest: float) -> tuple[FloatImage, Float
 
 
 def _ruled(at: FloatImage, pitch: float, width: float) -> FloatImage:
-    """Return 1 on lines of a width at a pitch, 0 between, with edges of one pixel."""
+    """Return 1 on lines of a width and pitch, 0 in between, with edges of one pixel."""
     away = np.abs((at / np.float32(pitch)) % 1.0 - 0.5) * np.float32(pitch)
     return np.asarray(np.clip((width / 2.0 - away) / SPACING + 0.5, 0.0, 1.0), dtype=np.float32)
 
@@ -130,7 +130,7 @@ def _lines(rng: np.random.Generator) -> FloatImage:
 
 
 def _streaks(rng: np.random.Generator) -> FloatImage:
-    """Return the scratches of a brush, along the needle or across it."""
+    """Return the scratches of brushed metal, along the needle or across it."""
     long, thin = rng.uniform(0.01, 0.06), rng.uniform(0.0001, 0.0002)
     size = (thin, long) if rng.random() < 0.5 else (long, thin)
     strength, wide = rng.uniform(0.04, 0.15), rng.uniform(0.02, 0.08)
@@ -145,7 +145,7 @@ def _weave(rng: np.random.Generator) -> FloatImage:
     cloth = 1.0 + depth * np.sin(turn * first) * np.sin(turn * second)
     cloth = cloth * (1.0 + 0.08 * _noise(rng, 0.0008))
     for _ in range(rng.integers(0, 5)):
-        # Folds and seams: dark, wide, in any direction.
+        # Folds and seams: dark, wide, in random directions.
         at, width = _turned(rng, np.pi)[0], rng.uniform(0.0008, 0.004)
         away = (at - np.float32(rng.uniform(at.min(), at.max()))) / np.float32(width)
         cloth = cloth * (1.0 - rng.uniform(0.2, 0.6) * np.exp(-0.5 * away * away))
@@ -153,14 +153,14 @@ def _weave(rng: np.random.Generator) -> FloatImage:
 
 
 def _dots(rng: np.random.Generator) -> FloatImage:
-    """Return the lattice of a panel's light guide."""
+    """Return the dot lattice of a light panel."""
     turn = np.float32(2.0 * np.pi / rng.uniform(0.0015, 0.006))
     first, second = _turned(rng, 0.1)
     return np.asarray((np.cos(turn * first) * np.cos(turn * second)) ** 2, dtype=np.float32)
 
 
 def _print(rng: np.random.Generator) -> FloatImage:
-    """Return words, bars and rings in black, of 1.5 to 9 mm."""
+    """Return black words, bars and rings of 1.5 to 9 mm."""
     ink: NDArray[np.uint8] = np.zeros(_SHAPE, dtype=np.uint8)
     rows, columns = _SHAPE
     for _ in range(rng.integers(8, 60)):
@@ -192,11 +192,9 @@ def _clutter(rng: np.random.Generator) -> FloatImage:
         return int(rng.integers(columns)), int(rng.integers(rows))
 
     for _ in range(rng.integers(2, 7)):
-        # Rails and edges: along the needle or across it, askew by a little.
-        middle, size = (
-            place(),
-            (rng.uniform(0.04, 0.25) / SPACING, rng.uniform(0.003, 0.03) / SPACING),
-        )
+        # Rails and edges: along the needle or across it, slightly rotated.
+        middle = place()
+        size = (rng.uniform(0.04, 0.25) / SPACING, rng.uniform(0.003, 0.03) / SPACING)
         turned = float(rng.normal(0.0, 3.0)) + (90.0 if rng.random() < 0.4 else 0.0)
         corners = cv2.boxPoints((middle, size, turned)).astype(np.int32)
         shade = float(rng.uniform(0.3, 1.6))
@@ -211,7 +209,7 @@ def _clutter(rng: np.random.Generator) -> FloatImage:
         cv2.polylines(seen, [cable], False, shade, thick, cv2.LINE_AA)
         cv2.polylines(seen, [cable], False, 1.8 * shade, max(thick // 4, 1), cv2.LINE_AA)
     for _ in range(rng.integers(2, 12)):
-        # A head that shines on one side, and its slot.
+        # Head of a screw, with its slot.
         middle, radius = place(), round(float(rng.uniform(0.0015, 0.006)) / SPACING)
         bright = float(rng.uniform(0.4, 2.0))
         cv2.circle(seen, middle, radius + 4, 0.3, -1, cv2.LINE_AA)

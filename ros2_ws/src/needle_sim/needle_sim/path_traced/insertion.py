@@ -26,29 +26,28 @@ _LARGEST_ANGLE = np.deg2rad(5.0)
 _LARGEST_OFFSET = 0.0003
 _SPACING = 0.0003
 _DISTAL_LENGTH = 0.01
-# Of the shaft before the phantom, from the sheath on [m].
+# Length of the shaft in front of the phantom [m].
 _OUTSIDE = 0.03
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TracedPair:
-    """One exposure of an insertion.
+    """Exposure of an insertion.
 
     Attributes
     ----------
     number : int
-        Of the exposure.
+        Number of the exposure.
     images : pair of ndarray of uint8
-        Left and right.
+        Left and right image.
     insertion : float
-        What the stage says [m].
+        Insertion of the stage [m].
     truth : Truth or None
-        None where there is no needle in the phantom.
+        Ground truth; None without a needle in the phantom.
     meshes : pair of NeedleMesh or None
-        The needle that left and right saw, with its extreme point and the middle of its face; the
-        right one is farther in where its camera exposes later.
+        Needle at the exposures of left and right; the right one may be inserted further.
     visible_share : pair of float
-        Of the needle's last 10 mm, by the left and the right camera.
+        Visible share of the needle's last 10 mm, in the left and the right image.
     """
 
     number: int
@@ -71,36 +70,36 @@ def trace_insertion(
     curvature: float = CURVATURE,
     empty_first: bool = False,
 ) -> Iterator[TracedPair]:
-    """Render a random insertion; the stage rests at its end if more frames are wanted.
+    """Render a random insertion; further frames show the stage at rest at its end.
 
-    The needle enters within 0.3 mm of the entry point and, as far as pitch and yaw together go,
-    within 5 deg of its direction; its path is drawn as that of `render_insertion`.
+    The needle enters within 0.3 mm of the entry point and within 5 deg of the nominal direction;
+    its path is drawn like that of `render_insertion`.
 
     Parameters
     ----------
     mitsuba : Mitsuba
-        As `load_mitsuba` gives it.
+        Result of `load_mitsuba`.
     rig : StereoRig
         Cameras and phantom.
     look : Appearance
-        What it looks like; its seed keys the path, too.
+        Appearance; its seed determines the path as well.
     frames : int
-        How many exposures.
+        Number of exposures.
     depth : float
-        Where the stage stops [m].
+        Insertion at which the stage stops [m].
     step : float
-        Insertion from one exposure to the next [m].
+        Insertion between exposures [m].
     begin : float
         Insertion of the first exposure [m].
     curvature : float
-        Of the needle's path [1/m].
+        Curvature of the needle's path [1/m].
     empty_first : bool
-        Whether one exposure without the needle comes before the others.
+        Whether an exposure without the needle precedes the others.
 
     Returns
     -------
     iterator of TracedPair
-        One exposure after the other.
+        The exposures.
 
     Raises
     ------
@@ -135,9 +134,9 @@ def trace_insertion(
 
 
 def _entry(seed: int, path: RandomPath) -> FloatArray:
-    """Return the tip's pose at the entry, shape (4, 4) [m]: beside the entry point, turned aside.
+    """Return a random pose of the tip at the entry, shape (4, 4) [m].
 
-    The yaw turns the whole path about rig's x axis: it stays as deep under the surface.
+    The yaw rotates the whole path about rig's x axis, so that its depth does not change.
     """
     rng = np.random.default_rng([seed, 0, _STREAM])
     around, away = rng.uniform(0.0, 2.0 * np.pi), _LARGEST_OFFSET * np.sqrt(rng.uniform())
@@ -149,21 +148,21 @@ def _entry(seed: int, path: RandomPath) -> FloatArray:
 
 
 def _shape(look: Appearance) -> NeedleShape:
-    """Return the bend before the needle's end; straight, its shaft has the tip's heading."""
+    """Return the shape of the needle, with or without a bend."""
     if look.lean == 0.0:
         return NeedleShape(diameter=look.diameter, bend_angle=0.0, lean=0.0)
-    # Half of the bend leans the end to one side of the path, half the shaft to the other.
+    # Half of the bend tilts the end to one side of the path, the other half the shaft.
     return NeedleShape(diameter=look.diameter, bend_angle=2.0 * look.lean, lean=look.lean)
 
 
 def _mesh(plant: NeedlePlant, look: Appearance) -> NeedleMesh:
     end = NeedleEnd(look.diameter, look.bevel_angle, look.hollow)
-    # It bends towards its sharp side.
+    # The needle bends towards its sharp side.
     return needle_mesh(_middle_line(plant, look), -plant.T_rig_tip[:3, 1], end)
 
 
 def _middle_line(plant: NeedlePlant, look: Appearance) -> FloatArray:
-    """Return the needle's middle line from before the phantom to the end, (M, 3) [m]."""
+    """Return the needle's centreline, including the part outside, (M, 3) [m]."""
     line = plant.centreline(_SPACING)
     if look.lean > 0.0:
         line = _shape(look).shaft_centreline(plant.T_rig_tip, line, _SPACING)
@@ -185,11 +184,11 @@ TRUTH_COLUMNS = (
     *("face_x_mm", "face_y_mm", "face_z_mm", "heading_x", "heading_y", "heading_z"),
     *("bevel_length_mm", "diameter_mm", "light", "bottom", "needle", "bubbles"),
 )
-"""The axis's end is the tip; then the metal's extreme point, the face's middle, the heading."""
+"""End of the axis (the tip), foremost point of the metal, centre of the bevel, heading, ..."""
 
 
 def truth_values(look: Appearance, pair: TracedPair) -> list[float | str]:
-    """Return the values of `TRUTH_COLUMNS`; empty where there is no needle."""
+    """Return the values of `TRUTH_COLUMNS`; empty without a needle."""
     scene: list[float | str] = [look.lamps, look.floor, look.metal, look.bubbles]
     if pair.truth is None or pair.meshes is None:
         return [*[""] * 14, look.lamps, look.floor, "", look.bubbles]

@@ -1,4 +1,4 @@
-"""Marks that are drawn, not traced: lint, dust, paths of older needles, edges of a clear box."""
+"""Marks that are drawn, not traced: lint, dust, earlier needle paths, edges of a clear box."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from needle_sim.camera.optics import FloatImage, Optics
 from needle_sim.camera.stroke import stroke
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.path_traced.world import LENGTH, World, is_box, sides
+from needle_sim.path_traced.world import LENGTH, World, block_bounds, is_box
 
 _STREAM = 32
 _SPACING = 0.0004
-# Where lint is, along the needle, and how far from the phantom's faces at least [m].
+# Range of lint along the needle, and its clearance from the phantom's faces [m].
 _LENGTHS = (0.004, 0.14)
 _CLEARANCE = 0.001
 _FIBRE_LENGTHS = (0.0005, 0.007)
@@ -25,19 +25,19 @@ _LINT_BLUR_PX = 0.4
 _TRACK_DIAMETERS = (0.0003, 0.0009)
 _TRACK_DEPTHS = (0.03, 0.12)
 _TRACK_ASIDE = 0.01
-# Clouds come and go over such a length, and thin out over the last of it [m].
+# Length over which the clouding of a track varies and fades out at its end [m].
 _CLOUD_LENGTH = 0.005
-# A track's edge is no edge: it blurs over this [px].
+# Blur of a track's edge [px].
 _TRACK_BLUR_PX = 1.5
 
 
 class Marks:
-    """Lint, old paths and edges of one phantom; each camera sees the same ones.
+    """Lint, earlier paths and edges of a phantom, identical for both cameras.
 
     Parameters
     ----------
     world : World
-        The phantom, how many, and the seed.
+        Static parts of the sequence.
     """
 
     def __init__(self, world: World) -> None:
@@ -52,16 +52,16 @@ class Marks:
             self._add_edges(rng, world)
 
     def draw(self, image: FloatImage, optics: Optics, white: float) -> None:
-        """Draw them over an image of the floor.
+        """Draw the marks over an image of the floor.
 
         Parameters
         ----------
         image : ndarray of float32
-            Radiance; changed.
+            Radiance, modified in place.
         optics : Optics
-            The camera.
+            Optics of the camera.
         white : float
-            Radiance of light lint and of clouded gel [of the image's unit].
+            Radiance of light lint and of clouded gel [unit of the image].
         """
         for line, diameter, grey, blur in self._lines:
             seen = stroke(
@@ -70,14 +70,14 @@ class Marks:
                 blur,
                 optics.image_size,
             )
-            there = (seen.row, seen.column)
+            pixels = (seen.row, seen.column)
             strength = np.abs(grey)[seen.sample]
             colour = np.where(grey[seen.sample] > 0.0, white, 0.0)
-            image[there] += seen.coverage * strength * (colour - image[there])
+            image[pixels] += seen.coverage * strength * (colour - image[pixels])
 
     def _add_lint(self, rng: np.random.Generator, world: World) -> None:
-        """Add a fibre that is bent and turned at random, or a speck; light or dark."""
-        low, high = np.transpose([*sides(world.rig, world.look), _LENGTHS])
+        """Add a randomly bent and rotated fibre, or a speck; light or dark."""
+        low, high = np.transpose([*block_bounds(world.rig, world.look), _LENGTHS])
         middle = rng.uniform(low + _CLEARANCE, high - _CLEARANCE)
         is_dust = rng.random() < _DUST_SHARE
         length = _DUST_LENGTH if is_dust else rng.uniform(*_FIBRE_LENGTHS)
@@ -91,9 +91,9 @@ class Marks:
         self._lines.append((line, float(diameter), np.full(count, strength), _LINT_BLUR_PX))
 
     def _add_edges(self, rng: np.random.Generator, world: World) -> None:
-        """Add the box's four edges along the needle, where its walls are glued together."""
+        """Add the four glued edges of the box along the needle."""
         z = np.arange(0.0, LENGTH, _SPACING)
-        (_, x), (_, y) = sides(world.rig, world.look)
+        (_, x), (_, y) = block_bounds(world.rig, world.look)
         for up, aside in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
             line = np.stack([np.full_like(z, up * x), np.full_like(z, aside * y), z], axis=1)
             strength = rng.uniform(0.2, 0.8) * rng.choice([-1.0, 1.0])
@@ -101,7 +101,7 @@ class Marks:
             self._lines.append((line, diameter, np.full(len(z), strength), _TRACK_BLUR_PX))
 
     def _add_track(self, rng: np.random.Generator, world: World) -> None:
-        """Add the path of an older needle: gel that is torn and clouded, unevenly."""
+        """Add the path of an earlier needle: torn, unevenly clouded gel."""
         depth, rig = rng.uniform(*_TRACK_DEPTHS), world.rig
         path = random_path(
             int(rng.integers(2**31)), depth, (rig.half_height, rig.half_width), CURVATURE

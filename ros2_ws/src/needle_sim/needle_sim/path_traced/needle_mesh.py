@@ -1,4 +1,4 @@
-"""The needle as triangles: a tube swept along a bent line, ground flat at its end."""
+"""Triangle mesh of the needle: a tube along a bent centreline, with a bevel at its end."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from needle_sim.needle.se3 import FloatArray
 
 IndexArray = NDArray[np.uint32]
 
-# Of the tube's section: with 40 it is thinner than a round one by 0.3 % at most.
+# Sides of the tube's section: with 40, it is at most 0.3 % thinner than a round one.
 _SIDES = 40
-# Always as many sections along the tube, so that one mesh serves a whole sequence.
+# Constant number of sections along the tube, so that one mesh serves a whole sequence.
 _STATIONS = 480
 _BORE_SHARE = 0.6
 _BORE_DEPTH_DIAMETERS = 4.0
@@ -21,16 +21,16 @@ _BORE_DEPTH_DIAMETERS = 4.0
 
 @dataclasses.dataclass(frozen=True)
 class NeedleEnd:
-    """Make and grind of the needle.
+    """Geometry of the needle's end.
 
     Attributes
     ----------
     diameter : float
-        Of the shaft [m].
+        Diameter of the shaft [m].
     bevel_angle : float
-        Between the ground face and the axis [rad].
+        Angle between bevel and axis [rad].
     hollow : bool
-        Whether it is a tube inside, too.
+        Whether the needle is hollow.
     """
 
     diameter: float
@@ -39,22 +39,22 @@ class NeedleEnd:
 
     @property
     def bevel_length(self) -> float:
-        """Of the ground face, along the axis [m]."""
+        """Length of the bevel along the axis [m]."""
         return float(self.diameter / np.tan(self.bevel_angle))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles.
+    """Triangle mesh.
 
     Attributes
     ----------
     points, normals : ndarray, shape (N, 3)
-        Corners in `rig` [m] and the surface's normals there.
+        Vertices in `rig` [m], and the surface normals there.
     texture : ndarray, shape (N, 2)
         Texture coordinates; the first grows along the axis.
     faces : ndarray of uint32, shape (F, 3)
-        Corners of each triangle.
+        Vertex indices of each triangle.
     """
 
     points: FloatArray
@@ -65,18 +65,18 @@ class Mesh:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NeedleMesh:
-    """The parts of a needle.
+    """Meshes of a needle's parts, and its characteristic points.
 
     Attributes
     ----------
     line : ndarray, shape (M, 3)
-        Its middle line in `rig`, the end of the axis last [m].
+        Centreline in `rig`, the end of the axis last [m].
     parts : dict of str to Mesh
-        `shaft`, the tube's outside; `face`, what was ground; of a hollow needle `bore`, its inside.
+        `shaft`, the outside of the tube; `face`, the bevel; for a hollow needle `bore`, its inside.
     extreme : ndarray, shape (3,)
-        The farthest point of the metal, half a diameter beside the axis's end, in `rig` [m].
+        Foremost point of the metal, half a diameter beside the end of the axis, in `rig` [m].
     face_middle : ndarray, shape (3,)
-        Where the axis goes through the plane of the ground face, in `rig` [m].
+        Intersection of the axis with the plane of the bevel, in `rig` [m].
     """
 
     line: FloatArray
@@ -86,7 +86,7 @@ class NeedleMesh:
 
 
 class _Axis:
-    """The middle line by distance from its beginning, with a direction across it."""
+    """Centreline by arc length, with lateral directions."""
 
     def __init__(self, line: FloatArray, sharp_side: FloatArray) -> None:
         steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
@@ -97,7 +97,7 @@ class _Axis:
         self.length = float(self._distance[-1])
 
     def at(self, distance: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return points, and two directions across, each (..., 3); the first to the sharp side."""
+        """Return points and two lateral directions, each (..., 3); the first to the sharp side."""
         point, tangent = (
             np.stack(
                 [np.interp(distance, self._distance, part[:, axis]) for axis in range(3)], axis=-1
@@ -111,27 +111,27 @@ class _Axis:
 
 
 def needle_mesh(line: FloatArray, sharp_side: FloatArray, end: NeedleEnd) -> NeedleMesh:
-    """Return the needle along a middle line.
+    """Return the mesh of the needle along a centreline.
 
-    The last point of the line is the end of the axis: it is level with the metal's farthest point.
-    The ground face is the plane through that farthest point, across it, and through the axis half
-    the bevel's length behind its end.
+    The last point of the line is the end of the axis, level with the foremost point of the metal.
+    The plane of the bevel contains the foremost point and meets the axis half the bevel's length
+    behind its end.
 
     Parameters
     ----------
     line : ndarray, shape (M, 3)
-        Middle line in `rig`, the end last [m].
+        Centreline in `rig`, the end last [m].
     sharp_side : ndarray, shape (3,)
-        Direction in `rig` in which the farthest point lies beside the axis.
+        Direction from the axis to the foremost point, in `rig`.
     end : NeedleEnd
-        How it is made.
+        Geometry of the needle's end.
     """
     axis = _Axis(line, sharp_side)
     radius = end.diameter / 2.0
-    # Closer together where the needle is bent and ground, wider behind.
+    # Denser at the bent and bevelled end.
     station = axis.length * (1.0 - (1.0 - np.linspace(0.0, 1.0, _STATIONS)) ** 1.5)
     angle = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)
-    # So far behind the end the plane cuts the tube at this angle. Stations beyond fall together.
+    # Arc length at which the bevel cuts the tube at each angle; stations beyond it coincide.
     cut = axis.length - end.bevel_length / 2.0 * (1.0 - np.cos(angle))
     reach = np.minimum(station[:, np.newaxis], cut)
     middle, side, third = axis.at(reach)
@@ -154,7 +154,7 @@ def needle_mesh(line: FloatArray, sharp_side: FloatArray, end: NeedleEnd) -> Nee
 
 
 def _tube(points: FloatArray, normals: FloatArray) -> Mesh:
-    """Return the triangles between rings of corners, (R, S, 3)."""
+    """Return the triangles between rings of vertices, (R, S, 3)."""
     rings, sides = points.shape[:2]
     ring, place = np.mgrid[: rings - 1, :sides]
     here, beside = ring * sides + place, ring * sides + (place + 1) % sides
@@ -169,7 +169,7 @@ def _tube(points: FloatArray, normals: FloatArray) -> Mesh:
 
 
 def _ring_face(outer: FloatArray, inner: FloatArray, normal: FloatArray) -> Mesh:
-    """Return the flat ring between two closed lines of corners, (S, 3)."""
+    """Return the flat ring between two closed lines of vertices, (S, 3)."""
     both = np.stack([outer, inner])
     return _tube(both, np.broadcast_to(normal, both.shape))
 
@@ -177,7 +177,7 @@ def _ring_face(outer: FloatArray, inner: FloatArray, normal: FloatArray) -> Mesh
 def _bore(
     axis: _Axis, opening: FloatArray, radius: float, angle: FloatArray, end: NeedleEnd
 ) -> Mesh:
-    """Return the inside of a hollow needle's end, closed at its bottom."""
+    """Return the bore of a hollow needle's end, closed at its bottom."""
     bottom = np.array(axis.length - end.bevel_length - _BORE_DEPTH_DIAMETERS * end.diameter)
     middle, side, third = axis.at(bottom)
     outward = np.cos(angle)[:, np.newaxis] * side + np.sin(angle)[:, np.newaxis] * third

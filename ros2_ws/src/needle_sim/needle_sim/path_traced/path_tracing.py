@@ -14,22 +14,23 @@ from needle_sim.path_traced.scene import Scene
 from needle_sim.path_traced.tracer import MM, Mitsuba
 from needle_sim.path_traced.world import LENGTH, is_box, reach_sideways
 
-# Each iteration leaves less than a hundredth of the lens distortion's error.
+# Each iteration reduces the error of the lens distortion to less than a hundredth.
 _UNDISTORTING_STEPS = 14
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays that start where lines of sight enter the phantom, or pass it by.
+    """Lines of sight from where they enter the phantom, or pass it.
 
     Attributes
     ----------
     origin : ndarray, shape (..., 3)
-        On the window's inner face, in `rig`; of lines of sight that pass it by, on the outer [m].
+        Start on the window's inner face, in `rig`; on the outer face if the ray passes the phantom
+        [m].
     direction : ndarray, shape (..., 3)
-        Of unit length, in `rig`, behind that face.
+        Unit vector in `rig`, behind that face.
     in_air : ndarray of bool, shape (...)
-        Whether a line of sight passes the phantom by: nothing bends it.
+        Whether the line of sight passes the phantom without refraction.
     """
 
     origin: FloatArray
@@ -40,22 +41,22 @@ class Rays:
 def refracted_rays(pixels: ArrayLike, camera: SimulatedCamera, rig: StereoRig) -> Rays:
     """Return the lines of sight of pixels.
 
-    The phantom begins at z = 0, where the needle enters. A surface that both cameras share has no
-    other end; a box's wall ends at the box's other walls.
+    The phantom begins at z = 0, where the needle enters. A shared surface has no other bounds; the
+    wall of a box ends at the other walls.
 
     Parameters
     ----------
     pixels : array_like, shape (..., 2)
         u, v [px]; whole numbers are pixel centres.
     camera : SimulatedCamera
-        One of the rig's.
+        Camera of the rig.
     rig : StereoRig
-        The phantom.
+        Rig with the phantom.
 
     Returns
     -------
     Rays
-        One for each pixel.
+        One ray per pixel.
     """
     pixels = np.asarray(pixels, dtype=np.float64)
     pose, window = camera.T_optical_rig, camera.window
@@ -67,13 +68,13 @@ def refracted_rays(pixels: ArrayLike, camera: SimulatedCamera, rig: StereoRig) -
     inwards = incoming @ window.normal
     length = (window.outer - window.height(camera.centre)) / inwards
     outer = camera.centre + length[..., np.newaxis] * incoming
-    # Snell: what lies in the faces shrinks by n, the rest of the unit length leads inwards.
+    # Snell: the tangential component shrinks by n, the normal one completes the unit length.
     flat = incoming - inwards[..., np.newaxis] * window.normal
     origin = outer
     for thickness, index in zip(window.thicknesses, window.indices, strict=False):
-        direction = _bent(flat / index, window.normal)
+        direction = _refracted(flat / index, window.normal)
         origin = origin - thickness / (direction @ window.normal)[..., np.newaxis] * direction
-    direction = _bent(flat / window.indices[-1], window.normal)
+    direction = _refracted(flat / window.indices[-1], window.normal)
 
     in_air = origin[..., 2] <= 0.0
     if is_box(rig):
@@ -83,8 +84,8 @@ def refracted_rays(pixels: ArrayLike, camera: SimulatedCamera, rig: StereoRig) -
     return Rays(np.where(straight, outer, origin), np.where(straight, incoming, direction), in_air)
 
 
-def _bent(flat: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return unit vectors against a normal with a part (..., 3) across it."""
+def _refracted(flat: FloatArray, normal: FloatArray) -> FloatArray:
+    """Return unit vectors against a normal with a tangential component (..., 3)."""
     return np.asarray(flat - np.sqrt(1.0 - (flat**2).sum(axis=-1))[..., np.newaxis] * normal)
 
 
@@ -108,18 +109,18 @@ def _undistorted(pixels: FloatArray, camera: SimulatedCamera) -> FloatArray:
 PixelArray = NDArray[np.int64]
 
 _DEPTH = 6
-# No path counts more than this many times the brightest lamp's radiance: it would leave a spark.
-_BRIGHTEST = 10.0
-_MOST_PATHS = 4_000_000
+# Upper bound of a path's radiance, in units of the brightest lamp, to avoid bright outliers.
+_MAX_RADIANCE = 10.0
+_MAX_PATHS = 4_000_000
 
 
 class PathTracer:
-    """Traces what a camera sees in a scene, and the light on its floor.
+    """Path-traces the view of a camera, and the light on the floor.
 
     Parameters
     ----------
     mitsuba : Mitsuba
-        As `load_mitsuba` gives it.
+        Result of `load_mitsuba`.
     """
 
     def __init__(self, mitsuba: Mitsuba) -> None:
@@ -136,36 +137,36 @@ class PathTracer:
         samples: int,
         key: list[int],
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return light, coverage and distance of what stands before the floor.
+        """Return light, coverage and distance of the objects in front of the floor.
 
         Parameters
         ----------
         scene : Scene
-            What is there.
+            Scene to trace.
         pixels : ndarray of int, shape (N, 2)
             u, v of the pixels [px].
         camera : SimulatedCamera
-            Who sees it.
+            Camera of the view.
         rig : StereoRig
-            The phantom that it looks into.
+            Rig with the phantom.
         samples : int
-            Paths a pixel, evenly over its area.
+            Number of paths per pixel, uniform over its area.
         key : list of int
-            Keys them.
+            Seed of the paths.
 
         Returns
         -------
         light : ndarray, shape (N,)
-            Mean radiance of a pixel's paths, those that meet the floor first counted as 0.
+            Mean radiance of a pixel's paths; paths that hit the floor first count as 0.
         cover : ndarray, shape (N,)
-            Share of the paths that meet something else first.
+            Share of the paths that hit another object first.
         way : ndarray, shape (N,)
-            How far those go, on average over all paths: times `cover` the distance [m].
+            Length of these paths, averaged over all paths: distance times `cover` [m].
         """
         parts = [
             self._part(scene, part, camera, rig, samples=samples, key=[*key, number])
             for number, part in enumerate(
-                np.array_split(pixels, max(1, -(-len(pixels) * samples // _MOST_PATHS)))
+                np.array_split(pixels, max(1, -(-len(pixels) * samples // _MAX_PATHS)))
             )
             if len(part)
         ]
@@ -177,33 +178,33 @@ class PathTracer:
     def covered(
         self, scene: Scene, pixels: PixelArray, camera: SimulatedCamera, rig: StereoRig
     ) -> NDArray[np.bool_]:
-        """Return at which pixels, (N, 2), something stands before the floor, in their middle."""
+        """Return for each pixel, (N, 2), whether its centre shows an object in front of the floor."""
         mi = self._mi
         rays = refracted_rays(pixels, camera, rig)
         origin = mi.Point3f(*(MM * rays.origin.T).astype(np.float32))
         direction = mi.Vector3f(*rays.direction.T.astype(np.float32))
         hit = scene.tracer.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=True)
-        before = self._before(hit, scene)
+        before = self._hits_object(hit, scene)
         return np.asarray(before, dtype=np.bool_)
 
     def floor_light(
         self, scenes: list[Scene], points: FloatArray, *, samples: int, key: list[int]
     ) -> list[FloatArray]:
-        """Return the light that falls from above on places in each of several scenes.
+        """Return the direct light from above on points, in each of several scenes.
 
-        Only what comes straight from lamps and room counts. The scenes' light is sampled alike, so
-        that their ratio shows what stands in the way and no noise.
+        It comes from lamps and room without reflections. All scenes use the same samples, so that
+        their ratio shows shadows without noise.
 
         Parameters
         ----------
         scenes : list of Scene
-            With the same lamps.
+            Scenes with the same lamps.
         points : ndarray, shape (N, 3)
-            In `rig` [m].
+            Points in `rig` [m].
         samples : int
-            Paths for each point.
+            Number of paths per point.
         key : list of int
-            Keys them.
+            Seed of the paths.
 
         Returns
         -------
@@ -221,9 +222,10 @@ class PathTracer:
         )
         light = weight.x * self._dr.maximum(towards.d.x, 0.0) / np.pi
         ray = at.spawn_ray_to(towards.p)
-        # A floor throws no shadow: another camera's backdrop is no wall between lamp and box.
+        # Floors cast no shadows: the backdrop of the other camera is not a real wall.
         blocked = [
-            self._before(scene.tracer.ray_intersect_preliminary(ray), scene) for scene in scenes
+            self._hits_object(scene.tracer.ray_intersect_preliminary(ray), scene)
+            for scene in scenes
         ]
         return [self._mean(self._dr.select(hidden, 0.0, light), samples) for hidden in blocked]
 
@@ -240,7 +242,7 @@ class PathTracer:
         mi = self._mi
         sampler = self._sampler(key, len(pixels) * samples)
         index = self._index(len(pixels), samples)
-        # Within a pixel origin and direction are as good as linear.
+        # Origin and direction are practically linear within a pixel.
         half = np.array([[0.5, 0.0], [0.0, 0.5]])
         middle = refracted_rays(pixels, camera, rig)
         right, left, down, up = (
@@ -262,16 +264,16 @@ class PathTracer:
             mi.Ray3f(mi.Point3f(origin), mi.Vector3f(self._dr.normalize(direction)))
         )
         hit = scene.tracer.ray_intersect_preliminary(ray, coherent=True)
-        before = self._before(hit, scene)
+        before = self._hits_object(hit, scene)
         light, _, _ = self._integrator.sample(scene.tracer, sampler, ray, None, before)
         cover = self._dr.select(before, mi.Float(1.0), 0.0)
-        bounded = self._dr.select(before, self._dr.minimum(light.x, _BRIGHTEST), 0.0)
+        bounded = self._dr.select(before, self._dr.minimum(light.x, _MAX_RADIANCE), 0.0)
         way = self._dr.select(before, hit.t / MM, 0.0)
         mean = self._mean
         return mean(bounded, samples), mean(cover, samples), mean(way, samples)
 
-    def _before(self, hit: Any, scene: Scene) -> Any:
-        """Return which rays meet something, and not a floor."""
+    def _hits_object(self, hit: Any, scene: Scene) -> Any:
+        """Return which rays hit an object other than a floor."""
         before = hit.is_valid()
         for floor in scene.floors:
             before &= hit.shape != self._mi.ShapePtr(floor)

@@ -25,12 +25,12 @@ _FULL = 255.0
 _HAZE_BLUR_PX = 9.0
 _BLOOM_BLUR_PX = 2.5
 _BLOOM_ALONG_PX = 14.0
-# Beyond this, more light makes no wider bloom: wells overflow into the drain.
-_BRIGHTEST = 6.0 * _FULL
+# Light beyond this causes no wider bloom, because the sensor drains it.
+_MAX_LIGHT = 6.0 * _FULL
 
 
 def flicker(look: Appearance, number: int) -> float:
-    """Return by what the light of an exposure is stronger, for both cameras."""
+    """Return the factor of an exposure's light, for both cameras."""
     rng = np.random.default_rng([look.seed, number, 40])
     return float(np.exp(look.flicker * rng.standard_normal()))
 
@@ -38,22 +38,22 @@ def flicker(look: Appearance, number: int) -> float:
 def grey_image(
     light: FloatImage, look: Appearance, black: float, rng: np.random.Generator
 ) -> GreyImage:
-    """Return what the sensor makes of light.
+    """Return the image of the sensor.
 
     Parameters
     ----------
     light : ndarray of float32, shape (rows, columns)
-        In grey levels, as far above full scale as it is.
+        Light in grey levels, without an upper bound.
     look : Appearance
-        Haze, blur, blooming, noise.
+        Haze, blur, blooming and noise.
     black : float
-        What the sensor says of no light [grey levels].
+        Black level of the sensor [grey levels].
     rng : numpy.random.Generator
-        For the noise.
+        Generator of the noise.
     """
-    image = np.minimum(light, _BRIGHTEST).astype(np.float32)
+    image = np.minimum(light, _MAX_LIGHT).astype(np.float32)
     if look.haze > 0.0:
-        # What is scattered forwards arrives beside its place: it takes contrast from what is small.
+        # Forward scattering reduces the contrast of small objects.
         glow = cv2.GaussianBlur(image, (0, 0), _HAZE_BLUR_PX)
         image += 0.5 * look.haze * (glow - image)
     image = cv2.GaussianBlur(image, (0, 0), look.blur_px)
@@ -71,70 +71,67 @@ def grey_image(
 
 
 _GAIN_STREAM = 33
-# Paths a pixel of the needle, of what stands still, and of each place of the floor.
+# Paths per pixel of the needle and of static objects, and per point of the floor.
 _NEEDLE_SAMPLES = 96
-_STILL_SAMPLES = 64
+_STATIC_SAMPLES = 64
 _FLOOR_SAMPLES = 192
 _SHADOW_SAMPLES = 48
-# What the floor's light is sampled over [m]: across the needle, along it; spacing.
+# Grid of the floor's light: half width across the needle, range along it, spacing [m].
 _SIDE = 0.072
 _REACH = (-0.03, 0.15)
 _SPACING = 0.00075
 _GRID_SHAPE = (round(2.0 * _SIDE / _SPACING), round((_REACH[1] - _REACH[0]) / _SPACING))
-# How far around what stands before the floor pixels are traced [px].
+# Margin around static objects in which pixels are traced [px].
 _MARGIN_PX = 2
 _BLACK = (0.0, 8.0)
 
 
 class PathTracedRenderer:
-    """Draws a metal needle as both cameras see it.
+    """Renders a metal needle in both cameras.
 
-    An image is made of layers. The backdrop (the floor, or what stands behind a clear box) is its
-    picture times the light on it, which is sampled on a grid, with and without the needle, so that
-    the needle's shadow is there. What stands before it (needle, bubbles, walls) is path-traced
-    where it is, with its share of each pixel. Lint, old paths and a box's edges are drawn on the
-    backdrop's layer. Haze takes from all layers by their distance; then come its glow, blur,
-    blooming and noise.
+    An image consists of layers. The backdrop (the floor, or the background of a clear box) is its
+    picture times the light on it, which is sampled on a grid with and without the needle, for the
+    needle's shadow. Objects in front of it (needle, bubbles, walls) are path-traced, with their
+    share of each pixel. Lint, earlier paths and the edges of a box are drawn on the backdrop. Haze
+    fades all layers by their distance; then follow its glow, blur, blooming and noise.
 
-    Exact are shape and place of all that is traced: lines of sight obey Snell's law at each
-    camera's window, layer by layer; the phantom begins at z = 0, a box ends at its walls.
-    Approximated are: light inside the phantom, which comes straight from lamps that stand where the
-    phantom's middle sees them through a level top, also in a box; what the surface mirrors back
-    into the phantom, a ring of one brightness, in a box nothing; light that the floor gets from
-    walls and needle, none; caustics of bubbles, which only throw shadows; haze, which fades what is
-    far by one exponential and glows by one width; the window's own reflections, none; a floor that
-    is Lambertian, brushed metal too; and what stands behind a box, which is a flat picture, seen as
-    if the gel reached to it, in a light that falls on it from above and before.
+    Shape and position of all traced objects are exact: lines of sight obey Snell's law at each
+    layer of a camera's window; the phantom begins at z = 0, a box ends at its walls.
+    Approximations: lamps are at their apparent position from the phantom's centre through a level
+    top, also for a box; the surface mirrors a ring of constant brightness into the phantom, nothing
+    in a box; walls and needle do not light the floor; bubbles cast shadows without caustics; haze
+    is one exponential with a glow of one width; windows do not reflect; all floors are Lambertian;
+    the background of a box is a flat picture in gel, lit from above and from the front.
 
-    Two renderers of one rig and appearance draw the same images, bit for bit, whatever was drawn
-    before and on however many cores.
+    Renderers with the same rig and appearance produce bit-identical images, in any order and on any
+    number of cores.
 
     Parameters
     ----------
     mitsuba : Mitsuba
-        As `load_mitsuba` gives it.
+        Result of `load_mitsuba`.
     rig : StereoRig
         Cameras and phantom.
     look : Appearance
-        Metal, light, floor, dirt, and the seed of all that is random.
+        Appearance, with the seed of all random numbers.
     """
 
     def __init__(self, mitsuba: Mitsuba, rig: StereoRig, look: Appearance) -> None:
         self._mitsuba, self._rig, self._look = mitsuba, rig, look
         self._world = make_world(rig, look)
         self._tracer = PathTracer(mitsuba)
-        self._still = Scene(mitsuba, self._world)
-        self._moving: Scene | None = None
-        self._bent: NeedleMesh | None = None
+        self._static_scene = Scene(mitsuba, self._world)
+        self._needle_scene: Scene | None = None
+        self._current_needle: NeedleMesh | None = None
         self._light: dict[Backdrop, FloatImage] = {}
         for behind in dict.fromkeys(self._world.backdrops):
             (light,) = self._tracer.floor_light(
-                [self._still],
+                [self._static_scene],
                 _grid(behind).reshape(-1, 3),
                 samples=_FLOOR_SAMPLES,
                 key=[look.seed],
             )
-            # One sample's noise is finer than any shade of still things.
+            # Sampling noise is finer than the shadows of static objects.
             self._light[behind] = cv2.GaussianBlur(
                 light.reshape(_GRID_SHAPE).astype(np.float32), (0, 0), 1.5
             )
@@ -142,7 +139,7 @@ class PathTracedRenderer:
         self._views = [self._view(*each, side) for side, each in enumerate(cameras)]
         rng = np.random.default_rng([look.seed, 0, _GAIN_STREAM])
         self._black = float(rng.uniform(*_BLACK))
-        # What is before the phantom counts for no exposure.
+        # Exposure ignores the area in front of the phantom.
         medians = [np.median(view.floor[view.floor_points[..., 2] > 0.0]) for view in self._views]
         self._gains = (
             (look.floor_level - self._black) / np.array(medians) * rng.normal(1.0, 0.03, 2)
@@ -156,9 +153,9 @@ class PathTracedRenderer:
         Parameters
         ----------
         needles : pair of NeedleMesh or None
-            As it is when left and right expose; None is not there.
+            Needle at the exposures of left and right; None without a needle.
         exposure_number : int
-            Keys the noise; not negative.
+            Key of the noise, not negative.
 
         Returns
         -------
@@ -178,17 +175,17 @@ class PathTracedRenderer:
         return left, right
 
     def _scene_with(self, needle: NeedleMesh) -> Scene:
-        if self._moving is None:
-            self._moving = Scene(self._mitsuba, self._world, needle.parts)
-        elif needle is not self._bent:
-            self._moving.bend(needle.parts)
-        self._bent = needle
-        return self._moving
+        if self._needle_scene is None:
+            self._needle_scene = Scene(self._mitsuba, self._world, needle.parts)
+        elif needle is not self._current_needle:
+            self._needle_scene.update_needle(needle.parts)
+        self._current_needle = needle
+        return self._needle_scene
 
     def _shadow(self, scene: Scene, behind: Backdrop, key: list[int]) -> FloatImage:
-        """Return which share of the light on the grid the needle leaves."""
+        """Return the share of the grid's light that the needle does not block."""
         without, beside = self._tracer.floor_light(
-            [self._still, scene],
+            [self._static_scene, scene],
             _grid(behind).reshape(-1, 3),
             samples=_SHADOW_SAMPLES,
             key=key,
@@ -201,9 +198,9 @@ class PathTracedRenderer:
         floor, light, cover = view.floor, view.light, view.cover
         if needle is not None:
             scene = self._scene_with(needle)
-            # A lit panel outshines the lamps' shadows.
+            # Shadows are invisible on a lit panel.
             if self._look.floor != "panel":
-                floor = floor * view.on_grid(self._shadow(scene, view.behind, key[:2]))
+                floor = floor * view.on_grid(self._shadow(scene, view.backdrop, key[:2]))
             pixels = _needle_pixels(view.optics, needle)
             light, cover = light.copy(), cover.copy()
             self._trace(view, scene, pixels, light, cover, samples=_NEEDLE_SAMPLES, key=key)
@@ -220,12 +217,12 @@ class PathTracedRenderer:
         samples: int,
         key: list[int],
     ) -> None:
-        """Put what pixels, (N, 2), show before the backdrop into light and cover."""
+        """Set light and cover of pixels, (N, 2), that show objects in front of the backdrop."""
         there = (pixels[:, 1], pixels[:, 0])
         seen, covered, way = self._tracer.layer(
             scene, pixels, view.optics.camera, self._rig, samples=samples, key=key
         )
-        clear = _clearness(self._look.haze, way / np.maximum(covered, 1e-9) / view.behind.gel)
+        clear = _transmission(self._look.haze, way / np.maximum(covered, 1e-9) / view.backdrop.gel)
         clear = np.where(view.in_air[there], 1.0, clear)
         light[there] = clear * seen + (1.0 - clear) * covered * view.veil
         cover[there] = covered
@@ -241,7 +238,7 @@ class PathTracedRenderer:
         blank = np.zeros(size, dtype=np.float32)
         view = _View(optics, behind, points, rays.in_air, 0.0, blank, blank.copy(), blank.copy())
         floor = view.on_grid(self._light[behind])
-        # The mean over each pixel: a quarter of the way to the next one, in both directions.
+        # Mean over each pixel, from four samples.
         right, down = (np.gradient(points, axis=axis) / 4.0 for axis in (1, 0))
         quarters = [
             behind.reflectance(points + u * right + v * down)
@@ -254,22 +251,24 @@ class PathTracedRenderer:
         if look.floor_blur_px > 0.0:
             floor = cv2.GaussianBlur(floor, (0, 0), look.floor_blur_px)
         veil = float(np.median(floor))
-        clear = np.where(rays.in_air, 1.0, _clearness(look.haze, 1.0))
+        clear = np.where(rays.in_air, 1.0, _transmission(look.haze, 1.0))
         floor = np.asarray(clear * floor + (1.0 - clear) * veil, dtype=np.float32)
-        # Clouded gel scatters light from all sides, over a dark floor little of it.
+        # Clouded gel scatters light from all sides, little of it over a dark floor.
         Marks(self._world).draw(floor, optics, 0.4 * float(np.median(self._light[behind])) + veil)
 
         view = dataclasses.replace(view, veil=veil, floor=floor)
-        found = self._tracer.covered(self._still, pixels.reshape(-1, 2), camera, rig).reshape(size)
+        found = self._tracer.covered(
+            self._static_scene, pixels.reshape(-1, 2), camera, rig
+        ).reshape(size)
         around = np.ones((2 * _MARGIN_PX + 1,) * 2, dtype=np.uint8)
         near = cv2.dilate(found.astype(np.uint8), around) > 0
         self._trace(
             view,
-            self._still,
+            self._static_scene,
             pixels[near],
             view.light,
             view.cover,
-            samples=_STILL_SAMPLES,
+            samples=_STATIC_SAMPLES,
             key=[look.seed, side],
         )
         return view
@@ -277,28 +276,28 @@ class PathTracedRenderer:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _View:
-    """Still part of one camera's image.
+    """Static part of a camera's image.
 
     Attributes
     ----------
     optics : Optics
-        Where the camera sees points.
-    behind : Backdrop
-        What it sees behind the needle.
+        Optics of the camera.
+    backdrop : Backdrop
+        Backdrop of the camera.
     floor_points : ndarray, shape (rows, columns, 3)
-        Where lines of sight meet that, in `rig` [m].
+        Intersections of the lines of sight with the backdrop, in `rig` [m].
     in_air : ndarray of bool, shape (rows, columns)
-        Which of them pass the phantom by.
+        Whether a line of sight passes the phantom.
     veil : float
         Radiance of haze.
     floor : ndarray of float32, shape (rows, columns)
-        The backdrop's radiance without a needle.
+        Radiance of the backdrop without a needle.
     light, cover : ndarray of float32, shape (rows, columns)
-        Radiance and share of what stands before it.
+        Radiance and coverage of objects in front of the backdrop.
     """
 
     optics: Optics
-    behind: Backdrop
+    backdrop: Backdrop
     floor_points: FloatArray
     in_air: NDArray[np.bool_]
     veil: float
@@ -307,32 +306,32 @@ class _View:
     cover: FloatImage
 
     def on_grid(self, values: FloatImage) -> FloatImage:
-        """Return values of the backdrop's grid where lines of sight meet it, (rows, columns)."""
-        aside, along = self.floor_points @ self.behind.sideways, self.floor_points[..., 2]
+        """Return values of the backdrop's grid at the lines of sight, (rows, columns)."""
+        aside, along = self.floor_points @ self.backdrop.sideways, self.floor_points[..., 2]
         column = ((along - _REACH[0]) / _SPACING).astype(np.float32)
         row = ((aside + _SIDE) / _SPACING).astype(np.float32)
         there = cv2.remap(values, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(there, dtype=np.float32)
 
 
-def _clearness(haze: float, way: FloatArray | float) -> FloatArray:
-    """Return the share of light left after a share of the way through the phantom."""
+def _transmission(haze: float, way: FloatArray | float) -> FloatArray:
+    """Return the transmitted share of light after a share of the path through the phantom."""
     return np.asarray((1.0 - haze) ** np.minimum(way, 1.0))
 
 
 def _needle_pixels(optics: Optics, needle: NeedleMesh) -> NDArray[np.int64]:
-    """Return the pixels, (N, 2), that show the needle or are next to such."""
+    """Return the pixels, (N, 2), that show the needle, and their neighbours."""
     width, height = optics.image_size
     place = np.rint(optics.project(needle.parts["shaft"].points)).astype(np.int64)
     inside = np.all((place >= 0) & (place < [width, height]), axis=1)
     near = np.zeros((height, width), dtype=np.uint8)
     near[place[inside, 1], place[inside, 0]] = 1
-    # From one ring of the tube to the next it is a few pixels.
+    # The rings of the tube are a few pixels apart.
     near = cv2.dilate(near, np.ones((9, 9), dtype=np.uint8))
     return np.stack(np.nonzero(near)[::-1], axis=-1).astype(np.int64)
 
 
 def _grid(behind: Backdrop) -> FloatArray:
-    """Return places of a backdrop in `rig`, (*_GRID_SHAPE, 3): rows across the needle [m]."""
+    """Return the grid points of a backdrop in `rig`, (*_GRID_SHAPE, 3): rows across the needle [m]."""
     aside, along = np.mgrid[: _GRID_SHAPE[0], : _GRID_SHAPE[1]]
     return behind.points(aside * _SPACING - _SIDE, along * _SPACING + _REACH[0])

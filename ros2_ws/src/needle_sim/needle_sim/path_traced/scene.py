@@ -1,8 +1,8 @@
-"""The scene that is traced: floor, box, bubbles, lamps, room and needle.
+"""Scene for the path tracer: floor, box, bubbles, lamps, room and needle.
 
-Lines of sight are refracted before they get here (`refracted_rays`), so that the scene has no
-surface: the light comes straight from lamps that stand where the middle of the phantom sees them,
-and from the room as it is seen from there.
+`refracted_rays` refracts the lines of sight, so that the scene has no surface: the light comes
+directly from lamps at their apparent positions from the phantom's centre, and from the room as seen
+from there.
 """
 
 from __future__ import annotations
@@ -27,31 +27,30 @@ from needle_sim.path_traced.world import (
     is_box,
     refractive_index,
     room_light,
-    sides,
 )
 
-# Steel at 580 nm, against air.
+# Steel at 580 nm, relative to air.
 _STEEL_INDEX = 2.9
 _STEEL_EXTINCTION = 3.1
 _PAINT_INDEX = 1.5
 _DARK: dict[Metal, float] = {"oxide": 0.05, "painted": 0.02}
 _SHEATH_LENGTH = 0.04
 _SHEATH_RADIUS = 0.0015
-# The floor in the scene is only seen in mirrors: coarser than in the image.
+# The floor in the scene is visible only in reflections, at this coarser resolution.
 _COARSER = 4
 
 
 class Scene:
-    """A world in the tracer's hands, with or without a needle.
+    """Mitsuba scene of a world, with or without a needle.
 
     Parameters
     ----------
     mitsuba : Mitsuba
-        As `load_mitsuba` gives it.
+        Result of `load_mitsuba`.
     world : World
-        What stands still.
+        Static parts.
     needle : dict of str to Mesh, optional
-        Parts of the needle; their shape may change later, their number not.
+        Parts of the needle; their shape may change later, but not their number.
     """
 
     def __init__(
@@ -68,12 +67,12 @@ class Scene:
             parts |= self._bubbles(world.bubbles, refractive_index(world.rig))
         for name, mesh in (needle or {}).items():
             parts[name] = self._mesh(name, mesh, self._metal(world, name))
-        # Optimised, the order of shapes and with it the noise is another from time to time.
+        # Optimisation may change the order of shapes, and with it the noise.
         self.tracer = self._mi.load_dict(parts, optimize=False)
         self._parameters = self._mi.traverse(self.tracer)
 
-    def bend(self, needle: dict[str, Mesh]) -> None:
-        """Put the needle's parts elsewhere."""
+    def update_needle(self, needle: dict[str, Mesh]) -> None:
+        """Set a new shape of the needle."""
         for name, mesh in needle.items():
             self._set(self._parameters, f"{name}.", mesh)
         self._parameters.update()
@@ -109,7 +108,7 @@ class Scene:
         along, across = look.roughness_along, look.roughness_across
         if part == "face":
             along = across = look.face_roughness
-        # Grinding takes paint off, and leaves oxide steel bare.
+        # Grinding removes paint and oxide.
         dark = None if part == "face" else _DARK.get(look.metal)
         if dark is None:
             return _both_sides(
@@ -151,7 +150,7 @@ class Scene:
             "type": "diffuse",
             "reflectance": {
                 "type": "bitmap",
-                # The rectangle's first axis lies against z.
+                # The first axis of the rectangle is -z.
                 "bitmap": self._mi.Bitmap(np.ascontiguousarray(picture[:, ::-1])),
                 "raw": True,
                 "wrap_mode": "clamp",
@@ -160,10 +159,10 @@ class Scene:
         return shape
 
     def _box(self, world: World) -> dict[str, Any]:
-        """Return the box's walls and the sheath before it, through which the needle comes."""
-        (bottom, top), (_, beside) = sides(world.rig, world.look)
+        """Return the walls of the box, and the sheath in front of it."""
+        (bottom, top), (_, beside) = block_bounds(world.rig, world.look)
         wall = world.wall
-        # Half sides and middles: front (where the needle enters), far end, and both opaque sides.
+        # Centres and half sides: front (where the needle enters), far end, and both opaque sides.
         high = (top - bottom) / 2.0
         middle = (top + bottom) / 2.0 - 1e-5
         long = (LENGTH + 2.0 * wall) / 2.0
@@ -207,7 +206,7 @@ class Scene:
                 "to_world": transform @ self._transform().scale([MM * across, MM * along, 1.0]),
                 "emitter": {"type": "area", "radiance": lamp.radiance},
             }
-        # The picture's up is y: turned to x.
+        # Rotate the picture's up direction from y to x.
         parts["room"] = {
             "type": "envmap",
             "bitmap": self._mi.Bitmap(room_light(world)[..., np.newaxis]),

@@ -1,4 +1,4 @@
-"""Mitsuba 3, which is an extra: loaded when it is asked for, and missed in one line."""
+"""Loads Mitsuba 3, an optional dependency; a missing one is a one-line error."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from typing import Any, NamedTuple
 from needle_core.errors import UserError
 
 VARIANT = "llvm_ad_mono"
-"""Grey light, compiled by LLVM: on one core 5 times as many paths a second as scalar_rgb."""
+"""Grey light, compiled by LLVM: 5 times as fast as scalar_rgb on one core."""
 
 MM = 1e3
-"""Scenes are in mm: the tracer's guard against self-intersection is a tenth of a unit near 1 m."""
+"""Scale of scenes, which are in mm: near 1 m the tracer's self-intersection guard is 0.1 units."""
 
 _LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
-# Older ones end the process: they cannot compile IEEE 754's minimum for x86.
-_OLDEST_LLVM = 17
+# Older versions abort the process: they cannot compile the IEEE 754 minimum for x86.
+_MIN_LLVM = 17
 _LIBRARY_FOLDERS = ("/usr/lib/x86_64-linux-gnu", "/usr/lib64", "/usr/lib")
 _LIBRARY_NAME = re.compile(r"libLLVM(?:-|\.so\.)(\d+)[\d.]*(?:\.so(?:\.1)?)?")
 _HINT = "docs/dependencies.md says how to install it"
 
 
 class Mitsuba(NamedTuple):
-    """The tracer's two modules, which have no types.
+    """Modules of the tracer, which have no types.
 
     Attributes
     ----------
     mi, dr : module
-        `mitsuba`, its variant chosen, and `drjit`, its arrays.
+        `mitsuba` with its variant set, and `drjit`, its array library.
     """
 
     mi: Any
@@ -39,12 +39,12 @@ class Mitsuba(NamedTuple):
 def load_mitsuba() -> Mitsuba:
     """Return the tracer.
 
-    LLVM is taken from DRJIT_LIBLLVM_PATH, else the newest one among the system's libraries.
+    It uses the LLVM library in DRJIT_LIBLLVM_PATH, or the newest one of the system.
 
     Raises
     ------
     UserError
-        If Mitsuba or an LLVM that is new enough is missing.
+        If Mitsuba or a recent LLVM is missing.
     """
     try:
         import drjit  # noqa: PLC0415
@@ -62,10 +62,9 @@ def load_mitsuba() -> Mitsuba:
         raise UserError(
             f"{os.environ[_LIBRARY_VARIABLE]} is no LLVM library that can be used; {_HINT}"
         ) from None
-    if version[0] < _OLDEST_LLVM:
+    if version[0] < _MIN_LLVM:
         raise UserError(
-            f"{os.environ[_LIBRARY_VARIABLE]} is LLVM {version[0]}, "
-            f"older than {_OLDEST_LLVM}; {_HINT}"
+            f"{os.environ[_LIBRARY_VARIABLE]} is LLVM {version[0]}, older than {_MIN_LLVM}; {_HINT}"
         )
     return Mitsuba(mitsuba, drjit)
 
@@ -78,9 +77,9 @@ def _newest_llvm() -> Path:
         if (match := _LIBRARY_NAME.fullmatch(path.name)) is not None
     ]
     version, path = max(found, default=(0, Path()))
-    if version < _OLDEST_LLVM:
+    if version < _MIN_LLVM:
         raise UserError(
-            f"renderer path_traced needs LLVM {_OLDEST_LLVM} or newer, which is not installed; "
+            f"renderer path_traced needs LLVM {_MIN_LLVM} or newer, which is not installed; "
             + _HINT
         )
     return path

@@ -15,28 +15,30 @@ from needle_sim.path_traced.appearance import Appearance, Lamps
 from needle_sim.path_traced.floors import ALBEDO, FloorPicture, floor_picture
 
 LENGTH = 0.155
-"""Of the block along z, from the needle's entry on [m]."""
-_SIDE = 0.07  # of a block under one level surface [m]
+"""Length of the block along z, from the needle's entry [m]."""
+_SIDE = 0.07  # half width of a block under a common level surface [m]
 
 
 def refractive_index(rig: StereoRig) -> float:
-    """Return the phantom's refractive index [-]."""
+    """Return the refractive index of the phantom [-]."""
     return rig.left.window.indices[-1]
 
 
 def is_box(rig: StereoRig) -> bool:
-    """Return whether each camera has a wall of its own, all clear; else both share one surface."""
+    """Return whether each camera has its own clear wall; otherwise both share one surface."""
     return float(rig.left.window.normal @ rig.right.window.normal) < 0.5
 
 
 def reach_sideways(camera: SimulatedCamera, rig: StereoRig) -> float:
-    """Return how far a camera's wall reaches to both sides; a shared surface is endless [m]."""
+    """Return the half width of a camera's wall; infinite for a shared surface [m]."""
     other = rig.right if camera is rig.left else rig.left
     return other.window.inner if is_box(rig) else np.inf
 
 
-def sides(rig: StereoRig, look: Appearance) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the block's bounds in x and y [m]."""
+def block_bounds(
+    rig: StereoRig, look: Appearance
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the bounds of the block in x and y [m]."""
     if is_box(rig):
         return (-rig.half_height, rig.half_height), (-rig.half_width, rig.half_width)
     return (look.floor_height, rig.half_height), (-_SIDE, _SIDE)
@@ -44,20 +46,20 @@ def sides(rig: StereoRig, look: Appearance) -> tuple[tuple[float, float], tuple[
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Backdrop:
-    """A plane with a picture behind the needle, upright before a camera's window.
+    """Plane with a picture behind the needle, parallel to z and facing a camera's window.
 
-    What stands in the air behind a clear box is put where it would be if the gel went on.
+    Objects in the air behind a clear box are placed as if the gel extended to them.
 
     Attributes
     ----------
     normal, sideways : ndarray, shape (3,)
         Unit vectors in `rig`, towards the camera and across the needle; both across z.
     depth : float
-        Of the plane behind the needle's axis [m].
+        Distance of the plane behind the needle's axis [m].
     gel : float
-        Way through the phantom towards it, from the window's inner face [m].
+        Path length through the phantom, from the window's inner face [m].
     picture : FloorPicture
-        How much light each place gives back.
+        Reflectance of the plane.
     """
 
     normal: FloatArray
@@ -67,7 +69,7 @@ class Backdrop:
     picture: FloorPicture
 
     def points(self, aside: FloatArray, along: FloatArray) -> FloatArray:
-        """Return places on the plane, (..., 3) in `rig`, by y-like and z coordinate [m]."""
+        """Return points on the plane, (..., 3) in `rig`, from lateral and z coordinates [m]."""
         return np.asarray(
             np.asarray(aside)[..., np.newaxis] * self.sideways
             + np.asarray(along)[..., np.newaxis] * [0.0, 0.0, 1.0]
@@ -75,19 +77,19 @@ class Backdrop:
         )
 
     def intersect(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
-        """Return where rays, each (..., 3), meet the plane, (..., 3) in `rig` [m]."""
+        """Return the intersections of rays, each (..., 3), with the plane, (..., 3) in `rig` [m]."""
         length = -(self.depth + origin @ self.normal) / (direction @ self.normal)
         return np.asarray(origin + length[..., np.newaxis] * direction)
 
     def reflectance(self, points: FloatArray) -> FloatImage:
-        """Return the picture at places of the plane, (rows, columns, 3) in `rig` [m]."""
+        """Return the reflectance at points of the plane, (rows, columns, 3) in `rig` [m]."""
         return self.picture.at(points @ self.sideways, points[..., 2])
 
 
 def backdrop(
     camera: SimulatedCamera, rig: StereoRig, look: Appearance, picture: FloorPicture
 ) -> Backdrop:
-    """Return what a camera sees behind the needle: the floor, or what stands behind the box."""
+    """Return the backdrop of a camera: the floor, or the background behind the box."""
     window = camera.window
     normal = np.array([*window.normal[:2], 0.0])
     depth = window.inner + look.behind if is_box(rig) else -look.floor_height
@@ -96,7 +98,7 @@ def backdrop(
 
 
 MIDDLE = np.array([0.0, 0.0, 0.06])
-"""Of what the cameras see of the phantom, in `rig` [m]: lamps point there."""
+"""Centre of the visible phantom in `rig`, to which lamps point [m]."""
 
 # Angles from the vertical over MIDDLE: across the needle (either side), along it; distance [m].
 _ACROSS = np.deg2rad([8.0, 60.0])
@@ -109,18 +111,18 @@ _STRIP_LENGTH = (0.15, 0.35)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lamp:
-    """A bright rectangle that points at the phantom's middle.
+    """Bright rectangle that points at the centre of the phantom.
 
     Attributes
     ----------
     centre : ndarray, shape (3,)
-        In `rig`, in air [m].
+        Centre in `rig`, in air [m].
     half_sides : pair of float
-        Half its sides; the second lies about along the needle, unless it is turned [m].
+        Half sides; the second is about parallel to the needle, unless `turned` [m].
     turned : bool
         Whether the sides are exchanged.
     radiance : float
-        Against that of the brightest lamp.
+        Radiance relative to the brightest lamp.
     """
 
     centre: FloatArray
@@ -130,7 +132,7 @@ class Lamp:
 
 
 def place_lamps(kind: Lamps, rng: np.random.Generator) -> list[Lamp]:
-    """Return the lamps of a kind in random places: one side first, the second on the other."""
+    """Return the lamps of a kind at random positions, alternating between both sides."""
     count = {"softbox": 1, "softboxes": 2, "strip": 1, "room": 0}[kind]
     side = rng.choice([-1.0, 1.0])
     lamps = []
@@ -140,7 +142,7 @@ def place_lamps(kind: Lamps, rng: np.random.Generator) -> list[Lamp]:
         direction = np.array([1.0, np.tan(across), np.tan(np.clip(along, -1.0, 1.0))])
         direction /= np.linalg.norm(direction)
         centre = MIDDLE + rng.uniform(*_DISTANCES) * direction
-        # No lamp beside the phantom: its top would hide it.
+        # A lower lamp would be hidden by the phantom's top.
         centre[0] = max(centre[0], 0.15)
         sizes = (_STRIP_WIDTH, _STRIP_LENGTH) if kind == "strip" else (_SOFTBOX, _SOFTBOX)
         half = (float(rng.uniform(*sizes[0])), float(rng.uniform(*sizes[1])))
@@ -150,10 +152,10 @@ def place_lamps(kind: Lamps, rng: np.random.Generator) -> list[Lamp]:
 
 
 def apparent_centre(lamp: Lamp, rig: StereoRig) -> FloatArray:
-    """Return where a lamp seems to stand from the middle of the phantom, (3,) in `rig` [m].
+    """Return the apparent position of a lamp from the centre of the phantom, (3,) in `rig` [m].
 
-    It is seen straight above its place on the ground, as much higher as Snell's law makes the light
-    steeper inside: through a level top without layers, whatever the cameras look through.
+    It keeps its horizontal position and appears higher, because refraction makes the light steeper
+    inside. The top is level and without layers, independent of the cameras' windows.
     """
     up, index = np.array([1.0, 0.0, 0.0]), refractive_index(rig)
     top = SimulatedWindow(up, rig.half_height, (), (index,))
@@ -168,7 +170,7 @@ def apparent_centre(lamp: Lamp, rig: StereoRig) -> FloatArray:
 
 
 def irradiance(lamps: list[Lamp], rig: StereoRig) -> float:
-    """Return about how much light falls on a floor at the middle, of the radiance's unit."""
+    """Return the approximate irradiance of the floor at its centre, in units of the radiance."""
     total = 0.0
     for lamp in lamps:
         away = apparent_centre(lamp, rig) - MIDDLE
@@ -179,7 +181,7 @@ def irradiance(lamps: list[Lamp], rig: StereoRig) -> float:
 
 
 PANEL_RADIANCE = 1.0
-"""Of a lit panel, as of the brightest lamp."""
+"""Radiance of a lit panel, in units of the brightest lamp."""
 
 _STREAM = 30
 _ROOM_STREAM = 31
@@ -187,32 +189,32 @@ _SMALLEST_BUBBLE = 0.0001
 _LARGEST_BUBBLES = (0.0003, 0.0012)
 _BOX_WALLS = (0.003, 0.008)
 _WALL_ALBEDOS = (0.05, 0.8)
-# Pixels of the room's light: from up to down, and around.
+# Pixels of the room's light: polar and azimuthal.
 _SKY = (64, 32)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class World:
-    """Still parts of a sequence.
+    """Static parts of a sequence.
 
     Attributes
     ----------
     rig : StereoRig
         Phantom and cameras.
     look : Appearance
-        Kinds and amounts.
+        Appearance of the sequence.
     lamps : list of Lamp
-        Where the light comes from.
+        Lamps.
     room : float
-        Radiance of the room, against the brightest lamp's.
+        Radiance of the room relative to the brightest lamp.
     backdrops : pair of Backdrop
-        What left and right see behind the needle; the same one where they share a surface.
+        Backdrops of left and right; identical if both share a surface.
     bubbles : BubbleCloud or None
-        Air in the phantom.
+        Bubbles in the phantom.
     wall : float
         Thickness of the box's walls [m].
     wall_albedo : float
-        Share of the light that they give back.
+        Reflectance of the walls.
     """
 
     rig: StereoRig
@@ -226,7 +228,7 @@ class World:
 
 
 def make_world(rig: StereoRig, look: Appearance) -> World:
-    """Return what stands still in a sequence of a look; the same look gives the same."""
+    """Return the static parts of a sequence, determined by its appearance."""
     rng = np.random.default_rng([look.seed, 0, _STREAM])
     lamps = place_lamps(look.lamps, rng)
     wall, albedo = float(rng.uniform(*_BOX_WALLS)), float(rng.uniform(*_WALL_ALBEDOS))
@@ -243,11 +245,11 @@ def make_world(rig: StereoRig, look: Appearance) -> World:
 
 
 def room_light(world: World) -> FloatImage:
-    """Return the room's radiance by direction, as one inside the phantom sees it.
+    """Return the radiance of the room by direction, seen from inside the phantom.
 
-    Rows lead from straight up to straight down, columns around. Above the critical angle there is
-    the room; below it the surface mirrors what is in the phantom: mostly its floor. A clear box is
-    open to all sides.
+    Rows are polar angles from up to down, columns azimuths. Within the critical angle the room is
+    visible; beyond it, the surface mirrors the inside of the phantom, mostly its floor. A clear box
+    is open to all sides.
     """
     look = world.look
     rng = np.random.default_rng([look.seed, 0, _ROOM_STREAM])

@@ -1,1 +1,1 @@
-"""The simulated rig behind the rig's topics and services."""
+"""Executables of the simulated rig."""

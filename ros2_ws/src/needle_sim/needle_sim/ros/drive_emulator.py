@@ -1,4 +1,4 @@
-"""The `drive_emulator` executable: two drives on a bus, as a process of their own."""
+"""The `drive_emulator` executable."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ Publishes   sim/drive_positions: where the motors really are, from the home swit
             the drives count; 50 Hz
 """
 
-_LOOK = 0.2
+_WAKE_UP_PERIOD = 0.2
 
 
 class _CommandLines:
-    """Lines of this program's input, as they come."""
+    """Port with the lines of this program's input."""
 
     def __init__(self) -> None:
         self._is_closed = False
@@ -48,12 +48,12 @@ class _CommandLines:
         try:
             terminal = sys.stdin.fileno()
         except (AttributeError, ValueError, OSError):
-            # A program without input.
+            # The program has no input.
             return
         threading.Thread(target=self._read, args=(terminal, arrive), daemon=True).start()
 
     def send(self, batch: tuple[Any, ...]) -> None:
-        """Do nothing: nobody answers a line."""
+        """Do nothing: lines have no answer."""
 
     def close(self) -> None:
         self._is_closed = True
@@ -61,9 +61,9 @@ class _CommandLines:
     def _read(self, terminal: int, arrive: Callable[[Any], None]) -> None:
         rest = b""
         while not self._is_closed:
-            if not select.select([terminal], [], [], _LOOK)[0]:
+            if not select.select([terminal], [], [], _WAKE_UP_PERIOD)[0]:
                 continue
-            # What is typed for a shell in front is not for a program in its background.
+            # Input for the shell in the foreground is not for a program in its background.
             if os.isatty(terminal) and os.tcgetpgrp(terminal) != os.getpgrp():
                 continue
             data = os.read(terminal, 4096)
@@ -75,20 +75,20 @@ class _CommandLines:
 
 
 class _Plug:
-    """The adapter's plug, which a command pulls."""
+    """Port that plugs and unplugs the adapter."""
 
     def __init__(self, adapter: PtyCan) -> None:
         self._adapter = adapter
 
     def open(self, arrive: Callable[[Any], None]) -> None:
-        """Do nothing: a plug says nothing."""
+        """Do nothing: the plug has no input."""
 
     def send(self, batch: tuple[PlugCommand, ...]) -> None:
-        for order in batch:
-            self._adapter.plug(plugged_in=order is PlugCommand.IN)
+        for command in batch:
+            self._adapter.plug(plugged_in=command is PlugCommand.IN)
 
     def close(self) -> None:
-        """Do nothing: the bus takes the adapter away."""
+        """Do nothing: the CAN port removes the adapter."""
 
 
 def _ports(settings: DriveEmulatorParameters) -> Mapping[str, RealPort]:
@@ -98,7 +98,7 @@ def _ports(settings: DriveEmulatorParameters) -> Mapping[str, RealPort]:
 
 
 def main() -> int:
-    """Run the emulator; returns its exit code."""
+    """Run the emulator; return its exit code."""
     return run_component(
         "drive_emulator",
         DriveEmulatorParameters,

@@ -45,7 +45,7 @@ def _ports(settings: SimRigParameters) -> Mapping[str, RealPort]:
 
 
 def main() -> int:
-    """Run the node; returns its exit code."""
+    """Run the node; return its exit code."""
     return run_component("sim_rig", SimRigParameters, _make, help_text=HELP, ports=_ports)
 
 

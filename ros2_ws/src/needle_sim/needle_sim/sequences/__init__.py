@@ -1,1 +1,1 @@
-"""Image sequences on the command line, by either renderer."""
+"""Image sequences on the command line, with either renderer."""

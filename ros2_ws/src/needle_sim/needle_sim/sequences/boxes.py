@@ -1,4 +1,4 @@
-"""Boxes of gel before two webcams, drawn at random, as the text of a calibration file."""
+"""Random gel boxes in front of two webcams, as calibration files."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from needle_sim.needle.se3 import FloatArray
 _STREAM = 60
 _SIZE = (640, 480)
 _FOCAL_PX = (560.0, 1000.0)
-_CENTRE_PX = 12.0  # of the principal point, from the image's middle, at most
-_RADIAL, _TANGENTIAL = 0.12, 0.0005  # distortion: k1 at most, spread of p1 and p2
-# At the needle; at 5.7 a needle of 1.3 mm is 7.4 px wide [px/m].
+_CENTRE_PX = 12.0  # maximum offset of the principal point from the image centre
+_RADIAL, _TANGENTIAL = 0.12, 0.0005  # distortion: maximum of k1, standard deviation of p1 and p2
+# Scale at the needle: at 5700, a needle of 1.3 mm is 7.4 px wide [px/m].
 _SCALE = (4500.0, 7500.0)
-_LEAST_AIR = 0.03  # before the wall [m]
-_HALF_SIDES = (0.025, 0.048)  # of the gel, from the needle's axis to each wall [m]
+_MIN_AIR = 0.03  # distance from camera to wall [m]
+_HALF_SIDES = (0.025, 0.048)  # distance from the needle's axis to each wall [m]
 _WALLS, _ACRYLIC = (0.003, 0.008), (1.485, 1.495)  # thickness [m], refractive index
 _GEL = (1.33, 1.42)
-_TILT = 0.005  # spread of a wall's normal off the axis [rad]
-_BEFORE_ENTRY_PX = (15.0, 70.0)  # where the needle's entry is, from the image's border
-_ASIDE = 0.012  # how far a camera is beside the middle of what it sees, at most [m]
-_ROLL = 0.03  # spread of its roll [rad]
+_TILT = 0.005  # standard deviation of a wall's tilt [rad]
+_BEFORE_ENTRY_PX = (15.0, 70.0)  # distance of the needle's entry from the image border
+_MAX_OFFSET = 0.012  # of a camera from the centre of its view [m]
+_ROLL = 0.03  # standard deviation of its roll [rad]
 
 
 def draw_box(seed: int) -> str:
-    """Return the calibration of two webcams, head-on before the top and one side of a box.
+    """Return the calibration of two webcams in front of the top and one side of a box.
 
     Parameters
     ----------
     seed : int
-        Same seed, same box; not negative.
+        Seed of the box, not negative.
     """
     rng = np.random.default_rng([seed, _STREAM])
     gel, acrylic = float(rng.uniform(*_GEL)), float(rng.uniform(*_ACRYLIC))
@@ -48,14 +48,14 @@ def _camera(
     rng: np.random.Generator, axis: FloatArray, wall: float, acrylic: float, gel: float
 ) -> dict[str, object]:
     inner, scale = float(rng.uniform(*_HALF_SIDES)), float(rng.uniform(*_SCALE))
-    # What is behind refracting layers looks nearer.
+    # Refraction reduces the apparent distance.
     apparent = inner / gel + wall / acrylic
-    focal = max(float(rng.uniform(*_FOCAL_PX)), scale * (_LEAST_AIR + apparent))
+    focal = max(float(rng.uniform(*_FOCAL_PX)), scale * (_MIN_AIR + apparent))
     along = np.array([0.0, 0.0, 1.0])
     seen = along * (_SIZE[0] / 2.0 - rng.uniform(*_BEFORE_ENTRY_PX)) / scale
-    aside = np.append(rng.uniform(-_ASIDE, _ASIDE, 2), 0.0) * (1.0 - np.abs(axis))
+    aside = np.append(rng.uniform(-_MAX_OFFSET, _MAX_OFFSET, 2), 0.0) * (1.0 - np.abs(axis))
     centre = seen + aside + (inner + wall + focal / scale - apparent) * axis
-    centre[2] += rng.uniform(-_ASIDE, _ASIDE)
+    centre[2] += rng.uniform(-_MAX_OFFSET, _MAX_OFFSET)
     ahead = seen - centre
     ahead /= np.linalg.norm(ahead)
     down = np.cross(ahead, along)

@@ -1,4 +1,4 @@
-"""`ros2 run needle_sim render_images`: image sequences without any graph."""
+"""`ros2 run needle_sim render_images`: image sequences without a ROS graph."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ exit codes: 0 done, 2 bad input or something missing, 130 interrupted.
 
 @dataclasses.dataclass(frozen=True)
 class RenderOptions:
-    """Options of `render_images`; SI."""
+    """Options of `render_images`, in SI units."""
 
     output: Path
     look: Scenario | Appearance
@@ -78,13 +78,13 @@ class RenderOptions:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `render_images`; returns its exit code."""
+    """Run `render_images`; return its exit code."""
     words = sys.argv[1:] if arguments is None else arguments
     return run_command(lambda: render_images(parse(words)))
 
 
 def render_images(options: RenderOptions) -> int:
-    """Render what was asked for."""
+    """Render the images; return the exit code."""
     if not options.box:
         return _render(options)
     with tempfile.TemporaryDirectory() as folder:
@@ -131,7 +131,7 @@ def parse(arguments: Sequence[str]) -> RenderOptions:
     Raises
     ------
     UserError
-        Anything that cannot be rendered as asked.
+        If an option is invalid.
     """
     given = _parser().parse_args(arguments)
     depth = number("--depth-mm", given.depth_mm, 1.0, 300.0, "mm") / 1e3
@@ -161,7 +161,7 @@ def parse(arguments: Sequence[str]) -> RenderOptions:
 def _look(
     renderer: str, scenario: str | None, appearance: str | None, noise: str | None, seed: int
 ) -> Scenario | Appearance:
-    """Return what is to be seen; refuses options that belong to the other renderer."""
+    """Return the scenario or appearance; reject options of the other renderer."""
     if renderer not in RENDERERS:
         raise UserError(f"--renderer {renderer!r} is not one of {', '.join(RENDERERS)}")
     if renderer == "path_traced":
@@ -180,7 +180,7 @@ def _look(
 def _write(
     rig: StereoRig, look: Scenario | Appearance, options: RenderOptions, calibration: Path
 ) -> Iterator[None]:
-    """Write one pair after the other."""
+    """Write the pairs, one per iteration."""
     way: dict[str, Any] = {
         name: getattr(options, name) for name in ("frames", "depth", "step", "curvature", "begin")
     }

@@ -1,1 +1,1 @@
-"""Thousands of simulated needles at a time."""
+"""Monte Carlo studies: thousands of simulated needles at a time."""

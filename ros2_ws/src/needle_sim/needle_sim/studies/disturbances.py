@@ -19,34 +19,34 @@ from needle_sim.needle.se3 import FloatArray
 
 START, NOISE, OUTLIER, OUTLIER_DIRECTION, MISSED, CURVATURE, BUMP, TARGET, DRIFT, BREATH = range(10)
 PUSH, ROLL, BIAS = range(10, 13)
-"""Purposes of random numbers."""
+"""Purposes of random numbers, each with its own stream."""
 PER_NEEDLE = 4
-"""Numbers for each needle and draw: two needles share one block of the generator."""
+"""Numbers per needle and draw: two needles share one block of the generator."""
 
 
 def uniform_numbers(
     seed: int, purpose: int, step: int, first: int, count: int
 ) -> NDArray[np.float32]:
-    """Return four numbers, uniform in [0, 1), for each of some needles.
+    """Return four numbers, uniform in [0, 1), for each needle.
 
-    Philox counts through its sequence by a number that can be set: needle, step and purpose are
-    that number.
+    Needle, step and purpose form the counter of the Philox generator, so that neither chunks nor
+    the order of calls change the numbers.
 
     Parameters
     ----------
     seed : int
-        Of the study, >= 0.
+        Seed of the study, >= 0.
     purpose : int
         One of `START` ... `BIAS`.
     step : int
-        Number of the exposure, or of whatever the purpose counts.
+        Number of the exposure, or another counter of the purpose.
     first, count : int
         The needles `first` ... `first + count - 1`.
 
     Returns
     -------
     ndarray, shape (count, 4)
-        A row for each needle; single precision, in steps of 2^-24.
+        One row per needle; single precision, in steps of 2^-24.
     """
     block, skip = divmod(first, 2)
     bits = np.random.Philox(key=seed, counter=[block, step, purpose, 0])
@@ -55,20 +55,20 @@ def uniform_numbers(
 
 
 def quantile_levels(numbers: NDArray[np.float32]) -> FloatArray:
-    """Return uniform numbers as levels at which a distribution has finite quantiles.
+    """Return uniform numbers as levels of finite quantiles.
 
-    That is the middle of each of the 2^24 steps that a number has: 0 would be infinitely far off.
+    These are the centres of the 2^24 steps of a number, because the quantile of 0 is infinite.
     """
     return np.asarray(numbers.astype(np.float64) + 0.5**25)
 
 
 def normal_numbers(numbers: NDArray[np.float32]) -> FloatArray:
-    """Return normal numbers of variance 1 from as many uniform ones."""
+    """Return standard normal numbers from uniform ones."""
     return np.asarray(scipy.special.ndtri(quantile_levels(numbers)))
 
 
 def random_directions(numbers: NDArray[np.float32]) -> FloatArray:
-    """Return unit vectors, uniform on the sphere, from the first two of some uniform numbers."""
+    """Return unit vectors, uniform on the sphere, from the first two numbers of each row."""
     share = numbers.astype(np.float64)
     up = 2.0 * share[:, 0] - 1.0
     across = np.sqrt(1.0 - up * up)
@@ -77,63 +77,60 @@ def random_directions(numbers: NDArray[np.float32]) -> FloatArray:
 
 
 Insertion = TypeVar("Insertion", float, FloatArray)
-"""Of all needles, or of each."""
+"""Insertion of all needles, or of each."""
 PATCH_LENGTH = 0.020
-"""Insertion over which the curvature stays the same [m]."""
-_NOTHING_LEFT = 1e-6
+"""Insertion over which the curvature is constant [m]."""
+_NEGLIGIBLE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
 class Disturbances:
-    """All that can go wrong; nothing does by default.
+    """Disturbances of a study; all are off by default.
 
     Attributes
     ----------
     noise : float
-        Of a measured coordinate: the largest error where the noise is uniform, the standard
-        deviation where it is normal, the scale where it is Student's t [m].
+        Noise of a measured coordinate: maximum error if uniform, standard deviation if normal,
+        scale if Student's t [m].
     noise_shape : str
         "uniform", "normal" or "student".
     noise_lasting : float
-        Of normal noise, the correlation of an error with that of the exposure before, in [0, 1).
+        Correlation of normal noise between successive exposures, in [0, 1).
     degrees_of_freedom : float
-        Of Student's t.
+        Degrees of freedom of Student's t.
     bias_walk : float
-        Largest bias of a measured coordinate, which walks by a tenth of it from one exposure to the
-        next [m].
+        Maximum bias of a measured coordinate; the bias walks by a tenth of it per exposure [m].
     outliers : float
-        Share of measurements that are off in a random direction instead.
+        Share of outliers, which are off in a random direction.
     outlier_size : tuple of float
-        Least and largest distance by which an outlier is off, uniform in between [m].
+        Minimum and maximum distance of an outlier, uniform in between [m].
     found : float
-        Share of the exposures in which the tip is found.
+        Share of exposures in which the tip is detected.
     delay : int
-        How many steps late a measurement arrives; the controller is told its age.
+        Delay of a measurement in steps; the controller receives its age.
     untold_delay : int
-        The same, but it comes as if it were new.
+        Delay in steps that the controller does not know: the measurement appears to be new.
     curvature_scale : float
-        The plant's curvature as a multiple of what the controller assumes.
+        Curvature of the plant as a multiple of the controller's assumption.
     curvature_patches : float
-        The curvature is off by up to this share, uniform, anew every 20 mm for each needle.
+        Maximum relative error of the curvature, uniform, drawn every 20 mm for each needle.
     layer : tuple of float
-        Factor of the curvature in a layer of tissue, and the insertion from which on the needle is
-        in it [m].
+        Factor of the curvature in a layer of tissue, and insertion at which the layer begins [m].
     push : float
-        Curvature by which the tissue bends the path to one side, in a direction across z that is
-        fixed in space and drawn for each needle [1/m].
+        Curvature by which the tissue bends the path towards a direction across z, which is fixed in
+        space and drawn for each needle [1/m].
     rotation_gain : float
-        Share of the base's rotation that reaches the tip, before play and lag.
+        Share of the base rotation that reaches the tip, before play and lag.
     roll_walk : float
-        Standard deviation by which the tip turns about its axis by itself, over each metre of
-        insertion [rad/sqrt(m)].
+        Random walk of the tip's rotation about its axis, over inserted length [rad/sqrt(m)].
     play : float
-        Dead band of the shaft's torsion, +- [rad].
+        Half width of the dead band of the shaft's torsion [rad].
     lag_length : float
         Lag of the shaft's torsion [m].
     slip : float
-        Share by which the stage moves farther than the needle goes in, > -1.
+        Relative excess of the stage's motion over the needle's insertion, > -1.
     bump : float
-        Distance by which the phantom, and the needle in it, is moved at half the depth, in a random
+        Distance by which the phantom moves with the needle at half the depth, in a random
         direction [m].
     """
 
@@ -162,19 +159,19 @@ class Disturbances:
 def measured(
     tips: FloatArray, disturbances: Disturbances, seed: int, exposure: int, first: int
 ) -> FloatArray:
-    """Return what is measured of some needles' tips.
+    """Return the measured tips of some needles.
 
-    The first measurement, exposure 0, is neither an outlier nor missing: the needle rests at its
-    entry point, which is known, and the rig waits there until it has seen the tip.
+    Exposure 0 is neither an outlier nor missing, because the rig waits at the known entry point
+    until it has detected the tip.
 
     Parameters
     ----------
     tips : ndarray, shape (N, 3)
         The true tips [m].
     disturbances : Disturbances
-        What goes wrong.
+        Disturbances of the study.
     seed, exposure, first : int
-        Key the randomness: of the study, the exposure and the first needle.
+        Keys of the random numbers: seed of the study, exposure, first needle.
 
     Returns
     -------
@@ -207,13 +204,13 @@ def measured(
 
 
 def patch_factors(patches: float, seed: int, patch: int, first: int, count: int) -> FloatArray:
-    """Return what multiplies each needle's curvature in one patch, (count,), in 1 +- patches."""
+    """Return the factor of each needle's curvature in one patch, (count,), within 1 +- patches."""
     share = uniform_numbers(seed, CURVATURE, patch, first, count)[:, 0]
     return np.asarray(1.0 + patches * (2.0 * share.astype(np.float64) - 1.0))
 
 
 def bumps(distance: float, seed: int, first: int, count: int) -> FloatArray:
-    """Return by what the phantom of each needle is moved, (count, 3) [m]."""
+    """Return the displacement of each needle's phantom, (count, 3) [m]."""
     share = uniform_numbers(seed, BUMP, 0, first, count)
     return np.asarray(distance * random_directions(share))
 
@@ -221,30 +218,30 @@ def bumps(distance: float, seed: int, first: int, count: int) -> FloatArray:
 def push_axes(push: float, seed: int, first: int, count: int) -> FloatArray:
     """Return the rotation of each needle's heading per inserted length, (count, 3) [rad/m].
 
-    It turns a heading along z towards a direction across z, uniform in angle.
+    It turns a heading along z towards a random direction across z.
     """
     around = 2.0 * np.pi * uniform_numbers(seed, PUSH, 0, first, count)[:, 0]
     return np.asarray(push * np.stack([-np.sin(around), np.cos(around), 0.0 * around], axis=-1))
 
 
 def roll_steps(spread: float, seed: int, step: int, first: int, count: int) -> FloatArray:
-    """Return by what each tip turns by itself in a step, (count,) [rad], normal."""
+    """Return the random rotation of each tip in a step, (count,) [rad], normal."""
     share = uniform_numbers(seed, ROLL, step, first, count)[:, 0]
     return spread * normal_numbers(share)
 
 
 class BiasWalk:
-    """Bias of the measured tips that walks from one exposure to the next.
+    """Random walk of the measurement bias over the exposures.
 
-    Each coordinate starts anywhere within +-`largest`, walks up or down by a tenth of that, and is
-    thrown back at the bounds.
+    Each coordinate starts within +-`largest`, walks up or down by a tenth of that, and is reflected
+    at the bounds.
 
     Parameters
     ----------
     largest : float
-        [m].
+        Maximum bias [m].
     seed, first, count : int
-        Key the randomness: of the study, the first needle, and how many there are.
+        Keys of the random numbers: seed of the study, first needle, number of needles.
     """
 
     def __init__(self, largest: float, seed: int, first: int, count: int) -> None:
@@ -254,7 +251,7 @@ class BiasWalk:
         self._bias: FloatArray = largest * (2.0 * share.astype(np.float64) - 1.0)
 
     def at(self, exposure: int) -> FloatArray:
-        """Return the bias of an exposure, (count, 3) [m]; called for 0, 1, 2 and so on."""
+        """Return the bias of an exposure, (count, 3) [m]; call it for 0, 1, 2 and so on."""
         if exposure > 0:
             seed, first, count = self._key
             share = uniform_numbers(seed, BIAS, exposure, first, count)[:, :3]
@@ -265,44 +262,44 @@ class BiasWalk:
 
 
 class DelayLine:
-    """Measurements that arrive some steps late.
+    """Delays measurements by some steps.
 
-    The first one arrives before the needle moves; until the second does, nothing arrives.
+    The first measurement is not delayed; then nothing arrives until the second one is due.
 
     Parameters
     ----------
     steps : int
-        How many steps late, >= 0.
+        Number of steps, >= 0.
     """
 
     def __init__(self, steps: int) -> None:
         self._steps = steps
-        self._under_way: collections.deque[tuple[FloatArray, Any]] = collections.deque()
+        self._pending: collections.deque[tuple[FloatArray, Any]] = collections.deque()
 
     def push(self, tips: FloatArray, insertion: Insertion) -> tuple[FloatArray, Insertion]:
-        """Take what was exposed now; return what arrives now.
+        """Add a measurement; return the one that arrives now.
 
         Parameters
         ----------
         tips : ndarray, shape (N, 3)
-            Measured at this insertion [m]; further columns come along.
+            Present measurement [m]; may have further columns.
         insertion : float, or ndarray, shape (N,)
-            Where the needles are now [m].
+            Present insertion [m].
 
         Returns
         -------
         tips : ndarray, shape (N, 3)
-            Measured earlier [m]; NaN if nothing arrives.
+            Arriving measurement [m]; NaN if nothing arrives.
         age : float, or ndarray, shape (N,)
-            Insertion since [m].
+            Insertion since that measurement [m].
         """
         none = insertion - insertion
         if self._steps == 0:
             return tips, none
-        self._under_way.append((tips, insertion))
-        if len(self._under_way) <= self._steps:
+        self._pending.append((tips, insertion))
+        if len(self._pending) <= self._steps:
             return np.full_like(tips, np.nan), none
-        late, then = self._under_way.popleft()
+        late, then = self._pending.popleft()
         return late, insertion - then
 
 
@@ -316,13 +313,13 @@ def _add_noise(
 
 
 def _normal_errors(lasting: float, seed: int, exposure: int, first: int, count: int) -> FloatArray:
-    """Return errors of variance 1, each with what is left of all those before."""
+    """Return errors of variance 1 that are correlated with those of earlier exposures."""
     errors = np.zeros((count, 3))
     for back in range(exposure + 1):
         left = lasting**back
-        if left < _NOTHING_LEFT:
+        if left < _NEGLIGIBLE:
             break
-        # The first is as large as all others together.
+        # The first one has the stationary variance.
         left *= 1.0 if back == exposure else math.sqrt(1.0 - lasting * lasting)
         share = uniform_numbers(seed, NOISE, exposure - back, first, count)
         errors += left * normal_numbers(share[:, :3])

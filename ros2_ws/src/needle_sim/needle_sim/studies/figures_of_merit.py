@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from needle_sim.needle.se3 import FloatArray
 
 BAND = 1e-3
-"""Half width of what counts as in the plane [m]: the paper's +-1 mm."""
+"""Half width of the band around the plane [m]: the paper's +-1 mm."""
 DOUBT = 0.05
-"""Stated probability of a miss at which an end is called doubtful."""
+"""Stated probability of a miss above which the end of a run counts as doubtful."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Belief:
-    """Place at which a controller takes each needle to be, and how sure it is.
+    """Estimate of a controller for each needle, with its uncertainty.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class Belief:
     sin_pitch, sin_pitch_std : ndarray, shape (N,)
         Sine of the pitch out of the plane, and its standard deviation.
     missed : ndarray, shape (N,), optional
-        Probability that it is more than `BAND` from plane or point; None if it never says so.
+        Probability that the tip is more than `BAND` from plane or point; None if not estimated.
     """
 
     x: FloatArray
@@ -39,17 +39,17 @@ class Belief:
 
 
 class ConsistencyTally:
-    """Compares what a controller says of some needles with the truth, step after step.
+    """Compares the estimates of a controller with the truth, step by step.
 
     Parameters
     ----------
     needles : int
-        How many.
+        Number of needles.
 
     Attributes
     ----------
     missed : ndarray, shape (N,)
-        Probability that it gave to a miss after the last step; NaN if nothing is said.
+        Estimated probability of a miss after the last step; NaN if not estimated.
     """
 
     def __init__(self, needles: int) -> None:
@@ -59,14 +59,14 @@ class ConsistencyTally:
         self.missed: FloatArray = np.full(needles, np.nan)
 
     def add(self, belief: Belief | None, x: FloatArray, pitch: FloatArray) -> None:
-        """Take one step.
+        """Add one step.
 
         Parameters
         ----------
         belief : Belief, optional
-            What the controller says after it; None if it says nothing.
+            Estimate of the controller after the step; None if it has none.
         x, pitch : ndarray, shape (N,)
-            The truth [m, rad].
+            True values [m, rad].
         """
         if belief is None:
             return
@@ -82,28 +82,28 @@ class ConsistencyTally:
 
     @property
     def inside(self) -> FloatArray:
-        """Share of x and pitch within 2 (first row) and 3 sigma, (2, N); NaN if nothing is said."""
+        """Share of x and pitch within 2 (first row) and 3 sigma, (2, N); NaN without estimates."""
         if not self._compared:
             return np.full_like(self._within, np.nan)
         return self._within / self._compared
 
     @property
     def x_inside(self) -> FloatArray:
-        """Share of x alone within 3 sigma, (N,); NaN if nothing is said."""
+        """Share of x alone within 3 sigma, (N,); NaN without estimates."""
         if not self._compared:
             return np.full_like(self._x_within_3, np.nan)
         return 2.0 * self._x_within_3 / self._compared
 
 
 def is_doubtful(missed: FloatArray) -> FloatArray:
-    """Return 1 where a miss that is stated so probable is doubt, else 0; NaN if nothing is said."""
+    """Return 1 if the probability of a miss exceeds `DOUBT`, else 0; NaN without estimates."""
     return np.where(np.isnan(missed), np.nan, missed > DOUBT)
 
 
 FAR_OFF = 5e-3
-"""Distance from plane or point at which an end must not be trusted [m]."""
+"""Distance from plane or point beyond which the end of a run must be doubtful [m]."""
 LAST_STEPS = 20
-"""Steps at the end over which a run is judged."""
+"""Number of final steps that are evaluated."""
 
 BoolArray = NDArray[np.bool_]
 _Rows = TypeVar("_Rows")
@@ -111,7 +111,7 @@ _Rows = TypeVar("_Rows")
 
 @dataclasses.dataclass(frozen=True)
 class Outcomes:
-    """Outcome of each run, from the true tips.
+    """Outcomes of all runs, from the true tips.
 
     Attributes
     ----------
@@ -120,17 +120,16 @@ class Outcomes:
     x_last : ndarray, shape (N, K)
         Distance from the plane after each of the last K = `LAST_STEPS` steps [m].
     settled : ndarray, shape (N,)
-        Insertion at which the tip entered the band for the last time [m]; infinite if it ended
-        outside.
+        Insertion at which the tip last entered the band [m]; infinite if it ended outside.
     rotation : ndarray, shape (N,)
-        Sum of all the base turned, either way [rad].
+        Total rotation of the base, in either direction [rad].
     inside_2_sigma, inside_3_sigma : ndarray, shape (N,)
-        Share of x and pitch after the last steps that lay within so many of the controller's own
-        standard deviations from where it took them to be; NaN where it does not say.
+        Share of x and pitch after the last steps within 2 or 3 of the controller's own standard
+        deviations; NaN without estimates.
     x_inside_3_sigma : ndarray, shape (N,)
-        The same of x alone.
+        The same for x alone.
     missed : ndarray, shape (N,)
-        Probability that the controller gives at the end to |x| > 1 mm; NaN where it does not say.
+        Probability of |x| > 1 mm at the end, estimated by the controller; NaN without estimates.
     """
 
     x_start: FloatArray
@@ -149,24 +148,24 @@ class Outcomes:
 
     @property
     def converged_at_end(self) -> BoolArray:
-        """Tell whether |x| <= 1 mm at the end."""
+        """Whether |x| <= 1 mm at the end."""
         return np.asarray(np.abs(self.x_end) <= BAND)
 
     @property
     def converged_last_steps(self) -> BoolArray:
-        """Tell whether |x| <= 1 mm after each of the last steps."""
+        """Whether |x| <= 1 mm after each of the last steps."""
         return np.asarray(np.all(np.abs(self.x_last) <= BAND, axis=1))
 
     @property
     def diverged(self) -> BoolArray:
-        """Tell whether a run that missed ended farther off than it started, still moving away."""
+        """Whether a run that missed ended farther off than it started, and moving away."""
         end = np.abs(self.x_end)
         away = (end > np.abs(self.x_start)) & (end > np.abs(self.x_last[:, 0]))
         return np.asarray(~self.converged_at_end & away)
 
 
 def concatenate(parts: Sequence[_Rows]) -> _Rows:
-    """Return the outcomes of all parts as one; a dataclass of arrays, one row for each run."""
+    """Concatenate dataclasses of arrays with one row per run."""
     kind: Any = type(parts[0])
     names = [field.name for field in dataclasses.fields(kind)]
     whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
@@ -174,14 +173,14 @@ def concatenate(parts: Sequence[_Rows]) -> _Rows:
 
 
 class Tally:
-    """Follows some needles from start to end, in memory that does not grow with the steps.
+    """Accumulates the outcomes of some needles, in memory independent of the number of steps.
 
     Parameters
     ----------
     x : ndarray, shape (N,)
         Distance from the plane at insertion 0 [m].
     steps : int
-        How many steps there will be.
+        Number of steps.
     """
 
     def __init__(self, x: FloatArray, steps: int) -> None:
@@ -195,23 +194,23 @@ class Tally:
 
     @property
     def in_last_steps(self) -> bool:
-        """Tell whether the last step added is one of those over which a run is judged."""
+        """Whether the last added step is one of the final steps that are evaluated."""
         return self._step > self._skip
 
     def add(self, x: FloatArray, insertion: float, turned: FloatArray) -> None:
-        """Take one step.
+        """Add one step.
 
         Parameters
         ----------
         x : ndarray, shape (N,)
-            Distance from the plane after it [m].
+            Distance from the plane after the step [m].
         insertion : float
-            Inserted length after it [m].
+            Inserted length after the step [m].
         turned : ndarray, shape (N,)
-            What the base turned in it [rad].
+            Rotation of the base in the step [rad].
         """
         outside = np.abs(x) > BAND
-        # infinite while outside; the insertion of the entry once inside again
+        # Infinite while outside; the insertion of the entry once inside.
         np.minimum(self._settled, insertion, out=self._settled)
         self._settled[outside] = np.inf
         self._rotation += np.abs(turned)
@@ -220,7 +219,7 @@ class Tally:
         self._step += 1
 
     def outcomes(self) -> Outcomes:
-        """Return what became of the needles."""
+        """Return the outcomes."""
         inside_2_sigma, inside_3_sigma = self.beliefs.inside
         return Outcomes(
             x_start=self._start,
@@ -237,8 +236,8 @@ class Tally:
 def figures(outcomes: Outcomes) -> dict[str, float | None]:
     """Return the figures of a study, by the names of `monte_carlo --json`.
 
-    Settling figures are over the runs that ended inside the band, for the others never settled;
-    null if there is none. What the controller says of itself is null where it says nothing.
+    Settling figures cover the runs that ended inside the band; they are null without such runs.
+    Figures of the controller's estimates are null without estimates.
     """
     at_end = outcomes.converged_at_end
     last = np.abs(outcomes.x_last) * 1e3
@@ -266,18 +265,18 @@ def figures(outcomes: Outcomes) -> dict[str, float | None]:
 
 
 def mean_or_none(values: FloatArray) -> float | None:
-    """Return the mean; None where nothing is said, which is NaN."""
+    """Return the mean; None if a value is NaN."""
     mean = float(np.mean(values))
     return None if np.isnan(mean) else mean
 
 
 def trusted_far_off(distance: FloatArray, missed: FloatArray) -> float | None:
-    """Return how many runs end beyond `FAR_OFF` and are not called doubtful; None: nothing is said.
+    """Return the number of runs that end beyond `FAR_OFF` without doubt; None without estimates.
 
     Parameters
     ----------
     distance : ndarray, shape (N,)
-        From plane or point at the end, either side [m].
+        Distance from plane or point at the end, with either sign [m].
     missed : ndarray, shape (N,)
         See `Outcomes`.
     """

@@ -27,17 +27,17 @@ from needle_sim.studies.disturbances import (
     roll_steps,
 )
 
-# Square of the largest angle of one step for which the series below are exact to the last digit.
-_SERIES_UP_TO = 0.5
+# Square of the angle of one step up to which the series below are exact to the last digit.
+_MAX_SERIES_SQUARE = 0.5
 _TERMS = 9
-# Their coefficients, the highest power first.
+# Coefficients of the series, the highest power first.
 _FIRST = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in reversed(range(_TERMS)))
 _SECOND = tuple((-1.0) ** k / math.factorial(2 * k + 2) for k in reversed(range(_TERMS)))
 _THIRD = tuple((-1.0) ** k / math.factorial(2 * k + 3) for k in reversed(range(_TERMS)))
 
 
 class NeedleBatch:
-    """The tips of many needles, from their starts on.
+    """Tips of many needles.
 
     Parameters
     ----------
@@ -60,22 +60,22 @@ class NeedleBatch:
 
     @property
     def x(self) -> FloatArray:
-        """The tips' distance from the plane, shape (N,) [m]; a view."""
+        """Distances of the tips from the plane, shape (N,) [m]; a view."""
         return np.asarray(self._position[0])
 
     @property
     def tips(self) -> FloatArray:
-        """The tips, shape (N, 3) [m]; a view."""
+        """Positions of the tips, shape (N, 3) [m]; a view."""
         return np.asarray(self._position.T)
 
     @property
     def pitch(self) -> FloatArray:
-        """The tips' pitch out of the plane, shape (N,) [rad]."""
+        """Pitch of the tips out of the plane, shape (N,) [rad]."""
         return np.asarray(np.arcsin(np.clip(self._rotation[2], -1.0, 1.0)))
 
     @property
     def T_rig_tip(self) -> FloatArray:  # noqa: N802
-        """The tips' poses, shape (N, 4, 4) [m]."""
+        """Poses of the tips, shape (N, 4, 4) [m]."""
         count = self._position.shape[1]
         poses = np.zeros((count, 4, 4))
         poses[:, :3, :3] = self._rotation.T.reshape(count, 3, 3)
@@ -84,11 +84,11 @@ class NeedleBatch:
         return poses
 
     def shift(self, offsets: FloatArray) -> None:
-        """Move all needles as they are by some offsets, shape (N, 3) [m]."""
+        """Translate the needles by offsets, shape (N, 3) [m]."""
         self._position += offsets.T
 
-    def turn(self, rotations: FloatArray) -> None:
-        """Turn all needles' headings, their tips at rest.
+    def rotate(self, rotations: FloatArray) -> None:
+        """Rotate the headings of all needles about their tips.
 
         Parameters
         ----------
@@ -108,9 +108,9 @@ class NeedleBatch:
         d_insertion: ArrayLike,
         d_rotation: ArrayLike,
         curvature: ArrayLike,
-        wandered: ArrayLike = 0.0,
+        tip_rotation: ArrayLike = 0.0,
     ) -> None:
-        """Insert each needle, and turn its base over that length.
+        """Insert each needle, and rotate its base over that length.
 
         Parameters
         ----------
@@ -119,9 +119,9 @@ class NeedleBatch:
         d_rotation : array_like, shape (N,)
             Rotation of each base [rad].
         curvature : array_like, shape (N,) or ()
-            kappa of each needle's path over that length [1/m].
-        wandered : array_like, shape (N,) or ()
-            Rotation of each tip by itself over that length [rad].
+            Curvature of each needle's path over that length [1/m].
+        tip_rotation : array_like, shape (N,) or ()
+            Additional random rotation of each tip over that length [rad].
         """
         turned = np.asarray(d_rotation, dtype=np.float64)
         if self._torsion is not None:
@@ -130,7 +130,7 @@ class NeedleBatch:
             np.ascontiguousarray(np.broadcast_to(values, self._position.shape[1:]))
             for values in (
                 np.asarray(d_insertion, dtype=np.float64),
-                turned + np.asarray(wandered, dtype=np.float64),
+                turned + np.asarray(tip_rotation, dtype=np.float64),
                 np.asarray(curvature, dtype=np.float64),
             )
         )
@@ -175,13 +175,13 @@ def _fill_coefficients(
         coefficients[0, i] = first
         coefficients[1, i] = second
         coefficients[2, i] = third
-        far += square > _SERIES_UP_TO
+        far += square > _MAX_SERIES_SQUARE
     if far == 0:
         return
     for i in range(turned.shape[0]):
         bend = curvature[i] * length[i]
         square = bend * bend + turned[i] * turned[i]
-        if square > _SERIES_UP_TO:
+        if square > _MAX_SERIES_SQUARE:
             angle = np.sqrt(square)
             half = np.sin(0.5 * angle) / angle
             coefficients[0, i] = np.sin(angle) / angle
@@ -196,7 +196,7 @@ def _move_row(
     motion: tuple[FloatArray, FloatArray, FloatArray],
     coefficients: FloatArray,
 ) -> None:
-    """Move one coordinate of the tips, and turn one row of their rotation matrices."""
+    """Update one coordinate of the tips and one row of their rotation matrices."""
     lengths, turned, curvature = motion
     for i in range(turned.shape[0]):
         length, turn = lengths[i], turned[i]
@@ -216,25 +216,25 @@ def _move_row(
 
 
 class DisturbedNeedles:
-    """Some needles of a study.
+    """Needles of a study under its disturbances: motion and measurements.
 
     Parameters
     ----------
     starts : ndarray, shape (N, 3)
         x [m], pitch, roll [rad] of each needle.
     disturbances : Disturbances
-        What goes wrong.
+        Disturbances of the study.
     curvature : float
-        What the controller assumes [1/m].
+        Curvature that the controller assumes [1/m].
     bump_at : float
-        Insertion at which the phantom is moved, where that is a disturbance [m].
+        Insertion at which the phantom is moved, if it is [m].
     seed, first : int
-        Key the randomness: of the study, and the first needle.
+        Keys of the random numbers: seed of the study, first needle.
 
     Attributes
     ----------
     true : NeedleBatch
-        Where they really are.
+        True states of the needles.
     """
 
     def __init__(
@@ -250,7 +250,7 @@ class DisturbedNeedles:
         wrong = disturbances
         torsion = Torsion(wrong.play, wrong.lag_length) if wrong.play or wrong.lag_length else None
         self.true = NeedleBatch(starts, torsion)
-        self._wrong = disturbances
+        self._disturbances = disturbances
         self._assumed = curvature * wrong.curvature_scale
         self._curvature = np.asarray(self._assumed)
         self._bump_at = bump_at
@@ -261,26 +261,26 @@ class DisturbedNeedles:
         self._patch = -1
         self._insertions = 0
         self._exposure = 0
-        self._untold_delay = DelayLine(wrong.untold_delay)
+        self._hidden_delay = DelayLine(wrong.untold_delay)
         self._delay = DelayLine(wrong.delay)
 
     def measure_first(self) -> FloatArray:
-        """Return what is measured of the tips before they move, (N, 3) [m]."""
+        """Return the tips measured before the first motion, (N, 3) [m]."""
         return self._measured()
 
     def insert(self, begin: float, end: float, length: ArrayLike, turned: FloatArray) -> None:
-        """Move the stage on by a step, from one insertion to another.
+        """Move the stages from one insertion to another.
 
         Parameters
         ----------
         begin, end : float
-            Insertions of the stage, where every step is a whole one [m].
+            Nominal insertions of the stage, before and after the step [m].
         length : array_like, shape (N,) or ()
-            What each one's stage moves [m].
+            Motion of each stage [m].
         turned : ndarray, shape (N,)
-            What their bases turn [rad].
+            Rotation of the bases [rad].
         """
-        wrong, (seed, first) = self._wrong, self._key
+        wrong, (seed, first) = self._disturbances, self._key
         patch = int((begin + 1e-9) / PATCH_LENGTH)
         if wrong.curvature_patches and patch != self._patch:
             self._patch = patch
@@ -291,42 +291,42 @@ class DisturbedNeedles:
             curvature = curvature * factor
         inserted = np.broadcast_to(np.asarray(length) / (1.0 + wrong.slip), self._count)
         self._insertions += 1
-        wandered: FloatArray = np.zeros(self._count)
+        tip_rotation: FloatArray = np.zeros(self._count)
         if wrong.roll_walk:
-            wandered = roll_steps(wrong.roll_walk, seed, self._insertions, first, self._count)
-            wandered *= np.sqrt(inserted)
-        # Turning in space and turning with the tip commute: half of the push before, half after is
-        # exact but for the place, which is off by less than 1 um at the end.
+            tip_rotation = roll_steps(wrong.roll_walk, seed, self._insertions, first, self._count)
+            tip_rotation *= np.sqrt(inserted)
+        # Rotations in space and with the tip commute: half of the push before and half after the step
+        # is exact except for the position, whose error is below 1 um at the end.
         half = 0.5 * inserted[:, np.newaxis] * self._push
         if wrong.push:
-            self.true.turn(half)
-        self.true.advance(inserted, wrong.rotation_gain * turned, curvature, wandered)
+            self.true.rotate(half)
+        self.true.advance(inserted, wrong.rotation_gain * turned, curvature, tip_rotation)
         if wrong.push:
-            self.true.turn(half)
+            self.true.rotate(half)
         if wrong.bump and begin < self._bump_at <= end:
             self.true.shift(bumps(wrong.bump, seed, first, self._count))
 
-    def seen(self, insertion: Insertion) -> tuple[FloatArray, Insertion]:
-        """Return what of the tips arrives after a step.
+    def measure(self, insertion: Insertion) -> tuple[FloatArray, Insertion]:
+        """Return the measurement that arrives after a step.
 
         Parameters
         ----------
         insertion : float, or ndarray, shape (N,)
-            Of the stage [m].
+            Insertion of the stages [m].
 
         Returns
         -------
         tips : ndarray, shape (N, 3)
-            [m]; NaN where nothing arrives.
+            Measured tips [m]; NaN if nothing arrives.
         age : float, or ndarray, shape (N,)
-            Insertion since they were measured, as the controller is told [m].
+            Insertion since the measurement, as given to the controller [m].
         """
         self._exposure += 1
         tips = self._measured()
-        as_new, _ = self._untold_delay.push(tips, insertion)
+        as_new, _ = self._hidden_delay.push(tips, insertion)
         return self._delay.push(as_new, insertion)
 
     def _measured(self) -> FloatArray:
         seed, first = self._key
-        tips = measured(self.true.tips, self._wrong, seed, self._exposure, first)
-        return tips + self._bias.at(self._exposure) if self._wrong.bias_walk else tips
+        tips = measured(self.true.tips, self._disturbances, seed, self._exposure, first)
+        return tips + self._bias.at(self._exposure) if self._disturbances.bias_walk else tips

@@ -29,30 +29,30 @@ from needle_sim.studies.needles import DisturbedNeedles
 from needle_sim.studies.study import CHUNK, Controller, StudySettings, needle_chunks
 
 NEAREST, FARTHEST = 0.060, 0.120
-"""How far ahead of their starts the points lie [m]."""
+"""Distance of the points ahead of the starts [m]."""
 CURVATURE_SHARE = 0.6
-"""Share of the needle's curvature that the arc from the true start to the point takes at most. What
-a hand can aim at is more; but over its first centimetres a needle does not know yet how it lies."""
+"""Maximum curvature of the arc from the true start to a point, as a share of the
+needle's. The margin is needed because the roll is unknown over the first centimetres."""
 BREATHING_RATE = 0.2
-"""Of targets that breathe [Hz]."""
+"""Breathing rate of moving targets [Hz]."""
 INSERTION_SPEED = 0.002
-"""How fast the needles of a study go in, where that matters [m/s]."""
+"""Insertion speed of the needles, which sets the time for moving targets [m/s]."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MovingTargets:
-    """Targets that drift and breathe, each in directions and with a phase of its own.
+    """Targets that drift and breathe, each with its own directions and phase.
 
     Attributes
     ----------
     places : ndarray, shape (N, 3)
-        Where they are at the begin but for the breath [m].
+        Mean positions at the start [m].
     drift : float
-        How fast each drifts [m/s].
+        Drift speed [m/s].
     breath : float
-        Amplitude of their breathing, a sine of time [m].
+        Amplitude of the breathing, a sine of time [m].
     seed, first : int
-        Key the randomness: of the study, and the first target.
+        Keys of the random numbers: seed of the study, first target.
     """
 
     places: FloatArray
@@ -62,12 +62,12 @@ class MovingTargets:
     first: int = 0
 
     def part(self, first: int, count: int) -> MovingTargets:
-        """Return `count` of the targets, as they are here."""
+        """Return `count` of the targets, with the same motion."""
         places = self.places[first : first + count]
         return dataclasses.replace(self, places=places, first=self.first + first)
 
     def at(self, time: FloatArray | float) -> FloatArray:
-        """Return where they are, (N, 3) [m], at a time of each or of all [s]."""
+        """Return the positions, (N, 3) [m], at one time, or at a time for each target [s]."""
         count = len(self.places)
         passed = np.broadcast_to(np.asarray(time, dtype=float), (count,))[:, None]
         drifts, breaths = (
@@ -80,21 +80,21 @@ class MovingTargets:
 
 
 def random_targets(starts: FloatArray, curvature: float, seed: int) -> FloatArray:
-    """Return a point for each needle that it can reach from where it really starts.
+    """Return a point for each needle that is reachable from its true start.
 
     Parameters
     ----------
     starts : ndarray, shape (N, 3)
         x [m], pitch, roll [rad] of each needle.
     curvature : float
-        Of a needle's path [1/m].
+        Curvature of a needle's path [1/m].
     seed : int
-        Of all randomness.
+        Seed of the random numbers.
 
     Returns
     -------
     ndarray, shape (N, 3)
-        Distance ahead uniform, the place across it uniform within what can be reached [m].
+        Points with uniform distance ahead, uniform within the reachable cross-section [m].
     """
     count = len(starts)
     share = uniform_numbers(seed, TARGET, 0, 0, count).astype(np.float64)
@@ -110,34 +110,34 @@ def random_targets(starts: FloatArray, curvature: float, seed: int) -> FloatArra
 
 
 ARRIVED = 1e-4
-"""Insertion left at which a needle stays where it is [m]."""
+"""Remaining insertion below which a needle has arrived [m]."""
 
 
 class PointController(Controller, Protocol):
-    """Controller of some needles that knows where each one's way ends.
+    """Controller of some needles that knows the remaining insertion of each.
 
-    It is told where the targets are before its start and before each step.
+    It receives the targets before its start and before each step.
     """
 
     def set_targets(self, time: float, targets: FloatArray) -> None:
-        """Take where the targets are, (N, 3) [m], at a time [s]."""
+        """Set the positions of the targets, (N, 3) [m], at a time [s]."""
 
     def insertion_left(self) -> FloatArray:
-        """Return how far each needle has to go on after the last step, (N,) [m]."""
+        """Return the remaining insertion of each needle after the last step, (N,) [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PointOutcomes:
-    """Outcome of each run, from the true tips.
+    """Outcomes of all runs, from the true tips.
 
     Attributes
     ----------
     error : ndarray, shape (N,)
         Distance of the tip from its point at the end [m].
     rotation : ndarray, shape (N,)
-        Sum of all the base turned, either way [rad].
+        Total rotation of the base, in either direction [rad].
     inside_2_sigma, inside_3_sigma, missed : ndarray, shape (N,)
-        As of `figures_of_merit.Outcomes`, of the end alone.
+        As in `figures_of_merit.Outcomes`, at the end only.
     """
 
     error: FloatArray
@@ -148,7 +148,7 @@ class PointOutcomes:
 
     @property
     def reached(self) -> BoolArray:
-        """Tell whether the tip ended within 1 mm of its point."""
+        """Whether the tip ended within 1 mm of its point."""
         return np.asarray(self.error <= BAND)
 
 
@@ -169,17 +169,17 @@ def run_point_study(
     starts : ndarray, shape (N, 3)
         x [m], pitch, roll [rad] of each needle.
     targets : MovingTargets
-        A point for each.
+        One point per needle.
     new_controller : callable
         Returns a controller for some needles.
     settings : StudySettings
-        What the needles have in common; a needle that is not there at the depth stays there.
+        Common settings of the needles; a needle stops at the depth even if it has not arrived.
     on_progress : callable
-        Told after each step how many needles were on their way.
+        Called after each step with the number of moving needles.
     chunk : int
-        Needles steered at a time; changes the time it takes, not the outcomes.
+        Number of needles steered together; it changes the run time, not the outcomes.
     first : int
-        Number of the first needle: of a part of a study the place where it begins.
+        Number of the first needle, for a part of a larger study.
 
     Returns
     -------
@@ -223,33 +223,33 @@ def _steer(
     rate = controller.start(needles.measure_first())
     inserted, rotation, error = np.zeros(count), np.zeros(count), np.full(count, np.nan)
     inside, missed = np.full((2, count), np.nan), np.full(count, np.nan)
-    on_the_way = np.ones(count, dtype=bool)
+    is_moving = np.ones(count, dtype=bool)
     begin = 0.0
     while True:
         left = np.minimum(controller.insertion_left(), settings.depth - inserted)
-        # Not "left <= ARRIVED": who does not know how far it has to go stays where it is.
-        arrived = on_the_way & ~(left > ARRIVED)
+        # Not "left <= ARRIVED": a needle with NaN left must stop.
+        arrived = is_moving & ~(left > ARRIVED)
         if np.any(arrived):
-            said = ConsistencyTally(count)
-            said.add(controller.belief(), true.x, true.pitch)
-            there = targets.at(inserted / INSERTION_SPEED)
-            off = np.linalg.norm(true.tips - there, axis=1)
-            error[arrived], missed[arrived] = off[arrived], said.missed[arrived]
-            inside[:, arrived] = said.inside[:, arrived]
-            on_the_way &= ~arrived
-            if not np.any(on_the_way):
+            tally = ConsistencyTally(count)
+            tally.add(controller.belief(), true.x, true.pitch)
+            points = targets.at(inserted / INSERTION_SPEED)
+            off = np.linalg.norm(true.tips - points, axis=1)
+            error[arrived], missed[arrived] = off[arrived], tally.missed[arrived]
+            inside[:, arrived] = tally.inside[:, arrived]
+            is_moving &= ~arrived
+            if not np.any(is_moving):
                 break
-        # What has arrived goes on unheeded: so all needles make one step at a time.
-        length = np.where(on_the_way, np.minimum(left, settings.step_length), settings.step_length)
+        # Arrived needles move on without being evaluated, so that all needles step together.
+        length = np.where(is_moving, np.minimum(left, settings.step_length), settings.step_length)
         turned = rate * length
         inserted = inserted + length
-        rotation += np.where(on_the_way, np.abs(turned), 0.0)
+        rotation += np.where(is_moving, np.abs(turned), 0.0)
         end = begin + settings.step_length
         needles.insert(begin, end, length, turned)
         begin = end
-        on_progress(int(np.sum(on_the_way)))
+        on_progress(int(np.sum(is_moving)))
         time = end / INSERTION_SPEED
         controller.set_targets(time, targets.at(time))
-        tips, age = needles.seen(inserted)
+        tips, age = needles.measure(inserted)
         rate = controller.step(length, turned, tips, age)
     return PointOutcomes(error, rotation, inside[0], inside[1], missed)

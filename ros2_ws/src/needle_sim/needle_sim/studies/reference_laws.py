@@ -1,5 +1,19 @@
-"""Published laws that serve as references: sliding mode control and RRT replanning."""
+"""Published reference laws: sliding mode control, and RRT with replanning at every step.
 
+Sliding mode: D. C. Rucker et al., "Sliding Mode Control of Steerable Needles", IEEE Trans. Robotics
+29(5), 2013: the base always rotates at its maximum rate, towards the side of the bend on which the
+target lies. It needs neither curvature nor gains, but the whole pose of the tip.
+
+RRT: S. Patil, R. Alterovitz, "Interactive motion planning for steerable needles in 3D environments
+with obstacles" (BioRob 2010); G. J. Vrooijink et al., "Needle path planning and steering in a
+three-dimensional non-static environment using two-dimensional ultrasound images" (IJRR 2014). A
+tree of arcs with any curvature up to the needle's grows towards random points; a point is connected
+to the nearest node from which such an arc reaches it (reachability-guided sampling). Duty-cycled
+spinning realises smaller curvatures.
+"""
+
+# Compiled functions do not support keyword arguments well.
+# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
@@ -17,44 +31,40 @@ def sliding_mode_rate(target: ArrayLike, largest_rate: float) -> FloatArray:
     Parameters
     ----------
     target : array_like, shape (..., 3)
-        In the tip's frame, whose z is the heading and to whose -y the needle bends [m].
+        Target in the tip frame: z is the heading, the needle bends towards -y [m].
     largest_rate : float
-        What it turns at [rad/m].
+        Maximum rotation rate [rad/m].
     """
     x, y, _ = np.moveaxis(np.asarray(target, dtype=float), -1, 0)
     return np.asarray(largest_rate * np.sign(np.arctan2(x, -y)))
 
 
-# Compiled code takes keywords slowly or not at all.
-# ruff: noqa: PLR0917
-
-
 SAMPLES = 400
-"""Random points of a plan."""
-_LONGEST = 0.02
-"""Of one arc of the tree [m]."""
-_TO_TARGET = 0.1
-"""Share of the random points that are the target."""
-_APART = 0.001
-"""Of the points of an arc that are looked at [m]."""
+"""Number of random points per plan."""
+_MAX_ARC = 0.02
+"""Maximum length of an arc of the tree [m]."""
+_TARGET_SHARE = 0.1
+"""Share of the random points that equal the target."""
+_CHECK_SPACING = 0.001
+"""Spacing of collision checks along an arc [m]."""
 
 
 class DutyCycle:
-    """Makes a bevel bend as a plan wants it, by spinning part of the way; many needles at once.
+    """Duty-cycled spinning that realises the curvatures of a plan, for many needles at once.
 
     Parameters
     ----------
     largest_rate : float
-        What the base turns at, at most, per inserted length [rad/m].
+        Maximum rotation of the base per inserted length [rad/m].
     step_length : float
-        Inserted length over which a command is held [m].
+        Inserted length per command [m].
     """
 
     def __init__(self, largest_rate: float, step_length: float) -> None:
         self._limit = largest_rate * step_length
         self._step_length = step_length
-        self._owed: FloatArray = np.zeros(())
-        self._to_spin: FloatArray = np.zeros(())
+        self._pending_spin: FloatArray = np.zeros(())
+        self._remaining_spin: FloatArray = np.zeros(())
 
     def rates(self, arcs: FloatArray) -> FloatArray:
         """Return the rotation of each base per inserted length [rad/m].
@@ -62,15 +72,15 @@ class DutyCycle:
         Parameters
         ----------
         arcs : ndarray, shape (N, 3)
-            See `plan`; the share of the curvature is that of the whole cycle.
+            See `plan`; the share of the curvature is the mean over a cycle.
         """
-        self._owed = self._owed + (1.0 - arcs[:, 2]) * self._limit
-        starts = (self._to_spin <= 0.0) & (self._owed >= math.pi)
-        self._to_spin = np.where(starts, 2.0 * math.pi, self._to_spin)
-        spins = self._to_spin > 0.0
-        spun = np.minimum(self._to_spin, self._limit)
-        self._to_spin = self._to_spin - spun
-        self._owed = self._owed - spun
+        self._pending_spin = self._pending_spin + (1.0 - arcs[:, 2]) * self._limit
+        starts = (self._remaining_spin <= 0.0) & (self._pending_spin >= math.pi)
+        self._remaining_spin = np.where(starts, 2.0 * math.pi, self._remaining_spin)
+        spins = self._remaining_spin > 0.0
+        spun = np.minimum(self._remaining_spin, self._limit)
+        self._remaining_spin = self._remaining_spin - spun
+        self._pending_spin = self._pending_spin - spun
         aimed = np.arctan2(arcs[:, 0], -arcs[:, 1])
         turns = np.where(spins, spun, np.clip(aimed, -self._limit, self._limit))
         return np.asarray(turns / self._step_length)
@@ -87,25 +97,25 @@ def plan(
     chance: FloatArray,
     arc: FloatArray,
 ) -> bool:
-    """Write the first arc of a path to a target; return whether there is one.
+    """Write the first arc of a path to a target; return whether a path was found.
 
     Parameters
     ----------
     position, rotation : ndarray, shape (3,), (3, 3)
-        Pose of the tip, whose z is the heading and to whose -y it bends [m].
+        Pose of the tip: z is the heading, the needle bends towards -y [m].
     target : ndarray, shape (3,)
-        Where it is to go [m].
+        Target point [m].
     obstacles : ndarray, shape (M, 7)
         Ends of the axis and radius of each capsule [m].
     curvature : float
-        Of the needle's path [1/m].
+        Curvature of the needle's path [1/m].
     clear : float
-        Distance to keep from each surface [m].
+        Clearance from each obstacle [m].
     chance : ndarray, shape (S, 4)
         Uniform random numbers in [0, 1) for each random point.
     arc : ndarray, shape (3,), written
-        x and y of the direction that it bends to, in the tip's frame, and its curvature as a share
-        of the needle's.
+        x and y of the bending direction in the tip frame, and the curvature as a share of the
+        needle's.
     """
     count = chance.shape[0] + 1
     places, headings = np.empty((count, 3)), np.empty((count, 3))
@@ -115,7 +125,7 @@ def plan(
     bend, end, heading = np.empty(3), np.empty(3), np.empty(3)
     far_ahead = headings[0] @ (target - position)
     for k in range(count):
-        # The newest node tries the target first; from the root on, whenever one was added.
+        # Try to connect the newest node, first the root, with the target.
         node = nodes - 1
         far = arc_to(places[node], headings[node], target, curvature, bend)
         if lengths[node] + far < shortest and is_clear(
@@ -125,8 +135,8 @@ def plan(
         if best == 0 or k == chance.shape[0]:
             break
         goal = target.copy()
-        if chance[k, 3] >= _TO_TARGET:
-            # Ahead of the tip and within what its tightest arcs reach there.
+        if chance[k, 3] >= _TARGET_SHARE:
+            # Sample ahead of the tip, within the reach of its tightest arcs.
             ahead = chance[k, 2] * far_ahead
             aside = 0.5 * curvature * ahead * ahead
             across = aside * (2.0 * chance[k, 0] - 1.0), aside * (2.0 * chance[k, 1] - 1.0)
@@ -139,7 +149,7 @@ def plan(
         if node < 0:
             continue
         arc_to(places[node], headings[node], goal, curvature, bend)
-        far = min(nearest, _LONGEST)
+        far = min(nearest, _MAX_ARC)
         if not is_clear(places[node], headings[node], bend, far, obstacles, clear):
             continue
         move(places[node], headings[node], bend, far, end, heading)
@@ -161,16 +171,16 @@ def plan(
 def arc_to(
     place: FloatArray, heading: FloatArray, goal: FloatArray, curvature: float, bend: FloatArray
 ) -> float:
-    """Return the length of the arc to a point [m], infinite where none leads there.
+    """Return the length of the arc to a point [m]; infinite if the point is not reachable.
 
     Parameters
     ----------
     place, heading, goal : ndarray, shape (3,)
-        Begin, direction there, and end [m].
+        Start, heading at the start, and end of the arc [m].
     curvature : float
-        What it may have at most [1/m].
+        Maximum curvature [1/m].
     bend : ndarray, shape (3,), written
-        Its curvature times the direction that it bends to [1/m].
+        Curvature times bending direction [1/m].
     """
     way = goal - place
     ahead = way @ heading
@@ -193,7 +203,7 @@ def move(
     end: FloatArray,
     end_heading: FloatArray,
 ) -> None:
-    """Write where an arc of a curvature `bend` leads after a length, and its direction there."""
+    """Write the end of an arc with curvature vector `bend`, and the heading there."""
     size = math.sqrt(bend @ bend)
     angle = size * length
     if angle < 1e-9:
@@ -213,11 +223,11 @@ def is_clear(
     obstacles: FloatArray,
     clear: float,
 ) -> bool:
-    """Return whether an arc, see `move`, keeps its distance from all obstacles."""
+    """Return whether an arc, see `move`, keeps the clearance from all obstacles."""
     if not math.isfinite(length):
         return False
     point, direction = np.empty(3), np.empty(3)
-    steps = math.ceil(length / _APART)
+    steps = math.ceil(length / _CHECK_SPACING)
     for k in range(1, steps + 1):
         move(place, heading, bend, length * k / steps, point, direction)
         for m in range(obstacles.shape[0]):

@@ -15,12 +15,12 @@ from needle_sim.studies.figures_of_merit import Belief, Outcomes, Tally, concate
 from needle_sim.studies.needles import DisturbedNeedles
 
 POINTS = 10
-"""Points of a grid along each coordinate."""
+"""Number of grid points along each coordinate."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StartBounds:
-    """Largest |x| [m], |pitch| and |roll| [rad] of a start."""
+    """Maximum |x| [m], |pitch| and |roll| [rad] of a start."""
 
     x: float
     pitch: float
@@ -28,7 +28,7 @@ class StartBounds:
 
     @property
     def half_widths(self) -> FloatArray:
-        """All three, in the order of a start."""
+        """The three bounds, in the order of a start."""
         return np.array([self.x, self.pitch, self.roll])
 
 
@@ -38,12 +38,12 @@ def endpoint_grid(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
 
 
 def cell_grid(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
-    """Return the middles of the 10 x 10 x 10 cells that the bounds enclose."""
+    """Return the centres of the 10 x 10 x 10 cells within the bounds."""
     return _grid((2.0 * np.arange(POINTS) + 1.0) / POINTS - 1.0, bounds, draws)
 
 
 def random_starts(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
-    """Return as many starts as the grids have runs, uniform within the bounds, no two alike."""
+    """Return random starts, uniform within the bounds, as many as the grids have runs."""
     numbers = uniform_numbers(seed, START, 0, 0, POINTS**3 * draws)
     share = numbers[:, :3].astype(np.float64)
     return np.asarray((2.0 * share - 1.0) * bounds.half_widths)
@@ -54,7 +54,7 @@ GRIDS: Mapping[str, Callable[[StartBounds, int, int], FloatArray]] = {
     "cell": cell_grid,
     "random": random_starts,
 }
-"""Each takes bounds, draws and seed, and returns x [m], pitch, roll [rad], (1000 draws, 3)."""
+"""Functions of bounds, draws and seed; they return x [m], pitch, roll [rad], (1000 draws, 3)."""
 
 
 def _grid(unit: FloatArray, bounds: StartBounds, draws: int) -> FloatArray:
@@ -63,18 +63,17 @@ def _grid(unit: FloatArray, bounds: StartBounds, draws: int) -> FloatArray:
 
 
 CHUNK = 500
-"""Needles steered at a time: what is known of them fits into a processor's cache."""
+"""Number of needles steered together: their state fits into a processor's cache."""
 
 
 class Controller(Protocol):
-    """Controller of some needles; everything has their number as its leading axis.
+    """Controller of some needles, which are the leading axis of all arrays.
 
-    A last tip is measured after the last step, as the node does before it is done.
-
+    A last tip is measured after the last step, as by the node.
     """
 
     def start(self, tips: FloatArray) -> FloatArray:
-        """Take the first measured tips, (N, 3) [m]; return the rotation rates, (N,) [rad/m]."""
+        """Start with the first measured tips, (N, 3) [m]; return rotation rates, (N,) [rad/m]."""
 
     def step(
         self,
@@ -83,18 +82,18 @@ class Controller(Protocol):
         tips: FloatArray,
         age: float | FloatArray,
     ) -> FloatArray:
-        """Take what happened in a step and what was measured after it.
+        """Process the motion of a step and the measurement after it.
 
         Parameters
         ----------
         d_insertion : float, or ndarray, shape (N,)
-            Insertion of the step, of all or of each [m].
+            Insertion of the step, of all needles or of each [m].
         d_rotation : ndarray, shape (N,)
-            What the bases turned [rad].
+            Rotation of the bases [rad].
         tips : ndarray, shape (N, 3)
             The measured tips [m]; NaN where missing.
         age : float, or ndarray, shape (N,)
-            Insertion since they were measured, likewise [m].
+            Insertion since the measurement, of all needles or of each [m].
 
         Returns
         -------
@@ -103,28 +102,28 @@ class Controller(Protocol):
         """
 
     def belief(self) -> Belief | None:
-        """Return what is known after the last step; None from a controller that does not say."""
+        """Return the estimate after the last step; None from a controller without estimates."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StudySettings:
-    """Common settings of every needle of a study.
+    """Common settings of all needles of a study.
 
     Attributes
     ----------
     curvature : float
-        What the controller assumes, kappa [1/m]; `disturbances` say how far the plant is off.
+        Curvature that the controller assumes [1/m]; `disturbances` set the plant's deviation.
     depth : float
-        Insertion at the end [m].
+        Final insertion [m].
     step_length : float
         Insertion between measurements [m]; the last step ends at the depth.
     disturbances : Disturbances
-        What goes wrong.
+        Disturbances of plant and measurements.
     seed : int
-        Of all randomness.
+        Seed of all random numbers.
     turn_delay : float
-        Insertion from a measurement until the base begins to turn by it, less than a step [m]: of a
-        needle that goes in continuously, its speed times the time that an answer takes.
+        Insertion between a measurement and the start of the resulting rotation, less than a step
+        [m]: for continuous insertion, the speed times the response time.
     """
 
     curvature: float
@@ -149,7 +148,7 @@ def run_study(
     chunk: int = CHUNK,
     first: int = 0,
 ) -> Outcomes:
-    """Steer each needle from its start.
+    """Steer each needle from its start to the depth.
 
     Parameters
     ----------
@@ -158,13 +157,13 @@ def run_study(
     new_controller : callable
         Returns a controller for some needles.
     settings : StudySettings
-        What the needles have in common.
+        Common settings of the needles.
     on_progress : callable
-        Told after each step how many needles have made one.
+        Called after each step with the number of needles.
     chunk : int
-        Needles steered at a time; changes the time it takes, not the outcomes.
+        Number of needles steered together; it changes the run time, not the outcomes.
     first : int
-        Number of the first needle: of a part of a study the place where it begins.
+        Number of the first needle, for a part of a larger study.
 
     Returns
     -------
@@ -180,10 +179,10 @@ def run_study(
 def needle_chunks(
     starts: FloatArray, settings: StudySettings, *, bump_at: float, chunk: int, begin: int = 0
 ) -> Iterator[tuple[int, DisturbedNeedles]]:
-    """Yield the needles of a study, `chunk` at a time, each time after the place of the first.
+    """Yield the needles of a study in chunks: (index of the first one, needles).
 
-    Parameters, but for `bump_at` (see `DisturbedNeedles`), as of `run_study`; `begin` is its
-    `first`.
+    `bump_at` is that of `DisturbedNeedles`, `begin` the `first` of `run_study`; the other arguments
+    are those of `run_study`.
     """
     for first in range(0, len(starts), chunk):
         yield (
@@ -213,7 +212,7 @@ def _steer(
         reached = min(step * settings.step_length, settings.depth)
         length = reached - insertion
         turned = rate * length
-        # Where the turn is done does not depend on where it begins.
+        # The rotation ends with the step, wherever it starts.
         turns_from = insertion + min(settings.turn_delay, 0.9 * length)
         if turns_from > insertion:
             needles.insert(insertion, turns_from, turns_from - insertion, 0.0 * turned)
@@ -221,7 +220,7 @@ def _steer(
         insertion = reached
         tally.add(true.x, insertion, turned)
         on_progress(len(true.x))
-        tips, age = needles.seen(insertion)
+        tips, age = needles.measure(insertion)
         rate = controller.step(length, turned, tips, age)
         if tally.in_last_steps:
             tally.beliefs.add(controller.belief(), true.x, true.pitch)

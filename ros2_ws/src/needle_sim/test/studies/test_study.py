@@ -151,7 +151,7 @@ def test_the_roll_wanders_by_the_root_of_the_insertion_and_a_bias_is_seen_alone(
     np.testing.assert_allclose(needles.measure_first() - needles.true.tips, bias.at(0), atol=1e-15)
     for step in range(20):
         needles.insert(step * 1e-3, (step + 1) * 1e-3, 1e-3, np.zeros(count))
-        seen, _ = needles.seen((step + 1) * 1e-3)
+        seen, _ = needles.measure((step + 1) * 1e-3)
         off = seen - needles.true.tips
         np.testing.assert_allclose(off, bias.at(step + 1), atol=1e-15)
     turned = np.arctan2(needles.true.T_rig_tip[:, 1, 0], needles.true.T_rig_tip[:, 0, 0])
