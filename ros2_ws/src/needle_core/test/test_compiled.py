@@ -25,7 +25,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return package
 
 
-def test_it_is_kept_in_the_users_cache_or_where_the_user_says(
+def test_compiled_code_is_cached_in_the_users_cache_or_a_chosen_folder(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = Path(compiled._cache_directory(package))
@@ -37,7 +37,7 @@ def test_it_is_kept_in_the_users_cache_or_where_the_user_says(
         assert Path(compiled._cache_directory(package)).is_relative_to(tmp_path / name)
 
 
-def test_without_a_home_nothing_is_kept(
+def test_without_a_home_nothing_is_cached(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("HOME")

@@ -12,19 +12,19 @@ def test_keys_have_the_units_of_the_documents() -> None:
     assert "source" not in status.values
 
 
-def test_what_cannot_be_read_keeps_its_default() -> None:
+def test_a_malformed_value_keeps_its_default() -> None:
     keys = ("starts", "insertion_m", "depth_m", "target_point_m", "r1_low_m", "reachable_depth_m")
     for text in ("nan", "inf", "-inf", "two", "", "1, 2", "1e999", "1, x, 3"):
         assert ControllerStatus.parse(dict.fromkeys(keys, text)) == ControllerStatus()
         assert DeviceStatus.parse({"insertion_m": text}) == DeviceStatus()
 
 
-def test_simulated_is_true_only_where_it_is_said() -> None:
+def test_simulated_is_true_only_if_given() -> None:
     said = {text: DeviceStatus.parse({"simulated": text}).simulated for text in ("true", "", "yes")}
     assert said == {"true": True, "": None, "yes": False}
 
 
-def test_keys_of_others_are_left_out() -> None:
+def test_unknown_keys_are_ignored() -> None:
     assert DeviceStatus.parse({"state": "MOVING", "text": "x", "colour": "blue"}) == DeviceStatus(
         state="MOVING"
     )

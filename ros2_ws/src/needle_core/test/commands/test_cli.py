@@ -48,7 +48,7 @@ def raise_(error: BaseException) -> int:
     raise error
 
 
-def test_what_a_user_can_cause_is_an_exit_code_and_one_line(
+def test_a_user_error_is_an_exit_code_and_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert run_command(lambda: cli.EXIT_MISSED) == 1
@@ -131,7 +131,7 @@ def test_a_hangup_that_is_ignored_stays_so() -> None:
 
 
 @pytest.mark.parametrize("number", ENDING_SIGNALS)
-def test_a_command_cleans_up_undisturbed_by_a_repeated_wish(
+def test_a_repeated_signal_does_not_disturb_the_clean_up(
     number: signal.Signals, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []

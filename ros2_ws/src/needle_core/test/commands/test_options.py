@@ -18,7 +18,7 @@ from needle_core.commands.options import (
 from needle_core.errors import OutOfBoundsError, UserError
 
 
-def test_words_that_are_not_understood_are_a_users_error_and_help_keeps_its_lines() -> None:
+def test_unknown_arguments_are_a_user_error_and_help_keeps_its_lines() -> None:
     parser = CommandParser("study", "Runs,\nand says so.", "example:\n  study --seed 1")
     parser.add_argument("--seed")
     for words, complaint in (
@@ -47,7 +47,7 @@ def test_a_number_is_one_and_lies_within_its_bounds() -> None:
             whole_number("--draws", text, 1, 10)
 
 
-def test_a_file_is_written_where_a_folder_is(tmp_path: Path) -> None:
+def test_an_output_file_needs_an_existing_folder(tmp_path: Path) -> None:
     assert output_file("--json", None) is None
     assert output_file("--json", tmp_path / "new.json") == tmp_path / "new.json"
     assert output_file("--json", "new.json") == Path("new.json")

@@ -28,12 +28,12 @@ from .made_bags import (
 
 
 @pytest.mark.parametrize("text", ["just text", "\x00", "a: [1", ""])
-def test_metadata_that_are_none_are_refused(bag: Path, text: str) -> None:
+def test_malformed_metadata_are_rejected(bag: Path, text: str) -> None:
     (bag / "metadata.yaml").write_text(text)
     assert "metadata.yaml" in reason(bag)
 
 
-def test_no_pipe_or_link_is_opened_and_no_file_outside_of_the_bag(
+def test_pipes_links_and_files_outside_of_the_bag_are_not_opened(
     bag: Path, tmp_path: Path
 ) -> None:
     for file in sorted(bag.iterdir(), reverse=True):
@@ -64,7 +64,7 @@ def test_a_message_of_another_type_is_refused(bag: Path) -> None:
 # ---- what is no bag, or kept in another way -----------------------------------------------------
 
 
-def test_what_is_no_whole_bag_is_named_with_the_remedy(bag: Path, tmp_path: Path) -> None:
+def test_an_incomplete_bag_is_reported_with_its_remedy(bag: Path, tmp_path: Path) -> None:
     (tmp_path / "README.md").touch()
     for path, words in (
         (bag / "metadata.yaml", f"name an .mcap file or the bag's directory, {bag}"),
@@ -101,7 +101,7 @@ def test_what_is_no_whole_bag_is_named_with_the_remedy(bag: Path, tmp_path: Path
         ({"version": 10, "message_count": None, "topics_with_message_count": 3}, "version 10"),
     ],
 )
-def test_what_is_kept_in_another_way_is_not_broken(
+def test_an_unsupported_storage_is_not_reported_as_broken(
     bag: Path, values: dict[str, object], words: str
 ) -> None:
     change(bag, version=10, something_new={"a": 1})

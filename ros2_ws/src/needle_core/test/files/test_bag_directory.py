@@ -107,7 +107,7 @@ def test_a_wrong_bit_in_a_message_or_a_missing_end_is_refused(bag: Path) -> None
 
 
 @pytest.mark.parametrize("chunked", [True, False])
-def test_an_index_that_tells_of_other_messages_is_refused(tmp_path: Path, chunked: bool) -> None:
+def test_an_index_with_other_messages_is_rejected(tmp_path: Path, chunked: bool) -> None:
     file = tmp_path / "a.mcap"
     with file.open("wb") as stream:
         mcap = begin(stream, use_chunking=chunked)
@@ -118,7 +118,7 @@ def test_an_index_that_tells_of_other_messages_is_refused(tmp_path: Path, chunke
     assert "its index tells of 60, or of others" in reason(file)
 
 
-def test_metadata_that_tell_of_other_messages_are_refused(bag: Path) -> None:
+def test_metadata_with_other_messages_are_rejected(bag: Path) -> None:
     told = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     a, b = told["topics_with_message_count"]
     for wrong in (

@@ -22,7 +22,7 @@ VALUES = st.recursive(
 
 @settings(deadline=None, max_examples=15, derandomize=True)
 @given(VALUES, st.sampled_from([None, True, False]))
-def test_what_has_no_key_twice_is_read_as_it_was_written(value: object, flow: bool | None) -> None:
+def test_yaml_without_duplicate_keys_is_read_unchanged(value: object, flow: bool | None) -> None:
     assert load_yaml(yaml.safe_dump(value, default_flow_style=flow)) == value
 
 
@@ -37,7 +37,7 @@ def test_a_key_that_stands_twice_is_named_with_its_line() -> None:
             load_yaml(text)
 
 
-def test_what_cannot_be_read_is_one_line(tmp_path: Path) -> None:
+def test_an_unreadable_file_is_a_one_line_error(tmp_path: Path) -> None:
     path = tmp_path / "file.yaml"
     for content, words in (
         (None, "cannot be read: No such file"),

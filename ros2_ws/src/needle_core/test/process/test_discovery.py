@@ -85,7 +85,7 @@ def test_profiles_of_the_users_own_stay_and_are_named(
         (PROFILES, "/not/there.xml", "no such file"),
     ],
 )
-def test_what_another_set_up_left_is_named_and_dropped(
+def test_variables_of_another_setup_are_reported_and_removed(
     capsys: pytest.CaptureFixture[str], variable: str, value: str, effect: str
 ) -> None:
     after = kept(**{variable: value})
@@ -95,7 +95,7 @@ def test_what_another_set_up_left_is_named_and_dropped(
     assert capsys.readouterr().err == ""
 
 
-def test_what_asks_for_a_network_stays_and_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+def test_variables_that_ask_for_a_network_stay_and_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     asked = {DISCOVERY_RANGE: "SUBNET", "ROS_STATIC_PEERS": "10.0.0.1", SERVER: "a:1"}
     assert kept(**asked) == {**asked, PROFILES: str(NETWORK)}
     assert kept(**{DISCOVERY_RANGE: "OFF"})[DISCOVERY_RANGE] == "OFF"
@@ -105,7 +105,7 @@ def test_what_asks_for_a_network_stays_and_is_named(capsys: pytest.CaptureFixtur
     ]
 
 
-def test_what_does_not_exist_or_contradicts_itself_is_refused(
+def test_missing_or_contradictory_settings_are_rejected(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     for asked in ("subnet", "LOCALHSOT", "1"):

@@ -17,7 +17,7 @@ from needle_core.process.shared_memory import dead_ports, remove_dead_ports, rem
 PORTS = range(7400, 7410)
 
 
-def test_who_comes_second_is_told_who_has_a_name_and_a_released_one_is_free() -> None:
+def test_the_second_claim_names_the_holder_and_a_released_name_is_free() -> None:
     name = f"/device/status {uuid.uuid4()}"
     first, other = Claim(name, "/first"), Claim(f"{name} too", "/other")
     with pytest.raises(UserError, match=rf"/first \(process {os.getpid()}\) has {name}"):
@@ -36,7 +36,7 @@ def make_port(folder: Path, port: int) -> Path:
     return lock
 
 
-def test_dead_ports_go_and_others_stay(tmp_path: Path) -> None:
+def test_dead_ports_are_removed_and_others_stay(tmp_path: Path) -> None:
     make_port(tmp_path, 7400)
     listener = make_port(tmp_path, 7401)
     make_port(tmp_path, 7402).unlink()
@@ -69,7 +69,7 @@ def word(state: int) -> bytes:
     return state.to_bytes(4, sys.byteorder)
 
 
-def test_ports_whose_maker_ended_half_way_go_and_others_stay(
+def test_incomplete_ports_are_removed_and_others_stay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = {"fastrtps_port7001": 2, "fastrtps_port7002": 3, "fastrtps_0123456789abcdef": 0}

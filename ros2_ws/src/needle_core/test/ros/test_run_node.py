@@ -67,7 +67,7 @@ def fail(error: Exception, *, signalled: bool = False) -> Any:
     return act
 
 
-def test_a_node_goes_when_what_it_said_is_acknowledged(middleware: Middleware) -> None:
+def test_a_node_ends_when_its_messages_are_acknowledged(middleware: Middleware) -> None:
     def end_by_signal(_: Any, end: Any) -> int:
         signal.raise_signal(signal.SIGINT)
         return int(end.requested)
@@ -79,7 +79,7 @@ def test_a_node_goes_when_what_it_said_is_acknowledged(middleware: Middleware) -
         assert middleware.done == ["init", acknowledged, "destroyed", "shutdown"]
 
 
-def test_what_fails_is_bad_input_an_internal_error_or_missed_after_a_signal(
+def test_a_failure_is_bad_input_an_internal_error_or_ignored_after_a_signal(
     middleware: Middleware, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad, odd = UserError("rate = 0 Hz, must be > 0"), RuntimeError("a fault of its own")
@@ -100,7 +100,7 @@ def test_what_fails_is_bad_input_an_internal_error_or_missed_after_a_signal(
         assert ("destroyed" in middleware.done) is (spin is not None)
 
 
-def test_words_are_explained_or_refused_before_anything_begins(
+def test_arguments_are_explained_or_rejected_before_the_start(
     middleware: Middleware, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for word in ("--help", "-h"):

@@ -65,7 +65,7 @@ def test_a_gap_of_a_century_is_one_tick_and_the_phase_stays() -> None:
     assert clerk.ticks == [3e9 + 0.1, 3e9 + 0.6]
 
 
-def test_what_nobody_receives_is_dropped_and_the_rest_is_counted() -> None:
+def test_messages_without_subscriber_are_dropped_and_the_others_counted() -> None:
     clerk = Clerk()
     runner, said = heard(clerk, 1.0, 1.1)
     assert said == ["at 1.0", "at 1.1"]
@@ -73,7 +73,7 @@ def test_what_nobody_receives_is_dropped_and_the_rest_is_counted() -> None:
     assert set(clerk.peers.subscribers) == {"out"}
 
 
-def test_what_comes_in_at_a_port_is_handled_and_every_timer_has_a_last_tick() -> None:
+def test_port_input_is_handled_and_every_timer_has_a_last_tick() -> None:
     clerk = Clerk()
     runner, _ = heard(clerk, 1.0)
     (answer,) = runner.arrive("door", ("a", "b"), c.Moment(1.0, 0))

@@ -87,7 +87,7 @@ def test_virtual_time_goes_at_the_pace_of_the_wall_clock(pace: float) -> None:
         assert wall - begin == pytest.approx(steady / pace)
 
 
-def test_what_comes_in_is_handled_at_the_moment_that_the_wall_clock_shows() -> None:
+def test_input_is_handled_at_the_time_of_the_wall_clock() -> None:
     scene = Scene()
     # Between two ticks: whoever waits for the next one is woken.
     for when in (0.503, 0.507):
@@ -109,7 +109,7 @@ def test_a_short_delay_is_made_up_for() -> None:
 
 
 @pytest.mark.parametrize("pace", [0.5, 1.0, 4.0])
-def test_a_long_delay_is_lost_and_told_and_no_time_is_skipped(pace: float) -> None:
+def test_a_long_delay_is_lost_and_reported_and_no_time_is_skipped(pace: float) -> None:
     scene = Scene(pace)
     begin = scene.wall.now
     scene.worker.takes = [3.0]
@@ -122,7 +122,7 @@ def test_a_long_delay_is_lost_and_told_and_no_time_is_skipped(pace: float) -> No
     assert late[-1] - late[0] == pytest.approx((len(late) - 1) * PERIOD / pace)
 
 
-def test_what_comes_in_during_a_delay_is_handled_right_after_it_and_asked_for_then() -> None:
+def test_input_during_a_delay_is_read_and_handled_right_after_it() -> None:
     scene = Scene()
     scene.worker.takes = [3.0]
     begin = scene.wall.now
@@ -136,7 +136,7 @@ def test_what_comes_in_during_a_delay_is_handled_right_after_it_and_asked_for_th
     assert asked_at == pytest.approx(begin + 3.0, abs=SLACK)
 
 
-def test_a_port_that_is_lost_is_told_and_all_are_closed() -> None:
+def test_a_lost_port_is_reported_and_all_ports_are_closed() -> None:
     scene = Scene()
     scene.line.arrive(PortChange("unplugged"))
     scene.runner.run(0.1)

@@ -80,7 +80,7 @@ def test_a_message_takes_its_time_and_says_when_it_was_sent() -> None:
     assert all(at.stamp_ns - at.sent_ns >= 400_000_000 for _, at in late.received)
 
 
-def test_what_is_sent_before_discovery_is_lost_but_for_what_is_latched() -> None:
+def test_messages_before_discovery_are_lost_unless_latched() -> None:
     plain, latched = Receiver(), Receiver()
     run([Sender(), plain], seed=3)
     run([Sender(delivery=LATCHED), latched], seed=3)
@@ -89,7 +89,7 @@ def test_what_is_sent_before_discovery_is_lost_but_for_what_is_latched() -> None
     assert set(plain.numbers) <= set(latched.numbers)
 
 
-def test_peers_are_told_as_they_are_found() -> None:
+def test_peers_are_reported_as_they_are_discovered() -> None:
     receiver = Receiver()
     run([Sender(), Sender("second"), receiver, Server()])
     last = receiver.peers[-1]
@@ -100,7 +100,7 @@ def test_peers_are_told_as_they_are_found() -> None:
     assert len(receiver.peers) == 3
 
 
-def test_messages_keep_their_order_but_for_what_overtakes() -> None:
+def test_messages_keep_their_order_unless_a_fault_lets_one_overtake() -> None:
     def late(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
         return (Arrival(0.35 if int(message.position[0]) % 5 == 0 else 0.0, message, overtakes),)
 
@@ -111,7 +111,7 @@ def test_messages_keep_their_order_but_for_what_overtakes() -> None:
         assert {5, 6, 7, 8, 9, 10} <= set(receiver.numbers)
 
 
-def test_faults_lose_double_and_silence_what_they_are_meant_for() -> None:
+def test_faults_drop_duplicate_and_silence_the_selected_messages() -> None:
     def numbers(*faults: Fault) -> list[int]:
         receiver = Receiver()
         run([Sender(), receiver], seed=1, faults=faults)
@@ -131,7 +131,7 @@ def test_faults_lose_double_and_silence_what_they_are_meant_for() -> None:
 # ---- services and actions -----------------------------------------------------------------------
 
 
-def test_a_call_is_answered_once_by_its_server_or_given_up() -> None:
+def test_a_call_is_answered_once_or_fails_after_its_timeout() -> None:
     server = Server(Reply(NUMBER, True, "as asked"), Reply(NUMBER, False, "twice"))
     for servers, answer in (
         ([server], Answer("serve", True, "as asked")),
@@ -172,7 +172,7 @@ def test_a_handler_that_raises_is_reported_and_ends_nothing() -> None:
     assert texts(told) == ["internal error: ValueError: others is not among its outputs"]
 
 
-def test_health_is_told_on_change_and_once_a_second() -> None:
+def test_diagnostics_are_published_on_change_and_once_a_second() -> None:
     well = Diagnose("part", Diagnostic(Level.OK, "well", {"count": "1"}))
     counted = Diagnose("part", Diagnostic(Level.OK, "well", {"count": "2"}))
     ill = Diagnose("part", Diagnostic(Level.WARN, "ill"))
@@ -197,7 +197,7 @@ def test_a_component_that_exits_does_nothing_more_and_ends_the_run() -> None:
 # ---- ports --------------------------------------------------------------------------------------
 
 
-def test_what_goes_through_a_port_arrives_at_the_others_of_its_name_in_order() -> None:
+def test_a_batch_arrives_in_order_at_all_ports_of_the_same_name() -> None:
     one, other, third = Wired("one", sends=True), Wired("other"), Wired("third")
     third.ports = (Port("another wire", third._take),)
     VirtualRunner([one, other, third]).run(0.1)
@@ -212,7 +212,7 @@ def test_what_goes_through_a_port_arrives_at_the_others_of_its_name_in_order() -
     assert 0.3 * one.count < len(other.arrived) < 0.7 * one.count
 
 
-def test_what_waits_at_a_port_is_one_batch() -> None:
+def test_waiting_input_of_a_port_is_one_batch() -> None:
     batches: list[int] = []
     one, other = Wired("one", sends=True), Wired("other")
 
@@ -232,7 +232,7 @@ def test_what_waits_at_a_port_is_one_batch() -> None:
     assert numbers == list(range(1, len(numbers) + 1))
 
 
-def test_a_port_is_lost_and_opened_also_for_who_starts_meanwhile() -> None:
+def test_a_port_is_lost_and_reopened_also_for_a_component_that_starts_meanwhile() -> None:
     changes: list[str] = []
 
     def wired(name: str, *, sends: bool = False) -> Wired:
@@ -273,7 +273,7 @@ def test_a_port_is_lost_and_opened_also_for_who_starts_meanwhile() -> None:
 @pytest.mark.parametrize(
     ("delivery", "expected"), [(Delivery(depth=2, reliable=False), 2), (RELIABLE, 10)]
 )
-def test_who_stood_still_has_what_its_queue_holds_and_a_timer_fires_once(
+def test_a_frozen_component_keeps_its_queue_and_a_timer_fires_once(
     delivery: Delivery, expected: int
 ) -> None:
     sender, receiver = Sender(), Receiver(delivery=delivery)
@@ -292,7 +292,7 @@ def test_who_stood_still_has_what_its_queue_holds_and_a_timer_fires_once(
     assert sender.count - count in (1, 2)
 
 
-def test_a_killed_component_is_gone_with_what_it_had_and_missed_after_a_while() -> None:
+def test_a_killed_component_loses_its_state_and_is_dropped_after_its_lease() -> None:
     sender, receiver, late = Sender(delivery=LATCHED), Receiver(), Receiver("late")
     runner = VirtualRunner([sender, receiver], seed=1)
     with pytest.raises(ValueError, match="component 'sender' runs already"):

@@ -29,13 +29,13 @@ class Settings:
     name: str = ""
 
 
-def test_what_is_within_its_bounds_passes() -> None:
+def test_a_value_within_its_bounds_passes() -> None:
     check_bounded_fields(Settings())
     check_bounded_fields(Settings(width=1e9, gate=3.0, noise=5.0))
     check_bounds("width", 0.0, 0.0, 1.0, "m")
 
 
-def test_what_is_not_is_told_with_its_bounds() -> None:
+def test_a_value_out_of_bounds_is_reported_with_its_bounds() -> None:
     for settings, said in (
         (Settings(width=0.0), r"width = 0 m is outside"),
         (Settings(gate=-1.0), r"gate = -1 is outside"),
@@ -47,7 +47,7 @@ def test_what_is_not_is_told_with_its_bounds() -> None:
             check_bounded_fields(settings)
 
 
-def test_a_number_that_is_none_is_refused_and_infinity_where_it_is_no_value() -> None:
+def test_nan_and_invalid_infinities_are_rejected() -> None:
     for value in (math.nan, math.inf, -math.inf):
         with pytest.raises(UserError, match=f"width = {value} m is not finite"):
             check_bounded_fields(Settings(width=value))
@@ -69,7 +69,7 @@ class Parameters:
         check_fields(self)
 
 
-def test_parameters_are_taken_whole_and_typed_or_named_with_their_node() -> None:
+def test_parameters_are_applied_with_their_types_or_rejected_with_the_node() -> None:
     values = {"rate": 100.0, "count": 1, "gains": [0.0, 9.0], "law": "pid"}
     assert from_values(Parameters, values, "/rig") == Parameters(100.0, 1, (0.0, 9.0), "pid")
     for wrong, said in (

@@ -61,7 +61,7 @@ def test_a_misspelt_node_is_named(file: Path) -> None:
             checked(file, f"{name}: {{ros__parameters: {{a: 1}}}}", "/rig1/device_driver")
 
 
-def test_what_is_no_parameter_file_is_named_in_one_line(file: Path) -> None:
+def test_a_file_that_is_not_a_parameter_file_is_a_one_line_error(file: Path) -> None:
     for text, words in (
         (f"{DRIVES}\nsim_rig: {{}}\n{DRIVES}", "duplicate key 'device_driver' in line 3"),
         (f"{DRIVES}\n/{DRIVES}", "'/device_driver' stands there twice"),
@@ -98,7 +98,7 @@ def test_an_override_that_ros_puts_below_a_file_stops_the_node(file: Path) -> No
     )
 
 
-def test_nodes_that_start_together_get_what_is_theirs(file: Path) -> None:
+def test_nodes_that_start_together_get_their_own_parameters(file: Path) -> None:
     file.write_text(f"{BOTH_RIGS}\n/**: {{ros__parameters: {{rate: 5.0}}}}")
     nodes = ("device_driver", "sim_rig")
     assert read_parameters(file, nodes, "rig2") == {

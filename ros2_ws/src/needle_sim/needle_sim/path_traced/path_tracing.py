@@ -178,7 +178,7 @@ class PathTracer:
     def covered(
         self, scene: Scene, pixels: PixelArray, camera: SimulatedCamera, rig: StereoRig
     ) -> NDArray[np.bool_]:
-        """Return for each pixel, (N, 2), whether its centre shows an object in front of the floor."""
+        """Return whether each pixel, (N, 2), shows an object in front of the floor."""
         mi = self._mi
         rays = refracted_rays(pixels, camera, rig)
         origin = mi.Point3f(*(MM * rays.origin.T).astype(np.float32))

@@ -332,6 +332,6 @@ def _needle_pixels(optics: Optics, needle: NeedleMesh) -> NDArray[np.int64]:
 
 
 def _grid(behind: Backdrop) -> FloatArray:
-    """Return the grid points of a backdrop in `rig`, (*_GRID_SHAPE, 3): rows across the needle [m]."""
+    """Return the grid points of a backdrop in `rig`, (*_GRID_SHAPE, 3) [m]."""
     aside, along = np.mgrid[: _GRID_SHAPE[0], : _GRID_SHAPE[1]]
     return behind.points(aside * _SPACING - _SIDE, along * _SPACING + _REACH[0])

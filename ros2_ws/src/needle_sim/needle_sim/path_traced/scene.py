@@ -24,6 +24,7 @@ from needle_sim.path_traced.world import (
     Backdrop,
     World,
     apparent_centre,
+    block_bounds,
     is_box,
     refractive_index,
     room_light,

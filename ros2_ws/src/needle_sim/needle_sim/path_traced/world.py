@@ -77,7 +77,7 @@ class Backdrop:
         )
 
     def intersect(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
-        """Return the intersections of rays, each (..., 3), with the plane, (..., 3) in `rig` [m]."""
+        """Return the intersections of rays with the plane, (..., 3) in `rig` [m]."""
         length = -(self.depth + origin @ self.normal) / (direction @ self.normal)
         return np.asarray(origin + length[..., np.newaxis] * direction)
 

@@ -295,8 +295,8 @@ class DisturbedNeedles:
         if wrong.roll_walk:
             tip_rotation = roll_steps(wrong.roll_walk, seed, self._insertions, first, self._count)
             tip_rotation *= np.sqrt(inserted)
-        # Rotations in space and with the tip commute: half of the push before and half after the step
-        # is exact except for the position, whose error is below 1 um at the end.
+        # Rotations in space and with the tip commute: half of the push before the step and half
+        # after it is exact except for the position, whose error is below 1 um at the end.
         half = 0.5 * inserted[:, np.newaxis] * self._push
         if wrong.push:
             self.true.rotate(half)

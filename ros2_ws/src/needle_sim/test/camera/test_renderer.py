@@ -90,7 +90,7 @@ def test_noise_is_the_scenario_s_and_new_in_every_exposure_camera_and_seed(rig: 
         Scenario("loud", "too much", noise=51.0)
 
 
-def test_clean_is_what_it_always_was(rig: StereoRig) -> None:
+def test_clean_images_are_unchanged(rig: StereoRig) -> None:
     left, _ = render(StereoRenderer(rig, 5), needle(0.08), 7)
     assert left.dtype == np.uint8
     assert left.shape == (768, 1024)
@@ -155,7 +155,7 @@ def test_the_bend_turns_by_its_angle_and_ends_at_the_tip() -> None:
     np.testing.assert_allclose(local[:, 0], 0.0, atol=1e-12)
 
 
-def test_a_short_path_draws_only_what_is_inside() -> None:
+def test_a_short_path_draws_only_the_part_inside() -> None:
     plant = needle(0.004, 0.0, 0.0)
     line = NeedleShape().shaft_centreline(plant.T_rig_tip, plant.centreline(0.001), 0.0003)
     # As far as the bend lies beside the path.

@@ -78,7 +78,7 @@ def test_a_scenario_is_drawn_through_windows_too(name: str) -> None:
             assert np.all(heights + renderer.bubbles.radius < camera.window.inner)
 
 
-def test_a_scenario_that_is_not_there_is_named() -> None:
+def test_an_unknown_scenario_is_reported() -> None:
     assert find_scenario("clean") is CLEAN
     with pytest.raises(UserError, match="scenario 'fog' is not one of clean, clutter, heavy_clu"):
         find_scenario("fog")
@@ -173,7 +173,7 @@ def test_events_come_in_every_stretch_and_in_every_kind() -> None:
 
 
 @pytest.mark.parametrize("length", [0.02, 0.12])
-def test_an_event_blocks_whom_it_says(
+def test_an_occlusion_blocks_its_cameras(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch, length: float
 ) -> None:
     rig = small(rig)

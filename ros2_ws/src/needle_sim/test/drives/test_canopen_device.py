@@ -30,7 +30,7 @@ def remap(master: Master, number: int, entries: list[int], kind: int, base: int 
     master.write(base + number, 1, cob_id, 4)
 
 
-def test_each_drive_boots_once_says_what_it_is_and_boots_anew_after_a_reset(
+def test_each_drive_boots_identifies_itself_and_reboots_after_a_reset(
     master: Master,
 ) -> None:
     assert [(frame.identifier, frame.data) for frame in master.heard[:2]] == [
@@ -75,7 +75,7 @@ def test_writes_are_refused_with_the_code_of_the_standard(master: Master) -> Non
         assert aborted.value.code == code, entries
 
 
-def test_values_come_in_segments_too_and_blocks_are_refused(master: Master) -> None:
+def test_values_are_read_in_segments_and_block_transfers_are_rejected(master: Master) -> None:
     sdo = master.nodes[INSERTION].sdo
     with sdo.open(0x6081, 0, "wb", size=4, force_segment=True) as entry:
         entry.write((4711).to_bytes(4, "little"))
@@ -85,7 +85,7 @@ def test_values_come_in_segments_too_and_blocks_are_refused(master: Master) -> N
     assert aborted.value.code == Abort.COMMAND
 
 
-def test_what_is_mapped_goes_with_every_nth_sync(master: Master) -> None:
+def test_mapped_objects_are_sent_with_every_nth_sync(master: Master) -> None:
     remap(master, 1, [0x60640020, 0x60410010], 2)
     master.heard.clear()
     master.sync(5)

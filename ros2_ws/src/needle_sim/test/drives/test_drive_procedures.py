@@ -55,7 +55,7 @@ def test_homing_finds_the_edge_of_the_switch(start: float) -> None:
     assert master.true_counts() == pytest.approx(master.read(0x6064), abs=0.5)
 
 
-def test_homing_to_the_positive_switch_with_an_offset_and_where_it_stands() -> None:
+def test_homing_to_the_positive_switch_with_an_offset_and_at_the_present_position() -> None:
     master = Master(start=0.249 * 2e7)
     master.write(0x607C, 0, 100, 4)
     master.home(18)
@@ -80,7 +80,7 @@ def test_homing_can_be_broken_off() -> None:
     assert not master.status() & 0x1000
 
 
-def test_a_limit_switch_stops_what_runs_into_it(master: Master) -> None:
+def test_a_limit_switch_stops_the_axis(master: Master) -> None:
     master.write(0x6085, 0, 1_000_000, 4)
     master.enable(CSP)
     for k in range(1, 40):

@@ -45,7 +45,7 @@ def test_the_power_state_goes_where_the_standard_says() -> None:
         assert tuple(next_state(state, word).value for word in WORDS) == WAYS[state.value]
 
 
-def test_it_runs_at_once_to_an_old_target_when_enabled(master: Master) -> None:
+def test_an_enabled_drive_moves_at_once_to_an_old_target(master: Master) -> None:
     # What an honest drive does: a driver must set the target to where it is before.
     master.target(500)
     master.write(0x6060, 0, CSP, 1)
@@ -141,7 +141,7 @@ def test_halt_stops_and_its_release_goes_on(master: Master) -> None:
 
 
 @pytest.mark.parametrize("action", LimitAction)
-def test_a_target_beyond_the_software_limits_is_not_gone_to(action: LimitAction) -> None:
+def test_a_target_beyond_the_software_limits_is_not_reached(action: LimitAction) -> None:
     master = Master(limit_action=action)
     master.write(0x607D, 1, 0, 4)
     master.write(0x607D, 2, 1_000, 4)
@@ -187,7 +187,7 @@ def test_a_stalled_motor_is_a_following_error(master: Master) -> None:
     assert master.true_counts() == at
 
 
-def test_a_fault_brakes_then_wants_a_rising_edge(master: Master) -> None:
+def test_a_fault_brakes_and_is_reset_by_a_rising_edge(master: Master) -> None:
     master.write(0x6085, 0, 1_000_000, 4)
     master.enable(CSP)
     before = run_at(master, 800)
@@ -219,7 +219,7 @@ def test_a_reboot_stops_forgets_home_and_counts_anew(master: Master) -> None:
     assert (master.read(0x6064), master.state()) == (0, 0x40)
 
 
-def test_a_hung_drive_is_silent_ends_at_its_set_point_and_has_missed_the_heartbeat(
+def test_a_hung_drive_is_silent_and_ends_at_its_set_point(
     master: Master,
 ) -> None:
     master.write(0x1017, 0, 30, 2)
@@ -241,7 +241,7 @@ def test_a_hung_drive_is_silent_ends_at_its_set_point_and_has_missed_the_heartbe
     assert master.true_counts() == 8_000.0
 
 
-def test_a_cut_bus_loses_frames_both_ways_and_the_drive_s_watchdog_sees_it(
+def test_a_cut_bus_loses_frames_both_ways_and_trips_the_drive_s_watchdog(
     master: Master,
 ) -> None:
     master.write(0x1017, 0, 30, 2)

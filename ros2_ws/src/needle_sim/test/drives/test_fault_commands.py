@@ -46,14 +46,14 @@ def test_a_fault_happens_on_command_and_ends_with_restore(
     assert not happened(drives.bus) or line.startswith("emcy")
 
 
-def test_a_drive_that_is_rebooted_on_command_says_so(drives: DriveEmulator) -> None:
+def test_a_reboot_on_command_is_logged(drives: DriveEmulator) -> None:
     typed(drives, "reboot rotation")
     said = [(frame.identifier, frame.data) for frame in drives.bus.poll(2.0)]
     assert (0x702, b"\0") in said
     assert (0x701, b"\0") not in said
 
 
-def test_an_adapter_is_unplugged_and_plugged_in_by_whoever_has_it(drives: DriveEmulator) -> None:
+def test_the_adapter_is_unplugged_and_plugged_in_on_command(drives: DriveEmulator) -> None:
     said = typed(drives, "unplug", "restore")
     orders = [action.batch for action in said if isinstance(action, Send)]
     assert orders == [(PlugCommand.OUT,), (PlugCommand.IN,)]
@@ -71,7 +71,7 @@ def test_lines_that_are_no_commands_are_named_and_do_nothing(drives: DriveEmulat
     assert {drive.error_code for drive in drives.bus.drives.values()} == {0}
 
 
-def test_drives_that_cannot_be_are_refused() -> None:
+def test_invalid_drive_settings_are_rejected() -> None:
     for bad in ({"insertion_node_id": 2}, {"limit_action": "ignore"}, {"insertion_start": 0.3}):
         with pytest.raises(UserError, match=r"node id|one of|beyond"):
             DriveEmulator(DriveEmulatorParameters(**bad))

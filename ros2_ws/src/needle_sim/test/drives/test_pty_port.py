@@ -98,7 +98,7 @@ def read(terminal: int, count: int) -> bytes:
     return data
 
 
-def test_closing_the_channel_throws_away_what_waits_and_opening_it_nothing(port: PtyPort) -> None:
+def test_closing_the_channel_drops_pending_output_and_opening_it_does_not(port: PtyPort) -> None:
     terminal = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
     try:
         for words in (b"C\r", b"S6\r", b"O\r"):
@@ -115,7 +115,7 @@ def test_closing_the_channel_throws_away_what_waits_and_opening_it_nothing(port:
         os.close(terminal)
 
 
-def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:
+def test_files_and_links_of_others_are_left_alone(tmp_path: Path) -> None:
     file = tmp_path / "can"
     file.write_text("mine")
     with pytest.raises(UserError, match="can"):

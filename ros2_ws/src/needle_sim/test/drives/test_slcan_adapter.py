@@ -30,7 +30,7 @@ def test_frames_are_taken_whole_or_byte_by_byte(adapter: SlcanAdapter) -> None:
     assert adapter.feed(b"T000002010\r").reply == b"Z\r"
 
 
-def test_what_is_no_frame_is_refused_and_noise_thrown_away(adapter: SlcanAdapter) -> None:
+def test_malformed_frames_are_rejected_and_noise_is_dropped(adapter: SlcanAdapter) -> None:
     refused = (
         b"t08\r",
         b"t2013AABB\r",

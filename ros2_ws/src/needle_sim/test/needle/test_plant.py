@@ -41,7 +41,7 @@ def coordinates_rate(_: float, q: np.ndarray, rotation_rate: float) -> np.ndarra
     )
 
 
-def test_it_follows_the_paper_s_coordinate_equations() -> None:
+def test_the_plant_follows_the_paper_s_coordinate_equations() -> None:
     pitch, roll = np.deg2rad([2.0, 15.0])
     plant = needle(pitch, roll)
     q = np.array([0.0, 0.0, 0.0, 0.0, pitch, roll])
@@ -186,7 +186,7 @@ def test_broadcasting_equals_looping() -> None:
         assert many.rotation[row, column] == pytest.approx(float(one.rotation))
 
 
-def test_what_cannot_be_is_refused_and_changes_nothing() -> None:
+def test_an_invalid_parameter_is_rejected_and_changes_nothing() -> None:
     plant = NeedlePlant(np.eye(4), curvature=CURVATURE)
     for inputs in ((np.nan, 0.0), (0.001, np.inf)):
         with pytest.raises(ValueError, match="finite"):

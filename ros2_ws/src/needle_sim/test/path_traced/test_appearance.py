@@ -20,7 +20,7 @@ from needle_sim.path_traced.appearance import (
 from needle_sim.path_traced.renderer import flicker, grey_image
 
 
-def test_a_name_fixes_what_it_says_and_the_seed_draws_the_rest_so_that_all_of_it_comes() -> None:
+def test_a_name_fixes_its_properties_and_the_seed_draws_the_others_in_full_range() -> None:
     looks = [draw_appearance(RANDOM, seed) for seed in range(60)]
     assert {look.metal for look in looks} == set(METALS)
     assert {look.lamps for look in looks} == set(LAMPS)

@@ -55,7 +55,7 @@ def bent_line() -> tuple[np.ndarray, np.ndarray]:
     return line, aside
 
 
-def test_a_pixel_s_ray_meets_what_is_projected_there(boxes: list[StereoRig]) -> None:
+def test_a_pixel_s_ray_meets_the_point_projected_there(boxes: list[StereoRig]) -> None:
     for rig, camera in cameras([RIG, TOP_AND_SIDE, *boxes]):
         columns = np.linspace(0.0, camera.image_width - 1.0, 9)
         lines = np.linspace(0.0, camera.image_height - 1.0, 7)
@@ -94,7 +94,7 @@ def test_before_the_phantom_rays_go_straight_on() -> None:
 
 
 @pytest.mark.parametrize("hollow", [False, True])
-def test_the_mesh_is_as_thick_as_it_says_and_ends_where_it_says(hollow: bool) -> None:
+def test_the_mesh_has_its_diameter_and_its_end(hollow: bool) -> None:
     line, aside = bent_line()
     end = NeedleEnd(0.0007, float(np.deg2rad(30.0)), hollow)
     needle = needle_mesh(line, aside, end)
@@ -146,7 +146,7 @@ def test_an_insertion_is_the_empty_phantom_then_a_needle_that_stops_at_its_depth
         assert length == pytest.approx(pair.insertion, abs=1e-3)
 
 
-def test_a_box_stands_before_what_is_behind_it(boxes: list[StereoRig]) -> None:
+def test_a_box_stands_in_front_of_its_background(boxes: list[StereoRig]) -> None:
     look, picture = draw_appearance(RANDOM, 3), FloorPicture(np.zeros((2, 2), dtype=np.float32))
     for rig, camera in cameras(boxes):
         behind = backdrop(camera, rig, look, picture)

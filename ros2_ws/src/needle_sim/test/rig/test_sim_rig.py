@@ -56,7 +56,7 @@ def test_tips_are_within_their_noise_of_the_truth_and_another_seed_draws_others(
     assert [message for topic, message in another if topic == "needle/tip"] != tips
 
 
-def test_a_needle_that_nobody_waits_for_is_exposed_once_a_second() -> None:
+def test_an_idle_needle_is_exposed_once_a_second() -> None:
     said = run(made(), 0.0, 4.5)
     assert sum(topic == "needle/tip" for topic, _ in said) == 4
 
@@ -95,7 +95,7 @@ def test_bad_parameters_are_refused_in_one_line(parameters: dict[str, Any], mess
         made(**parameters)
 
 
-def test_the_limits_that_are_given_are_kept() -> None:
+def test_given_limits_are_respected() -> None:
     given = {
         name: 0.9 * value
         for name, value in vars(SafetyLimits()).items()

@@ -93,7 +93,7 @@ def test_random_paths_stay_inside_differ_and_are_smooth() -> None:
     np.testing.assert_array_equal(path_and_tips(2)[0], paths[2][0])
 
 
-def test_where_no_path_stays_inside_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_phantom_without_a_possible_path_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(insertions, "_CANDIDATES", 4)
     with pytest.raises(UserError, match="no random path of 120 mm stays inside the phantom"):
         random_path(0, 0.12, (0.0041, math.inf), 1.0 / 0.122)

@@ -136,7 +136,7 @@ def test_a_bias_walks_by_tenths_within_its_bounds_and_stays_spread_evenly() -> N
 
 
 @pytest.mark.parametrize("steps", [0, 3])
-def test_a_late_measurement_comes_with_its_age(steps: int) -> None:
+def test_a_late_measurement_has_its_age(steps: int) -> None:
     line = DelayLine(steps)
     for exposure in range(1, 8):
         tips, age = line.push(np.full((2, 3), float(exposure)), 0.001 * exposure)

@@ -53,7 +53,7 @@ def test_targets_lie_where_an_arc_of_the_allowed_curvature_leads_and_follow_the_
     assert not np.any(random_targets(STARTS, CURVATURE, 4) == targets)
 
 
-def test_targets_drift_and_breathe_as_told_whichever_are_asked() -> None:
+def test_targets_drift_and_breathe_independent_of_the_selection() -> None:
     places = random_targets(STARTS[:100], CURVATURE, 3)
     targets = MovingTargets(places, drift=0.002 / 60.0, breath=0.003, seed=5)
     period, whole = 1.0 / BREATHING_RATE, FARTHEST / INSERTION_SPEED

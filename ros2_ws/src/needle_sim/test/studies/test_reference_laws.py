@@ -55,7 +55,7 @@ def test_a_duty_cycle_spins_for_the_share_that_is_not_to_bend(share: float) -> N
 
 
 @pytest.mark.parametrize("obstacles", [FREE, BALL], ids=["free", "ball"])
-def test_a_planned_needle_comes_near_and_past_what_is_in_the_way(obstacles: FloatArray) -> None:
+def test_a_planned_needle_reaches_its_target_past_an_obstacle(obstacles: FloatArray) -> None:
     rng, cycle, arc = np.random.default_rng(4), DutyCycle(RATE, STEP), np.zeros(3)
 
     def planned(pose: FloatArray) -> float:
@@ -70,7 +70,7 @@ def test_a_planned_needle_comes_near_and_past_what_is_in_the_way(obstacles: Floa
     assert (least > 0.0) == bool(len(obstacles))
 
 
-def test_what_no_path_leads_to_is_said() -> None:
+def test_a_target_without_a_path_is_reported() -> None:
     arc, chance = np.full(3, 7.0), np.random.default_rng(5).random((100, 4))
     aside = np.array([0.05, 0.0, 0.02])
     assert not plan(np.zeros(3), np.eye(3), aside, FREE, CURVATURE, 0.001, chance, arc)

@@ -190,7 +190,7 @@ def test_a_bump_moves_the_needle_once_at_half_the_depth_and_not_the_plane() -> N
     np.testing.assert_allclose(found.x_last - calm.x_last, moved[10:, :, 0].T, atol=1e-12)
 
 
-def test_tips_that_are_late_untold_come_as_if_they_were_new() -> None:
+def test_tips_with_a_hidden_delay_appear_to_be_new() -> None:
     prompt, _ = watched(STARTS[:3], depth=0.010)
     both, _ = watched(STARTS[:3], depth=0.010, disturbances=Disturbances(delay=2, untold_delay=1))
     assert np.all(np.isnan(both.tips[:3]))
@@ -198,7 +198,7 @@ def test_tips_that_are_late_untold_come_as_if_they_were_new() -> None:
     np.testing.assert_allclose(both.ages, [0.0] * 2 + [0.002] * 8)
 
 
-def test_what_a_controller_says_is_compared_with_the_truth_of_that_step() -> None:
+def test_estimates_are_compared_with_the_truth_of_their_step() -> None:
     class Knowing(Watching):
         """Knows the tip of a needle that lies in a plane at its roll of 0, and says so."""
 
