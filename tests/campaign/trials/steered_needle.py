@@ -12,12 +12,12 @@ import numpy as np
 from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.component import Actions, Moment
-from needle_core.runners.transport import delay
 from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sensors import Sensor, TipSensor
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
 from scenario.virtual_rig import FASTEST, Held, VirtualRig
+from transport_faults import delay
 
 OFFSET = 0.003
 TIP_STD = 5e-5

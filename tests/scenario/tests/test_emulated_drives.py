@@ -12,9 +12,10 @@ import pytest
 from needle_core.can_frame import CAN, CanFrame
 from needle_core.component import Publish
 from needle_core.messages import EmergencyStop
-from needle_core.runners.transport import Arrival, Arrivals, Link, delay
+from needle_core.runners.transport import Arrival, Arrivals, Link
 from scenario.rules.scene import ESTOP, Scene
 from scenario.virtual_rig import DRIVER, VirtualRig
+from transport_faults import delay
 
 SYNC, DEVICE_TYPE, LIMITS, HOMING_SPEEDS = 0x080, 0x1000, 0x607D, 0x6099
 

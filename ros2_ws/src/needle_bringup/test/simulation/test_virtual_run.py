@@ -19,9 +19,10 @@ from needle_bringup.simulation.rig_configuration import command_line_parameters,
 from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.virtual_run import COMPUTE, make_components
 from needle_core.component import Output
-from needle_core.runners.transport import Arrival, Arrivals, Fault, Link, delay, drop, duplicate
+from needle_core.runners.transport import Arrival, Arrivals, Fault, Link
 from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_sim.sim_rig import SimRig
+from transport_faults import delay, drop, duplicate
 
 pytestmark = pytest.mark.usefixtures("compiled")
 SHORT = ("--level", "tip", "--depth-mm", "6")

@@ -124,16 +124,16 @@ class McapFile:
         BrokenMcapError
             If the file does not contain the messages that its index lists.
         """
-        seen: Counter[str] = Counter()
+        read_counts: Counter[str] = Counter()
         found = self._reader.iter_messages(topics, starting_at=start, ending_before=stop)
         for _, channel, message in found:
-            seen[channel.topic] += 1
+            read_counts[channel.topic] += 1
             yield channel.topic, message.log_time, message.publish_time, message.data
         first, last = self.span or (start, start)
         listed = {topic: n for topic, n in self.counts().items() if n and topic in topics}
-        if start <= first and last < stop and seen != listed:
+        if start <= first and last < stop and read_counts != listed:
             raise BrokenMcapError(
-                f"it holds {seen.total()} messages of these topics, its index tells of "
+                f"it holds {read_counts.total()} messages of these topics, its index tells of "
                 f"{sum(listed.values())}, or of others"
             )
 

@@ -33,9 +33,7 @@ def test_malformed_metadata_are_rejected(bag: Path, text: str) -> None:
     assert "metadata.yaml" in reason(bag)
 
 
-def test_pipes_links_and_files_outside_of_the_bag_are_not_opened(
-    bag: Path, tmp_path: Path
-) -> None:
+def test_pipes_links_and_files_outside_of_the_bag_are_not_opened(bag: Path, tmp_path: Path) -> None:
     for file in sorted(bag.iterdir(), reverse=True):
         elsewhere = file.rename(tmp_path / file.name)
         os.mkfifo(file)

@@ -95,7 +95,9 @@ def test_variables_of_another_setup_are_reported_and_removed(
     assert capsys.readouterr().err == ""
 
 
-def test_variables_that_ask_for_a_network_stay_and_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
+def test_variables_that_ask_for_a_network_stay_and_are_reported(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     asked = {DISCOVERY_RANGE: "SUBNET", "ROS_STATIC_PEERS": "10.0.0.1", SERVER: "a:1"}
     assert kept(**asked) == {**asked, PROFILES: str(NETWORK)}
     assert kept(**{DISCOVERY_RANGE: "OFF"})[DISCOVERY_RANGE] == "OFF"

@@ -28,17 +28,9 @@ from needle_core.component import (
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.messages import EmergencyStop
 from needle_core.runners.timeline import START_NS
-from needle_core.runners.transport import (
-    Arrival,
-    Arrivals,
-    Fault,
-    Link,
-    delay,
-    drop,
-    duplicate,
-    silence,
-)
+from needle_core.runners.transport import Arrival, Arrivals, Fault, Link
 from needle_core.runners.virtual import DISCOVERY, LEASE, VirtualRunner
+from transport_faults import delay, drop, duplicate, silence
 
 from .runner_scene import Once, Receiver, Sender, Server, Wired, run
 

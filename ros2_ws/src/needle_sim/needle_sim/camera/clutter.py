@@ -284,8 +284,8 @@ def hand_capsules(
     forward = -side * sideways if side else sideways
     aside = np.array([0.0, 0.0, 1.0])
     # Fast in and out, with a pause over the target.
-    there = min(1.0, 1.6 * np.sin(np.pi * event.progress))
-    over = over - (1.0 - there) * _FAR * forward
+    reached = min(1.0, 1.6 * np.sin(np.pi * event.progress))
+    over = over - (1.0 - reached) * _FAR * forward
     return [
         (
             over + a0 * forward + b0 * aside,

@@ -76,8 +76,10 @@ def project(points: ArrayLike, camera: SimulatedCamera) -> FloatArray:
     """
     crossing = refraction_point(points, camera.centre, camera.window)
     pose = camera.T_optical_rig
-    seen = crossing @ pose[:3, :3].T + pose[:3, 3]
-    return _distorted_pixel(seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2], camera)
+    in_camera = crossing @ pose[:3, :3].T + pose[:3, 3]
+    return _distorted_pixel(
+        in_camera[..., 0] / in_camera[..., 2], in_camera[..., 1] / in_camera[..., 2], camera
+    )
 
 
 def _distorted_pixel(x: FloatArray, y: FloatArray, camera: SimulatedCamera) -> FloatArray:
@@ -161,12 +163,12 @@ class Optics:
         """
         if self._lens is None:
             return SHARP_PX
-        sharp, seen = (
+        focus, distance = (
             self.window.height(self.centre) - self._apparent_height(np.asarray(height))
             for height in (self._lens.focus_height, self.window.height(points))
         )
         focal_px = float(self.camera.camera_matrix[0, 0])
-        confusion = self._lens.aperture * focal_px * np.abs(seen - sharp) / (seen * sharp)
+        confusion = self._lens.aperture * focal_px * np.abs(distance - focus) / (distance * focus)
         return np.asarray(np.hypot(SHARP_PX, confusion / 4.0))
 
     def _apparent_height(self, height: FloatArray) -> FloatArray:

@@ -211,9 +211,9 @@ class _Entries:
 
     def matrix(self, key: str, rows: int, columns: int) -> FloatArray:
         own, name = self.part(key), self.name(key)
-        seen = own.get("rows"), own.get("cols")
-        if seen != (rows, columns):
-            raise UserError(f"{name} is {seen[0]!r} x {seen[1]!r}, not {rows} x {columns}")
+        shape = own.get("rows"), own.get("cols")
+        if shape != (rows, columns):
+            raise UserError(f"{name} is {shape[0]!r} x {shape[1]!r}, not {rows} x {columns}")
         return own.numbers("data", rows * columns).reshape(rows, columns)
 
 

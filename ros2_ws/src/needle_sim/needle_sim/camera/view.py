@@ -180,12 +180,12 @@ class View:
         """Return the share of points (M, 3) in `rig` that are in the image and not under a hand."""
         width, height = self._optics.image_size
         pixels = self._optics.project(points)
-        seen = np.all((pixels >= 0.0) & (pixels <= [width - 1, height - 1]), axis=1)
+        visible = np.all((pixels >= 0.0) & (pixels <= [width - 1, height - 1]), axis=1)
         if moment.hand and len(points):
             hidden = self._hand_mask(moment)
-            column, row = np.rint(pixels[seen]).astype(np.intp).T
-            seen[seen] = hidden[row, column] < 0.5
-        return float(seen.mean()) if len(points) else 0.0
+            column, row = np.rint(pixels[visible]).astype(np.intp).T
+            visible[visible] = hidden[row, column] < 0.5
+        return float(visible.mean()) if len(points) else 0.0
 
     def _draw_moment(self, image: FloatImage, moment: SceneState) -> None:
         if len(moment.shadow):
@@ -287,13 +287,13 @@ class View:
         line = moment.shadow
         px_per_m = self._optics.radius_px(line, 1e-3) / 1e-3
         penumbra = shadow.penumbra * moment.shadow_fall * px_per_m
-        seen = self._stroke(line, moment.diameter, np.hypot(self._optics.blur_px(line), penumbra))
-        pixels = (seen.row, seen.column)
-        dark = image[pixels] * (1.0 - shadow.darkness * seen.coverage)
+        tube = self._stroke(line, moment.diameter, np.hypot(self._optics.blur_px(line), penumbra))
+        pixels = (tube.row, tube.column)
+        dark = image[pixels] * (1.0 - shadow.darkness * tube.coverage)
         if self._bubbles is not None:
             # The reflection of a bubble above is not in the shadow.
             added = self._bubbles.added[pixels]
-            dark = added + (image[pixels] - added) * (1.0 - shadow.darkness * seen.coverage)
+            dark = added + (image[pixels] - added) * (1.0 - shadow.darkness * tube.coverage)
         image[pixels] = dark
 
     def _stroke(self, line: FloatArray, diameter: float, blur: float | FloatArray) -> Stroke:

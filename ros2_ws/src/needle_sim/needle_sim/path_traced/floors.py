@@ -185,7 +185,7 @@ def _print(rng: np.random.Generator) -> FloatImage:
 
 def _clutter(rng: np.random.Generator) -> FloatImage:
     """Return rails, cables and screws of 0.2 to 2 times the wall's brightness."""
-    seen = np.ones(_SHAPE, dtype=np.float32)
+    factor = np.ones(_SHAPE, dtype=np.float32)
     rows, columns = _SHAPE
 
     def place() -> tuple[int, int]:
@@ -198,24 +198,26 @@ def _clutter(rng: np.random.Generator) -> FloatImage:
         turned = float(rng.normal(0.0, 3.0)) + (90.0 if rng.random() < 0.4 else 0.0)
         corners = cv2.boxPoints((middle, size, turned)).astype(np.int32)
         shade = float(rng.uniform(0.3, 1.6))
-        cv2.fillPoly(seen, [corners], shade, cv2.LINE_AA)
+        cv2.fillPoly(factor, [corners], shade, cv2.LINE_AA)
         if rng.random() < 0.6:
-            cv2.polylines(seen, [corners], True, 0.4 * shade, int(rng.integers(2, 12)), cv2.LINE_AA)
+            cv2.polylines(
+                factor, [corners], True, 0.4 * shade, int(rng.integers(2, 12)), cv2.LINE_AA
+            )
     for _ in range(rng.integers(0, 4)):
         bend = np.cumsum(rng.normal(0.0, 0.006, (30, 2)).cumsum(axis=0), axis=0) / SPACING / 3.0
         cable = (bend + place()).astype(np.int32)
         thick = round(float(rng.uniform(0.001, 0.006)) / SPACING)
         shade = float(rng.uniform(0.1, 0.6))
-        cv2.polylines(seen, [cable], False, shade, thick, cv2.LINE_AA)
-        cv2.polylines(seen, [cable], False, 1.8 * shade, max(thick // 4, 1), cv2.LINE_AA)
+        cv2.polylines(factor, [cable], False, shade, thick, cv2.LINE_AA)
+        cv2.polylines(factor, [cable], False, 1.8 * shade, max(thick // 4, 1), cv2.LINE_AA)
     for _ in range(rng.integers(2, 12)):
         # Head of a screw, with its slot.
         middle, radius = place(), round(float(rng.uniform(0.0015, 0.006)) / SPACING)
         bright = float(rng.uniform(0.4, 2.0))
-        cv2.circle(seen, middle, radius + 4, 0.3, -1, cv2.LINE_AA)
-        cv2.circle(seen, middle, radius, bright, -1, cv2.LINE_AA)
+        cv2.circle(factor, middle, radius + 4, 0.3, -1, cv2.LINE_AA)
+        cv2.circle(factor, middle, radius, bright, -1, cv2.LINE_AA)
         turned = float(rng.uniform(0.0, np.pi))
         away = round(0.8 * radius * np.cos(turned)), round(0.8 * radius * np.sin(turned))
         first, last = ((middle[0] + k * away[0], middle[1] + k * away[1]) for k in (-1, 1))
-        cv2.line(seen, first, last, 0.2, max(radius // 4, 1), cv2.LINE_AA)
-    return np.asarray(cv2.GaussianBlur(seen, (0, 0), rng.uniform(1.0, 6.0)), dtype=np.float32)
+        cv2.line(factor, first, last, 0.2, max(radius // 4, 1), cv2.LINE_AA)
+    return np.asarray(cv2.GaussianBlur(factor, (0, 0), rng.uniform(1.0, 6.0)), dtype=np.float32)

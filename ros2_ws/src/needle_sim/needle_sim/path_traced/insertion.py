@@ -8,11 +8,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from needle_sim.camera.image_folder import Truth, truth_of
-from needle_sim.camera.insertions import CURVATURE, RandomPath, advance_to, random_path
+from needle_sim.camera.image_folder import truth_of
+from needle_sim.camera.insertions import (
+    CURVATURE,
+    RandomPath,
+    RenderedPair,
+    advance_to,
+    random_path,
+)
 from needle_sim.camera.optics import Optics
 from needle_sim.camera.stereo_rig import StereoRig
-from needle_sim.camera.view import GreyImage
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray, exp_twist
@@ -31,37 +36,22 @@ _OUTSIDE = 0.03
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class TracedPair:
-    """Exposure of an insertion.
+class TracedPair(RenderedPair):
+    """Exposure of an insertion of a metal needle.
 
     Attributes
     ----------
-    number : int
-        Number of the exposure.
-    images : pair of ndarray of uint8
-        Left and right image.
-    insertion : float
-        Insertion of the stage [m].
-    truth : Truth or None
-        Ground truth; None without a needle in the phantom.
     meshes : pair of NeedleMesh or None
         Needle at the exposures of left and right; the right one may be inserted further.
-    visible_share : pair of float
-        Visible share of the needle's last 10 mm, in the left and the right image.
     """
 
-    number: int
-    images: tuple[GreyImage, GreyImage]
-    insertion: float
-    truth: Truth | None
     meshes: tuple[NeedleMesh, NeedleMesh] | None
-    visible_share: tuple[float, float]
 
 
 def trace_insertion(
     mitsuba: Mitsuba,
     rig: StereoRig,
-    look: Appearance,
+    appearance: Appearance,
     *,
     frames: int,
     depth: float,
@@ -81,7 +71,7 @@ def trace_insertion(
         Result of `load_mitsuba`.
     rig : StereoRig
         Cameras and phantom.
-    look : Appearance
+    appearance : Appearance
         Appearance; its seed determines the path as well.
     frames : int
         Number of exposures.
@@ -106,29 +96,32 @@ def trace_insertion(
     UserError
         If no path of this depth stays inside the phantom.
     """
-    path = random_path(look.seed, depth, (rig.half_height, rig.half_width), curvature)
-    plant = NeedlePlant(_entry(look.seed, path), curvature=curvature)
+    path = random_path(appearance.seed, depth, (rig.half_height, rig.half_width), curvature)
+    plant = NeedlePlant(_entry(appearance.seed, path), curvature=curvature)
     optics = [Optics(camera, None) for camera in (rig.left, rig.right)]
 
     def pairs() -> Iterator[TracedPair]:
-        renderer = PathTracedRenderer(mitsuba, rig, look)
+        renderer = PathTracedRenderer(mitsuba, rig, appearance)
         insertions = [min(begin + number * step, depth) for number in range(frames)]
         for number, insertion in enumerate([0.0, *insertions] if empty_first else insertions):
             advance_to(plant, insertion, path.rotation)
             truth = meshes = None
-            seen = (0.0, 0.0)
-            if look.needle and insertion > 0.0:
-                left = right = _mesh(plant, look)
-                truth = truth_of(plant.T_rig_tip, _shape(look))
-                if look.lag > 0.0:
+            visible = (0.0, 0.0)
+            if appearance.needle and insertion > 0.0:
+                left = right = _mesh(plant, appearance)
+                truth = truth_of(plant.T_rig_tip, _shape(appearance))
+                if appearance.lag > 0.0:
                     later = copy.deepcopy(plant)
-                    advance_to(later, min(insertion + look.lag, depth), path.rotation)
-                    right = _mesh(later, look)
+                    advance_to(later, min(insertion + appearance.lag, depth), path.rotation)
+                    right = _mesh(later, appearance)
                 meshes = left, right
                 distal = [mesh.line[-int(_DISTAL_LENGTH / _SPACING) :] for mesh in meshes]
-                seen = (_visible_share(distal[0], optics[0]), _visible_share(distal[1], optics[1]))
+                visible = (
+                    _visible_share(distal[0], optics[0]),
+                    _visible_share(distal[1], optics[1]),
+                )
             images = renderer.render(meshes, number)
-            yield TracedPair(number, images, insertion, truth, meshes, seen)
+            yield TracedPair(number, images, insertion, truth, visible, meshes)
 
     return pairs()
 
@@ -147,25 +140,27 @@ def _entry(seed: int, path: RandomPath) -> FloatArray:
     return np.asarray(pose)
 
 
-def _shape(look: Appearance) -> NeedleShape:
+def _shape(appearance: Appearance) -> NeedleShape:
     """Return the shape of the needle, with or without a bend."""
-    if look.lean == 0.0:
-        return NeedleShape(diameter=look.diameter, bend_angle=0.0, lean=0.0)
+    if appearance.lean == 0.0:
+        return NeedleShape(diameter=appearance.diameter, bend_angle=0.0, lean=0.0)
     # Half of the bend tilts the end to one side of the path, the other half the shaft.
-    return NeedleShape(diameter=look.diameter, bend_angle=2.0 * look.lean, lean=look.lean)
+    return NeedleShape(
+        diameter=appearance.diameter, bend_angle=2.0 * appearance.lean, lean=appearance.lean
+    )
 
 
-def _mesh(plant: NeedlePlant, look: Appearance) -> NeedleMesh:
-    end = NeedleEnd(look.diameter, look.bevel_angle, look.hollow)
+def _mesh(plant: NeedlePlant, appearance: Appearance) -> NeedleMesh:
+    end = NeedleEnd(appearance.diameter, appearance.bevel_angle, appearance.hollow)
     # The needle bends towards its sharp side.
-    return needle_mesh(_middle_line(plant, look), -plant.T_rig_tip[:3, 1], end)
+    return needle_mesh(_middle_line(plant, appearance), -plant.T_rig_tip[:3, 1], end)
 
 
-def _middle_line(plant: NeedlePlant, look: Appearance) -> FloatArray:
+def _middle_line(plant: NeedlePlant, appearance: Appearance) -> FloatArray:
     """Return the needle's centreline, including the part outside, (M, 3) [m]."""
     line = plant.centreline(_SPACING)
-    if look.lean > 0.0:
-        line = _shape(look).shaft_centreline(plant.T_rig_tip, line, _SPACING)
+    if appearance.lean > 0.0:
+        line = _shape(appearance).shaft_centreline(plant.T_rig_tip, line, _SPACING)
     back = line[0] - line[1]
     back /= np.linalg.norm(back)
     before = np.arange(int(_OUTSIDE / _SPACING), 0, -1)[:, np.newaxis] * _SPACING
@@ -175,8 +170,8 @@ def _middle_line(plant: NeedlePlant, look: Appearance) -> FloatArray:
 def _visible_share(points: FloatArray, optics: Optics) -> float:
     """Return the share of points (N, 3) in `rig` that are in a camera's image."""
     pixels = optics.project(points)
-    seen = np.all((pixels >= 0.0) & (pixels <= np.subtract(optics.image_size, 1.0)), axis=1)
-    return float(seen.mean())
+    visible = np.all((pixels >= 0.0) & (pixels <= np.subtract(optics.image_size, 1.0)), axis=1)
+    return float(visible.mean())
 
 
 TRUTH_COLUMNS = (
@@ -187,18 +182,23 @@ TRUTH_COLUMNS = (
 """End of the axis (the tip), foremost point of the metal, centre of the bevel, heading, ..."""
 
 
-def truth_values(look: Appearance, pair: TracedPair) -> list[float | str]:
+def truth_values(appearance: Appearance, pair: TracedPair) -> list[float | str]:
     """Return the values of `TRUTH_COLUMNS`; empty without a needle."""
-    scene: list[float | str] = [look.lamps, look.floor, look.metal, look.bubbles]
+    scene: list[float | str] = [
+        appearance.lamps,
+        appearance.floor,
+        appearance.metal,
+        appearance.bubbles,
+    ]
     if pair.truth is None or pair.meshes is None:
-        return [*[""] * 14, look.lamps, look.floor, "", look.bubbles]
+        return [*[""] * 14, appearance.lamps, appearance.floor, "", appearance.bubbles]
     truth = pair.truth
     heading = (
         np.sin(truth.pitch),
         -np.cos(truth.pitch) * np.sin(truth.yaw),
         np.cos(truth.pitch) * np.cos(truth.yaw),
     )
-    end = NeedleEnd(look.diameter, look.bevel_angle, look.hollow)
+    end = NeedleEnd(appearance.diameter, appearance.bevel_angle, appearance.hollow)
     places = np.concatenate([truth.tip, pair.meshes[0].extreme, pair.meshes[0].face_middle])
     values = [*places * MM, *heading, end.bevel_length * MM, end.diameter * MM]
     return [*(round(float(value), 6) for value in values), *scene]

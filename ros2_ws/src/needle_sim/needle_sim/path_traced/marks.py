@@ -41,12 +41,12 @@ class Marks:
     """
 
     def __init__(self, world: World) -> None:
-        look = world.look
-        rng = np.random.default_rng([look.seed, 0, _STREAM])
+        appearance = world.appearance
+        rng = np.random.default_rng([appearance.seed, 0, _STREAM])
         self._lines: list[tuple[FloatArray, float, FloatArray, float]] = []
-        for _ in range(look.tracks):
+        for _ in range(appearance.tracks):
             self._add_track(rng, world)
-        for _ in range(look.lint):
+        for _ in range(appearance.lint):
             self._add_lint(rng, world)
         if is_box(world.rig):
             self._add_edges(rng, world)
@@ -64,20 +64,20 @@ class Marks:
             Radiance of light lint and of clouded gel [unit of the image].
         """
         for line, diameter, grey, blur in self._lines:
-            seen = stroke(
+            drawn = stroke(
                 optics.project(line),
                 optics.radius_px(line, diameter / 2.0),
                 blur,
                 optics.image_size,
             )
-            pixels = (seen.row, seen.column)
-            strength = np.abs(grey)[seen.sample]
-            colour = np.where(grey[seen.sample] > 0.0, white, 0.0)
-            image[pixels] += seen.coverage * strength * (colour - image[pixels])
+            pixels = (drawn.row, drawn.column)
+            strength = np.abs(grey)[drawn.sample]
+            colour = np.where(grey[drawn.sample] > 0.0, white, 0.0)
+            image[pixels] += drawn.coverage * strength * (colour - image[pixels])
 
     def _add_lint(self, rng: np.random.Generator, world: World) -> None:
         """Add a randomly bent and rotated fibre, or a speck; light or dark."""
-        low, high = np.transpose([*block_bounds(world.rig, world.look), _LENGTHS])
+        low, high = np.transpose([*block_bounds(world.rig, world.appearance), _LENGTHS])
         middle = rng.uniform(low + _CLEARANCE, high - _CLEARANCE)
         is_dust = rng.random() < _DUST_SHARE
         length = _DUST_LENGTH if is_dust else rng.uniform(*_FIBRE_LENGTHS)
@@ -93,7 +93,7 @@ class Marks:
     def _add_edges(self, rng: np.random.Generator, world: World) -> None:
         """Add the four glued edges of the box along the needle."""
         z = np.arange(0.0, LENGTH, _SPACING)
-        (_, x), (_, y) = block_bounds(world.rig, world.look)
+        (_, x), (_, y) = block_bounds(world.rig, world.appearance)
         for up, aside in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
             line = np.stack([np.full_like(z, up * x), np.full_like(z, aside * y), z], axis=1)
             strength = rng.uniform(0.2, 0.8) * rng.choice([-1.0, 1.0])
@@ -113,7 +113,9 @@ class Marks:
         smooth = np.hanning(round(2.0 * _CLOUD_LENGTH / _SPACING))
         cloud = np.convolve(rng.standard_normal(len(line)), smooth / np.linalg.norm(smooth), "same")
         strength = (
-            rng.uniform(0.2, 1.0) * world.look.track_strength * np.clip(1.0 + 0.6 * cloud, 0.0, 2.5)
+            rng.uniform(0.2, 1.0)
+            * world.appearance.track_strength
+            * np.clip(1.0 + 0.6 * cloud, 0.0, 2.5)
         )
         left = np.arange(len(line))[::-1] * _SPACING
         strength *= np.clip(left / _CLOUD_LENGTH, 0.0, 1.0)

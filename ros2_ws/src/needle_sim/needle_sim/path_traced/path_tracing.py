@@ -60,9 +60,9 @@ def refracted_rays(pixels: ArrayLike, camera: SimulatedCamera, rig: StereoRig) -
     """
     pixels = np.asarray(pixels, dtype=np.float64)
     pose, window = camera.T_optical_rig, camera.window
-    seen = np.ones((*pixels.shape[:-1], 3))
-    seen[..., :2] = _undistorted(pixels, camera)
-    incoming = seen @ pose[:3, :3]
+    sight = np.ones((*pixels.shape[:-1], 3))
+    sight[..., :2] = _undistorted(pixels, camera)
+    incoming = sight @ pose[:3, :3]
     incoming /= np.linalg.norm(incoming, axis=-1, keepdims=True)
 
     inwards = incoming @ window.normal

@@ -29,14 +29,14 @@ _BLOOM_ALONG_PX = 14.0
 _MAX_LIGHT = 6.0 * _FULL
 
 
-def flicker(look: Appearance, number: int) -> float:
+def flicker(appearance: Appearance, number: int) -> float:
     """Return the factor of an exposure's light, for both cameras."""
-    rng = np.random.default_rng([look.seed, number, 40])
-    return float(np.exp(look.flicker * rng.standard_normal()))
+    rng = np.random.default_rng([appearance.seed, number, 40])
+    return float(np.exp(appearance.flicker * rng.standard_normal()))
 
 
 def grey_image(
-    light: FloatImage, look: Appearance, black: float, rng: np.random.Generator
+    light: FloatImage, appearance: Appearance, black: float, rng: np.random.Generator
 ) -> GreyImage:
     """Return the image of the sensor.
 
@@ -44,7 +44,7 @@ def grey_image(
     ----------
     light : ndarray of float32, shape (rows, columns)
         Light in grey levels, without an upper bound.
-    look : Appearance
+    appearance : Appearance
         Haze, blur, blooming and noise.
     black : float
         Black level of the sensor [grey levels].
@@ -52,19 +52,20 @@ def grey_image(
         Generator of the noise.
     """
     image = np.minimum(light, _MAX_LIGHT).astype(np.float32)
-    if look.haze > 0.0:
+    if appearance.haze > 0.0:
         # Forward scattering reduces the contrast of small objects.
         glow = cv2.GaussianBlur(image, (0, 0), _HAZE_BLUR_PX)
-        image += 0.5 * look.haze * (glow - image)
-    image = cv2.GaussianBlur(image, (0, 0), look.blur_px)
-    if look.bloom > 0.0:
+        image += 0.5 * appearance.haze * (glow - image)
+    image = cv2.GaussianBlur(image, (0, 0), appearance.blur_px)
+    if appearance.bloom > 0.0:
         beyond = np.maximum(image - _FULL, 0.0)
         around = cv2.GaussianBlur(beyond, (0, 0), _BLOOM_BLUR_PX)
         column = cv2.GaussianBlur(beyond, (1, 0), sigmaX=1e-3, sigmaY=_BLOOM_ALONG_PX)
-        image += look.bloom * (6.0 * around + 6.0 * column)
+        image += appearance.bloom * (6.0 * around + 6.0 * column)
     image += black
     spread = np.sqrt(
-        look.noise**2 + look.shot_noise**2 * np.clip(image, 0.0, _FULL) / _FULL, dtype=np.float32
+        appearance.noise**2 + appearance.shot_noise**2 * np.clip(image, 0.0, _FULL) / _FULL,
+        dtype=np.float32,
     )
     image += spread * rng.standard_normal(image.shape, dtype=np.float32)
     return np.asarray(np.clip(np.rint(image), 0.0, _FULL), dtype=np.uint8)
@@ -112,13 +113,13 @@ class PathTracedRenderer:
         Result of `load_mitsuba`.
     rig : StereoRig
         Cameras and phantom.
-    look : Appearance
+    appearance : Appearance
         Appearance, with the seed of all random numbers.
     """
 
-    def __init__(self, mitsuba: Mitsuba, rig: StereoRig, look: Appearance) -> None:
-        self._mitsuba, self._rig, self._look = mitsuba, rig, look
-        self._world = make_world(rig, look)
+    def __init__(self, mitsuba: Mitsuba, rig: StereoRig, appearance: Appearance) -> None:
+        self._mitsuba, self._rig, self._look = mitsuba, rig, appearance
+        self._world = make_world(rig, appearance)
         self._tracer = PathTracer(mitsuba)
         self._static_scene = Scene(mitsuba, self._world)
         self._needle_scene: Scene | None = None
@@ -129,7 +130,7 @@ class PathTracedRenderer:
                 [self._static_scene],
                 _grid(behind).reshape(-1, 3),
                 samples=_FLOOR_SAMPLES,
-                key=[look.seed],
+                key=[appearance.seed],
             )
             # Sampling noise is finer than the shadows of static objects.
             self._light[behind] = cv2.GaussianBlur(
@@ -137,12 +138,12 @@ class PathTracedRenderer:
             )
         cameras = zip((rig.left, rig.right), self._world.backdrops, strict=True)
         self._views = [self._view(*each, side) for side, each in enumerate(cameras)]
-        rng = np.random.default_rng([look.seed, 0, _GAIN_STREAM])
+        rng = np.random.default_rng([appearance.seed, 0, _GAIN_STREAM])
         self._black = float(rng.uniform(*_BLACK))
         # Exposure ignores the area in front of the phantom.
         medians = [np.median(view.floor[view.floor_points[..., 2] > 0.0]) for view in self._views]
         self._gains = (
-            (look.floor_level - self._black) / np.array(medians) * rng.normal(1.0, 0.03, 2)
+            (appearance.floor_level - self._black) / np.array(medians) * rng.normal(1.0, 0.03, 2)
         )
 
     def render(
@@ -162,15 +163,15 @@ class PathTracedRenderer:
         left, right : ndarray of uint8, shape (image_height, image_width)
             Grey images.
         """
-        look = self._look
-        light = flicker(look, exposure_number)
+        appearance = self._look
+        light = flicker(appearance, exposure_number)
         images = []
         for side, view in enumerate(self._views):
-            key = [look.seed, exposure_number, side]
+            key = [appearance.seed, exposure_number, side]
             image = self._exposed(view, needles and needles[side], key)
             rng = np.random.default_rng(key)
             grey = np.asarray(image * (self._gains[side] * light), dtype=np.float32)
-            images.append(grey_image(grey, look, self._black, rng))
+            images.append(grey_image(grey, appearance, self._black, rng))
         left, right = images
         return left, right
 
@@ -228,7 +229,7 @@ class PathTracedRenderer:
         cover[there] = covered
 
     def _view(self, camera: SimulatedCamera, behind: Backdrop, side: int) -> _View:
-        look, rig = self._look, self._rig
+        appearance, rig = self._look, self._rig
         optics = Optics(camera, None)
         size = (camera.image_height, camera.image_width)
         row, column = np.mgrid[: size[0], : size[1]]
@@ -245,13 +246,13 @@ class PathTracedRenderer:
             for u in (-1.0, 1.0)
             for v in (-1.0, 1.0)
         ]
-        if look.floor == "panel":
+        if appearance.floor == "panel":
             floor += PANEL_RADIANCE / ALBEDO["panel"]
         floor = floor * np.mean(quarters, axis=0)
-        if look.floor_blur_px > 0.0:
-            floor = cv2.GaussianBlur(floor, (0, 0), look.floor_blur_px)
+        if appearance.floor_blur_px > 0.0:
+            floor = cv2.GaussianBlur(floor, (0, 0), appearance.floor_blur_px)
         veil = float(np.median(floor))
-        clear = np.where(rays.in_air, 1.0, _transmission(look.haze, 1.0))
+        clear = np.where(rays.in_air, 1.0, _transmission(appearance.haze, 1.0))
         floor = np.asarray(clear * floor + (1.0 - clear) * veil, dtype=np.float32)
         # Clouded gel scatters light from all sides, little of it over a dark floor.
         Marks(self._world).draw(floor, optics, 0.4 * float(np.median(self._light[behind])) + veil)
@@ -269,7 +270,7 @@ class PathTracedRenderer:
             view.light,
             view.cover,
             samples=_STATIC_SAMPLES,
-            key=[look.seed, side],
+            key=[appearance.seed, side],
         )
         return view
 

@@ -103,14 +103,14 @@ class Scene:
         return shape
 
     def _metal(self, world: World, part: str) -> dict[str, Any]:
-        look, index = world.look, refractive_index(world.rig)
+        appearance, index = world.appearance, refractive_index(world.rig)
         if part == "bore":
             return _both_sides({"type": "diffuse", "reflectance": 0.03})
-        along, across = look.roughness_along, look.roughness_across
+        along, across = appearance.roughness_along, appearance.roughness_across
         if part == "face":
-            along = across = look.face_roughness
+            along = across = appearance.face_roughness
         # Grinding removes paint and oxide.
-        dark = None if part == "face" else _DARK.get(look.metal)
+        dark = None if part == "face" else _DARK.get(appearance.metal)
         if dark is None:
             return _both_sides(
                 {
@@ -144,7 +144,7 @@ class Scene:
             "to_world": transform @ self._transform().scale([MM * half_z, MM * floors.SIDE, 1.0]),
         }
         picture = behind.picture.reflectance[::_COARSER, ::_COARSER, np.newaxis]
-        if world.look.floor == "panel":
+        if world.appearance.floor == "panel":
             shape["emitter"] = {"type": "area", "radiance": PANEL_RADIANCE}
             picture = np.full_like(picture, ALBEDO["panel"])
         shape["bsdf"] = {
@@ -161,7 +161,7 @@ class Scene:
 
     def _box(self, world: World) -> dict[str, Any]:
         """Return the walls of the box, and the sheath in front of it."""
-        (bottom, top), (_, beside) = block_bounds(world.rig, world.look)
+        (bottom, top), (_, beside) = block_bounds(world.rig, world.appearance)
         wall = world.wall
         # Centres and half sides: front (where the needle enters), far end, and both opaque sides.
         high = (top - bottom) / 2.0

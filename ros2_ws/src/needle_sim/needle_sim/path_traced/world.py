@@ -36,12 +36,12 @@ def reach_sideways(camera: SimulatedCamera, rig: StereoRig) -> float:
 
 
 def block_bounds(
-    rig: StereoRig, look: Appearance
+    rig: StereoRig, appearance: Appearance
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the bounds of the block in x and y [m]."""
     if is_box(rig):
         return (-rig.half_height, rig.half_height), (-rig.half_width, rig.half_width)
-    return (look.floor_height, rig.half_height), (-_SIDE, _SIDE)
+    return (appearance.floor_height, rig.half_height), (-_SIDE, _SIDE)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,12 +87,12 @@ class Backdrop:
 
 
 def backdrop(
-    camera: SimulatedCamera, rig: StereoRig, look: Appearance, picture: FloorPicture
+    camera: SimulatedCamera, rig: StereoRig, appearance: Appearance, picture: FloorPicture
 ) -> Backdrop:
     """Return the backdrop of a camera: the floor, or the background behind the box."""
     window = camera.window
     normal = np.array([*window.normal[:2], 0.0])
-    depth = window.inner + look.behind if is_box(rig) else -look.floor_height
+    depth = window.inner + appearance.behind if is_box(rig) else -appearance.floor_height
     gel = 2.0 * window.inner if is_box(rig) else window.inner + depth
     return Backdrop(normal / np.linalg.norm(normal), window.sideways, depth, gel, picture)
 
@@ -201,7 +201,7 @@ class World:
     ----------
     rig : StereoRig
         Phantom and cameras.
-    look : Appearance
+    appearance : Appearance
         Appearance of the sequence.
     lamps : list of Lamp
         Lamps.
@@ -218,7 +218,7 @@ class World:
     """
 
     rig: StereoRig
-    look: Appearance
+    appearance: Appearance
     lamps: list[Lamp]
     room: float
     backdrops: tuple[Backdrop, Backdrop]
@@ -227,21 +227,21 @@ class World:
     wall_albedo: float
 
 
-def make_world(rig: StereoRig, look: Appearance) -> World:
+def make_world(rig: StereoRig, appearance: Appearance) -> World:
     """Return the static parts of a sequence, determined by its appearance."""
-    rng = np.random.default_rng([look.seed, 0, _STREAM])
-    lamps = place_lamps(look.lamps, rng)
+    rng = np.random.default_rng([appearance.seed, 0, _STREAM])
+    lamps = place_lamps(appearance.lamps, rng)
     wall, albedo = float(rng.uniform(*_BOX_WALLS)), float(rng.uniform(*_WALL_ALBEDOS))
     bubbles = None
-    if look.bubbles > 0:
-        kinds = Bubbles(look.bubbles, _SMALLEST_BUBBLE, float(rng.uniform(*_LARGEST_BUBBLES)))
+    if appearance.bubbles > 0:
+        kinds = Bubbles(appearance.bubbles, _SMALLEST_BUBBLE, float(rng.uniform(*_LARGEST_BUBBLES)))
         bubbles = place_bubbles(kinds, rig, rng)
-    room = look.room_light * irradiance(lamps, rig) / np.pi if lamps else 1.0
-    left = backdrop(rig.left, rig, look, floor_picture(look.floor, rng))
+    room = appearance.room_light * irradiance(lamps, rig) / np.pi if lamps else 1.0
+    left = backdrop(rig.left, rig, appearance, floor_picture(appearance.floor, rng))
     right = left
     if is_box(rig):
-        right = backdrop(rig.right, rig, look, floor_picture(look.floor, rng))
-    return World(rig, look, lamps, room, (left, right), bubbles, wall, albedo)
+        right = backdrop(rig.right, rig, appearance, floor_picture(appearance.floor, rng))
+    return World(rig, appearance, lamps, room, (left, right), bubbles, wall, albedo)
 
 
 def room_light(world: World) -> FloatImage:
@@ -251,8 +251,8 @@ def room_light(world: World) -> FloatImage:
     visible; beyond it, the surface mirrors the inside of the phantom, mostly its floor. A clear box
     is open to all sides.
     """
-    look = world.look
-    rng = np.random.default_rng([look.seed, 0, _ROOM_STREAM])
+    appearance = world.appearance
+    rng = np.random.default_rng([appearance.seed, 0, _ROOM_STREAM])
     rows, columns = _SKY
     polar = (np.arange(rows) + 0.5) / rows * np.pi
     around = (np.arange(columns) + 0.5) / columns * 2.0 * np.pi
@@ -264,8 +264,8 @@ def room_light(world: World) -> FloatImage:
     if is_box(world.rig):
         return np.asarray(np.maximum(sky, 0.0), dtype=np.float32)
     light = irradiance(world.lamps, world.rig) / np.pi + world.room
-    mirrored = ALBEDO[look.floor] * light
-    if look.floor == "panel":
+    mirrored = ALBEDO[appearance.floor] * light
+    if appearance.floor == "panel":
         mirrored += PANEL_RADIANCE
     total = np.sin(polar) > 1.0 / refractive_index(world.rig)
     sky[total] = mirrored

@@ -185,7 +185,7 @@ def _write(
         name: getattr(options, name) for name in ("frames", "depth", "step", "curvature", "begin")
     }
     columns: tuple[str, ...] = ()
-    pairs: Iterator[RenderedPair | TracedPair]
+    pairs: Iterator[RenderedPair]
     if isinstance(look, Scenario):
         pairs = render_insertion(rig, look, seed=options.seed, **way)
     else:
