@@ -1,4 +1,4 @@
-"""Where compiled code is kept, and when it is compiled anew."""
+"""The cache of compiled code, and its invalidation."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_code_that_is_edited_in_any_room_of_its_package_is_compiled_anew(package
         (room / file).write_text(text)
         compiled._cache_directory.cache_clear()
         folders.append(compiled._cache_directory(package))
-    # What no compiled code reads changes nothing.
+    # Files that compiled code does not read have no effect.
     assert len(set(folders)) == 4
     assert folders[-1] == folders[-2]
 

@@ -1,4 +1,4 @@
-"""Every message there and back, through rosbags' CDR and through rclpy's."""
+"""Round trip of every message, through the CDR of rosbags and of rclpy."""
 
 import dataclasses
 import importlib.util
@@ -20,7 +20,7 @@ from needle_core.ros.base_node import to_stamp
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STAMP = 1_234_567_890_123
 TURN = (0.0, 0.6, 0.0, 0.8)
-# Where a message says how many, or which.
+# Fields with a count or an index.
 LENGTHS = {"covariance": 36, "d": 5, "k": 9, "r": 9, "p": 12, "colour": 4}
 TEXTS = {"severity": "warning", "source": "rig1/person", "session": "18a3f0c2d9"}
 _NUMBERS = itertools.cycle(range(3, 99))

@@ -1,4 +1,4 @@
-"""Messages of one source, as the device tells them from those of an earlier process."""
+"""Hold messages of one source, with the session that identifies its process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rotations as messages, against scipy's."""
+"""Quaternions of rotation matrices, compared with scipy."""
 
 from __future__ import annotations
 

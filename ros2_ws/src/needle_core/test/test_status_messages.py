@@ -1,4 +1,4 @@
-"""Key-values of device and controller, as foreign nodes may send them."""
+"""Key-value messages of device and controller, also malformed ones."""
 
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 

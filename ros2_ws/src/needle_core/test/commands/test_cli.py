@@ -1,4 +1,4 @@
-"""Entry points and exit codes: what a shell sees of a command or node, whatever comes."""
+"""Entry points and exit codes of commands and nodes."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_a_repeated_signal_does_not_disturb_the_clean_up(
 def test_a_signal_while_modules_are_loaded_ends_at_once(
     kind: Callable[[str], Any], code: int, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Also in a shell's background.
+    # Also in a background job.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     monkeypatch.setattr(importlib, "import_module", lambda _: signal.raise_signal(number))
     with pytest.raises(LeftError) as left:
@@ -191,5 +191,5 @@ def test_the_exit_code_and_the_last_words_come_through(
         with pytest.raises(end) as left:
             kind("made_up")()
         assert left.value.args == (4,)
-        # A command leaves by the interpreter, which writes them.
+        # A command exits through the interpreter, which flushes them.
         assert file.read_text() == ("last words\n" if end is LeftError else "")

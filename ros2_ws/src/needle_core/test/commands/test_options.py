@@ -1,4 +1,4 @@
-"""What all command lines understand, and what they refuse in one line."""
+"""Options of all command lines, and their one-line errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_unknown_arguments_are_a_user_error_and_help_keeps_its_lines() -> None:
     parser = CommandParser("study", "Runs,\nand says so.", "example:\n  study --seed 1")
     parser.add_argument("--seed")
     for words, complaint in (
-        # Options are written in full.
+        # Options cannot be abbreviated.
         (["--see", "1"], "unrecognized arguments: --see 1; see --help"),
         (["--seed"], "argument --seed: expected one argument; see --help"),
     ):

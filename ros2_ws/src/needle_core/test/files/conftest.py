@@ -1,4 +1,4 @@
-"""A bag to spoil."""
+"""A bag for tests that damage it."""
 
 from __future__ import annotations
 

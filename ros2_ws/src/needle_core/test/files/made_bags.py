@@ -1,4 +1,4 @@
-"""Bags that tests make, spoil and read."""
+"""Bags that tests write, damage and read."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def reason(path: Path) -> str:
 
 
 def refusal(bag: Path) -> str:
-    """Why a bag is refused: what reads it and `recover` say the same, and change nothing."""
+    """Reason of a rejection: reader and `recover` report the same, and change nothing."""
     before = {file: file.read_bytes() for file in bag.iterdir()}
     said = reason(bag)
     with pytest.raises(UserError) as caught:

@@ -1,4 +1,4 @@
-"""Bags that are damaged or kept in another way: refused in one line."""
+"""Damaged and unsupported bags: rejected in one line."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_message_of_another_type_is_refused(bag: Path) -> None:
         read(file)
 
 
-# ---- what is no bag, or kept in another way -----------------------------------------------------
+# ---- not a bag, or an unsupported storage --------------------------------------------------------
 
 
 def test_an_incomplete_bag_is_reported_with_its_remedy(bag: Path, tmp_path: Path) -> None:

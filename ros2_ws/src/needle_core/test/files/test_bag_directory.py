@@ -1,4 +1,4 @@
-"""Bags, of whatever recorder: read whole, or what is missing is told."""
+"""Bags of any recorder: read completely, or the missing part is reported."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_a_definition_is_read_part_by_part_as_it_is_as_a_whole() -> None:
             parsed_types("ros2msg", f"int32 a\n{'=' * 80}\n{after}", "a/msg/A")
 
 
-# ---- damaged, or made to harm -------------------------------------------------------------------
+# ---- damaged or malicious -----------------------------------------------------------------------
 
 
 def test_a_wrong_bit_in_a_message_or_a_missing_end_is_refused(bag: Path) -> None:

@@ -1,4 +1,4 @@
-"""Only regular files are opened, and files are replaced whole."""
+"""Regular files only, and atomic replacement of files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_a_file_is_replaced_whole_and_a_links_target_is_not_touched(tmp_path: Pa
     assert precious.read_text() == "mine"
     assert not link.is_symlink()
     assert link.read_bytes() == b"new"
-    # As of any new file.
+    # Like any new file.
     assert link.stat().st_mode == precious.stat().st_mode
     (tmp_path / "folder").mkdir()
     with pytest.raises(OSError, match="directory"):

@@ -1,4 +1,4 @@
-"""YAML is read with each key once."""
+"""YAML files without duplicate keys."""
 
 from __future__ import annotations
 

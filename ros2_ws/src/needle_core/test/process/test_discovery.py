@@ -1,4 +1,4 @@
-"""Who reaches a node: this machine alone, unless the user asks for a network."""
+"""Discovery range of a node: this machine, unless the user asks for a network."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_the_discovery_range_decides_with_and_without_shared_memory(
     restrict_discovery(environment, shared_memory=False)
     assert environment[PROFILES] == str(without_shared_memory)
     assert is_network_enabled(environment) is opened
-    # What such a node starts has shared memory again.
+    # Processes started by such a node use shared memory again.
     restrict_discovery(environment)
     assert environment == kept(**{DISCOVERY_RANGE: asked})
     assert kept() == {DISCOVERY_RANGE: "LOCALHOST", PROFILES: str(THIS_MACHINE)}
@@ -121,7 +121,7 @@ def test_missing_or_contradictory_settings_are_rejected(
     for domain in ("233", "-1", "7abc", "1.5", "1" * 5000):
         with pytest.raises(UserError, match=f"^ROS_DOMAIN_ID={domain} is not a number from 0 to 2"):
             kept(ROS_DOMAIN_ID=domain)
-        # Nodes that are started together have a domain of their own.
+        # Nodes that are started together have their own domain.
         environment = {"ROS_DOMAIN_ID": domain}
         clean_environment(environment, own_graph=True)
         assert environment == {}
@@ -138,7 +138,7 @@ def test_nodes_that_are_started_together_find_each_other() -> None:
 
 
 def elements(file: Path, *left_out: str) -> list[tuple[str, str]]:
-    """Return the elements of profiles, tag and text; but some, and what is in those."""
+    """Return tags and texts of a profile's elements, without some elements and their content."""
 
     def is_left_out(element: ElementTree.Element) -> bool:
         name = element.tag.removeprefix(_NAMES)
@@ -161,6 +161,6 @@ def test_the_files_differ_in_interfaces_and_shared_memory_only() -> None:
         listed = ElementTree.parse(file).getroot().iter(f"{_NAMES}interfaceWhiteList")
         assert [address.text for one in listed for address in one] == ["127.0.0.1"]
     assert elements(NETWORK, "needle_shm") == elements(NETWORK_UDP)
-    # What it means for ROS's layer on Fast DDS to discover this machine alone.
+    # Meaning of LOCALHOST in rmw_fastrtps.
     discovery = ("maxInitialPeersRange", "metatrafficUnicastLocatorList", "initialPeersList")
     assert elements(THIS_MACHINE, "needle_shm") == elements(THIS_MACHINE_UDP, *discovery)

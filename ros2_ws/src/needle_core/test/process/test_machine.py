@@ -1,4 +1,4 @@
-"""A process' share of the machine: its name, its domain, and Fast DDS's shared memory."""
+"""Exclusive names, ROS domains and Fast DDS's shared memory."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_incomplete_ports_are_removed_and_others_stay(
 
     def go_on_making(_: float) -> None:
         ready.write_bytes(word(2))
-        # Somebody else has seen it, too, and makes it anew.
+        # Another process removes it and creates it again.
         (tmp_path / "new").write_bytes(word(1))
         (tmp_path / "new").rename(renewed)
 

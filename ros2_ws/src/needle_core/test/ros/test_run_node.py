@@ -1,4 +1,4 @@
-"""A node's start and end: exit codes, last words, and one line for what a person can cause."""
+"""Start and end of a node: exit codes, last messages, and one-line errors."""
 
 from __future__ import annotations
 

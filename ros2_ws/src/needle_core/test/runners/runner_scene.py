@@ -30,7 +30,7 @@ from needle_core.runners.virtual import VirtualRunner
 
 
 class Sender(Component):
-    """Counts on `numbers`, every 0.1 s."""
+    """Publishes increasing numbers on `numbers` every 0.1 s."""
 
     def __init__(self, name: str = "sender", delivery: Delivery = RELIABLE) -> None:
         self.name = name
@@ -44,7 +44,7 @@ class Sender(Component):
 
 
 class Receiver(Component):
-    """Keeps what it receives, with the moment."""
+    """Stores received messages with their moment."""
 
     def __init__(self, name: str = "receiver", delivery: Delivery = RELIABLE) -> None:
         self.name = name
@@ -86,7 +86,7 @@ class Once(Component):
 
 
 class Wired(Component):
-    """Sends two batches in each of its ticks, and keeps what arrives, with the time."""
+    """Sends two batches per tick, and stores the arriving ones with their time."""
 
     def __init__(self, name: str, *, sends: bool = False) -> None:
         self.name = name
@@ -106,7 +106,7 @@ class Wired(Component):
 
 
 class Server(Component):
-    """Answers as it is told; none at all by default."""
+    """Sends the given answers; none by default."""
 
     name = "server"
 
@@ -123,7 +123,7 @@ class Server(Component):
 def run(
     components: Sequence[Component], seconds: float = 3.0, **options: Any
 ) -> tuple[VirtualRunner, list[tuple[int, str, Any]]]:
-    """Run; return what was said on all topics: stamp, topic, message."""
+    """Run; return all publications: stamp, topic, message."""
     told: list[tuple[int, str, Any]] = []
 
     def tap(stamp: int, sender: str, message: Any, output: Output) -> None:

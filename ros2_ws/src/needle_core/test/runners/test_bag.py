@@ -1,4 +1,4 @@
-"""A component on a bag: its timers tick by recorded time, and what nobody hears is dropped."""
+"""A component on a bag: timers tick by recorded time, messages without subscriber are dropped."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from needle_core.runners.bag import BagRunner
 
 
 class Clerk(c.Component):
-    """Notes when its timer ticked and who it knows; repeats what it hears, aloud and at a port."""
+    """Records its ticks and peers; repeats received messages on a topic and at a port."""
 
     name = "clerk"
 

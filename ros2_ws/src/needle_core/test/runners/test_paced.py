@@ -1,4 +1,4 @@
-"""The paced runner on a wall clock of the test's own: pace, lag, what comes from outside."""
+"""The paced runner on a simulated wall clock: pace, lag, external input."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PERIOD = 0.02
 
 
 class Worker(Component):
-    """Takes time of the wall clock now and then, and notes what comes in through its port."""
+    """Consumes wall-clock time now and then, and records the input of its port."""
 
     name = "worker"
 
@@ -89,7 +89,7 @@ def test_virtual_time_goes_at_the_pace_of_the_wall_clock(pace: float) -> None:
 
 def test_input_is_handled_at_the_time_of_the_wall_clock() -> None:
     scene = Scene()
-    # Between two ticks: whoever waits for the next one is woken.
+    # Between two ticks: input wakes the waiting runner.
     for when in (0.503, 0.507):
         scene.wall.at(scene.wall.now + when, partial(scene.line.arrive, (when,)))
     scene.runner.run(1.0)
@@ -126,7 +126,7 @@ def test_input_during_a_delay_is_read_and_handled_right_after_it() -> None:
     scene = Scene()
     scene.worker.takes = [3.0]
     begin = scene.wall.now
-    # What may age tells when it is asked.
+    # A callable batch is evaluated when it is handled.
     for batch in (("stop",), lambda: (scene.wall.now,), tuple):
         scene.wall.at(begin + 1.0, partial(scene.line.arrive, batch))
     scene.runner.run(2.0)

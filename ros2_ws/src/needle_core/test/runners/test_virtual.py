@@ -1,4 +1,4 @@
-"""The virtual runner: repeatable, and as unkind as a graph."""
+"""The virtual runner: repeatable, with the faults of a real graph."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_another_component_changes_no_draw_of_the_others() -> None:
     alone, beside = Receiver(), Receiver()
     run([Sender(), alone])
     run([Once([]), Sender(), beside, Server()])
-    # While the others are found, their news keep the receiver busy.
+    # Discovery events of the others keep the receiver busy.
     settled = DISCOVERY[1] + 0.1
     late = [[item for item in r.received if item[1].steady > settled] for r in (alone, beside)]
     assert late[0] == late[1] != []
@@ -194,7 +194,7 @@ def test_a_batch_arrives_in_order_at_all_ports_of_the_same_name() -> None:
     third.ports = (Port("another wire", third._take),)
     VirtualRunner([one, other, third]).run(0.1)
     numbers = [number for _, number in other.arrived]
-    # Wires are there at once, while discovery takes a while.
+    # Ports are connected at once, while discovery takes time.
     assert numbers == list(range(1, len(numbers) + 1))
     assert one.count - 12 < len(numbers) <= one.count
     assert other.arrived[0][0] < 0.003
@@ -251,7 +251,7 @@ def test_a_port_is_lost_and_reopened_also_for_a_component_that_starts_meanwhile(
     runner.run(0.1)
     assert anew.arrived
     assert changes == ["unplugged", "unplugged", ""]
-    # Nor does anything pass a lost port outwards.
+    # A lost port does not send either.
     runner.lose_port("one", "wire", "full")
     runner.run(0.001)
     arrived = len(anew.arrived)
@@ -259,7 +259,7 @@ def test_a_port_is_lost_and_reopened_also_for_a_component_that_starts_meanwhile(
     assert len(anew.arrived) == arrived
 
 
-# ---- what befalls components --------------------------------------------------------------------
+# ---- life of components and faults --------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -296,12 +296,12 @@ def test_a_killed_component_loses_its_state_and_is_dropped_after_its_lease() -> 
     runner.run(LEASE - 0.1)
     assert not runner.runs("sender")
     assert (sender.count, late.numbers) == (count, [])
-    # It has found the one that came late.
+    # It has discovered the late component.
     assert receiver.peers[-1].nodes == {"sender", "receiver", "late"}
     runner.start(Sender())
     runner.run(0.25)
     assert receiver.peers[-1].publishers["numbers"] == ("sender",)
-    # The new one counts anew.
+    # The new component counts from 1.
     assert receiver.numbers[-1] < 5
     runner.stop("sender")
     assert runner.run(1.0)

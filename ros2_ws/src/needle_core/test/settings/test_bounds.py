@@ -1,4 +1,4 @@
-"""One check of bounds for all numbers that people give."""
+"""The check of bounds for all numbers of the user."""
 
 from __future__ import annotations
 

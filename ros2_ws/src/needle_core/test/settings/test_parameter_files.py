@@ -1,4 +1,4 @@
-"""Parameters reach the node, or stop it with one line."""
+"""Parameters take effect in the node, or stop it with one line."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_sections_of_which_none_reaches_it_stop_the_node(file: Path) -> None:
         (f"/*/{DRIVES}", "/device_driver", "/*/device_driver"),
         (BOTH_RIGS, "/rig3/device_driver", "/rig1/device_driver"),
         ("rig2: {device_driver: {ros__parameters: {}}}", "/rig1/device_driver", "rig2/dev"),
-        # What is for all nodes is not what was written for this kind of node.
+        # A section for all nodes does not count as one for this kind of node.
         (f"/**: {{ros__parameters: {{}}}}\n{DRIVES}", "/rig1/device_driver", "device_driver"),
     ):
         with pytest.raises(UserError) as caught:

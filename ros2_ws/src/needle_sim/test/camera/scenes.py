@@ -1,4 +1,4 @@
-"""Needles to be rendered, and what they take from an image."""
+"""Needles to render, and their effect on an image."""
 
 from __future__ import annotations
 

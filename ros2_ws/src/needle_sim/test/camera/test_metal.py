@@ -1,4 +1,4 @@
-"""A bare needle and paper under it: what mirrors the lamp, and where lines lie."""
+"""A bare needle and graph paper: reflection of the lamp, and position of the lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Refraction against Snell's law and OpenCV's pinhole camera."""
+"""Refraction, compared with Snell's law and OpenCV's pinhole camera."""
 
 from __future__ import annotations
 

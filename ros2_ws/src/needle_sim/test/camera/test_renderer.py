@@ -1,4 +1,4 @@
-"""The renderer: where the needle's darkness lies, its end, its noise, its repeatability."""
+"""The renderer: position and end of the needle, noise, repeatability."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from .scenes import (
 
 
 def middles(dark: np.ndarray, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the middle of what is dark in each column, looked for about some rows."""
+    """Return the centre of the dark pixels in each column, searched around some rows."""
     about = np.rint(rows).astype(int)[:, np.newaxis] + np.arange(-9, 10)
     part = dark[about, columns[:, np.newaxis]]
     return np.asarray((part * about).sum(axis=1) / part.sum(axis=1))
@@ -98,7 +98,7 @@ def test_clean_images_are_unchanged(rig: StereoRig) -> None:
     assert golden is not None
     u, v = project(needle(0.08).T_rig_tip[:3, 3], rig.left).astype(int)
     difference = np.abs(left[v - 40 : v + 40, u - 80 : u + 40].astype(int) - golden)
-    # Other processors blur the mottle with other roundings.
+    # Other processors blur the mottle with different rounding.
     assert difference.max() <= 1
     assert np.mean(difference > 0) < 0.01
 

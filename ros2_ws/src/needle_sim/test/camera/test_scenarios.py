@@ -1,4 +1,4 @@
-"""The scenarios' troubles: repeatable, where geometry puts them, and nothing else changed."""
+"""Disturbances of the scenarios: repeatable, at the right place, without side effects."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_the_shadow_lies_on_the_floor(rig: StereoRig) -> None:
     left, right = middles(dark[0], columns), middles(dark[1], across)
 
     def right_rows(depth: float) -> np.ndarray:
-        """How far the right camera sees what the left one sees from there, if it is so deep."""
+        """Return the disparity between left and right of a point at this depth."""
         seen = (np.array([float(u), v]) for u, v in zip(columns, left, strict=True))
         places = [project(place_at(0.0175 - depth, pixel, rig.left), rig.right) for pixel in seen]
         return np.array([v - np.interp(u, across, right) for u, v in places])

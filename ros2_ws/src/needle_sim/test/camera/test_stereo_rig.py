@@ -1,4 +1,4 @@
-"""The calibration file's reader: the shipped files, and one line for every bad one."""
+"""The reader of calibration files: the shipped files, and one-line errors."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_each_camera_may_have_its_own_window() -> None:
 
 
 GONE = object()
-# Where in a file what stands instead, and what the error names.
+# Key in the file, invalid value, and key in the error.
 BAD = [
     ("phantom", GONE, "phantom is missing"),
     ("left.camera_matrix", GONE, "left.camera_matrix is missing"),

@@ -1,4 +1,4 @@
-"""A master for the emulated drives: PyPI canopen on a bus without threads and without waiting."""
+"""A master for the emulated drives: PyPI canopen on a bus without threads and delays."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def settings(name: str, limit_action: LimitAction, *, start: float = 0.0, lag: f
 
 
 class Master:
-    """Both drives, booted and OPERATIONAL, and what was heard of them."""
+    """Both drives, booted and OPERATIONAL, and the frames received from them."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class Master:
             self.heard.append(frame)
             self.network.notify(frame.identifier, bytearray(frame.data), self.now)
 
-    # ---- what tests do ------------------------------------------------------------------------
+    # ---- interface for tests ------------------------------------------------------------------
 
     def wait(self, seconds: float) -> None:
         end = self.now + seconds

@@ -1,4 +1,4 @@
-"""The emulated drives as a CANopen network sees them, through PyPI canopen."""
+"""The emulated drives as CANopen devices, tested with PyPI canopen."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_writes_are_refused_with_the_code_of_the_standard(master: Master) -> Non
         (0x6040, 0, 0, 4, Abort.WRONG_LENGTH),
         (0x6060, 0, 3, 1, Abort.VALUE_RANGE),
         (0x6098, 0, 1, 1, Abort.VALUE_RANGE),
-        # While the PDO is on.
+        # While the PDO is enabled.
         (0x1A00, 1, 0x60640020, 4, Abort.DEVICE_STATE),
         (0x1800, 1, 0x00000999, 4, Abort.VALUE_RANGE),
     ):
@@ -119,7 +119,7 @@ def test_a_synchronous_pdo_is_applied_with_the_sync_only(master: Master) -> None
     assert (master.read(0x607A), master.read(0x6081)) == (0, 88)
     master.sync()
     assert master.read(0x607A) == 77
-    # Too short to hold all that is mapped: not taken at all.
+    # A frame shorter than the mapping is ignored.
     master.network.send_message(0x401, (99).to_bytes(4, "little"))
     assert master.read(0x6081) == 88
 
@@ -163,6 +163,6 @@ def test_a_lost_heartbeat_of_the_master_is_an_emergency_and_a_fault(master: Mast
     assert master.read(0x603F) == 0x8130
     master.sync()
     assert master.state() == 0x08
-    # 0x1029 is 0: it leaves OPERATIONAL. The other drive monitors nobody.
+    # 0x1029 is 0: it leaves OPERATIONAL. The other drive monitors no heartbeat.
     assert master.bus.drives["insertion"].device.state == 0x7F
     assert master.bus.drives["rotation"].device.state == 0x05

@@ -1,4 +1,4 @@
-"""What the emulated drives do by themselves: profile positions, homing, limit switches."""
+"""Procedures of the emulated drives: profile positions, homing, limit switches."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def test_the_next_profile_target_waits_for_the_first_and_relative_ones_add(
 @pytest.mark.parametrize("start", [2_345.5, -1.0, -5_000.0])
 def test_homing_finds_the_edge_of_the_switch(start: float) -> None:
     master = Master(start=start)
-    # It counts from where it stood.
+    # It counts from its position at power-up.
     assert master.read(0x6064) == 0
     master.home()
-    # It stands a braking distance off the edge and counts from the edge itself.
+    # It rests a braking distance off the edge and counts from the edge.
     assert 0 <= master.read(0x6064) < 100
     assert master.true_counts() == pytest.approx(master.read(0x6064), abs=0.5)
 
@@ -92,7 +92,7 @@ def test_a_limit_switch_stops_the_axis(master: Master) -> None:
     at = master.true_counts()
     master.sync(10)
     assert master.true_counts() == at
-    # The way back is open.
+    # The opposite direction is free.
     master.target(0)
     master.sync(3)
     assert master.true_counts() == 0.0

@@ -1,4 +1,4 @@
-"""What the emulated drives do with their motors, told to them through PyPI canopen."""
+"""Motion of the emulated drives, commanded through PyPI canopen."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_the_power_state_goes_where_the_standard_says() -> None:
 
 
 def test_an_enabled_drive_moves_at_once_to_an_old_target(master: Master) -> None:
-    # What an honest drive does: a driver must set the target to where it is before.
+    # Like a real drive: the driver must set the target to the present position before.
     master.target(500)
     master.write(0x6060, 0, CSP, 1)
     master.control(0x06, 0x07, 0x0F)
@@ -64,7 +64,7 @@ def test_a_set_point_is_reached_a_sync_later_and_motion_ends_there(master: Maste
     assert master.read(0x6064) == 0
     master.wait(0.01)
     assert master.read(0x6064) == pytest.approx(400, abs=40)
-    # Without another SYNC it goes on by its own clock, and ends by itself.
+    # Without another SYNC the motion continues and ends on the drive's clock.
     master.wait(1.0)
     assert master.read(0x6064) == master.true_counts() == 800
 

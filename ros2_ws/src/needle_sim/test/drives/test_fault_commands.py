@@ -17,7 +17,7 @@ AT = Moment(1.0, 1_000_000_000)
 @pytest.fixture
 def drives() -> DriveEmulator:
     emulator = DriveEmulator(DriveEmulatorParameters())
-    # They have booted.
+    # Both drives have booted.
     list(emulator.timers[0].handler(AT))
     return emulator
 

@@ -1,4 +1,4 @@
-"""The adapter at a pseudo-terminal, reached with python-can, and what is plugged into what."""
+"""The adapter at a pseudo-terminal, accessed with python-can."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_bus_reads_the_port_until_it_is_closed_and_can_be_plugged(tmp_path: Pa
 
 
 def read(terminal: int, count: int) -> bytes:
-    """Return so many bytes: a terminal hands on what was written in whatever pieces it likes."""
+    """Return a number of bytes; a terminal may deliver them in any pieces."""
     data = b""
     while len(data) < count:
         data += os.read(terminal, count - len(data))
@@ -104,7 +104,7 @@ def test_closing_the_channel_drops_pending_output_and_opening_it_does_not(port: 
         for words in (b"C\r", b"S6\r", b"O\r"):
             os.write(terminal, words)
             port.receive()
-        # Whoever waits at the port was told that there is something to read.
+        # A waiting reader has been notified of the input.
         assert read(terminal, 3) == b"\r\r\r"
         port.send([CanFrame(0x181, b"\1")])
         for words in (b"C\r", b"N\r"):
@@ -121,7 +121,7 @@ def test_files_and_links_of_others_are_left_alone(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="can"):
         PtyPort(file)
     assert file.read_text() == "mine"
-    # What a killed emulator leaves leads nowhere, or by now to somebody else's terminal.
+    # The link of a killed emulator is dead, or leads to the terminal of another process.
     stale = tmp_path / "stale"
     stale.symlink_to("/dev/pts/ptmx")
     port = PtyPort(stale)

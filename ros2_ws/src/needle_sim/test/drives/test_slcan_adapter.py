@@ -1,4 +1,4 @@
-"""The adapter's bytes, as the LAWICEL protocol has them."""
+"""The bytes of the adapter, according to the LAWICEL protocol."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_frames_are_taken_whole_or_byte_by_byte(adapter: SlcanAdapter) -> None:
         assert (taken.reply, taken.frames) == (b"z\r", (frame,))
         in_pieces = [adapter.feed(bytes([byte])).frames for byte in command]
         assert in_pieces == [()] * (len(command) - 1) + [(frame,)]
-    # No drive listens to 29 bits.
+    # The drives ignore 29-bit identifiers.
     assert adapter.feed(b"T000002010\r").reply == b"Z\r"
 
 

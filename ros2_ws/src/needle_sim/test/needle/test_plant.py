@@ -1,4 +1,4 @@
-"""The plant against the paper's equations, integrated by somebody else, and its own invariants."""
+"""The plant, compared with the integrated equations of the paper, and its invariants."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""exp_twist against scipy's matrix exponential, at all sizes of angle."""
+"""exp_twist, compared with scipy's matrix exponential for all angles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Torsion: dead band and lag, each against what defines it. Noise: its bounds."""
+"""Torsion: dead band and lag, compared with their definitions. Noise: its bounds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_the_lag_follows_its_differential_equation_both_ways() -> None:
     base, tip = 1.0, 0.0
     for _ in range(10):
         length, turned = rng.uniform(0.0005, 0.01), rng.uniform(-1.0, 1.0)
-        # The shaft rubs alike when it is drawn back.
+        # The friction is the same in retraction.
         torsion.advance(rng.choice((-1.0, 1.0)) * length, turned)
         tip = solve_ivp(
             lambda s, y, base=base, rate=turned / length: (base + rate * s - y) / 0.008,

@@ -1,4 +1,4 @@
-"""Looks: drawn by the seed, fixed by name, light that a sensor can take."""
+"""Appearances: drawn by the seed, fixed by name, and their light on the sensor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where things are: rays against the quick renderer's projection, the mesh against its words."""
+"""Geometry: rays compared with the quick renderer's projection, and the needle mesh."""
 
 from __future__ import annotations
 

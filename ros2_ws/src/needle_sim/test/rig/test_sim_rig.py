@@ -22,7 +22,7 @@ def made(**parameters: Any) -> SimRig:
 
 
 def run(rig: SimRig, begin: float, end: float) -> list[Any]:
-    """Let both of its timers go, cycles first; return what it publishes, topic and message."""
+    """Run both timers, cycles first; return the publications: topic and message."""
     said: list[Action] = []
     for tick in range(round(begin * 50), round(end * 50)):
         at = Moment(tick / 50, tick * 20_000_000)

@@ -1,4 +1,4 @@
-"""Rendered sequences: what the folder says is what was rendered; bad arguments are one line."""
+"""Rendered sequences: content of the folder, and one-line errors of bad arguments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled code is compiled, or read from its cache, before any test is measured."""
+"""Loads compiled code before any test is measured."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def test_shares_within_2_and_3_sigma_count_x_and_pitch_alike() -> None:
     np.testing.assert_allclose(tally.x_inside, [1.0, 1.0, 0.0])
     assert np.all(np.isnan(tally.missed))
     assert np.all(np.isnan(is_doubtful(tally.missed)))
-    # A second step in which all is as believed; of doubts the last word counts.
+    # A second step with exact estimates; the last miss probability counts.
     for missed in ([0.9, 0.0, 0.0], [0.05, 0.06, 0.0]):
         tally.add(Belief(level, std, level, std, np.array(missed)), level, level)
     np.testing.assert_allclose(tally.inside[0], [1.0, 2.5 / 3.0, 2.0 / 3.0])

@@ -20,7 +20,7 @@ def test_the_compiled_batch_is_the_plant(largest_turn: float, torsion: tuple[flo
     reference = NeedlePlant(poses, curvature=0.0, torsion=Torsion(*torsion))
     for length in rng.uniform(0.0, 0.002, 30):
         turned = rng.uniform(-largest_turn, largest_turn, 20)
-        # It may change on the way.
+        # The curvature may change during the insertion.
         reference.curvature = rng.uniform(0.0, 12.0, 20)
         batch.advance(length, turned, reference.curvature)
         reference.advance(length, turned)

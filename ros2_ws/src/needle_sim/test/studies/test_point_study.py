@@ -133,6 +133,6 @@ def test_best_comes_to_points_that_drift_and_breathe() -> None:
     near = np.argsort(places[:, 2])[:5]
     starts, moving = STARTS[near], MovingTargets(places[near], 0.002 / 60.0, 0.003, seed=7)
     found = run_point_study(starts, moving, point_controller_factory("best", 0.001), noisy)
-    # 0.25 mm of thousands; where nothing is foretold 2.2 mm.
+    # 0.25 mm for thousands of needles; 2.2 mm without prediction.
     assert np.sqrt(np.mean(found.error**2)) < 0.0005
     assert np.rad2deg(np.mean(found.rotation)) < 1300.0

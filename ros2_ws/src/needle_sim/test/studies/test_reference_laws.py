@@ -66,7 +66,7 @@ def test_a_planned_needle_reaches_its_target_past_an_obstacle(obstacles: FloatAr
 
     miss, least = steered(planned, STEP)
     assert miss < 0.001
-    # Without it in its way the needle would have gone through the ball.
+    # Without the obstacle the needle would pass through the ball.
     assert (least > 0.0) == bool(len(obstacles))
 
 

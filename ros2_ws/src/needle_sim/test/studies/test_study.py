@@ -42,7 +42,7 @@ def settings(**changes: Any) -> StudySettings:
 
 
 class Watching:
-    """Does not steer; keeps what it is told."""
+    """Does not steer; stores its inputs."""
 
     def __init__(self) -> None:
         self.lengths: list[float] = []
@@ -88,7 +88,7 @@ def test_not_steered_the_needle_ends_where_its_arc_takes_it() -> None:
     ("wrong", "curvature", "length"),
     [
         ({"curvature_scale": 0.8}, 0.8 * CURVATURE, 0.12),
-        # The needle goes in less, or more, than the stage says.
+        # The needle is inserted less, or more, than the stage moves.
         ({"slip": 0.05}, CURVATURE, 0.12 / 1.05),
         ({"slip": -0.05}, CURVATURE, 0.12 / 0.95),
     ],
@@ -200,7 +200,7 @@ def test_tips_with_a_hidden_delay_appear_to_be_new() -> None:
 
 def test_estimates_are_compared_with_the_truth_of_their_step() -> None:
     class Knowing(Watching):
-        """Knows the tip of a needle that lies in a plane at its roll of 0, and says so."""
+        """Estimates the tip of a needle in a plane, with its roll of 0."""
 
         def belief(self) -> Belief | None:
             x = self.tips[-1][:, 0]
