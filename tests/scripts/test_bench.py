@@ -17,7 +17,9 @@ NEEDLES = (0, 5_000, 9_999)
 def test_the_plain_loop_ends_where_the_study_does() -> None:
     # Other code in other words: an oracle for the study, too.
     starts = benchmark.STARTS
-    ends = run_study(starts, controller_factory("paper", benchmark.NOISE), benchmark.STUDY).x_end
+    ends = run_study(
+        starts, controller_factory("paper", benchmark.TIP_NOISE), benchmark.STUDY
+    ).x_end
     design = benchmark.design()
     plain = [
         reference_loop.steer(starts[k].tolist(), benchmark.noise_of(k), design) for k in NEEDLES

@@ -89,7 +89,7 @@ def steer(
         tip_noise=TIP_STD * math.sqrt(3.0),
         camera_rate=FRAME_RATE,
     )
-    sim = _SteeredRig(needle, see=see)
+    sim = _SteeredRig(needle, new_sensor=see)
     driver = {"max_depth": steering.depth + 0.01, "insertion_drive": "hand" if pushed else "motor"}
     late = (delay("needle/tip", latency),)
     rig = VirtualRig(seed, sim, PlaneController(steering), driver=driver, faults=late)

@@ -20,7 +20,7 @@ from needle_bringup.studies.study_controllers import (
 )
 from needle_core.commands.cli import JsonValue
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.figures_of_merit import Outcomes, is_doubtful, figures, concatenate
+from needle_sim.studies.figures_of_merit import Outcomes, concatenate, figures, is_doubtful
 from needle_sim.studies.point_study import (
     MovingTargets,
     PointOutcomes,

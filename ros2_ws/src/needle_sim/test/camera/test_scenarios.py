@@ -127,7 +127,7 @@ def test_the_shadow_lies_on_the_floor(rig: StereoRig) -> None:
     left, right = middles(dark[0], columns), middles(dark[1], across)
 
     def right_rows(depth: float) -> np.ndarray:
-        """Return the disparity between left and right of a point at this depth."""
+        """Return the offset of the right shadow from the left one projected at a depth [px]."""
         seen = (np.array([float(u), v]) for u, v in zip(columns, left, strict=True))
         places = [project(place_at(0.0175 - depth, pixel, rig.left), rig.right) for pixel in seen]
         return np.array([v - np.interp(u, across, right) for u, v in places])
