@@ -29,20 +29,20 @@ Row = tuple[str, str, str, str]
 INTRODUCTION = """\
 # The paper's results, reproduced
 
-`scripts/paper --out docs` writes this page: section IV of [[KC09]](equations.md) in simulation, with
-preset `paper`. Its bench trials run here through rendered images, the tracker and all nodes.
+`scripts/paper --out docs` writes this page: section IV of [[KC09]](equations.md) in simulation,
+with preset `paper`. Its bench trials run here through rendered images, the tracker and all nodes.
 
 """
 FIGURES = """
-Rows of `best`: RMS over the last 20 mm to a plane; RMS and share within 1 mm at points. "limit" is a
-particle filter that knows the true model and steers with the laws of `best`.
+Rows of `best`: RMS over the last 20 mm to a plane; RMS and share within 1 mm at points. "limit" is
+a particle filter that knows the true model and steers with the laws of `best`.
 
-**Figure 3.** Start r = (-3 mm, 2 deg, 15 deg). Closed loop with ±0.5 mm noise. Camera trial with torsion; its
-first millimetres follow from the insertion, because the needle cannot be seen yet.
+**Figure 3.** Start r = (-3 mm, 2 deg, 15 deg). Closed loop with ±0.5 mm noise. Camera trial with
+torsion; its first millimetres follow from the insertion, because the needle cannot be seen yet.
 
 ![open loop, closed loop, camera trial](images/paper_figure_3.png)
 
-**Figure 4.** Camera trials towards a plane 3 mm above the entry, with unknown pitch, roll and torsion.
+**Figure 4.** Camera trials towards a plane 3 mm above the entry; unknown pitch, roll and torsion.
 
 ![mean and standard deviation of r1](images/paper_figure_4.png)
 
