@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from needle_core.component import Batch, Component, PortChange, RealPort
 from needle_core.runners.process import Process
@@ -15,22 +15,6 @@ from needle_core.runners.virtual import VirtualRunner
 
 SLACK = 0.05
 """Delay behind the wall clock that the runner catches up; a longer delay is lost [s]."""
-
-
-class Bell(Protocol):
-    """Used part of `threading.Event`; tests replace it by one on a simulated clock."""
-
-    def set(self) -> None:
-        """Signal new input, from any thread."""
-
-    def clear(self) -> None:
-        """Acknowledge the signal."""
-
-    def is_set(self) -> bool:
-        """Return whether input was signalled."""
-
-    def wait(self, timeout: float) -> bool:
-        """Wait at most `timeout` seconds for a signal; return whether there was one."""
 
 
 class PacedRunner(VirtualRunner):
@@ -50,7 +34,7 @@ class PacedRunner(VirtualRunner):
         Ratio of virtual to real time.
     ports : mapping of str to RealPort
         Real ports, by the name of the component's port.
-    bell : Bell, optional
+    bell : threading.Event, optional
         Signals new input.
     clock : callable, optional
         Returns the wall clock's steady time [s].
@@ -70,7 +54,7 @@ class PacedRunner(VirtualRunner):
         *,
         pace: float = 1.0,
         ports: Mapping[str, RealPort] | None = None,
-        bell: Bell | None = None,
+        bell: threading.Event | None = None,
         clock: Callable[[], float] = time.monotonic,
         **more: Any,
     ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -69,7 +69,7 @@ class Scene:
             [self.worker],
             pace=pace,
             ports={"outside": self.line},
-            bell=self.wall,
+            bell=cast(Any, self.wall),
             clock=self.wall,
         )
 

@@ -110,11 +110,12 @@ class CanopenDevice:
 
     def is_read_request(self, frame: CanFrame) -> bool:
         """Return whether a frame requests the value of an object of this device."""
-        return frame.identifier == SDO_REQUEST + self.node_id or frame.remote
+        return frame.identifier == SDO_REQUEST + self.node_id
 
     def receive(self, frame: CanFrame, now: float) -> bool:
         """Handle a frame other than SYNC; return whether it was for this device."""
-        if self.state is NetworkState.BOOTING:
+        # Remote frames are not supported, like by many drives.
+        if self.state is NetworkState.BOOTING or frame.remote:
             return False
         identifier = frame.identifier
         if identifier == NMT:
@@ -190,9 +191,6 @@ class CanopenDevice:
         self.dictionary.on_write(0x1003, 0, then=lambda _: self._errors.clear())
 
     def _handle_pdo(self, frame: CanFrame) -> bool:
-        if frame.remote:
-            self._answer_remote(frame.identifier)
-            return False
         matching = [pdo for pdo in self._receive if pdo.cob_id == frame.identifier]
         for pdo in matching:
             pdo.receive(frame.data)
@@ -229,16 +227,11 @@ class CanopenDevice:
             transmit.reset()
 
     def _answer(self, frame: CanFrame) -> None:
-        if self.state is NetworkState.STOPPED or frame.remote:
+        if self.state is NetworkState.STOPPED:
             return
         answer = self._sdo.answer(frame.data)
         if answer is not None:
             self._send(SDO_ANSWER, answer)
-
-    def _answer_remote(self, identifier: int) -> None:
-        for pdo in self._transmit:
-            if pdo.cob_id == identifier:
-                self._send_pdo(pdo, pdo.data())
 
     def _check_heartbeats(self, now: float) -> None:
         for k in range(1, _HEARTBEAT_CONSUMERS + 1):

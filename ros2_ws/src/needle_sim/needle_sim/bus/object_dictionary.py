@@ -205,7 +205,6 @@ class ObjectDictionary:
 
 
 # Command specifiers of the client, in the upper three bits of the first byte.
-_DOWNLOAD_SEGMENT = 0
 _INITIATE_DOWNLOAD = 1
 _INITIATE_UPLOAD = 2
 _UPLOAD_SEGMENT = 3
@@ -213,12 +212,10 @@ _ABORT = 4
 _TOGGLE = 0x10
 _SEGMENT = 7
 _EXPEDITED = 4
-# Longest object; longer downloads are rejected [bytes].
-_MAX_LENGTH = 128
 
 
 class SdoServer:
-    """SDO server for one client: expedited and segmented transfers, no blocks.
+    """SDO server for one client: expedited downloads, expedited and segmented uploads, no blocks.
 
     Parameters
     ----------
@@ -230,10 +227,8 @@ class SdoServer:
         self._dictionary = dictionary
         self._key = (0, 0)
         self._upload: bytes | None = None
-        self._download: bytearray | None = None
         self._toggle = 0
         self._handlers = {
-            _DOWNLOAD_SEGMENT: self._download_segment,
             _INITIATE_DOWNLOAD: self._initiate_download,
             _INITIATE_UPLOAD: self._initiate_upload,
             _UPLOAD_SEGMENT: self._upload_segment,
@@ -245,15 +240,15 @@ class SdoServer:
             return None
         specifier = request[0] >> 5
         if specifier == _ABORT:
-            self._upload = self._download = None
+            self._upload = None
             return None
         if specifier in (_INITIATE_DOWNLOAD, _INITIATE_UPLOAD):
-            self._upload = self._download = None
+            self._upload = None
             self._key = (int.from_bytes(request[1:3], "little"), request[3])
         try:
             return self._handlers.get(specifier, self._reject)(request)
         except SdoAbortError as error:
-            self._upload = self._download = None
+            self._upload = None
             return b"\x80" + self._multiplexer + int(error.code).to_bytes(4, "little")
 
     def _reject(self, _: bytes) -> bytes:
@@ -266,30 +261,12 @@ class SdoServer:
 
     def _initiate_download(self, request: bytes) -> bytes:
         command = request[0]
-        if command & 2:
-            unused = command >> 2 & 3 if command & 1 else 0
-            self._dictionary.write(*self._key, request[4 : 8 - unused])
-        else:
-            self._dictionary.entry(*self._key)
-            self._download = bytearray()
-            self._toggle = 0
-        return b"\x60" + self._multiplexer + bytes(4)
-
-    def _download_segment(self, request: bytes) -> bytes:
-        if self._download is None:
+        if not command & 2:
+            # Writable objects have at most 4 bytes and need no segments.
             raise SdoAbortError(Abort.COMMAND)
-        self._check_toggle(request[0])
-        unused = request[0] >> 1 & 7
-        self._download += request[1 : 8 - unused]
-        if len(self._download) > _MAX_LENGTH:
-            raise SdoAbortError(Abort.WRONG_LENGTH)
-        answer = bytes([0x20 | self._toggle]) + bytes(7)
-        self._toggle ^= _TOGGLE
-        if request[0] & 1:
-            data = bytes(self._download)
-            self._download = None
-            self._dictionary.write(*self._key, data)
-        return answer
+        unused = command >> 2 & 3 if command & 1 else 0
+        self._dictionary.write(*self._key, request[4 : 8 - unused])
+        return b"\x60" + self._multiplexer + bytes(4)
 
     def _initiate_upload(self, _: bytes) -> bytes:
         data = self._dictionary.read(*self._key)

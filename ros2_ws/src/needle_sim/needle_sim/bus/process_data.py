@@ -157,7 +157,7 @@ class ReceivePdo(_Pdo):
 
 
 class TransmitPdo(_Pdo):
-    """Sends values to the bus: with every n-th SYNC, on change, by timer or on request.
+    """Sends values to the bus: with every n-th SYNC, on change or by timer.
 
     The parameters are those of `_Pdo`.
     """
