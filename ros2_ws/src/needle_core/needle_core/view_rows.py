@@ -1,4 +1,4 @@
-"""Rows of the conversion table for images and for what viewers draw."""
+"""Rows of the conversion table for images and for markers, paths and frames of viewers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Devices of the simulated rig: what moves the needle at each level."""
+"""Devices of the simulated rig: they move the needle at each level."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Path tracing: refracted lines of sight, what stands in front of the floor, light on the floor."""
+"""Path tracing: refracted lines of sight, objects in front of the floor, light on the floor."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Disturbances of a study (measurements, tissue, needle) and the random numbers behind them.
 
-The controller is not told about any of them.
+The controller does not know any of them.
 """
 
 from __future__ import annotations
