@@ -38,7 +38,7 @@ def dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:
     """
     return [
         name
-        for name in map(_name, ports)
+        for name in (f"{_PREFIX}port{port}" for port in ports)
         if any(path.exists() for path in _files(folder, name)) and not _is_held(folder, name)
     ]
 
@@ -97,10 +97,6 @@ def _is_incomplete(port: Path) -> bool:
 
 def _files(folder: Path, name: str) -> tuple[Path, Path, Path]:
     return folder / name, folder / f"{name}_el", folder / f"sem.{name}_mutex"
-
-
-def _name(port: int) -> str:
-    return f"{_PREFIX}port{port}"
 
 
 def _is_held(folder: Path, name: str) -> bool:

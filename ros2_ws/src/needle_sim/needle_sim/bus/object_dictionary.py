@@ -280,13 +280,10 @@ class SdoServer:
     def _upload_segment(self, request: bytes) -> bytes:
         if self._upload is None:
             raise SdoAbortError(Abort.COMMAND)
-        self._check_toggle(request[0])
+        if request[0] & _TOGGLE != self._toggle:
+            raise SdoAbortError(Abort.TOGGLE)
         part, rest = self._upload[:_SEGMENT], self._upload[_SEGMENT:]
         command = self._toggle | (_SEGMENT - len(part)) << 1 | (not rest)
         self._upload = rest or None
         self._toggle ^= _TOGGLE
         return bytes([command]) + part.ljust(_SEGMENT, b"\0")
-
-    def _check_toggle(self, command: int) -> None:
-        if command & _TOGGLE != self._toggle:
-            raise SdoAbortError(Abort.TOGGLE)
