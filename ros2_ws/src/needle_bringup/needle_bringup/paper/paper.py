@@ -50,7 +50,7 @@ def _paper(arguments: Sequence[str]) -> int:
     out = make_folder("--out", given.out or str(root / OUT))
     make_folder("--out", str(out / IMAGES))
     # They take a second to import: not for a command line that is refused.
-    from needle_analysis.figures.figure_style import save  # noqa: PLC0415
+    from needle_bags.figures.figure_style import save  # noqa: PLC0415
     from needle_bringup.paper.paper_figures import figures_of  # noqa: PLC0415
     from needle_bringup.paper.paper_page import as_text, key_figures, page, table  # noqa: PLC0415
     from needle_bringup.paper.paper_results import PaperRuns  # noqa: PLC0415

@@ -9,7 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from needle_analysis.figures.figure_style import ESTIMATE, GOAL_BAND, INK, STYLE
+from needle_bags.figures.figure_style import ESTIMATE, GOAL_BAND, INK, STYLE
 from needle_bringup.paper.paper_results import (
     DEPTH_MM,
     DOMAIN_PITCH_DEG,

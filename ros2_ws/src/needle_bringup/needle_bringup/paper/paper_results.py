@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import numpy.typing as npt
 
-from needle_analysis.run.run_summary import reduced_states, target_offset
 from needle_bags.reading.bag_reader import Run, Series
+from needle_bags.run.run_summary import reduced_states, target_offset
 from needle_bringup.paper.paper_runs import Columns, Laboratory
 from needle_bringup.studies.limit_study import NEEDLES, PARTICLES, limits
 from needle_bringup.studies.pure_insertions import ARC, curvature_errors

@@ -18,7 +18,7 @@ from needle_bringup.simulation.simulate_options import existing_file, parse
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import Parameters, read_parameters
 
-LAUNCHED_PACKAGES = {**PACKAGES, "player": "needle_bags", "live_view": "needle_analysis"}
+LAUNCHED_PACKAGES = {**PACKAGES, "player": "needle_bags", "live_view": "needle_bags"}
 """Package of each node that a launch file starts."""
 # What the live view wants and the player sends under /replay only: a rig would obey it.
 _NOT_FOR_RIGS = ("target_plane", "target_point")

@@ -200,9 +200,9 @@ def shown(path: Path) -> Path:
 def _import_report() -> tuple[ModuleType, ...]:
     """Import what makes the report: a second of work, best done while there is time to spare."""
     names = (
-        "needle_analysis.report.report",
+        "needle_bags.report.report",
         "needle_bags.reading.bag_reader",
-        "needle_analysis.run.run_summary",
+        "needle_bags.run.run_summary",
     )
     return tuple(loaded(name) for name in names)
 

@@ -27,7 +27,7 @@ CONNECTS_WITHIN = 30.0
 """How long a scheduler has to answer [s]."""
 _NUMERICAL = ("numpy", "scipy", "numba")
 _PACKAGES = (
-    "needle_analysis", "needle_bags", "needle_bringup", "needle_core", "needle_console",
+    "needle_bags", "needle_bringup", "needle_core", "needle_console",
     "needle_controller", "needle_device_driver", "needle_sim", "needle_tracker", "scenario",
 )  # fmt: skip
 

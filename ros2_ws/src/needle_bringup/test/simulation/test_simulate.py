@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from needle_analysis.ros import rerun
-from needle_analysis.run.run_summary import stop_cause, summarize
 from needle_bags.reading.bag_reader import HealthEvent, Run, Status, read_run
+from needle_bags.ros import rerun
+from needle_bags.run.run_summary import stop_cause, summarize
 from needle_bringup.simulated_operator.progress import Progress
 from needle_bringup.simulation import simulate
 from needle_bringup.simulation.rig_configuration import command_line_parameters, run_info
