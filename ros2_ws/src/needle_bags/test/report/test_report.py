@@ -16,7 +16,7 @@ from needle_bags.figures.event_figure import lanes_of
 from needle_bags.figures.pair_figures import is_same_needle
 from needle_bags.reading.bag_reader import HealthEvent, Result, Run, Status, read_run
 from needle_bags.report import report
-from needle_bags.report.glossary import TERMS, Glossary
+from needle_bags.report.page import TERMS, Glossary
 from needle_bags.report.report_page import verdict_text
 from needle_bags.rerun.rerun_bag import write_rerun
 from needle_bags.run.run_events import troubles
@@ -221,6 +221,6 @@ def test_a_term_is_explained_once_where_it_stands_first() -> None:
     assert 'id="term-95"' in again
     with pytest.raises(KeyError):
         glossary.explain("[what nobody knows]")
-    text = "".join(path.read_text() for path in Path(report.__file__).parent.glob("*_page.py"))
+    text = "".join(path.read_text() for path in Path(report.__file__).parent.glob("static/*.html"))
     used = {b or a for a, b in re.findall(r"\[([^\]|\[\n\"]+)(?:\|([^\]\n\"]+))?\]", text)}
     assert set(TERMS) <= used
