@@ -1,4 +1,4 @@
-"""A needle's drawing as messages in `rig`."""
+"""Messages of the live view, in `rig`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_bags.live.live_needle import LiveNeedle, SeenTip
-from needle_bags.live.spread import ellipsoid
+from needle_bags.live.live_needle import LiveNeedle, MeasuredTip
 from needle_controller.model.target_plane import RIG
 from needle_core import messages as m
 from needle_core.rotations import quaternion_from_rotation
@@ -17,37 +16,39 @@ from needle_tracker.optics.refraction import RefractedCamera
 Array = NDArray[np.float64]
 
 TARGET_FRAME, TIP_FRAME = "target_plane", "needle_tip"
-# Of visualization_msgs/Marker.
+# Constants of visualization_msgs/Marker.
 ARROW, CUBE, SPHERE, LINE_STRIP = 0, 1, 2, 4
 ADD, DELETE = 0, 2
-# What is drawn is as thick and long as it must be to be seen [m].
+# Sizes of the markers, large enough to be visible [m].
 _SHAFT, _TIP, _POINT = 1e-3, 2.5e-3, 4e-3
 _ARROW = (2e-2, 8e-4, 8e-4)
 _PLANE = (2e-4, 8e-2, 2e-1)
 _PLANE_CENTRE = 1e-1
-# Blue, orange, yellow and grey differ also to who sees no red or green.
+# Blue, orange, yellow and grey can be told apart without seeing red or green.
 _BLUE, _ORANGE, _YELLOW, _GREY = (0.2, 0.6, 1.0), (1.0, 0.6, 0.1), (1.0, 0.9, 0.2), (0.7, 0.7, 0.7)
+# 95 % of a normal distribution in space: chi-squared with three degrees of freedom.
+SIGMAS = 2.7955
 _ORIGIN, _UPRIGHT = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
-def to_tip(tip: SeenTip) -> m.Pose:
-    """Return the measured tip, its z axis along the shaft."""
+def to_tip(tip: MeasuredTip) -> m.Pose:
+    """Return the pose of the measured tip; its z axis is the shaft."""
     x, y, z, w = tip.quaternion.tolist()
-    return m.Pose(tip.stamp_ns, RIG, _xyz(tip.place), (x, y, z, w))
+    return m.Pose(tip.stamp_ns, RIG, _xyz(tip.position), (x, y, z, w))
 
 
 def to_path(path: Array, stamp_ns: int) -> m.Path:
-    """Return the way of the tip, shape (n, 3) [m]."""
+    """Return the path of the tip, shape (n, 3) [m]."""
     return m.Path(stamp_ns, RIG, tuple(map(_xyz, path)))
 
 
 def to_markers(needle: LiveNeedle, stamp_ns: int) -> m.Markers:
     """Return shaft, tip, estimate, its 95 % ellipsoid, plane and target point.
 
-    What is not known is taken away, so that nothing old stays in view.
+    Markers of unknown quantities are deleted.
     """
-    shaft, belief, plane, point = needle.shaft, needle.belief, needle.plane, needle.target_point
-    believed = needle.tip if belief is None else belief
+    shaft, estimate, plane, point = needle.shaft, needle.estimate, needle.plane, needle.target_point
+    uncertain = needle.tip if estimate is None else estimate
     drawn: dict[str, m.Marker] = {}
 
     def draw(
@@ -68,16 +69,17 @@ def to_markers(needle: LiveNeedle, stamp_ns: int) -> m.Markers:
 
     if shaft is not None:
         points = tuple(map(_xyz, shaft))
-        colour = _BLUE if needle.is_seen else _GREY
+        colour = _BLUE if needle.tip_found else _GREY
         draw("shaft", LINE_STRIP, (_SHAFT, 0.0, 0.0), _BLUE, points=points)
         draw("tip", SPHERE, (_TIP,) * 3, colour, at=points[-1])
-    if belief is not None:
-        ends = (_xyz(belief.place), _xyz(belief.place + _ARROW[0] * belief.rotation[:, 2]))
+    if estimate is not None:
+        end = estimate.position + _ARROW[0] * estimate.rotation[:, 2]
+        ends = (_xyz(estimate.position), _xyz(end))
         draw("estimate", ARROW, (_ARROW[1], 2.0 * _ARROW[2], 0.0), _ORANGE, points=ends)
-    if believed is not None:
-        axes, lengths = ellipsoid(believed.covariance)
-        place, turn = _xyz(believed.place), quaternion_from_rotation(axes.tolist())
-        draw("uncertainty", SPHERE, _xyz(2.0 * lengths), _ORANGE, 0.35, at=place, turn=turn)
+    if uncertain is not None:
+        axes, lengths = ellipsoid(uncertain.covariance)
+        at, turn = _xyz(uncertain.position), quaternion_from_rotation(axes.tolist())
+        draw("uncertainty", SPHERE, _xyz(2.0 * lengths), _ORANGE, 0.35, at=at, turn=turn)
     if plane is not None:
         rotation = plane.T_rig_plane[:3, :3]
         centre = _xyz(plane.T_rig_plane[:3, 3] + _PLANE_CENTRE * rotation[:, 2])
@@ -92,7 +94,7 @@ def to_markers(needle: LiveNeedle, stamp_ns: int) -> m.Markers:
 
 
 def to_transforms(needle: LiveNeedle, stamp_ns: int) -> m.Transforms | None:
-    """Return where the wanted plane and the measured tip are in `rig`; None: neither is known."""
+    """Return the poses of target plane and measured tip in `rig`; None if both are unknown."""
     found = []
     if needle.plane is not None:
         found.append(_transform(needle.plane.T_rig_plane, TARGET_FRAME, stamp_ns))
@@ -103,7 +105,7 @@ def to_transforms(needle: LiveNeedle, stamp_ns: int) -> m.Transforms | None:
 
 
 def camera_transforms(cameras: Mapping[str, RefractedCamera], stamp_ns: int) -> m.Transforms:
-    """Return where the cameras, by side, are in `rig`."""
+    """Return the poses of the cameras, by side, in `rig`."""
     poses = {side: np.linalg.inv(view.camera.T_optical_rig) for side, view in cameras.items()}
     return m.Transforms(
         tuple(
@@ -124,6 +126,27 @@ def _transform(matrix: Array, child: str, stamp_ns: int) -> m.Transform:
 
 
 def _xyz(values: Array) -> m.Vector3:
-    """Return Python floats: a numpy scalar of another width would go out as garbage."""
+    """Return Python floats: rclpy would send a numpy scalar of another width as garbage."""
     x, y, z = values.tolist()
     return (x, y, z)
+
+
+def ellipsoid(covariance: Array) -> tuple[Array, Array]:
+    """Return the ellipsoid that contains 95 % of a normal distribution.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (3, 3)
+        Of a position [m^2].
+
+    Returns
+    -------
+    axes : ndarray, shape (3, 3)
+        Directions of the half axes as columns, right-handed.
+    lengths : ndarray, shape (3,)
+        Of the half axes [m].
+    """
+    variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    if np.linalg.det(axes) < 0.0:
+        axes = axes * [1.0, 1.0, -1.0]
+    return axes, SIGMAS * np.sqrt(np.maximum(variances, 0.0))

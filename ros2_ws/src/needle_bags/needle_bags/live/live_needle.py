@@ -1,4 +1,4 @@
-"""The needle as it is known now: what was seen, what is believed, what is wanted."""
+"""Current state of the needle, collected from the topics of the rig."""
 
 from __future__ import annotations
 
@@ -12,131 +12,133 @@ from needle_controller.model.target_plane import TargetPlane, offset_plane
 
 Array = NDArray[np.float64]
 
-# A plane that was asked for is the one in force if its offset is [m].
+# A requested plane is in force if its offset agrees within this [m].
 _SAME_OFFSET = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
-class SeenTip:
+class MeasuredTip:
     """A tip that the tracker found.
 
     Attributes
     ----------
     stamp_ns : int
         Time of exposure [ns].
-    place : ndarray, shape (3,)
+    position : ndarray, shape (3,)
         In `rig` [m].
     quaternion : ndarray, shape (4,)
         x, y, z, w of the frame whose z axis is the shaft.
     covariance : ndarray, shape (3, 3)
-        Of the place [m^2].
+        Of the position [m^2].
     """
 
     stamp_ns: int
-    place: Array
+    position: Array
     quaternion: Array
     covariance: Array
 
 
 @dataclasses.dataclass(frozen=True)
-class Belief:
-    """The controller's estimate, in `target_plane`.
+class TipEstimate:
+    """The controller's estimate of the tip.
 
     Attributes
     ----------
-    place : ndarray, shape (3,)
+    position : ndarray, shape (3,)
         Of the tip [m].
     rotation : ndarray, shape (3, 3)
         Axes of the tip's frame as columns; the third is the heading.
     covariance : ndarray, shape (3, 3)
-        Of the place [m^2].
+        Of the position [m^2].
     """
 
-    place: Array
+    position: Array
     rotation: Array
     covariance: Array
 
 
 class LiveNeedle:
-    """Gathers what the graph says, and answers what there is to be drawn.
+    """State of the needle.
 
     Attributes
     ----------
-    tip : SeenTip or None
-        The last that was found.
+    tip : MeasuredTip or None
+        The last tip that was found.
     answered_ns : int or None
-        Exposure of the last answer, found or not [ns].
-    is_seen : bool
-        Whether a tip was found in that.
+        Exposure of the tracker's last answer, with or without a tip [ns].
+    tip_found : bool
+        Whether that answer had a tip.
     target_point : ndarray, shape (3,), or None
-        The point that is steered to, in `rig` [m].
+        The target point, in `rig` [m].
     """
 
     def __init__(self) -> None:
-        self.tip: SeenTip | None = None
+        self.tip: MeasuredTip | None = None
         self.answered_ns: int | None = None
-        self.is_seen = False
+        self.tip_found = False
         self.target_point: Array | None = None
-        self._belief: Belief | None = None
-        self._asked_plane: TargetPlane | None = None
+        self._estimate: TipEstimate | None = None
+        self._requested_plane: TargetPlane | None = None
         self._offset: float | None = None
         self._insertion = 0.0
         self._trail = ShaftTrail()
 
-    def take_insertion(self, insertion: float) -> None:
-        """Take how far the needle is in [m]."""
+    def set_insertion(self, insertion: float) -> None:
+        """Set the insertion depth [m]."""
         self._insertion = insertion
 
-    def take_tip(self, tip: SeenTip) -> None:
-        """Take a tip that was found."""
-        self.tip, self.answered_ns, self.is_seen = tip, tip.stamp_ns, True
-        self._trail.add(self._insertion, tip.place)
+    def add_tip(self, tip: MeasuredTip) -> None:
+        """Add a measured tip."""
+        self.tip, self.answered_ns, self.tip_found = tip, tip.stamp_ns, True
+        self._trail.add(self._insertion, tip.position)
 
-    def take_no_tip(self, stamp_ns: int) -> None:
-        """Take that none was found in an exposure [ns]."""
-        self.answered_ns, self.is_seen = stamp_ns, False
+    def add_missing_tip(self, stamp_ns: int) -> None:
+        """Note that an exposure [ns] showed no tip."""
+        self.answered_ns, self.tip_found = stamp_ns, False
 
-    def take_belief(self, belief: Belief) -> None:
-        """Take what the controller believes."""
-        self._belief = belief
+    def set_estimate(self, estimate: TipEstimate) -> None:
+        """Set the controller's estimate, in `target_plane`."""
+        self._estimate = estimate
 
-    def take_plane(self, plane: TargetPlane) -> None:
-        """Take a plane that was asked for."""
-        self._asked_plane = plane
+    def request_plane(self, plane: TargetPlane) -> None:
+        """Note a requested target plane; the controller may reject it."""
+        self._requested_plane = plane
 
-    def take_targets(self, offset: float | None, point: Array | None) -> None:
-        """Take what is in force: the plane's offset [m], and the point where one is steered to."""
+    def set_targets(self, offset: float | None, point: Array | None) -> None:
+        """Set the offset of the target plane [m] and the target point that are in force."""
         self._offset, self.target_point = offset, point
 
     @property
     def plane(self) -> TargetPlane | None:
-        """The wanted plane; None before the controller has spoken."""
+        """The target plane; None before the first controller status."""
         if self._offset is None:
             return None
-        asked = self._asked_plane
-        if asked is not None and abs(asked.offset - self._offset) <= _SAME_OFFSET:
-            return asked
+        requested = self._requested_plane
+        if requested is not None and abs(requested.offset - self._offset) <= _SAME_OFFSET:
+            return requested
         return offset_plane(self._offset)
 
     @property
-    def belief(self) -> Belief | None:
-        """The controller's estimate, in `rig`; None while there is none."""
-        plane, belief = self.plane, self._belief
-        if plane is None or belief is None:
+    def estimate(self) -> TipEstimate | None:
+        """The controller's estimate, in `rig`; None before the first one."""
+        plane, estimate = self.plane, self._estimate
+        if plane is None or estimate is None:
             return None
         rotation, origin = plane.T_rig_plane[:3, :3], plane.T_rig_plane[:3, 3]
-        return Belief(
-            place=rotation @ belief.place + origin,
-            rotation=rotation @ belief.rotation,
-            covariance=rotation @ belief.covariance @ rotation.T,
+        return TipEstimate(
+            position=rotation @ estimate.position + origin,
+            rotation=rotation @ estimate.rotation,
+            covariance=rotation @ estimate.covariance @ rotation.T,
         )
 
     @property
     def path(self) -> Array:
-        """Way of the tip in `rig` [m], shape (n, 3)."""
+        """Path of the tip in `rig` [m], shape (n, 3)."""
         return self._trail.path
 
     @property
     def shaft(self) -> Array | None:
         """Shaft in `rig`, from the entry to the tip [m], shape (n, 3); None without a tip."""
-        return None if self.tip is None else self._trail.shaft(self._insertion, self.tip.place)
+        if self.tip is None:
+            return None
+        return self._trail.shaft(self._insertion, self.tip.position)

@@ -1,4 +1,4 @@
-"""live_view as a component: the steered needle as messages that any ROS viewer shows."""
+"""live_view as a component: the needle as messages for ROS viewers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from needle_bags.live.latest_images import LatestImages
+from needle_bags.live.camera_images import LatestImages, draw_needle
 from needle_bags.live.live_messages import (
     camera_frame,
     camera_transforms,
@@ -20,8 +20,7 @@ from needle_bags.live.live_messages import (
     to_transforms,
 )
 from needle_bags.live.live_needle import LiveNeedle
-from needle_bags.live.marked_image import marked_image
-from needle_bags.live.needle_inputs import needle_inputs, refusing
+from needle_bags.live.needle_inputs import needle_inputs, rejecting
 from needle_core import messages as m
 from needle_core.component import (
     IMAGES_BEST_EFFORT,
@@ -54,7 +53,7 @@ class LiveViewParameters:
     """Parameters of live_view."""
 
     rate: float = fixed_parameter(
-        10.0, "Hz", "How often each message is sent, images included, at most.", 0.5, 30.0
+        10.0, "Hz", "Maximum rate of each message, images included.", 0.5, 30.0
     )
 
     def __post_init__(self) -> None:
@@ -63,14 +62,14 @@ class LiveViewParameters:
 
 
 class LiveView(Component):
-    """Shows a `LiveNeedle`, each message only while somebody subscribes to it.
+    """Publishes a `LiveNeedle`, each topic only while it has a subscriber.
 
     Parameters
     ----------
     settings : LiveViewParameters
         The node's parameters.
     transforms : bool
-        Whether /tf and /tf_static can be sent.
+        Whether to publish /tf and /tf_static.
     """
 
     name = "live_view"
@@ -97,9 +96,9 @@ class LiveView(Component):
         self._makers = {topic: make for topic, _, make in rows}
         self.inputs = (
             *needle_inputs(needle),
-            refusing(Input(_CALIBRATION, m.Text, self._on_calibration, LATCHED)),
+            rejecting(Input(_CALIBRATION, m.Text, self._on_calibration, LATCHED)),
             *(
-                refusing(
+                rejecting(
                     Input(topic, m.Image, partial(self._on_image, s), IMAGES_BEST_EFFORT, lazy=True)
                 )
                 for s, topic in _IMAGES.items()
@@ -108,16 +107,16 @@ class LiveView(Component):
         self.outputs = tuple(Output(topic, kind) for topic, kind, _ in rows)
         if transforms:
             self.outputs += (Output(TF_STATIC, m.Transforms, LATCHED),)
-        self.timers = (Timer(1.0 / settings.rate, self._show),)
+        self.timers = (Timer(1.0 / settings.rate, self._publish),)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note who looks at what, and receive the images that somebody looks at."""
+        """Note the subscribers; receive images only while they are displayed."""
         self._peers = peers
         for side in SIDES:
-            is_wanted = PICTURES[side] in peers.subscribers
-            if not is_wanted:
+            is_displayed = PICTURES[side] in peers.subscribers
+            if not is_displayed:
                 self._images[side] = LatestImages()
-            yield Listen(_IMAGES[side], is_wanted)
+            yield Listen(_IMAGES[side], is_displayed)
 
     def _on_calibration(self, message: m.Text, at: Moment) -> Actions:
         views = stereo_views(calibration_from(message.text, Path(_CALIBRATION)))
@@ -133,20 +132,20 @@ class LiveView(Component):
             self._images[side].add(message.stamp_ns, frame.pixels)
         return ()
 
-    def _show(self, at: Moment) -> Actions:
+    def _publish(self, at: Moment) -> Actions:
         for topic, make in self._makers.items():
             if topic in self._peers.subscribers and (message := make(at)) is not None:
                 yield Publish(topic, message)
 
     def _picture(self, side: str, at: Moment) -> m.CompressedImage | None:
-        due = self._images[side].next(self._needle.answered_ns, at.steady)
-        if due is None:
+        found = self._images[side].next(self._needle.answered_ns, at.steady)
+        if found is None:
             return None
-        stamp_ns, answered, image = due
+        stamp_ns, answered, image = found
         shaft, note = np.empty((0, 2)), "no answer of the tracker"
         if answered:
-            note = "tip found" if self._needle.is_seen else "no tip found"
-        if answered and self._needle.is_seen and self._needle.shaft is not None:
+            note = "tip found" if self._needle.tip_found else "no tip found"
+        if answered and self._needle.tip_found and self._needle.shaft is not None:
             shaft = self._cameras[side].project(self._needle.shaft)
-        data = marked_image(image, shaft, f"{side}: {note}")
+        data = draw_needle(image, shaft, f"{side}: {note}")
         return m.CompressedImage(stamp_ns, camera_frame(side), "jpeg", data)

@@ -10,10 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from needle_bags.live.latest_images import LatestImages
-from needle_bags.live.live_needle import Belief, LiveNeedle, SeenTip
-from needle_bags.live.marked_image import marked_image
-from needle_bags.live.spread import SIGMAS, ellipsoid
+from needle_bags.live.camera_images import LatestImages, draw_needle
+from needle_bags.live.live_messages import SIGMAS, ellipsoid
+from needle_bags.live.live_needle import LiveNeedle, MeasuredTip, TipEstimate
 from needle_bags.run.shaft_trail import ShaftTrail
 from needle_controller.model.target_plane import TargetPlane
 
@@ -78,12 +77,12 @@ def test_what_is_believed_in_the_plane_is_shown_in_the_rig() -> None:
     needle: Any = LiveNeedle()
     heading = Rotation.from_euler("y", 0.1).as_matrix()
     covariance = np.diag([1.0, 2.0, 3.0]) * 1e-6
-    needle.take_belief(Belief(np.array([0.001, 0.0, 0.05]), heading, covariance))
-    assert [needle.belief] == [None]
-    needle.take_plane(plane)
-    needle.take_targets(plane.offset, None)
-    belief = needle.belief
-    assert plane.from_rig(belief.place) == pytest.approx(np.array([0.001, 0.0, 0.05]))
+    needle.set_estimate(TipEstimate(np.array([0.001, 0.0, 0.05]), heading, covariance))
+    assert [needle.estimate] == [None]
+    needle.request_plane(plane)
+    needle.set_targets(plane.offset, None)
+    belief = needle.estimate
+    assert plane.from_rig(belief.position) == pytest.approx(np.array([0.001, 0.0, 0.05]))
     assert belief.rotation == pytest.approx(turned @ heading)
     assert turned.T @ belief.covariance @ turned == pytest.approx(covariance)
 
@@ -93,10 +92,10 @@ def test_the_plane_that_is_in_force_counts_not_one_that_was_refused() -> None:
     assert [needle.plane] == [None]
     asked = np.eye(4)
     asked[0, 3] = 0.05
-    needle.take_plane(TargetPlane(asked))
-    needle.take_targets(0.003, np.array([0.01, 0.0, 0.1]))
+    needle.request_plane(TargetPlane(asked))
+    needle.set_targets(0.003, np.array([0.01, 0.0, 0.1]))
     assert needle.plane.offset == pytest.approx(0.003)
-    needle.take_targets(0.05, None)
+    needle.set_targets(0.05, None)
     assert needle.plane.T_rig_plane[0, 3] == pytest.approx(0.05)
     assert needle.target_point is None
 
@@ -104,10 +103,10 @@ def test_the_plane_that_is_in_force_counts_not_one_that_was_refused() -> None:
 def test_a_tip_that_is_not_found_leaves_the_last_one_and_says_so() -> None:
     needle: Any = LiveNeedle()
     assert [needle.shaft] == [None]
-    needle.take_insertion(0.02)
-    needle.take_tip(SeenTip(100, arc(0.02), UPRIGHT, np.eye(3)))
-    needle.take_no_tip(200)
-    assert (needle.answered_ns, needle.is_seen) == (200, False)
+    needle.set_insertion(0.02)
+    needle.add_tip(MeasuredTip(100, arc(0.02), UPRIGHT, np.eye(3)))
+    needle.add_missing_tip(200)
+    assert (needle.answered_ns, needle.tip_found) == (200, False)
     assert needle.shaft[-1] == pytest.approx(arc(0.02))
 
 
@@ -145,7 +144,7 @@ def test_an_image_is_drawn_once_with_its_own_answer_or_late_without() -> None:
 
 def test_shaft_and_tip_are_drawn_where_they_are() -> None:
     def coloured(shaft: NDArray[np.float64]) -> NDArray[np.bool_]:
-        data = np.frombuffer(marked_image(blank(), shaft, ""), np.uint8)
+        data = np.frombuffer(draw_needle(blank(), shaft, ""), np.uint8)
         picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
         assert picture is not None
         assert picture.shape == (120, 160, 3)
