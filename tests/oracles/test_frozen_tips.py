@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pytest
 
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
-from needle_bags.reading.bag_order import messages_as_sent
+from needle_bags.reading.bag_messages import messages_as_sent
 from needle_bags.reading.bag_reader import Run, read_run
 from needle_bags.ros.rerun import Node
 from needle_core.component import Actions, Moment, Publish

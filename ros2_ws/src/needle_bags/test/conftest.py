@@ -12,9 +12,8 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from made_up_run import make_run, write_run
-from needle_bags.format.bag_copy import BagCopy
-from needle_bags.reading.bag_files import read_contents
-from needle_bags.reading.bag_order import raw_as_sent
+from needle_bags.format.bag_writer import BagCopy
+from needle_bags.reading.bag_messages import raw_as_sent, read_contents
 from needle_bags.reading.bag_reader import Run, read_run
 from needle_bags.report import report
 

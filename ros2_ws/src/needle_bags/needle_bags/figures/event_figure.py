@@ -19,7 +19,7 @@ from needle_bags.figures.figure_style import (
     WIDTH,
 )
 from needle_bags.reading.bag_reader import HealthEvent, Run, Status
-from needle_bags.run.run_events import health_of, is_aborted, trips
+from needle_bags.run.run_summary import health_of, is_aborted, trips
 
 _STATE_COLORS = {
     "STEERING": ESTIMATE,

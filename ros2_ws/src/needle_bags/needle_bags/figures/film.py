@@ -1,4 +1,4 @@
-"""A film of the insertion: exposures of the bag, each with where the needle was."""
+"""Film of the insertion: exposures of the bag, each with the shape of the needle."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from needle_bags.run.shaft_trail import ShaftTrail
 
 Floats = npt.NDArray[np.float64]
 
-MOST_FRAMES = 61
-"""Every 2 mm of 120 mm, and the needle before it goes in."""
+MAX_FRAMES = 61
+"""Every 2 mm of 120 mm, and the start."""
 
 READINGS = (
     "Insertion",
@@ -27,7 +27,7 @@ READINGS = (
     "Base turned",
     "Controller",
 )
-"""What is told of each frame."""
+"""Labels of the values shown with each frame."""
 _NOTHING = "-"
 
 
@@ -40,11 +40,11 @@ class Frame:
     stamp : int
         Its time, ROS clock [ns].
     shaft : (n, 3) float64
-        Needle as measured, from the entry point to the tip, in `rig` [m]; empty: no tip.
+        Measured needle, from the entry point to the tip, in `rig` [m]; empty: no tip.
     needle : (m, 3) float64
-        The true one where the bag has it, else the measured one.
+        The true needle if the bag has it, otherwise the measured one.
     readings : tuple of str
-        Values of `READINGS`, for people.
+        Values of `READINGS`, as text.
     """
 
     stamp: int
@@ -54,10 +54,10 @@ class Frame:
 
 
 def film_of(run: Run) -> list[Frame]:
-    """Return the frames of a run's film in their order, `MOST_FRAMES` at most.
+    """Return the frames of a run's film, at most `MAX_FRAMES`.
 
-    Each is an exposure of the bag: of its cameras, or without images of what measured the tip. They
-    are equally far apart by how far the needle was moved, so that no time is spent where it rests.
+    Each is an exposure of the cameras, or of the simulated sensor without images. They are equally
+    spaced by the motion of the needle, so that a resting needle takes no frames.
 
     Raises
     ------
@@ -77,18 +77,18 @@ def film_of(run: Run) -> list[Frame]:
 
 
 def _spread(insertion: Floats) -> npt.NDArray[np.int64]:
-    """Return indices that are equally far apart in how far the needle was moved, (N,)."""
-    if len(insertion) <= MOST_FRAMES:
+    """Return indices that are equally spaced by the motion of the needle, (N,)."""
+    if len(insertion) <= MAX_FRAMES:
         return np.arange(len(insertion))
-    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(insertion)))])
-    if not way[-1] > 0.0:
-        way = np.arange(len(insertion), dtype=np.float64)
-    wanted = np.linspace(0.0, way[-1], MOST_FRAMES)
-    return np.unique(np.searchsorted(way, wanted - 1e-9 * way[-1]).clip(max=len(way) - 1))
+    travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(insertion)))])
+    if not travel[-1] > 0.0:
+        travel = np.arange(len(insertion), dtype=np.float64)
+    wanted = np.linspace(0.0, travel[-1], MAX_FRAMES)
+    return np.unique(np.searchsorted(travel, wanted - 1e-9 * travel[-1]).clip(max=len(travel) - 1))
 
 
 def _trails(run: Run, series: Series, stamps: Stamps) -> list[Floats]:
-    """Return the needle at each stamp, from the entry to the tip of that stamp; (0, 3): no tip."""
+    """Return the needle at each stamp, from the entry to the tip; (0, 3) without a tip."""
     insertions = run.insertion_at(series.stamps).tolist()
     wanted = frozenset(stamps.tolist())
     trail = ShaftTrail()
@@ -96,32 +96,27 @@ def _trails(run: Run, series: Series, stamps: Stamps) -> list[Floats]:
     for stamp, insertion, row in zip(
         series.stamps.tolist(), insertions, series.values, strict=True
     ):
-        place = row[:3]
-        if not np.isfinite(place).all():
+        position = row[:3]
+        if not np.isfinite(position).all():
             continue
-        trail.add(insertion, place)
+        trail.add(insertion, position)
         if stamp in wanted:
-            found[stamp] = trail.shaft(insertion, place)
+            found[stamp] = trail.shaft(insertion, position)
     return [found.get(stamp, np.empty((0, 3))) for stamp in stamps.tolist()]
 
 
 class _Readings:
-    """Readings of an exposure."""
+    """Values shown with an exposure."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
         self._true_r1 = dict(zip(run.truth.stamps.tolist(), true_r1(run).tolist(), strict=True))
         self._estimates = {stamp: index for index, stamp in enumerate(run.reduced_state.stamps)}
-        self._told_at = [status.log_time for status in run.controller_status]
+        self._status_times = [status.log_time for status in run.controller_status]
 
     def at(self, stamp: int) -> tuple[str, ...]:
         run = self._run
-        insertion = float(run.insertion_at(np.array([stamp]))[0])
-        base = _NOTHING
-        if len(run.joints):
-            times, turns = run.joints.stamps - run.joints.stamps[0], run.joints.values[:, 1]
-            turned = np.interp(float(stamp - run.joints.stamps[0]), times.astype(float), turns)
-            base = f"{np.degrees(turned):.0f} deg"
+        insertion, rotation = run.joints_at(np.array([stamp]))[0].tolist()
         r1 = self._true_r1.get(stamp)
         index = self._estimates.get(stamp)
         estimated, controller = (_NOTHING,) * 3, _NOTHING
@@ -133,26 +128,26 @@ class _Readings:
                 f"{np.degrees(pitch):+.1f} deg",
                 f"{np.degrees(roll):+.0f} deg",
             )
-            controller = _belief(status)
+            controller = _confidence(status)
         return (
             _NOTHING if np.isnan(insertion) else f"{insertion * 1e3:.1f} mm",
             _NOTHING if r1 is None else f"{r1 * 1e3:+.2f} mm",
             *estimated,
-            base,
+            _NOTHING if np.isnan(rotation) else f"{np.degrees(rotation):.0f} deg",
             controller,
         )
 
     def _status_of(self, index: int) -> Status | None:
-        """Return what the controller said last before it had the next estimate."""
+        """Return the last controller status before the next estimate."""
         received = self._run.reduced_state.received
         until = int(received[index + 1]) if index + 1 < len(received) else None
-        told = self._run.controller_status
-        last = len(told) if until is None else bisect_left(self._told_at, until)
-        return told[last - 1] if last else None
+        statuses = self._run.controller_status
+        last = len(statuses) if until is None else bisect_left(self._status_times, until)
+        return statuses[last - 1] if last else None
 
 
 def _interval(status: Status | None) -> str:
-    """Return half of the interval that holds r1 with 95 %."""
+    """Return half of the 95 % interval of r1, as text."""
     if status is None:
         return ""
     try:
@@ -162,8 +157,8 @@ def _interval(status: Status | None) -> str:
     return f" ± {(high - low) / 2 * 1e3:.2f}" if np.isfinite(high - low) else ""
 
 
-def _belief(status: Status | None) -> str:
-    said = status.values.get("trusted", "") if status else ""
-    if said in ("", "trusted"):
-        return said or _NOTHING
-    return said.partition(":")[0]
+def _confidence(status: Status | None) -> str:
+    trusted = status.values.get("trusted", "") if status else ""
+    if trusted in ("", "trusted"):
+        return trusted or _NOTHING
+    return trusted.partition(":")[0]

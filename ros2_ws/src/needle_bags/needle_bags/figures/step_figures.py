@@ -32,7 +32,7 @@ from needle_bags.run.innovation import (
     Innovations,
     gate_room,
     missed_tips,
-    refused_tips,
+    rejected_tips,
 )
 from needle_bags.run.stage_timing import StageTiming
 
@@ -82,7 +82,7 @@ def _draw_gate(axes: Any, run: Run) -> None:
         top = room.margin * MM
         axes.axhline(top, color=RED, lw=1.2, label="a tip above this is refused")
     marks: Sequence[tuple[Stamps, str, str, str]] = (
-        (refused_tips(run), "x", RED, "refused"),
+        (rejected_tips(run), "x", RED, "refused"),
         (missed_tips(run), "|", MEASURED, "no tip found"),
     )
     for stamps, marker, color, label in marks:

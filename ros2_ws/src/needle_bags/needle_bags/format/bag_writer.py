@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import os
+import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Final
 
 from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from needle_bags.format.bag_metadata import (
+    USUAL_QOS,
     DataFile,
     bag_information,
     channel_metadata,
@@ -27,6 +32,7 @@ LIBRARY: Final = "needle_bags"
 COMPRESSIONS: Final = ("none", "zstd")
 CHUNK_SIZE: Final = 2 * 2**20
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
+_STAMP_END: Final = 12
 
 
 class BagWriteError(UserError):
@@ -244,3 +250,79 @@ def refuse_existing_bag(directory: Path) -> None:
         raise UserError(f"cannot record into {directory}: it is a file")
     if (directory / METADATA_FILE).exists() or any(directory.glob("*.mcap")):
         raise UserError(f"{directory} holds a bag already: name a new directory")
+
+
+class BagCopy:
+    """A compressed bag that adds each topic with its first message.
+
+    Parameters
+    ----------
+    directory : Path
+        The new bag.
+    distribution : str
+        ROS distribution of its message types.
+    custom_data : mapping
+        Texts for metadata.yaml.
+
+    Raises
+    ------
+    UserError
+        If the directory holds a bag already or cannot be made.
+    """
+
+    def __init__(self, directory: Path, distribution: str, custom_data: Mapping[str, str]) -> None:
+        self._writer = BagWriter(directory, distribution=distribution, compression="zstd")
+        self._topics: dict[str, int] = {}
+        for key, text in custom_data.items():
+            self._writer.set_custom_data(key, text)
+
+    def put(self, topic: BagTopic, data: bytes, log_time: int, sent: int) -> None:
+        """Append a message that was received at `log_time` and sent at `sent` [ns].
+
+        Raises
+        ------
+        UserError
+            If the disk refuses the data.
+        """
+        if topic.name not in self._topics:
+            self._topics[topic.name] = self._writer.add_topic(topic)
+        self._writer.write(self._topics[topic.name], data, log_time, sent)
+
+    def close(self) -> None:
+        """Complete the bag; raises UserError if the disk refuses the data."""
+        self._writer.close()
+
+
+def standard_topic(name: str, type_name: str) -> BagTopic:
+    """Return a topic of a standard message type."""
+    store = _jazzy()
+    definition, _ = store.generate_msgdef(type_name, ros_version=2)
+    return BagTopic(name, type_name, definition, store.hash_rihs01(type_name), (USUAL_QOS,))
+
+
+def standard_text(text: str) -> bytes:
+    """Return a std_msgs/String as CDR."""
+    name = "std_msgs/msg/String"
+    store = _jazzy()
+    return bytes(store.serialize_cdr(store.types[name](data=text), name))
+
+
+@functools.cache
+def _jazzy() -> Typestore:
+    """Return Jazzy's types; loading them takes 0.1 s, which readers do not need."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def stamp_of(data: bytes) -> int:
+    """Return the stamp [ns] of a message (CDR) that begins with a header.
+
+    Raises
+    ------
+    UserError
+        If the message is too short.
+    """
+    if len(data) < _STAMP_END:
+        raise UserError(f"a message of {len(data)} bytes has no header with a stamp")
+    order = "<" if data[1] & 1 else ">"
+    sec, nanosec = struct.unpack_from(f"{order}iI", data, 4)
+    return int(sec) * 10**9 + int(nanosec)

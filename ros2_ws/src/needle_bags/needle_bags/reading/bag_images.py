@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from needle_bags.format.bag_copy import stamp_of
-from needle_bags.reading.bag_files import read_messages
-from needle_bags.reading.bag_order import raw_as_sent
+from needle_bags.format.bag_writer import stamp_of
+from needle_bags.reading.bag_messages import raw_as_sent, read_messages
 from needle_bags.reading.bag_reader import Run, nanoseconds
 from needle_core.errors import UserError
 

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from needle_bags.reading.bag_files import read_contents, read_messages
+from needle_bags.reading.bag_messages import read_contents, read_messages
 from needle_core.errors import UserError
 
 if TYPE_CHECKING:

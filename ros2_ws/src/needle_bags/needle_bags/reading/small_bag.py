@@ -13,11 +13,10 @@ import numpy as np
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_copy import BagCopy, stamp_of, standard_topic
-from needle_bags.reading.bag_files import read_contents
+from needle_bags.format.bag_writer import BagCopy, stamp_of, standard_topic
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
 from needle_bags.reading.bag_images import pixels_of, plain_image
-from needle_bags.reading.bag_order import SentMessage, raw_as_sent
+from needle_bags.reading.bag_messages import SentMessage, raw_as_sent, read_contents
 from needle_bags.reading.bag_reader import Run, read_run
 from needle_core.commands.cli import EXIT_DONE, run_command
 from needle_core.commands.options import CommandParser

@@ -14,8 +14,7 @@ from needle_bags.figures.film_views import View
 from needle_bags.figures.step_figures import timing_rows
 from needle_bags.reading.bag_reader import Run
 from needle_bags.report.page import base64_text, number, render
-from needle_bags.run.run_events import troubles
-from needle_bags.run.run_summary import rerun_of
+from needle_bags.run.run_summary import rerun_of, troubles
 from needle_bags.run.stage_timing import StageTiming
 from needle_core.commands.cli import JsonValue
 

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from tqdm import tqdm
 
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
-from needle_bags.reading.bag_order import Reorder, SentMessage, messages_as_sent
+from needle_bags.reading.bag_messages import Reorder, SentMessage, messages_as_sent
 from needle_bags.reading.bag_reader import Run, Series, nanoseconds
 from needle_bags.rerun.comparison import FIELDS, Record, members
 from needle_bags.rerun.reception_order import in_reception_order

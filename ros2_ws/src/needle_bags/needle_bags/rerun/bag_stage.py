@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from needle_bags.reading.bag_images import plain_image
-from needle_bags.reading.bag_order import SentMessage
+from needle_bags.reading.bag_messages import SentMessage
 from needle_bags.rerun.bag_pass import CONVERTER, Output
 from needle_core.component import Component, Moment, Publish
 from needle_core.convert import from_ros

@@ -11,7 +11,7 @@ from typing import Any
 
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.reading.bag_order import SentMessage
+from needle_bags.reading.bag_messages import SentMessage
 from needle_controller.protocol.heard_messages import HeardMessage, heard_messages
 
 _STATUS = "needle/controller_status"

@@ -9,10 +9,9 @@ from typing import Any
 
 import yaml
 
-from needle_bags.format.bag_copy import BagCopy, stamp_of, standard_text, standard_topic
-from needle_bags.reading.bag_files import read_contents
+from needle_bags.format.bag_writer import BagCopy, stamp_of, standard_text, standard_topic
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
-from needle_bags.reading.bag_order import raw_as_sent
+from needle_bags.reading.bag_messages import raw_as_sent, read_contents
 from needle_bags.reading.bag_reader import Run
 from needle_bags.reading.bag_rigs import CALIBRATION
 from needle_bags.recording.provenance import commit

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from needle_bags.reading.bag_order import SentMessage, messages_as_sent
+from needle_bags.reading.bag_messages import SentMessage, messages_as_sent
 from needle_bags.rerun.bag_pass import CONVERTER, Output
 from needle_bags.ros.parameter_snapshots import plain_value
 from needle_controller.plane_controller import (

@@ -31,7 +31,7 @@ from needle_bags.player.player_options import (
 )
 from needle_bags.player.replay_names import REPLAY, is_guarded, marks_a_rig, played_name
 from needle_bags.player.terminal_keys import BACK, FASTER, ON, PAUSE, SLOWER, Keys
-from needle_bags.reading.bag_files import raw_messages, read_contents
+from needle_bags.reading.bag_messages import raw_messages, read_contents
 from needle_bags.ros.conversions import recorded_offer
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_core.diagnostics import Diagnostic, Level

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from needle_bags.format.bag_writer import refuse_existing_bag
 from needle_bags.link.openigtlink import LINK, Listeners, OpenIGTLink, OpenIGTLinkParameters
 from needle_bags.live.live_view import LiveView, LiveViewParameters
-from needle_bags.reading.bag_files import read_messages
+from needle_bags.reading.bag_messages import read_messages
 from needle_bags.reading.bag_reader import Run, read_run
 from needle_bags.rerun.bag_pass import (
     TIP_TOPICS,

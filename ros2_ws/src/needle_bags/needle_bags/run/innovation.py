@@ -1,4 +1,4 @@
-"""Distance of each measured tip from where it was expected, and from what would refuse it."""
+"""Innovation of each measured tip, and its margin to the gate that rejects tips."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ QUANTILE_95 = 7.815
 
 @dataclasses.dataclass(frozen=True)
 class Innovations:
-    """Measured minus expected tip, for every tip that was used but the first.
+    """Measured minus predicted tip, for every used tip except the first.
 
-    The expected one is the estimate at the tip before, moved on by what the joints did, along an
-    arc of the configured curvature.
+    The prediction is the estimate at the previous tip, advanced by the motion of the joints along
+    an arc of the configured curvature.
 
     Attributes
     ----------
@@ -33,9 +33,9 @@ class Innovations:
     values : (N, 3) float64
         Innovation in the axes of the target plane [m].
     sigmas : (N, 3) float64
-        Its expected standard deviations [m]: estimate and measurement together.
+        Its predicted standard deviations [m], of estimate and measurement together.
     squared : (N,) float64
-        Innovation squared, normalised by its covariance [-]; 3 on average where all fits.
+        Innovation squared, normalised by its covariance [-]; 3 on average for a consistent filter.
     """
 
     stamps: Stamps
@@ -46,7 +46,7 @@ class Innovations:
 
 @dataclasses.dataclass(frozen=True)
 class GateRoom:
-    """Room that every measured tip had left before it was refused by where a needle can be.
+    """Margin of every measured tip to the gate.
 
     Attributes
     ----------
@@ -55,9 +55,9 @@ class GateRoom:
     reach : (N,) float64
         Distance from the entry point beyond the insertion [m].
     jump : (N,) float64
-        Distance from the last used tip beyond what the needle was moved [m]; NaN at the first.
+        Distance from the last used tip beyond the motion of the needle [m]; NaN at the first.
     margin : float or None
-        Both must stay below this [m]; None where the bag does not tell.
+        Upper limit of both [m]; None if the bag lacks it.
     """
 
     stamps: Stamps
@@ -78,12 +78,12 @@ def innovations(run: Run) -> Innovations | None:
         rotation_from_quaternion(run.estimate.values[here, 3:]),
     )
     covariance = run.estimate_covariances.values[here].reshape(-1, 6, 6)
-    inserted, turned = np.diff(_joints_at(run, stamps), axis=0).T
+    inserted, turned = np.diff(run.joints_at(stamps), axis=0).T
     shift = arc(np.maximum(inserted, 0.0), turned, curvature).shift
     moved = np.einsum("nij,nj->ni", rotation[:-1], shift)
     measured = run.tips.values[there] - np.array([target_offset(run), 0.0, 0.0])
     values = measured[1:] - position[:-1] - moved
-    # A turn of the estimate by w, about fixed axes, displaces the end by w x moved.
+    # A rotation error w of the estimate, about fixed axes, displaces the prediction by w x moved.
     jacobian = np.concatenate(
         [np.broadcast_to(np.eye(3), (len(moved), 3, 3)), -cross_matrix(moved)], axis=2
     )
@@ -98,7 +98,7 @@ def innovations(run: Run) -> Innovations | None:
 
 
 def gate_room(run: Run) -> GateRoom:
-    """Return how near the tips of a run came to the bounds of where a needle can be."""
+    """Return the margins of the tips of a run."""
     finite = np.isfinite(run.tips.values).all(axis=1)
     stamps, tips = run.tips.stamps[finite], run.tips.values[finite]
     insertion = run.insertion_at(stamps)
@@ -115,25 +115,24 @@ def gate_room(run: Run) -> GateRoom:
     return GateRoom(stamps, reach, jump, margin if isinstance(margin, float) else None)
 
 
-def refused_tips(run: Run) -> Stamps:
-    """Return the stamps of tips that the controller refused [ns].
+def rejected_tips(run: Run) -> Stamps:
+    """Return the stamps of tips that the controller rejected [ns].
 
-    It says how many it has refused: each time it is one more, that is the last tip that had come
-    and was not used.
+    The status counts them: each increment belongs to the last unused tip received before it.
     """
     unused = ~np.isin(run.tips.stamps, run.estimate.stamps)
     order = np.argsort(run.tips.received[unused])
     received = run.tips.received[unused][order].tolist()
     stamps = run.tips.stamps[unused][order].tolist()
-    refused: list[int] = []
+    rejected: list[int] = []
     for status in run.controller_status:
         text = status.values.get("tips_rejected", "")
-        if not text.isdigit() or int(text) <= len(refused):
+        if not text.isdigit() or int(text) <= len(rejected):
             continue
         come = bisect_right(received, status.log_time)
-        free = [stamp for stamp in stamps[:come] if stamp not in refused]
-        refused += free[len(refused) - int(text) :]
-    return np.array(sorted(refused), np.int64)
+        free = [stamp for stamp in stamps[:come] if stamp not in rejected]
+        rejected += free[len(rejected) - int(text) :]
+    return np.array(sorted(rejected), np.int64)
 
 
 def missed_tips(run: Run) -> Stamps:
@@ -143,17 +142,8 @@ def missed_tips(run: Run) -> Stamps:
     return stamps
 
 
-def _joints_at(run: Run, stamps: Stamps) -> Floats:
-    start = run.joints.stamps[0]
-    times = (run.joints.stamps - start).astype(np.float64)
-    return np.stack(
-        [np.interp((stamps - start).astype(np.float64), times, v) for v in run.joints.values.T],
-        axis=1,
-    )
-
-
 def _measurement_covariances(run: Run, stamps: Stamps) -> Floats:
-    """Return each tip's covariance, (N, 3, 3): its own, or the configured where it had none."""
+    """Return each tip's covariance, (N, 3, 3); the configured one for tips without."""
     configured = run.parameter("plane_controller", "measurement_std")
     sigma = configured if isinstance(configured, float) else 0.0
     matrices: Floats = np.tile(np.eye(3) * sigma**2, (len(stamps), 1, 1))

@@ -1,22 +1,23 @@
-"""The figures of one run: how well the needle followed the plane, and how fast it went."""
+"""Summary of a run: distance from the target plane, errors, speed, and events."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from needle_bags.reading.bag_reader import Run, Series, Stamps
-from needle_bags.run.run_events import is_aborted
+from needle_bags.reading.bag_reader import HealthEvent, Result, Run, Series, Stamps, Status
 from needle_controller.presets.own_parts import GROUPS
 from needle_core.commands.cli import JsonValue, finite_or_none
 
 GOAL = 1e-3
 LAST_STRETCH = 20e-3
-# The axes report the depth with encoder steps, not exactly.
+# Encoder resolution of the reported depth.
 DEPTH_TOLERANCE = 1e-6
-# A device that moves no more, and the level of diagnostics that says so.
+# Device states without motion; levels of diagnostics.
 STOPPED = ("FAULT", "ESTOPPED")
-ERROR = 2
+WARNING, ERROR = 1, 2
 
 Floats = npt.NDArray[np.float64]
 
@@ -34,9 +35,9 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
     Returns
     -------
     dict
-        The keys of `scripts/simulate --json`; null for what the bag does not tell. r1 is the
-        signed true distance of the tip from the wanted plane, point_error its distance at the end
-        from the wanted point, null where the needle was not steered to one.
+        The keys of `scripts/simulate --json`; null if the bag lacks the data. r1 is the signed true
+        distance of the tip from the target plane, point_error its final distance from the target
+        point, null without a target point.
     """
     r1 = true_r1(run)
     depth = run.insertion_at(run.truth.stamps)
@@ -80,24 +81,24 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
 
 
 def _steps(run: Run) -> int:
-    """Return how many steps were done; of a continuous insertion how many tips were used."""
+    """Return the number of completed steps, or of tips used in a continuous insertion."""
     if run.last_status("insertion") == "continuous":
         return int(run.last_status("step"))
     return sum(result.outcome == "succeeded" for result in run.results)
 
 
 def rerun_of(run: Run) -> str | None:
-    """Return the name of the bag that this one is a rerun of: nothing was steered in it."""
+    """Return the name of the bag that this one is a rerun of, or None."""
     return _text(run.run_info.get("rerun_of"))
 
 
 def steered_by(run: Run) -> str | None:
-    """Return the controller that turned the needle; in a rerun it is that of the first run."""
+    """Return the controller that steered the needle; in a rerun, that of the original run."""
     return _text(run.run_info.get("steered_by")) if rerun_of(run) else _controller(run)
 
 
 def target_offset(run: Run) -> float:
-    """Return the wanted plane's x in `rig` [m]: what the controller steered to, last."""
+    """Return x of the last target plane in `rig` [m]."""
     try:
         return float(run.last_status("target_offset_m"))
     except ValueError:
@@ -106,7 +107,7 @@ def target_offset(run: Run) -> float:
 
 
 def point_error(run: Run) -> float | None:
-    """Return the true tip's distance at the end from the point it was steered to, if it was [m]."""
+    """Return the final distance of the true tip from the target point [m], or None."""
     try:
         point = [float(part) for part in run.last_status("target_point_m").split(",")]
     except ValueError:
@@ -117,21 +118,21 @@ def point_error(run: Run) -> float | None:
 
 
 def true_r1(run: Run) -> Floats:
-    """Return the truth's signed distance from the wanted plane [m], (N,), at `truth.stamps`."""
+    """Return the true signed distance from the target plane [m], (N,), at `truth.stamps`."""
     return run.truth.values[:, 0] - target_offset(run)
 
 
 def tip_error(run: Run) -> Floats:
-    """Return measured minus true tip in `rig` [m], (N, 3), where both have the same stamp.
+    """Return measured minus true tip in `rig` [m], (N, 3), at common stamps.
 
-    A tip that is not finite measures nothing: it is left out here and counted in the summary.
+    Tips that are not finite are left out; the summary counts them.
     """
     here, there = finite_tips(run).at(run.truth.stamps)
     return finite_tips(run).values[here] - run.truth.values[there, :3]
 
 
 def finite_tips(run: Run) -> Series:
-    """Return the measured tips that are numbers."""
+    """Return the measured tips that are finite."""
     finite = np.isfinite(run.tips.values).all(axis=1)
     return Series(run.tips.stamps[finite], run.tips.values[finite], run.tips.received[finite])
 
@@ -158,7 +159,7 @@ def estimate_error(run: Run, estimate: Series) -> tuple[Stamps, Floats]:
     run : Run
         The run, with its truth.
     estimate : Series
-        r by stamp, (N, 3): `run.reduced_state`, or today's.
+        r by stamp, (N, 3): `run.reduced_state`, or that of a rerun.
     """
     here, there = estimate.at(run.truth.stamps)
     error = estimate.values[here] - reduced_states(run.truth, target_offset(run))[there]
@@ -168,17 +169,13 @@ def estimate_error(run: Run, estimate: Series) -> tuple[Stamps, Floats]:
 
 def commanded_rotation(run: Run) -> Floats:
     """Return each step's insertion [m] and rotation [rad], and the commanded rotation, (N, 3)."""
-    stamps = run.commands.stamps
-    if not len(run.joints) or not len(stamps):
+    if not len(run.joints):
         return np.empty((0, 3))
-    start = run.joints.stamps[0]
-    at, known = (x.astype(np.float64) for x in (stamps - start, run.joints.stamps - start))
-    rotation = np.interp(at, known, run.joints.values[:, 1])
-    return np.stack([run.insertion_at(stamps), rotation, run.commands.values[:, 1]], axis=1)
+    return np.column_stack([run.joints_at(run.commands.stamps), run.commands.values[:, 1]])
 
 
 def reached_depth(run: Run) -> bool:
-    """Return whether the needle went as deep as the controller was told."""
+    """Return whether the needle reached the commanded depth."""
     if any(status.values.get("state") == "DONE" for status in run.controller_status):
         return True
     try:
@@ -190,9 +187,9 @@ def reached_depth(run: Run) -> bool:
 
 
 def stop_cause(run: Run) -> str:
-    """Return why the needle went no deeper: what was said first after it was last steered.
+    """Return why the insertion stopped: the first reason reported after the last steering.
 
-    What comes later, such as a device that is disabled at the end, only follows from it.
+    Later reports, such as that of a disabled device, are consequences.
     """
     if reached_depth(run):
         return run.last_status("reason")
@@ -217,14 +214,71 @@ def stop_cause(run: Run) -> str:
 
 
 def watchdog_trips(run: Run) -> int:
-    """Return how often a steady-clock watchdog tripped, in all nodes that count it."""
-    # At level drive sim_rig has no status of its own: each trip is a line of its health.
+    """Return the number of watchdog trips of all nodes."""
+    # At level drive sim_rig publishes no device/status, and reports trips in /diagnostics.
     total = sum(event.part == "sim_rig: watchdogs" and event.level > 0 for event in run.health)
     for statuses in (run.controller_status, run.device_status):
         values = [s.values["watchdog_trips"] for s in statuses if "watchdog_trips" in s.values]
         if values and values[-1].isdigit():
             total += int(values[-1])
     return total
+
+
+def is_aborted(result: Result) -> bool:
+    """Return whether a step or path was aborted, not completed or replaced."""
+    return result.outcome.startswith("aborted")
+
+
+def troubles(run: Run) -> list[HealthEvent]:
+    """Return all warnings and faults, tripped watchdogs and aborted steps, in order.
+
+    Parameters
+    ----------
+    run : Run
+        The recorded run.
+    """
+    aborted = [
+        HealthEvent(result.log_time, "device: step", WARNING, result.outcome)
+        for result in run.results
+        if is_aborted(result)
+    ]
+    health = [event for event in health_of(run) if event.level]
+    return sorted([*health, *trips(run), *aborted], key=lambda event: event.log_time)
+
+
+def health_of(run: Run) -> list[HealthEvent]:
+    """Return the health events, except problems that ended before the first command.
+
+    Nodes warn at the start while they wait for each other.
+    """
+    begin = run.first_command
+    if begin is None:
+        return run.health
+    recovered = {
+        event.part: event.log_time
+        for event in run.health
+        if event.log_time <= begin and not event.level
+    }
+    return [event for event in run.health if event.log_time > recovered.get(event.part, -1)]
+
+
+def trips(run: Run) -> list[HealthEvent]:
+    """Return the trips of the watchdogs of controller and device, with the reported reason."""
+    return [
+        *_trips("plane_controller: watchdog", run.controller_status),
+        *_trips("device: watchdog", run.device_status),
+    ]
+
+
+def _trips(part: str, statuses: Sequence[Status]) -> Iterator[HealthEvent]:
+    before = None
+    for status in statuses:
+        text = status.values.get("watchdog_trips", "")
+        count = int(text) if text.isdigit() else 0
+        if before is not None and count > before:
+            why = status.values.get("reason") or "no reason given"
+            yield HealthEvent(status.log_time, part, WARNING, why)
+        before = count
 
 
 def _rms_of_last(r1: Floats, depth: Floats) -> float | None:

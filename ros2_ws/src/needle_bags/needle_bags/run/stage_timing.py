@@ -14,8 +14,8 @@ from collections import defaultdict
 import numpy as np
 import numpy.typing as npt
 
-from needle_bags.format.bag_copy import stamp_of
-from needle_bags.reading.bag_order import messages_as_sent, raw_as_sent
+from needle_bags.format.bag_writer import stamp_of
+from needle_bags.reading.bag_messages import messages_as_sent, raw_as_sent
 from needle_bags.reading.bag_reader import Run
 
 Floats = npt.NDArray[np.float64]

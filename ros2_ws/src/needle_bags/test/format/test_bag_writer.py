@@ -16,11 +16,10 @@ from rosbags.interfaces import QosDurability, QosReliability, QosTime
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from needle_bags.format.bag_copy import standard_text, standard_topic
 from needle_bags.format.bag_metadata import USUAL_QOS
-from needle_bags.format.bag_writer import BagWriter
+from needle_bags.format.bag_writer import BagWriter, standard_text, standard_topic
 from needle_bags.format.message_definitions import full_definition
-from needle_bags.reading.bag_files import read_contents
+from needle_bags.reading.bag_messages import read_contents
 from needle_bags.recording import recording as recording_module
 from needle_bags.recording.recorder_health import WARN_WAITING, RecorderHealth
 from needle_bags.recording.recording import FreeSpace, Received, Recording, open_recording

@@ -20,7 +20,7 @@ from std_msgs.msg import Int32, String
 from std_srvs.srv import Trigger
 
 from needle_bags.format.bag_writer import BagWriter
-from needle_bags.reading.bag_files import read_contents, read_messages
+from needle_bags.reading.bag_messages import read_contents, read_messages
 from needle_bags.recording.recording import FreeSpace, Recording
 from needle_bags.recording.worker import Job, RunJob
 from needle_bags.recovery.bag_recovery import recover_bag

@@ -17,9 +17,8 @@ from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as OtherWriter
 
-from needle_bags.format.bag_copy import standard_text, standard_topic
-from needle_bags.format.bag_writer import BagWriter
-from needle_bags.reading.bag_files import read_contents, read_messages
+from needle_bags.format.bag_writer import BagWriter, standard_text, standard_topic
+from needle_bags.reading.bag_messages import read_contents, read_messages
 from needle_bags.reading.bag_reader import read_run
 from needle_bags.recovery import bag_recovery, recover
 from needle_bags.recovery.bag_recovery import recover_bag

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from needle_bags.figures.film import MOST_FRAMES, READINGS, film_of
+from needle_bags.figures.film import MAX_FRAMES, READINGS, film_of
 from needle_bags.figures.film_views import (
     MOST_BYTES,
     _small_jpeg,
@@ -39,9 +39,9 @@ def with_depth(run: Run, depth: np.ndarray) -> Run:
 
 def test_frames_are_exposures_evenly_apart_that_end_where_their_tip_is(made_up: Run) -> None:
     frames = film_of(made_up)
-    assert [frame.stamp for frame in frames] == [2 * STEP_NS * n for n in range(MOST_FRAMES)]
+    assert [frame.stamp for frame in frames] == [2 * STEP_NS * n for n in range(MAX_FRAMES)]
     depths = [float(frame.readings[0].removesuffix(" mm")) for frame in frames]
-    assert depths == [2.0 * number for number in range(MOST_FRAMES)]
+    assert depths == [2.0 * number for number in range(MAX_FRAMES)]
     nothing = Series(made_up.truth.stamps[:0], made_up.truth.values[:0], made_up.truth.stamps[:0])
     blind = film_of(dataclasses.replace(made_up, truth=nothing))
     for frame, seen in zip(frames[1:], blind[1:], strict=True):
@@ -58,7 +58,7 @@ def test_no_frame_is_spent_where_the_needle_rests(made_up: Run) -> None:
     frames = film_of(run)
     insertions = run.insertion_at(np.array([frame.stamp for frame in frames]))
     assert insertions.max() <= 0.1 + 1e-9
-    assert len(frames) > MOST_FRAMES // 2
+    assert len(frames) > MAX_FRAMES // 2
     # Drawn out again: that is part of the film.
     there_and_back = 0.06 - np.abs(made_up.joints.values[:, 0] - 0.06)
     assert film_of(with_depth(made_up, there_and_back))[-1].stamp == made_up.tips.stamps[-1]
@@ -104,7 +104,7 @@ def test_the_film_has_the_pictures_of_the_bag_in_order(make_run: Callable[..., P
     for view in views:
         shades = [np.median(decoded(data)) for data in view.pictures]
         # The made-up images are as bright as their number.
-        assert np.abs(np.array(shades) - np.arange(MOST_FRAMES)).max() <= 2.0
+        assert np.abs(np.array(shades) - np.arange(MAX_FRAMES)).max() <= 2.0
 
 
 def test_the_film_of_real_cameras_has_the_tip_where_it_is_seen(

@@ -19,8 +19,7 @@ from needle_bags.report import report
 from needle_bags.report.page import TERMS, Glossary
 from needle_bags.report.report_page import verdict_text
 from needle_bags.rerun.rerun_bag import write_rerun
-from needle_bags.run.run_events import troubles
-from needle_bags.run.run_summary import summarize
+from needle_bags.run.run_summary import summarize, troubles
 from needle_bags.run.stage_timing import STAGES
 from needle_core.commands.cli import JsonValue
 

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.reading.bag_order import SentMessage
+from needle_bags.reading.bag_messages import SentMessage
 from needle_bags.rerun.reception_order import in_reception_order
 from needle_controller.protocol.heard_messages import HeardMessages
 

@@ -16,11 +16,10 @@ import yaml
 from rclpy.parameter import Parameter
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_copy import BagCopy, standard_text, standard_topic
+from needle_bags.format.bag_writer import BagCopy, standard_text, standard_topic
 from needle_bags.link import openigtlink
 from needle_bags.live import live_view
-from needle_bags.reading.bag_files import read_contents, read_messages
-from needle_bags.reading.bag_order import raw_as_sent
+from needle_bags.reading.bag_messages import raw_as_sent, read_contents, read_messages
 from needle_bags.reading.bag_reader import read_run
 from needle_bags.rerun.bag_pass import Output
 from needle_bags.rerun.rerun_bag import TABLE, write_rerun

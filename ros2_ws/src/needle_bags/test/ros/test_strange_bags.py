@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from needle_bags.format.bag_copy import standard_topic
-from needle_bags.format.bag_writer import BagWriter
+from needle_bags.format.bag_writer import BagWriter, standard_topic
 from needle_bags.reading import small_bag
 from needle_bags.recovery import recover
 from needle_bags.report import report

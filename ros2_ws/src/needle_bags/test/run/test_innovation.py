@@ -15,7 +15,7 @@ from needle_bags.run.innovation import (
     gate_room,
     innovations,
     missed_tips,
-    refused_tips,
+    rejected_tips,
 )
 
 KAPPA = 8.0
@@ -133,5 +133,5 @@ def test_refused_and_missed_tips_are_found() -> None:
     used = ~np.isin(whole.estimate.stamps, [6 * 10**9, 7 * 10**9, 9 * 10**9])
     estimate = Series(*(part[used] for part in dataclasses.astuple(whole.estimate)))
     run = dataclasses.replace(whole, estimate=estimate)
-    assert refused_tips(run).tolist() == [7 * 10**9, 9 * 10**9]
+    assert rejected_tips(run).tolist() == [7 * 10**9, 9 * 10**9]
     assert missed_tips(run).tolist() == [3 * 10**9, 4 * 10**9]

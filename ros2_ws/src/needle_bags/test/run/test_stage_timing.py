@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_copy import BagCopy, standard_topic
+from needle_bags.format.bag_writer import BagCopy, standard_topic
 from needle_bags.run.stage_timing import stage_timings
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

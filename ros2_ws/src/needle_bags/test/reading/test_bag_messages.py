@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_copy import stamp_of, standard_topic
-from needle_bags.format.bag_writer import BagWriter
-from needle_bags.reading.bag_order import messages_as_sent, raw_as_sent
+from needle_bags.format.bag_writer import BagWriter, stamp_of, standard_topic
+from needle_bags.reading.bag_messages import messages_as_sent, raw_as_sent
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPE = "std_msgs/msg/Header"
