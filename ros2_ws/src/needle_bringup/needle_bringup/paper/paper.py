@@ -6,8 +6,7 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
-from needle_bringup.descendants import ending_descendants
-from needle_bringup.workplace import checkout, make_folder, temporary_folder
+from needle_bringup.workplace import checkout, ending_descendants, make_folder, temporary_folder
 from needle_core.commands.cli import EXIT_DONE, run_command, write_json
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError

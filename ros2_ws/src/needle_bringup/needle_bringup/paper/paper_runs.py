@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_bags.reading.bag_reader import Run, read_run
-from needle_bringup.descendants import ran
+from needle_bringup.workplace import ran
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue
 from needle_core.files.installed import find_executable
 

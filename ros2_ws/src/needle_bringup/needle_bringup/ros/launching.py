@@ -12,7 +12,7 @@ from launch_ros.actions import Node
 
 from launch import LaunchDescription
 from needle_bringup.simulation.launch_nodes import LAUNCHED_PACKAGES, refuse_misspelt
-from needle_bringup.simulation.node_process import RECORDER_GRACE
+from needle_bringup.simulation.node_graph import RECORDER_GRACE
 from needle_core.settings.parameter_files import Parameters
 
 

@@ -8,8 +8,11 @@ import time
 from collections.abc import Callable
 from typing import Any, TextIO
 
-from needle_bringup.simulated_operator.component import PROGRESS, SimulatedOperator
-from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
+from needle_bringup.simulated_operator.component import (
+    PROGRESS,
+    SimulatedOperator,
+    SimulatedOperatorParameters,
+)
 from needle_bringup.simulated_operator.progress import PROGRESS_FD, Progress, Shown
 from needle_core.commands.cli import EXIT_INTERRUPTED
 from needle_core.ros.main import run_component

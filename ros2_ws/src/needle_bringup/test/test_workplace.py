@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from needle_bringup import descendants
-from needle_bringup.descendants import ending_descendants, ran
-from needle_bringup.workplace import make_folder, temporary_folder
+from needle_bringup import workplace
+from needle_bringup.workplace import ending_descendants, make_folder, ran, temporary_folder
 from needle_core.errors import UserError
 
 
@@ -29,7 +28,7 @@ def test_descendants_are_ended_and_killed_if_they_stay(monkeypatch: pytest.Monke
         assert len(value) == 32
         return list(alive.items())
 
-    monkeypatch.setattr(descendants, "processes_with", found)
+    monkeypatch.setattr(workplace, "processes_with", found)
     monkeypatch.setattr(os, "kill", kill)
     monkeypatch.setattr("time.monotonic", lambda: next(now))
     monkeypatch.setattr("time.sleep", lambda _: None)
