@@ -1,9 +1,9 @@
-"""`docs/paper.md`: the paper's values beside ours, a line on every difference, the figures."""
+"""The page `docs/paper.md`: values of the paper and of this project, and their differences."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -20,68 +20,22 @@ from needle_bringup.paper.paper_results import (
     missed_later,
     settled_mm,
 )
-from needle_bringup.studies.limit_study import Reached
 from needle_bringup.studies.pure_insertions import RADIUS
 from needle_core.commands.cli import JsonValue
 
+_TEMPLATE = Path(__file__).with_name("static") / "paper.md"
 Row = tuple[str, str, str, str]
-
-INTRODUCTION = """\
-# The paper's results, run again
-
-Made by `scripts/paper --out docs`; do not edit. V. Kallem, N. J. Cowan, "Image Guidance of Flexible
-Tip-Steerable Needles" (IEEE Trans. Robotics 25(1), 2009), section IV. Everything is simulated with
-the controller `paper`; what the paper measured on a bench runs here through rendered camera images,
-the tracker and the whole node graph.
-
-## The paper's values beside ours
-
-"""
-FIGURES = """
-## Figure 3
-
-![open loop, closed loop, a trial by cameras](images/paper_figure_3.png)
-
-The start is r = (-3 mm, 2 deg, 15 deg) in all three columns. Columns 1 and 2 are simulated with the
-tip's measurement alone (closed loop: +-0.5 mm noise); black is the truth. Column 3 goes through the
-cameras, with torsion in the needle's shaft; as on a bench, only the measurements and the estimate
-are shown. Before the needle can be seen, a few millimetres in, the tracker says where it must be:
-the first measurements are the entry point moved on.
-
-## Figure 4
-
-![mean and standard deviation of r1](images/paper_figure_4.png)
-
-Trials by cameras towards a plane 3 mm above the entry point, with pitch and roll that differ from
-trial to trial and that the controller does not know. Torsion: +-10 deg of play and a lag of 2 mm,
-likewise unknown.
-
-## The study of 10,000 runs
-
-![how far off the runs end](images/paper_study.png)
-
-The paper says neither whether its grid holds its bounds ("endpoint") or the middles of cells
-("cell": 0.9 of the bounds), nor whether "converged" means at the end or over a stretch. All four
-readings are in the table. The runs to 240 mm are the same runs, with the same noise, inserted
-farther.
-
-## Domain of attraction
-
-![share of starts that converge](images/paper_domain.png)
-
-The white box is what the paper's study covers. Depth 120 mm, +-1 mm noise.
-"""
 
 
 def page(results: PaperRuns) -> str:
     """Return the whole page."""
     lines = ["| what | paper | here | difference |", "| --- | --- | --- | --- |"]
     lines += ["| " + " | ".join(row) + " |" for row in table(results)]
-    return INTRODUCTION + "\n".join(lines) + "\n" + FIGURES
+    return _TEMPLATE.read_text("utf-8").replace("@ROWS@", "\n".join(lines))
 
 
 def table(results: PaperRuns) -> Iterator[Row]:
-    """Yield what, paper's value, ours, and one line on the difference."""
+    """Yield (quantity, value of the paper, value here, note on the difference)."""
     yield (
         "figure 3, open loop: r1 at 120 mm",
         '"rapidly diverged"; no number',
@@ -118,15 +72,6 @@ def table(results: PaperRuns) -> Iterator[Row]:
     yield from _study_rows(results)
     yield from _robustness_rows(results)
     yield from _curvature_rows(results)
-    for label, row in results.limits.items():
-        best, limit = row.best, row.limit
-        yield (
-            f"`best`, {label}, and the limit: plane, RMS of the last 20 mm; points, RMS and within "
-            "1 mm",
-            "-",
-            f"{_reached(best)}; limit {_reached(limit)}",
-            "the limit is a particle filter that knows the true model, with the laws of `best`",
-        )
 
 
 def key_figures(results: PaperRuns) -> dict[str, JsonValue]:
@@ -153,12 +98,6 @@ def key_figures(results: PaperRuns) -> dict[str, JsonValue]:
             f"{grid}_missed": missed,
             f"{grid}_missed_also_later": still,
             f"{grid}_missed_worst_later_mm": worst,
-        }
-    for label, row in results.limits.items():
-        key = re.sub("[^a-z0-9]+", "_", label)
-        values |= {
-            f"limit_{key}_rms_mm": row.limit.rms_mm,
-            f"limit_{key}_point_rms_mm": row.limit.point_rms_mm,
         }
     for scale in SCALES:
         key = f"kappa_scale_{scale:g}_converged_at_end".replace(".", "_")
@@ -239,11 +178,6 @@ def _curvature_rows(results: PaperRuns) -> Iterator[Row]:
         f"arc: 1/kappa {100.0 * errors.bias:+.1f} ± {100.0 * errors.spread:.1f} %",
         "noise along a short arc looks like curvature to a plain fit",
     )
-
-
-def _reached(reached: Reached) -> str:
-    share = 100.0 * reached.point_share
-    return f"{reached.rms_mm:.2f} mm, {reached.point_rms_mm:.2f} mm, {share:.1f} %"
 
 
 def _percent(figures: dict[str, JsonValue], key: str) -> str:
