@@ -1,1 +1,1 @@
-"""Figures of a run, or of two, and the frames of its film."""
+"""Figures and film of a run, or of two."""

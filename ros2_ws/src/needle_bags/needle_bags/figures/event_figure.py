@@ -1,4 +1,4 @@
-"""The run on the time axis: states, the hold, and whatever was not well."""
+"""Time line of a run: states, hold, warnings and faults."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ _STATE_COLORS = {
 _QUIET = "#d4d8dd"
 _LEVEL_COLORS = {1: MEASURED, 2: RED, 3: GREY}
 _LEVEL_NAMES = {1: "warning", 2: "error", 3: "stale"}
-_MOST_PARTS = 12
-_SHORTEST = 0.004
+_MAX_PARTS = 12
+_MIN_LENGTH = 0.004
 
 
 @dataclasses.dataclass(frozen=True)
 class Span:
-    """A lane's colour from `begin` to `end`, system clock [ns]."""
+    """Coloured part of a lane from `begin` to `end`, system clock [ns]."""
 
     begin: int
     end: int
@@ -55,14 +55,14 @@ class Lane:
 
 
 def lanes_of(run: Run) -> list[Lane]:
-    """Return the lanes of a run: controller, device, hold, then the parts that were not well."""
+    """Return the lanes of a run: controller, device, hold, then the parts with problems."""
     end = _end(run)
     lanes = [
-        Lane("controller", list(_states(run.controller_status, end))),
-        Lane("device", list(_states(run.device_status, end))),
+        Lane("controller", list(_state_spans(run.controller_status, end))),
+        Lane("device", list(_state_spans(run.device_status, end))),
     ]
     if len(run.holds):
-        lanes.append(Lane("hold", list(_pressed(run, end))))
+        lanes.append(Lane("hold", list(_hold_spans(run, end))))
     stops = [
         Span(result.log_time, result.log_time, RED) for result in run.results if is_aborted(result)
     ]
@@ -72,12 +72,14 @@ def lanes_of(run: Run) -> list[Lane]:
     lanes.append(Lane("watchdogs", tripped))
     health = health_of(run)
     parts = dict.fromkeys(event.part for event in health)
-    lanes += [Lane(part, list(_health(health, part, end))) for part in list(parts)[:_MOST_PARTS]]
+    lanes += [
+        Lane(part, list(_problem_spans(health, part, end))) for part in list(parts)[:_MAX_PARTS]
+    ]
     return [lane for lane in lanes if lane.spans]
 
 
 def event_figure(run: Run) -> Figure | None:
-    """Return the lanes drawn over seconds of wall time since the first command; None if empty."""
+    """Draw the lanes over the wall time since the first command; None without lanes."""
     lanes = lanes_of(run)
     if not lanes:
         return None
@@ -90,7 +92,7 @@ def event_figure(run: Run) -> Figure | None:
         for row, lane in enumerate(lanes):
             for color in dict.fromkeys(span.color for span in lane.spans):
                 bars = [
-                    ((s.begin - start) * 1e-9, max((s.end - s.begin) * 1e-9, _SHORTEST * length))
+                    ((s.begin - start) * 1e-9, max((s.end - s.begin) * 1e-9, _MIN_LENGTH * length))
                     for s in lane.spans
                     if s.color == color
                 ]
@@ -105,12 +107,12 @@ def event_figure(run: Run) -> Figure | None:
 
 
 def level_name(level: int) -> str:
-    """Return what a diagnostic's level is called."""
+    """Return the name of a diagnostic level."""
     return _LEVEL_NAMES.get(level, "?")
 
 
-def _states(statuses: Sequence[Status], end: int) -> Iterable[Span]:
-    """Yield one span for each stretch of one state."""
+def _state_spans(statuses: Sequence[Status], end: int) -> Iterable[Span]:
+    """Yield a span for each period of a state."""
     changes = [(s.log_time, s.values.get("state", "")) for s in statuses]
     begin, state = changes[0] if changes else (0, "")
     for time, now in changes:
@@ -121,7 +123,7 @@ def _states(statuses: Sequence[Status], end: int) -> Iterable[Span]:
         yield Span(begin, end, _STATE_COLORS.get(state, _QUIET))
 
 
-def _pressed(run: Run, end: int) -> Iterable[Span]:
+def _hold_spans(run: Run, end: int) -> Iterable[Span]:
     times, pressed = run.holds.received.tolist(), run.holds.values[:, 0] > 0.5
     begin = None
     for time, now in zip(times, pressed.tolist(), strict=True):
@@ -134,8 +136,8 @@ def _pressed(run: Run, end: int) -> Iterable[Span]:
         yield Span(begin, end, GOAL_BAND)
 
 
-def _health(health: Sequence[HealthEvent], part: str, end: int) -> Iterable[Span]:
-    """Yield the stretches in which a part was not well."""
+def _problem_spans(health: Sequence[HealthEvent], part: str, end: int) -> Iterable[Span]:
+    """Yield the periods in which a part had a problem."""
     events = [event for event in health if event.part == part]
     for event, after in zip(events, [*(e.log_time for e in events[1:]), end], strict=True):
         if event.level:

@@ -1,4 +1,4 @@
-"""Style of all figures of a run, and the units that people read."""
+"""Style of all figures."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any, BinaryIO
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-# Apart from each other also for who sees no red, green or blue, and from the ground in both modes.
+# Distinguishable with any colour vision deficiency, on light and dark backgrounds.
 INK = "#1b1b1b"
 TRUTH = "#8d9299"
 MEASURED = "#cf6a00"
 ESTIMATE = "#0067b1"
 GOAL_BAND = "#207a30"
 PLUM, TEAL, RED = "#7a1050", "#2099c0", "#b3140c"
-# Only for what may stand back: zero lines, and shadows.
+# For zero lines and shadows only.
 GREY = "#9aa0a8"
 BROAD: dict[str, Any] = {"color": TRUTH, "lw": 3.6, "solid_capstyle": "round"}
-"""The truth: so broad that a thin line on it hides nothing."""
+"""Style of the truth: broad, so that a thin line can be drawn over it."""
 THIN: dict[str, Any] = {"color": ESTIMATE, "lw": 1.3}
 DASHED, DOTTED = (0, (4, 2)), (0, (1, 1.4))
 AXES: dict[str, dict[str, Any]] = {
@@ -27,9 +27,9 @@ AXES: dict[str, dict[str, Any]] = {
     "z (along)": {"color": TEAL, "lw": 1.3, "ls": DOTTED},
 }
 MM = 1e3
-# Narrow, so that the text can still be read on a phone [inch].
+# Narrow enough to read the text on a phone [inch].
 WIDTH = 5.6
-# Room for five digits and a label; an axis with its label; a title [inch].
+# Space for five digits and a label; an axis with its label; a title [inch].
 _MARGINS = {"left": 0.75, "right": 0.12, "bottom": 0.5, "top": 0.3}
 STYLE: dict[Any, Any] = {
     "font.size": 9.5,
@@ -60,18 +60,18 @@ def png_size(png: bytes) -> tuple[int, int]:
 
 
 def place(figure: Figure, rows: int, *, gap: float = 0.34, **margins: float) -> None:
-    """Place a figure's axes by fixed margins: a layout engine measures all text twice more.
+    """Place the axes of a figure by fixed margins; a layout engine takes three times as long.
 
     Parameters
     ----------
     figure : Figure
-        Its axes are in a grid.
+        A figure with a grid of axes.
     rows : int
-        Of the grid.
+        Rows of the grid.
     gap : float
-        Between rows: a title, and an axis with its label where each row has one [inch].
+        Space between rows, for a title and an axis with its label [inch].
     **margins : float
-        `left`, `right`, `bottom` and `top`, where others are needed [inch].
+        `left`, `right`, `bottom` and `top`, if not the defaults [inch].
     """
     width, height = figure.get_size_inches()
     left, right, bottom, top = (margins.get(side, inch) for side, inch in _MARGINS.items())

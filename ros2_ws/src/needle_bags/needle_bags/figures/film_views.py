@@ -1,4 +1,4 @@
-"""Views of a film: the cameras' pictures, the needle from the side and from above."""
+"""Views of the film: camera images, and drawings from the side and from above."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ Floats = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 Projection = Callable[[Floats], Floats]
 
-MOST_BYTES = 30_000
-"""Of a camera's picture: a film of both has 3.7 MB at most, 5 MB as text."""
+MAX_BYTES = 30_000
+"""Size limit of a camera image; a film of both cameras has at most 3.7 MB, 5 MB as text."""
 _LARGEST_PX = (480, 400)
-# The first that is small enough.
+# Tried in this order.
 _QUALITIES = (75, 60, 45, 30, 15, 5, 1)
-_MOST_POINTS = 24
-_FAR_PX = 1e4
+_MAX_POINTS = 24
+_MAX_COORDINATE_PX = 1e4
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """One picture of the film, or one for each frame, with what is drawn over it.
+    """A picture for all frames, or one for each, with the needle drawn over it.
 
     Attributes
     ----------
     name : str
-        What it is.
+        Caption.
     size : tuple of int
-        Width and height in which `lines` count [px].
+        Width and height of the coordinates in `lines` [px].
     pictures : sequence of bytes
-        JPEG for each frame, empty where the bag has none; or one PNG for all frames.
+        A JPEG for each frame, empty if the bag has none; or one PNG for all frames.
     lines : sequence of (n, 2) float64
-        The needle in each frame, from the entry point to the tip; empty: none is drawn.
+        The needle in each frame, from the entry point to the tip; empty: not drawn.
     """
 
     name: str
@@ -66,13 +66,13 @@ class View:
 
     @property
     def is_chart(self) -> bool:
-        """Whether one drawing serves all frames."""
+        """Whether there is one drawing for all frames."""
         return len(self.pictures) == 1 and self.pictures[0].startswith(b"\x89PNG")
 
 
 def projections(run: Run) -> dict[str, Projection]:
-    """Return how each camera sees points of `rig`; empty where the bag does not tell."""
-    # A run without images needs nothing that is compiled.
+    """Return the projections of both cameras; empty without a calibration."""
+    # Compiled code, which a run without images does not need.
     from needle_tracker.optics.refraction import stereo_views  # noqa: PLC0415
 
     try:
@@ -86,16 +86,16 @@ def projections(run: Run) -> dict[str, Projection]:
 def camera_views(
     run: Run, frames: Sequence[Frame], whole: Collection[int]
 ) -> tuple[list[View], dict[tuple[int, str], Image]]:
-    """Return what the cameras saw, and some of the images as they were.
+    """Return the camera views, and some of the images in full size.
 
     Parameters
     ----------
     run : Run
         The run; its images are read.
     frames : sequence of Frame
-        The film.
+        Frames of the film.
     whole : collection of int
-        Frames whose images are returned as they were, by frame and side.
+        Frames whose images are returned in full size, by frame and side.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def camera_views(
 
 
 def plan_views(run: Run, frames: Sequence[Frame]) -> list[View]:
-    """Return the needle from the side, with what it is steered to, and from above."""
+    """Return drawings of needle and target from the side and from above."""
     names = {0: "from the side, with the wanted plane", 1: "from above"}
     return [_plan_view(run, frames, axis, name) for axis, name in names.items()]
 
@@ -186,16 +186,16 @@ def _target_point(run: Run) -> Floats | None:
 
 
 def _pixels(project: Projection | None, needle: Floats) -> Floats:
-    """Return where a needle is drawn, of few points, (n, 2)."""
+    """Return the pixels of a needle, thinned out, (n, 2)."""
     if project is None or not len(needle):
         return np.empty((0, 2))
-    chosen = np.unique(np.linspace(0, len(needle) - 1, _MOST_POINTS).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(needle) - 1, _MAX_POINTS).round().astype(int))
     line = np.asarray(project(needle[chosen]), np.float64)
-    return np.clip(line[np.isfinite(line).all(axis=1)], -_FAR_PX, _FAR_PX)
+    return np.clip(line[np.isfinite(line).all(axis=1)], -_MAX_COORDINATE_PX, _MAX_COORDINATE_PX)
 
 
 def _small_jpeg(image: Image) -> bytes:
-    """Return an image as a JPEG of `_LARGEST_PX` and `MOST_BYTES` at most."""
+    """Return an image as a JPEG of at most `_LARGEST_PX` and `MAX_BYTES`."""
     height, width = image.shape
     scale = min(1.0, _LARGEST_PX[0] / width, _LARGEST_PX[1] / height)
     size = (max(round(width * scale), 1), max(round(height * scale), 1))
@@ -204,6 +204,6 @@ def _small_jpeg(image: Image) -> bytes:
     for quality in _QUALITIES:
         done, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
         data = bytes(encoded) if done else b""
-        if len(data) <= MOST_BYTES:
+        if len(data) <= MAX_BYTES:
             break
     return data

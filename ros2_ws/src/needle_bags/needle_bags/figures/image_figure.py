@@ -1,4 +1,4 @@
-"""The images of a run with the tip drawn in: measured, and where the truth says it is."""
+"""Camera images of a run with the measured and the true tip."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _HALF_WIDTH_PX = 110
 
 
 def frames_shown(run: Run, frames: Sequence[Frame]) -> list[int]:
-    """Return which frames of a film are shown: of measured tips, spread over the insertion."""
+    """Return the frames to show: some with a measured tip, spread over the insertion."""
     seen = [index for index, frame in enumerate(frames) if len(frame.shaft)]
     if not seen:
         return []
@@ -37,8 +37,8 @@ def images_figure(
 ) -> Figure | None:
     """Return a few exposures of both cameras, cut out around the tip; None without images.
 
-    Each column is one exposure. The circle is the measured tip projected back into the image
-    through the calibration in the bag, the cross is the truth.
+    Each column is one exposure. The circle is the measured tip, projected with the calibration in
+    the bag; the cross is the truth.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The figures of a run's report, drawn from its bag; millimetres and degrees for people."""
+"""Figures of states, path and errors over the insertion, in mm and degrees."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _MEASURED_DOTS: dict[str, Any] = {
 
 
 def states_figure(run: Run) -> Figure:
-    """Return [KC09] figure 3's four rows: r1, r2, r3 and the accumulated rotation."""
+    """Return the four rows of [KC09] figure 3: r1, r2, r3 and the accumulated rotation."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 7.6))
         place(figure, 4)
@@ -81,7 +81,7 @@ def states_figure(run: Run) -> Figure:
                 label="base of the needle, measured",
             )
         if rerun_of(run):
-            _draw_not_steered(rotation, run)
+            _draw_rerun_commands(rotation, run)
         elif len(run.control_input):
             rotation.plot(
                 _insertion_mm(run, run.control_input),
@@ -97,8 +97,8 @@ def states_figure(run: Run) -> Figure:
         return figure
 
 
-def _draw_not_steered(axes: Any, run: Run) -> None:
-    """Draw what a rerun would have commanded: a stick for each step, from where the base was."""
+def _draw_rerun_commands(axes: Any, run: Run) -> None:
+    """Draw the commands of a rerun: a line for each step, from the recorded rotation."""
     insertion, begin, end = commanded_rotation(run).T
     step = run.commands.values[:, 0]
     gap = np.full(len(begin), np.nan)
@@ -118,7 +118,7 @@ def path_figure(run: Run) -> Figure:
         grid = figure.add_gridspec(2, 2, height_ratios=[1.0, 1.5])
         side = figure.add_subplot(grid[0, :])
         above = figure.add_subplot(grid[1, 0])
-        # In a grid its labels would be cut off.
+        # A grid would cut off its labels.
         space = figure.add_axes((0.53, 0.06, 0.42, 0.44), projection="3d")
         tips = finite_tips(run).values * MM
         truth = run.truth.values[:, :3] * MM
@@ -142,7 +142,7 @@ def path_figure(run: Run) -> Figure:
 
 
 def error_figure(run: Run) -> Figure:
-    """Return the measurement's and the estimate's error against the truth."""
+    """Return the errors of measurement and estimate against the truth."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 5.0))
         place(figure, 2, right=0.7)

@@ -1,4 +1,4 @@
-"""Figures of two runs over each other."""
+"""Figures that compare two runs."""
 
 from __future__ import annotations
 
@@ -55,20 +55,20 @@ def pair_figures(first: Run, second: Run) -> dict[str, Figure]:
 
 
 def is_same_needle(runs: tuple[Run, Run]) -> bool:
-    """Return whether both runs are of one insertion: at least one is a rerun of it."""
+    """Return whether both runs are of one insertion, because one is a rerun."""
     first, second = (run.joints.values for run in runs)
     return any(rerun_of(run) for run in runs) and np.array_equal(first, second)
 
 
 def _needles(runs: tuple[Run, Run]) -> list[tuple[str, str, Run]]:
-    """Return (letter, colour, run) of each needle: one where both runs are of the same."""
+    """Return (letter, colour, run) of each needle; one if both runs share it."""
     if is_same_needle(runs):
         return [("A and B", TRUTH, runs[0])]
     return list(zip(LETTERS, _COLORS, runs, strict=True))
 
 
 def _states(runs: tuple[Run, Run]) -> Figure:
-    """Draw figure 3's rows: truth broad, estimate thin; and what was commanded."""
+    """Draw the rows of figure 3, truth broad and estimate thin, and the commands."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 10.4))
         place(figure, 5, bottom=1.0)

@@ -1,4 +1,4 @@
-"""Figures of what happened at each tip: innovation, gate, and the time that each stage took."""
+"""Figures of each step: innovation, gate, and duration of the stages."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from needle_bags.run.stage_timing import StageTiming
 
 
 def innovation_figure(run: Run, found: Innovations) -> Figure:
-    """Return innovation, its size beside what is expected, and the room left to the gate."""
+    """Return innovation, its normalised square, and the margin to the gate."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 6.6))
         place(figure, 3)
@@ -50,7 +50,7 @@ def innovation_figure(run: Run, found: Innovations) -> Figure:
         for column, (name, style) in enumerate(AXES.items()):
             parts.plot(insertion, found.values[:, column] * MM, **style, label=name)
         parts.axhline(0.0, color=GREY, lw=0.8)
-        # The first tips are known so badly that their band would hide all the others.
+        # The band of the first tips would exceed the range of all others.
         top = 1.25 * max(np.abs(found.values).max() * MM, float(np.median(band)))
         parts.set(title="Innovation: measured minus expected tip", ylabel="mm", ylim=(-top, top))
         parts.legend(loc="best", ncols=2)
@@ -95,7 +95,7 @@ def _draw_gate(axes: Any, run: Run) -> None:
 
 
 def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
-    """Return the wall time of each stage of every step."""
+    """Return the wall time of the stages of every step."""
     marks = ("o", "^", "s", "x", "+", "v")
     colors = (ESTIMATE, MEASURED, PLUM, RED, INK, TEAL)
     with mpl.rc_context(STYLE):
@@ -113,7 +113,7 @@ def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
 
 
 def _scale_by_tens(axes: Any) -> None:
-    """Make a logarithmic axis with plain numbers: typeset powers cost what a small figure does."""
+    """Make a logarithmic axis with plain numbers; rendering typeset powers is slow."""
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(LogFormatter())

@@ -1,1 +1,1 @@
-"""The needle for programs that speak OpenIGTLink, such as 3D Slicer."""
+"""OpenIGTLink server for programs such as 3D Slicer."""

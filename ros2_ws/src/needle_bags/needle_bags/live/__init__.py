@@ -1,1 +1,1 @@
-"""Picture of a needle while it is steered: no ROS."""
+"""Live view of the needle for ROS viewers."""

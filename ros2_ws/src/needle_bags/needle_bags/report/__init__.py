@@ -1,1 +1,1 @@
-"""A run, or two, as a page: what it says, and in which words."""
+"""HTML pages of a run, or of two."""

@@ -1,4 +1,4 @@
-"""`report`: what a bag alone tells of a run, or two bags of two, as a page with figures."""
+"""`report`: the report of a run from its bag, or the comparison of two runs, as a web page."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def write_report(run: Run, summary: dict[str, JsonValue], directory: Path | None
     summary : dict
         Its figures (`run_summary.summarize`).
     directory : Path, optional
-        Where to; the bag's directory by default, or `<file>_report` beside a single file.
+        Destination; by default the bag's directory, or `<file>_report` beside a single file.
 
     Returns
     -------
@@ -100,7 +100,7 @@ def write_pair_report(
     runs, summaries : pairs
         Both runs and their figures.
     directory : Path, optional
-        Where to; the second bag's directory by default.
+        Destination; by default the directory of the second bag.
 
     Returns
     -------
@@ -119,7 +119,7 @@ def write_pair_report(
 
 
 def _folder(run: Run) -> Path:
-    """Return where a run's report goes: its bag's directory, or a folder beside its file."""
+    """Return the default destination of a report."""
     stem = run.path.name.removesuffix(".zstd").removesuffix(".mcap")
     return run.path.with_name(f"{stem}_report") if run.path.is_file() else run.path
 
@@ -144,7 +144,7 @@ def _png(figure: Figure) -> bytes:
 
 
 def figures_of(run: Run, timings: Sequence[StageTiming]) -> dict[str, Figure | None]:
-    """Return a run's figures but its images by their file's name, None where nothing is in one.
+    """Return the figures of a run except images, by file name; None without data.
 
     Parameters
     ----------

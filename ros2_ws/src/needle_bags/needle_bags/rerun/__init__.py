@@ -1,1 +1,1 @@
-"""A bag's inputs through today's code, beside what was recorded."""
+"""Recorded inputs processed by the current code."""

@@ -1,4 +1,4 @@
-"""A bag's inputs through today's code, recorded outputs beside today's."""
+"""Processes the inputs of a bag with the current code; collects recorded and new outputs."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from needle_core.message_types import rosbags_types
 POSE = "needle/tip_pose"
 TIP_TOPICS = ("needle/tip", POSE)
 
-# What was asked so shortly before the bag's end may not have its answer in it [ns].
-_LAST_ANSWERS = 500_000_000
+# The answers to inputs this short before the end of the bag may be missing from it [ns].
+_END_MARGIN = 500_000_000
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 CONVERTER = Converter(rosbags_types(_STORE))
-"""Makes messages as rosbags has them."""
+"""Converts to rosbags messages."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """A message that today's code puts out.
+    """A message of the current code.
 
     Attributes
     ----------
     topic : str
         Relative name.
     log_time : int
-        When what led to it was received [ns].
+        Log time of the input that caused it [ns].
     stamp : int
-        Its own stamp [ns].
+        Stamp of the message [ns].
     message : Any
-        The message, as rosbags has it.
+        The message, of rosbags' class.
     """
 
     topic: str
@@ -65,41 +65,41 @@ class Output:
 
 
 class Stage(Protocol):
-    """A part of the rig that takes messages and puts some out."""
+    """A part of the rig that turns messages into outputs."""
 
     @property
     def topics(self) -> frozenset[str]:
-        """Names of what it takes, relative to the rig's namespace, or absolute."""
+        """Names of its input topics, relative to the rig's namespace, or absolute."""
         ...
 
-    def take(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
-        """Take a message of a topic, by its relative name; return what it led to."""
+    def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
+        """Process a message of a topic, by its relative name; return the outputs."""
         ...
 
 
 class FinishingStage(Stage, Protocol):
-    """A stage that may have something left when the bag ends."""
+    """A stage that may have outputs left at the end of the bag."""
 
     def finish(self, log_time: int) -> list[Output]:
-        """Return what is left."""
+        """Return the remaining outputs."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Rerun:
-    """Both sides of a bag that was run again.
+    """Result of a rerun.
 
     Attributes
     ----------
     recorded, today : list of Record
-        What is compared.
+        Records to compare.
     outputs : list of Output
-        Today's, as they came.
+        Outputs of the current code, in order.
     tips_without_images : int
-        Recorded answers of the tracker whose images are not in the bag.
+        Number of recorded tracker answers whose images are not in the bag.
     unanswered : int
-        Recorded pairs that the tracker never answered, since it did not hear them: before it knew
-        the cameras, or where its queue was full. They are left out.
+        Number of recorded pairs that the tracker never received: before it knew the cameras, or
+        when its queue was full. They are left out.
     """
 
     recorded: list[Record]
@@ -116,21 +116,21 @@ def has_images(run: Run) -> bool:
 
 
 def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None) -> Rerun:
-    """Take a bag through the stages.
+    """Process a bag with the stages.
 
     Parameters
     ----------
     run : Run
         The run; its bag is read again.
     tracker : FinishingStage or None
-        What takes the images; None without images.
+        Processes the images; None without images.
     controller : Stage or None
-        What takes the tips, as recorded; None where no controller was recorded.
+        Processes the recorded tips; None if no controller was recorded.
 
     Returns
     -------
     Rerun
-        Outputs beside the recorded ones.
+        New and recorded outputs.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
     recorded: list[Record] = []
     outputs: list[Output] = []
     exposed: set[int] = set()
-    # The tracker answers every pair that it hears.
+    # The tracker answers every pair that it receives.
     answered = set(run.tip_covariances.stamps.tolist())
     without_images = last_time = unanswered = 0
     for topic, sent, message in _inputs(run, watched | _topics(tracker)):
@@ -160,7 +160,7 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
             stamp = nanoseconds(message.header.stamp)
             recorded.append(Record(topic, stamp, dict(members(message))))
         if tracker is not None and topic in tracker.topics:
-            outputs += tracker.take(topic, sent, message)
+            outputs += tracker.process(topic, sent, message)
     if tracker is not None:
         outputs += tracker.finish(last_time)
         kept = [r for r in recorded if r.topic not in TIP_TOPICS or r.stamp in exposed]
@@ -169,8 +169,8 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
         )
         recorded = kept
     if controller is not None:
-        for topic, sent, message in _inputs(run, controller.topics, _in_hearing_order(run)):
-            outputs += controller.take(topic, sent, message)
+        for topic, sent, message in _inputs(run, controller.topics, _by_reception(run)):
+            outputs += controller.process(topic, sent, message)
     today = [
         Record(o.topic, o.stamp, dict(members(o.message)))
         for o in _recordable(recorded, outputs, last_time)
@@ -179,7 +179,7 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
 
 
 def run_stage(run: Run, stage: FinishingStage) -> list[Output]:
-    """Take a bag through one stage, in the order of sending; return what it puts out.
+    """Process a bag with one stage, in the order of sending; return its outputs.
 
     Raises
     ------
@@ -190,32 +190,32 @@ def run_stage(run: Run, stage: FinishingStage) -> list[Output]:
     last_time = 0
     for topic, sent, message in _inputs(run, stage.topics):
         last_time = max(last_time, sent.log_time)
-        outputs += stage.take(topic, sent, message)
+        outputs += stage.process(topic, sent, message)
     return outputs + stage.finish(last_time)
 
 
 def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Output]:
-    """Take a bag's joints through the controller with other tips than the recorded ones.
+    """Process the joints of a bag with the controller, and tips that replace the recorded ones.
 
     Parameters
     ----------
     run : Run
         The run; its bag is read again.
     controller : Stage
-        What takes the tips.
+        Processes the tips.
     answers : sequence of Output
-        What today's tracker said; it stands for the recorded answers of the same stamps.
+        Answers of the current tracker; they replace the recorded answers of the same stamps.
 
     Returns
     -------
     list of Output
-        What the controller puts out.
+        Outputs of the controller.
     """
     today = {(answer.topic, answer.stamp): answer.message for answer in answers}
     answered = {answer.stamp for answer in answers}
     recorded = set(run.tips.stamps.tolist())
     outputs: list[Output] = []
-    for topic, sent, message in _inputs(run, controller.topics, _in_hearing_order(run)):
+    for topic, sent, message in _inputs(run, controller.topics, _by_reception(run)):
         stamp = nanoseconds(message.header.stamp) if topic in TIP_TOPICS else 0
         if topic not in TIP_TOPICS or stamp not in answered:
             taken = {topic: message}
@@ -225,7 +225,7 @@ def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Out
             taken = {topic: today.get((topic, stamp))}
         for name, content in taken.items():
             if name in controller.topics and content is not None:
-                outputs += controller.take(name, sent, content)
+                outputs += controller.process(name, sent, content)
     return outputs
 
 
@@ -237,7 +237,7 @@ def estimate_errors(run: Run, outputs: Sequence[Output] | None) -> npt.NDArray[n
     run : Run
         The run, with its truth.
     outputs : sequence of Output or None
-        Today's; None for the recorded estimates.
+        Outputs of the current code; None for the recorded estimates.
 
     Returns
     -------
@@ -260,13 +260,13 @@ def estimate_errors(run: Run, outputs: Sequence[Output] | None) -> npt.NDArray[n
 def _recordable(
     recorded: Sequence[Record], outputs: Sequence[Output], end: int
 ) -> Iterator[Output]:
-    """Yield outputs without the last ones of a bag that ended before their like was recorded."""
+    """Yield the outputs except those at the end that the bag could not record any more."""
     last: dict[str, int] = {}
     for record in recorded:
         last[record.topic] = max(record.stamp, last.get(record.topic, 0))
     for output in outputs:
         newer = output.stamp > last.get(output.topic, 0)
-        if not (newer and output.log_time > end - _LAST_ANSWERS):
+        if not (newer and output.log_time > end - _END_MARGIN):
             yield output
 
 
@@ -274,14 +274,14 @@ def _topics(stage: Stage | None) -> frozenset[str]:
     return frozenset() if stage is None else stage.topics
 
 
-def _in_hearing_order(run: Run) -> Reorder:
+def _by_reception(run: Run) -> Reorder:
     return functools.partial(in_reception_order, namespace=run.namespace)
 
 
 def _inputs(
     run: Run, relative: Set[str], reorder: Reorder | None = None
 ) -> Iterator[tuple[str, SentMessage, Any]]:
-    """Yield (relative topic, as sent, message) of these topics, with a bar."""
+    """Yield (relative topic, raw message, message) of these topics, with a progress bar."""
     names = {name if name.startswith("/") else run.namespace + name: name for name in relative}
     messages = messages_as_sent(
         run.path, lambda name: name in names, lambda name: names[name] in IMAGE_TOPICS, reorder

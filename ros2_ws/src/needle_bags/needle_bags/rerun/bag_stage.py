@@ -1,4 +1,4 @@
-"""A component on a bag's messages, without a node or a graph."""
+"""Runs a component on the messages of a bag."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from needle_core.runners.bag import BagRunner
 
 
 class BagStage:
-    """A component in the place of its node: recorded messages in, today's out.
+    """A component that processes recorded messages.
 
     Parameters
     ----------
     component : Component
         The component.
     received : iterable of str
-        Its topics that somebody receives.
+        Its output topics that have a subscriber.
 
     Attributes
     ----------
     runner : BagRunner
-        What runs it.
+        Runner of the component.
     """
 
     def __init__(self, component: Component, received: Iterable[str]) -> None:
@@ -39,18 +39,18 @@ class BagStage:
 
     @property
     def topics(self) -> frozenset[str]:
-        """Relative names of what it takes."""
+        """Relative names of its input topics."""
         return frozenset(self._rows)
 
-    def take(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
-        """Take a message of a topic, by its relative name; return what it led to."""
+    def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
+        """Process a message of a topic, by its relative name; return the outputs."""
         row, at = self._rows[topic], Moment(sent.time * 1e-9, sent.time, sent.time)
         plain = plain_image(message) if row.message is Image else message
         published = self.runner.deliver(row.topic, from_ros(row.message, plain), at)
         return [_output(action, sent.log_time) for action in published]
 
     def finish(self, log_time: int) -> list[Output]:
-        """Return what still waited for something at the bag's end."""
+        """Return the outputs that remain at the end of the bag."""
         published = self.runner.finish(Moment(math.inf, log_time))
         return [_output(action, log_time) for action in published]
 

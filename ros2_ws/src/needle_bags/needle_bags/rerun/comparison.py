@@ -1,9 +1,9 @@
-"""Recorded outputs beside today's, message by message and field by field.
+"""Comparison of recorded and recomputed messages, field by field.
 
-Why there are tolerances at all: on one machine with one set of libraries the same input gives the
-same bits, and every difference is 0. Another processor or another version of numpy, OpenCV or LLVM
-rounds differently in the last digits, and a filter over 120 steps carries that on. Each tolerance
-is far above what rounding does (some 1e-12 relative) and far below what the quantity is good for.
+On one machine with one set of libraries the same input gives the same bits. Another processor or
+another version of numpy, OpenCV or LLVM rounds differently in the last digits, and a filter
+propagates that over 120 steps. Each tolerance is far above rounding errors (some 1e-12 relative)
+and far below the accuracy of the quantity.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ COVARIANCE = Tolerance("of sigmas", 0.0, 1e-3, "nobody knows a variance to a tho
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """A part of a message that is compared as one.
+    """A part of a message that is compared as a unit.
 
     Attributes
     ----------
     name : str
-        What it is called in the report.
+        Name in the report.
     paths : tuple of str
         Its members in the message, such as `vector.x`.
     tolerance : Tolerance
-        What it may differ by.
+        Allowed difference.
     """
 
     name: str
@@ -99,12 +99,12 @@ FIELDS: Mapping[str, tuple[Field, ...]] = {
         Field("duration", tuple(f"points.{k}.time_from_start" for k in range(3)), DURATION),
     ),
 }
-"""Relative topic to what is compared within the tolerance of its kind; the rest must be equal."""
+"""Relative topic to its fields with a tolerance; all other members must be equal."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """One message: its relative topic, its stamp [ns] and its members by path."""
+    """A message: relative topic, stamp [ns] and members by path."""
 
     topic: str
     stamp: int
@@ -118,13 +118,13 @@ class FieldResult:
     Attributes
     ----------
     topic, field, unit : str
-        Which one.
+        Topic, field and unit.
     compared, differing : int
-        Messages that both have, and those of them that differ by more than the tolerance.
+        Number of common messages, and of those that differ by more than the tolerance.
     largest : float
-        Largest difference, in `unit`; infinite where only one is a number, or texts differ.
+        Largest difference, in `unit`; infinite if only one is a number, or texts differ.
     first : int or None
-        Stamp of the first message that differs [ns].
+        Stamp of the first differing message [ns].
     """
 
     topic: str
@@ -138,7 +138,7 @@ class FieldResult:
 
 @dataclasses.dataclass(frozen=True)
 class TopicResult:
-    """The messages of one topic that only one side has, by stamp [ns]."""
+    """Messages of a topic that only one side has, by stamp [ns]."""
 
     topic: str
     recorded: int
@@ -156,21 +156,21 @@ class Comparison:
 
     @property
     def changed(self) -> bool:
-        """Tell whether anything differs."""
+        """Whether anything differs."""
         return any(t.missing or t.extra for t in self.topics) or any(
             field.differing for field in self.fields
         )
 
 
 def members(message: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield (path, value) of a message of rosbags; arrays of numbers and durations stay whole.
+    """Yield (path, value) of a message of rosbags; large arrays and durations stay whole.
 
     Parameters
     ----------
     message : dataclass instance
         A deserialised message.
     path : str
-        What stands before its own members.
+        Prefix of the paths.
     """
     for field in dataclasses.fields(message):
         if field.name.startswith("__"):
@@ -204,7 +204,7 @@ def compare(recorded: Iterable[Record], today: Iterable[Record]) -> Comparison:
     Parameters
     ----------
     recorded, today : iterable of Record
-        Both sides, each topic in its own order; messages of one stamp are matched in that order.
+        Both sides; messages of a topic with equal stamps are matched in their order.
 
     Returns
     -------
@@ -258,7 +258,7 @@ def _compare_field(topic: str, field: Field, pairs: _Pairs) -> FieldResult:
         if a.shape != b.shape:
             difference, allowed = np.array([math.inf]), np.zeros(1)
         elif tolerance is COVARIANCE:
-            difference, allowed = _of_sigmas(a, b), np.full(a.shape, tolerance.relative)
+            difference, allowed = _relative_to_sigmas(a, b), np.full(a.shape, tolerance.relative)
         else:
             if field.name == ORIENTATION and float(a @ b) < 0.0:
                 b = -b  # the same rotation
@@ -272,7 +272,7 @@ def _compare_field(topic: str, field: Field, pairs: _Pairs) -> FieldResult:
 
 
 def _compare_rest(topic: str, known: Sequence[Field], pairs: _Pairs) -> FieldResult:
-    """Compare what has no tolerance: names and frames, which are equal or not."""
+    """Compare the members without a tolerance, such as names and frames."""
     skipped = {path for field in known for path in field.paths} | {"header.stamp"}
     different = []
     for stamp, old, new in pairs:
@@ -298,7 +298,7 @@ def _numbers(field: Field, values: Values) -> Floats:
 
 
 def _difference(a: Floats, b: Floats) -> Floats:
-    """Return |a - b|; 0 where both are the same infinity or both no number, else infinite there."""
+    """Return |a - b|; 0 for equal infinities or two NaN, infinite if only one is a number."""
     with np.errstate(invalid="ignore"):
         difference: Floats = np.abs(a - b)
     difference[(a == b) | (np.isnan(a) & np.isnan(b))] = 0.0
@@ -306,8 +306,8 @@ def _difference(a: Floats, b: Floats) -> Floats:
     return difference
 
 
-def _of_sigmas(a: Floats, b: Floats) -> Floats:
-    """Return the difference of two covariances (flat, square) in products of their sigmas."""
+def _relative_to_sigmas(a: Floats, b: Floats) -> Floats:
+    """Return the difference of two flat covariance matrices relative to their sigmas."""
     size = math.isqrt(len(a))
     with np.errstate(invalid="ignore"):
         variances = np.abs(np.diagonal(a.reshape(size, size)))

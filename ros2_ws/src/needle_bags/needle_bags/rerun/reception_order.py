@@ -1,7 +1,7 @@
-"""The messages of a bag that the controller heard, in the order in which it heard them.
+"""Messages of a bag in the order in which the controller received them.
 
-needle/controller_status tells what the controller had heard since the status before, message by
-message (`needle_controller.protocol.heard_messages`).
+needle/controller_status lists the messages received since the previous status
+(`needle_controller.protocol.heard_messages`).
 """
 
 from __future__ import annotations
@@ -21,47 +21,46 @@ _STORE = get_typestore(Stores.ROS2_JAZZY)
 def in_reception_order(
     messages: list[SentMessage], namespace: str
 ) -> list[tuple[int, SentMessage]]:
-    """Return the messages with the times by which the controller had heard them, in their order.
+    """Return the messages with their times of reception by the controller, in that order.
 
     Parameters
     ----------
     messages : list of SentMessage
-        Everything small in a bag.
+        All small messages of a bag.
     namespace : str
-        Of the rig's topics, `/` or with one at its end.
+        Namespace of the rig's topics, ends with `/`.
 
     Returns
     -------
     list of tuple
-        Time [ns] and message: that of sending, or the least later one that keeps the order of
-        hearing. Topics that no status tells of count as heard when they were sent. What was sent
-        before the last of its topic that was heard, and is told by no status, is left out.
+        Time [ns] and message: the time of sending, or the earliest later one that keeps the order
+        of reception. Messages of topics that no status lists are received when they were sent. A
+        message that is not listed, although a later one of its topic is, is left out.
     """
     ordered = sorted(messages, key=lambda m: (m.time, m.log_time))
-    heard_at: dict[tuple[str, int], int] = {}
+    received_at: dict[tuple[str, int], int] = {}
     time = 0
-    told = list(_told(ordered, namespace))
-    for status, heard in told:
-        for topic, sent_ns in heard:
+    for status, received in _statuses(ordered, namespace):
+        for topic, sent_ns in received:
             time = max(time + 1, sent_ns)
-            heard_at.setdefault((namespace + topic, sent_ns), time)
-        # A status comes after what it tells of.
-        time = heard_at[status.topic, status.time] = max(time + 1, status.time)
+            received_at.setdefault((namespace + topic, sent_ns), time)
+        # A status follows the messages that it lists.
+        time = received_at[status.topic, status.time] = max(time + 1, status.time)
     last: dict[str, int] = {}
-    for topic, sent_ns in heard_at:
+    for topic, sent_ns in received_at:
         last[topic] = max(sent_ns, last.get(topic, 0))
-    # What no status tells of any more was heard after the last one.
+    # Messages after the last status were received after it.
     rest = dict.fromkeys(last, time + 1)
     timed = [
-        (heard_at.get((m.topic, m.time)) or max(m.time, rest.get(m.topic, 0)), m)
+        (received_at.get((m.topic, m.time)) or max(m.time, rest.get(m.topic, 0)), m)
         for m in ordered
-        if (m.topic, m.time) in heard_at or m.time >= last.get(m.topic, 0)
+        if (m.topic, m.time) in received_at or m.time >= last.get(m.topic, 0)
     ]
     # Equal times keep the order of sending.
     return sorted(timed, key=lambda pair: pair[0])
 
 
-def _told(
+def _statuses(
     messages: Iterable[SentMessage], namespace: str
 ) -> Iterator[tuple[SentMessage, list[HeardMessage]]]:
     for message in messages:

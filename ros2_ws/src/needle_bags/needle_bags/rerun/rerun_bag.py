@@ -1,4 +1,4 @@
-"""A copy of a bag that has today's outputs in place of the recorded ones."""
+"""Writes a copy of a bag with the outputs of the current code."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def write_rerun(
     *,
     shown: Sequence[Output] = (),
 ) -> None:
-    """Write the copy, and `outputs.txt` beside it: today's outputs to be read, and diffed.
+    """Write the copy, and its outputs as text into `outputs.txt`.
 
     Parameters
     ----------
@@ -42,14 +42,14 @@ def write_rerun(
     target : Path
         The new bag's directory.
     outputs : sequence of Output
-        Today's. Topics that are in none keep what was recorded; of the tracker's topics also the
-        stamps that are in none (their images are not in the bag).
+        Outputs of the current code. Other topics keep the recorded messages, and the tracker's
+        topics those of the stamps without outputs (their images are not in the bag).
     parameters : mapping
-        Full node name to the parameters that were used.
+        Full node name to its parameters.
     calibration : str
-        The calibration that was used.
+        The calibration.
     shown : sequence of Output
-        What viewers show today, in place of all that the bag has on these topics.
+        Outputs of the viewers, which replace all recorded messages of their topics.
 
     Raises
     ------
@@ -95,12 +95,12 @@ def write_rerun(
 def _changed(
     run: Run, custom: Mapping[str, str], parameters: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, str]:
-    """Return what the copy says of itself beside what the bag said."""
+    """Return the custom data that differ from those of the original bag."""
     every = {**run.parameters, **{name: _plain(values) for name, values in parameters.items()}}
     document = {name: {"ros__parameters": values} for name, values in every.items()}
     presets = {v["preset"] for v in parameters.values() if "preset" in v}
     info = {**run.run_info, "rerun_of": run.path.absolute().name}
-    # That of the run, in which the needle went in.
+    # The command of the original run does not make this bag.
     info.pop("command", None)
     if steered_by(run) is not None:
         info["steered_by"] = steered_by(run)

@@ -1,4 +1,4 @@
-"""Findings of a rerun, as a person reads them and as flat JSON."""
+"""Result of a rerun as text and as flat JSON."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def tolerance_table() -> str:
 
 
 def describe(run: Run, comparison: Comparison) -> str:
-    """Return what differs and where, a line for each field that does.
+    """Return a line for each differing field.
 
     Parameters
     ----------
     run : Run
-        The run, to say where in the insertion.
+        The run, for the insertion depths.
     comparison : Comparison
-        What was compared.
+        The comparison.
     """
     lines = [_missing(run, topic) for topic in comparison.topics]
     rows = [
@@ -52,14 +52,14 @@ def describe(run: Run, comparison: Comparison) -> str:
 
 
 def outputs_table(run: Run, outputs: Sequence[Output]) -> str:
-    """Return outputs as a table with a line for each exposure, rounded to what matters.
+    """Return outputs as a table with a line for each exposure, rounded.
 
     Parameters
     ----------
     run : Run
-        The run that they belong to.
+        The run.
     outputs : sequence of Output
-        Today's.
+        Outputs of the current code.
     """
     found = {(output.topic, output.stamp): output.message for output in outputs}
     stamps = np.array(sorted({output.stamp for output in outputs}), np.int64)
@@ -101,7 +101,7 @@ def _cells(values: Sequence[float] | None, scales: Sequence[float], digits: int)
 
 
 def errors_text(run: Run, outputs: Sequence[Output]) -> str:
-    """Return how far both estimates are from the truth; empty where there is none."""
+    """Return the errors of both estimates against the truth; empty without it."""
     pairs = {"recorded": estimate_errors(run, None), "today": estimate_errors(run, outputs)}
     rows = []
     for name, errors in pairs.items():

@@ -1,4 +1,4 @@
-"""Recorded tips and joints through what plane_controller does, without the node or a graph."""
+"""Runs plane_controller on recorded tips and joints, without a graph."""
 
 from __future__ import annotations
 
@@ -36,29 +36,29 @@ _NEVER = Moment(0.0, 0)
 
 
 class ControllerStage:
-    """Today's step protocol, estimator and law on a bag's messages.
+    """The current step protocol, estimator and law on the messages of a bag.
 
-    The device is the recorded one: its joints and answers are those to other commands, maybe, and
-    a step that is answered led where the joints say; so one other decision does not end the
-    comparison. Watchdogs run out where the recorded ones did.
+    Joints and results are those of the recorded device, which may belong to other commands; a step
+    with a result ends where the joints say, so that one differing decision does not end the
+    comparison. Watchdogs trip where the recorded ones did.
 
     Parameters
     ----------
     settings : SteeringSettings
-        The node's, as the run began.
+        Settings at the start of the run.
     node : str
-        The node's full name in the bag, whose changes of parameters are taken over.
+        Full name of the node in the bag; its parameter changes are applied.
     ends : mapping of int to JointSample
-        Stamp of a command [ns] to where it led (`step_ends`).
+        Stamp of a command [ns] to the joints at its end (`step_ends`).
 
     Attributes
     ----------
     tips : int
         Tips used so far.
     notes : list of str
-        What could not be done as recorded.
+        Deviations from the recorded run.
     name : str
-        What steers, in words.
+        Name of the controller.
     """
 
     def __init__(
@@ -75,24 +75,24 @@ class ControllerStage:
         self.tips = 0
         self.notes: list[str] = []
         self._rows = {row.topic: row for row in self._controller.inputs}
-        self._takers: dict[str, Callable[[Any, int], Actions]] = {
-            **{topic: partial(_hand, row) for topic, row in self._rows.items()},
-            "device/result": self._take_result,
-            TARGET_PLANE: partial(self._take_target, TARGET_PLANE),
-            TARGET_POINT: partial(self._take_target, TARGET_POINT),
-            "needle/controller_status": self._take_status,
-            "/parameter_events": self._take_parameters,
+        self._handlers: dict[str, Callable[[Any, int], Actions]] = {
+            **{topic: partial(_deliver, row) for topic, row in self._rows.items()},
+            "device/result": self._handle_result,
+            TARGET_PLANE: partial(self._handle_target, TARGET_PLANE),
+            TARGET_POINT: partial(self._handle_target, TARGET_POINT),
+            "needle/controller_status": self._handle_status,
+            "/parameter_events": self._handle_parameters,
         }
 
     @property
     def topics(self) -> frozenset[str]:
-        """Relative names of what it takes, and one absolute."""
-        return frozenset(self._takers)
+        """Names of its input topics, relative or absolute."""
+        return frozenset(self._handlers)
 
-    def take(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
-        """Take a message of a topic, by its relative name; return what it led to."""
+    def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
+        """Process a message of a topic, by its relative name; return the outputs."""
         outputs = []
-        for action in self._takers[topic](message, sent.time):
+        for action in self._handlers[topic](message, sent.time):
             if not isinstance(action, Publish) or action.topic == STATUS:
                 continue
             self.tips += action.topic == "needle/estimate"
@@ -100,22 +100,22 @@ class ControllerStage:
             outputs.append(Output(action.topic, sent.log_time, action.message.stamp_ns, content))
         return outputs
 
-    def _take_result(self, message: Any, sent_ns: int) -> Actions:
+    def _handle_result(self, message: Any, sent_ns: int) -> Actions:
         stamp = to_nanoseconds(message.stamp)
         if (end := self._ends.get(stamp)) is not None:
             self._steering.on_recorded_step(stamp, end)
-        return _hand(self._rows["device/result"], message, sent_ns)
+        return _deliver(self._rows["device/result"], message, sent_ns)
 
-    def _take_target(self, topic: str, message: Any, sent_ns: int) -> Actions:
-        actions = list(_hand(self._rows[topic], message, sent_ns))
+    def _handle_target(self, topic: str, message: Any, sent_ns: int) -> Actions:
+        actions = list(_deliver(self._rows[topic], message, sent_ns))
         if complaint := self._controller.complaints.get(topic):
             self.notes.append(f"{topic} refused: {complaint}")
         return actions
 
-    def _take_status(self, message: Any, _: int) -> Actions:
-        """Start, stop and lose patience where the recorded controller did.
+    def _handle_status(self, message: Any, _: int) -> Actions:
+        """Start, stop and time out where the recorded controller did.
 
-        Calls of services and the steady clock are in no bag.
+        Service calls and the steady clock are not recorded.
         """
         values = values_of(message)
         before, now = self._recorded_state, values.get("state", "")
@@ -123,7 +123,7 @@ class ControllerStage:
         trips = values.get("watchdog_trips", "")
         if trips.isdecimal() and int(trips) > self._recorded_trips:
             self._recorded_trips = int(trips)
-            return self._wait_too_long()
+            return self._time_out()
         if now in _STEERING and before not in _STEERING:
             reply, actions = self._controller.start(_NEVER)
             if not reply.success:
@@ -137,12 +137,12 @@ class ControllerStage:
             return self._controller.stop(_NEVER)[1]
         return ()
 
-    def _wait_too_long(self) -> Actions:
+    def _time_out(self) -> Actions:
         begin, self._steady = self._steady, self._steady + _LONGER_THAN_ANY_TIMEOUT
         late = [*self._steering.on_time(begin), *self._steering.on_time(self._steady)]
         return self._controller.carry_out(late, _NEVER)
 
-    def _take_parameters(self, message: Any, _: int) -> Actions:
+    def _handle_parameters(self, message: Any, _: int) -> Actions:
         if message.node != self._node:
             return ()
         known = {field.name for field in dataclasses.fields(SteeringSettings)}
@@ -161,13 +161,13 @@ class ControllerStage:
         return ()
 
 
-def _hand(row: Input, message: Any, sent_ns: int) -> Actions:
-    """Let the controller handle a recorded message."""
+def _deliver(row: Input, message: Any, sent_ns: int) -> Actions:
+    """Deliver a recorded message to the controller."""
     return row.handler(from_ros(row.message, message), Moment(0.0, 0, sent_ns))
 
 
 def step_ends(path: Path, namespace: str) -> dict[int, JointSample]:
-    """Return where each command led that was answered: the joints sent next, by its stamp [ns].
+    """Return the joints at the end of each command with a result, by its stamp [ns].
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""`rerun`: a bag's images and tips through today's code, in place of the nodes."""
+"""`rerun`: processes the images and tips of a bag with the current code."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ NOT_COMPARED = {
     LiveView.name: "since no bag tells when it looked",
     OpenIGTLink.name: "since ports are not recorded",
 }
-"""Viewer to why nothing of it can be compared."""
+"""Viewer to the reason why its output is not compared."""
 
 P = TypeVar("P")
 
@@ -91,9 +91,9 @@ class Node:
     name : str
         Its full name.
     values : mapping
-        Its parameters, those of --params on top.
+        Its parameters, including those of --params.
     given : frozenset of str
-        Names of those of --params.
+        Names of the parameters in --params.
     """
 
     name: str
@@ -101,7 +101,7 @@ class Node:
     given: frozenset[str]
 
     def parameters(self, kind: type[P]) -> P:
-        """Return them as a node's parameter class has them; warn of those it no longer has."""
+        """Return the parameters as a parameter class; warn of those that no longer exist."""
         names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
         known = {name: value for name, value in self.values.items() if name in names}
         unknown = [n for n in self.values if n not in names and not n.startswith(OF_EVERY_NODE)]
@@ -170,7 +170,11 @@ def _run(words: Sequence[str]) -> int:
     if rerun.unanswered:
         print(f"note: {rerun.unanswered} pairs are left out: stereo_tracker did not hear them")
     print("CHANGED" if comparison.changed else f"UNCHANGED: {len(rerun.recorded)} messages agree")
-    for text in (describe(run, comparison), errors_text(run, rerun.outputs), _seen(viewers)):
+    for text in (
+        describe(run, comparison),
+        errors_text(run, rerun.outputs),
+        _viewer_counts(viewers),
+    ):
         if text:
             print(text)
     if given.output is not None:
@@ -228,9 +232,9 @@ def _node(
 
 
 def _announced(run: Run) -> dict[str, dict[str, Any]]:
-    """Return what nodes said of their parameters as they started, by full name.
+    """Return the parameters that nodes announced at their start, by full name.
 
-    That is all that a bag of ROS 2's own recorder has, if the recorder was there first.
+    A bag of ROS 2's own recorder has no others.
     """
     found: dict[str, dict[str, Any]] = {}
     for _, _, message in read_messages(run.path, "/parameter_events".__eq__):
@@ -265,16 +269,16 @@ def _tracker(run: Run, node: Node, text: str) -> BagStage:
 def _viewers(
     run: Run, params: tuple[Path | None, Sections], calibration: str
 ) -> dict[str, BagStage]:
-    """Return what shows the needle: live_view, and openigtlink to one that listens."""
+    """Return the viewers: live_view, and openigtlink with one client."""
     begin = Moment(0.0, 0)
 
     def settings(name: str, kind: type[P]) -> P:
         return _node(run, name, params, {}, has_defaults=True).parameters(kind)
 
-    # /tf is everybody's: what the bag has there stays.
+    # The recorded /tf, which other nodes publish as well, is kept.
     view = LiveView(settings(LiveView.name, LiveViewParameters), transforms=False)
     viewers = {view.name: BagStage(view, (output.topic for output in view.outputs))}
-    # Not every bag has its topic.
+    # Not every bag has the topic of the calibration.
     list(viewers[view.name].runner.deliver(CALIBRATION, Text(calibration), begin))
     if importlib.util.find_spec("pyigtl") is not None:
         link = OpenIGTLink(settings(OpenIGTLink.name, OpenIGTLinkParameters))
@@ -283,7 +287,7 @@ def _viewers(
     return viewers
 
 
-def _seen(viewers: Mapping[str, BagStage]) -> str:
+def _viewer_counts(viewers: Mapping[str, BagStage]) -> str:
     """Return a line for each viewer; empty without any."""
     lines = []
     for name, viewer in viewers.items():

@@ -1,1 +1,1 @@
-"""The figures of one run."""
+"""Summary, events and timing of a run."""

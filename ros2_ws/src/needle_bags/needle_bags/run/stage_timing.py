@@ -1,9 +1,8 @@
-"""Duration of each stage of a step or path, by when its messages were sent.
+"""Duration of each stage of a step or path, by the times at which its messages were sent.
 
-A cycle of the driver ends with its joint_states. The first that it sends once its status has said
-that it heard a command are of the first cycle whose set-points were made from it. On a rig their
-stamp is when the SYNC behind these set-points was written; in simulated time the stamp is no time
-of day, and the end of the cycle stands for it.
+A driver cycle ends with its joint_states. The first joint_states after the status that reports a
+command belong to the first cycle with set-points from it. On a rig their stamp is the time of the
+SYNC after these set-points; in simulated time the end of the cycle is used.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ from needle_bags.reading.bag_reader import Run
 Floats = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
 
-# Each side's goes with its image, and is quicker read.
+# Published with each image, and faster to read.
 _IMAGES = ("stereo/left/camera_info", "stereo/right/camera_info")
 _EXPOSURE = "sim/tip_pose"
 _TIP, _COMMAND, _RESULT = "needle/tip_pose", "device/joint_trajectory", "device/result"
 _JOINTS, _STATUS = "joint_states", "device/status"
-# A stamp that is no older when it is sent is a time of day [ns].
+# An older stamp is in simulated time [ns].
 _FRESH = 1_000_000_000
 STAGES = (
     ("tracker", "both images to tip"),
@@ -41,14 +40,14 @@ STAGES = (
 
 @dataclasses.dataclass(frozen=True)
 class StageTiming:
-    """One stage's durations.
+    """Durations of a stage.
 
     Attributes
     ----------
     name, meaning : str
-        Which stage, and from what to what.
+        Name, and its first and last event.
     stamps : (N,) int64
-        The exposure at which the step began [ns].
+        Exposure at the start of the step [ns].
     seconds : (N,) float64
         Wall time [s].
     """
@@ -60,7 +59,7 @@ class StageTiming:
 
 
 def stage_timings(run: Run) -> list[StageTiming]:
-    """Return the stages of a run that its bag tells of.
+    """Return the timings of the stages that the bag contains.
 
     Raises
     ------
@@ -69,11 +68,11 @@ def stage_timings(run: Run) -> list[StageTiming]:
     """
     sent = _first_sent(run)
     left, right = (sent[topic] for topic in _IMAGES)
-    # Of cameras that run freely each has stamps of its own; a pair's is the left one's.
+    # Free-running cameras have different stamps; a pair has that of the left image.
     exposed = {stamp: max(time, right.get(stamp, time)) for stamp, time in left.items()}
     exposed = exposed or sent[_EXPOSURE]
     tips, commands, results = sent[_TIP], sent[_COMMAND], sent[_RESULT]
-    set_points = _set_points(commands, _hearings(run), sent[_JOINTS])
+    set_points = _set_points(commands, _received_commands(run), sent[_JOINTS])
     durations = [
         _between(exposed, tips),
         _between(tips, commands),
@@ -92,7 +91,7 @@ def stage_timings(run: Run) -> list[StageTiming]:
 
 
 def _first_sent(run: Run) -> dict[str, dict[int, int]]:
-    """Return relative topic -> stamp -> when the first message with that stamp was sent."""
+    """Return the time of the first message by relative topic and stamp."""
     topics = (*_IMAGES, _EXPOSURE, _TIP, _COMMAND, _RESULT, _JOINTS)
     names = {run.namespace + name: name for name in topics}
     sent: dict[str, dict[int, int]] = defaultdict(dict)
@@ -101,8 +100,8 @@ def _first_sent(run: Run) -> dict[str, dict[int, int]]:
     return sent
 
 
-def _hearings(run: Run) -> tuple[Times, Times]:
-    """Return when the device said that it had heard commands, (N,), and up to which stamp."""
+def _received_commands(run: Run) -> tuple[Times, Times]:
+    """Return the times of device statuses, (N,), and the latest command stamps in them."""
     said, heard = [], []
     status = run.namespace + _STATUS
     for sent, message in messages_as_sent(run.path, status.__eq__, lambda _: False):
@@ -113,10 +112,10 @@ def _hearings(run: Run) -> tuple[Times, Times]:
 
 
 def _set_points(
-    commands: dict[int, int], hearings: tuple[Times, Times], joints: dict[int, int]
+    commands: dict[int, int], received_commands: tuple[Times, Times], joints: dict[int, int]
 ) -> dict[int, int]:
-    """Return by a command's stamp when its first set-points were on the bus [ns]."""
-    said, heard = hearings
+    """Return the time of the first set-points on the bus by command stamp [ns]."""
+    said, heard = received_commands
     cycles = sorted((sent, stamp) for stamp, sent in joints.items())
     ends = np.array([sent for sent, _ in cycles], np.int64)
     set_points = {}
@@ -131,12 +130,12 @@ def _set_points(
 
 
 def _between(begins: dict[int, int], ends: dict[int, int]) -> dict[int, int]:
-    """Return by stamp how long after one message the other with that stamp was sent [ns]."""
+    """Return the delay between two messages with equal stamps, by stamp [ns]."""
     return {stamp: ends[stamp] - begins[stamp] for stamp in begins.keys() & ends.keys()}
 
 
 def _waits(begins: dict[int, int], ends: dict[int, int]) -> dict[int, int]:
-    """Return by stamp how long after a message any of the others was sent next [ns]."""
+    """Return the delay from each message to the next of the others, by stamp [ns]."""
     times = np.sort(np.array(list(ends.values()), np.int64))
     waits = {}
     for stamp, time in begins.items():

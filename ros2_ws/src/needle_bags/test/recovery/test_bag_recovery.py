@@ -198,7 +198,7 @@ class Interruption(Exception):
 
 
 @pytest.mark.parametrize(
-    "step", ["_read_through", "write_metadata", "_set_aside", "sync_directory"]
+    "step", ["_read_through", "write_metadata", "_keep_original", "sync_directory"]
 )
 def test_an_interrupted_recovery_is_done_again_alike(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str

@@ -14,7 +14,7 @@ import pytest
 
 from needle_bags.figures.film import MAX_FRAMES, READINGS, film_of
 from needle_bags.figures.film_views import (
-    MOST_BYTES,
+    MAX_BYTES,
     _small_jpeg,
     camera_views,
     plan_views,
@@ -137,7 +137,7 @@ def test_the_film_of_real_cameras_has_the_tip_where_it_is_seen(
 def test_a_picture_is_small_whatever_it_shows(shape: tuple[int, int]) -> None:
     noise = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
     data = _small_jpeg(noise)
-    assert 0 < len(data) <= MOST_BYTES
+    assert 0 < len(data) <= MAX_BYTES
     height, width = decoded(data).shape
     assert height <= 400
     assert width <= 480

@@ -145,7 +145,7 @@ def test_code_that_breaks_is_told_from_code_that_changed(
     def mistaken(*_: object) -> None:
         raise ValueError("behind the camera")
 
-    monkeypatch.setattr("needle_bags.ros.controller_rerun.ControllerStage.take", mistaken)
+    monkeypatch.setattr("needle_bags.ros.controller_rerun.ControllerStage.process", mistaken)
     assert rerun(eight_steps) == 3
     assert "internal error, please report it: ValueError: behind" in capsys.readouterr().err
 
