@@ -98,7 +98,9 @@ class SimulatedOperator(Component):
         self, settings: SimulatedOperatorParameters, name: str = name, now: float = 0.0
     ) -> None:
         self.name, self.settings = name, settings
-        self._unrecorded: Sequence[str] = ("recorder",) if settings.wait_for_recorder else ()
+        self._unrecorded: Sequence[str] = (
+            ("recorder",) if settings.wait_for_recorder else ()
+        )
         self._nodes: frozenset[str] = frozenset()
         self._sequence = OperatorSequence(
             now,
@@ -121,7 +123,7 @@ class SimulatedOperator(Component):
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Note the missing partners."""
-        self._sequence.see_devices(peers.publishers.get(_DEVICE, ()))
+        self._sequence.handle_devices(peers.publishers.get(_DEVICE, ()))
         missing = [
             f"service {call.service}" for call in PREPARATION if call.service not in peers.services
         ]
@@ -131,7 +133,7 @@ class SimulatedOperator(Component):
         if HOLD not in peers.subscribers:
             missing.append(f"subscriber of {HOLD}")
         self._missing, self._nodes = missing, peers.nodes
-        self._sequence.see_missing([*self._missing, *self._unrecorded])
+        self._sequence.handle_missing([*self._missing, *self._unrecorded])
         return ()
 
     def on_answer(self, answer: Answer, at: Moment) -> Actions:
@@ -141,7 +143,7 @@ class SimulatedOperator(Component):
         call = self._pending
         if call is None or call.service != answer.service or not answer.answered:
             return ()
-        self._sequence.take_answer(call, answer.success, answer.text, at.steady)
+        self._sequence.handle_answer(call, answer.success, answer.text, at.steady)
         return self._advance(at)
 
     def on_stop(self, at: Moment) -> Actions:
@@ -155,14 +157,14 @@ class SimulatedOperator(Component):
 
     def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
         sequence = self._sequence
-        sequence.see_controller(message, at.steady)
+        sequence.handle_controller(message, at.steady)
         if sequence.steering and sequence.depth:
             shown = Shown(sequence.insertion, sequence.depth, sequence.waits_because)
             yield Send(PROGRESS, (shown,))
         yield from self._advance(at)
 
     def _on_device(self, message: DeviceStatus, at: Moment) -> Actions:
-        self._sequence.see_device(message, at.steady)
+        self._sequence.handle_device(message, at.steady)
         return self._advance(at)
 
     def _on_health(self, message: m.Diagnostics, at: Moment) -> Actions:
@@ -172,7 +174,7 @@ class SimulatedOperator(Component):
                 recorded = {name.lstrip("/") for name in status.text.split(", ")}
                 missing = sorted(self._nodes - recorded)
                 self._unrecorded = [f"recorder of {name}'s parameters" for name in missing]
-                self._sequence.see_missing([*self._missing, *self._unrecorded])
+                self._sequence.handle_missing([*self._missing, *self._unrecorded])
         return ()
 
     def _on_timer(self, at: Moment) -> Actions:

@@ -226,7 +226,7 @@ class _ProgressTap:
             if message.state in ("STEERING", "WAITING_FOR_TIP", "DONE") and message.depth_m:
                 self._progress.show(message.insertion_m, message.depth_m)
             waits = message.state == "WAITING_FOR_TIP"
-            self._progress.tell_wait(message.reason if waits else "")
+            self._progress.show_wait(message.reason if waits else "")
 
     def close(self, line: str) -> None:
         self._progress.close(line)
