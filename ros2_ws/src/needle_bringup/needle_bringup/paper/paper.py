@@ -1,4 +1,4 @@
-"""`scripts/paper`: every figure and number of [KC09] section IV, the paper's value beside ours."""
+"""`scripts/paper`: every figure and number of [KC09] section IV."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _paper(arguments: Sequence[str]) -> int:
     root = checkout()
     out = make_folder("--out", given.out or str(root / OUT))
     make_folder("--out", str(out / IMAGES))
-    # They take a second to import: not for a command line that is refused.
+    # These imports take a second; an invalid command line does not need them.
     from needle_bags.figures.figure_style import save  # noqa: PLC0415
     from needle_bringup.paper.paper_figures import figures_of  # noqa: PLC0415
     from needle_bringup.paper.paper_page import as_text, key_figures, page, table  # noqa: PLC0415

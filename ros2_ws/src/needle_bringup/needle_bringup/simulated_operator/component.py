@@ -98,9 +98,7 @@ class SimulatedOperator(Component):
         self, settings: SimulatedOperatorParameters, name: str = name, now: float = 0.0
     ) -> None:
         self.name, self.settings = name, settings
-        self._unrecorded: Sequence[str] = (
-            ("recorder",) if settings.wait_for_recorder else ()
-        )
+        self._unrecorded: Sequence[str] = ("recorder",) if settings.wait_for_recorder else ()
         self._nodes: frozenset[str] = frozenset()
         self._sequence = OperatorSequence(
             now,
