@@ -23,7 +23,7 @@ from needle_bringup.paper.paper_results import (
 from needle_bringup.studies.pure_insertions import RADIUS
 from needle_core.commands.cli import JsonValue
 
-_TEMPLATE = Path(__file__).with_name("static") / "paper.md"
+_TEMPLATE = Path(__file__).with_name("static") / "paper_page.txt"
 Row = tuple[str, str, str, str]
 
 
