@@ -313,7 +313,7 @@ class _Collector:
     def _add_hold(self, log_time: int, message: Any) -> None:
         pressed = float(message.buttons[0]) if len(message.buttons) else 0.0
         scale = float(message.axes[0]) if len(message.axes) else 0.0
-        # Its stamp is a count, of each source its own.
+        # The stamp of a hold is a counter of its source.
         self._rows.setdefault("holds", []).append((log_time, log_time, (pressed, scale)))
 
     def _add_joints(self, log_time: int, message: Any) -> None:
@@ -337,7 +337,7 @@ class _Collector:
         self.results.append(Result(log_time, nanoseconds(message.stamp), message.frame_id))
 
     def add_diagnostics(self, log_time: int, message: Any) -> None:
-        """Take what is not well, and what is again, where it changed."""
+        """Add the changes between problem and recovery of each part."""
         for status in message.status:
             name = str(status.name).removeprefix(self._own)
             if name == status.name and name.startswith(self._others):
