@@ -23,7 +23,7 @@ from needle_bringup.studies.study_laws import (
     rrt_law,
     sliding_law,
 )
-from needle_controller.laws.law import LinearizingLaw, StepLaw
+from needle_controller.laws.law import LinearizingLaw
 from needle_controller.many_needles import ManyObservers
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import TargetMotion
@@ -85,23 +85,6 @@ class SteeredNeedles:
         self._estimators: Estimators | None = None
         self._insertion: FloatArray = np.zeros(())
         self._turned: FloatArray = np.zeros(())
-
-    @classmethod
-    def one_by_one(
-        cls, new: Callable[[], Estimator], law: StepLaw, covariance: Array | None = None
-    ) -> SteeredNeedles:
-        """Return needles with any estimator and law, called one by one.
-
-        Parameters
-        ----------
-        new : callable
-            Returns a needle's estimator.
-        law : StepLaw
-            Law of all needles.
-        covariance : ndarray, shape (3, 3), optional
-            Claimed covariance of each tip [m^2].
-        """
-        return cls(lambda _: EachEstimator(lambda _: new()), each_rate(lambda _: law), covariance)
 
     def start(self, tips: FloatArray) -> FloatArray:
         """Handle the first measured tips; see `study.Controller.start`."""
