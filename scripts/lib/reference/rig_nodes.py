@@ -233,7 +233,7 @@ def _player(module: ModuleType, *more: str) -> Node:
 
 def _make_and_look(node: Any, _: Noted) -> None:
     node._make_publishers()
-    node.look_around()
+    node.check_graph()
 
 
 def _report_and_close(node: Any, _: Noted) -> None:

@@ -86,7 +86,7 @@ class Operator(Component):
 
     @property
     def trouble(self) -> str:
-        """Why there is no input; empty if there is."""
+        """Reason for missing input; empty if there is input."""
         return self._decision.trouble
 
     def on_settings(self, settings: OperatorParameters, at: Moment) -> Actions:
