@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_analysis.link.link_port import LinkPort
-from needle_analysis.link.openigtlink import OpenIGTLink, OpenIGTLinkParameters
+from needle_bags.link.link_port import LinkPort
+from needle_bags.link.openigtlink import OpenIGTLink, OpenIGTLinkParameters
 from needle_core import messages as m
 from needle_core.component import Moment, Send
 from needle_core.status_messages import ControllerStatus

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from needle_bringup.simulation.needle_options import contradictions
 from needle_bringup.simulation.rig_configuration import (
     NODES,
     command_line_parameters,
+    contradictions,
     merge,
     nodes_of,
     refuse_reserved,
