@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from needle_controller.controller_status import received_messages
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.observers.estimator import pose_estimate
 from needle_controller.plane_controller import COMMANDS, STATUS, PlaneController, tip_covariance
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.protocol.heard_messages import heard_messages
 from needle_core import messages as m
 from needle_core.component import Actions, Diagnose, Log, Moment, Peers, Publish, Reply
 from needle_core.diagnostics import Diagnostic, Level
@@ -117,7 +117,7 @@ def test_it_steers_step_by_step_and_says_what_it_believes() -> None:
     rate = bench.published["needle/control_input"][-1].values[1]
     before = bench.published[COMMANDS][-2].points[0].positions[1]
     assert point.positions[1] - before == pytest.approx(rate * 0.001)
-    heard = [one for s in bench.published[STATUS] for one in heard_messages(s.heard)]
+    heard = [one for s in bench.published[STATUS] for one in received_messages(s.heard)]
     assert [one.topic for one in heard[-2:]] == ["joint_states", "device/result"]
     assert bench.call("stop") == (True, "stopped")
     assert bench.status.state == "IDLE"
@@ -138,7 +138,7 @@ def test_joints_that_cannot_be_used_are_named_and_counted() -> None:
     assert "not finite" in bench.health["joint_states"].message
     health = bench.health["joint_states"]
     assert (health.level, health.values["joint_states_refused"]) == (Level.WARN, "2")
-    assert bench.component.steering.intake.joints.latest is None
+    assert bench.component.steering.tips.joints.latest is None
     bench.joints(insertion=0.0, rotation=0.0)
     assert bench.health["joint_states"].level is Level.OK
 
@@ -206,7 +206,7 @@ def test_targets_are_taken_or_refused_and_the_last_stays() -> None:
     for bad, said in (((np.nan, 0.0, 0.0), "not finite"), ((0.5, 0.0, 0.0), "cannot be reached")):
         bench.hear("target_plane", dataclasses.replace(plane, position=bad))
         assert said in bench.health["target_plane"].message
-    assert "the last plane stays" in bench.component.complaints["target_plane"]
+    assert "the last plane stays" in bench.component.problems["target_plane"]
     assert bench.status.target_offset_m == 0.005
     for x, z in ((0.01, 0.1), (0.09, 0.1)):
         bench.hear("target_point", m.Point(0, "rig", (x, 0.0, z)))

@@ -70,7 +70,7 @@ class PathSteering:
         self._law = prompt_point_law(settings)
         self.path: NeedlePath | None = None
 
-    def why_not(self, target: Array, obstacles: Obstacles, rotation: float) -> str:
+    def find_first(self, target: Array, obstacles: Obstacles, rotation: float) -> str:
         """Return why a needle that is out cannot be led to a target, empty if it can.
 
         The path that is found is the first to be followed.

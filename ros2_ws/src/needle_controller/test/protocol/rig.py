@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.actions import Action, Awaiting, SendStep, SteeringState
 from needle_controller.protocol.continuous import make_steering
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import Action, Awaiting, SendStep, SteeringState
-from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_controller.protocol.tip_checks import TipMeasurement
 from needle_core.component import Log
 from needle_core.status_messages import DeviceStatus
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from needle_controller.protocol import steering
-from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import (
+from needle_controller.protocol.actions import (
     Action,
     Awaiting,
     PublishUpdate,
     SendPath,
     SteeringState,
 )
-from needle_controller.protocol.step_watch import MOST_REFUSALS
-from needle_controller.protocol.trust import Trust
+from needle_controller.protocol.confidence import Confidence
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.motion_monitors import MAX_ABORTS_AT_REST
 
 from .rig import FREE, HELD, MOVING, TICK, Rig, logged, sent, spied, where
 
@@ -89,7 +89,9 @@ def test_a_tip_leads_to_the_turn_of_a_step_and_a_path_beyond(
     assert where(rig) == AT_WORK
     # In doubt it goes at half the speed.
     doubtful = ContinuousRig()
-    monkeypatch.setattr(steering, "trust_of", lambda *_: Trust("doubtful", is_doubtful=True))
+    monkeypatch.setattr(
+        steering, "assess_confidence", lambda *_: Confidence("doubtful", is_doubtful=True)
+    )
     assert path_in(doubtful.see()).points[1][2] == pytest.approx(2.0 * step.duration)
 
 
@@ -160,7 +162,7 @@ def test_an_answer_that_a_path_was_taken_asks_for_nothing_and_forgets_refusals()
     rig = ContinuousRig()
     for text in ("replaced", "succeeded"):
         for count in rig.refused():
-            if count == MOST_REFUSALS:
+            if count == MAX_ABORTS_AT_REST:
                 break
         first = path_in(rig.see())
         rig.see()
@@ -182,14 +184,14 @@ def test_refusals_in_a_row_are_a_fault_each_of_a_path_sent_when_the_last_was_kno
             stamps.append(path_in(rig.see()).stamp_ns)
             rig.steering.on_result(stamps[-1 - late], "aborted: no")
             assert heard < 100
-        assert heard == 1 + (MOST_REFUSALS - 1) * (late + 1)
+        assert heard == 1 + (MAX_ABORTS_AT_REST - 1) * (late + 1)
         assert rig.steering.state is SteeringState.FAULT
         assert "without motion" in rig.steering.reason
 
 
 def test_refusals_of_all_that_a_cut_cable_held_back_count_once() -> None:
     rig = ContinuousRig()
-    stamps = [path_in(rig.see()).stamp_ns for _ in range(3 * MOST_REFUSALS)]
+    stamps = [path_in(rig.see()).stamp_ns for _ in range(3 * MAX_ABORTS_AT_REST)]
     for stamp in stamps:
         rig.steering.on_result(stamp, "aborted: nobody holds to run")
     assert where(rig) == AT_WORK

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from needle_controller.protocol.steering_types import Awaiting, SteeringState
-from needle_controller.protocol.step_watch import MOST_REFUSALS, MOST_UNFOLLOWED
+from needle_controller.protocol.actions import Awaiting, SteeringState
+from needle_controller.protocol.motion_monitors import MAX_ABORTS_AT_REST, MAX_UNFOLLOWED_STEPS
 
 from .rig import FREE, HELD, MOVING, TICK, Rig, device, logged, none_sent, sent, where
 
@@ -57,12 +57,12 @@ def test_a_device_that_falls_silent_within_a_step_is_named_and_heard_again() -> 
         rig.steering.on_time(0.0)
         assert rig.steering.on_time(9.9) == []
         assert "nothing heard of the device for 10 s" in logged(rig.steering.on_time(10.0))
-        assert rig.steering.patience.silence
+        assert rig.steering.watchdog.silence
         assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
         assert rig.steering.on_time(1e3) == []
         heard = rig.settle(1) if by_joints else rig.steering.on_device(MOVING)
         assert "heard again" in logged(heard)
-        assert not rig.steering.patience.silence
+        assert not rig.steering.watchdog.silence
         rig.steering.on_device(HELD)
         rig.run(step)
         rig.steering.on_time(2e3)
@@ -72,7 +72,7 @@ def test_a_device_that_falls_silent_within_a_step_is_named_and_heard_again() -> 
     rig.steering.on_time(0.0)
     rig.steering.on_time(10.0)
     rig.steering.on_stop()
-    assert not rig.steering.patience.silence
+    assert not rig.steering.watchdog.silence
 
 
 def test_a_retraction_ends_steering_until_the_needle_is_out() -> None:
@@ -85,7 +85,7 @@ def test_a_retraction_ends_steering_until_the_needle_is_out() -> None:
     assert "IDLE: needle retracted to 0.00479 m" in logged(rig.settle())
     assert where(rig) == (IDLE, NOTHING)
     assert not rig.steering.control.started
-    assert rig.steering.intake.last is None
+    assert rig.steering.tips.last is None
     rig.insertion = 0.004
     rig.settle()
     assert "retracted: draw it out first" in rig.start()
@@ -123,7 +123,7 @@ def test_commands_that_never_move_end_in_a_fault_and_a_start_counts_anew() -> No
     rig = Rig()
     rig.steps(1)
     for _ in range(2):
-        for _ in range(MOST_REFUSALS):
+        for _ in range(MAX_ABORTS_AT_REST):
             assert rig.steering.state is SteeringState.STEERING
             step = sent(rig.expose())
             actions = rig.steering.on_result(step.stamp_ns, "aborted: beyond a limit")
@@ -134,14 +134,14 @@ def test_commands_that_never_move_end_in_a_fault_and_a_start_counts_anew() -> No
     # One that moved a little is no refusal, and those before it are forgotten.
     for _ in range(3):
         rig.run(sent(rig.expose()), part=0.01, text="aborted: slow")
-        for _ in range(MOST_REFUSALS - 1):
+        for _ in range(MAX_ABORTS_AT_REST - 1):
             rig.steering.on_result(sent(rig.expose()).stamp_ns, "aborted: no")
         assert rig.steering.state is SteeringState.STEERING
 
 
 def test_a_person_who_lets_go_at_once_many_times_is_no_fault() -> None:
     rig = Rig()
-    for _ in range(2 * MOST_REFUSALS):
+    for _ in range(2 * MAX_ABORTS_AT_REST):
         step = sent(rig.expose())
         rig.steering.on_result(step.stamp_ns, "aborted: hold released")
         rig.steering.on_device(FREE)
@@ -153,12 +153,12 @@ def test_steps_that_the_joints_do_not_follow_are_a_fault() -> None:
     for share in (0.0, 0.9):
         rig = Rig()
         rig.steps(3)
-        for count in range(1, MOST_UNFOLLOWED + 1):
+        for count in range(1, MAX_UNFOLLOWED_STEPS + 1):
             assert rig.steering.state is SteeringState.STEERING
             rig.run(rig.good_tips(), part=share)
             said = logged(rig.settle())
             assert "said to have succeeded" in said
-            assert ("so were 3 in a row" in said) is (count == MOST_UNFOLLOWED)
+            assert ("so were 3 in a row" in said) is (count == MAX_UNFOLLOWED_STEPS)
         assert where(rig) == (FAULT, NOTHING)
         assert rig.steering.step == 3
         # A person has looked after it.
@@ -169,10 +169,10 @@ def test_steps_that_the_joints_do_not_follow_are_a_fault() -> None:
 
 def test_a_step_that_was_followed_forgets_those_that_were_not() -> None:
     rig = Rig()
-    for _ in range(MOST_UNFOLLOWED + 1):
+    for _ in range(MAX_UNFOLLOWED_STEPS + 1):
         rig.run(rig.good_tips(), part=0.5)
         rig.settle()
         assert "said to have succeeded" in rig.steering.reason
-        assert rig.steering.intake.after_ns <= rig.now - TICK
+        assert rig.steering.tips.after_ns <= rig.now - TICK
         rig.run(rig.good_tips())
     assert rig.steering.state is SteeringState.STEERING

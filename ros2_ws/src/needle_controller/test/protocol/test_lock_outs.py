@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
+from needle_controller.protocol.actions import Awaiting, SteeringState
 from needle_controller.protocol.joint_history import CONFIRMED_BY, JointSample
-from needle_controller.protocol.steering_types import Awaiting, SteeringState
-from needle_controller.protocol.tip_gate import Fault, TipMeasurement
+from needle_controller.protocol.tip_checks import TipFault, TipMeasurement
 
 from .rig import MOVING, SECOND, TICK, Rig, logged, none_sent, sent, where
 
@@ -49,9 +49,9 @@ def test_tips_that_jumped_together_count_from_the_fourth() -> None:
     rig.steps(10)
     for count in range(1, 4):
         assert "jumped" in logged(rig.expose(x=0.006))
-        assert rig.steering.intake.refused == {Fault.JUMP: count}
+        assert rig.steering.tips.rejected == {TipFault.JUMP: count}
     rig.run(sent(rig.expose(x=0.006)))
-    assert rig.steering.intake.refused == {Fault.JUMP: 3}
+    assert rig.steering.tips.rejected == {TipFault.JUMP: 3}
     # One that is away from the others begins the count anew, and so does one that is not.
     for _ in range(2):
         for _ in range(3):
@@ -80,18 +80,18 @@ def test_one_tip_from_the_future_holds_nothing_up() -> None:
             assert rig.start() == "steering"
         step = rig.good_tips()
         assert step.stamp_ns == rig.now
-        assert rig.steering.intake.after_ns <= rig.now
+        assert rig.steering.tips.after_ns <= rig.now
         if when == "wanted":
-            assert rig.steering.intake.refused == {Fault.AHEAD_OF_JOINTS: 1}
+            assert rig.steering.tips.rejected == {TipFault.AHEAD_OF_JOINTS: 1}
 
 
 def test_a_refused_tip_is_believed_to_be_of_its_stamp_up_to_a_tenth_of_a_second() -> None:
     for ahead, believed in ((99_000_000, True), (101_000_000, False)):
         rig = Rig()
-        before = rig.steering.intake.after_ns
+        before = rig.steering.tips.after_ns
         nowhere = TipMeasurement(rig.now + ahead, "rig", np.full(3, np.nan))
         rig.steering.on_tip(nowhere)
-        assert rig.steering.intake.after_ns == (nowhere.stamp_ns if believed else before)
+        assert rig.steering.tips.after_ns == (nowhere.stamp_ns if believed else before)
 
 
 def test_of_many_tips_that_wait_the_newest_are_kept() -> None:
@@ -104,7 +104,7 @@ def test_of_many_tips_that_wait_the_newest_are_kept() -> None:
     rig.now += 39 * TICK
     step = sent(rig.joints())
     assert step.stamp_ns == first + 16 * TICK // 2
-    assert rig.steering.intake.refused.total() == 0
+    assert rig.steering.tips.rejected.total() == 0
 
 
 SPIKES = [(0, 0.01, 0.0), (0, -0.0006, 0.0), (0, 0.0006, 0.0), (0, 0.0, 2.0), (3600, 0.0, 0.0)]
@@ -179,7 +179,7 @@ def test_a_clock_that_went_back_is_a_stop_and_a_start() -> None:
     rig.now -= 50 * SECOND
     assert "the clock of joint_states went -" in logged(rig.settle(CONFIRMED_BY))
     assert where(rig) == (IDLE, Awaiting.NOTHING)
-    assert rig.steering.intake.last is None
+    assert rig.steering.tips.last is None
     assert rig.start() == "steering"
     rig.run(rig.good_tips())
     assert rig.steering.step == 6

@@ -8,14 +8,18 @@ import math
 import numpy as np
 import pytest
 
+from needle_controller.controller_status import ReceptionLog, received_messages
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.protocol.heard_messages import HeardMessages, heard_messages
+from needle_controller.protocol.actions import next_step
+from needle_controller.protocol.confidence import (
+    Confidence,
+    assess_confidence,
+    point_miss_probability,
+)
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.next_step import next_step
-from needle_controller.protocol.trust import Trust, point_missed, trust_of
 
 SETTINGS = SteeringSettings(depth=0.12)
 
@@ -58,20 +62,20 @@ def test_trust_is_the_interval_of_the_covariance_the_doubts_and_the_end() -> Non
     for r1 in (-0.002, 0.002):
         estimator.reset([r1, 0.0, 0.0], np.zeros(2))
         estimate = estimator.estimate()
-        trust = trust_of(estimate)
+        trust = assess_confidence(estimate)
         half = 1.96 * math.sqrt(estimate.covariance[0, 0])
         assert trust.r1 == pytest.approx(r1, rel=1e-12)
         ends = trust.r1 - trust.low, trust.high - trust.r1
         assert ends == pytest.approx((half, half), rel=1e-4)
         assert (trust.verdict, trust.is_doubtful) == ("trusted", False)
-    there, elsewhere = trust_of(estimate, 0.049), trust_of(estimate, 0.72)
+    there, elsewhere = assess_confidence(estimate, 0.049), assess_confidence(estimate, 0.72)
     assert (there.verdict, there.is_doubtful) == ("trusted", False)
     assert elsewhere.verdict.startswith("doubtful: 72 %")
     assert elsewhere.is_doubtful
     wide = np.diag([1.1e-6, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert trust_of(dataclasses.replace(estimate, covariance=wide)).is_doubtful
+    assert assess_confidence(dataclasses.replace(estimate, covariance=wide)).is_doubtful
     # An estimator that does not judge itself is not judged by its end either.
-    unjudged = trust_of(dataclasses.replace(estimate, miss=None), 0.72)
+    unjudged = assess_confidence(dataclasses.replace(estimate, miss=None), 0.72)
     assert (unjudged.verdict, unjudged.is_doubtful) == ("", False)
 
 
@@ -82,29 +86,29 @@ def test_a_point_is_missed_as_often_as_it_is_said() -> None:
         root = rng.normal(0.0, spread, (3, 3))
         drawn = off + rng.normal(size=(40_000, 3)) @ root.T
         share = float(np.mean(np.linalg.norm(drawn, axis=1) > 1e-3))
-        assert float(point_missed(off, root @ root.T)) == pytest.approx(share, abs=0.03)
+        assert float(point_miss_probability(off, root @ root.T)) == pytest.approx(share, abs=0.03)
 
 
 def test_trust_in_a_line_says_the_distance_its_interval_and_the_verdict() -> None:
-    said = Trust("trusted", False, 0.001, -0.001, 0.003).summary
+    said = Confidence("trusted", False, 0.001, -0.001, 0.003).summary
     assert said == "r1 = 0.00100 m +- 0.00200 m (95 %), trusted"
-    assert Trust(r1=0.0, low=-1.0, high=1.0).summary.endswith("(95 %)")
+    assert Confidence(r1=0.0, low=-1.0, high=1.0).summary.endswith("(95 %)")
 
 
 def test_what_was_heard_is_read_back_in_its_order_and_told_once() -> None:
-    heard = HeardMessages()
-    assert heard_messages(heard.take_text()) == []
+    heard = ReceptionLog()
+    assert received_messages(heard.pop_text()) == []
     messages = [("joint_states", 1_700_000_000_000_000_000), ("needle/tip", 5), ("joint_states", 7)]
     for message in messages:
         heard.add(*message)
-    assert heard_messages(heard.take_text()) == messages
-    assert heard.take_text() == ""
+    assert received_messages(heard.pop_text()) == messages
+    assert heard.pop_text() == ""
     # It is full until it is told.
     for number in range(103):
         assert heard.is_full is (number >= 100)
         heard.add("joint_states", number)
-    assert len(heard_messages(heard.take_text())) == 103
+    assert len(received_messages(heard.pop_text())) == 103
     assert not heard.is_full
     # What nobody sent so is no message.
-    found = heard_messages("joint_states soon, needle/tip -1, device/result 7, x 8 9")
+    found = received_messages("joint_states soon, needle/tip -1, device/result 7, x 8 9")
     assert found == [("device/result", 7)]

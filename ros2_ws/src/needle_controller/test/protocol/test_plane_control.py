@@ -17,8 +17,8 @@ from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_settings import PathSettings
 from needle_controller.presets.path_steering import path_planner
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
+from needle_controller.protocol.actions import next_step
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.next_step import next_step
 from needle_controller.protocol.plane_control import PlaneControl
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 
@@ -160,12 +160,12 @@ def test_an_update_says_turn_miss_and_reach() -> None:
     joints = JointSample(9, needle.joints.insertion - 1e-6, 1.5)
     update = needle.control.update(needle.tip, joints)
     assert update.turned == pytest.approx(0.5)
-    assert update.missed == update.estimate.miss
+    assert update.miss_probability == update.estimate.miss
     assert not update.blocked
     needle.control.target_point = np.array(POINT)
     update = needle.control.update(needle.tip, joints)
     # It is far from there.
-    assert update.missed == pytest.approx(1.0)
+    assert update.miss_probability == pytest.approx(1.0)
     needle.control.restart()
     assert not needle.control.started
     assert needle.control.update(needle.tip, joints).turned == 0.0
@@ -199,7 +199,7 @@ def test_a_point_that_moves_is_met_where_it_will_be_if_its_clock_is_known() -> N
             if apart is None:
                 needle.control.target_point = breathing(needle.time)
             else:
-                needle.control.see_target_point(breathing(needle.time), needle.time + apart)
+                needle.control.observe_target_point(breathing(needle.time), needle.time + apart)
 
         needle.steer(before=see)
         ends.append(needle.tip)
@@ -244,7 +244,7 @@ def test_new_settings_keep_point_and_obstacles_unless_they_change_them_or_cannot
 def test_the_needle_comes_to_the_point_past_an_obstacle() -> None:
     settings = dataclasses.replace(TO_PAST, target_offset=0.004)
     needle = Needle(settings, starts_deg=10.0)
-    assert needle.control.path_obstacle(0.0) == ""
+    assert needle.control.reason_without_path(0.0) == ""
     needle.steer()
     assert not needle.blocked
     assert needle.off(PAST) < 0.001
@@ -268,15 +268,15 @@ def test_a_wall_that_comes_on_the_way_stops_the_needle_before_it() -> None:
 def test_a_needle_that_is_out_is_told_why_there_is_no_path_and_from_where_there_is() -> None:
     control = PlaneControl(TO_PAST, offset_plane(0.0))
     control.obstacles = Obstacles([Obstacle(PAST, PAST, 0.004)])
-    assert "the target point is -0.004 m from an obstacle" in control.path_obstacle(0.0)
+    assert "the target point is -0.004 m from an obstacle" in control.reason_without_path(0.0)
     control.obstacles = Obstacles([Obstacle((0.0, 0.0, 0.003), (0.0, 0.0, 0.003), 0.004)])
-    assert "the entry is -0.001 m from an obstacle" in control.path_obstacle(0.0)
+    assert "the entry is -0.001 m from an obstacle" in control.reason_without_path(0.0)
     # A wall that ends at y = 6 mm: from an entry farther in +y there is room beside it.
     control.obstacles = Obstacles(
         [Obstacle((-0.06, y, 0.025), (0.06, y, 0.025), 0.011) for y in (-0.045, -0.025, -0.005)]
     )
     control.target_point = np.array([0.0, 0.008, 0.1])
-    said = control.path_obstacle(0.0)
+    said = control.reason_without_path(0.0)
     assert "in place of (0, 0) there is one" in said
     x, y = (float(part) for part in said.split("entering at (")[1].split(") m")[0].split(","))
     assert y > 0.0
@@ -288,4 +288,4 @@ def test_a_needle_that_is_out_is_told_why_there_is_no_path_and_from_where_there_
             for row in control.obstacles.table
         ]
     )
-    assert control.path_obstacle(0.0) == ""
+    assert control.reason_without_path(0.0) == ""

@@ -11,8 +11,8 @@ from needle_controller.model.target_plane import offset_plane
 from needle_controller.planning import entry
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.actions import Awaiting, SteeringState
 from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.steering_types import Awaiting, SteeringState
 
 from .rig import HELD, MOVING, TICK, Rig, device, logged, none_sent, sent, where
 
@@ -117,7 +117,7 @@ def test_a_needle_that_is_out_is_another_one() -> None:
     assert rig.start() == "steering"
     assert rig.steering.step == 0
     assert not rig.steering.control.started
-    assert rig.steering.intake.last is None
+    assert rig.steering.tips.last is None
 
 
 def test_settings_change_protocol_controller_and_plane_on_the_way() -> None:
@@ -157,5 +157,5 @@ def test_start_says_where_no_path_leads_past_obstacles(monkeypatch: pytest.Monke
         rig.run(sent(actions))
     assert "IDLE: no way on from insertion 0.0" in logged(actions)
     assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
-    said = steering.control.path_obstacle(0.0)
+    said = steering.control.reason_without_path(0.0)
     assert "no path to the target point is clear of the 3 obstacles, nor is one from" in said

@@ -9,16 +9,16 @@ import pytest
 
 from needle_controller.presets.own_parts import OwnPartError
 from needle_controller.protocol import steering
-from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import (
+from needle_controller.protocol.actions import (
     Action,
     Awaiting,
     PublishUpdate,
     SendStep,
     SteeringState,
 )
-from needle_controller.protocol.tip_gate import TipMeasurement
-from needle_controller.protocol.trust import Trust
+from needle_controller.protocol.confidence import Confidence
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.tip_checks import TipMeasurement
 
 from .rig import FREE, HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
 
@@ -47,10 +47,10 @@ def test_a_tip_leads_to_one_step_and_its_end_to_the_wish_for_another() -> None:
     assert none_sent(rig.run(step))
     end = rig.now
     assert where(rig) == (STEERING, Awaiting.TIP)
-    assert (rig.steering.step, rig.steering.intake.after_ns) == (1, end)
+    assert (rig.steering.step, rig.steering.tips.after_ns) == (1, end)
     early = TipMeasurement(end - TICK // 2, "rig", np.array([0.0, 0.0, 0.0009]))
     assert rig.steering.on_tip(early) == []
-    assert rig.steering.intake.refused.total() == 0
+    assert rig.steering.tips.rejected.total() == 0
     assert sent(rig.expose()).insertion == pytest.approx(0.002)
     assert rig.steering.insertion == pytest.approx(0.001)
 
@@ -75,7 +75,7 @@ def test_without_hold_no_tip_is_used_and_after_it_a_fresh_one() -> None:
         assert none_sent(rig.expose())
         assert rig.steering.on_device(HELD) == []
         assert where(rig) == (STEERING, Awaiting.TIP)
-        assert rig.steering.intake.after_ns == rig.now
+        assert rig.steering.tips.after_ns == rig.now
         # A step waits for a device that still moves; a hold lost meanwhile asks anew.
         rig.steering.on_device(MOVING)
         assert none_sent(rig.expose())
@@ -109,7 +109,7 @@ def test_joints_that_were_sent_before_the_answer_do_not_show_a_standstill() -> N
     assert none_sent(rig.steering.on_tip(rig.measured()))
     rig.insertion, rig.rotation = step.insertion, step.rotation
     rig.settle(1)
-    assert (rig.steering.step, rig.steering.intake.after_ns) == (1, rig.now)
+    assert (rig.steering.step, rig.steering.tips.after_ns) == (1, rig.now)
 
 
 def test_the_command_follows_from_stamps_whatever_order_the_topics_come_in() -> None:
@@ -159,7 +159,7 @@ def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew() ->
                 rig.steering.on_device(MOVING)
                 rig.expose()
             else:
-                early, last = rig.measured(ahead=TICK), rig.steering.intake.last
+                early, last = rig.measured(ahead=TICK), rig.steering.tips.last
                 rig.settle(1)
             rig.insertion += moved
             rig.rotation += turned
@@ -168,7 +168,7 @@ def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew() ->
                 actions = rig.steering.on_device(HELD)
             else:
                 actions = rig.steering.on_tip(early)
-                assert (rig.steering.intake.last is last) is looked_at_anew
+                assert (rig.steering.tips.last is last) is looked_at_anew
             assert none_sent(actions) is looked_at_anew, waiting
             if looked_at_anew:
                 assert where(rig) == (STEERING, Awaiting.TIP)
@@ -190,12 +190,14 @@ def test_the_last_step_ends_at_the_depth_and_then_it_is_done() -> None:
     # It says how sure it is, and that the needle ends away from its plane.
     assert "insertion 0.0025 m reached; r1 = " in rig.steering.reason
     assert "m (95 %), doubtful: " in rig.steering.reason
-    assert rig.steering.trust.is_doubtful
+    assert rig.steering.confidence.is_doubtful
     assert "at the depth" in rig.start()
 
 
 def test_in_doubt_it_goes_on_at_half_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(steering, "trust_of", lambda *_: Trust("doubtful", is_doubtful=True))
+    monkeypatch.setattr(
+        steering, "assess_confidence", lambda *_: Confidence("doubtful", is_doubtful=True)
+    )
     assert sent(Rig().expose()).duration == pytest.approx(1.0)
 
 
@@ -208,7 +210,7 @@ def test_a_recorded_device_may_have_made_another_step() -> None:
     rig.steering.on_recorded_step(step.stamp_ns + 1, other)
     assert rig.steering.on_result(step.stamp_ns, "succeeded") == []
     rig.run(SendStep(step.stamp_ns + 1, other.insertion, other.rotation, 0.5))
-    assert (rig.steering.step, rig.steering.intake.after_ns) == (1, rig.now)
+    assert (rig.steering.step, rig.steering.tips.after_ns) == (1, rig.now)
 
 
 def test_an_own_part_that_fails_on_the_way_stops_the_needle(

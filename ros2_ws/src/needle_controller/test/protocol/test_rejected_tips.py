@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from needle_controller.model.target_plane import plane_from_pose
-from needle_controller.protocol.steering_types import Action, Awaiting, SteeringState
-from needle_controller.protocol.tip_gate import Fault, TipCovariance, TipMeasurement
+from needle_controller.protocol.actions import Action, Awaiting, SteeringState
+from needle_controller.protocol.tip_checks import TipCovariance, TipFault, TipMeasurement
 from needle_core.component import Log
 
 from .rig import HELD, MOVING, SECOND, TICK, Rig, logged, none_sent, sent, spied, where
@@ -29,9 +29,9 @@ def told(rig: Rig, ahead: int = 0) -> TipCovariance:
 def test_a_refused_tip_moves_nothing_and_asks_for_another() -> None:
     kinds = set()
     for position, frame, fault, said in (
-        ([np.nan, 0.0, 0.0], "rig", Fault.NOT_FINITE, "not finite"),
-        ([0.0, 0.0, 0.0], "map", Fault.FRAME, "'map'"),
-        ([0.5, 0.2, 1.0], "rig", Fault.TOO_FAR, "from the entry point"),
+        ([np.nan, 0.0, 0.0], "rig", TipFault.NOT_FINITE, "not finite"),
+        ([0.0, 0.0, 0.0], "map", TipFault.FRAME, "'map'"),
+        ([0.5, 0.2, 1.0], "rig", TipFault.TOO_FAR, "from the entry point"),
     ):
         rig = Rig()
         tip = bad(rig, position, frame)
@@ -39,12 +39,12 @@ def test_a_refused_tip_moves_nothing_and_asks_for_another() -> None:
         assert isinstance(log, Log)
         assert said in log.text
         kinds.add(log.kind)
-        assert rig.steering.intake.refused == {fault: 1}
+        assert rig.steering.tips.rejected == {fault: 1}
         assert said in rig.steering.rejection
         assert rig.steering.reason == f"tip refused: {rig.steering.rejection}"
         assert not rig.steering.control.started
         assert where(rig) == (STEERING, Awaiting.TIP)
-        assert rig.steering.intake.after_ns == tip.stamp_ns
+        assert rig.steering.tips.after_ns == tip.stamp_ns
         sent(rig.expose())
         assert rig.steering.rejection == ""
     # Each reason is told for itself.
@@ -56,26 +56,26 @@ def test_a_tip_that_nobody_waits_for_is_told_of_where_no_needle_can_be() -> None
     step = sent(rig.expose())
     assert "from the entry point" in logged(rig.steering.on_tip(bad(rig, [0.1, 0.0, 1.0])))
     assert rig.steering.on_tip(bad(rig, [0.0, 0.0, 1e-3])) == []
-    assert rig.steering.intake.refused == {Fault.TOO_FAR: 1}
+    assert rig.steering.tips.rejected == {TipFault.TOO_FAR: 1}
     rig.run(step)
     rig.run(sent(rig.expose()))
     rig.steering.on_stop()
     rig.steering.on_tip(bad(rig, [0.1, 0.0, 1.0]))
-    assert rig.steering.intake.refused == {Fault.TOO_FAR: 2}
+    assert rig.steering.tips.rejected == {TipFault.TOO_FAR: 2}
     assert rig.steering.reason == "stopped"
 
 
 def test_a_stamp_that_is_old_or_far_ahead_does_not_set_the_clock() -> None:
     rig = Rig()
     rig.steps(1)
-    after = rig.steering.intake.after_ns
+    after = rig.steering.tips.after_ns
     assert "not newer" in logged(rig.steering.on_tip(bad(rig, [0.0] * 3, ahead=TICK - rig.now)))
     future = bad(rig, [0.0] * 3, ahead=3600 * SECOND)
     assert "ahead of joint_states" in logged(rig.steering.on_tip(future))
-    assert rig.steering.intake.after_ns == after
+    assert rig.steering.tips.after_ns == after
     sent(rig.expose())
     other = Rig()
-    other.steering.intake.after_ns = 0
+    other.steering.tips.after_ns = 0
     assert "older" in logged(other.steering.on_tip(TipMeasurement(1, "rig", np.zeros(3))))
 
 
@@ -85,7 +85,7 @@ def test_of_tips_that_wait_those_go_that_came_before_their_time() -> None:
         assert rig.steering.on_tip(rig.measured(ahead=ahead * TICK)) == []
     # Its topic keeps its order: two had a stamp too late, the first had a good one.
     assert rig.steering.on_tip(rig.measured(ahead=2 * TICK)) == []
-    assert rig.steering.intake.refused == {Fault.AHEAD_OF_JOINTS: 2}
+    assert rig.steering.tips.rejected == {TipFault.AHEAD_OF_JOINTS: 2}
     rig.now += TICK
     assert sent(rig.joints()).stamp_ns == rig.now
 
@@ -148,7 +148,7 @@ def test_a_tip_whose_joints_never_come_is_given_up() -> None:
         assert "no joint_states" not in logged(rig.steering.on_time(start + 1.99))
         assert "no joint_states" in logged(rig.steering.on_time(start + 2.0))
         rig.now += 2 * TICK
-    assert rig.steering.intake.refused == {Fault.NO_JOINTS: 2}
+    assert rig.steering.tips.rejected == {TipFault.NO_JOINTS: 2}
     assert rig.steering.watchdog_trips == 3
     sent(rig.expose())
 
@@ -196,7 +196,7 @@ def test_a_tip_with_a_bad_covariance_is_refused() -> None:
     actions = rig.steering.on_tip_pose(TipCovariance(rig.now, "map", np.eye(3)))
     assert none_sent(actions)
     assert "frame 'map'" in logged(actions)
-    assert rig.steering.intake.refused == {Fault.BAD_COVARIANCE: 1}
+    assert rig.steering.tips.rejected == {TipFault.BAD_COVARIANCE: 1}
     rig.expose()
     sent(rig.steering.on_tip_pose(told(rig)))
 
@@ -208,9 +208,9 @@ def test_a_covariance_of_a_later_tip_says_that_the_tips_own_is_lost() -> None:
     actions = rig.steering.on_tip_pose(told(rig, ahead=TICK))
     assert "no needle/tip_pose" in logged(actions)
     assert "set it to configured" in logged(actions)
-    assert rig.steering.intake.refused == {Fault.NO_COVARIANCE: 1}
+    assert rig.steering.tips.rejected == {TipFault.NO_COVARIANCE: 1}
     assert rig.steering.watchdog_trips == 0
-    assert rig.steering.intake.after_ns == rig.now
+    assert rig.steering.tips.after_ns == rig.now
     # The tip of that one is there for the next step.
     sent(rig.expose())
 
@@ -223,7 +223,7 @@ def test_a_source_of_tips_alone_is_told_what_to_set() -> None:
     rig.steering.on_time(2.0)
     assert rig.steering.state is SteeringState.WAITING_FOR_TIP
     assert "set it to configured" in rig.steering.reason
-    assert rig.steering.intake.refused == {Fault.NO_COVARIANCE: 1}
+    assert rig.steering.tips.rejected == {TipFault.NO_COVARIANCE: 1}
     # Configured, it asks for none and uses none.
     steps = []
     for spoilt in (False, True):

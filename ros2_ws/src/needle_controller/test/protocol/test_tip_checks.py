@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.tip_gate import (
+from needle_controller.protocol.tip_checks import (
     AcceptedTip,
-    Fault,
-    RefusedTip,
+    RejectedTip,
     TipCovariance,
+    TipFault,
     TipMeasurement,
-    refuse_message,
-    refuse_position,
-    refuse_stamp,
+    check_message,
+    check_position,
+    check_stamp,
 )
 
 NAN, INF = np.nan, np.inf
@@ -29,7 +29,7 @@ def tip(x: float, y: float, z: float, *, stamp_ns: int = 100, frame: str = "rig"
 LAST = AcceptedTip(tip(0.0, 0.0, 0.099, stamp_ns=50), JointSample(50, 0.099, 0.0))
 
 
-def fault(refusal: RefusedTip | None) -> Fault | None:
+def fault(refusal: RejectedTip | None) -> TipFault | None:
     assert refusal is None or refusal.text
     return None if refusal is None else refusal.fault
 
@@ -37,53 +37,55 @@ def fault(refusal: RefusedTip | None) -> Fault | None:
 def test_a_message_is_refused_whatever_the_needle_did() -> None:
     for measured, wanted in (
         (tip(0.0, 0.0, 0.02, stamp_ns=51), None),
-        (tip(0.0, 0.0, 0.02, stamp_ns=50), Fault.NOT_NEWER),
-        (tip(0.0, 0.0, 0.02, stamp_ns=10), Fault.NOT_NEWER),
-        (tip(NAN, 0.0, 0.02), Fault.NOT_FINITE),
-        (tip(0.0, INF, 0.02), Fault.NOT_FINITE),
-        (tip(0.0, 0.0, 0.02, frame="left_camera_optical"), Fault.FRAME),
+        (tip(0.0, 0.0, 0.02, stamp_ns=50), TipFault.NOT_NEWER),
+        (tip(0.0, 0.0, 0.02, stamp_ns=10), TipFault.NOT_NEWER),
+        (tip(NAN, 0.0, 0.02), TipFault.NOT_FINITE),
+        (tip(0.0, INF, 0.02), TipFault.NOT_FINITE),
+        (tip(0.0, 0.0, 0.02, frame="left_camera_optical"), TipFault.FRAME),
     ):
-        assert fault(refuse_message(measured, LAST)) is wanted, measured
+        assert fault(check_message(measured, LAST)) is wanted, measured
         # The first tip has none before it.
-        first = None if wanted is Fault.NOT_NEWER else wanted
-        assert fault(refuse_message(measured, None)) is first, measured
-    assert "(4e-08 s behind)" in str(refuse_message(tip(0.0, 0.0, 0.0, stamp_ns=10), LAST))
+        first = None if wanted is TipFault.NOT_NEWER else wanted
+        assert fault(check_message(measured, None)) is first, measured
+    assert "(4e-08 s behind)" in str(check_message(tip(0.0, 0.0, 0.0, stamp_ns=10), LAST))
 
 
 def test_a_stamp_is_refused_where_its_joints_will_never_be_known() -> None:
     oldest, latest = JointSample(40, 0.0, 0.0), JointSample(60, 0.0, 0.0)
     for stamp_ns, wanted in (
-        (39, Fault.BEFORE_JOINTS),
+        (39, TipFault.BEFORE_JOINTS),
         (40, None),
         (60 + SECOND, None),
-        (61 + SECOND, Fault.AHEAD_OF_JOINTS),
+        (61 + SECOND, TipFault.AHEAD_OF_JOINTS),
     ):
         measured = tip(0.0, 0.0, 0.0, stamp_ns=stamp_ns)
-        assert fault(refuse_stamp(measured, oldest, latest)) is wanted, stamp_ns
-        assert refuse_stamp(measured, None, None) is None
+        assert fault(check_stamp(measured, oldest, latest)) is wanted, stamp_ns
+        assert check_stamp(measured, None, None) is None
     late = tip(0.0, 0.0, 0.0, stamp_ns=60 + 5 * SECOND // 2)
-    assert "2.5 s ahead" in str(refuse_stamp(late, oldest, latest))
+    assert "2.5 s ahead" in str(check_stamp(late, oldest, latest))
 
 
 def test_a_place_is_refused_where_no_needle_can_be() -> None:
-    rows: list[tuple[tuple[float, float, float], JointSample, AcceptedTip | None, Fault | None]] = [
+    rows: list[
+        tuple[tuple[float, float, float], JointSample, AcceptedTip | None, TipFault | None]
+    ] = [
         # As far as the stage went, its scale and the noise: 1.15 0.1 m + 4 mm.
         ((0.0, 0.0, 0.1189999), NOW, None, None),
-        ((0.0, 0.0, 0.1190001), NOW, None, Fault.TOO_FAR),
+        ((0.0, 0.0, 0.1190001), NOW, None, TipFault.TOO_FAR),
         ((0.0713, 0.0, -0.0951), NOW, None, None),
-        ((0.0715, 0.0, -0.0953), NOW, None, Fault.TOO_FAR),
-        ((-1e300, 0.2, 1.0), NOW, None, Fault.TOO_FAR),
+        ((0.0715, 0.0, -0.0953), NOW, None, TipFault.TOO_FAR),
+        ((-1e300, 0.2, 1.0), NOW, None, TipFault.TOO_FAR),
         # Drawn out beyond its zero: the noise is left.
         ((0.0, 0.00399, 0.0), JointSample(100, -0.1, 0.0), None, None),
-        ((0.0, 0.00401, 0.0), JointSample(100, -0.1, 0.0), None, Fault.TOO_FAR),
+        ((0.0, 0.00401, 0.0), JointSample(100, -0.1, 0.0), None, TipFault.TOO_FAR),
         # Since the last tip the needle has gone 1 mm, this way or that: 1 mm + 4 mm.
         ((0.003, 0.0, 0.1029999), NOW, LAST, None),
-        ((0.003, 0.0, 0.1030001), NOW, LAST, Fault.JUMP),
+        ((0.003, 0.0, 0.1030001), NOW, LAST, TipFault.JUMP),
         ((0.0, 0.0, 0.0940001), JointSample(100, 0.098, 0.0), LAST, None),
-        ((0.0, 0.0, 0.0939999), JointSample(100, 0.098, 0.0), LAST, Fault.JUMP),
+        ((0.0, 0.0, 0.0939999), JointSample(100, 0.098, 0.0), LAST, TipFault.JUMP),
     ]
     for place, joints, last, wanted in rows:
-        assert fault(refuse_position(tip(*place), joints, last, MARGIN)) is wanted, place
+        assert fault(check_position(tip(*place), joints, last, MARGIN)) is wanted, place
 
 
 def test_a_covariance_is_refused_that_no_tip_can_have() -> None:

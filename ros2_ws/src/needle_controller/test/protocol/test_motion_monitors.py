@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+from needle_controller.protocol.actions import SendStep
 from needle_controller.protocol.joint_history import JointHistory, JointSample
-from needle_controller.protocol.patience import Patience
-from needle_controller.protocol.retraction import RetractionWatch
-from needle_controller.protocol.steering_types import SendStep
-from needle_controller.protocol.step_watch import (
-    Followed,
-    StepWatch,
+from needle_controller.protocol.motion_monitors import (
+    RetractionMonitor,
+    StepMonitor,
+    StepOutcome,
+    Watchdog,
 )
 
 from .rig import TICK
 
 STEP = SendStep(5 * TICK, 0.01, 0.5, 0.5)
-NOT_YET, ARRIVED, STOOD = Followed
+PENDING, ARRIVED, STOPPED_SHORT = StepOutcome
 OUT, TOLERANCE = 0.002, 0.0002
 
 
@@ -22,82 +22,82 @@ def test_a_step_has_arrived_where_both_joints_are_at_its_end_or_beyond() -> None
     for insertion, rotation, wanted in (
         (0.01 - 0.99e-5, 0.5 + 0.99e-2, ARRIVED),
         (0.0101, 0.5 - 0.99e-2, ARRIVED),
-        (0.01 - 1.01e-5, 0.5, NOT_YET),
-        (0.01, 0.5 + 1.01e-2, NOT_YET),
-        (0.01, 0.5 - 1.01e-2, NOT_YET),
+        (0.01 - 1.01e-5, 0.5, PENDING),
+        (0.01, 0.5 + 1.01e-2, PENDING),
+        (0.01, 0.5 - 1.01e-2, PENDING),
     ):
-        watch, joints = StepWatch(STEP, 0), JointHistory()
+        watch, joints = StepMonitor(STEP, 0), JointHistory()
         assert watch.end_ns == STEP.stamp_ns
         # One of the step's own stamp is of before it; the first at the end decides.
         for stamp, place in ((5, STEP.insertion), (6, insertion), (7, insertion)):
             joints.add(JointSample(stamp * TICK, place, rotation))
-        assert watch.look(joints, None) is wanted, insertion
+        assert watch.update(joints, None) is wanted, insertion
         assert watch.end_ns == (6 if wanted is ARRIVED else 5) * TICK
 
 
-def looked(moved: tuple[float, float], sent: int = 100, answered: int = 100) -> list[Followed]:
+def looked(moved: tuple[float, float], sent: int = 100, answered: int = 100) -> list[StepOutcome]:
     """Return the verdicts on six samples, of which the third is moved."""
-    watch, verdicts = StepWatch(STEP, answered), []
+    watch, verdicts = StepMonitor(STEP, answered), []
     for k in range(7):
         at = moved if k == 2 else (0.0, 0.0)
         sample = JointSample((6 + k) * TICK, 0.005 + at[0], at[1], sent)
-        verdicts.append(watch.look(JointHistory(), sample))
-        if verdicts[-1] is STOOD:
+        verdicts.append(watch.update(JointHistory(), sample))
+        if verdicts[-1] is STOPPED_SHORT:
             assert watch.end_ns == sample.stamp_ns
     return verdicts
 
 
 def test_joints_stand_that_rest_for_five_samples_sent_after_the_answer() -> None:
-    at_once = [NOT_YET] * 4 + [STOOD] * 3
+    at_once = [PENDING] * 4 + [STOPPED_SHORT] * 3
     assert looked((0.0, 0.0)) == at_once
     assert looked((1.9e-6, -0.9e-4)) == at_once
     for moved in ((2.1e-6, 0.0), (0.0, -1.1e-4)):
         # The third began anew, and so did the fourth, which is away from the third.
-        assert looked(moved) == [NOT_YET] * 7
-    assert looked((0.0, 0.0), sent=99) == [NOT_YET] * 7
-    assert StepWatch(STEP, 0).look(JointHistory(), None) is NOT_YET
+        assert looked(moved) == [PENDING] * 7
+    assert looked((0.0, 0.0), sent=99) == [PENDING] * 7
+    assert StepMonitor(STEP, 0).update(JointHistory(), None) is PENDING
 
 
 def test_joints_have_moved_that_went_on_since_the_last_look() -> None:
-    patience = Patience()
+    watchdog = Watchdog()
     looks = [None, 0.01, 0.01 + 1.9e-6, 0.01 + 4e-6, 0.01 + 1.9e-6, None, 0.01]
     said = [
-        patience.has_moved(None if place is None else JointSample(k, place, 0.0))
+        watchdog.has_moved(None if place is None else JointSample(k, place, 0.0))
         for k, place in enumerate(looks)
     ]
     assert said == [False, False, False, True, True, False, False]
 
 
-def watched(watch: RetractionWatch, *places: float) -> list[bool]:
-    return [watch.watch(place, out_below=OUT, tolerance=TOLERANCE) for place in places]
+def watched(watch: RetractionMonitor, *places: float) -> list[bool]:
+    return [watch.update(place, out_below=OUT, tolerance=TOLERANCE) for place in places]
 
 
 def test_a_needle_is_drawn_back_where_the_median_of_five_samples_is() -> None:
-    watch = RetractionWatch()
+    watch = RetractionMonitor()
     assert not any(watched(watch, *[0.01] * 3, *[0.02] * 5, 0.005, 0.005))
     assert not any(watched(watch, *[0.02] * 3, 0.005, *[0.02] * 5))
     assert not any(watched(watch, *[0.02 - 1.99e-4] * 5))
-    assert watch.obstacle == ""
+    assert watch.reason == ""
     assert watched(watch, *[0.02 - 2.01e-4] * 3)[-1]
-    assert "was retracted: draw it out first" in watch.obstacle
+    assert "was retracted: draw it out first" in watch.reason
     # Pushed in again it was drawn back all the same; out, it was not.
     watched(watch, *[0.025] * 5)
-    assert watch.obstacle
+    assert watch.reason
     watched(watch, *[0.0021] * 5)
-    assert watch.obstacle
+    assert watch.reason
     watched(watch, *[0.002] * 5)
-    assert watch.obstacle == ""
+    assert watch.reason == ""
 
 
 def test_a_needle_that_is_out_may_go_to_and_fro() -> None:
-    watch = RetractionWatch()
+    watch = RetractionMonitor()
     watched(watch, *[0.002] * 5)
     assert watched(watch, *[0.0015] * 5).count(True) == 1
-    assert watch.obstacle == ""
+    assert watch.reason == ""
     watched(watch, *[0.02] * 5, *[0.01] * 5)
-    assert watch.obstacle
-    watch.begin(0.01)
-    assert watch.obstacle == ""
+    assert watch.reason
+    watch.reset(0.01)
+    assert watch.reason == ""
     # The first two samples say nothing yet.
     assert watched(watch, 0.005, 0.005, 0.005) == [False, False, True]
 
@@ -109,13 +109,13 @@ def test_joints_that_jumped_are_back_where_the_needle_was_followed_to() -> None:
         ((0.020201, 0.3), True),
         ((0.02, 0.401), True),
     ):
-        watch, before = RetractionWatch(), JointSample(0, 0.02, 0.3)
+        watch, before = RetractionMonitor(), JointSample(0, 0.02, 0.3)
         watched(watch, *[0.02] * 5)
-        assert watch.jump(before, JointSample(1, 0.01, 0.3), TOLERANCE)
-        assert "jumped from 0.02 m, 0.3 rad to 0.01 m, 0.3 rad: draw" in watch.obstacle
+        assert watch.add_jump(before, JointSample(1, 0.01, 0.3), TOLERANCE)
+        assert "jumped from 0.02 m, 0.3 rad to 0.01 m, 0.3 rad: draw" in watch.reason
         # What comes between was not seen to move either, and is no retraction.
         assert not any(watched(watch, *[0.01] * 5, *[0.005] * 5))
-        assert watch.jump(JointSample(2, 0.005, 0.3), JointSample(3, *back), TOLERANCE) is away
-        assert bool(watch.obstacle) is away, back
+        assert watch.add_jump(JointSample(2, 0.005, 0.3), JointSample(3, *back), TOLERANCE) is away
+        assert bool(watch.reason) is away, back
         watched(watch, *[0.002] * 5)
-        assert watch.obstacle == ""
+        assert watch.reason == ""
