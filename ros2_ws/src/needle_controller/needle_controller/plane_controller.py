@@ -16,7 +16,7 @@ from needle_controller.model.kinematics import angle_axes
 from needle_controller.model.point_reach import point_from_message
 from needle_controller.model.target_plane import plane_from_pose
 from needle_controller.observers.estimator import Estimate
-from needle_controller.planning.marked_obstacles import obstacles_from_markers
+from needle_controller.planning.obstacles import obstacles_from_markers
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import (
     Action,

@@ -153,7 +153,7 @@ def command_line_parameters(
 def _obstacles(path: Path) -> list[float]:
     """Return a file's obstacles as plane_controller's parameter has them."""
     # It brings compiled code along: half a second that only runs with obstacles pay for.
-    from needle_controller.planning.obstacle_files import read_obstacles  # noqa: PLC0415
+    from needle_controller.planning.obstacles import read_obstacles  # noqa: PLC0415
 
     return [float(value) for value in read_obstacles(path).table.ravel()]
 

@@ -15,9 +15,8 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from needle_controller.planning.obstacle_files import read_obstacles
-from needle_controller.planning.obstacles import Obstacles
-from needle_controller.planning.safe_starts import SafeStarts, safe_starts
+from needle_controller.planning.entry import SafeStarts, safe_starts
+from needle_controller.planning.obstacles import Obstacles, read_obstacles
 from needle_controller.presets.path_steering import path_planner
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json

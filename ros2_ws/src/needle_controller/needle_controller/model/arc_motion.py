@@ -1,8 +1,7 @@
-"""Motion along arcs on SE(3), exact and with its derivative by the curvature ([KC09] (2)).
+"""Exact motion along arcs on SE(3), and its derivative by the curvature ([KC09] (2)).
 
-Over an advance the tip moves by exp((V1 l + V2 theta)^): in its own axes it is turned by the
-rotation vector (kappa l, 0, theta) and shifted along the helix that belongs to it. Leading axes
-broadcast.
+Over an advance the tip moves by exp((V1 l + V2 theta)^): in its own axes it rotates by the rotation
+vector (kappa l, 0, theta) and moves along the corresponding helix. Leading axes broadcast.
 """
 
 from __future__ import annotations
@@ -14,11 +13,11 @@ import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
 
-_SERIES_BELOW = 0.01
+SERIES_BELOW = 0.01
 
 
 def cross_matrix(vector: npt.ArrayLike) -> Array:
-    """Return v^, for which v^ w = v x w, shape (..., 3, 3) of (..., 3)."""
+    """Return v^ with v^ w = v x w, shape (..., 3, 3) of (..., 3)."""
     vector = np.asarray(vector, dtype=float)
     matrix = np.zeros((*vector.shape[:-1], 3, 3))
     x, y, z = (vector[..., i] for i in range(3))
@@ -29,9 +28,9 @@ def cross_matrix(vector: npt.ArrayLike) -> Array:
 
 
 def rotation_exp(vector: npt.ArrayLike) -> Array:
-    """Return the rotation about a vector by its length [rad], shape (..., 3, 3) of (..., 3)."""
+    """Return the rotation of a rotation vector [rad], shape (..., 3, 3) of (..., 3)."""
     vector = np.asarray(vector, dtype=float)
-    a, b, _ = _factors(np.sum(vector * vector, axis=-1))
+    a, b, _ = rodrigues_factors(np.sum(vector * vector, axis=-1))
     matrix = cross_matrix(vector)
     return np.asarray(
         np.eye(3) + a[..., None, None] * matrix + b[..., None, None] * (matrix @ matrix)
@@ -41,7 +40,7 @@ def rotation_exp(vector: npt.ArrayLike) -> Array:
 def left_jacobian(vector: npt.ArrayLike) -> Array:
     """Return J with exp((v + dv)^) = exp((J dv)^) exp(v^) to first order, (..., 3, 3)."""
     vector = np.asarray(vector, dtype=float)
-    _, b, c = _factors(np.sum(vector * vector, axis=-1))
+    _, b, c = rodrigues_factors(np.sum(vector * vector, axis=-1))
     matrix = cross_matrix(vector)
     return np.asarray(
         np.eye(3) + b[..., None, None] * matrix + c[..., None, None] * (matrix @ matrix)
@@ -50,14 +49,14 @@ def left_jacobian(vector: npt.ArrayLike) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class RelativeMotion:
-    """A motion's end in the axes of its start, and its derivative by the curvature.
+    """End of a motion in the axes of its start, and its derivative by the curvature.
 
     Attributes
     ----------
     shift : ndarray, shape (..., 3)
-        The end's position [m].
+        Position of the end [m].
     rotation : ndarray, shape (..., 3, 3)
-        The end's orientation.
+        Orientation of the end.
     shift_slope : ndarray, shape (..., 3)
         d shift / d curvature [m^2].
     rotation_slope : ndarray, shape (..., 3)
@@ -71,7 +70,7 @@ class RelativeMotion:
 
 
 def arc(length: npt.ArrayLike, turn: npt.ArrayLike, curvature: npt.ArrayLike) -> RelativeMotion:
-    """Return the tip's motion over one advance; negative arguments take it back.
+    """Return the tip's motion over one advance; negative arguments reverse it.
 
     Parameters
     ----------
@@ -89,8 +88,8 @@ def arc(length: npt.ArrayLike, turn: npt.ArrayLike, curvature: npt.ArrayLike) ->
     )
     x = kappa * inserted
     q = x * x + z * z
-    a, b, c = _factors(q)
-    small = q < _SERIES_BELOW
+    a, b, c = rodrigues_factors(q)
+    small = q < SERIES_BELOW
     safe = np.where(small, 1.0, q)
     db = np.where(
         small, -1.0 / 24.0 + q * (1.0 / 360.0 - q / 13440.0), (a - 2.0 * b) / (2.0 * safe)
@@ -100,7 +99,7 @@ def arc(length: npt.ArrayLike, turn: npt.ArrayLike, curvature: npt.ArrayLike) ->
     )
     one, zero = np.ones_like(x), np.zeros_like(x)
     shift = np.stack([c * x * z, -b * x, one - c * x * x], axis=-1) * inserted[..., None]
-    # By x, with dq/dx = 2 x.
+    # Derivative by x, with dq/dx = 2 x
     slope = np.stack(
         [
             c * z + 2.0 * dc * x * x * z,
@@ -118,10 +117,10 @@ def arc(length: npt.ArrayLike, turn: npt.ArrayLike, curvature: npt.ArrayLike) ->
     )
 
 
-def _factors(squared: Array) -> tuple[Array, Array, Array]:
-    """Return sin(a)/a, (1 - cos(a))/a^2, (a - sin(a))/a^3 of a^2: Rodrigues' formula's factors."""
+def rodrigues_factors(squared: Array) -> tuple[Array, Array, Array]:
+    """Return Rodrigues' factors sin(a)/a, (1 - cos(a))/a^2, (a - sin(a))/a^3 of a^2."""
     q = np.asarray(squared, dtype=float)
-    small = q < _SERIES_BELOW
+    small = q < SERIES_BELOW
     safe = np.where(small, 1.0, q)
     angle = np.sqrt(safe)
     a = np.where(small, 1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0)), np.sin(angle) / angle)

@@ -1,4 +1,4 @@
-"""The step protocol: when the needle is moved, based on which data, and when it is not.
+"""The step protocol: when the needle moves, and based on which data.
 
 States: IDLE -> STEERING <-> WAITING_FOR_TIP -> DONE | FAULT. Handlers take events and return
 actions; time is an argument. Commands depend on stamps, never on the order in which topics arrive.
@@ -69,8 +69,7 @@ class Steering:
     command_ns : int
         Stamp of the last command sent [ns]; 0 before the first.
     insertion, reach, confidence : float, Reachability or None, Confidence
-        At the last used tip: insertion [m], reachability of plane or point, confidence in the
-        estimate.
+        At the last used tip: insertion [m], reachability of the target, confidence.
     tips : TipQueue
         Tips and joints.
     watchdog : Watchdog
@@ -356,7 +355,7 @@ class Steering:
     def _send(self) -> list[Action]:
         step, device = self._ready_step, self._device
         if step is None or device is None or not device.hold_owner:
-            # The step was computed for an earlier hold: compute a new one after the next.
+            # The step was computed for an earlier hold, and is discarded.
             self._ready_step = None
             self.awaiting = Awaiting.HOLD
             return []
@@ -396,7 +395,6 @@ class Steering:
         return self._leave(SteeringState.IDLE, why, "warning") if self._steering else []
 
     def _leave(self, state: SteeringState, reason: str, severity: str) -> list[Action]:
-        """Stop steering; `state` is the new state."""
         self.state, self.reason = state, reason
         self.awaiting = Awaiting.NOTHING
         self.watchdog.silence = ""

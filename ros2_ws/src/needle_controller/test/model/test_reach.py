@@ -18,6 +18,7 @@ from needle_controller.model.point_reach import (
     widest_at,
 )
 from needle_controller.model.reachability import (
+    LARGEST_PITCH,
     check_offset,
     farthest_offsets,
     least_insertion,
@@ -60,11 +61,10 @@ def test_random_rolls_never_beat_the_farthest_offsets_and_those_take_all_inserti
             assert float(least) == pytest.approx(far, rel=1e-9)
 
 
-def test_a_pitch_limit_adds_a_straight_stretch() -> None:
-    limit = math.radians(20.0)
-    least = float(least_insertion([-0.05, 0.0, 0.0], CURVATURE, pitch_limit=limit))
-    arcs = 2.0 * (1.0 - math.cos(limit)) / CURVATURE
-    expected = 2.0 * limit / CURVATURE + (0.05 - arcs) / math.sin(limit)
+def test_the_largest_pitch_adds_a_straight_part() -> None:
+    least = float(least_insertion([-0.5, 0.0, 0.0], CURVATURE))
+    arcs = 2.0 * (1.0 - math.cos(LARGEST_PITCH)) / CURVATURE
+    expected = 2.0 * LARGEST_PITCH / CURVATURE + (0.5 - arcs) / math.sin(LARGEST_PITCH)
     assert least == pytest.approx(expected, rel=1e-12)
 
 
@@ -100,9 +100,6 @@ def test_calls_that_make_no_sense_are_refused_with_what_and_why() -> None:
     for curvature in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(UserError, match="curvature"):
             least_insertion([0.0, 0.0, 0.0], curvature)
-    for limit in (0.0, 0.5 * math.pi):
-        with pytest.raises(UserError, match="pitch_limit"):
-            least_insertion([0.0, 0.0, 0.0], CURVATURE, pitch_limit=limit)
     with pytest.raises(UserError, match="pitch"):
         least_insertion([0.0, 1.6, 0.0], CURVATURE)
     with pytest.raises(UserError, match="tolerance"):

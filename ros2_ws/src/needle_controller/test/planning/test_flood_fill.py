@@ -12,11 +12,11 @@ from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.planning import entry as entries
 from needle_controller.planning.entry import NoPath, first_path
 from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
-from needle_controller.planning.path_settings import PathSettings
 
 CURVATURE = 1.0 / 0.1356
-SETTINGS = PathSettings(math.radians(30.0) / 0.001, curvature_share=1.0, comfortable_share=1.0)
+SETTINGS = PathSettings(math.radians(30.0) / 0.001, curvature_share=1.0, gentle_share=1.0)
 PLANNER = PathPlanner(SETTINGS)
 ENTRY = TipState(np.zeros(3), np.eye(3), CURVATURE)
 TARGET = np.array([0.0, 0.0, 0.1])
@@ -48,15 +48,15 @@ def _no_hint(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("_no_hint")
 def test_a_wall_with_a_gap_has_a_path_and_one_without_has_none() -> None:
-    clear = 2.0 * SETTINGS.least_clear
+    clear = 2.0 * SETTINGS.least_clearance
     assert may(Obstacles())
     assert may(wall(clear + 0.001))
     # A cell's size and 0.1 mm of bending are what the fill cannot tell apart.
     assert not may(wall(clear - 0.0015))
     found = first_path(PLANNER, ENTRY, TARGET, wall(clear - 0.0015))
     assert isinstance(found, NoPath)
-    assert found.exists_none
-    assert "no path to the target point is clear of the" in found.why
+    assert found.is_proven
+    assert "no path to the target point is clear of the" in found.reason
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
@@ -106,12 +106,12 @@ def test_what_has_a_path_is_never_said_to_have_none() -> None:
 @pytest.mark.usefixtures("_no_hint")
 def test_what_is_not_found_is_not_said_to_be_impossible(monkeypatch: pytest.MonkeyPatch) -> None:
     # Wide enough for the fill, by its cells' size, and too narrow for a needle.
-    narrow = wall(2.0 * SETTINGS.least_clear - 0.0003)
+    narrow = wall(2.0 * SETTINGS.least_clearance - 0.0003)
     monkeypatch.setattr(entries, "THOROUGH_STARTS", 5)
     found = first_path(PLANNER, ENTRY, TARGET, narrow)
     assert isinstance(found, NoPath)
-    assert not found.exists_none
-    assert "was found clear of the" in found.why
+    assert not found.is_proven
+    assert "was found clear of the" in found.reason
 
 
 def test_the_thorough_search_finds_what_the_quick_one_misses() -> None:

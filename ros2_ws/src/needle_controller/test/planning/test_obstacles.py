@@ -11,12 +11,22 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from needle_controller.planning.clearance import chain_margin, needed
-from needle_controller.planning.marked_obstacles import CYLINDER, SPHERE, obstacles_from_markers
-from needle_controller.planning.obstacle_files import read_obstacles
-from needle_controller.planning.obstacles import MOST_OBSTACLES, Obstacle, Obstacles
-from needle_controller.planning.path_settings import PathSettings, Unknown
-from needle_controller.planning.segments import segment_distance
+from needle_controller.planning.obstacles import (
+    CYLINDER,
+    MOST_OBSTACLES,
+    SPHERE,
+    Obstacle,
+    Obstacles,
+    obstacles_from_markers,
+    read_obstacles,
+    segment_distance,
+)
+from needle_controller.planning.path_evaluation import (
+    PathSettings,
+    PoseUncertainty,
+    chain_margin,
+    required_clearance,
+)
 from needle_core.errors import UserError
 from needle_core.messages import Marker, Markers
 
@@ -60,8 +70,10 @@ def test_a_chord_is_as_clear_as_it_must_be_at_the_worse_of_its_ends(
     # Place, and the path's length there.
     points = np.array([[1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.01, 0.01]])
     table = np.array([[1.02, 0.0, 0.005, 1.02, 0.0, 0.005, 0.003]])
-    margin = chain_margin(points, 2, table, Unknown(*unknown), settings)
-    assert margin == pytest.approx(0.017 - needed(worst, Unknown(*unknown), settings))
+    margin = chain_margin(points, 2, table, PoseUncertainty(*unknown), settings)
+    assert margin == pytest.approx(
+        0.017 - required_clearance(worst, PoseUncertainty(*unknown), settings)
+    )
 
 
 def test_what_is_no_obstacle_is_refused_by_name() -> None:

@@ -14,11 +14,11 @@ from scipy.linalg import expm
 
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
-from needle_controller.planning.legs import cut_short, leg_towards, move, seen_from
+from needle_controller.planning.entry import SafeStarts, safe_starts
+from needle_controller.planning.legs import advance_pose, in_tip_axes, leg_towards, truncated
 from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
-from needle_controller.planning.path_settings import PathSettings
-from needle_controller.planning.safe_starts import SafeStarts, safe_starts
 from needle_core.errors import UserError
 
 CURVATURE = 1.0 / 0.122
@@ -45,7 +45,7 @@ def driven(tip: TipState, path: NeedlePath, curvature: float) -> Array:
     places = [pose[:3, 3]]
     for row in path.legs:
         leg = leg_towards(pose[:3], row[:3], curvature, 1.0, RATE)
-        leg = cut_short(leg, row[3])
+        leg = truncated(leg, row[3])
         # Where it bends less than it can, the bevel goes to and fro: this is the mean.
         assert leg.curvature < curvature or abs(leg.turn) <= RATE * leg.turning + 1e-9
         assert leg.curvature <= curvature
@@ -77,7 +77,7 @@ def sampled_clearance(places: Array, obstacles: Obstacles) -> float:
 
 
 def test_a_path_that_is_driven_again_is_clear_and_ends_within_the_tolerance() -> None:
-    settings = PathSettings(RATE, curvature_share=0.9, comfortable_share=0.9)
+    settings = PathSettings(RATE, curvature_share=0.9, gentle_share=0.9)
     plans, paths = PathPlanner(settings), 0
     for seed in range(30):
         rng = np.random.default_rng([8, seed])
@@ -101,7 +101,7 @@ def test_a_path_that_is_driven_again_is_clear_and_ends_within_the_tolerance() ->
         assert path.length == pytest.approx(length, rel=1e-3)
         assert np.linalg.norm(places[-1] - target) <= settings.goal_tolerance + 1e-4
         # Chords of 5 mm are up to 0.03 mm off their arcs.
-        clear = sampled_clearance(places, obstacles) - settings.least_clear
+        clear = sampled_clearance(places, obstacles) - settings.least_clearance
         assert clear >= -3e-5
         assert path.margin == pytest.approx(clear, abs=6e-5)
     assert paths > 5
@@ -141,16 +141,16 @@ def test_without_obstacles_the_path_is_one_leg_to_the_target() -> None:
 def test_a_needle_whose_pose_is_known_is_led_past_what_is_in_the_way() -> None:
     plans, pose, least, insertion = planner(), ENTRY.pose, math.inf, 0.0
     paths: list[NeedlePath] = []
-    while (ahead := seen_from(pose, TARGET)[2]) > 1e-5:
+    while (ahead := in_tip_axes(pose, TARGET)[2]) > 1e-5:
         tip = TipState(pose[:, 3], pose[:, :3], CURVATURE)
-        followed = paths[-1] if paths else None
-        path = plans.path(tip, TARGET, IN_THE_WAY, insertion=insertion, followed=followed)
+        previous = paths[-1] if paths else None
+        path = plans.path(tip, TARGET, IN_THE_WAY, insertion=insertion, previous=previous)
         paths.append(found(path))
         length = min(0.002, ahead)
-        x, y, _ = seen_from(pose, paths[-1].aim)
+        x, y, _ = in_tip_axes(pose, paths[-1].aim)
         turn = min(max(math.atan2(x, -y), -RATE * length), RATE * length)
         for _ in range(4):
-            move(pose, length / 4, turn / 4, CURVATURE, pose)
+            advance_pose(pose, length / 4, turn / 4, CURVATURE, pose)
             least = min(least, IN_THE_WAY.clearance(pose[:, 3]) - NEEDLE)
         insertion += length
     assert len(paths[0].legs) > 1
@@ -187,20 +187,20 @@ def test_a_followed_path_goes_on_from_where_the_needle_is_unless_it_runs_into_so
     plans = planner()
     path = found(plans.path(ENTRY, TARGET, IN_THE_WAY))
     first = float(path.legs[0, 3])
-    left = path.rest(0.5 * first)
+    left = path.remaining_legs(0.5 * first)
     assert left[0, 3] == pytest.approx(0.5 * first)
     np.testing.assert_array_equal(left[:, :3], path.legs[:, :3])
-    np.testing.assert_array_equal(path.rest(first)[:, :3], path.legs[1:, :3])
-    np.testing.assert_array_equal(path.rest(1.0)[:, :3], path.legs[-1:, :3])
-    # A target that moves is followed.
+    np.testing.assert_array_equal(path.remaining_legs(first)[:, :3], path.legs[1:, :3])
+    np.testing.assert_array_equal(path.remaining_legs(1.0)[:, :3], path.legs[-1:, :3])
+    # A target that moves is previous.
     moved = TARGET + np.array([0.002, 0.0, 0.0])
-    again = found(plans.path(ENTRY, moved, IN_THE_WAY, followed=path))
+    again = found(plans.path(ENTRY, moved, IN_THE_WAY, previous=path))
     np.testing.assert_allclose(again.legs[-1, :3], moved)
     direct = found(plans.path(ENTRY, TARGET, Obstacles()))
-    around = found(plans.path(ENTRY, TARGET, IN_THE_WAY, followed=direct))
+    around = found(plans.path(ENTRY, TARGET, IN_THE_WAY, previous=direct))
     assert around.margin >= 0.0
     assert len(around.legs) > 1
-    assert plans.path(ENTRY, TARGET, BURIED, followed=direct) is None
+    assert plans.path(ENTRY, TARGET, BURIED, previous=direct) is None
 
 
 def test_bad_calls_are_refused_with_the_value() -> None:

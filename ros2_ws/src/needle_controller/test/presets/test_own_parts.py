@@ -16,8 +16,7 @@ from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.presets.own_estimator import tried_estimator
 from needle_controller.presets.own_law import OwnLaw, tried_law
 from needle_controller.presets.own_parts import GROUPS, OwnPartError
-from needle_controller.presets.own_planner import tried_planner
-from needle_controller.presets.path_steering import PathSteering
+from needle_controller.presets.path_steering import PathSteering, tried_planner
 from needle_controller.presets.point_steering import prompt_point_law
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
@@ -232,8 +231,8 @@ def test_an_own_planner_leads_by_its_via_points_to_the_target(offer: Offer) -> N
     assert around is not None
     np.testing.assert_allclose(around.aim, [0.0, -0.01, 0.04])
     assert around.length == pytest.approx(2.0 * np.hypot(0.01, 0.04))
-    assert way.why_not(target, Obstacles([sphere]), 0.0) == ""
-    none = way.why_not(target, Obstacles([sphere, sphere]), 0.0)
+    assert way.find_first(target, Obstacles([sphere]), 0.0) == ""
+    none = way.find_first(target, Obstacles([sphere, sphere]), 0.0)
     assert none == f"planner {settings.planner} finds no path to the target point past 2 obstacles"
     name = offer("planner", PLANNER.replace("return [target]", "return [target + 0.01]"))
     with pytest.raises(OwnPartError, match=r"does not end at the target \[0.0, 0.0, 0.08\] m"):

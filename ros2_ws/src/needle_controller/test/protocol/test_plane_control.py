@@ -14,7 +14,7 @@ from needle_controller.filter import hypothesis_filter
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.planning.obstacles import Obstacle, Obstacles
-from needle_controller.planning.path_settings import PathSettings
+from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.presets.path_steering import path_planner
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_controller.protocol.actions import next_step
