@@ -1,8 +1,8 @@
-"""The arc of a pure insertion ([KC09] IV-B): its points, and how they move with what is unknown.
+"""Arc of a pure insertion ([KC09] IV-B): its points, and their derivatives by the unknowns.
 
 The unknowns, (..., 7): the entry [m], two angles of the heading there [rad], and the two components
-of kappa n across the heading [1/m], n being the direction the needle bends to. In these there is no
-singular point at kappa = 0. Leading axes broadcast.
+of kappa n across the heading [1/m], where n is the direction to which the needle bends. There is no
+singularity at kappa = 0. Leading axes broadcast.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ UNKNOWNS = 7
 
 
 def frame(heading: Array) -> Array:
-    """Return axes (as columns) of which the third is a heading."""
+    """Return axes as columns, of which the third is the heading."""
     aside = np.eye(3)[np.argmin(np.abs(heading))]
     first = np.cross(aside, heading)
     first /= np.linalg.norm(first)
@@ -31,7 +31,7 @@ def frame(heading: Array) -> Array:
 
 
 def headings(angles: Array) -> Array:
-    """Return the frames whose third axis is turned by two angles, shape (..., 3, 3)."""
+    """Return the frames whose third axis is rotated by two angles, shape (..., 3, 3)."""
     return rotation_exp(_with_zero(angles))
 
 

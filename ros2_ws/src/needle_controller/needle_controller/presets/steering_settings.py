@@ -1,4 +1,4 @@
-"""Settings of steering: the parameters of plane_controller."""
+"""Settings of steering, which are the parameters of plane_controller."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter, parameter
 
 ONE_SIDED_PRESETS = ("paper", "open_loop")
-"""Their coordinates end at roll +-90 deg."""
+"""Presets whose coordinates are limited to roll +-90 deg."""
 PRESETS = ("best", *ONE_SIDED_PRESETS)
 POINT_PRESETS = ("best",)
-"""Those that estimate the whole pose, and so can steer to a point."""
+"""Presets that estimate the whole pose, and can steer to a point."""
 INSERTIONS = ("stepwise", "continuous")
 TIP_NOISES = ("bounded", "normal")
 TIP_COVARIANCES = ("configured", "from_tip_pose")
-"""Where a tip's covariance comes from."""
+"""Sources of a tip's covariance."""
 PAPER_NOISE: dict[str, Any] = {
     "tip_covariance": "configured",
     "tip_noise": "bounded",
     "tip_noise_bound": 0.001,
     "measurement_std": 0.001 / math.sqrt(3.0),
 }
-"""Coordinates uniformly off by up to 1 mm, as the simulations of [KC09] have them."""
+"""Uniform errors of the coordinates up to 1 mm, as in the simulations of [KC09]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SteeringSettings:
-    """Settings of estimator, law and step protocol; taken as a whole or refused.
+    """Settings of estimator, law and step protocol.
 
     Raises
     ------
     UserError
-        A value out of its bounds, weights that give no stable gains, or flips with a preset that
-        cannot make them.
+        A value out of its bounds, weights without stable gains, or settings that exclude each
+        other.
     """
 
     preset: str = parameter(
@@ -249,7 +249,7 @@ class SteeringSettings:
     )
 
     def __post_init__(self) -> None:
-        """Check the whole; the gains where the preset has any."""
+        """Check all settings, and the gains of presets that have any."""
         check_fields(self)
         for name in ("state_weights", "process_noise"):
             numbers = getattr(self, name)
@@ -288,38 +288,38 @@ class SteeringSettings:
 
     @property
     def controller(self) -> str:
-        """Name of the controller: the preset, and its parts from other packages."""
+        """Name of the controller: the preset, and parts of other packages."""
         own = [f"{kind} {getattr(self, kind)}" for kind in GROUPS if getattr(self, kind)]
         return f"{self.preset} with {', '.join(own)}" if own else self.preset
 
     @property
     def turning(self) -> dict[str, float]:
-        """Settings common to all laws that turn the bevel, by name."""
+        """Settings common to all laws that turn the bevel."""
         names = ("step_length", "max_rotation_per_length", "max_winding")
         return {name: getattr(self, name) for name in names}
 
     @property
     def has_bounded_noise(self) -> bool:
-        """Whether a bound is claimed of the tips' noise, not a covariance."""
+        """Whether the tips have bounded noise instead of a covariance."""
         return self.tip_covariance == "configured" and self.tip_noise == "bounded"
 
     def configured_covariance(self) -> Array | None:
-        """Return a tip's covariance [m^2], shape (3, 3); None where the noise is bounded."""
+        """Return the configured covariance [m^2], shape (3, 3); None for bounded noise."""
         if self.tip_noise == "bounded":
             return None
         return np.asarray(np.eye(3) * self.measurement_std**2)
 
     def plane(self) -> TargetPlane:
-        """Return the wanted plane, until another one is given."""
+        """Return the configured target plane."""
         return offset_plane(self.target_offset)
 
     def check_point(self, point: npt.ArrayLike) -> None:
-        """Refuse a point, (3,) in `rig` [m], that these settings cannot steer to; UserError."""
+        """Check that a point, (3,) in `rig` [m], can be reached; raises UserError."""
         self.check_steers_to_points()
         check_point(point, self.curvature, self.depth)
 
     def check_steers_to_points(self) -> None:
-        """Refuse points altogether, with a law or a plan that is for planes; UserError."""
+        """Check that preset, law and plan allow target points; raises UserError."""
         if self.law and not self.steers_to_points:
             raise own_part("law", self.law).error(
                 "cannot steer to a point: it lacks to_point(estimate, target)"
@@ -334,11 +334,11 @@ class SteeringSettings:
 
     @property
     def steers_to_points(self) -> bool:
-        """Whether the law is one for points, too."""
+        """Whether the law can steer to points."""
         if self.law:
             return callable(getattr(own_part("law", self.law).cls, "to_point", None))
         return self.preset in POINT_PRESETS
 
     def check_plane(self, plane: TargetPlane) -> None:
-        """Refuse a wanted plane that is out of reach; raises UserError."""
+        """Check that a target plane can be reached; raises UserError."""
         check_within_reach(plane, self.curvature, self.depth)

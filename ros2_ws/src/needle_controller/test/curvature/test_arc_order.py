@@ -9,8 +9,11 @@ import pytest
 from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 
-from needle_controller.curvature.arc_order import check_order, order
-from needle_controller.curvature.curvature_checks import fit_checked
+from needle_controller.curvature.curvature_checks import (
+    check_independent_residuals,
+    fit_checked,
+    neighbour_correlation,
+)
 from needle_controller.curvature.curvature_fit import CurvatureFitSettings
 from needle_controller.model.arrays import Array
 from needle_core.errors import UserError
@@ -49,7 +52,9 @@ def refused(tips: Array, insertion: Array | None) -> int:
     count = 0
     for each in tips:
         try:
-            check_order(fit_checked(each, insertion, settings).fit.misses, REPEATING)
+            check_independent_residuals(
+                fit_checked(each, insertion, settings).fit.residuals, REPEATING
+            )
         except UserError:
             count += 1
     return count
@@ -81,8 +86,8 @@ def test_errors_that_repeat_are_allowed_for() -> None:
     bowed = tips[0] + noise(tips[0].shape, 2e-6, rng)
     bowed[:, 1] += REPEATING * np.sin(6.0 * np.pi * insertion / 0.12)
     assert refused(bowed[None], insertion) == 0
-    off = fit_checked(bowed, insertion, CurvatureFitSettings()).fit.misses
-    shared, significance = order(off)
+    off = fit_checked(bowed, insertion, CurvatureFitSettings()).fit.residuals
+    shared, significance = neighbour_correlation(off)
     assert significance > 10.0
     assert 0.3 * REPEATING < shared < REPEATING
 
@@ -111,6 +116,6 @@ def test_what_is_wrong_is_said_with_a_way_out() -> None:
     misses = np.zeros((60, 3))
     misses[:, 0] = 1e-3 * np.sin(np.linspace(0.0, 2.0 * np.pi, 60))
     with pytest.raises(UserError, match=r"beside it, wants <= 0\.05 mm.*--until-mm.*rotation_rad"):
-        check_order(misses, REPEATING)
-    check_order(misses, 1e-3)
-    assert order(np.zeros((8, 3))) == (0.0, 0.0)
+        check_independent_residuals(misses, REPEATING)
+    check_independent_residuals(misses, 1e-3)
+    assert neighbour_correlation(np.zeros((8, 3))) == (0.0, 0.0)

@@ -10,9 +10,12 @@ import pytest
 from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
-from needle_controller.curvature.circle_fit import circle_curvature
 from needle_controller.curvature.curvature_checks import fit_checked
-from needle_controller.curvature.curvature_fit import CurvatureFitSettings, fit_curvature
+from needle_controller.curvature.curvature_fit import (
+    CurvatureFitSettings,
+    circle_curvature,
+    fit_curvature,
+)
 from needle_controller.curvature.insertion_arc import arc_points
 from needle_core.errors import UserError
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from needle_controller.filter.hypotheses import (
+from needle_controller.filter.filter_settings import (
     RollHypothesis,
     TorsionHypothesis,
 )

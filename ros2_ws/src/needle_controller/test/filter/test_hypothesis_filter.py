@@ -9,10 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from needle_controller.filter.bank import advance_needle, correct_needle
-from needle_controller.filter.filter_settings import ROLL_HYPOTHESES, FilterSettings
-from needle_controller.filter.hypotheses import (
-    LASTING,
+from needle_controller.filter.filter_settings import (
+    CORRELATED,
     NORMAL,
+    ROLL_HYPOTHESES,
+    FilterSettings,
     NoiseHypothesis,
     RollHypothesis,
     TorsionHypothesis,
@@ -168,7 +169,7 @@ def test_in_a_study_each_needle_is_as_the_node_has_it(with_covariance: bool) -> 
     "noise",
     [
         NoiseHypothesis(NORMAL, (1.0,), (1.0,), 1.0),
-        NoiseHypothesis(LASTING, (1.0,), (1.0,), 1.0, (0.5,)),
+        NoiseHypothesis(CORRELATED, (1.0,), (1.0,), 1.0, (0.5,)),
     ],
 )
 def test_another_plane_is_another_description_of_the_same_needle(noise: NoiseHypothesis) -> None:

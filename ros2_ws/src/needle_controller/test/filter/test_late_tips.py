@@ -7,7 +7,7 @@ import pytest
 
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
-from needle_controller.filter.late_tips import FIRST, untold_age
+from needle_controller.filter.late_tips import FIRST, hidden_age
 from needle_controller.filter.mixture import LATE, WARNINGS
 from needle_controller.many_needles import ManyFilters
 from needle_controller.model.arrays import Array
@@ -146,29 +146,29 @@ def test_an_age_is_not_a_slip() -> None:
     inserted, ways = seen(0.003)
     # Two coordinates of two tips are off by what is claimed, in the mean.
     ways *= np.sqrt(1.0 + 4.0 * STEP**2 / 3.0 / np.sum(ways**2, axis=-1, keepdims=True).clip(1e-9))
-    assert untold_age(inserted, ways, 0.0, *KNOWN) == pytest.approx(0.003, abs=1e-4)
+    assert hidden_age(inserted, ways, 0.0, *KNOWN) == pytest.approx(0.003, abs=1e-4)
     inserted, ways = seen(0.0, 0.2)
-    assert untold_age(inserted, ways, 0.0, *KNOWN) == 0.0
+    assert hidden_age(inserted, ways, 0.0, *KNOWN) == 0.0
 
 
 def test_a_first_tip_that_was_too_deep_is_not_an_age() -> None:
     inserted, ways = seen(0.0)
     ways[:, 2] -= 0.0022
-    assert untold_age(inserted, ways, 0.0, np.inf, *KNOWN[1:]) > 0.0
-    assert untold_age(inserted, ways, 0.0022, *KNOWN) == 0.0
+    assert hidden_age(inserted, ways, 0.0, np.inf, *KNOWN[1:]) > 0.0
+    assert hidden_age(inserted, ways, 0.0022, *KNOWN) == 0.0
 
 
 def test_nothing_is_said_without_a_start_or_without_tips() -> None:
     inserted, ways = seen(0.003)
     few = np.where((inserted < FIRST + 4.5 * STEP)[:, None], ways, np.nan)
-    ages = [untold_age(inserted, w, 0.0, *KNOWN) for w in (few, np.full_like(ways, np.nan), ways)]
+    ages = [hidden_age(inserted, w, 0.0, *KNOWN) for w in (few, np.full_like(ways, np.nan), ways)]
     np.testing.assert_array_equal(np.array(ages) > 0.0, [True, False, True])
     few[np.argmax(inserted >= FIRST)] = np.nan
-    assert untold_age(inserted, few, 0.0, *KNOWN) == 0.0
+    assert hidden_age(inserted, few, 0.0, *KNOWN) == 0.0
 
 
 def test_a_known_insertion_scale_leaves_no_slip() -> None:
     inserted, ways = seen(0.0, 0.2)
-    assert untold_age(inserted, ways, 0.0, *KNOWN) == 0.0
+    assert hidden_age(inserted, ways, 0.0, *KNOWN) == 0.0
     # What a slip would explain is then an age.
-    assert untold_age(inserted, ways, 0.0, *KNOWN[:2], 0.0) > 0.0
+    assert hidden_age(inserted, ways, 0.0, *KNOWN[:2], 0.0) > 0.0

@@ -10,13 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal, norm, truncnorm
 
-from needle_controller.filter.filter_settings import FilterSettings
-from needle_controller.filter.hypotheses import LASTING, NoiseHypothesis
+from needle_controller.filter.filter_settings import CORRELATED, FilterSettings, NoiseHypothesis
 from needle_controller.filter.records import E_KAPPA, E_SCALE, ERROR, HYPOTHESIS
 from needle_controller.filter.tip_update import (
     new_reading,
-    new_work,
-    read_tip,
+    new_workspace,
+    prepare_reading,
     truncated_moments,
     update_hypothesis,
 )
@@ -30,7 +29,7 @@ PLAIN = FilterSettings(outlier_share=1e-6, curvature_range=(0.01, 100.0))
 LASTS = dataclasses.replace(
     PLAIN,
     model_error=0.0,
-    noise_hypotheses=(NoiseHypothesis(LASTING, (1.0,), (1.0,), 1.0, (0.6,)),),
+    noise_hypotheses=(NoiseHypothesis(CORRELATED, (1.0,), (1.0,), 1.0, (0.6,)),),
 )
 WITH_OUTLIERS = FilterSettings()
 Records = npt.NDArray[np.void]
@@ -62,9 +61,9 @@ def taken(
     settings: FilterSettings = PLAIN,
 ) -> Records:
     after: Records = before.copy()
-    reading, work = new_reading(), new_work()
+    reading, work = new_reading(), new_workspace()
     reading.tip[:], reading.covariance[:] = tip, noise
-    assert read_tip(reading)
+    assert prepare_reading(reading)
     for h in after:
         update_hypothesis(h, reading, settings.assumptions(), work)
     return after
@@ -96,7 +95,7 @@ def test_a_missing_tip_is_none() -> None:
     for tip, spread in (([np.nan, 0.0, 0.0], 1.0), ([0.0, 0.0, 0.0], np.inf)):
         reading = new_reading()
         reading.tip[:], reading.covariance[:] = tip, np.full((3, 3), spread)
-        assert not read_tip(reading)
+        assert not prepare_reading(reading)
 
 
 def test_uniform_noise_gives_the_posteriors_moments() -> None:
@@ -126,33 +125,33 @@ def test_uniform_noise_gives_the_posteriors_moments() -> None:
     )
 
 
-CORRELATED = np.array([[4e-7, 1e-7, 0.0], [1e-7, 9e-7, -2e-7], [0.0, -2e-7, 2.5e-7]])
+DEPENDENT = np.array([[4e-7, 1e-7, 0.0], [1e-7, 9e-7, -2e-7], [0.0, -2e-7, 2.5e-7]])
 
 
 def test_normal_noise_gives_kalmans_update() -> None:
     before = estimates()
     tip = np.array([0.0105, 0.0193, 0.031])
-    after = taken(before, tip, CORRELATED)
+    after = taken(before, tip, DEPENDENT)
     measured = np.eye(ERROR)[:3]
     found = changes(before, after)
     for h in range(COUNT):
         covariance, expected = before["covariance"][h], before["position"][h]
-        spread = measured @ covariance @ measured.T + CORRELATED
+        spread = measured @ covariance @ measured.T + DEPENDENT
         gain = covariance @ measured.T @ np.linalg.inv(spread)
         wanted = gain @ (tip - expected)
         np.testing.assert_allclose(found[h, :7], wanted[:7], rtol=1e-4, atol=1e-8)
         keep = np.eye(ERROR) - gain @ measured
-        wanted = keep @ covariance @ keep.T + gain @ CORRELATED @ gain.T
+        wanted = keep @ covariance @ keep.T + gain @ DEPENDENT @ gain.T
         scale = np.outer(np.sqrt(np.diag(wanted)), np.sqrt(np.diag(wanted)))
         np.testing.assert_allclose(after["covariance"][h] / scale, wanted / scale, atol=2e-4)
         # Relative to the density of uniform noise of the same variances.
         density = multivariate_normal(expected, spread).pdf(tip)
-        in_box = 1.0 / np.sqrt(12.0**3 * np.linalg.det(CORRELATED))
+        in_box = 1.0 / np.sqrt(12.0**3 * np.linalg.det(DEPENDENT))
         assert after["evidence"][h] == pytest.approx(density / in_box, rel=1e-4)
 
 
 def with_lasting_noise(h: Records, shares: tuple[float, ...]) -> Records:
-    h["shape"] = LASTING
+    h["shape"] = CORRELATED
     h["noise_weights"] = 0.0
     h["noise_weights"][:, :, : len(shares)] = shares
     return h
@@ -194,7 +193,7 @@ def test_where_nothing_was_known_before_no_error_is_taken_off() -> None:
 
 
 def test_tips_show_which_coordinate_is_noisier() -> None:
-    noise = NoiseHypothesis(LASTING, (1.0, 2.0), (0.5, 0.5), 1.0, (0.0, 0.0))
+    noise = NoiseHypothesis(CORRELATED, (1.0, 2.0), (0.5, 0.5), 1.0, (0.0, 0.0))
     settings = dataclasses.replace(PLAIN, noise_hypotheses=(noise,))
     known = with_lasting_noise(estimates(np.eye(ERROR) * 1e-10), (0.5, 0.5))
     rng = np.random.default_rng(5)
