@@ -1,6 +1,6 @@
 """Filters, observers and laws of many needles, for studies: compiled loops over the node's code."""
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -14,13 +14,7 @@ from needle_controller.filter.bank import advance_needle, correct_needle, start_
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.late_tips import LAST
 from needle_controller.filter.mixture import estimate_from_record, estimate_needle
-from needle_controller.filter.records import (
-    ESTIMATE,
-    EVENT,
-    HYPOTHESIS,
-    NEEDLE,
-    TORSION,
-)
+from needle_controller.filter.records import ESTIMATE, EVENT, HYPOTHESIS, NEEDLE, TORSION
 from needle_controller.laws.law import LinearizingGains, linearizing_rate
 from needle_controller.laws.point_law import point_turn
 from needle_controller.laws.point_turns import PointLawSettings
@@ -56,7 +50,7 @@ class ManyFilters:
     Attributes
     ----------
     estimates, torsions : ndarray of ESTIMATE, TORSION, shape (N,), (N, K)
-        Assumptions of the filter.
+        Present estimates.
     """
 
     def __init__(self, settings: FilterSettings, count: int, shortest_step: float) -> None:
@@ -204,11 +198,7 @@ def _correct_all(
 
 @parallel
 def _estimate_all(
-    needles: Records,
-    hypotheses: Records,
-    estimates: Records,
-    torsions: Records,
-    assumed: Records,
+    needles: Records, hypotheses: Records, estimates: Records, torsions: Records, assumed: Records
 ) -> None:
     for n in prange(needles.size):
         estimate_needle(needles[n], hypotheses[n], estimates[n], torsions[n], assumed[0])

@@ -18,13 +18,7 @@ from needle_controller.model.target_plane import plane_from_pose
 from needle_controller.observers.estimator import Estimate
 from needle_controller.planning.obstacles import obstacles_from_markers
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.protocol.actions import (
-    Action,
-    PublishUpdate,
-    SendPath,
-    SendStep,
-    StartReply,
-)
+from needle_controller.protocol.actions import Action, PublishUpdate, SendPath, SendStep, StartReply
 from needle_controller.protocol.continuous import make_steering
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering import Steering

@@ -72,7 +72,7 @@ class InsertionRecord:
         Raises
         ------
         UserError
-            It turned; the message says by how much and from where on.
+            It turned; the message gives angle and insertion.
         """
         if self.rotation is None or len(self.rotation) == 0:
             return

@@ -100,12 +100,12 @@ def forecast_tip(
         precision[BEND, BEND] = np.eye(2) * scale**-2.0
         # Least squares about the arc: (D^T W D + P) x = D^T W r + P x0
         covariance = np.linalg.inv(information + precision)
-        wanted = pull + precision @ offset
-        change = covariance @ wanted
+        right_side = pull + precision @ offset
+        change = covariance @ right_side
         means.append(points[-1] + design[-1] @ change)
         covariances.append(design[-1] @ covariance @ design[-1].T)
         log_det = np.linalg.slogdet(covariance)[1] - 4.0 * np.log(scale)
-        evidence.append(0.5 * (log_det + wanted @ change - offset @ precision @ offset))
+        evidence.append(0.5 * (log_det + right_side @ change - offset @ precision @ offset))
     share = np.exp(np.array(evidence) - np.max(evidence))
     share /= np.sum(share)
     mean = share @ np.array(means)

@@ -5,7 +5,7 @@ insertion since the last tip waits in a queue, so that a late tip is applied at 
 exposure. Angles of base and tip are relative to the start.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -18,11 +18,7 @@ import numpy.typing as npt
 from needle_controller.filter.late_tips import FIRST, LAST, hidden_age
 from needle_controller.filter.merging import copy_hypothesis, merge
 from needle_controller.filter.motion import LARGEST_TURN, advance_hypothesis
-from needle_controller.filter.records import (
-    E_TURN,
-    ERROR,
-    LONGEST_QUEUE,
-)
+from needle_controller.filter.records import E_TURN, ERROR, LONGEST_QUEUE
 from needle_controller.filter.tip_update import (
     Reading,
     new_reading,
@@ -111,12 +107,7 @@ def _start_hypotheses(needle: Any, hypotheses: Records, prior: Records, assumed:
 
 @compiled
 def advance_needle(
-    needle: Any,
-    hypotheses: Records,
-    events: Records,
-    length: float,
-    turn: float,
-    assumed: Any,
+    needle: Any, hypotheses: Records, events: Records, length: float, turn: float, assumed: Any
 ) -> None:
     """Queue a motion of the base until the next tip: inserted length [m] and rotation [rad].
 

@@ -5,7 +5,7 @@ the base as a lag of the tip. With late tips, the same length of insertion is mi
 millimetres on; with a needle that slips, the missing length grows.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 

@@ -1,6 +1,5 @@
 """Combination of all hypotheses of a needle into one estimate; compiled."""
 
-# Compiled code takes keywords slowly or not at all.
 from __future__ import annotations
 
 import math
@@ -44,11 +43,7 @@ _NO_MEAN_ROLL = 0.1
 
 @compiled
 def estimate_needle(
-    needle: Any,
-    hypotheses: Records,
-    estimate: Any,
-    torsions: Records,
-    assumed: Any,
+    needle: Any, hypotheses: Records, estimate: Any, torsions: Records, assumed: Any
 ) -> None:
     """Compute the estimate of a needle.
 

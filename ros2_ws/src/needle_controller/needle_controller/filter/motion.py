@@ -6,7 +6,7 @@ angle is constant until the base is D ahead, then follows at that distance. Lag 
 the shaft over the inserted length, d(tip)/dl = (behind - tip) / L.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -14,13 +14,7 @@ import math
 from typing import Any
 
 from needle_controller.filter.filter_settings import GAIN
-from needle_controller.filter.records import (
-    E_KAPPA,
-    E_SCALE,
-    E_TORSION,
-    E_TURN,
-    ERROR,
-)
+from needle_controller.filter.records import E_KAPPA, E_SCALE, E_TORSION, E_TURN, ERROR
 from needle_controller.model.arrays import Array
 from needle_core.compiled import compiled
 
@@ -137,25 +131,25 @@ def advance_hypothesis(
     theta, torsion_change = tip - h.tip_angle, dtip_dtorsion - h.dtip_dtorsion
     h.tip_angle, h.behind_play, h.dtip_dtorsion = tip, behind, dtip_dtorsion
     # T <- T exp((V1 s l + V2 theta)^), (2): in its own axes the tip turns by (kappa s l, 0, theta).
-    gone = h.scale * length
-    x, z = h.curvature * gone, theta
+    advanced = h.scale * length
+    x, z = h.curvature * advanced, theta
     a, b, c = rotation_factors(x * x + z * z)
     kappa_per_scale = h.curvature / h.scale
     for i in range(3):
         r0, r1, r2 = h.rotation[i, 0], h.rotation[i, 1], h.rotation[i, 2]
         # Mean heading m over the motion: p <- p + s l m.
         heading = c * x * z * r0 - b * x * r1 + (1.0 - c * x * x) * r2
-        h.position[i] += gone * heading
+        h.position[i] += advanced * heading
         # R <- R exp((x, 0, z)^) = R (I + a (.)^ + b (.)^ (.)^)
         h.rotation[i, 0] = (1.0 - b * z * z) * r0 + a * z * r1 + b * x * z * r2
         h.rotation[i, 1] = (1.0 - b * (x * x + z * z)) * r1 - a * z * r0 + a * x * r2
         h.rotation[i, 2] = (1.0 - b * x * x) * r2 + b * x * z * r0 - a * x * r1
         # dp / dkappa and dR / dkappa (a rotation vector)
-        shift = gone * gone * (c * z * r0 - b * r1 - 2.0 * c * x * r2)
-        bend = gone * ((1.0 - c * z * z) * r0 + b * z * r1 + c * x * z * r2)
+        shift = advanced * advanced * (c * z * r0 - b * r1 - 2.0 * c * x * r2)
+        bend = advanced * ((1.0 - c * z * z) * r0 + b * z * r1 + c * x * z * r2)
         # dp = w x (s l m) + shift dkappa + (l m + kappa / s shift) ds
-        gain[(i + 1) % 3, (i + 2) % 3] = gone * heading
-        gain[(i + 2) % 3, (i + 1) % 3] = -gone * heading
+        gain[(i + 1) % 3, (i + 2) % 3] = advanced * heading
+        gain[(i + 2) % 3, (i + 1) % 3] = -advanced * heading
         gain[i, i] = gain[i, E_TORSION - E_TURN] = 0.0
         gain[i, E_KAPPA - E_TURN] = shift
         gain[i, E_SCALE - E_TURN] = length * heading + kappa_per_scale * shift

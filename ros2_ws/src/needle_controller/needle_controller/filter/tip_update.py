@@ -17,7 +17,7 @@ where d and d' are the errors of the estimate at both tips. A part of the varian
 was there at the tip before, because no estimate is less certain than its tip; the rest is new.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -29,14 +29,7 @@ import numpy.typing as npt
 
 from needle_controller.filter.filter_settings import CORRELATED, GAIN, LAG, UNIFORM
 from needle_controller.filter.motion import rotate
-from needle_controller.filter.records import (
-    E_KAPPA,
-    E_SCALE,
-    E_TORSION,
-    E_TURN,
-    ERROR,
-    NOISES,
-)
+from needle_controller.filter.records import E_KAPPA, E_SCALE, E_TORSION, E_TURN, ERROR, NOISES
 from needle_controller.model.arrays import Array
 from needle_core.compiled import compiled
 
@@ -201,10 +194,10 @@ def _weigh_noises(
     row = i if shape == CORRELATED else 0
     per_deviation, per_variance = 1.0 / deviation, 1.0 / variance
     claimed = max(bound * bound / 3.0, assumed.model_error)
-    last = taken = 0.0
+    last = moved_by = 0.0
     for k in range(3):
         last += reading.directions[i, k] * h.residual[k]
-        taken += reading.directions[i, k] * work.change[k]
+        moved_by += reading.directions[i, k] * work.change[k]
     # Skip impossible models explicitly: the compiler would evaluate a branch for all of them.
     possible, count = work.possible, 0
     for m in range(NOISES):
@@ -227,16 +220,16 @@ def _weigh_noises(
             # Variance of d' - c d; the error of the model is not correlated.
             new = variance - c * (2.0 - c) * old + 2.0 * c * c * assumed.model_error
             total = new + (1.0 - c * c) * measured
-            off = innovation - c * (last - taken * old * per_variance)
+            difference = innovation - c * (last - moved_by * old * per_variance)
             per_total = 1.0 / total
             likely = 2.0 * bound * _DENSITY * math.sqrt(per_total)
-            likely *= math.exp(-0.5 * off * off * per_total)
+            likely *= math.exp(-0.5 * difference * difference * per_total)
             # Noise smaller than claimed is possible, but the gain does not rely on it.
             if measured < claimed:
                 total = new + (1.0 - c * c) * claimed
                 per_total = 1.0 / total
             gain = (variance - c * old) * per_deviation * per_total
-            middle, rest = gain * off, 1.0 - gain * gain * total
+            middle, rest = gain * difference, 1.0 - gain * gain * total
         shares[row, m] *= likely
         mass += shares[row, m]
         mean += shares[row, m] * middle

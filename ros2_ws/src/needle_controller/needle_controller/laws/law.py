@@ -1,6 +1,5 @@
 """Control laws: from an estimate to the rotation of the next step ([KC09] (7), (10))."""
 
-# Compiled code takes keywords slowly or not at all.
 from __future__ import annotations
 
 import dataclasses
@@ -88,14 +87,14 @@ def linearizing_rate(
     sine = (s[2] + length * v) / curvature
     scale = saturation_factor(s2, sine, law.demand_margin)
     s2, sine = scale * s2, scale * sine
-    wanted_roll = math.atan2(sine, math.sqrt(1.0 - s2 * s2 - sine * sine))
+    desired_roll = math.atan2(sine, math.sqrt(1.0 - s2 * s2 - sine * sine))
     # The drift of the roll, (5): -kappa cos(roll) tan(pitch), by (6) without trigonometric
     # functions.
     squared = s[1] * s[1]
     cosines = math.sqrt(max(1.0 - squared - (s[2] / curvature) ** 2, 0.0))
     cosines = math.copysign(cosines, 0.5 * math.pi - abs(roll))
     drift = -curvature * cosines * s[1] / (1.0 - squared)
-    rate = (wanted_roll - roll) / length - drift
+    rate = (desired_roll - roll) / length - drift
     return v, min(max(rate, -limit), limit)
 
 

@@ -7,7 +7,7 @@ the roll turns the shorter way to one of the two that have this s3. For each tor
 rotation of the base that turns the tip through play and lag; the rotations are averaged by weight.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class RollLaw:
             out of the plane.
         """
         known, s = hypotheses_of(estimate), estimate.linearized
-        turn, wanted = roll_turn(
+        turn, desired = roll_turn(
             float(s[0]),
             float(s[1]),
             known.uncertainty,
@@ -139,7 +139,7 @@ class RollLaw:
             self.settings,
         )
         length = self.settings.step_length
-        return SteeringCommand((wanted - float(s[2])) / length, turn / length)
+        return SteeringCommand((desired - float(s[2])) / length, turn / length)
 
 
 def hypotheses_of(estimate: Estimate) -> Hypotheses:
@@ -191,7 +191,7 @@ def roll_turn(
         t = torsions[k]
         if t.weight < least or t.weight == 0.0:
             continue
-        s3, sine = wanted_bend(x, sin_pitch, uncertainty, t, settings)
+        s3, sine = desired_bend(x, sin_pitch, uncertainty, t, settings)
         tip_turn = nearest_turn(t.roll, sine, bend_sign, wound, settings.max_winding)
         dead_band = settings.far_dead_band if abs(x) > settings.near else settings.near_dead_band
         dead_band += settings.scatter_dead_band * (1.0 - t.agreement)
@@ -214,7 +214,7 @@ def heaviest(torsions: Records) -> float:
 
 
 @compiled
-def wanted_bend(
+def desired_bend(
     x: float, sin_pitch: float, uncertainty: Array, t: Any, settings: RollLawSettings
 ) -> tuple[float, float]:
     """Return the desired s3 [1/m] and the sine of the roll that has it.
@@ -243,7 +243,7 @@ def wanted_bend(
     if descent > steepest:
         descent = steepest
         slope = 0.5 * steepest / distance
-    wanted_pitch = -descent if x > 0.0 else descent
+    desired_pitch = -descent if x > 0.0 else descent
     steerable = t.curvature * math.sqrt(max(1e-6, 1.0 - sin_pitch * sin_pitch))
     gain = settings.pitch_gain * caution
     # Standard deviation of the desired s3, relative to the largest possible one.
@@ -251,7 +251,7 @@ def wanted_bend(
     uncertain = gain / steerable * math.sqrt(max(variance, 0.0))
     gain /= math.sqrt(1.0 + (settings.uncertainty_weight * uncertain) ** 2)
     # s3 = gain (desired sin(pitch) - sin(pitch)), limited by the curvature
-    s3 = gain * (wanted_pitch - sin_pitch)
+    s3 = gain * (desired_pitch - sin_pitch)
     s3 = min(max(s3, -steerable), steerable)
     return s3, min(max(s3 / steerable, -1.0), 1.0)
 
@@ -282,8 +282,8 @@ def nearest_turn(
             continue
         if bend_sign < 0.0 and side == 0:
             continue
-        wanted = upright if side == 0 else math.pi - upright
-        turn, cost = allowed_turn(wanted - roll, wound, max_winding)
+        desired = upright if side == 0 else math.pi - upright
+        turn, cost = allowed_turn(desired - roll, wound, max_winding)
         if cost < cheapest:
             best, cheapest = turn, cost
     return best

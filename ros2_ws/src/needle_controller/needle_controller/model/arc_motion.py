@@ -101,11 +101,7 @@ def arc(length: npt.ArrayLike, turn: npt.ArrayLike, curvature: npt.ArrayLike) ->
     shift = np.stack([c * x * z, -b * x, one - c * x * x], axis=-1) * inserted[..., None]
     # Derivative by x, with dq/dx = 2 x
     slope = np.stack(
-        [
-            c * z + 2.0 * dc * x * x * z,
-            -b - 2.0 * db * x * x,
-            -2.0 * c * x - 2.0 * dc * x**3,
-        ],
+        [c * z + 2.0 * dc * x * x * z, -b - 2.0 * db * x * x, -2.0 * c * x - 2.0 * dc * x**3],
         axis=-1,
     )
     turning = np.stack([one - c * z * z, -b * z, c * x * z], axis=-1)

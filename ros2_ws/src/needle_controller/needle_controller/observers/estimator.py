@@ -10,11 +10,7 @@ import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import linearized_from_reduced
-from needle_controller.model.kinematics import (
-    REDUCED,
-    angles_from_rotation,
-    rotation_from_angles,
-)
+from needle_controller.model.kinematics import REDUCED, angles_from_rotation, rotation_from_angles
 
 
 @dataclasses.dataclass(frozen=True)

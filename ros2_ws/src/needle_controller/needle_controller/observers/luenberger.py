@@ -1,6 +1,5 @@
 """The paper's observer ([KC09] (9)): a constant gain on the tip's distance from the plane."""
 
-# Compiled code takes keywords slowly or not at all.
 from __future__ import annotations
 
 import dataclasses

@@ -16,7 +16,7 @@ directions by asin(rho / length). The needle always moves forward, less than 90 
 at the entry.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 

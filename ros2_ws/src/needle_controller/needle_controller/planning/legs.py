@@ -5,7 +5,7 @@ curvature, until the aim is straight ahead; then the bevel alternates or spins, 
 path is straight. Poses are (3, 4) arrays: the rotation's columns, then the position, in `rig`.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def trace_leg(
     pose : ndarray, shape (3, 4)
         Start of the leg.
     leg : Leg
-        What is previous.
+        The leg.
     curvature : float
         kappa [1/m].
     length : float

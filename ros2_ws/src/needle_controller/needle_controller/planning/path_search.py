@@ -16,7 +16,7 @@ obstacle, shows the direction of better ones. The draws z depend only on the num
 the same problem has the same solution.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ class PathSteering:
     Attributes
     ----------
     path : NeedlePath or None
-        Present path; None with another package's planner, which plans anew at every step.
+        Present path; None with another package's planner, which plans again at every step.
     """
 
     def __init__(self, settings: SteeringSettings) -> None:

@@ -60,20 +60,16 @@ class Steering:
         Estimator and law.
     state, awaiting, reason : SteeringState, Awaiting, str
         Present state, the input that the next action needs, and the cause of a problem.
-    starts, step : int
-        Number of starts; number of completed steps.
+    starts, step, watchdog_trips : int
+        Numbers of starts, of completed steps, and of timeouts.
     rejection : str
         Why the last tip was rejected; empty once one was used.
-    watchdog_trips : int
-        Number of timeouts.
     command_ns : int
         Stamp of the last command sent [ns]; 0 before the first.
     insertion, reach, confidence : float, Reachability or None, Confidence
         At the last used tip: insertion [m], reachability of the target, confidence.
-    tips : TipQueue
-        Tips and joints.
-    watchdog : Watchdog
-        Waiting times.
+    tips, watchdog : TipQueue, Watchdog
+        Queued tips with joint positions; waiting times.
     """
 
     _moves_while_awaiting_tip = False

@@ -63,14 +63,14 @@ def refused(tips: Array, insertion: Array | None) -> int:
 @pytest.mark.parametrize(
     ("size", "known"), [(None, True), (None, False), (TRACKER, True), (2e-4, True)]
 )
-def test_of_pure_insertions_none_is_refused(size: float | None, known: bool) -> None:
+def test_pure_insertions_are_accepted(size: float | None, known: bool) -> None:
     rng = default_rng(5)
     tips, insertion = insertions(20, 0.06, 0.0, rng)
     tips = tips + noise(tips.shape, size, rng)
     assert refused(tips, insertion if known else None) == 0
 
 
-def test_outliers_are_no_order() -> None:
+def test_outliers_are_not_correlated_residuals() -> None:
     rng = default_rng(6)
     tips, insertion = insertions(30, 0.06, 0.0, rng)
     tips = tips + noise(tips.shape, TRACKER, rng)
@@ -79,7 +79,7 @@ def test_outliers_are_no_order() -> None:
     assert refused(tips, insertion) == 0
 
 
-def test_errors_that_repeat_are_allowed_for() -> None:
+def test_repeating_errors_are_tolerated() -> None:
     """All tips bowed along the arc, three times, as by a calibration's error."""
     rng = default_rng(7)
     tips, insertion = insertions(1, 0.12, 0.0, rng)
@@ -104,7 +104,7 @@ def test_errors_that_repeat_are_allowed_for() -> None:
         (0.12, None, 90.0),
     ],
 )
-def test_steered_insertions_are_refused(arc: float, size: float | None, degrees: float) -> None:
+def test_steered_insertions_are_rejected(arc: float, size: float | None, degrees: float) -> None:
     rng = default_rng(8)
     tips, insertion = insertions(10, arc, math.radians(degrees), rng)
     tips = tips + noise(tips.shape, size, rng)
@@ -112,7 +112,7 @@ def test_steered_insertions_are_refused(arc: float, size: float | None, degrees:
     assert refused(tips[:3], None) == 3
 
 
-def test_what_is_wrong_is_said_with_a_way_out() -> None:
+def test_the_error_names_a_remedy() -> None:
     misses = np.zeros((60, 3))
     misses[:, 0] = 1e-3 * np.sin(np.linspace(0.0, 2.0 * np.pi, 60))
     with pytest.raises(UserError, match=r"beside it, wants <= 0\.05 mm.*--until-mm.*rotation_rad"):

@@ -77,7 +77,7 @@ def test_95_of_100_tips_are_in_the_interval() -> None:
     assert np.mean(inside) > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 60)
 
 
-def test_of_a_nearly_straight_needle_it_is_gaussian_process_regression(
+def test_the_forecast_of_a_straight_needle_is_gaussian_process_regression(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The same model in its other form: covariances of places, in place of unknowns."""
@@ -113,7 +113,7 @@ def test_the_radius_of_a_stiff_needle_is_in_its_interval(radius: float) -> None:
     assert np.mean((low <= radius) & (radius <= high)) > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 60)
 
 
-def test_the_command_says_where_the_tip_will_be(
+def test_the_command_prints_the_forecast(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     noise = np.random.default_rng(4).normal(0.0, NOISE, (len(INSERTION), 3))

@@ -93,7 +93,7 @@ def test_converges(least: float, largest_rms: float, trouble: dict[str, float]) 
         (1e-4, np.diag([4e-10, 1e-11, 1e-11]), 10.0),
     ],
 )
-def test_an_accurate_sensor_is_not_believed_too_much(
+def test_an_accurate_sensor_does_not_cause_overconfidence(
     noise: float, covariance: Array | None, play_deg: float
 ) -> None:
     """A linear filter with tips that exact would hold the wrong roll for certain."""

@@ -26,12 +26,7 @@ def arc(inserted: Array | float) -> Array:
     return np.stack([x, np.zeros_like(x), RADIUS * np.sin(angle)], axis=-1)
 
 
-def inserted_by(
-    steps: int,
-    *,
-    late: int = 0,
-    frame: Array | None = None,
-) -> HypothesisFilter:
+def inserted_by(steps: int, *, late: int = 0, frame: Array | None = None) -> HypothesisFilter:
     """Return what has seen a needle that is inserted without a turn, tips with +-1 mm noise.
 
     In the middle of it everything may be expressed in another frame, (4, 4).
@@ -77,7 +72,7 @@ def called_late(filters: ManyFilters) -> Array:
 
 
 @pytest.mark.parametrize("late", [3, 5])
-def test_late_tips_are_taken_as_late_and_said(late: int) -> None:
+def test_late_tips_are_detected_and_reported(late: int) -> None:
     filters = many_inserted_by(40, late=late)
     np.testing.assert_array_equal(called_late(filters), 1)
     # Where the needle is, not where it was.
@@ -99,7 +94,7 @@ def test_late_tips_are_the_same_in_another_frame() -> None:
     )
 
 
-def test_tips_that_are_taken_again_come_with_their_covariance_in_the_new_frame() -> None:
+def test_replayed_tips_have_their_covariance_in_the_new_frame() -> None:
     at, known = np.eye(4), np.diag([1e-7, 2e-7, 3e-7])
     at[:3, :3] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
     turn, stays = at[:3, :3], HypothesisFilter(FilterSettings(), None, np.zeros(3))
@@ -132,7 +127,7 @@ def test_tips_that_are_taken_again_come_with_their_covariance_in_the_new_frame()
         {"late": 3, "age": 3 * STEP},
     ],
 )
-def test_what_is_not_late_or_says_so_is_not_called_late(other: dict[str, float]) -> None:
+def test_punctual_tips_and_stated_ages_are_not_detected_as_late(other: dict[str, float]) -> None:
     assert not np.any(called_late(many_inserted_by(40, **other)))  # type: ignore[arg-type]
 
 
@@ -158,7 +153,7 @@ def test_a_first_tip_that_was_too_deep_is_not_an_age() -> None:
     assert hidden_age(inserted, ways, 0.0022, *KNOWN) == 0.0
 
 
-def test_nothing_is_said_without_a_start_or_without_tips() -> None:
+def test_no_age_is_detected_without_a_start_or_tips() -> None:
     inserted, ways = seen(0.003)
     few = np.where((inserted < FIRST + 4.5 * STEP)[:, None], ways, np.nan)
     ages = [hidden_age(inserted, w, 0.0, *KNOWN) for w in (few, np.full_like(ways, np.nan), ways)]

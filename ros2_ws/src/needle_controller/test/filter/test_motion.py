@@ -19,14 +19,7 @@ from needle_controller.filter.motion import (
 from needle_controller.filter.records import E_KAPPA, E_SCALE, E_TORSION, ERROR, HYPOTHESIS
 from needle_controller.model.arrays import Array
 
-CASES = [
-    (0.001, 0.2),
-    (0.001, -0.5),
-    (0.002, 0.0),
-    (0.001, LARGEST_TURN),
-    (0.0, 0.4),
-    (0.01, 0.7),
-]
+CASES = [(0.001, 0.2), (0.001, -0.5), (0.002, 0.0), (0.001, LARGEST_TURN), (0.0, 0.4), (0.01, 0.7)]
 TORSIONS = [(0.1, 0.0), (0.25, 0.0), (0.0, 0.004), (0.0, 0.008), (0.1, 0.002), (0.0, 0.0)]
 SIZES = ("play", "lag", "gain")
 SCALES = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 1.0, 0.1, 0.05])
@@ -83,7 +76,7 @@ def test_the_step_is_the_exponential_of_the_twist(length: float, turn: float) ->
 
 @pytest.mark.parametrize(("length", "turn"), CASES)
 @pytest.mark.parametrize(("play", "lag"), TORSIONS)
-def test_covariance_goes_by_the_steps_derivative(
+def test_the_covariance_follows_the_steps_derivative(
     length: float, turn: float, play: float, lag: float
 ) -> None:
     """F by central differences of the step itself, in the error's own coordinates."""
@@ -115,7 +108,7 @@ def test_covariance_goes_by_the_steps_derivative(
     np.testing.assert_array_equal(found, found.T)
 
 
-def test_torsions_angles_are_kept() -> None:
+def test_torsion_angles_are_updated() -> None:
     for play, lag in TORSIONS:
         before = hypothesis(play, lag)
         after = moved(before, 0.001, 0.5)

@@ -7,13 +7,7 @@ import numpy as np
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 
-from .needles import (
-    STEP,
-    drive,
-    noisy,
-    path,
-    turns_for,
-)
+from .needles import STEP, drive, noisy, path, turns_for
 
 
 def test_a_late_tip_is_used_at_its_exposure() -> None:

@@ -80,7 +80,7 @@ def changes(before: Records, after: Records) -> Array:
 @pytest.mark.parametrize(
     ("lower", "upper"), [(-1.0, 0.5), (0.3, 2.0), (-9.0, 1.0), (-7.0, 8.0), (3.0, 4.5)]
 )
-def test_moments_of_a_normal_cut_off_are_scipys(lower: float, upper: float) -> None:
+def test_truncated_moments_equal_scipys(lower: float, upper: float) -> None:
     mass, mean, variance = truncated_moments(lower, upper)
     cut = truncnorm(lower, upper)
     assert mass == pytest.approx(norm.cdf(upper) - norm.cdf(lower), rel=1e-5)
@@ -157,7 +157,7 @@ def with_lasting_noise(h: Records, shares: tuple[float, ...]) -> Records:
     return h
 
 
-def test_errors_that_last_are_told_from_the_estimates_own() -> None:
+def test_correlated_errors_are_separated_from_the_estimates_own() -> None:
     """Against a Kalman filter whose state has the tip's error, too."""
     known = np.array([2e-4, 4e-4, 5e-4]) ** 2
     before = with_lasting_noise(estimates(np.diag([*known, *SCALES[3:] ** 2])), (1.0,))
@@ -186,13 +186,13 @@ def test_errors_that_last_are_told_from_the_estimates_own() -> None:
     np.testing.assert_allclose(after["evidence"], likelihood, rtol=1e-4)
 
 
-def test_where_nothing_was_known_before_no_error_is_taken_off() -> None:
+def test_a_wide_prior_removes_no_correlated_error() -> None:
     before = with_lasting_noise(estimates(np.eye(ERROR) * 0.02**2), (1.0,))
     after = taken(before, MIDDLE + 0.01, settings=LASTS)
     np.testing.assert_allclose(changes(before, after)[:, :3], 0.01, rtol=0.005)
 
 
-def test_tips_show_which_coordinate_is_noisier() -> None:
+def test_the_noisier_coordinate_is_learnt() -> None:
     noise = NoiseHypothesis(CORRELATED, (1.0, 2.0), (0.5, 0.5), 1.0, (0.0, 0.0))
     settings = dataclasses.replace(PLAIN, noise_hypotheses=(noise,))
     known = with_lasting_noise(estimates(np.eye(ERROR) * 1e-10), (0.5, 0.5))
@@ -212,7 +212,7 @@ def with_state_of(after: Records, before: Records) -> Records:
     return h
 
 
-def test_an_exact_tip_is_taken() -> None:
+def test_an_exact_tip_is_used() -> None:
     after = taken(estimates(), MIDDLE, np.zeros((3, 3)))
     for name in HYPOTHESIS.names or ():
         assert np.all(np.isfinite(after[name]))
@@ -242,7 +242,7 @@ def test_a_doubtful_tip_gives_the_mixtures_moments() -> None:
 
 
 @pytest.mark.parametrize("is_uniform", [False, True])
-def test_tips_show_how_large_the_noise_is(is_uniform: bool) -> None:
+def test_the_size_of_the_noise_is_learnt(is_uniform: bool) -> None:
     settings = FilterSettings()
     known = estimates(np.diag((SCALES * 0.1) ** 2), is_uniform=is_uniform)
     shares = settings.noises()[int(is_uniform), 1]

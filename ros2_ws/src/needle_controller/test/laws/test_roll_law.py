@@ -24,7 +24,7 @@ def law(**changes: float) -> RollLaw:
     return RollLaw(RollLawSettings(**changes))
 
 
-def test_turns_to_where_the_needle_bends_towards_the_plane_within_the_limit() -> None:
+def test_turns_the_bend_towards_the_plane_within_the_limit() -> None:
     """dpitch/dl = curvature sin(roll), (5): above the plane the roll has to become negative."""
     for x in (0.003, -0.003):
         command = law()(estimate(x))
@@ -59,7 +59,7 @@ def test_flips_are_planned_at_depths_that_increase() -> None:
         FlipPlan((0.05, 0.05)).check_within(0.1)
 
 
-def test_the_nearer_side_is_taken_unless_it_winds_too_far() -> None:
+def test_the_shorter_turn_is_chosen_within_the_winding_limit() -> None:
     assert nearest_turn(2.8, np.sin(0.2), 0.0, 0.0, 20.0) == pytest.approx(np.pi - 0.2 - 2.8)
     assert nearest_turn(0.3, np.sin(0.2), 0.0, 0.0, 20.0) == pytest.approx(-0.1)
     near, far = nearest_turn(0.0, 0.5, 1.0, 0.0, 7.0), nearest_turn(0.0, 0.5, 1.0, 6.8, 7.0)
@@ -76,7 +76,7 @@ def turned(needle: Estimate, **changes: float) -> float:
     return float(law(near_dead_band=0.1, far_dead_band=0.1, **changes)(needle).rotation_rate) * STEP
 
 
-def test_small_errors_and_rolls_that_disagree_are_left_alone() -> None:
+def test_small_errors_and_disagreeing_rolls_are_not_corrected() -> None:
     band = RollLawSettings().near_dead_band
     assert law()(estimate(roll=0.9 * band)).rotation_rate == 0.0
     assert law()(estimate(roll=1.1 * band)).rotation_rate < 0.0
@@ -97,7 +97,7 @@ def torsion(
     return t
 
 
-def test_play_is_taken_up_and_lag_is_led() -> None:
+def test_play_and_lag_are_compensated() -> None:
     assert base_turn(torsion(play=0.5), 0.2, 0.0, STEP) == pytest.approx(0.7)
     assert base_turn(torsion(play=0.5), -0.2, 0.0, STEP) == pytest.approx(-0.7)
     assert base_turn(torsion(0.1, 0.1, play=0.5), 0.2, 0.6, STEP) == pytest.approx(0.2)
@@ -110,7 +110,7 @@ def test_play_is_taken_up_and_lag_is_led() -> None:
     assert base_turn(torsion(0.2, 0.9, lag=0.008), 0.0, 0.9, STEP) == pytest.approx(-0.7)
 
 
-def test_settings_out_of_bounds_are_refused() -> None:
+def test_settings_out_of_bounds_are_rejected() -> None:
     for name in ("step_length", "max_rotation_per_length", "pitch_gain"):
         with pytest.raises(OutOfBoundsError, match=name):
             law(**{name: -1.0})

@@ -27,7 +27,7 @@ def gains(**changes: Any) -> Gains:
     return design_gains(**{**WEIGHTS, **changes})
 
 
-def test_gains_are_those_of_the_riccati_equations() -> None:
+def test_gains_solve_the_riccati_equations() -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)
         # In the units of s and of ds/dl.
@@ -77,7 +77,7 @@ def test_the_defaults_are_stable_in_steps() -> None:
     assert np.max(design.observer_poles.real) < 0.0
 
 
-def test_bad_weights_are_refused_with_what_and_why() -> None:
+def test_weights_without_gains_are_rejected() -> None:
     rows: list[tuple[dict[str, Any], str]] = [
         ({"process_noise": (0.0, 0.0, 0.0)}, "process_noise"),
         ({"state_weights": (0.0, 0.0, 0.0)}, "state_weights"),

@@ -37,7 +37,7 @@ def some_coordinates(count: int) -> Array:
     return np.concatenate([rng.normal(0.0, 0.02, (count, 3)), angles], axis=1)
 
 
-def test_rotations_are_those_of_intrinsic_xyz_angles_and_of_quaternions() -> None:
+def test_rotations_equal_scipys_intrinsic_xyz_and_quaternions() -> None:
     angles = some_coordinates(50)[:, 3:]
     expected = Rotation.from_euler("XYZ", angles)
     np.testing.assert_allclose(rotation_from_angles(angles), expected.as_matrix(), atol=1e-14)
@@ -47,13 +47,13 @@ def test_rotations_are_those_of_intrinsic_xyz_angles_and_of_quaternions() -> Non
     )
 
 
-def test_a_turn_is_as_exact_where_it_is_small() -> None:
+def test_small_rotations_are_exact() -> None:
     vectors = np.outer([0.0, 1e-4, 0.05, 0.0999, 0.1001, 1.0], [2.0 / 7.0, -3.0 / 7.0, 6.0 / 7.0])
     expected = Rotation.from_rotvec(vectors).as_matrix()
     np.testing.assert_allclose(rotation_exp(vectors), expected, rtol=0.0, atol=1e-14)
 
 
-def test_angle_axes_turn_the_tip_as_its_angles_do() -> None:
+def test_angle_axes_are_the_derivatives_of_the_rotation() -> None:
     angles, h = some_coordinates(20)[:, 3:], 1e-6
     for i in range(3):
         change = np.eye(3)[i] * h
@@ -75,7 +75,7 @@ def test_linearized_state_round_trip() -> None:
     assert np.all(np.isnan(reduced_from_linearized(outside, CURVATURE)[:, 2]))
 
 
-def test_linearized_system_along_a_trajectory_of_the_reduced_one() -> None:
+def test_the_linearized_system_holds_along_a_reduced_trajectory() -> None:
     """ds/dl = A s + B v of (8) holds along (5), whatever u does."""
 
     def rate_at(length: float) -> float:
@@ -88,12 +88,7 @@ def test_linearized_system_along_a_trajectory_of_the_reduced_one() -> None:
         return [math.sin(pitch), CURVATURE * math.sin(roll), drift + rate_at(length)]
 
     solution = solve_ivp(
-        rates,
-        (0.0, 0.1),
-        [-0.003, 0.2, 0.4],
-        rtol=1e-11,
-        atol=1e-13,
-        dense_output=True,
+        rates, (0.0, 0.1), [-0.003, 0.2, 0.4], rtol=1e-11, atol=1e-13, dense_output=True
     )
     h = 1e-5
     for length in np.linspace(0.01, 0.09, 9):

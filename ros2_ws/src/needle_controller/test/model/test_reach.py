@@ -30,7 +30,7 @@ from needle_sim.needle.plant import NeedlePlant, initial_pose
 CURVATURE = 1.0 / 0.122
 
 
-def test_the_plant_gets_there_in_the_least_insertion() -> None:
+def test_the_plant_reaches_the_plane_in_the_least_insertion() -> None:
     """On SE(3), rolls of +-90 deg: the closed form is exact."""
     x, pitch = -0.004, 0.05
     least = float(least_insertion([x, pitch, 0.0], CURVATURE))
@@ -68,7 +68,7 @@ def test_the_largest_pitch_adds_a_straight_part() -> None:
     assert least == pytest.approx(expected, rel=1e-12)
 
 
-def test_up_and_down_are_alike_and_needles_are_judged_one_by_one() -> None:
+def test_reach_is_symmetric_and_broadcasts() -> None:
     reduced = default_rng(2).uniform(-1, 1, (50, 3)) * [0.02, 1.2, 3.0]
     whole = least_insertion(reduced, CURVATURE, tolerance=1e-3)
     np.testing.assert_allclose(least_insertion(-reduced, CURVATURE, tolerance=1e-3), whole)
@@ -78,7 +78,7 @@ def test_up_and_down_are_alike_and_needles_are_judged_one_by_one() -> None:
     assert np.isnan(least_insertion([np.nan, 0.0, 0.0], CURVATURE))
 
 
-def test_what_is_left_of_the_depth_decides() -> None:
+def test_the_remaining_depth_decides_reachability() -> None:
     reduced = [-0.003, 0.0, 0.3]
     needed = float(least_insertion(reduced, CURVATURE))
     for spare, expected in ((1e-6, True), (-1e-6, False)):
@@ -91,7 +91,7 @@ def test_what_is_left_of_the_depth_decides() -> None:
         assert float(point.depth) == pytest.approx(0.1)
 
 
-def test_calls_that_make_no_sense_are_refused_with_what_and_why() -> None:
+def test_invalid_arguments_raise_errors_with_the_value() -> None:
     check_offset(0.028, CURVATURE, 0.12)
     with pytest.raises(UserError, match=r"0\.03 m cannot be reached.*-0\.0289.* to 0\.0289"):
         check_offset(0.03, CURVATURE, 0.12)

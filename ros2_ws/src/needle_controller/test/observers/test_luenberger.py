@@ -170,7 +170,7 @@ def test_law_is_7_for_short_steps() -> None:
     assert float(command.virtual_input) == pytest.approx(-estimate.linearized @ gains.feedback)
 
 
-def test_law_caps_the_rotation_and_open_loop_never_turns() -> None:
+def test_law_limits_the_rotation_and_open_loop_never_turns() -> None:
     one = observer()
     slow = LinearizingLaw(law().gains._replace(max_rotation_per_length=10.0))
     for x, rate in ((0.02, -10.0), (-0.02, 10.0)):
@@ -186,7 +186,7 @@ def test_pure_rotation_turns_the_roll_alone() -> None:
     np.testing.assert_allclose(one.estimate().reduced, [0.001, 0.0, 0.5], atol=1e-12)
 
 
-def test_in_a_study_each_needle_is_as_the_node_has_it() -> None:
+def test_many_needles_equal_single_ones() -> None:
     rng, count = default_rng(8), 5
     tips = rng.normal(0.0, 2e-3, (20, count, 3))
     turns = rng.normal(0.0, 0.1, (20, count))
@@ -278,7 +278,7 @@ def test_covariance_is_honest() -> None:
     assert known.covariance[3, 3] >= SETTINGS.initial_yaw_std**2
 
 
-def test_saturation_is_said() -> None:
+def test_saturation_is_reported() -> None:
     one = observer()
     one.reset([0.0, 0.0, 0.0], [0.0, 1.5])
     assert any("saturated" in warning for warning in one.estimate().warnings)

@@ -60,7 +60,7 @@ def test_a_wall_with_a_gap_has_a_path_and_one_without_has_none() -> None:
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_gap_counts_only_where_a_needle_can_come_to_it_and_on_to_the_target(sign: float) -> None:
+def test_a_gap_counts_only_within_reach_of_needle_and_target(sign: float) -> None:
     # Over half of 100 mm a needle that comes back gets 9.2 mm aside, one that need not 9.6 mm.
     assert may(wall(0.004, sign * 0.004))
     assert not may(wall(0.004, sign * 0.014))
@@ -69,7 +69,7 @@ def test_a_gap_counts_only_where_a_needle_can_come_to_it_and_on_to_the_target(si
     assert not may(wall(0.004, -sign * 0.004), target=aside)
 
 
-def test_a_target_is_reached_by_all_the_curvature_and_the_tolerance_but_no_more() -> None:
+def test_curvature_and_tolerance_bound_the_reachable_targets() -> None:
     # The circle of the largest curvature, 0.1 m on, and how far it is aside there.
     radius = 1.0 / CURVATURE
     aside = radius - math.sqrt(radius**2 - 0.1**2)
@@ -80,11 +80,11 @@ def test_a_target_is_reached_by_all_the_curvature_and_the_tolerance_but_no_more(
         assert may(Obstacles(), tip, tip.position + target) is reached
 
 
-def test_what_is_not_ahead_has_no_path() -> None:
+def test_a_target_behind_the_needle_has_no_path() -> None:
     assert not may(Obstacles(), target=np.array([0.0, 0.0, -0.01]))
 
 
-def test_what_has_a_path_is_never_said_to_have_none() -> None:
+def test_the_flood_fill_never_excludes_an_existing_path() -> None:
     paths = 0
     for seed in range(16):
         rng = np.random.default_rng([5, seed])
@@ -104,7 +104,7 @@ def test_what_has_a_path_is_never_said_to_have_none() -> None:
 
 
 @pytest.mark.usefixtures("_no_hint")
-def test_what_is_not_found_is_not_said_to_be_impossible(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_search_is_not_reported_as_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     # Wide enough for the fill, by its cells' size, and too narrow for a needle.
     narrow = wall(2.0 * SETTINGS.least_clearance - 0.0003)
     monkeypatch.setattr(entries, "THOROUGH_STARTS", 5)
@@ -114,7 +114,7 @@ def test_what_is_not_found_is_not_said_to_be_impossible(monkeypatch: pytest.Monk
     assert "was found clear of the" in found.reason
 
 
-def test_the_thorough_search_finds_what_the_quick_one_misses() -> None:
+def test_the_thorough_search_finds_more_than_the_quick_one() -> None:
     # Scene 182 of the obstacle study of seed 909.
     rows = [
         (-0.00113, 0.01008, 0.07275, 0.01968, 0.00163, 0.04861, 0.00685),

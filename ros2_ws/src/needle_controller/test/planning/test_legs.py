@@ -62,7 +62,7 @@ def test_a_leg_leads_to_its_aim() -> None:
         assert np.all(np.linalg.norm(np.diff(points[:count, :3], axis=0), axis=1) < 0.0101)
 
 
-def test_an_aim_within_the_circle_is_missed_by_how_deep_it_lies() -> None:
+def test_an_aim_within_the_circle_is_missed_by_its_depth() -> None:
     # The needle bends to -y; the circle's centre is at y = -R. Here 3 mm within it.
     radius = 1.0 / CURVATURE
     inner = radius - 0.003
@@ -81,7 +81,7 @@ def test_an_aim_within_the_circle_is_missed_by_how_deep_it_lies() -> None:
     assert full.gentle_miss > 1e-4
 
 
-def test_a_leg_is_cut_where_its_whole_goes_through() -> None:
+def test_a_truncated_leg_continues_as_the_whole_leg() -> None:
     aim = np.array([0.006, 0.003, 0.09])
     whole = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
     points, end = np.empty((MOST_POINTS, 4)), np.empty((3, 4))

@@ -43,7 +43,7 @@ capsules:
 """
 
 
-def test_the_distance_of_segments_is_the_least_of_any_two_of_their_points() -> None:
+def test_segment_distance_is_the_least_distance_of_points() -> None:
     rng = np.random.default_rng(3)
     for _ in range(20):
         a, b, c, d = rng.normal(size=(4, 3))
@@ -63,7 +63,7 @@ def test_clearance_is_from_the_surface_of_the_nearest() -> None:
 
 
 @pytest.mark.parametrize(("unknown", "worst"), [((0.001, 0.0), 0.0), ((0.0, 0.2), 0.01)])
-def test_a_chord_is_as_clear_as_it_must_be_at_the_worse_of_its_ends(
+def test_a_chord_has_the_required_clearance_of_its_worse_end(
     unknown: tuple[float, float], worst: float
 ) -> None:
     settings = PathSettings(200.0)
@@ -76,7 +76,7 @@ def test_a_chord_is_as_clear_as_it_must_be_at_the_worse_of_its_ends(
     )
 
 
-def test_what_is_no_obstacle_is_refused_by_name() -> None:
+def test_invalid_obstacles_are_rejected_by_number() -> None:
     for obstacles, words in (
         ([Obstacle((0.0, math.nan, 0.0), (0.0, 0.0, 0.0), 0.01)], "y of obstacle 1 = nan"),
         ([ROUND, Obstacle((0.0, 0.0, 50.0), (0.0, 0.0, 50.0), 0.01)], "z of obstacle 2 = 50 m"),
@@ -87,7 +87,7 @@ def test_what_is_no_obstacle_is_refused_by_name() -> None:
             Obstacles(obstacles)
 
 
-def test_a_file_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_file_is_read_or_rejected_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "obstacles.yaml"
     path.write_text(FILE, encoding="utf-8")
     np.testing.assert_allclose(
@@ -113,7 +113,7 @@ def test_a_file_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
         read_obstacles(tmp_path / "no.yaml")
 
 
-def test_markers_become_capsules_or_are_named() -> None:
+def test_markers_become_capsules_or_are_rejected_by_name() -> None:
     half = math.sqrt(0.5)
     # A quarter turn about x takes z to -y.
     lying = dataclasses.replace(

@@ -76,7 +76,7 @@ def sampled_clearance(places: Array, obstacles: Obstacles) -> float:
     return least
 
 
-def test_a_path_that_is_driven_again_is_clear_and_ends_within_the_tolerance() -> None:
+def test_a_simulated_path_is_clear_and_ends_within_the_tolerance() -> None:
     settings = PathSettings(RATE, curvature_share=0.9, gentle_share=0.9)
     plans, paths = PathPlanner(settings), 0
     for seed in range(30):
@@ -107,7 +107,7 @@ def test_a_path_that_is_driven_again_is_clear_and_ends_within_the_tolerance() ->
     assert paths > 5
 
 
-def test_the_goal_tolerance_is_what_a_path_may_pass_its_target_by() -> None:
+def test_the_goal_tolerance_limits_the_distance_from_the_target() -> None:
     # Within the circle of 90 % of the curvature, once the bevel has turned, by less than 1 mm.
     radius = 1.0 / (0.9 * CURVATURE)
     inner = radius - 0.0006
@@ -120,7 +120,7 @@ def test_the_goal_tolerance_is_what_a_path_may_pass_its_target_by() -> None:
             assert np.linalg.norm(end - target) == pytest.approx(0.0006, abs=2e-5)
 
 
-def test_a_plan_depends_on_the_question_alone() -> None:
+def test_a_plan_depends_on_the_problem_alone() -> None:
     first, other = planner(), planner()
     other.path(ENTRY, [0.0, 0.01, 0.08], IN_THE_WAY)
     for _ in range(2):
@@ -138,7 +138,7 @@ def test_without_obstacles_the_path_is_one_leg_to_the_target() -> None:
     assert path.length == pytest.approx(np.linalg.norm(TARGET), rel=0.01)
 
 
-def test_a_needle_whose_pose_is_known_is_led_past_what_is_in_the_way() -> None:
+def test_a_needle_with_known_pose_passes_an_obstacle() -> None:
     plans, pose, least, insertion = planner(), ENTRY.pose, math.inf, 0.0
     paths: list[NeedlePath] = []
     while (ahead := in_tip_axes(pose, TARGET)[2]) > 1e-5:
@@ -162,7 +162,7 @@ def test_a_needle_whose_pose_is_known_is_led_past_what_is_in_the_way() -> None:
     np.testing.assert_array_equal(again.legs, paths[0].legs)
 
 
-def test_there_is_no_path_across_a_wall_nor_what_bends_too_little_or_is_too_short() -> None:
+def test_walls_stiff_needles_and_short_needles_have_no_path() -> None:
     rows = [
         Obstacle((-0.05, y, 0.05), (0.05, y, 0.05), 0.005) for y in np.arange(-0.06, 0.061, 0.008)
     ]
@@ -173,7 +173,7 @@ def test_there_is_no_path_across_a_wall_nor_what_bends_too_little_or_is_too_shor
     assert planner(longest=0.12).path(ENTRY, TARGET, Obstacles(), insertion=0.03) is None
 
 
-def test_what_is_unknown_widens_what_must_be_clear() -> None:
+def test_uncertainty_increases_the_required_clearance() -> None:
     near = Obstacles([Obstacle((0.0, 0.004, 0.02), (0.0, 0.004, 0.02), 0.003)])
     straight = np.array([0.0, 0.0, 0.09])
     # The needle bends to -y before it is turned: away from the sphere.
@@ -183,7 +183,7 @@ def test_what_is_unknown_widens_what_must_be_clear() -> None:
     assert (-1.0 if doubted is None else doubted.margin) < known.margin
 
 
-def test_a_followed_path_goes_on_from_where_the_needle_is_unless_it_runs_into_something() -> None:
+def test_the_previous_path_continues_unless_it_is_blocked() -> None:
     plans = planner()
     path = found(plans.path(ENTRY, TARGET, IN_THE_WAY))
     first = float(path.legs[0, 3])
@@ -203,7 +203,7 @@ def test_a_followed_path_goes_on_from_where_the_needle_is_unless_it_runs_into_so
     assert plans.path(ENTRY, TARGET, BURIED, previous=direct) is None
 
 
-def test_bad_calls_are_refused_with_the_value() -> None:
+def test_invalid_calls_raise_errors_with_the_value() -> None:
     with pytest.raises(UserError, match="sigmas = -1"):
         planner(sigmas=-1.0)
     bent = TipState(np.zeros(3), np.eye(3), math.nan)
@@ -222,7 +222,7 @@ def starts_of(obstacles: Obstacles) -> SafeStarts:
     )
 
 
-def test_safe_starts_are_those_with_a_path() -> None:
+def test_safe_starts_have_a_path() -> None:
     starts = starts_of(Obstacles())
     # At 0.1 m a needle of 90 % of this curvature gets 44 mm aside, less while it turns;
     # tilted by 30 deg the target lies 50 mm aside of 87 mm ahead.
@@ -234,7 +234,7 @@ def test_safe_starts_are_those_with_a_path() -> None:
     assert math.degrees(starts.largest_tilt) == pytest.approx(5.0 * math.sqrt(2.0))
 
 
-def test_safe_starts_are_not_in_an_obstacle_or_behind_it() -> None:
+def test_starts_in_or_behind_an_obstacle_are_not_safe() -> None:
     # An axis is x first: beside the entry in +x, from the surface to near the target.
     shaded = starts_of(Obstacles([Obstacle((0.03, -0.05, 0.01), (0.03, 0.05, 0.01), 0.008)]))
     assert not np.any(shaded.shifted[4, :])

@@ -113,7 +113,7 @@ def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Offer]:
         sys.modules.pop(module, None)
 
 
-def test_an_own_estimator_stands_in_the_preset_s_place(offer: Offer) -> None:
+def test_an_own_estimator_replaces_the_presets(offer: Offer) -> None:
     name = offer("estimator", ESTIMATOR)
     settings = SteeringSettings(estimator=name, **PAPER_NOISE)
     assert settings.controller == f"best with estimator {name}"
@@ -133,7 +133,7 @@ def test_an_own_estimator_stands_in_the_preset_s_place(offer: Offer) -> None:
     assert float(law(found, 0.001).rotation_rate) != 0.0
 
 
-def test_what_no_estimator_can_be_is_named(offer: Offer) -> None:
+def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
     for sound, wrong, said in (
         ("    def correct(self", "    def not_correct(self", "lacks correct(tip, covariance, age)"),
         ("def change_frame(", "def not_change_frame(", "lacks change_frame(T_new_old)"),
@@ -176,9 +176,7 @@ def test_a_name_is_offered_by_one_package_and_is_a_class(offer: Offer) -> None:
         tried_law(function)
 
 
-def test_an_own_law_turns_no_faster_than_the_rig_may_and_knows_how_far_points_are(
-    offer: Offer,
-) -> None:
+def test_an_own_law_is_limited_and_gets_the_remaining_insertion(offer: Offer) -> None:
     settings = SteeringSettings(law=offer("law", LAW), max_rotation_per_length=10.0)
     _, law = make_controller(settings, np.eye(3))
     estimate = pose_estimate(np.zeros(3), np.eye(3), 8.0, np.eye(6))
@@ -199,7 +197,7 @@ def test_an_own_law_turns_no_faster_than_the_rig_may_and_knows_how_far_points_ar
             assert float(said) == pytest.approx(left)
 
 
-def test_what_no_law_can_be_is_named(offer: Offer) -> None:
+def test_invalid_laws_are_rejected_with_the_reason(offer: Offer) -> None:
     rate = "40.0 * insertion"
     for wrong, said in (
         ("np.nan", "holds nan"),
@@ -218,7 +216,7 @@ def test_what_no_law_can_be_is_named(offer: Offer) -> None:
         SteeringSettings(law=name, flip_depths=(0.05,))
 
 
-def test_an_own_planner_leads_by_its_via_points_to_the_target(offer: Offer) -> None:
+def test_an_own_planner_steers_by_its_via_points(offer: Offer) -> None:
     settings = SteeringSettings(planner=offer("planner", PLANNER))
     way, target = PathSteering(settings), np.array([0.0, 0.0, 0.08])
     tip = entry_state(settings.curvature)

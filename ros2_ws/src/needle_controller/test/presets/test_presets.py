@@ -39,15 +39,12 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
     ("cannot be reached", {"target_point": (0.04, 0.0, 0.06)}),
     ("target_point", {"target_point": (0.0, 0.0, 2.0)}),
     ("paper cannot steer to a point", {"preset": "paper", "target_point": (0.0, 0.0, 0.1)}),
-    (
-        "flip_depths do not go together",
-        {"flip_depths": (0.05,), "target_point": (0.0, 0.0, 0.1)},
-    ),
+    ("flip_depths do not go together", {"flip_depths": (0.05,), "target_point": (0.0, 0.0, 0.1)}),
 ]
 """What the refusal names, and the values."""
 
 
-def test_what_cannot_be_steered_with_is_refused_by_name() -> None:
+def test_invalid_settings_are_rejected_by_name() -> None:
     for named, changes in REFUSED:
         with pytest.raises(UserError, match=named):
             SteeringSettings(**changes)

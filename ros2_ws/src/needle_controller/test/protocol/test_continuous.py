@@ -76,7 +76,7 @@ def test_the_same_tip_leads_to_the_same_path() -> None:
     assert len({path_in(ContinuousRig().see()) for _ in range(2)}) == 1
 
 
-def test_a_tip_leads_to_the_turn_of_a_step_and_a_path_beyond(
+def test_a_tip_leads_to_the_rotation_of_a_step_and_a_path_beyond(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stepwise, rig = Rig(), ContinuousRig()
@@ -110,7 +110,7 @@ def test_a_tip_within_a_step_length_only_renews_the_path() -> None:
     assert updates_in(rig.go(0.0015 * MM)) == rig.steering.step == 1
 
 
-def test_the_path_of_a_needle_that_went_back_begins_where_the_needle_is() -> None:
+def test_the_path_begins_at_a_needle_that_went_back() -> None:
     rig = ContinuousRig()
     first = path_in(rig.see())
     rig.insertion = -0.2 * MM
@@ -158,7 +158,7 @@ def test_without_hold_no_path_and_after_it_only_from_a_new_tip() -> None:
     assert path_in(rig.see()).stamp_ns == rig.now
 
 
-def test_an_answer_that_a_path_was_taken_asks_for_nothing_and_forgets_refusals() -> None:
+def test_an_accepted_path_resets_the_count_of_aborts() -> None:
     rig = ContinuousRig()
     for text in ("replaced", "succeeded"):
         for count in rig.refused():
@@ -174,7 +174,7 @@ def test_an_answer_that_a_path_was_taken_asks_for_nothing_and_forgets_refusals()
     rig.steering.on_recorded_step(rig.steering.command_ns, JointSample(0, 0.0, 0.0))
 
 
-def test_refusals_in_a_row_are_a_fault_each_of_a_path_sent_when_the_last_was_known() -> None:
+def test_aborts_in_a_row_are_a_fault() -> None:
     for late in (0, 1, 3):
         rig = ContinuousRig()
         stamps = [path_in(rig.see()).stamp_ns for _ in range(late)]
@@ -189,7 +189,7 @@ def test_refusals_in_a_row_are_a_fault_each_of_a_path_sent_when_the_last_was_kno
         assert "without motion" in rig.steering.reason
 
 
-def test_refusals_of_all_that_a_cut_cable_held_back_count_once() -> None:
+def test_aborts_delayed_by_a_cut_cable_count_once() -> None:
     rig = ContinuousRig()
     stamps = [path_in(rig.see()).stamp_ns for _ in range(3 * MAX_ABORTS_AT_REST)]
     for stamp in stamps:
@@ -197,7 +197,7 @@ def test_refusals_of_all_that_a_cut_cable_held_back_count_once() -> None:
     assert where(rig) == AT_WORK
 
 
-def test_paths_count_again_after_time_was_set_back_and_steering_started() -> None:
+def test_paths_are_sent_again_after_the_clock_went_back() -> None:
     rig = ContinuousRig()
     rig.now = 500 * TICK
     rig.settle()
@@ -212,7 +212,7 @@ def test_paths_count_again_after_time_was_set_back_and_steering_started() -> Non
     assert "aborted" in logged(rig.steering.on_result(path_in(actions).stamp_ns, "aborted: no"))
 
 
-def test_no_tips_is_waiting_and_a_good_one_ends_it() -> None:
+def test_the_tip_timeout_ends_with_a_good_tip() -> None:
     rig = ContinuousRig()
     rig.see()
     for second in range(10):
@@ -227,9 +227,7 @@ def test_no_tips_is_waiting_and_a_good_one_ends_it() -> None:
     assert rig.steering.reason == ""
 
 
-def test_the_estimator_is_moved_along_the_way_that_the_joints_went(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_estimator_follows_intermediate_joint_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = ContinuousRig()
     rig.see()
     way = spied(rig, monkeypatch.setattr, "advance")

@@ -13,7 +13,7 @@ IDLE, FAULT = SteeringState.IDLE, SteeringState.FAULT
 NOTHING = Awaiting.NOTHING
 
 
-def test_a_lost_answer_ends_in_a_fault_and_moves_nothing() -> None:
+def test_a_lost_answer_is_a_fault_without_motion() -> None:
     rig = Rig()
     step = sent(rig.expose())
     timeout = rig.steering.settings.result_timeout
@@ -38,7 +38,7 @@ def test_a_lost_answer_ends_in_a_fault_and_moves_nothing() -> None:
     assert sent(rig.expose()).insertion == pytest.approx(0.0016)
 
 
-def test_a_slow_step_of_a_device_that_never_says_moving_is_no_lost_answer() -> None:
+def test_a_slow_step_without_status_moving_is_not_a_lost_answer() -> None:
     rig = Rig()
     step = sent(rig.expose())
     for tenth in range(400):
@@ -49,7 +49,7 @@ def test_a_slow_step_of_a_device_that_never_says_moving_is_no_lost_answer() -> N
     assert rig.steering.state is SteeringState.STEERING
 
 
-def test_a_device_that_falls_silent_within_a_step_is_named_and_heard_again() -> None:
+def test_silence_of_the_device_and_its_end_are_logged() -> None:
     rig = Rig()
     for by_joints in (True, False):
         step = sent(rig.expose())
@@ -119,7 +119,7 @@ def test_a_device_that_stops_ends_steering() -> None:
         assert rig.start() == "steering"
 
 
-def test_commands_that_never_move_end_in_a_fault_and_a_start_counts_anew() -> None:
+def test_commands_without_motion_are_a_fault_and_a_start_resets_the_count() -> None:
     rig = Rig()
     rig.steps(1)
     for _ in range(2):
@@ -139,7 +139,7 @@ def test_commands_that_never_move_end_in_a_fault_and_a_start_counts_anew() -> No
         assert rig.steering.state is SteeringState.STEERING
 
 
-def test_a_person_who_lets_go_at_once_many_times_is_no_fault() -> None:
+def test_repeated_releases_are_not_a_fault() -> None:
     rig = Rig()
     for _ in range(2 * MAX_ABORTS_AT_REST):
         step = sent(rig.expose())
@@ -149,7 +149,7 @@ def test_a_person_who_lets_go_at_once_many_times_is_no_fault() -> None:
     assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
 
 
-def test_steps_that_the_joints_do_not_follow_are_a_fault() -> None:
+def test_unfollowed_steps_are_a_fault() -> None:
     for share in (0.0, 0.9):
         rig = Rig()
         rig.steps(3)
@@ -167,7 +167,7 @@ def test_steps_that_the_joints_do_not_follow_are_a_fault() -> None:
         assert rig.steering.step == 4
 
 
-def test_a_step_that_was_followed_forgets_those_that_were_not() -> None:
+def test_a_followed_step_resets_the_count_of_unfollowed_ones() -> None:
     rig = Rig()
     for _ in range(MAX_UNFOLLOWED_STEPS + 1):
         rig.run(rig.good_tips(), part=0.5)

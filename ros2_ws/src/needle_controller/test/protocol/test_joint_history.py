@@ -24,7 +24,7 @@ def history(*samples: tuple[int, float, float]) -> JointHistory:
     return made
 
 
-def test_joints_are_linear_between_samples_and_unknown_beyond_them() -> None:
+def test_joints_are_interpolated_and_unknown_outside_the_history() -> None:
     empty = JointHistory()
     assert (empty.at(5), empty.latest, empty.oldest) == (None, None, None)
     first, last = JointSample(100, 1e-5, 0.0), JointSample(400, 2e-5, 0.0)
@@ -42,7 +42,7 @@ def test_joints_are_linear_between_samples_and_unknown_beyond_them() -> None:
     assert two.at(begin + 1) == JointSample(begin + 1, 1e-6, 0.0)
 
 
-def test_samples_on_a_way_are_spaced_out() -> None:
+def test_samples_between_two_others_are_spaced() -> None:
     made = history(*((k * TICK, 1e-4 * k, 0.0) for k in range(12)))
     start, end = JointSample(TICK, 1e-4, 0.0), JointSample(10 * TICK, 1e-3, 0.0)
     kept = made.between(start, end, 2.9e-4)
@@ -61,7 +61,7 @@ def test_memory_is_bounded() -> None:
     assert made.at(995) == JointSample(995, 1e-6 * 995, 0.0)
 
 
-def test_memory_is_bounded_also_where_a_new_truth_is_longer_than_it() -> None:
+def test_memory_is_bounded_after_a_jump() -> None:
     made = JointHistory(length=2)
     for start in (0, HOUR, 2 * HOUR):
         for tick in range(20):
@@ -70,7 +70,7 @@ def test_memory_is_bounded_also_where_a_new_truth_is_longer_than_it() -> None:
         assert made.latest == JointSample(start + 19 * TICK, 0.0, 0.0)
 
 
-def test_a_sample_counts_that_follows_from_the_one_before() -> None:
+def test_consistent_samples_are_accepted() -> None:
     for gap_ns, insertion, rotation, heard in (
         # As far as a hand pushes and a motor turns in the time, and the noise of both.
         (TICK, 1.199e-3, 0.699, SampleResult.ACCEPTED),
@@ -105,7 +105,7 @@ def test_a_sample_counts_that_follows_from_the_one_before() -> None:
 SPIKES = [(TICK, 0.0, 0.0), (TICK, 0.05, 3.0), (HOUR, 0.05, 0.0), (-HOUR, 0.05, 0.0)]
 
 
-def test_a_spike_is_dropped_and_what_stays_is_the_new_truth() -> None:
+def test_a_spike_is_dropped_and_a_lasting_jump_is_accepted() -> None:
     for stamp, insertion, rotation in SPIKES:
         made = history((START, 0.05, 0.0))
         made.add(JointSample(START + stamp, insertion, rotation))
@@ -121,7 +121,7 @@ def test_a_spike_is_dropped_and_what_stays_is_the_new_truth() -> None:
         assert (made.problem, made.rejected) == ("", 7)
 
 
-def test_a_complaint_says_from_where_to_where_and_in_what_time() -> None:
+def test_the_problem_names_both_positions_and_the_time() -> None:
     made = history((START, 0.05, -1.0))
     made.add(JointSample(START + TICK, 0.0625, 2.5))
     said = "joint_states do not follow from the last: 0.0625 m, 2.5 rad after 0.05 m, -1 rad"
@@ -130,7 +130,7 @@ def test_a_complaint_says_from_where_to_where_and_in_what_time() -> None:
     assert made.problem == f"{said}, -3600 s later"
 
 
-def test_two_truths_in_turn_leave_the_first() -> None:
+def test_two_alternating_positions_keep_the_first() -> None:
     made = history((TICK, 0.05, 0.0))
     for tick in range(2, 40, 2):
         assert made.add(JointSample(tick * TICK, 0.0, 0.0)) is SampleResult.REJECTED

@@ -26,7 +26,7 @@ def shown(rig: Rig, tips: list[TipMeasurement]) -> None:
 
 
 @pytest.mark.parametrize("wrong", ["two bad tips", "five bad tips", "frozen camera"])
-def test_after_bad_tips_a_few_good_ones_are_enough(wrong: str) -> None:
+def test_steering_recovers_from_bad_tips(wrong: str) -> None:
     for restarted in (False, True):
         rig = Rig()
         rig.steps(20)
@@ -44,7 +44,7 @@ def test_after_bad_tips_a_few_good_ones_are_enough(wrong: str) -> None:
         rig.steps(3)
 
 
-def test_tips_that_jumped_together_count_from_the_fourth() -> None:
+def test_the_fourth_tip_after_a_jump_is_used() -> None:
     rig = Rig()
     rig.steps(10)
     for count in range(1, 4):
@@ -62,7 +62,7 @@ def test_tips_that_jumped_together_count_from_the_fourth() -> None:
     assert not none_sent(rig.expose(x=0.0))
 
 
-def test_one_tip_from_the_future_holds_nothing_up() -> None:
+def test_a_tip_with_a_future_stamp_does_not_block_steering() -> None:
     for when, ahead in itertools.product(("wanted", "moving", "idle"), (0.05, 1.5, 3600.0)):
         rig = Rig()
         rig.steps(3)
@@ -85,7 +85,7 @@ def test_one_tip_from_the_future_holds_nothing_up() -> None:
             assert rig.steering.tips.rejected == {TipFault.AHEAD_OF_JOINTS: 1}
 
 
-def test_a_refused_tip_is_believed_to_be_of_its_stamp_up_to_a_tenth_of_a_second() -> None:
+def test_the_stamp_of_a_rejected_tip_counts_up_to_a_tenth_of_a_second_ahead() -> None:
     for ahead, believed in ((99_000_000, True), (101_000_000, False)):
         rig = Rig()
         before = rig.steering.tips.after_ns
@@ -94,7 +94,7 @@ def test_a_refused_tip_is_believed_to_be_of_its_stamp_up_to_a_tenth_of_a_second(
         assert rig.steering.tips.after_ns == (nowhere.stamp_ns if believed else before)
 
 
-def test_of_many_tips_that_wait_the_newest_are_kept() -> None:
+def test_a_full_queue_keeps_the_newest_tips() -> None:
     rig = Rig()
     first = rig.now
     for k in range(1, 80):
@@ -110,7 +110,7 @@ def test_of_many_tips_that_wait_the_newest_are_kept() -> None:
 SPIKES = [(0, 0.01, 0.0), (0, -0.0006, 0.0), (0, 0.0006, 0.0), (0, 0.0, 2.0), (3600, 0.0, 0.0)]
 
 
-def test_a_spike_in_joint_states_stops_nothing() -> None:
+def test_a_spike_in_joint_states_does_not_stop_steering() -> None:
     for moving, spike in itertools.product((False, True), SPIKES):
         ahead, insertion, rotation = spike
         rig = Rig()
@@ -130,7 +130,7 @@ def test_a_spike_in_joint_states_stops_nothing() -> None:
         assert rig.steering.state is STEERING
 
 
-def test_a_doubt_about_joints_is_told_once() -> None:
+def test_inconsistent_joints_are_logged_once() -> None:
     rig = Rig()
     for count in range(1, 4):
         rig.now += TICK
@@ -145,7 +145,7 @@ def test_a_doubt_about_joints_is_told_once() -> None:
     assert "nothing heard" in logged(rig.steering.on_time(10.0))
 
 
-def test_joints_that_jumped_want_the_needle_out_unless_they_are_back() -> None:
+def test_after_a_joint_jump_the_needle_must_be_out_or_back() -> None:
     rig = Rig()
     rig.steps(15)
     deep = rig.insertion
@@ -170,7 +170,7 @@ def test_joints_that_jumped_want_the_needle_out_unless_they_are_back() -> None:
     assert rig.good_tips().insertion == pytest.approx(0.001)
 
 
-def test_a_clock_that_went_back_is_a_stop_and_a_start() -> None:
+def test_steering_stops_when_the_clock_goes_back_and_can_restart() -> None:
     rig = Rig()
     rig.now += 100 * SECOND
     rig.settle()
@@ -185,7 +185,7 @@ def test_a_clock_that_went_back_is_a_stop_and_a_start() -> None:
     assert rig.steering.step == 6
 
 
-def test_joints_that_were_silent_go_on_where_they_were() -> None:
+def test_steering_continues_after_a_gap_in_joint_states() -> None:
     for moved, goes_on in ((0.0, True), (0.00119, True), (-0.00019, True), (0.00121, False)):
         rig = Rig()
         rig.steps(5)

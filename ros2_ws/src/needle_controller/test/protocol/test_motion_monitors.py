@@ -18,7 +18,7 @@ PENDING, ARRIVED, STOPPED_SHORT = StepOutcome
 OUT, TOLERANCE = 0.002, 0.0002
 
 
-def test_a_step_has_arrived_where_both_joints_are_at_its_end_or_beyond() -> None:
+def test_a_step_has_arrived_when_both_joints_are_at_or_beyond_its_end() -> None:
     for insertion, rotation, wanted in (
         (0.01 - 0.99e-5, 0.5 + 0.99e-2, ARRIVED),
         (0.0101, 0.5 - 0.99e-2, ARRIVED),
@@ -47,7 +47,7 @@ def looked(moved: tuple[float, float], sent: int = 100, answered: int = 100) -> 
     return verdicts
 
 
-def test_joints_stand_that_rest_for_five_samples_sent_after_the_answer() -> None:
+def test_five_resting_samples_after_the_answer_are_a_standstill() -> None:
     at_once = [PENDING] * 4 + [STOPPED_SHORT] * 3
     assert looked((0.0, 0.0)) == at_once
     assert looked((1.9e-6, -0.9e-4)) == at_once
@@ -58,7 +58,7 @@ def test_joints_stand_that_rest_for_five_samples_sent_after_the_answer() -> None
     assert StepMonitor(STEP, 0).update(JointHistory(), None) is PENDING
 
 
-def test_joints_have_moved_that_went_on_since_the_last_look() -> None:
+def test_motion_is_detected_between_two_calls() -> None:
     watchdog = Watchdog()
     looks = [None, 0.01, 0.01 + 1.9e-6, 0.01 + 4e-6, 0.01 + 1.9e-6, None, 0.01]
     said = [
@@ -72,7 +72,7 @@ def watched(watch: RetractionMonitor, *places: float) -> list[bool]:
     return [watch.update(place, out_below=OUT, tolerance=TOLERANCE) for place in places]
 
 
-def test_a_needle_is_drawn_back_where_the_median_of_five_samples_is() -> None:
+def test_retraction_is_detected_from_the_median_of_five_samples() -> None:
     watch = RetractionMonitor()
     assert not any(watched(watch, *[0.01] * 3, *[0.02] * 5, 0.005, 0.005))
     assert not any(watched(watch, *[0.02] * 3, 0.005, *[0.02] * 5))
@@ -89,7 +89,7 @@ def test_a_needle_is_drawn_back_where_the_median_of_five_samples_is() -> None:
     assert watch.reason == ""
 
 
-def test_a_needle_that_is_out_may_go_to_and_fro() -> None:
+def test_a_needle_that_is_out_may_move_back_and_forth() -> None:
     watch = RetractionMonitor()
     watched(watch, *[0.002] * 5)
     assert watched(watch, *[0.0015] * 5).count(True) == 1
@@ -102,7 +102,7 @@ def test_a_needle_that_is_out_may_go_to_and_fro() -> None:
     assert watched(watch, 0.005, 0.005, 0.005) == [False, False, True]
 
 
-def test_joints_that_jumped_are_back_where_the_needle_was_followed_to() -> None:
+def test_jumped_joints_are_back_at_their_last_observed_position() -> None:
     for back, away in (
         ((0.0201999, 0.3999), False),
         ((0.0198001, 0.2001), False),

@@ -24,7 +24,7 @@ from needle_controller.protocol.joint_history import JointSample
 SETTINGS = SteeringSettings(depth=0.12)
 
 
-def test_a_step_goes_on_by_its_length_or_ends_at_depth_or_point() -> None:
+def test_a_step_has_its_length_or_ends_at_depth_or_point() -> None:
     rows: list[tuple[float, float | None, float | None]] = [
         (0.05, None, 0.051),
         (0.05, 0.005, 0.051),
@@ -57,7 +57,7 @@ def test_a_step_goes_on_by_its_length_or_ends_at_depth_or_point() -> None:
         assert slow == dataclasses.replace(step, duration=2.0 * step.duration)
 
 
-def test_trust_is_the_interval_of_the_covariance_the_doubts_and_the_end() -> None:
+def test_confidence_follows_from_covariance_and_miss_probability() -> None:
     estimator = HypothesisFilter(FilterSettings())
     for r1 in (-0.002, 0.002):
         estimator.reset([r1, 0.0, 0.0], np.zeros(2))
@@ -79,7 +79,7 @@ def test_trust_is_the_interval_of_the_covariance_the_doubts_and_the_end() -> Non
     assert (unjudged.verdict, unjudged.is_doubtful) == ("", False)
 
 
-def test_a_point_is_missed_as_often_as_it_is_said() -> None:
+def test_the_miss_probability_of_a_point_is_its_frequency() -> None:
     rng = np.random.default_rng(2)
     for spread in (0.0002, 0.0005, 0.0009):
         off = rng.normal(0.0, 0.0005, 3)
@@ -89,13 +89,13 @@ def test_a_point_is_missed_as_often_as_it_is_said() -> None:
         assert float(point_miss_probability(off, root @ root.T)) == pytest.approx(share, abs=0.03)
 
 
-def test_trust_in_a_line_says_the_distance_its_interval_and_the_verdict() -> None:
+def test_the_summary_contains_distance_interval_and_verdict() -> None:
     said = Confidence("trusted", False, 0.001, -0.001, 0.003).summary
     assert said == "r1 = 0.00100 m +- 0.00200 m (95 %), trusted"
     assert Confidence(r1=0.0, low=-1.0, high=1.0).summary.endswith("(95 %)")
 
 
-def test_what_was_heard_is_read_back_in_its_order_and_told_once() -> None:
+def test_the_reception_log_round_trips_once_in_order() -> None:
     heard = ReceptionLog()
     assert received_messages(heard.pop_text()) == []
     messages = [("joint_states", 1_700_000_000_000_000_000), ("needle/tip", 5), ("joint_states", 7)]

@@ -120,9 +120,7 @@ def test_a_flip_turns_the_bevel_over_and_holds_the_plane() -> None:
     assert max(needle.track[69:]) < 1e-3
 
 
-def test_all_that_a_filter_runs_has_run_before_the_needle_waits_for_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_all_compiled_code_runs_at_construction(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("start_needle", "advance_needle", "correct_needle", "estimate_needle")
     ran = []
     for name in names:
@@ -137,7 +135,7 @@ def test_all_that_a_filter_runs_has_run_before_the_needle_waits_for_it(
     assert set(ran) == set(names)
 
 
-def test_a_change_of_preset_keeps_the_estimated_pose_and_steers_on() -> None:
+def test_a_change_of_preset_keeps_the_estimated_pose() -> None:
     for before, after in (("best", "paper"), ("paper", "best"), ("open_loop", "paper")):
         needle = Needle(dataclasses.replace(PLANE, preset=before)).steer(40)
         pose = needle.control._estimator.estimate()
@@ -153,7 +151,7 @@ def test_a_change_of_preset_keeps_the_estimated_pose_and_steers_on() -> None:
             assert max(needle.steer(80).track[-20:]) < 1e-3
 
 
-def test_an_update_says_turn_miss_and_reach() -> None:
+def test_an_update_contains_turn_miss_probability_and_reach() -> None:
     needle = Needle(PLANE, turned=1.0)
     needle.steer(3)
     # An encoder at rest may read a count less.
@@ -190,7 +188,7 @@ def breathing(time: float) -> Array:
     return np.asarray(np.array(POINT) + np.array([0.0, y, 2e-5 * time]))
 
 
-def test_a_point_that_moves_is_met_where_it_will_be_if_its_clock_is_known() -> None:
+def test_a_moving_point_is_reached_if_its_clock_is_known() -> None:
     ends = []
     for apart in (0.0, 1.7e9, None):
         needle = Needle(TO_POINT)
@@ -209,7 +207,7 @@ def test_a_point_that_moves_is_met_where_it_will_be_if_its_clock_is_known() -> N
     np.testing.assert_array_equal(ends[1], ends[2])
 
 
-def test_the_depth_ends_it_before_the_point() -> None:
+def test_steering_ends_at_the_depth_before_the_point() -> None:
     needle = Needle(dataclasses.replace(TO_POINT, target_point=(0.0, 0.0, 0.04), depth=0.05))
     needle.control.target_point = np.array([0.0, 0.0, 0.1])
     needle.steer()
@@ -217,7 +215,7 @@ def test_the_depth_ends_it_before_the_point() -> None:
     assert not any(needle.reachable)
 
 
-def test_new_settings_keep_point_and_obstacles_unless_they_change_them_or_cannot() -> None:
+def test_new_settings_keep_point_and_obstacles_unless_they_change_them() -> None:
     control = PlaneControl(PLANE, PLANE.plane())
     assert control.target_point is None
     control.target_point, control.obstacles = np.array(POINT), WALL
@@ -234,14 +232,11 @@ def test_new_settings_keep_point_and_obstacles_unless_they_change_them_or_cannot
         thick = SteeringSettings(depth=depth, needle_diameter=0.002, goal_tolerance=0.002)
         control.configure(thick)
         assert path_planner(thick).settings == PathSettings(
-            thick.max_rotation_per_length,
-            needle_radius=0.001,
-            goal_tolerance=0.002,
-            longest=depth,
+            thick.max_rotation_per_length, needle_radius=0.001, goal_tolerance=0.002, longest=depth
         )
 
 
-def test_the_needle_comes_to_the_point_past_an_obstacle() -> None:
+def test_the_needle_reaches_a_point_past_an_obstacle() -> None:
     settings = dataclasses.replace(TO_PAST, target_offset=0.004)
     needle = Needle(settings, starts_deg=10.0)
     assert needle.control.reason_without_path(0.0) == ""
@@ -256,7 +251,7 @@ def test_the_needle_comes_to_the_point_past_an_obstacle() -> None:
     assert min(least) < 0.0
 
 
-def test_a_wall_that_comes_on_the_way_stops_the_needle_before_it() -> None:
+def test_a_new_wall_stops_the_needle_before_it() -> None:
     needle = Needle(TO_PAST, starts_deg=10.0).steer(8)
     needle.control.obstacles = WALL
     needle.steer()
@@ -265,7 +260,7 @@ def test_a_wall_that_comes_on_the_way_stops_the_needle_before_it() -> None:
     assert needle.least > 0.00035
 
 
-def test_a_needle_that_is_out_is_told_why_there_is_no_path_and_from_where_there_is() -> None:
+def test_the_reason_without_path_names_an_entry_with_a_path() -> None:
     control = PlaneControl(TO_PAST, offset_plane(0.0))
     control.obstacles = Obstacles([Obstacle(PAST, PAST, 0.004)])
     assert "the target point is -0.004 m from an obstacle" in control.reason_without_path(0.0)

@@ -20,7 +20,7 @@ SETTINGS = SteeringSettings(target_offset=0.003, tip_covariance="configured")
 HOLDING = dataclasses.replace(HELD, insertion_m=0.0, rotation_rad=0.0)
 
 
-def test_start_says_which_device_it_waits_for() -> None:
+def test_start_reports_the_missing_device_state() -> None:
     bare = Steering(SETTINGS)
     assert "no device/status has come" in bare.on_start()[0].message
     bare.on_device(HELD)
@@ -38,7 +38,7 @@ def test_start_says_which_device_it_waits_for() -> None:
         assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
 
 
-def test_start_waits_for_joints_that_say_what_the_device_does() -> None:
+def test_start_waits_until_joints_and_device_agree() -> None:
     """The joints lag behind the device: homing has ended there, and not here."""
     for insertion, rotation, agree in (
         (4.9e-5, -1.9e-2, True),
@@ -66,7 +66,7 @@ def test_start_waits_for_joints_that_say_what_the_device_does() -> None:
     sent(rig.expose())
 
 
-def test_start_refuses_a_needle_that_is_in_or_at_the_depth_or_turned_too_far() -> None:
+def test_start_is_refused_for_an_inserted_or_rolled_needle() -> None:
     assert Rig(started=False, insertion=0.002).start() == "steering"
     assert "is 0.0021 m in and was not followed" in Rig(started=False, insertion=0.0021).start()
     for short, said in ((0.9e-6, "is at the depth 0.001 m"), (1.1e-6, "steering")):
@@ -76,14 +76,14 @@ def test_start_refuses_a_needle_that_is_in_or_at_the_depth_or_turned_too_far() -
         assert ("roll in target_plane" not in said) is started, degrees
 
 
-def test_best_starts_with_its_base_turned_however_the_last_run_left_it() -> None:
+def test_best_starts_at_any_rotation_of_the_base() -> None:
     for turned in (2.0, -8.0):
         rig = Rig(started=False, rotation=turned)
         assert rig.start() == "steering"
         assert sent(rig.expose()).rotation == pytest.approx(turned, abs=0.53)
 
 
-def test_start_and_stop_count_only_where_they_change_something() -> None:
+def test_start_and_stop_are_idempotent() -> None:
     rig = Rig(started=False)
     # Tips move nothing while nobody has started.
     assert rig.expose() == []
@@ -110,7 +110,7 @@ def test_start_and_stop_count_only_where_they_change_something() -> None:
     assert none_sent(rig.settle(1))
 
 
-def test_a_needle_that_is_out_is_another_one() -> None:
+def test_a_needle_that_is_out_restarts_the_estimate() -> None:
     rig = Rig(insertion=0.0)
     rig.steps(2)
     rig.steering.on_stop()
@@ -120,7 +120,7 @@ def test_a_needle_that_is_out_is_another_one() -> None:
     assert rig.steering.tips.last is None
 
 
-def test_settings_change_protocol_controller_and_plane_on_the_way() -> None:
+def test_settings_change_while_steering() -> None:
     steering = Steering(SETTINGS)
     law = steering.control._law
     steering.control.plane = offset_plane(0.005)
@@ -135,7 +135,7 @@ def test_settings_change_protocol_controller_and_plane_on_the_way() -> None:
     assert steering.control._law is not law
 
 
-def test_start_says_where_no_path_leads_past_obstacles(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.MonkeyPatch) -> None:
     # A path from another entry is looked for in planning's own tests.
     monkeypatch.setattr(entry, "nearest_entry", lambda *_: None)
     buried = (0.0, 0.0, 0.06, 0.0, 0.0, 0.06, 0.004)

@@ -25,7 +25,7 @@ from .rig import FREE, HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
 STEERING = SteeringState.STEERING
 
 
-def test_a_tip_leads_to_one_step_and_its_end_to_the_wish_for_another() -> None:
+def test_a_tip_leads_to_one_step_and_its_end_awaits_another() -> None:
     rig = Rig()
     assert where(rig) == (STEERING, Awaiting.TIP)
     assert rig.steering.command_ns == 0
@@ -112,7 +112,7 @@ def test_joints_that_were_sent_before_the_answer_do_not_show_a_standstill() -> N
     assert (rig.steering.step, rig.steering.tips.after_ns) == (1, rig.now)
 
 
-def test_the_command_follows_from_stamps_whatever_order_the_topics_come_in() -> None:
+def test_the_command_does_not_depend_on_the_order_of_topics() -> None:
     """The answer, the tips and the joints of a step, each topic in its own order."""
     after = set()
     for order in itertools.permutations(("answer", "tips", "before", "after")):
@@ -145,7 +145,7 @@ def test_the_command_follows_from_stamps_whatever_order_the_topics_come_in() -> 
     assert command.stamp_ns == tips[5].stamp_ns
 
 
-def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew() -> None:
+def test_motion_since_the_exposure_requires_a_new_tip() -> None:
     for moved, turned, looked_at_anew in (
         (1.01e-4, 0.0, True),
         (0.99e-4, 0.0, False),
@@ -175,7 +175,7 @@ def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew() ->
                 assert sent(rig.expose()).insertion == pytest.approx(rig.insertion + 0.001)
 
 
-def test_the_last_step_ends_at_the_depth_and_then_it_is_done() -> None:
+def test_the_last_step_ends_at_the_depth() -> None:
     rig = Rig(depth=0.0025)
     ends = []
     while rig.steering.state is STEERING:
@@ -194,14 +194,14 @@ def test_the_last_step_ends_at_the_depth_and_then_it_is_done() -> None:
     assert "at the depth" in rig.start()
 
 
-def test_in_doubt_it_goes_on_at_half_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_uncertain_estimate_halves_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         steering, "assess_confidence", lambda *_: Confidence("doubtful", is_doubtful=True)
     )
     assert sent(Rig().expose()).duration == pytest.approx(1.0)
 
 
-def test_a_recorded_device_may_have_made_another_step() -> None:
+def test_a_recorded_step_replaces_the_sent_one() -> None:
     rig = Rig()
     rig.steering.on_recorded_step(5, JointSample(0, 0.0, 0.0))
     assert rig.steering.on_result(5, "succeeded") == []
@@ -213,9 +213,7 @@ def test_a_recorded_device_may_have_made_another_step() -> None:
     assert (rig.steering.step, rig.steering.tips.after_ns) == (1, rig.now)
 
 
-def test_an_own_part_that_fails_on_the_way_stops_the_needle(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_failing_part_of_another_package_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise OwnPartError("advance() raised RuntimeError")
 

@@ -34,7 +34,7 @@ def fault(refusal: RejectedTip | None) -> TipFault | None:
     return None if refusal is None else refusal.fault
 
 
-def test_a_message_is_refused_whatever_the_needle_did() -> None:
+def test_bad_messages_are_rejected_whatever_the_joints() -> None:
     for measured, wanted in (
         (tip(0.0, 0.0, 0.02, stamp_ns=51), None),
         (tip(0.0, 0.0, 0.02, stamp_ns=50), TipFault.NOT_NEWER),
@@ -50,7 +50,7 @@ def test_a_message_is_refused_whatever_the_needle_did() -> None:
     assert "(4e-08 s behind)" in str(check_message(tip(0.0, 0.0, 0.0, stamp_ns=10), LAST))
 
 
-def test_a_stamp_is_refused_where_its_joints_will_never_be_known() -> None:
+def test_stamps_outside_the_joint_history_are_rejected() -> None:
     oldest, latest = JointSample(40, 0.0, 0.0), JointSample(60, 0.0, 0.0)
     for stamp_ns, wanted in (
         (39, TipFault.BEFORE_JOINTS),
@@ -65,7 +65,7 @@ def test_a_stamp_is_refused_where_its_joints_will_never_be_known() -> None:
     assert "2.5 s ahead" in str(check_stamp(late, oldest, latest))
 
 
-def test_a_place_is_refused_where_no_needle_can_be() -> None:
+def test_unreachable_positions_are_rejected() -> None:
     rows: list[
         tuple[tuple[float, float, float], JointSample, AcceptedTip | None, TipFault | None]
     ] = [
@@ -88,7 +88,7 @@ def test_a_place_is_refused_where_no_needle_can_be() -> None:
         assert fault(check_position(tip(*place), joints, last, MARGIN)) is wanted, place
 
 
-def test_a_covariance_is_refused_that_no_tip_can_have() -> None:
+def test_invalid_covariances_are_rejected() -> None:
     for matrix, said in (
         (np.eye(3) * 1e-12, ""),
         (np.eye(3) + 0.9e-9 * np.eye(3, k=1), ""),
