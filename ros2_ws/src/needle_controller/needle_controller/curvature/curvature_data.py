@@ -13,10 +13,10 @@ import numpy as np
 
 from needle_controller.model.arrays import Array
 from needle_core.errors import OutOfBoundsError, UserError
+from needle_core.message_types import to_nanoseconds
 
 _COORDINATES = ("x_m", "y_m", "z_m")
 _LARGEST_COORDINATE = 1.0
-_NANOSECONDS = 1_000_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,20 +201,16 @@ def _read_tip(path: Path, message: Any, tips: dict[int, list[float]]) -> None:
         raise UserError(f"{path}: a tip is not finite: {position}")
     if message.header.frame_id != "rig":
         raise UserError(f"{path}: a tip is in frame '{message.header.frame_id}', wants 'rig'")
-    tips.setdefault(_nanoseconds(message), position)
+    tips.setdefault(to_nanoseconds(message.header.stamp), position)
 
 
 def _read_joints(message: Any, joints: dict[int, list[float]]) -> None:
     position: Mapping[str, float] = dict(zip(message.name, message.position, strict=False))
     if "insertion_joint" in position and "rotation_joint" in position:
         joints.setdefault(
-            _nanoseconds(message),
+            to_nanoseconds(message.header.stamp),
             [float(position["insertion_joint"]), float(position["rotation_joint"])],
         )
-
-
-def _nanoseconds(message: Any) -> int:
-    return int(message.header.stamp.sec) * _NANOSECONDS + int(message.header.stamp.nanosec)
 
 
 def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:

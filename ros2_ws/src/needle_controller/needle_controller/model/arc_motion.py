@@ -1,4 +1,4 @@
-"""Exact motion along arcs on SE(3), and its derivative by the curvature ([KC09] (2)).
+"""Exact motion along arcs on SE(3) ([KC09] (2)).
 
 Over an advance the tip moves by exp((V1 l + V2 theta)^): in its own axes it rotates by the rotation
 vector (kappa l, 0, theta) and moves along the corresponding helix. Leading axes broadcast.
@@ -49,7 +49,7 @@ def left_jacobian(vector: npt.ArrayLike) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class RelativeMotion:
-    """End of a motion in the axes of its start, and its derivative by the curvature.
+    """End of a motion in the axes of its start.
 
     Attributes
     ----------
@@ -57,16 +57,10 @@ class RelativeMotion:
         Position of the end [m].
     rotation : ndarray, shape (..., 3, 3)
         Orientation of the end.
-    shift_slope : ndarray, shape (..., 3)
-        d shift / d curvature [m^2].
-    rotation_slope : ndarray, shape (..., 3)
-        The end turns by the rotation vector `rotation_slope` d(curvature), in its own axes [m].
     """
 
     shift: Array
     rotation: Array
-    shift_slope: Array
-    rotation_slope: Array
 
 
 def arc(length: npt.ArrayLike, turn: npt.ArrayLike, curvature: npt.ArrayLike) -> RelativeMotion:
@@ -87,30 +81,9 @@ def arc(length: npt.ArrayLike, turn: npt.ArrayLike, curvature: npt.ArrayLike) ->
         np.asarray(curvature, dtype=float),
     )
     x = kappa * inserted
-    q = x * x + z * z
-    a, b, c = rodrigues_factors(q)
-    small = q < SERIES_BELOW
-    safe = np.where(small, 1.0, q)
-    db = np.where(
-        small, -1.0 / 24.0 + q * (1.0 / 360.0 - q / 13440.0), (a - 2.0 * b) / (2.0 * safe)
-    )
-    dc = np.where(
-        small, -1.0 / 120.0 + q * (1.0 / 2520.0 - q / 120960.0), (b - 3.0 * c) / (2.0 * safe)
-    )
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    shift = np.stack([c * x * z, -b * x, one - c * x * x], axis=-1) * inserted[..., None]
-    # Derivative by x, with dq/dx = 2 x
-    slope = np.stack(
-        [c * z + 2.0 * dc * x * x * z, -b - 2.0 * db * x * x, -2.0 * c * x - 2.0 * dc * x**3],
-        axis=-1,
-    )
-    turning = np.stack([one - c * z * z, -b * z, c * x * z], axis=-1)
-    return RelativeMotion(
-        shift=shift,
-        rotation=rotation_exp(np.stack([x, zero, z], axis=-1)),
-        shift_slope=slope * (inserted**2)[..., None],
-        rotation_slope=turning * inserted[..., None],
-    )
+    _, b, c = rodrigues_factors(x * x + z * z)
+    shift = np.stack([c * x * z, -b * x, 1.0 - c * x * x], axis=-1) * inserted[..., None]
+    return RelativeMotion(shift, rotation_exp(np.stack([x, np.zeros_like(x), z], axis=-1)))
 
 
 def rodrigues_factors(squared: Array) -> tuple[Array, Array, Array]:

@@ -49,29 +49,14 @@ def entry_state(
     return TipState(np.array([x, y, 0.0]), angles, curvature, heading_std=heading_std)
 
 
-@dataclasses.dataclass(frozen=True)
-class NoPath:
-    """Result of a search that has found no path for a needle that is still out.
-
-    Attributes
-    ----------
-    reason : str
-        Description; with an entry from which there is a path, if one is near.
-    is_proven : bool
-        Whether there is certainly no path, rather than none found.
-    """
-
-    reason: str
-    is_proven: bool
-
-
 def first_path(
     planner: PathPlanner, entry: TipState, target: npt.ArrayLike, obstacles: Obstacles
-) -> NeedlePath | NoPath:
+) -> NeedlePath | str:
     """Return the path of a needle that is still out, or the reason why there is none.
 
     If the quick search finds no path and the flood fill does not rule one out, the thorough search
-    follows.
+    follows. The reason tells a proof ("no path is clear") from a failed search ("was found clear"),
+    and names an entry with a path if one is near.
 
     Parameters
     ----------
@@ -93,8 +78,7 @@ def first_path(
         ("entry", entry.position, clear),
     ):
         if (distance := obstacles.clearance(point)) < wanted:
-            reason = f"the {name} is {distance:.4g} m from an obstacle, wants >= {wanted:.4g} m"
-            return NoPath(reason, is_proven=True)
+            return f"the {name} is {distance:.4g} m from an obstacle, wants >= {wanted:.4g} m"
     possible = planner.may_have_path(entry, target, obstacles)
     path = planner.path(entry, target, obstacles, starts=THOROUGH_STARTS) if possible else None
     if path is not None:
@@ -108,7 +92,7 @@ def first_path(
         reason += "; entering at ({:.4g}, {:.4g}) m in place of (0, 0) there is one".format(
             *nearest
         )
-    return NoPath(reason, is_proven=not possible)
+    return reason
 
 
 def nearest_entry(

@@ -13,7 +13,7 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import PITCH, YAW, X
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate
-from needle_controller.planning.entry import NoPath, entry_state, first_path
+from needle_controller.planning.entry import entry_state, first_path
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
@@ -160,8 +160,8 @@ class PathSteering:
                 f"{len(obstacles)} obstacles"
             )
         found = first_path(self._planner, entry, target, obstacles)
-        self.path = None if isinstance(found, NoPath) else found
-        return found.reason if isinstance(found, NoPath) else ""
+        self.path = None if isinstance(found, str) else found
+        return found if isinstance(found, str) else ""
 
     def command(
         self,
