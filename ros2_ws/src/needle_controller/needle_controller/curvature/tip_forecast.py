@@ -4,7 +4,7 @@ The uncertainty of an arc alone is too small, because the curvature varies sligh
 So the path is an arc plus the effect of a local curvature c, a stationary random process:
 
     p(s) = arc(s) + integral over u < s of c(u) x (arc(s) - arc(u)) du,
-    E[c(u) c(v)^T] = spread^2 exp(-|u - v| / length) across the path,
+    E[c(u) c(v)^T] = spread^2 exp(-|u - v| / length) across the path.
 
 The curvature of the arc is normal about 0 in each direction. Only the order of magnitude of its
 standard deviation is known: each of `SCALES` is a hypothesis, weighted by the evidence of the tips.

@@ -60,8 +60,8 @@ NEEDLE = np.dtype(
         ("pending_length", np.float64, LONGEST_QUEUE),  # [m]
         ("pending_turn", np.float64, LONGEST_QUEUE),  # [rad]
         ("initial_rotation", np.float64, (3, 3)),  # at the entry, with the base at 0
-        ("has_entry", np.bool_),  # whether the entry point is assumed, which is
-        ("entry", np.float64, 3),  # [m]
+        ("has_entry", np.bool_),  # whether the entry point is known
+        ("entry", np.float64, 3),  # entry point [m]
         ("start", np.float64, 3),  # the first tip [m]
         ("start_insertion", np.float64),  # [m]
         ("inserted", np.float64),  # since the start [m]

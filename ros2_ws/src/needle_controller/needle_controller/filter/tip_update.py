@@ -266,7 +266,7 @@ def truncated_moments(lower: float, upper: float) -> tuple[float, float, float]:
     Parameters
     ----------
     lower, upper : float
-        The bounds; those exceedance_probability 5.5 count as none (an error below 1e-6).
+        The bounds; those beyond 5.5 are ignored (an error below 1e-6).
     """
     if lower <= -_FAR and upper >= _FAR:
         return 1.0, 0.0, 1.0

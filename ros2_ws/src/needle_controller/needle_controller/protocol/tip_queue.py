@@ -29,7 +29,7 @@ _QUEUE_LENGTH = 64
 _MOVED_SHARE, _MOVED_ROTATION = 0.1, 2e-2
 """Motion since a tip's exposure from which on the tip is outdated [step lengths], [rad]."""
 _JOINTS_LATE_NS = 100_000_000
-"""Time by which a rejected tip's stamp may be ahead of the joints and still be believed [ns]."""
+"""Largest time by which a rejected tip's stamp may be ahead of the joints to count [ns]."""
 
 
 class TipQueue:
