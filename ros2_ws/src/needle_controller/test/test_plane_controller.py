@@ -1,4 +1,4 @@
-"""plane_controller as a component: what its inputs, services and timer lead to."""
+"""plane_controller as a component: inputs, services and timer."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Bench:
         return self
 
     def step(self) -> m.Trajectory:
-        """Show a tip; carry out the command that it leads to, and answer."""
+        """Send a tip, execute the resulting command, and answer."""
         self.tip()
         command: m.Trajectory = self.published[COMMANDS][-1]
         assert command.stamp_ns == self.now
@@ -156,7 +156,7 @@ def test_each_reason_to_reject_a_tip_is_logged_once_in_two_seconds() -> None:
     assert (bench.status.tips_rejected, bench.status.level) == (9, Level.WARN)
     for reason in ("not finite", "frame 'map'", "from the entry point"):
         assert sum(reason in line for line in bench.logs) == 2
-    # Time is looked at by the timer.
+    # The timer checks the timeouts.
     for _ in range(2):
         bench.do(bench.component.timers[0].handler(bench.at))
         bench.later += 3.0
@@ -187,7 +187,7 @@ def test_the_covariance_of_a_tip_pose_is_used() -> None:
 
 
 def test_the_covariance_follows_the_messages_convention(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fixed axes of target_plane: a sample of small turns has the published covariance."""
+    """A sample of small rotations about the axes of target_plane has the published covariance."""
     bench, rng, angles = Bench().started(), np.random.default_rng(1), np.array([0.5, -0.7, 1.2])
     mean, root = rotation_from_angles(angles), rng.normal(size=(6, 6))
     estimate = pose_estimate(np.zeros(3), mean, 8.0, root @ root.T)
@@ -216,7 +216,7 @@ def test_invalid_targets_are_rejected_and_the_last_stays() -> None:
         bench.receive("target_point", m.Point(0, "rig", (x, 0.0, z)))
         assert bench.status.target_point_m == (0.01, 0.0, 0.1)
     assert "entering at" in bench.health["target_point"].message
-    # A plane takes the point's place.
+    # A plane replaces the point.
     bench.receive("target_plane", plane)
     assert bench.status.target_point_m is None
     assert bench.health["target_plane"].level is Level.OK
@@ -233,7 +233,7 @@ def test_the_motion_of_a_stamped_point_is_predicted() -> None:
     for stamped, wanted in ((True, 0.0055), (False, 0.005)):
         bench = Bench()
         for k in range(41):
-            # It drifts along x.
+            # The point drifts along x.
             stamp = k * 250_000_000 + 5_000_000_000 if stamped else 0
             bench.receive("target_point", m.Point(stamp, "rig", (0.004 + 0.25e-4 * k, 0.0, 0.09)))
         points = bench.component.steering.control._points

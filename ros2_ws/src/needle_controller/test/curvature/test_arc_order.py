@@ -1,4 +1,4 @@
-"""Tips that leave their arc in order are told from tips that miss it at random."""
+"""Detection of correlated residuals along an arc."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TRACKER = 3e-5  # standard deviation of stereo_tracker's tips [m]
 
 
 def insertions(count: int, arc: float, turn: float, rng: Generator) -> tuple[Array, Array]:
-    """Return exact tips (count, K, 3) of needles that are turned once, half-way."""
+    """Return exact tips (count, K, 3) of needles that turn once, half-way."""
     poses = np.tile(np.eye(4), (count, 1, 1))
     tilted = Rotation.from_rotvec(rng.normal(0.0, math.radians(5.0), (count, 3)) * [1.0, 1.0, 0.0])
     rolled = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi, (count, 1)))
@@ -74,7 +74,7 @@ def test_outliers_are_not_correlated_residuals() -> None:
     rng = default_rng(6)
     tips, insertion = insertions(30, 0.06, 0.0, rng)
     tips = tips + noise(tips.shape, TRACKER, rng)
-    # Two in a row, the same way.
+    # Two consecutive outliers in the same direction.
     tips[:, 20:22] += [5e-3, 0.0, 0.0]
     assert refused(tips, insertion) == 0
 

@@ -1,4 +1,4 @@
-"""The command: files and bags that it reads, and what it says of them."""
+"""The command `identify_curvature`: files, bags and messages."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_steered_insertion_without_rotation_is_rejected(
     assert "the tips follow no single arc" in error
     assert error.count("\n") == 1
     turned = np.zeros(len(insertion))
-    # Whoever has recorded that nothing turned is believed.
+    # A recorded rotation of 0 is accepted.
     assert command(write_csv(path, noisy, insertion, turned)) == 0
     if known:
         write_csv(path, noisy, insertion, None)
@@ -203,7 +203,7 @@ def test_command_reads_a_bag(
     tmp_path: Path, needle: tuple[Array, Array], capsys: pytest.CaptureFixture[str]
 ) -> None:
     tips, insertion = needle
-    # Drawn back at the end, which is left out.
+    # The retraction at the end is omitted.
     back = slice(-2, -32, -1)
     path = write_bag(
         tmp_path / "bag",

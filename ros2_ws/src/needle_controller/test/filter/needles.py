@@ -1,4 +1,4 @@
-"""Exact needles, their turns and noisy tips, and a filter that is driven along them."""
+"""Exact needles with noisy tips, and a filter that follows them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bank of filters: consistency, torsion recovered, shapes of noise, bad settings."""
+"""The filter bank: consistency, torsion, noise shapes, bad settings."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_covariance_is_honest_for_gaussian_noise() -> None:
         yaw, pitch = rng.normal(0.0, settings.initial_angle_std, 2)
         roll = rng.normal(0.0, roll_std)
         turns = turns_for(count, seed=int(rng.integers(1 << 30)))
-        # The estimator allows for curvature that varies; so does this needle's.
+        # The needle's curvature varies as the estimator assumes.
         poses = path(turns, pitch, roll, CURVATURE * (1.0 + rng.normal(0.0, 0.15)))
         turned = np.eye(4)
         turned[:3, :3] = Rotation.from_rotvec([yaw, 0.0, 0.0]).as_matrix()
@@ -136,7 +136,7 @@ def test_warns_of_many_outliers() -> None:
 
 @pytest.mark.parametrize("with_covariance", [False, True])
 def test_many_needles_equal_single_ones(with_covariance: bool) -> None:
-    """To the last bit, whatever the others do; late tips and missing ones, too."""
+    """Bit for bit, with late and missing tips."""
     rng, count = np.random.default_rng(8), 6
     covariance = np.eye(3) * 1e-7 if with_covariance else None
     turns = np.stack([turns_for(30, seed) for seed in range(count)], axis=1)
@@ -178,10 +178,10 @@ def test_a_change_of_frame_keeps_the_needle(noise: NoiseHypothesis) -> None:
     transform[:3, :3], transform[:3, 3] = turn, [0.002, 0.001, -0.003]
     turns = turns_for(30)
     tips = noisy(path(turns))
-    # One normal noise: a box, or a mixture, would turn its sides with the plane.
+    # A single normal noise: a box or a mixture would depend on the axes of the plane.
     settings = FilterSettings(noise_hypotheses=(noise,), outlier_share=1e-6)
     old, new = HypothesisFilter(settings), HypothesisFilter(settings, turn)
-    # Noise that lasts has a size of its own along each axis.
+    # Correlated noise has a separate size for each axis.
     spread = np.diag([2e-7, 3e-7, 4e-7]) if noise.shape == NORMAL else np.eye(3) * 1e-6
     drive(old, turns[:20], tips[:21], spread)
     old.change_frame(transform)
@@ -289,7 +289,7 @@ def test_hypotheses_out_of_bounds_are_rejected() -> None:
 
 
 def test_nothing_is_compiled_twice() -> None:
-    """With and without covariance the same machine code runs."""
+    """The same machine code runs with and without covariance."""
     for covariance in (None, np.eye(3) * 1e-6):
         estimator = HypothesisFilter(FilterSettings())
         estimator.reset(np.zeros(3), np.zeros(2))

@@ -1,4 +1,4 @@
-"""Tips that are late and do not say so, and what only looks like it."""
+"""Detection of late tips, and of effects that resemble them."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def arc(inserted: Array | float) -> Array:
 
 
 def inserted_by(steps: int, *, late: int = 0, frame: Array | None = None) -> HypothesisFilter:
-    """Return what has seen a needle that is inserted without a turn, tips with +-1 mm noise.
+    """Return a filter after a pure insertion with +-1 mm noise.
 
-    In the middle of it everything may be expressed in another frame, (4, 4).
+    Half-way, everything may be transformed into another frame, (4, 4).
     """
     rng = np.random.default_rng(7)
     turn, offset = (np.eye(3), np.zeros(3)) if frame is None else (frame[:3, :3], frame[:3, 3])
@@ -53,7 +53,7 @@ def many_inserted_by(
     bump: float = 0.0,
     outliers: float = 0.0,
 ) -> ManyFilters:
-    """Return what has seen twenty such needles."""
+    """Return twenty such filters."""
     rng = np.random.default_rng(7)
     filters = ManyFilters(FilterSettings(), NEEDLES, STEP)
     filters.start(rng.uniform(-STEP, STEP, (NEEDLES, 3)))
@@ -75,14 +75,14 @@ def called_late(filters: ManyFilters) -> Array:
 def test_late_tips_are_detected_and_reported(late: int) -> None:
     filters = many_inserted_by(40, late=late)
     np.testing.assert_array_equal(called_late(filters), 1)
-    # Where the needle is, not where it was.
+    # The estimate is at the present position.
     off = filters.estimates["coordinates"][:, 2] - arc(40 * STEP)[2]
     assert np.sqrt(np.mean(off**2)) < 0.6 * STEP
 
 
 def test_late_tips_are_the_same_in_another_frame() -> None:
     at = np.eye(4)
-    # Axis for axis: noise is bounded along each.
+    # Axes are only permuted, because the noise is bounded along each.
     at[:3] = [[0.0, 1.0, 0.0, 0.01], [-1.0, 0.0, 0.0, -0.02], [0.0, 0.0, 1.0, 0.03]]
     elsewhere, here = (
         inserted_by(30, late=3, frame=at).estimate(),
@@ -111,7 +111,7 @@ def test_replayed_tips_have_their_covariance_in_the_new_frame() -> None:
     here, there = stays.estimate(), goes.estimate()
     assert LATE in here.warnings
     assert LATE in there.warnings
-    # Coordinates come in another order, which is all that differs.
+    # Only the order of the coordinates differs.
     np.testing.assert_allclose(there.position, turn @ here.position, atol=2e-4)
 
 
@@ -132,14 +132,14 @@ def test_punctual_tips_and_stated_ages_are_not_detected_as_late(other: dict[str,
 
 
 def seen(late: float, slip: float = 0.0) -> tuple[Array, Array]:
-    """Return insertions, and the ways of tips without noise."""
+    """Return insertions and displacements of exact tips."""
     inserted = np.arange(1, 21, dtype=np.float64) * STEP
     return inserted, arc(np.maximum(inserted - late, 0.0) / (1.0 + slip))
 
 
 def test_an_age_is_not_a_slip() -> None:
     inserted, ways = seen(0.003)
-    # Two coordinates of two tips are off by what is claimed, in the mean.
+    # Mean error of two coordinates of two tips, as claimed.
     ways *= np.sqrt(1.0 + 4.0 * STEP**2 / 3.0 / np.sum(ways**2, axis=-1, keepdims=True).clip(1e-9))
     assert hidden_age(inserted, ways, 0.0, *KNOWN) == pytest.approx(0.003, abs=1e-4)
     inserted, ways = seen(0.0, 0.2)
@@ -165,5 +165,5 @@ def test_no_age_is_detected_without_a_start_or_tips() -> None:
 def test_a_known_insertion_scale_leaves_no_slip() -> None:
     inserted, ways = seen(0.0, 0.2)
     assert hidden_age(inserted, ways, 0.0, *KNOWN) == 0.0
-    # What a slip would explain is then an age.
+    # Without slip, the missing insertion is an age.
     assert hidden_age(inserted, ways, 0.0, *KNOWN[:2], 0.0) > 0.0

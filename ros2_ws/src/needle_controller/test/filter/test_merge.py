@@ -1,4 +1,4 @@
-"""Which hypotheses are the same, and what is made of two of them."""
+"""Merging of equal hypotheses."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_different_hypotheses_are_not_merged(name: str, other: Any) -> None:
 
 
 def test_the_joined_estimate_has_the_mixtures_moments() -> None:
-    """Against samples of both Gaussians together."""
+    """Against samples of both Gaussians."""
     rng = np.random.default_rng(5)
     factor = rng.normal(size=(2, ERROR, ERROR)) * 0.02
     both = factor @ np.swapaxes(factor, -1, -2)

@@ -79,7 +79,7 @@ def test_the_step_is_the_exponential_of_the_twist(length: float, turn: float) ->
 def test_the_covariance_follows_the_steps_derivative(
     length: float, turn: float, play: float, lag: float
 ) -> None:
-    """F by central differences of the step itself, in the error's own coordinates."""
+    """F by central differences of the step, in the coordinates of the error."""
     before = hypothesis(play, lag)
 
     def end(error: Array) -> Any:
@@ -99,7 +99,7 @@ def test_the_covariance_follows_the_steps_derivative(
         transition[:3, i] = (ahead["position"] - behind["position"]) / (2.0 * error[i])
         turned = ahead["rotation"] @ behind["rotation"].T
         transition[3:6, i] = Rotation.from_matrix(turned).as_rotvec() / (2.0 * error[i])
-    # The path's own shift with the torsion is left out: curvature length^2 of what it turns.
+    # The filter neglects the shift of the path by the torsion, of order curvature length^2.
     transition[:3, E_TORSION] = 0.0
     wanted = transition @ before["covariance"] @ transition.T
     found = moved(before, length, turn)["covariance"]
@@ -137,11 +137,11 @@ def test_process_noise_is_added_where_it_belongs(play: float, lag: float) -> Non
     covariance = 1000.0 * added["covariance"]
     wanted = [0.0, 0.0, 0.0, 3.0, (5.0, 1.0, 0.0)[before["torsion_kind"]], 4.0]
     np.testing.assert_allclose(np.diag(covariance)[[0, 1, 2, 6, 7, 8]], wanted, atol=1e-9)
-    # About the heading, the last column, it is the roll that drifts.
+    # The roll drifts about the heading, the last column.
     axes = added["rotation"]
     drift = axes.T @ covariance[3:6, 3:6] @ axes
     np.testing.assert_allclose(drift, np.diag([2.0, 2.0, 6.0]), atol=1e-9)
-    # A size that is known exactly stays so.
+    # A torsion parameter without variance stays exact.
     before["covariance"][E_TORSION, E_TORSION] = 0.0
     assert moved(before, 0.001, 0.0, settings)["covariance"][E_TORSION, E_TORSION] == 0.0
 

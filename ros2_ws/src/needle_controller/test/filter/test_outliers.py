@@ -1,4 +1,4 @@
-"""Wrong tips, and needles that are displaced."""
+"""Outliers and displaced needles."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_an_outlier_is_ignored_and_a_jump_is_followed() -> None:
 def test_outliers_add_displaced_hypotheses_with_their_weight() -> None:
     turns = turns_for(9)
     tips = noisy(path(turns))
-    # Early, while several rolls are possible; the later ones have mostly ended.
+    # Early, while several rolls are possible.
     tips[9, 0] += 0.0025
 
     def hypotheses(jump_share: float) -> Any:
@@ -50,7 +50,7 @@ def test_outliers_add_displaced_hypotheses_with_their_weight() -> None:
     known = hypotheses(settings.jump_share)
     displaced = np.isclose(known["position"][:, 0], tips[9, 0], rtol=0.0, atol=1e-12)
     seen = np.sort(known["weight"][displaced])
-    # As far as there is room: the likeliest.
+    # The likeliest ones, as far as there is storage.
     assert len(seen) > 5
     np.testing.assert_allclose(seen, wanted[-len(seen) :])
 

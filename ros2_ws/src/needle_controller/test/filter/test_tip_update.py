@@ -1,4 +1,4 @@
-"""Updates by one tip: uniform and normal noise, outliers, and what a tip shows of the noise."""
+"""Updates by one tip: uniform and normal noise, outliers, learning of the noise."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Records = npt.NDArray[np.void]
 def estimates(
     covariance: Array | None = None, *, is_uniform: bool = False, seed: int = 3
 ) -> Records:
-    """Eight estimates about `MIDDLE`, by default none like another; noise is as claimed."""
+    """Eight different estimates about `MIDDLE`; noise as claimed."""
     rng = np.random.default_rng(seed)
     h = np.zeros(COUNT, HYPOTHESIS)
     h["position"] = MIDDLE
@@ -70,7 +70,7 @@ def taken(
 
 
 def changes(before: Records, after: Records) -> Array:
-    """What was added to the error's nine elements, (COUNT, 9)."""
+    """Change of the nine elements of the error, (COUNT, 9)."""
     turned = after["rotation"] @ np.swapaxes(before["rotation"], -1, -2)
     turn = Rotation.from_matrix(turned).as_rotvec()
     other = [after[name] - before[name] for name in ("curvature", "play", "scale")]
@@ -86,7 +86,7 @@ def test_truncated_moments_equal_scipys(lower: float, upper: float) -> None:
     assert mass == pytest.approx(norm.cdf(upper) - norm.cdf(lower), rel=1e-5)
     assert mean == pytest.approx(cut.mean(), abs=1e-5)
     assert variance == pytest.approx(cut.var(), abs=1e-4)
-    # Mirrored, it is the same.
+    # Mirrored bounds.
     other = truncated_moments(-upper, -lower)
     np.testing.assert_allclose(other, [mass, -mean, variance], rtol=1e-9, atol=1e-12)
 
@@ -99,7 +99,7 @@ def test_a_missing_tip_is_none() -> None:
 
 
 def test_uniform_noise_gives_the_posteriors_moments() -> None:
-    """Against samples of the prior, those in the box kept; one coordinate measured."""
+    """Against samples of the prior inside the box; one coordinate is measured."""
     rng = np.random.default_rng(4)
     covariance = np.zeros((ERROR, ERROR))
     used = [0, 4, E_KAPPA, E_SCALE]
@@ -158,7 +158,7 @@ def with_lasting_noise(h: Records, shares: tuple[float, ...]) -> Records:
 
 
 def test_correlated_errors_are_separated_from_the_estimates_own() -> None:
-    """Against a Kalman filter whose state has the tip's error, too."""
+    """Against a Kalman filter whose state includes the tip's error."""
     known = np.array([2e-4, 4e-4, 5e-4]) ** 2
     before = with_lasting_noise(estimates(np.diag([*known, *SCALES[3:] ** 2])), (1.0,))
     rest = np.array([7e-4, -2e-4, 1e-4])
@@ -167,7 +167,7 @@ def test_correlated_errors_are_separated_from_the_estimates_own() -> None:
     after = taken(before, MIDDLE + off, settings=LASTS)
     likelihood = 1.0
     for axis in range(3):
-        # What the estimate is off, and the tip's error; at the tip before their sum was seen.
+        # Errors of estimate and tip, whose sum was observed at the tip before.
         mean = np.array([0.0, 0.6 * rest[axis]])
         covariance = known[axis] * np.array([[1.0, -0.6], [-0.6, 0.36]])
         covariance[1, 1] += (1.0 - 0.6**2) * BOUND**2 / 3.0
@@ -206,7 +206,7 @@ def test_the_noisier_coordinate_is_learnt() -> None:
 
 
 def with_state_of(after: Records, before: Records) -> Records:
-    """What was learned of the noise, with the estimates as they were."""
+    """The learnt noise, with the old estimates."""
     h: Records = before.copy()
     h["noise_weights"] = after["noise_weights"]
     return h
@@ -228,7 +228,7 @@ def test_an_outlier_changes_nothing(is_uniform: bool) -> None:
 
 
 def test_a_doubtful_tip_gives_the_mixtures_moments() -> None:
-    """Half an outlier: the covariance of what was and of what would be, about their mean."""
+    """Probability 1/2 of an outlier: the mixture of the old and the updated covariance."""
     before = estimates(np.diag((SCALES * 0.3) ** 2))
     tip = MIDDLE + np.array([0.0022, 0.0, 0.0])
     whole, after = taken(before, tip), taken(before, tip, settings=WITH_OUTLIERS)

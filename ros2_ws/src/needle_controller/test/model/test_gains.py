@@ -1,4 +1,4 @@
-"""Gains of (9) and (10) against the Riccati equations, solved another way."""
+"""Gains of (9) and (10) against scipy's solution of the Riccati equations."""
 
 from __future__ import annotations
 

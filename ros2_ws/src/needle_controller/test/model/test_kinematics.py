@@ -70,13 +70,13 @@ def test_linearized_state_round_trip() -> None:
     np.testing.assert_allclose(
         reduced_from_linearized(linearized, CURVATURE), reduced, rtol=0, atol=1e-12
     )
-    # No reduced state is outside the region.
+    # Outside the region there is no reduced state.
     outside = [[0.0, 1.5, 0.0], [0.0, 0.8, 0.7 * CURVATURE]]
     assert np.all(np.isnan(reduced_from_linearized(outside, CURVATURE)[:, 2]))
 
 
 def test_the_linearized_system_holds_along_a_reduced_trajectory() -> None:
-    """ds/dl = A s + B v of (8) holds along (5), whatever u does."""
+    """ds/dl = A s + B v of (8) holds along (5) for any u."""
 
     def rate_at(length: float) -> float:
         return 20.0 * math.sin(60.0 * length) - 5.0
@@ -105,7 +105,7 @@ def test_transition_and_process_covariance_are_matrix_exponentials() -> None:
     density = np.array([[2.0, 0.3, 0.1], [0.3, 5.0, -1.0], [0.1, -1.0, 9.0]])
     for length in (0.0, 1e-3, 0.2):
         np.testing.assert_allclose(transition(length), expm(A * length), atol=1e-15)
-        # Van Loan's.
+        # Van Loan's method.
         block = np.block([[-A, density], [np.zeros((3, 3)), A.T]]) * length
         exponential = expm(block)
         expected = exponential[3:, 3:].T @ exponential[:3, 3:]

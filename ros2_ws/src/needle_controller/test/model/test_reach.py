@@ -1,4 +1,4 @@
-"""Reach of planes and points: closed forms against paths that are integrated step by step."""
+"""Reachability of planes and points: closed forms against integrated paths."""
 
 from __future__ import annotations
 
@@ -135,7 +135,8 @@ def test_no_path_ends_sooner_than_it_may_nor_beyond_the_widest_place() -> None:
         widest = widest_at(ahead, CURVATURE)
         assert not np.isnan(least_insertion_to_point([0.0, widest - 1e-6, ahead], CURVATURE))
         assert np.isnan(least_insertion_to_point([0.0, widest + 1e-6, ahead], CURVATURE))
-    # Within the circle a tolerance may help; beside or behind it is there already.
+    # Within the circle a tolerance may help; a target beside or behind the tip may be reached
+    # already.
     radius = 1.0 / CURVATURE
     inside = np.array([radius - np.sqrt((radius - 0.0005) ** 2 - 0.06**2), 0.0, 0.06])
     assert least_insertion_to_point(inside, CURVATURE, tolerance=0.001) == pytest.approx(
@@ -158,7 +159,7 @@ def test_refusals_of_a_point_say_why_and_from_where_it_would_go() -> None:
     aside = np.array([0.03, -0.04, 0.06])
     with pytest.raises(UserError, match="in place of") as refusal:
         check_point(aside, CURVATURE, 0.15)
-    # From that entry it can be reached, from a little less far not.
+    # The point can be reached from that entry, but not from a slightly nearer one.
     (place,) = re.findall(r"entering at \((.*?)\)", str(refusal.value))
     entry = np.array([*(float(part) for part in place.split(",")), 0.0])
     check_point(aside - 1.001 * entry, CURVATURE, 0.15)

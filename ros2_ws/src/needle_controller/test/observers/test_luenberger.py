@@ -80,7 +80,7 @@ def test_starts_at_the_orientation_the_base_gives() -> None:
 
 
 def test_prediction_follows_the_plant_from_a_known_state() -> None:
-    """No correction: the prediction alone, against SE(3), errs only by what v does in a step."""
+    """Prediction alone against SE(3): its error is that of a constant v in a step."""
     plant, one = NeedlePlant(poses(np.zeros(3)), curvature=CURVATURE), observer()
     one.reset(np.zeros(3), [0.0, 0.0])
     rng = default_rng(7)
@@ -140,7 +140,7 @@ def test_closed_loop_brings_the_needle_into_the_plane(x: float) -> None:
 
 
 def test_closed_loop_from_a_known_state_settles_within_the_needle() -> None:
-    """The law alone, true state known: the sign of every term matters here."""
+    """The law with the true state: the sign of every term matters."""
     plant, one, steer = (
         NeedlePlant(poses(np.array([0.003, 0.0, 0.0])), curvature=CURVATURE),
         observer(),
@@ -160,7 +160,7 @@ def test_law_is_7_for_short_steps() -> None:
     one.initial_rotation = rotation_from_angles([0.0, 0.5, 0.0])
     one.reset([1e-6, 0.0, 0.0], [0.0, 0.1])
     estimate = one.estimate()
-    # Enough pitch for the roll's own drift to matter: it is 4.5 rad/m here.
+    # With this pitch the roll drifts by 4.5 rad/m.
     assert abs(CURVATURE * np.tan(estimate.reduced[1])) > 1.0
     gains = law().gains._replace(step_length=1e-9, demand_margin=0.0, max_rotation_per_length=1e9)
     short = LinearizingLaw(gains)
@@ -253,7 +253,7 @@ def test_a_late_tip_is_compared_with_where_the_tip_was() -> None:
 
 
 def test_covariance_is_honest() -> None:
-    """Over many noisy runs the spread of the errors is within what the covariance says."""
+    """Over many noisy runs the errors agree with the covariance."""
     rng, count = default_rng(9), 60
     squares = []
     for _ in range(count):
@@ -273,7 +273,7 @@ def test_covariance_is_honest() -> None:
         squares.append(error**2 / np.diag(known.covariance)[[0, 4, 5]])
     assert np.all(np.sqrt(np.mean(squares, axis=0)) < 1.3)
     assert np.all(np.linalg.eigvalsh(known.covariance) > 0.0)
-    # y and z are as measured; the yaw is not observed.
+    # y and z are measured; the yaw is not observed.
     assert known.covariance[1, 1] == pytest.approx(SETTINGS.measurement_std**2)
     assert known.covariance[3, 3] >= SETTINGS.initial_yaw_std**2
 

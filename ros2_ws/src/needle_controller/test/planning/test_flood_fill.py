@@ -1,4 +1,4 @@
-"""Where no path exists: proved of what is closed, never said of what has a path."""
+"""Proof that no path exists, by the flood fill."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RADIUS = 0.003
 
 
 def wall(gap: float, middle: float = 0.0, depth: float = 0.05) -> Obstacles:
-    """A wall of rods across the way; between two of them is a gap, its middle aside in x [m]."""
+    """A wall of rods with a gap between two of them, whose middle is displaced in x [m]."""
     places = np.arange(0.5 * gap + RADIUS, 0.07, RADIUS)
     rods = [middle + sign * place for sign in (-1.0, 1.0) for place in places]
     return Obstacles([Obstacle((x, -0.08, depth), (x, 0.08, depth), RADIUS) for x in rods])
@@ -36,13 +36,13 @@ def may(obstacles: Obstacles, tip: TipState = ENTRY, target: Array = TARGET) -> 
 
 @pytest.fixture(scope="module", autouse=True)
 def _loaded() -> None:
-    """What is compiled is loaded once, and by no test."""
+    """Compiled code is loaded once, outside of the tests."""
     may(Obstacles())
 
 
 @pytest.fixture
 def _no_hint(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No entry near by is looked for, which takes seconds past a wall of rods."""
+    """Skip the search for another entry, which takes seconds at a wall of rods."""
     monkeypatch.setattr(entries, "nearest_entry", lambda *_: None)
 
 
@@ -51,7 +51,7 @@ def test_a_wall_with_a_gap_has_a_path_and_one_without_has_none() -> None:
     clear = 2.0 * SETTINGS.least_clearance
     assert may(Obstacles())
     assert may(wall(clear + 0.001))
-    # A cell's size and 0.1 mm of bending are what the fill cannot tell apart.
+    # The resolution of the fill is a cell and 0.1 mm of bending.
     assert not may(wall(clear - 0.0015))
     found = first_path(PLANNER, ENTRY, TARGET, wall(clear - 0.0015))
     assert isinstance(found, str)
@@ -60,7 +60,7 @@ def test_a_wall_with_a_gap_has_a_path_and_one_without_has_none() -> None:
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_gap_counts_only_within_reach_of_needle_and_target(sign: float) -> None:
-    # Over half of 100 mm a needle that comes back gets 9.2 mm aside, one that need not 9.6 mm.
+    # Over half of 100 mm a needle that returns gets 9.2 mm aside, one that does not 9.6 mm.
     assert may(wall(0.004, sign * 0.004))
     assert not may(wall(0.004, sign * 0.014))
     aside = np.array([sign * 0.025, 0.0, 0.1])
@@ -69,7 +69,7 @@ def test_a_gap_counts_only_within_reach_of_needle_and_target(sign: float) -> Non
 
 
 def test_curvature_and_tolerance_bound_the_reachable_targets() -> None:
-    # The circle of the largest curvature, 0.1 m on, and how far it is aside there.
+    # Lateral position of the circle of the largest curvature, 0.1 m ahead.
     radius = 1.0 / CURVATURE
     aside = radius - math.sqrt(radius**2 - 0.1**2)
     for beyond, reached in ((0.0005, True), (0.0030, False)):
@@ -104,7 +104,7 @@ def test_the_flood_fill_never_excludes_an_existing_path() -> None:
 
 @pytest.mark.usefixtures("_no_hint")
 def test_a_failed_search_is_not_reported_as_proof(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Wide enough for the fill, by its cells' size, and too narrow for a needle.
+    # Wide enough for the resolution of the fill, too narrow for a needle.
     narrow = wall(2.0 * SETTINGS.least_clearance - 0.0003)
     monkeypatch.setattr(entries, "THOROUGH_STARTS", 5)
     found = first_path(PLANNER, ENTRY, TARGET, narrow)

@@ -1,4 +1,4 @@
-"""Legs: the advance against scipy's exponential, what they lead to, miss, and are cut to."""
+"""Legs: the advance against scipy's exponential, aims, misses, truncation."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_an_aim_within_the_circle_is_missed_by_its_depth() -> None:
     assert leg.gentle_miss > leg.miss
     behind = leg_towards(pose_of(), np.array([0.0, -0.001, -0.02]), CURVATURE, 0.8, RATE)
     assert behind.miss > 0.02
-    # Scarce is what a share of the curvature misses.
+    # gentle_miss is the miss with a share of the curvature.
     aim = np.array([0.0, -0.0148, 0.0605])
     full = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
     share = leg_towards(pose_of(), aim, 0.8 * CURVATURE, 1.0, RATE)

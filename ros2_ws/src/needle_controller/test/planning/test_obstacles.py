@@ -1,4 +1,4 @@
-"""Obstacles: distances against least squares, and where they are given: file, message, settings."""
+"""Obstacles: distances against least squares; files, messages and settings."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_chord_has_the_required_clearance_of_its_worse_end(
     unknown: tuple[float, float], worst: float
 ) -> None:
     settings = PathSettings(200.0)
-    # Place, and the path's length there.
+    # Position, and the path's length there.
     points = np.array([[1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.01, 0.01]])
     table = np.array([[1.02, 0.0, 0.005, 1.02, 0.0, 0.005, 0.003]])
     margin = chain_margin(points, 2, table, PoseUncertainty(*unknown), settings)

@@ -1,6 +1,6 @@
-"""Paths past obstacles: what they lead to, clear, refuse, and from where there are any.
+"""Paths past obstacles: targets, clearance, rejections, safe starts.
 
-Paths are driven again with scipy's exponential, and their clearance is sampled densely.
+Paths are simulated with scipy's exponential, and their clearance is sampled densely.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ def found(path: NeedlePath | None) -> NeedlePath:
 
 
 def driven(tip: TipState, path: NeedlePath, curvature: float) -> Array:
-    """Return places of a needle that is driven along a path, 0.25 mm apart, shape (N, 3)."""
+    """Return positions of a needle simulated along a path, 0.25 mm apart, shape (N, 3)."""
     pose = np.vstack([tip.pose, [0.0, 0.0, 0.0, 1.0]])
     places = [pose[:3, 3]]
     for row in path.legs:
         leg = leg_towards(pose[:3], row[:3], curvature, 1.0, RATE)
         leg = truncated(leg, row[3])
-        # Where it bends less than it can, the bevel goes to and fro: this is the mean.
+        # With less than the full curvature, the bevel alternates: this is the mean path.
         assert leg.curvature < curvature or abs(leg.turn) <= RATE * leg.turning + 1e-9
         assert leg.curvature <= curvature
         for length, turn, kappa in (
@@ -66,7 +66,7 @@ def driven(tip: TipState, path: NeedlePath, curvature: float) -> Array:
 
 
 def sampled_clearance(places: Array, obstacles: Obstacles) -> float:
-    """Return the least distance of places from points strewn on capsules' axes, less the radii."""
+    """Return the least distance of positions from samples of the capsules' axes, less the radii."""
     shares = np.linspace(0.0, 1.0, 201)[:, np.newaxis]
     least = math.inf
     for row in obstacles.table:
@@ -108,7 +108,7 @@ def test_a_simulated_path_is_clear_and_ends_within_the_tolerance() -> None:
 
 
 def test_the_goal_tolerance_limits_the_distance_from_the_target() -> None:
-    # Within the circle of 90 % of the curvature, once the bevel has turned, by less than 1 mm.
+    # Less than 1 mm within the circle of 90 % of the curvature after the turn of the bevel.
     radius = 1.0 / (0.9 * CURVATURE)
     inner = radius - 0.0006
     target = np.array([0.0, inner * math.cos(0.7) - radius, inner * math.sin(0.7)])
@@ -156,7 +156,7 @@ def test_a_needle_with_known_pose_passes_an_obstacle() -> None:
     assert len(paths[0].legs) > 1
     assert np.linalg.norm(pose[:, 3] - TARGET) < 1e-3
     assert least > 0.0
-    # It does not change its mind with every step; asked anew it says the same.
+    # The plan does not change at every step.
     assert sum(len(b.legs) != len(a.legs) for a, b in itertools.pairwise(paths)) <= 4
     again = found(planner().path(ENTRY, TARGET, IN_THE_WAY))
     np.testing.assert_array_equal(again.legs, paths[0].legs)
@@ -176,7 +176,7 @@ def test_walls_stiff_needles_and_short_needles_have_no_path() -> None:
 def test_uncertainty_increases_the_required_clearance() -> None:
     near = Obstacles([Obstacle((0.0, 0.004, 0.02), (0.0, 0.004, 0.02), 0.003)])
     straight = np.array([0.0, 0.0, 0.09])
-    # The needle bends to -y before it is turned: away from the sphere.
+    # Before the turn the needle bends to -y, away from the sphere.
     known = found(planner().path(ENTRY, straight, near))
     unsure = TipState(np.zeros(3), np.eye(3), CURVATURE, 0.0003, math.radians(3.0))
     doubted = planner().path(unsure, straight, near)
@@ -192,7 +192,7 @@ def test_the_previous_path_continues_unless_it_is_blocked() -> None:
     np.testing.assert_array_equal(left[:, :3], path.legs[:, :3])
     np.testing.assert_array_equal(path.remaining_legs(first)[:, :3], path.legs[1:, :3])
     np.testing.assert_array_equal(path.remaining_legs(1.0)[:, :3], path.legs[-1:, :3])
-    # A target that moves is previous.
+    # The path follows a moving target.
     moved = TARGET + np.array([0.002, 0.0, 0.0])
     again = found(plans.path(ENTRY, moved, IN_THE_WAY, previous=path))
     np.testing.assert_allclose(again.legs[-1, :3], moved)
@@ -224,8 +224,8 @@ def starts_of(obstacles: Obstacles) -> SafeStarts:
 
 def test_safe_starts_have_a_path() -> None:
     starts = starts_of(Obstacles())
-    # At 0.1 m a needle of 90 % of this curvature gets 44 mm aside, less while it turns;
-    # tilted by 30 deg the target lies 50 mm aside of 87 mm ahead.
+    # At 0.1 m a needle with 90 % of this curvature gets 44 mm aside, less while it turns;
+    # tilted by 30 deg, the target is 50 mm aside and 87 mm ahead.
     assert np.all(starts.shifted)
     assert np.all(starts.tilted[1:4, 1:4])
     assert not np.any(starts.tilted[0, :])
@@ -235,7 +235,7 @@ def test_safe_starts_have_a_path() -> None:
 
 
 def test_starts_in_or_behind_an_obstacle_are_not_safe() -> None:
-    # An axis is x first: beside the entry in +x, from the surface to near the target.
+    # A capsule beside the entry in +x, from the surface to near the target.
     shaded = starts_of(Obstacles([Obstacle((0.03, -0.05, 0.01), (0.03, 0.05, 0.01), 0.008)]))
     assert not np.any(shaded.shifted[4, :])
     assert np.all(shaded.shifted[:3, :])

@@ -1,4 +1,4 @@
-"""Estimators, laws and planners of other packages: found, tried when loaded, held to what is."""
+"""Estimators, laws and planners of other packages: discovery, trials and limits."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ NUMBERS = itertools.count()
 
 @pytest.fixture
 def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Offer]:
-    """Return what makes a package that offers a class `Own` of a module; it returns its name."""
+    """Return a function that installs a package with a class `Own`, and returns its name."""
     modules = []
 
     def make(kind: str, source: str, package: str = "", name: str = "") -> str:
@@ -118,7 +118,7 @@ def test_an_own_estimator_replaces_the_presets(offer: Offer) -> None:
     settings = SteeringSettings(estimator=name, **PAPER_NOISE)
     assert settings.controller == f"best with estimator {name}"
     chances = []
-    # Chance is keyed by the seed and the needle.
+    # The random numbers depend on seed and needle.
     for seed, number in ((0, 0), (0, 500), (1, 0), (0, 500)):
         settings = SteeringSettings(estimator=name, seed=seed, **PAPER_NOISE)
         estimator, law = make_controller(settings, np.eye(3), number=number)
@@ -186,7 +186,7 @@ def test_an_own_law_is_limited_and_gets_the_remaining_insertion(offer: Offer) ->
         OwnLaw(tried_law(settings.law), settings).to_point,
         prompt_point_law(settings),
     ):
-        # A quarter of a circle of 50 mm radius, and straight on, either way.
+        # A quarter of a circle of 50 mm radius, straight ahead, and behind.
         for target, left in (
             ((0.05, 0.0, 0.05), 0.05 * np.pi / 2.0),
             ((0.0, 0.0, 0.1), 0.1),
@@ -208,7 +208,7 @@ def test_invalid_laws_are_rejected_with_the_reason(offer: Offer) -> None:
         with pytest.raises(OwnPartError) as error:
             tried_law(offer("law", LAW.replace(rate, wrong)))
         assert said in str(error.value)
-    # One for planes alone is not asked for a point.
+    # A law for planes alone is not tried with a point.
     name = offer("law", LAW.replace("def to_point", "def not_to_point"))
     with pytest.raises(UserError, match=r"cannot steer to a point: it lacks to_point"):
         SteeringSettings(law=name, target_point=(0.0, 0.0, 0.1))

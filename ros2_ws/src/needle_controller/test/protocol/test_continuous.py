@@ -1,4 +1,4 @@
-"""Continuous insertion: what path a tip leads to, and which tips are used."""
+"""Continuous insertion: paths, and the tips that are used."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class ContinuousRig(Rig):
         super().__init__(depth=depth, way="continuous")
 
     def go_to(self, insertion: float) -> None:
-        """Go on along the path, no farther than that leads."""
+        """Advance along the path, at most to its end."""
         assert self.path is not None
         knots = np.array(self.path.points)
         self.insertion = min(insertion, knots[-1, 0])
         self.rotation = float(np.interp(self.insertion, knots[:, 0], knots[:, 1]))
 
     def go(self, distance: float) -> list[Action]:
-        """Go on, then see the tip; return what that leads to."""
+        """Advance, then expose the tip; return the actions."""
         self.go_to(self.insertion + distance)
         return self.see()
 
@@ -64,7 +64,7 @@ class ContinuousRig(Rig):
         return actions
 
     def refused(self) -> Iterator[int]:
-        """See tips whose paths are refused at once; yield how many until it gives up."""
+        """Expose tips whose paths are aborted at once; yield their number until the fault."""
         count = 0
         while self.steering.state is SteeringState.STEERING:
             count += 1
@@ -87,7 +87,7 @@ def test_a_tip_leads_to_the_rotation_of_a_step_and_a_path_beyond(
     assert end == pytest.approx((2 * MM, step.rotation, 2 * step.duration))
     assert path.stamp_ns == rig.steering.command_ns == rig.now
     assert where(rig) == AT_WORK
-    # In doubt it goes at half the speed.
+    # An uncertain estimate halves the speed.
     doubtful = ContinuousRig()
     monkeypatch.setattr(
         steering, "assess_confidence", lambda *_: Confidence("doubtful", is_doubtful=True)
@@ -130,7 +130,7 @@ def test_the_path_ends_at_the_depth_and_steering_there() -> None:
         rig.see()
         assert rig.path is not None
         assert rig.path.points[-1][0] <= 2.5 * MM
-    # An axis rests beside its goal: the last tip is used there, and a path leads to the very end.
+    # An axis rests beside its goal: the last tip is used there, and the path leads to the end.
     assert rig.steering.insertion == rig.insertion
     rig.go(MM)
     assert rig.steering.state is SteeringState.DONE
@@ -168,7 +168,7 @@ def test_an_accepted_path_resets_the_count_of_aborts() -> None:
         rig.see()
         assert rig.steering.on_result(first.stamp_ns, text) == []
         assert where(rig) == AT_WORK
-    # Of a path that was never sent nothing is believed.
+    # Answers to paths that were never sent are ignored.
     for stamp in (rig.steering.command_ns + 1, rig.steering.command_ns + TICK):
         assert rig.steering.on_result(stamp, "aborted: no") == []
     rig.steering.on_recorded_step(rig.steering.command_ns, JointSample(0, 0.0, 0.0))
@@ -207,7 +207,7 @@ def test_paths_are_sent_again_after_the_clock_went_back() -> None:
     assert rig.steering.state is SteeringState.IDLE
     assert rig.start() == "steering"
     actions = rig.see()
-    # A needle that is out is another one: the path is its own.
+    # A needle that is out restarts the estimate, with a new path.
     assert updates_in(actions) == 1
     assert "aborted" in logged(rig.steering.on_result(path_in(actions).stamp_ns, "aborted: no"))
 
@@ -216,7 +216,7 @@ def test_the_tip_timeout_ends_with_a_good_tip() -> None:
     rig = ContinuousRig()
     rig.see()
     for second in range(10):
-        # Tips that renew the path are good ones.
+        # Tips that renew the path reset the timeout.
         assert rig.steering.on_time(float(second)) == []
         rig.see()
     rig.steering.on_time(10.0)

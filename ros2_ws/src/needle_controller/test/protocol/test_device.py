@@ -1,4 +1,4 @@
-"""What the device answers, or does not, and retraction."""
+"""Answers of the device, missing answers, and retraction."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_a_lost_answer_is_a_fault_without_motion() -> None:
     rig = Rig()
     step = sent(rig.expose())
     timeout = rig.steering.settings.result_timeout
-    # It moves for as long as it likes; the time runs from when it stands again.
+    # The timeout starts when the motion ends.
     rig.steering.on_device(MOVING)
     for second in range(100):
         rig.settle(1)
@@ -31,7 +31,7 @@ def test_a_lost_answer_is_a_fault_without_motion() -> None:
     assert rig.steering.watchdog_trips == 1
     assert rig.steering.on_result(step.stamp_ns, "succeeded") == []
     assert rig.expose() == []
-    # A person starts it again from where the needle really is.
+    # A new start continues from the actual position.
     rig.insertion = 0.0006
     rig.settle(1)
     assert rig.start() == "steering"
@@ -66,7 +66,7 @@ def test_silence_of_the_device_and_its_end_are_logged() -> None:
         rig.steering.on_device(HELD)
         rig.run(step)
         rig.steering.on_time(2e3)
-    # No silence is left of a run that has ended.
+    # The silence is cleared at the end of a run.
     rig.expose()
     rig.steering.on_device(MOVING)
     rig.steering.on_time(0.0)
@@ -91,7 +91,7 @@ def test_a_retraction_ends_steering_until_the_needle_is_out() -> None:
     assert "retracted: draw it out first" in rig.start()
     while rig.insertion > 0.0:
         rig.insertion = max(rig.insertion - 0.0005, 0.0)
-        # Nobody is told of it again.
+        # The retraction is logged once.
         assert rig.settle(1) == []
     rig.settle()
     assert rig.start() == "steering"
@@ -131,7 +131,7 @@ def test_commands_without_motion_are_a_fault_and_a_start_resets_the_count() -> N
         assert "10 commands in a row ended without motion" in logged(actions)
         assert "beyond a limit" in logged(actions)
         assert rig.start() == "steering"
-    # One that moved a little is no refusal, and those before it are forgotten.
+    # A command with a little motion resets the count.
     for _ in range(3):
         rig.run(sent(rig.expose()), part=0.01, text="aborted: slow")
         for _ in range(MAX_ABORTS_AT_REST - 1):
@@ -161,7 +161,7 @@ def test_unfollowed_steps_are_a_fault() -> None:
             assert ("so were 3 in a row" in said) is (count == MAX_UNFOLLOWED_STEPS)
         assert where(rig) == (FAULT, NOTHING)
         assert rig.steering.step == 3
-        # A person has looked after it.
+        # A start resets the count.
         assert rig.start() == "steering"
         rig.run(rig.good_tips())
         assert rig.steering.step == 4

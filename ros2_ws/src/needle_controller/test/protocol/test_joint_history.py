@@ -1,4 +1,4 @@
-"""The joints of the last seconds: between samples, and what does not follow from the last."""
+"""Joint history: interpolation, and inconsistent samples."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_joints_are_interpolated_and_unknown_outside_the_history() -> None:
     assert (three.at(99), three.at(401)) == (None, None)
     assert list(three.after(200)) == [last]
     assert [sample.stamp_ns for sample in three.after(199)] == [200, 400]
-    # Stamps of a real clock lose nothing.
+    # Stamps of a real clock keep their precision.
     begin = 1_700_000_000_000_000_001
     two = history((begin, 0.0, 0.0), (begin + 2, 2e-6, 0.0))
     assert two.at(begin + 1) == JointSample(begin + 1, 1e-6, 0.0)
@@ -72,12 +72,12 @@ def test_memory_is_bounded_after_a_jump() -> None:
 
 def test_consistent_samples_are_accepted() -> None:
     for gap_ns, insertion, rotation, heard in (
-        # As far as a hand pushes and a motor turns in the time, and the noise of both.
+        # Limits: the speed of a hand and of a motor, and the noise of both.
         (TICK, 1.199e-3, 0.699, SampleResult.ACCEPTED),
         (TICK, -1.199e-3, -0.699, SampleResult.ACCEPTED),
         (TICK, 1.201e-3, 0.0, SampleResult.REJECTED),
         (TICK, 0.0, -0.701, SampleResult.REJECTED),
-        # Unseen for no longer than 40 ms.
+        # A motion between samples lasts at most 40 ms.
         (SECOND, 2.199e-3, 1.299, SampleResult.ACCEPTED),
         (SECOND, 2.201e-3, 0.0, SampleResult.REJECTED),
         (SECOND, 0.0, 1.301, SampleResult.REJECTED),
@@ -92,7 +92,7 @@ def test_consistent_samples_are_accepted() -> None:
         made, row = history((START, 0.05, 1.0)), (gap_ns, insertion, rotation)
         sample = JointSample(START + gap_ns, 0.05 + insertion, 1.0 + rotation)
         finite = math.isfinite(insertion + rotation)
-        # A repeated one, and one that is no number, are not even counted.
+        # Repeated and non-finite samples are not counted.
         doubted = heard is SampleResult.REJECTED and finite
         assert made.add(sample) is heard, row
         assert (made.latest == sample) is (heard is SampleResult.ACCEPTED), row
@@ -110,7 +110,7 @@ def test_a_spike_is_dropped_and_a_lasting_jump_is_accepted() -> None:
         made = history((START, 0.05, 0.0))
         made.add(JointSample(START + stamp, insertion, rotation))
         assert "do not follow from the last" in made.problem
-        # One that does not follow from the spike either begins the count anew.
+        # A sample that is inconsistent with the spike restarts the count.
         assert made.add(JointSample(START + 5 * HOUR, 1.0, 0.0)) is SampleResult.REJECTED
         heard = [
             made.add(JointSample(START + stamp + tick * TICK, insertion, rotation))

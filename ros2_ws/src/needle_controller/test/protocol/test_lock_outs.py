@@ -1,4 +1,4 @@
-"""What is wrong for a while, or once, and how steering goes on from it."""
+"""Recovery of steering from temporary faults."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STEERING, IDLE = SteeringState.STEERING, SteeringState.IDLE
 
 
 def shown(rig: Rig, tips: list[TipMeasurement]) -> None:
-    """Show tips, right or wrong, one a tick; carry out what they lead to."""
+    """Expose tips, one per tick; execute the resulting steps."""
     for tip in tips:
         moved = TipMeasurement(rig.now + TICK, tip.frame_id, tip.position)
         actions = rig.expose(moved)
@@ -52,7 +52,7 @@ def test_the_fourth_tip_after_a_jump_is_used() -> None:
         assert rig.steering.tips.rejected == {TipFault.JUMP: count}
     rig.run(sent(rig.expose(x=0.006)))
     assert rig.steering.tips.rejected == {TipFault.JUMP: 3}
-    # One that is away from the others begins the count anew, and so does one that is not.
+    # A tip away from the others restarts the count, and so does one at the old place.
     for _ in range(2):
         for _ in range(3):
             assert none_sent(rig.expose(x=0.0))
@@ -99,7 +99,7 @@ def test_a_full_queue_keeps_the_newest_tips() -> None:
     first = rig.now
     for k in range(1, 80):
         rig.steering.on_tip(rig.measured(ahead=k * TICK // 2))
-        # The same again changes nothing.
+        # A repeated tip changes nothing.
         rig.steering.on_tip(rig.measured(ahead=k * TICK // 2))
     rig.now += 39 * TICK
     step = sent(rig.joints())
@@ -136,7 +136,7 @@ def test_inconsistent_joints_are_logged_once() -> None:
         rig.now += TICK
         actions = rig.steering.on_joints(JointSample(rig.now, 0.05, 0.0))
         assert bool(actions) is (count == 1)
-    # One that is repeated does not say that the device is there.
+    # A repeated sample does not end the silence of the device.
     rig.settle()
     sent(rig.expose())
     for second in (0.0, 9.0):

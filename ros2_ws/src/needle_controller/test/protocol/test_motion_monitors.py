@@ -1,4 +1,4 @@
-"""What watches a step, a wait, and the way of the needle: each at its bounds."""
+"""Motion monitors at their bounds."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_step_has_arrived_when_both_joints_are_at_or_beyond_its_end() -> None:
     ):
         watch, joints = StepMonitor(STEP, 0), JointHistory()
         assert watch.end_ns == STEP.stamp_ns
-        # One of the step's own stamp is of before it; the first at the end decides.
+        # A sample with the step's stamp was taken before it; the first at the end decides.
         for stamp, place in ((5, STEP.insertion), (6, insertion), (7, insertion)):
             joints.add(JointSample(stamp * TICK, place, rotation))
         assert watch.update(joints, None) is wanted, insertion
@@ -36,7 +36,7 @@ def test_a_step_has_arrived_when_both_joints_are_at_or_beyond_its_end() -> None:
 
 
 def looked(moved: tuple[float, float], sent: int = 100, answered: int = 100) -> list[StepOutcome]:
-    """Return the verdicts on six samples, of which the third is moved."""
+    """Return the outcomes for seven samples, of which the third is displaced."""
     watch, verdicts = StepMonitor(STEP, answered), []
     for k in range(7):
         at = moved if k == 2 else (0.0, 0.0)
@@ -52,7 +52,7 @@ def test_five_resting_samples_after_the_answer_are_a_standstill() -> None:
     assert looked((0.0, 0.0)) == at_once
     assert looked((1.9e-6, -0.9e-4)) == at_once
     for moved in ((2.1e-6, 0.0), (0.0, -1.1e-4)):
-        # The third began anew, and so did the fourth, which is away from the third.
+        # The third sample restarts the count, and so does the fourth.
         assert looked(moved) == [PENDING] * 7
     assert looked((0.0, 0.0), sent=99) == [PENDING] * 7
     assert StepMonitor(STEP, 0).update(JointHistory(), None) is PENDING
@@ -80,7 +80,7 @@ def test_retraction_is_detected_from_the_median_of_five_samples() -> None:
     assert watch.reason == ""
     assert watched(watch, *[0.02 - 2.01e-4] * 3)[-1]
     assert "was retracted: draw it out first" in watch.reason
-    # Pushed in again it was drawn back all the same; out, it was not.
+    # A later insertion does not cancel the retraction; a needle that is out does.
     watched(watch, *[0.025] * 5)
     assert watch.reason
     watched(watch, *[0.0021] * 5)
@@ -98,7 +98,7 @@ def test_a_needle_that_is_out_may_move_back_and_forth() -> None:
     assert watch.reason
     watch.reset(0.01)
     assert watch.reason == ""
-    # The first two samples say nothing yet.
+    # Two samples are too few for a median.
     assert watched(watch, 0.005, 0.005, 0.005) == [False, False, True]
 
 
@@ -113,7 +113,7 @@ def test_jumped_joints_are_back_at_their_last_observed_position() -> None:
         watched(watch, *[0.02] * 5)
         assert watch.add_jump(before, JointSample(1, 0.01, 0.3), TOLERANCE)
         assert "jumped from 0.02 m, 0.3 rad to 0.01 m, 0.3 rad: draw" in watch.reason
-        # What comes between was not seen to move either, and is no retraction.
+        # Samples after the jump are not a retraction.
         assert not any(watched(watch, *[0.01] * 5, *[0.005] * 5))
         assert watch.add_jump(JointSample(2, 0.005, 0.3), JointSample(3, *back), TOLERANCE) is away
         assert bool(watch.reason) is away, back

@@ -1,4 +1,4 @@
-"""The next step from where the needle is, how sure that is, and what was heard until then."""
+"""The next step, the confidence in the estimate, and the reception log."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_step_has_its_length_or_ends_at_depth_or_point() -> None:
         (0.05, 0.99e-4, None),
         (0.05, 1e-4, None),
         (0.05, -0.01, None),
-        # The depth ends it before the point; a last step may be longer by a thousandth.
+        # The depth is before the point; the last step may be longer by a thousandth.
         (0.1195, 0.005, 0.12),
         (0.12 - 1.0009e-3, None, 0.12),
         (0.12 - 1.0011e-3, None, 0.12 - 1.1e-6),
@@ -74,7 +74,7 @@ def test_confidence_follows_from_covariance_and_miss_probability() -> None:
     assert elsewhere.is_doubtful
     wide = np.diag([1.1e-6, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert assess_confidence(dataclasses.replace(estimate, covariance=wide)).is_doubtful
-    # An estimator that does not judge itself is not judged by its end either.
+    # Without a miss probability there is no verdict.
     unjudged = assess_confidence(dataclasses.replace(estimate, miss=None), 0.72)
     assert (unjudged.verdict, unjudged.is_doubtful) == ("", False)
 
@@ -103,12 +103,12 @@ def test_the_reception_log_round_trips_once_in_order() -> None:
         heard.add(*message)
     assert received_messages(heard.pop_text()) == messages
     assert heard.pop_text() == ""
-    # It is full until it is told.
+    # The log is full until it is published.
     for number in range(103):
         assert heard.is_full is (number >= 100)
         heard.add("joint_states", number)
     assert len(received_messages(heard.pop_text())) == 103
     assert not heard.is_full
-    # What nobody sent so is no message.
+    # Malformed entries are ignored.
     found = received_messages("joint_states soon, needle/tip -1, device/result 7, x 8 9")
     assert found == [("device/result", 7)]

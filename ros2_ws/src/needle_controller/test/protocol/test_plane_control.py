@@ -1,4 +1,4 @@
-"""One needle's estimator and law in closed loop: to a plane, to a point, past obstacles."""
+"""Estimator and law of one needle in closed loop: to a plane, to a point, past obstacles."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NOISE = 0.0005
 POINT, PAST = (0.004, -0.003, 0.05), (0.003, -0.004, 0.07)
 PLANE = SteeringSettings(**{**PAPER_NOISE, "tip_noise_bound": NOISE}, target_offset=0.003)
 TO_POINT = SteeringSettings(target_point=POINT, **PAPER_NOISE)
-# A sphere of 2 mm in the middle of the way.
+# A sphere of 2 mm in the middle of the path.
 TO_PAST = SteeringSettings(
     target_point=PAST,
     depth=0.15,
@@ -40,7 +40,7 @@ WALL = Obstacles(
 
 
 class Needle:
-    """An exact needle, and what steers it by tips with noise."""
+    """An exact needle, and a controller that gets noisy tips."""
 
     def __init__(
         self, settings: SteeringSettings, *, turned: float = 0.0, starts_deg: float = 15.0
@@ -67,7 +67,7 @@ class Needle:
     def steer(
         self, steps: int = 200, *, before: Callable[[int], object] = lambda _: None
     ) -> Needle:
-        """Steer on for so many steps of half a second, or to the end."""
+        """Steer for a number of steps of half a second, or to the end."""
         for k in range(steps):
             before(k)
             self.least = min(self.least, self.control.obstacles.clearance(self.tip))
@@ -107,7 +107,7 @@ def test_a_needle_is_steered_into_the_plane_however_its_base_was_turned(
 ) -> None:
     needle = Needle(dataclasses.replace(PLANE, **changes), turned=turned)  # type: ignore[arg-type]
     needle.steer(60)
-    # It unwinds on the way.
+    # The base unwinds on the way.
     assert abs(needle.joints.rotation) < needle.settings.max_winding
     assert max(needle.steer(60).track[-20:]) < 1e-3
 
@@ -144,8 +144,8 @@ def test_a_change_of_preset_keeps_the_estimated_pose() -> None:
         np.testing.assert_allclose(kept.position, pose.position, atol=1e-9)
         assert kept.linearized[1] == pytest.approx(pose.linearized[1], abs=1e-3)
         if after != "best":
-            # s, since it cannot say on which side of +-90 deg the roll is; the mean of a new bank
-            # of hypotheses lies between them.
+            # s does not represent the side of +-90 deg of the roll; the mean of a new bank
+            # of hypotheses lies between both.
             assert kept.linearized[2] == pytest.approx(pose.linearized[2], abs=1.0)
         elif before == "paper":
             assert max(needle.steer(80).track[-20:]) < 1e-3
@@ -154,7 +154,7 @@ def test_a_change_of_preset_keeps_the_estimated_pose() -> None:
 def test_an_update_contains_turn_miss_probability_and_reach() -> None:
     needle = Needle(PLANE, turned=1.0)
     needle.steer(3)
-    # An encoder at rest may read a count less.
+    # An encoder at rest may read one count less.
     joints = JointSample(9, needle.joints.insertion - 1e-6, 1.5)
     update = needle.control.update(needle.tip, joints)
     assert update.turned == pytest.approx(0.5)
@@ -162,7 +162,7 @@ def test_an_update_contains_turn_miss_probability_and_reach() -> None:
     assert not update.blocked
     needle.control.target_point = np.array(POINT)
     update = needle.control.update(needle.tip, joints)
-    # It is far from there.
+    # The tip is far from the point.
     assert update.miss_probability == pytest.approx(1.0)
     needle.control.restart()
     assert not needle.control.started
@@ -203,7 +203,7 @@ def test_a_moving_point_is_reached_if_its_clock_is_known() -> None:
         ends.append(needle.tip)
         if apart == 0.0:
             assert needle.off(breathing(needle.time)) < 0.0006
-    # Stamped by another clock nobody knows how old it is: it is where it was last seen.
+    # With stamps of another clock, the last observed position is used.
     np.testing.assert_array_equal(ends[1], ends[2])
 
 
@@ -227,7 +227,7 @@ def test_new_settings_keep_point_and_obstacles_unless_they_change_them() -> None
     assert len(control.obstacles) == 1
     control.configure(dataclasses.replace(PLANE, preset="paper"))
     assert control._points is None
-    # Every depth that a parameter may have is one of the planner.
+    # The planner accepts every depth that the parameter accepts.
     for depth in (0.0, 1e-5, 1.0):
         thick = SteeringSettings(depth=depth, needle_diameter=0.002, goal_tolerance=0.002)
         control.configure(thick)
@@ -244,7 +244,7 @@ def test_the_needle_reaches_a_point_past_an_obstacle() -> None:
     assert not needle.blocked
     assert needle.off(PAST) < 0.001
     assert needle.least > 0.00035
-    # Without the obstacle it would have gone through it.
+    # Without the obstacle the needle would have passed through it.
     straight = Needle(dataclasses.replace(settings, obstacles=()), starts_deg=10.0)
     ball, least = needle.control.obstacles, []
     straight.steer(70, before=lambda _: least.append(ball.clearance(straight.tip)))

@@ -1,4 +1,4 @@
-"""Tips that are refused, covariances that come with them, and the wait for a good one."""
+"""Rejected tips, covariances, and tip timeouts."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_rejected_tip_causes_no_motion_and_another_is_awaited() -> None:
         assert rig.steering.tips.after_ns == tip.stamp_ns
         sent(rig.expose())
         assert rig.steering.rejection == ""
-    # Each reason is told for itself.
+    # Each reason is logged separately.
     assert len(kinds) == 3
 
 
@@ -83,7 +83,7 @@ def test_queued_tips_with_too_late_stamps_are_removed() -> None:
     rig = Rig()
     for ahead in (1, 3, 4):
         assert rig.steering.on_tip(rig.measured(ahead=ahead * TICK)) == []
-    # Its topic keeps its order: two had a stamp too late, the first had a good one.
+    # The topic keeps its order: two stamps were too late, the first was good.
     assert rig.steering.on_tip(rig.measured(ahead=2 * TICK)) == []
     assert rig.steering.tips.rejected == {TipFault.AHEAD_OF_JOINTS: 2}
     rig.now += TICK
@@ -107,7 +107,7 @@ def test_a_tip_timeout_ends_with_a_good_tip() -> None:
     assert "STEERING: a good tip came" in logged(actions)
     sent(actions)
     assert where(rig) == (STEERING, Awaiting.RESULT)
-    # Stopping and starting work while it waits, too.
+    # Stop and start also work while it waits.
     other = Rig()
     other.expose(bad(other, [np.nan] * 3))
     other.steering.on_time(0.0)
@@ -141,7 +141,7 @@ def test_time_does_not_run_while_a_person_pauses() -> None:
 
 def test_a_tip_without_joints_expires() -> None:
     rig = Rig()
-    # Also while waiting for one already.
+    # Also in state WAITING_FOR_TIP.
     for start in (0.0, 100.0):
         rig.steering.on_tip(rig.measured(ahead=TICK))
         rig.steering.on_time(start)
@@ -185,7 +185,7 @@ def test_the_covariance_turns_with_the_plane(monkeypatch: pytest.MonkeyPatch) ->
     matrix[0, 2] = matrix[2, 0] = 1e-8
     sent(rig.steering.on_tip_pose(TipCovariance(rig.now, "rig", matrix)))
     wanted = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, 9.0]]) * 1e-8
-    # Added is what no source knows.
+    # measurement_std^2 is added.
     wanted += rig.steering.settings.measurement_std**2 * np.eye(3)
     np.testing.assert_allclose(np.asarray(calls[0][1]), wanted, atol=1e-14)
 
@@ -211,7 +211,7 @@ def test_a_later_covariance_shows_that_the_tips_own_is_lost() -> None:
     assert rig.steering.tips.rejected == {TipFault.NO_COVARIANCE: 1}
     assert rig.steering.watchdog_trips == 0
     assert rig.steering.tips.after_ns == rig.now
-    # The tip of that one is there for the next step.
+    # The tip of the later covariance is used for the next step.
     sent(rig.expose())
 
 
@@ -224,7 +224,7 @@ def test_tips_without_covariances_are_reported_with_the_setting_to_change() -> N
     assert rig.steering.state is SteeringState.WAITING_FOR_TIP
     assert "set it to configured" in rig.steering.reason
     assert rig.steering.tips.rejected == {TipFault.NO_COVARIANCE: 1}
-    # Configured, it asks for none and uses none.
+    # The configured covariance needs and uses no needle/tip_pose.
     steps = []
     for spoilt in (False, True):
         rig = Rig()

@@ -1,4 +1,4 @@
-"""What it takes to start steering, and other settings on the way."""
+"""Conditions for a start, and changes of settings."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_start_reports_the_missing_device_state() -> None:
 
 
 def test_start_waits_until_joints_and_device_agree() -> None:
-    """The joints lag behind the device: homing has ended there, and not here."""
+    """The joints lag behind the device's status after homing."""
     for insertion, rotation, agree in (
         (4.9e-5, -1.9e-2, True),
         (5.1e-5, 0.0, False),
@@ -85,7 +85,7 @@ def test_best_starts_at_any_rotation_of_the_base() -> None:
 
 def test_start_and_stop_are_idempotent() -> None:
     rig = Rig(started=False)
-    # Tips move nothing while nobody has started.
+    # Tips cause no motion before a start.
     assert rig.expose() == []
     assert rig.steering.starts == 0
     assert rig.start() == "steering"
@@ -96,13 +96,13 @@ def test_start_and_stop_are_idempotent() -> None:
         reply, _ = rig.steering.on_stop()
         assert (reply.success, reply.message) == (True, said)
         assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
-    # It goes on with what is known.
+    # Steering continues with the old estimate.
     assert rig.start() == "steering"
     assert rig.steering.reason == ""
     step = sent(rig.expose())
     assert step.insertion == pytest.approx(0.006)
     assert (rig.steering.step, rig.steering.starts) == (5, 2)
-    # A tip that waited for its joints when it was stopped is gone.
+    # A stop clears the queue of tips.
     rig.run(step)
     rig.steering.on_tip(rig.measured(ahead=TICK))
     rig.steering.on_stop()
@@ -127,7 +127,7 @@ def test_settings_change_while_steering() -> None:
     shallower = dataclasses.replace(SETTINGS, depth=0.1, tip_timeout=3.0)
     steering.configure(shallower)
     assert steering.settings is shallower
-    # A given plane stays unless the offset is another.
+    # A received plane stays unless the offset changes.
     assert steering.control.plane.offset == 0.005
     steering.configure(dataclasses.replace(shallower, target_offset=0.002, preset="open_loop"))
     assert steering.control.plane.offset == 0.002
@@ -136,7 +136,7 @@ def test_settings_change_while_steering() -> None:
 
 
 def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.MonkeyPatch) -> None:
-    # A path from another entry is looked for in planning's own tests.
+    # The search for another entry is tested with the planner.
     monkeypatch.setattr(entry, "nearest_entry", lambda *_: None)
     buried = (0.0, 0.0, 0.06, 0.0, 0.0, 0.06, 0.004)
     steering = Steering(
@@ -147,7 +147,7 @@ def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.Monk
     steering.on_device(HELD)
     rig.joints()
     assert "the target point is" in rig.start()
-    # One that comes on the way stops the needle.
+    # A new obstacle stops the needle.
     steering.control.obstacles = Obstacles([Obstacle((0.05, 0.0, 0.02), (0.05, 0.0, 0.02), 0.001)])
     assert rig.start() == "steering"
     rig.steps(2)

@@ -1,4 +1,4 @@
-"""One step after the other."""
+"""Steps of the protocol."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_tip_leads_to_one_step_and_its_end_awaits_another() -> None:
     step = sent(actions)
     assert step.stamp_ns == rig.now
     assert (step.insertion, step.duration) == pytest.approx((0.001, 0.5))
-    # Below the plane: the needle is turned so that it bends up, towards +x.
+    # Below the plane the needle is turned to bend towards +x.
     assert 0.0 < step.rotation <= np.deg2rad(30.0) + 1e-12
     update = next(action for action in actions if isinstance(action, PublishUpdate))
     assert update.stamp_ns == rig.steering.command_ns == rig.now
@@ -41,7 +41,7 @@ def test_a_tip_leads_to_one_step_and_its_end_awaits_another() -> None:
     assert rig.steering.reach is update.update.reach
     assert where(rig) == (STEERING, Awaiting.RESULT)
     assert none_sent(rig.expose())
-    # Answers to other commands are not ours.
+    # Answers to other commands are ignored.
     assert rig.steering.on_result(step.stamp_ns - 1, "succeeded") == []
     assert where(rig) == (STEERING, Awaiting.RESULT)
     assert none_sent(rig.run(step))
@@ -76,7 +76,7 @@ def test_without_hold_no_tip_is_used_and_after_it_a_fresh_one() -> None:
         assert rig.steering.on_device(HELD) == []
         assert where(rig) == (STEERING, Awaiting.TIP)
         assert rig.steering.tips.after_ns == rig.now
-        # A step waits for a device that still moves; a hold lost meanwhile asks anew.
+        # A step waits for a moving device; a release discards it.
         rig.steering.on_device(MOVING)
         assert none_sent(rig.expose())
         assert where(rig) == (STEERING, Awaiting.DEVICE)
@@ -113,7 +113,7 @@ def test_joints_that_were_sent_before_the_answer_do_not_show_a_standstill() -> N
 
 
 def test_the_command_does_not_depend_on_the_order_of_topics() -> None:
-    """The answer, the tips and the joints of a step, each topic in its own order."""
+    """Answer, tips and joints of a step arrive in any order of the topics."""
     after = set()
     for order in itertools.permutations(("answer", "tips", "before", "after")):
         if order.index("before") > order.index("after"):
@@ -141,7 +141,7 @@ def test_the_command_does_not_depend_on_the_order_of_topics() -> None:
                     actions += rig.steering.on_joints(sample)
         after.add(sent(actions))
     (command,) = after
-    # Not one exposed before or in the motion: the first of the needle at rest.
+    # The first tip of the needle at rest, not one exposed before or during the motion.
     assert command.stamp_ns == tips[5].stamp_ns
 
 
@@ -187,7 +187,7 @@ def test_the_last_step_ends_at_the_depth() -> None:
     np.testing.assert_allclose(ends, [(0.001, 0.5), (0.002, 0.5), (0.0025, 0.25)])
     assert ends[-1][0] == rig.steering.insertion == 0.0025
     assert where(rig) == (SteeringState.DONE, Awaiting.NOTHING)
-    # It says how sure it is, and that the needle ends away from its plane.
+    # The reason contains the confidence: the needle ends away from the plane.
     assert "insertion 0.0025 m reached; r1 = " in rig.steering.reason
     assert "m (95 %), doubtful: " in rig.steering.reason
     assert rig.steering.confidence.is_doubtful
@@ -224,7 +224,7 @@ def test_a_failing_part_of_another_package_is_a_fault(monkeypatch: pytest.Monkey
         (log,) = rig.expose()
     assert logged([log]) == "FAULT: advance() raised RuntimeError"
     assert where(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
-    # A tip that comes later moves nothing either.
+    # A later tip causes no motion either.
     assert none_sent(rig.expose())
     assert rig.start() == "steering"
     sent(rig.expose())

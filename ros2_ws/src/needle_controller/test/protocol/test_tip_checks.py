@@ -1,4 +1,4 @@
-"""Which tips are refused: each rule at its bound."""
+"""Checks of tips at their bounds."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_bad_messages_are_rejected_whatever_the_joints() -> None:
         (tip(0.0, 0.0, 0.02, frame="left_camera_optical"), TipFault.FRAME),
     ):
         assert fault(check_message(measured, LAST)) is wanted, measured
-        # The first tip has none before it.
+        # The first tip has no predecessor.
         first = None if wanted is TipFault.NOT_NEWER else wanted
         assert fault(check_message(measured, None)) is first, measured
     assert "(4e-08 s behind)" in str(check_message(tip(0.0, 0.0, 0.0, stamp_ns=10), LAST))
@@ -69,16 +69,16 @@ def test_unreachable_positions_are_rejected() -> None:
     rows: list[
         tuple[tuple[float, float, float], JointSample, AcceptedTip | None, TipFault | None]
     ] = [
-        # As far as the stage went, its scale and the noise: 1.15 0.1 m + 4 mm.
+        # Insertion times scale plus margin: 1.15 x 0.1 m + 4 mm.
         ((0.0, 0.0, 0.1189999), NOW, None, None),
         ((0.0, 0.0, 0.1190001), NOW, None, TipFault.TOO_FAR),
         ((0.0713, 0.0, -0.0951), NOW, None, None),
         ((0.0715, 0.0, -0.0953), NOW, None, TipFault.TOO_FAR),
         ((-1e300, 0.2, 1.0), NOW, None, TipFault.TOO_FAR),
-        # Drawn out beyond its zero: the noise is left.
+        # At a negative insertion only the margin is left.
         ((0.0, 0.00399, 0.0), JointSample(100, -0.1, 0.0), None, None),
         ((0.0, 0.00401, 0.0), JointSample(100, -0.1, 0.0), None, TipFault.TOO_FAR),
-        # Since the last tip the needle has gone 1 mm, this way or that: 1 mm + 4 mm.
+        # Since the last tip the needle has moved by 1 mm in either direction: 1 mm + 4 mm.
         ((0.003, 0.0, 0.1029999), NOW, LAST, None),
         ((0.003, 0.0, 0.1030001), NOW, LAST, TipFault.JUMP),
         ((0.0, 0.0, 0.0940001), JointSample(100, 0.098, 0.0), LAST, None),
