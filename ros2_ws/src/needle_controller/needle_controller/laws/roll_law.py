@@ -3,8 +3,8 @@
 In the linearized state s of [KC09] (6), x and sin(pitch) are means over all hypotheses. Far from
 the plane, the desired pitch is the steepest from which the needle can level out with a share of its
 curvature; near it, it is proportional to the distance. The desired s3 turns the pitch to it, and
-the roll turns the shorter way to one of the two that have this s3. For each torsion follows the
-rotation of the base that turns the tip through play and lag; the rotations are averaged by weight.
+the roll turns the shorter way to one of the two that have this s3. Each torsion determines the
+rotation of the base that turns the tip through play and lag; the mean over all torsions is used.
 """
 
 # Numba functions take positional arguments: keywords are slow or unsupported.

@@ -137,9 +137,6 @@ class ContinuousSteering(Steering):
         self._abort_known_ns = self.command_ns
         return self._on_abort("path", "path", text)
 
-    def on_recorded_step(self, stamp_ns: int, end: JointSample) -> None:
-        """Do nothing: a path depends on the joints, not on the end of the path before."""
-
     def on_device(self, status: DeviceStatus) -> list[Action]:
         """Handle the driver's status."""
         actions = super().on_device(status)

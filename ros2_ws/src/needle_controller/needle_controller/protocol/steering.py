@@ -177,7 +177,7 @@ class Steering:
         return self._on_abort("step", f"step {self.step + 1}", text)
 
     def on_recorded_step(self, stamp_ns: int, end: JointSample) -> None:
-        """Replace the sent step by a recorded one: its command's stamp [ns] and its end."""
+        """Replace a sent step by a recorded one: its command's stamp [ns] and its end."""
         if self._sent is not None:
             self._sent = SendStep(stamp_ns, end.insertion, end.rotation, self._sent.duration)
 
