@@ -175,7 +175,7 @@ class ControllerStatus(KeyValues):
     depth_m : float or None
         Insertion at which steering ends.
     heard : str
-        Messages received since the previous status, in order (`heard_messages`).
+        Messages received since the previous status, in order (`received_messages`).
     """
 
     part = "steering"
