@@ -53,7 +53,7 @@ def read_frames(path: str | Path, topics: Collection[str] = ()) -> dict[str, pd.
         import pandas as pd  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise UserError(
-            "pandas is not installed; docs/notebooks.md says how to install it"
+            "pandas is not installed; docs/viewers.md says how to install it"
         ) from error
     path = Path(path)
     types = {name: topic.type_name for name, topic in read_contents(path).topics.items()}

@@ -16,7 +16,7 @@ It moves nothing, nothing waits for it, and what comes in at its port is discard
 
 Subscribes  needle/tip_pose, needle/estimate, needle/controller_status, target_plane, joint_states
 Sends       TRANSFORM NeedleTipToRig, NeedleEstimateToRig, TargetPlaneToRig; POINT NeedleShaft,
-            NeedleTarget; STRING NeedleStatus; all in mm, in rig (docs/slicer.md)
+            NeedleTarget; STRING NeedleStatus; all in mm, in rig (docs/viewers.md)
 """
 
 
@@ -24,7 +24,8 @@ def main() -> int:
     """Run the node; returns its exit code."""
     if importlib.util.find_spec("pyigtl") is None:
         print(
-            "error: pyigtl is not installed; docs/slicer.md says how to install it", file=sys.stderr
+            "error: pyigtl is not installed; docs/viewers.md says how to install it",
+            file=sys.stderr,
         )
         return EXIT_BAD_INPUT
     return run_component(

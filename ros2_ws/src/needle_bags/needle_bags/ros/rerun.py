@@ -296,7 +296,7 @@ def _viewer_counts(viewers: Mapping[str, BagStage]) -> str:
             f"{name}: nothing to compare, {NOT_COMPARED[name]}; sent {counts or 'nothing'}"
         )
     if viewers and OpenIGTLink.name not in viewers:
-        lines.append(f"{OpenIGTLink.name}: left out, pyigtl is not installed (docs/slicer.md)")
+        lines.append(f"{OpenIGTLink.name}: left out, pyigtl is not installed (docs/viewers.md)")
     return "\n".join(lines)
 
 

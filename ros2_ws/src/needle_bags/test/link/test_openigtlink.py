@@ -127,4 +127,4 @@ def test_without_pyigtl_it_says_so(
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     assert executable.main() == 2
-    assert "pyigtl is not installed; docs/slicer.md" in capsys.readouterr().err
+    assert "pyigtl is not installed; docs/viewers.md" in capsys.readouterr().err
