@@ -62,7 +62,7 @@ SENT = partial(map, lambda pair: sent(*pair))
         ),
     ],
 )
-def test_the_order_is_that_of_hearing(
+def test_the_order_is_that_of_reception(
     messages: list[SentMessage], heard: list[tuple[str, int]]
 ) -> None:
     found = in_reception_order(list(messages), "/rig/")

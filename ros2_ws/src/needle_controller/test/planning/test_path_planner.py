@@ -14,7 +14,6 @@ from scipy.linalg import expm
 
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
-from needle_controller.planning.entry import SafeStarts, safe_starts
 from needle_controller.planning.legs import advance_pose, in_tip_axes, leg_towards, truncated
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_evaluation import PathSettings
@@ -209,37 +208,3 @@ def test_invalid_calls_raise_errors_with_the_value() -> None:
     bent = TipState(np.zeros(3), np.eye(3), math.nan)
     with pytest.raises(UserError, match="curvature = nan"):
         planner().path(bent, TARGET, Obstacles())
-
-
-def starts_of(obstacles: Obstacles) -> SafeStarts:
-    return safe_starts(
-        planner(),
-        [0.0, 0.0, 0.1],
-        obstacles,
-        CURVATURE,
-        offsets=np.array([-0.025, -0.01, 0.0, 0.01, 0.025]),
-        angles=np.radians([-30.0, -5.0, 0.0, 5.0, 30.0]),
-    )
-
-
-def test_safe_starts_have_a_path() -> None:
-    starts = starts_of(Obstacles())
-    # At 0.1 m a needle with 90 % of this curvature gets 44 mm aside, less while it turns;
-    # tilted by 30 deg, the target is 50 mm aside and 87 mm ahead.
-    assert np.all(starts.shifted)
-    assert np.all(starts.tilted[1:4, 1:4])
-    assert not np.any(starts.tilted[0, :])
-    assert not np.any(starts.tilted[:, 4])
-    assert starts.largest_shift == pytest.approx(0.025)
-    assert math.degrees(starts.largest_tilt) == pytest.approx(5.0 * math.sqrt(2.0))
-
-
-def test_starts_in_or_behind_an_obstacle_are_not_safe() -> None:
-    # A capsule beside the entry in +x, from the surface to near the target.
-    shaded = starts_of(Obstacles([Obstacle((0.03, -0.05, 0.01), (0.03, 0.05, 0.01), 0.008)]))
-    assert not np.any(shaded.shifted[4, :])
-    assert np.all(shaded.shifted[:3, :])
-    assert shaded.largest_shift < 0.03
-    none = starts_of(BURIED)
-    assert not none.shifted[2, 2]
-    assert (none.largest_shift, none.largest_tilt) == (0.0, 0.0)
