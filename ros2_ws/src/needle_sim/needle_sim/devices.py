@@ -7,7 +7,7 @@ from typing import Protocol
 
 from needle_core import messages as m
 from needle_core.component import Actions, Input, Moment, Output, Peers, Publish, Service
-from needle_device_driver.device import EMERGENCY_STOP, DeviceRows
+from needle_device_driver.device import EMERGENCY_STOP, DeviceInterface
 from needle_device_driver.procedure import run_at_once
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
@@ -63,7 +63,7 @@ class IdealDevice:
         self._axes = (SimulatedAxis("insertion"), SimulatedAxis("rotation"))
         self._supervisor = MotionSupervisor(*self._axes, limits)
         run_at_once(self._supervisor.configure(0.0))
-        self._rows = DeviceRows(self._supervisor, name, simulated=True, refuse=lambda: self._ended)
+        self._rows = DeviceInterface(self._supervisor, name, simulated=True, not_ready=lambda: self._ended)
         self.inputs: Sequence[Input] = self._rows.inputs
         self.outputs: Sequence[Output] = self._rows.outputs
         self.services: Sequence[Service] = self._rows.services

@@ -10,7 +10,7 @@ from needle_device_driver.cia402.cia402 import (
     DriveCommand,
     DriveState,
     Goal,
-    TransitionWatch,
+    TransitionMonitor,
     drive_state,
     next_command,
 )
@@ -97,7 +97,7 @@ def test_a_moving_axis_is_never_left_to_coast() -> None:
 
 
 def test_the_watch_names_what_nobody_ordered_but_not_what_crosses_on_the_bus_nor_a_fault() -> None:
-    watch = TransitionWatch()
+    watch = TransitionMonitor()
     for state, command in (
         (DriveState.NOT_READY_TO_SWITCH_ON, DriveCommand.DISABLE_VOLTAGE),
         (DriveState.SWITCH_ON_DISABLED, DriveCommand.SHUTDOWN),
@@ -109,11 +109,11 @@ def test_the_watch_names_what_nobody_ordered_but_not_what_crosses_on_the_bus_nor
         (DriveState.SWITCH_ON_DISABLED, DriveCommand.DISABLE_VOLTAGE),
     ):
         assert watch.unexplained(state) == ""
-        watch.sent(command)
+        watch.note_command(command)
     watch.unexplained(DriveState.OPERATION_ENABLED)
-    watch.sent(DriveCommand.QUICK_STOP)
+    watch.note_command(DriveCommand.QUICK_STOP)
     for _ in range(6):
-        watch.sent(DriveCommand.ENABLE_OPERATION)
+        watch.note_command(DriveCommand.ENABLE_OPERATION)
     by_itself = watch.unexplained(DriveState.SWITCH_ON_DISABLED)
     assert by_itself == "went from OPERATION_ENABLED to SWITCH_ON_DISABLED by itself"
     assert watch.unexplained(DriveState.FAULT_REACTION_ACTIVE) == ""

@@ -34,7 +34,7 @@ def orders(machine: DriveMachine, *answers: Feedback) -> list[DriveCommand]:
 
 
 def enabled(machine: DriveMachine, position: int = 0) -> None:
-    machine.want(Goal.ON)
+    machine.set_goal(Goal.ON)
     assert machine.switching
     orders(machine, *(said(word, position) for word in (DISABLED, READY, ON, ENABLED)))
     assert machine.ready
@@ -47,7 +47,7 @@ def test_after_a_quick_stop_nothing_is_ordered_before_the_axis_stands(
 ) -> None:
     enabled(machine)
     machine.stop()
-    machine.want(goal)
+    machine.set_goal(goal)
     # It trembles by two counts at last, for three cycles.
     ways = [*itertools.accumulate((400, 300, 200, 100, 3, 2, 2))]
     given = orders(machine, *(said(QUICK_STOP, position) for position in ways))
@@ -59,7 +59,7 @@ def test_after_a_quick_stop_nothing_is_ordered_before_the_axis_stands(
 
 def test_a_stop_on_the_way_off_ends_off(machine: DriveMachine) -> None:
     enabled(machine)
-    machine.want(Goal.OFF)
+    machine.set_goal(Goal.OFF)
     machine.stop()
     assert orders(machine, *[said(QUICK_STOP)] * 4)[-1] is DriveCommand.DISABLE_VOLTAGE
 
@@ -67,7 +67,7 @@ def test_a_stop_on_the_way_off_ends_off(machine: DriveMachine) -> None:
 def test_a_stop_holds_until_the_drive_has_said_that_it_took_it(machine: DriveMachine) -> None:
     enabled(machine)
     machine.stop()
-    machine.want(Goal.ON)
+    machine.set_goal(Goal.ON)
     assert orders(machine, *[said(ENABLED)] * 5) == [DriveCommand.QUICK_STOP] * 5
     assert not machine.ready
 
@@ -80,14 +80,14 @@ def test_a_stopped_axis_that_its_drive_would_pull_on_is_switched_off(
     machine.stop()
     places = (400, 500, 500, 500, 500)
     given = orders(machine, *(said(QUICK_STOP, place, behind=behind // 3 * 2) for place in places))
-    assert (given, machine.let_go) == ([DriveCommand.QUICK_STOP] * 5, False)
+    assert (given, machine.released_after_block) == ([DriveCommand.QUICK_STOP] * 5, False)
     assert orders(machine, said(QUICK_STOP, 500, behind=behind)) == [DriveCommand.DISABLE_VOLTAGE]
-    assert machine.let_go
+    assert machine.released_after_block
     assert machine.powered, "it is stopped, it has not lost its power"
     assert orders(machine, said(DISABLED, 500)) == [DriveCommand.DISABLE_VOLTAGE]
-    assert machine.trouble == ""
+    assert machine.problem == ""
     enabled(machine, 500)
-    assert not machine.let_go
+    assert not machine.released_after_block
 
 
 @pytest.mark.parametrize(
@@ -113,8 +113,8 @@ def test_a_drive_that_runs_on_in_its_quick_stop_is_switched_off(
         assert given[:9] == [DriveCommand.QUICK_STOP] * 9
         late = DriveCommand.DISABLE_VOLTAGE if off else DriveCommand.QUICK_STOP
         assert given[9:] == [late] * 11
-        assert ("runs on in its quick stop" in machine.trouble) is off
-        machine.begin_anew(said(DISABLED))
+        assert ("runs on in its quick stop" in machine.problem) is off
+        machine.restart(said(DISABLED))
 
 
 def test_the_mode_changes_only_while_the_drive_is_off(machine: DriveMachine) -> None:
@@ -141,7 +141,7 @@ def test_an_axis_that_never_comes_to_rest_is_switched_off_all_the_same(
     machine: DriveMachine,
 ) -> None:
     enabled(machine)
-    machine.want(Goal.OFF)
+    machine.set_goal(Goal.OFF)
     # On and on, but never far: it is no drive that runs on.
     given = orders(machine, *(said(QUICK_STOP, 8 + 8 * (count % 2)) for count in range(51)))
     assert given == [DriveCommand.QUICK_STOP] * 50 + [DriveCommand.DISABLE_VOLTAGE]
@@ -152,17 +152,17 @@ def test_a_drive_that_ignores_the_stop_is_switched_off_later(machine: DriveMachi
     machine.stop()
     given = orders(machine, *(said(ENABLED, 100 * count) for count in range(35)))
     assert given == [DriveCommand.QUICK_STOP] * 34 + [DriveCommand.DISABLE_VOLTAGE]
-    assert "runs on when stopped" in machine.trouble
+    assert "runs on when stopped" in machine.problem
 
 
 def test_a_fault_is_left_alone_and_a_word_of_no_state_is_trouble(machine: DriveMachine) -> None:
     enabled(machine)
     assert orders(machine, said(FAULT)) == [DriveCommand.DISABLE_VOLTAGE]
-    assert machine.trouble == ""
+    assert machine.problem == ""
     machine.update(said(0x0025))
-    assert machine.trouble == "says 0x0025, no statusword of CiA 402"
-    machine.begin_anew(said(DISABLED, 7))
-    assert (machine.trouble, machine.target, machine.switching) == ("", 7, False)
+    assert machine.problem == "says 0x0025, no statusword of CiA 402"
+    machine.restart(said(DISABLED, 7))
+    assert (machine.problem, machine.target, machine.switching) == ("", 7, False)
 
 
 def test_a_drive_that_leaves_its_mode_has_as_long_as_one_that_is_switched_on(
@@ -170,18 +170,18 @@ def test_a_drive_that_leaves_its_mode_has_as_long_as_one_that_is_switched_on(
 ) -> None:
     enabled(machine)
     orders(machine, *[said(ENABLED, mode=6)] * 100)
-    assert machine.trouble == ""
+    assert machine.problem == ""
     machine.update(said(ENABLED, mode=6))
-    assert machine.trouble == "is not on after 2 s: OPERATION_ENABLED, mode 6"
+    assert machine.problem == "is not on after 2 s: OPERATION_ENABLED, mode 6"
 
 
 @pytest.mark.parametrize(("statusword", "told"), [(0x0250, False), (0x0050, True)])
 def test_a_drive_that_does_not_listen_to_the_bus_is_told(
     machine: DriveMachine, statusword: int, told: bool
 ) -> None:
-    machine.want(Goal.ON)
+    machine.set_goal(Goal.ON)
     orders(machine, *[said(statusword)] * 100)
-    assert machine.trouble == ""
+    assert machine.problem == ""
     machine.update(said(statusword))
-    assert "is not on after 2 s: SWITCH_ON_DISABLED, mode 8" in machine.trouble
-    assert ("not under the bus's control (bit 9)" in machine.trouble) is told
+    assert "is not on after 2 s: SWITCH_ON_DISABLED, mode 8" in machine.problem
+    assert ("not under the bus's control (bit 9)" in machine.problem) is told

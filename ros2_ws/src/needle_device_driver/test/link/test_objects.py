@@ -13,9 +13,9 @@ import yaml
 from hypothesis import given, settings
 
 from needle_core.errors import OutOfBoundsError, UserError
-from needle_device_driver.cia402.cycle_times import CycleTimes
+from needle_device_driver.cia402.drive_cycle import CycleTimes
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.emergency import describe_error
+from needle_device_driver.link.error_codes import describe_error
 from needle_device_driver.parameters import DeviceDriverParameters
 
 DRIVE = DeviceDriverParameters().drive("insertion")
@@ -92,8 +92,8 @@ def test_the_drives_bounds_follow_the_supervisors_and_the_example_is_a_configura
     file = Path(__file__).resolve().parents[2] / "config" / "drives.yaml"
     values = yaml.safe_load(file.read_text("utf-8"))["device_driver"]["ros__parameters"]
     example = DeviceDriverParameters(**values).drive("rotation")
-    link = DeviceDriverParameters(link="socketcand", channel="can0").link_settings
-    assert str(link) == "socketcand localhost:29536 can0"
+    link = DeviceDriverParameters(link="socketcand", channel="can0")
+    assert link.link_name == "socketcand localhost:29536 can0"
     assert link.write_timeout == 0.05
     assert (example.max_torque, example.counts(2 * math.pi)) == (0.5, 65536)
 

@@ -9,7 +9,6 @@ from typing import Any
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
 from needle_device_driver.link.frame_link import FrameLink
-from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
@@ -25,9 +24,9 @@ _FRAME_TIME = 0.0005
 class BenchLink(FrameLink):
     """A link in the bench's time, whose frames are answered while they are sent."""
 
-    def __init__(self, settings: LinkSettings, bench: DriveBench) -> None:
+    def __init__(self, name: str, bench: DriveBench) -> None:
         self._bench = bench
-        super().__init__(settings)
+        super().__init__(name)
 
     @property
     def now(self) -> float:
@@ -39,15 +38,15 @@ class BenchLink(FrameLink):
 
     def open(self) -> None:
         if not self.is_open:
-            self.change("no such file" if self._bench.no_adapter else "")
+            self.set_port_error("no such file" if self._bench.no_adapter else "")
             super().open()
             self._bench.broken = ""
 
     def send(self, cob_id: int, data: bytes = b"") -> None:
         super().send(cob_id, data)
-        self.take_sent()
+        self.pop_outgoing()
         if self._bench.broken:
-            self.change(self._bench.broken)
+            self.set_port_error(self._bench.broken)
             return
         self._bench.now += _FRAME_TIME + self._bench.sdo_time * (cob_id in (0x601, 0x602))
         self._bench.bus.send(cob_id, data)
@@ -64,20 +63,20 @@ class DriveBench(SupervisorBench):
         self.broken = ""
         self.sdo_time = 0.0
         self.settings = DeviceDriverParameters(link="virtual", channel="test", **parameters)
-        self.link = BenchLink(self.settings.link_settings, self)
+        self.link = BenchLink(self.settings.link_name, self)
         self.bus = ScriptedBus([self.insertion, self.rotation], lambda f: self.link.receive([f]))
         watchdog = self.settings.watchdog
         self.axes = [
             Cia402Axis(name, self.settings.drive(name), self.link, period=PERIOD, watchdog=watchdog)
             for name in ("insertion", "rotation")
         ]
-        self.drives = DriveCycle(self.link, self.axes)
+        self.drives = DriveCycle(self.link, self.axes, PERIOD)
         self.supervisor = MotionSupervisor(
             self.axes[0],
             self.axes[1],
-            self.settings.limits,
+            self.settings,
             feedback_delay=1,
-            switching=lambda: self.drives.needs_cycles,
+            is_switching=lambda: self.drives.needs_cycles,
         )
 
     def run(self, procedure: Procedure[T]) -> T:

@@ -55,10 +55,10 @@ HARD = {
 
 
 def test_bounds_of_the_driver_are_those_of_the_document_and_parameters_of_their_name() -> None:
-    assert dataclasses.asdict(DeviceDriverParameters().limits) == BOUNDS
+    assert dataclasses.asdict(SafetyLimits.of(DeviceDriverParameters())) == BOUNDS
     for name, bound in BOUNDS.items():
         changed: dict[str, Any] = {name: 0.9 * bound}
-        given = DeviceDriverParameters(**changed).limits
+        given = SafetyLimits.of(DeviceDriverParameters(**changed))
         assert dataclasses.asdict(given) == BOUNDS | {name: 0.9 * bound}
     # Ideal axes come nearer to their targets.
     ideal = BOUNDS | {"insertion_tolerance": 1e-6, "rotation_tolerance": 1e-4}

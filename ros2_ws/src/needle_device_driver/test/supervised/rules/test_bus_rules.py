@@ -7,7 +7,6 @@ from collections.abc import Callable
 import pytest
 
 from needle_device_driver.cia402 import drive_setup
-from needle_device_driver.cia402.pdo_setup import silence_unused
 from needle_device_driver.link.frame_link import LinkError
 from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.procedure import Procedure
@@ -48,7 +47,7 @@ def test_link_loss_is_named_and_reset_opens_the_link_anew() -> None:
 
 def test_link_loss_while_nothing_is_sent_and_before_the_start() -> None:
     bench = DriveBench().configured()
-    bench.link.change("gone")
+    bench.link.set_port_error("gone")
     bench.supervisor.observe(bench.now)
     assert (bench.state, bench.rule) == ("FAULT", "link_loss")
     bench = DriveBench()
@@ -164,10 +163,11 @@ def test_reply_age_lost_answers_are_counted_and_given_up_after_a_pause() -> None
     bench.go(60)
     assert bench.outcomes == ["succeeded"] * 2
     count = bench.drives.unanswered
-    health = bench.drives.health("", {"more": "1"})
+    health = bench.drives.health("")
     assert health.message == f"{count} SYNCs were not answered in their cycle"
-    assert (health.values["unanswered_syncs"], health.values["more"]) == (str(count), "1")
-    assert bench.drives.health("", {}).message == "connected"
+    assert health.values["unanswered_syncs"] == str(count)
+    assert health.values["late_cycles"] == "0"
+    assert bench.drives.health("").message == "connected"
 
 
 # ---- a drive that starts anew -------------------------------------------------------------------
@@ -231,15 +231,16 @@ def test_drive_reboot_a_node_that_left_operational_is_found_by_its_heartbeat() -
 def test_drive_reboot_within_its_set_up_voids_it(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = DriveBench().homed()
     reboots = [True]
+    switch_off = drive_setup._switch_off_unused_pdos
 
     def reboots_once(access: ObjectAccess) -> Procedure[None]:
         if reboots:
             reboots.clear()
             bench.insertion.reboot()
             bench.bus.flush()
-        yield from silence_unused(access)
+        yield from switch_off(access)
 
-    monkeypatch.setattr(drive_setup, "silence_unused", reboots_once)
+    monkeypatch.setattr(drive_setup, "_switch_off_unused_pdos", reboots_once)
     bench.after(bench.insertion.reboot)
     bench.hold(False)
     # What it was told before it started anew is gone: only a whole set-up counts.

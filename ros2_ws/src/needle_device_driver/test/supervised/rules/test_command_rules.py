@@ -7,7 +7,8 @@ import math
 import pytest
 
 from needle_core.errors import OutOfBoundsError
-from needle_device_driver.supervisor.command import Command, CommandPoint, check_form
+from needle_core.messages import Trajectory, TrajectoryPoint
+from needle_device_driver.supervisor.command import check_form
 from needle_device_driver.supervisor.limits import SafetyLimits
 
 from ..ideal_axes import Bench
@@ -88,14 +89,14 @@ def test_homed_first() -> None:
 # ---- form ---------------------------------------------------------------------------------------
 
 
-def form(names: tuple[str, ...], *points: CommandPoint) -> str:
-    refusal = check_form(Command(1, names, points))
+def form(names: tuple[str, ...], *points: TrajectoryPoint) -> str:
+    refusal = check_form(Trajectory(1, names, points))
     return "" if refusal is None else refusal.rule.value
 
 
 def test_command_form() -> None:
-    def point(*positions: float, time: float = 0.5) -> CommandPoint:
-        return CommandPoint(positions, (), time)
+    def point(*positions: float, time: float = 0.5) -> TrajectoryPoint:
+        return TrajectoryPoint(positions, time)
 
     good = point(0.001, 0.1)
     assert form(NAMES, good) == form(NAMES[::-1], good) == ""
@@ -123,14 +124,14 @@ def test_command_form() -> None:
 
 def test_command_form_is_checked_and_told_in_short_and_joints_come_in_any_order() -> None:
     bench = Bench().ready()
-    point = CommandPoint((0.1, 0.001), (), 0.5)
+    point = TrajectoryPoint((0.1, 0.001), 0.5)
     names = tuple("joint\n" * 1000 for _ in range(300))
-    bench.supervisor.submit(Command(bench.ros_ns, names, (point,)), bench.now)
+    bench.supervisor.submit(Trajectory(bench.ros_ns, names, (point,)), bench.now)
     reason = bench.refused("command_form")
     assert len(reason) < 500
     assert reason.isprintable()
     assert "and 296 more" in reason
-    bench.supervisor.submit(Command(bench.ros_ns, NAMES[::-1], (point,)), bench.now)
+    bench.supervisor.submit(Trajectory(bench.ros_ns, NAMES[::-1], (point,)), bench.now)
     bench.go(25)
     assert bench.positions == (0.001, 0.1)
 
@@ -138,10 +139,10 @@ def test_command_form_is_checked_and_told_in_short_and_joints_come_in_any_order(
 def test_command_finite() -> None:
     for bad in (math.nan, math.inf, -math.inf):
         for point in (
-            CommandPoint((bad, 0.1), (), 0.5),
-            CommandPoint((0.001, bad), (), 0.5),
-            CommandPoint((0.001, 0.1), (0.0, bad), 0.5),
-            CommandPoint((0.001, 0.1), (), bad),
+            TrajectoryPoint((bad, 0.1), 0.5),
+            TrajectoryPoint((0.001, bad), 0.5),
+            TrajectoryPoint((0.001, 0.1), 0.5, (0.0, bad)),
+            TrajectoryPoint((0.001, 0.1), bad),
         ):
             assert form(NAMES, point) == "command_finite"
 

@@ -64,7 +64,7 @@ def test_hold_age_a_message_counts_as_long_as_it_says_and_a_quarter_of_a_second(
     bench.step(0.002, 0.1, 2.0)
     bench.hold(lifetime=lifetime)
     arrival = bench.now
-    for lasts in (bench.supervisor.may_move, bench.supervisor.held):
+    for lasts in (bench.supervisor.may_move, bench.supervisor.is_held):
         assert lasts(arrival + lives)
         assert not lasts(arrival + lives + 1e-6)
     bench.supervisor.drive(0.02, arrival + lives)
@@ -83,8 +83,8 @@ def test_hold_age_a_message_counts_as_long_as_it_says_and_a_quarter_of_a_second(
 def test_hold_age_is_told_alike_however_long_the_steady_clock_has_run(start: float) -> None:
     hold = Hold(0.25)
     hold.receive(HoldState("a", "", 1, True, 1.0, math.inf), start, counting=True)
-    assert hold.lapse(start + 0.249) == ""
-    assert hold.lapse(start + 0.251) == "no hold message for 0.251 s, limit 0.25 s"
+    assert hold.end_if_stale(start + 0.249) == ""
+    assert hold.end_if_stale(start + 0.251) == "no hold message for 0.251 s, limit 0.25 s"
 
 
 def test_hold_age_one_that_lives_for_no_time_is_a_release() -> None:
@@ -222,7 +222,7 @@ def test_speed_scale_slows_and_0_stands_still() -> None:
     bench.go(10, scale=0.0)
     assert bench.insertion.position == pytest.approx(0.0002)
     assert not bench.supervisor.may_move(bench.now)
-    assert not bench.supervisor.held(bench.now)
+    assert not bench.supervisor.is_held(bench.now)
     bench.hold(False)
     assert bench.status.speed_scale == 0.0
 

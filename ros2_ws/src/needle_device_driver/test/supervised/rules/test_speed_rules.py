@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from needle_device_driver.cia402.axis_speed import SpeedWatch
 from needle_device_driver.cia402.drive_monitor import Feedback
-from needle_device_driver.cia402.homing_run import HomingRun
+from needle_device_driver.cia402.drive_watch import HomingRun, SpeedMonitor
 from needle_device_driver.parameters import DeviceDriverParameters
 
 from ..drive_bench import RAD, DriveBench
@@ -120,7 +119,7 @@ class Answers:
 
     def __init__(self) -> None:
         settings = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
-        self.watch = SpeedWatch(settings, PERIOD)
+        self.watch = SpeedMonitor(settings, PERIOD)
         self.at = Feedback(0, 0, 0, 0, 0, 0)
 
     def answer(
@@ -136,7 +135,7 @@ class Answers:
             time=before.time + seconds,
         )
         self.watch.command(to)
-        return self.watch.judge(before, self.at, powered=True)
+        return self.watch.check(before, self.at, powered=True)
 
 
 def test_axis_speed_is_judged_by_elapsed_sync_periods() -> None:
@@ -157,14 +156,14 @@ def test_axis_speed_is_judged_by_elapsed_sync_periods() -> None:
         bound = 3.5 * PERIOD * periods
         for share, plausible in ((0.99, True), (1.01, False), (-1.01, False)):
             assert answers.answer(share * bound, syncs, numbers, seconds) is plausible
-        assert answers.watch.trouble
+        assert answers.watch.problem
 
 
 def test_axis_speed_once_too_fast_is_forgiven_and_what_was_commanded_fades() -> None:
     answers = Answers()
     for mm in (1.0, 0.04) * 5:
         answers.answer(mm)
-        assert not answers.watch.trouble
+        assert not answers.watch.problem
     # Ten cycles are a time constant: 0.5 mm/s, and 3 mm/s that fade.
     for _ in range(10):
         answers.answer(0.0, to=0.0)
@@ -172,9 +171,9 @@ def test_axis_speed_once_too_fast_is_forgiven_and_what_was_commanded_fades() -> 
     assert not answers.answer((0.5 + 3.0 * math.exp(-1.2)) * PERIOD + 1e-4, to=0.0)
     for mm in (1.0, 1.0):
         answers.answer(mm, to=0.0)
-    assert "moves at" in answers.watch.trouble
-    answers.watch.forget()
-    assert answers.watch.trouble == ""
+    assert "moves at" in answers.watch.problem
+    answers.watch.reset()
+    assert answers.watch.problem == ""
     assert not answers.answer(0.51 * PERIOD, to=0.0)
 
 
@@ -240,10 +239,10 @@ def test_homing_time_a_count_is_away_from_the_switch_where_it_is_more_than_the_b
 ) -> None:
     settings = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
     settings = dataclasses.replace(settings, counts_per_unit=1000.0)
-    homing = HomingRun(settings, 0.002, switches=True)
+    homing = HomingRun(settings, 0.002, has_inputs=True)
     for position in (0, counts):
         homing.update(Feedback(1, 0x0237, 6, 0, position, 0), position)
-    assert ("went 1 mm away from the limit switch" in homing.trouble) is is_away
+    assert ("went 1 mm away from the limit switch" in homing.problem) is is_away
 
 
 def test_homing_time_a_drive_that_reports_a_failure_has_no_other_name() -> None:

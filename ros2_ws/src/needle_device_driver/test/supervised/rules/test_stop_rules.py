@@ -57,8 +57,8 @@ def test_one_device_stops_and_refuses_everything_until_it_is_alone_and_reset() -
     bench = Bench().moving()
     supervisor, other = bench.supervisor, "another device is there: /sim_rig"
     at = bench.positions
-    supervisor.see_others(other)
-    supervisor.see_others(other)
+    supervisor.report_conflicting_device(other)
+    supervisor.report_conflicting_device(other)
     assert (bench.state, bench.rule) == ("FAULT", "one_device")
     assert bench.outcomes == [f"aborted: {other}"]
     assert supervisor.stops == 1
@@ -74,14 +74,14 @@ def test_one_device_stops_and_refuses_everything_until_it_is_alone_and_reset() -
     ):
         assert not reply.success
     assert bench.reset().message == other
-    supervisor.see_others("")
+    supervisor.report_conflicting_device("")
     assert bench.state == "FAULT"
     assert bench.reset().success
     assert bench.positions == at
     # Whoever said that a needle is out may have meant the other's.
     supervisor.confirm_needle_out(True)
-    supervisor.see_others(other)
-    supervisor.see_others("")
+    supervisor.report_conflicting_device(other)
+    supervisor.report_conflicting_device("")
     assert bench.reset().success
     assert "confirm first" in bench.run(supervisor.home(bench.now)).message
 
