@@ -132,7 +132,7 @@ _PLANTED: dict[str, tuple[Any, ...]] = {
     ),
     "a page's lost press that goes on": (
         "hold_is_of_now",
-        wrapped(PageSession, "lapses", _forgiving),
+        wrapped(PageSession, "end_if_stale", _forgiving),
         15,
     ),
     "a screw of twice the lead": ("none_beyond_limits", _axis_scaled("insertion", 2.0), 1),

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_console.console import Console, Hand, Lag, PageEvent
+from needle_console.console import Console, HoldRequest, PageEvent, SimulationLag
 from needle_console.console_parameters import ConsoleParameters
-from needle_console.hold.hold_state import RELEASED, HoldState, Mode
-from needle_console.page.desk import Desk
+from needle_console.hold.page_session import RELEASED, Mode, PageHold
+from needle_console.page.page_port import PagePort
 from needle_console.view.advice import Button
 from needle_console.view.snapshot import Snapshot
 from needle_console.view.targets import plane_pose, target_point
@@ -31,21 +31,21 @@ from needle_core.component import (
 from needle_core.diagnostics import Level
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
-INSERT = HoldState(True, 0.5, Mode.INSERT)
-RETRACT = HoldState(True, 0.5, Mode.RETRACT)
+INSERT = PageHold(True, 0.5, Mode.INSERT)
+RETRACT = PageHold(True, 0.5, Mode.RETRACT)
 TURN = (0.0, float(np.sin(np.pi / 12)), 0.0, float(np.cos(np.pi / 12)))
 """By 30 degrees, as a plane's that rises inwards."""
 
 
 class Bench:
-    """A console, and the desk of its page with a clock of its own."""
+    """A console, and the port of its page with a clock of its own."""
 
     def __init__(self) -> None:
         self.now = 10.0
         self.console = Console(ConsoleParameters())
-        self.desk = Desk(ConsoleParameters(), lambda: self.now)
+        self.port = PagePort(ConsoleParameters(), lambda: self.now)
         self._batches: list[Any] = []
-        self.desk.open(self._batches.append)
+        self.port.open(self._batches.append)
 
     @property
     def at(self) -> Moment:
@@ -56,7 +56,7 @@ class Bench:
         return list(row.handler(message, self.at))
 
     def events(self) -> list[PageEvent]:
-        """Return what the desk hands over now."""
+        """Return what the port hands over now."""
         batches, self._batches[:] = [batch() for batch in self._batches], []
         return [event for batch in batches for event in batch]
 
@@ -65,9 +65,9 @@ class Bench:
         (port,) = self.console.ports
         return list(port.handler(events or self.events(), self.at))
 
-    def hold(self, *states: HoldState) -> tuple[list[m.HoldState], list[Call]]:
+    def hold(self, *states: PageHold) -> tuple[list[m.HoldState], list[Call]]:
         """Let hands be taken in one batch; return what is said of the hold, and the calls."""
-        actions = self.take(*map(Hand, states))
+        actions = self.take(*map(HoldRequest, states))
         said = [one.message for one in actions if isinstance(one, Publish)]
         return said, [one for one in actions if isinstance(one, Call)]
 
@@ -80,8 +80,8 @@ class Bench:
     def snapshot(self) -> Snapshot:
         (sent,) = self.console.timers[0].handler(self.at)
         assert isinstance(sent, Send)
-        self.desk.send(sent.batch)
-        return self.desk.snapshot()
+        self.port.send(sent.batch)
+        return self.port.snapshot()
 
 
 def listened(actions: Actions) -> dict[str, bool]:
@@ -128,7 +128,7 @@ def test_buttons_call_their_services_and_answers_are_shown(bench: Bench) -> None
         (Button.STOP, Call("device/stop")),
         (Button.RESET, Call("device/reset")),
     ):
-        bench.desk.press(button)
+        bench.port.press(button)
         assert bench.take() == [call]
     for answer, shown in (
         (Answer("device/home", True, "homes"), "device/home: homes"),
@@ -140,9 +140,9 @@ def test_buttons_call_their_services_and_answers_are_shown(bench: Bench) -> None
 
 
 def test_the_hands_server_that_falls_silent_is_named(bench: Bench) -> None:
-    bench.desk.refused = lambda: {"foreign Host": 3}
+    bench.port.refusals = lambda: {"foreign Host": 3}
     for silent_for, level in ((0.9, Level.OK), (1.1, Level.ERROR)):
-        bench.desk.hold(RELEASED)
+        bench.port.set_hold(RELEASED)
         back = [one for one in bench.take() if isinstance(one, Diagnose)]
         # That it is there again is told at once.
         assert [one.diagnostic.level for one in back] == ([Level.OK] if level == Level.OK else [])
@@ -154,15 +154,15 @@ def test_the_hands_server_that_falls_silent_is_named(bench: Bench) -> None:
 
 def test_a_simulation_that_lags_is_named_while_it_does(bench: Bench) -> None:
     for seconds, named in ((0.0, False), (0.01, False), (1.0, True)):
-        bench.desk.note_lag(seconds)
+        bench.port.set_lag(seconds)
         assert bench.take() == []
-        assert bool(bench.snapshot().troubles) is named
-    (text,) = bench.snapshot().troubles
+        assert bool(bench.snapshot().warnings) is named
+    (text,) = bench.snapshot().warnings
     assert "1.0 s behind the clock" in text
     # It lags no more than it did.
     bench.now += 4.0
-    bench.take(Lag(1.0))
-    assert bench.snapshot().troubles == ()
+    bench.take(SimulationLag(1.0))
+    assert bench.snapshot().warnings == ()
 
 
 def test_what_is_heard_of_the_rig_is_shown_in_its_frames_only(bench: Bench) -> None:
@@ -184,9 +184,9 @@ def test_what_is_heard_of_the_rig_is_shown_in_its_frames_only(bench: Bench) -> N
     assert np.diag(shown.tip.covariance) == pytest.approx([1e-8, 2e-8, 3e-8])
     assert shown.T_rig_plane[:3, :3] == pytest.approx(plane_pose(0.0, 30.0)[:3, :3])
     assert shown.T_rig_plane[:3, 3] == pytest.approx([0.004, 0.0, 0.0])
-    (point,) = shown.course
+    (point,) = shown.track
     assert point.position == pytest.approx([0.004 + 0.005, 0.0, 0.01 * np.sqrt(0.75)])
-    assert shown.troubles == ("sim_rig: loop: slow",)
+    assert shown.warnings == ("sim_rig: loop: slow",)
     # One that was killed while it steered must not keep the needle in.
     assert list(bench.console.on_peers(Peers(), bench.at)) == []
     assert bench.snapshot().controller is None
@@ -205,9 +205,9 @@ def test_a_whole_image_is_shown_without_what_pads_its_rows(bench: Bench) -> None
 
 
 def test_targets_and_lines_for_the_log_go_through(bench: Bench) -> None:
-    bench.desk.send_plane(plane_pose(4.0, 30.0))
-    bench.desk.send_point(target_point(10.0, -5.0, 100.0))
-    bench.desk.notice("a line")
+    bench.port.send_plane(plane_pose(4.0, 30.0))
+    bench.port.send_point(target_point(10.0, -5.0, 100.0))
+    bench.port.log("a line")
     plane, point, line = bench.take()
     assert plane.message.orientation == pytest.approx(TURN)
     assert point == Publish("target_point", m.Point(0, "rig", (0.01, -0.005, 0.1)))
@@ -224,22 +224,22 @@ def test_of_holds_that_wait_the_newest_counts_unless_one_was_a_release_or_it_is_
         ((INSERT,), 1.01, RELEASED),
     ):
         for state in states:
-            bench.desk.hold(state)
+            bench.port.set_hold(state)
         bench.now += waited * m.HOLD_LIFETIME
-        assert bench.events() == [Hand(counts)]
+        assert bench.events() == [HoldRequest(counts)]
         assert bench.events() == []
 
 
 def test_wishes_of_pages_that_nobody_takes_are_not_piled_up(bench: Bench) -> None:
     for _ in range(1000):
-        bench.desk.press(Button.HOME)
+        bench.port.press(Button.HOME)
     assert 0 < len(bench.events()) < 100
     assert bench.events() == []
 
 
 def test_images_are_wanted_while_a_page_asks_for_views(bench: Bench) -> None:
     both = ("stereo/left/image_raw", "stereo/right/image_raw")
-    bench.desk.picture("left")
+    bench.port.view("left")
     assert listened(bench.take()) == dict.fromkeys(both, True)
     assert {row.topic for row in bench.console.inputs if row.lazy} == {*both}
     for waited, left in ((1.9, {}), (0.2, dict.fromkeys(both, False))):

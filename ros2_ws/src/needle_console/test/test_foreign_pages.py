@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from needle_console.access.access import Access
+from needle_console.access import Access
 from needle_console.console_parameters import ConsoleParameters
-from needle_console.page.desk import Desk
 from needle_console.page.gate import Gate
+from needle_console.page.page_port import PagePort
 from needle_console.view.snapshot import Snapshot
 from needle_core.errors import UserError
 from needle_core.status_messages import DeviceStatus
@@ -98,12 +98,12 @@ def test_no_page_is_shown_inside_another_one() -> None:
 def test_a_real_rig_is_held_at_its_own_machine_where_that_is_allowed(
     hold_real_rig: bool, is_local: bool
 ) -> None:
-    desk = Desk(ConsoleParameters(hold_real_rig=hold_real_rig))
+    port = PagePort(ConsoleParameters(hold_real_rig=hold_real_rig))
     # A device that is not heard may be a real one.
-    assert (desk.why_no_hold(is_local) == "") == (hold_real_rig and is_local)
+    assert (port.why_no_hold(is_local) == "") == (hold_real_rig and is_local)
     for simulated in (True, False, None):
-        desk.send((Snapshot(device=DeviceStatus(simulated=simulated)),))
-        may_hold = not desk.why_no_hold(is_local)
+        port.send((Snapshot(device=DeviceStatus(simulated=simulated)),))
+        may_hold = not port.why_no_hold(is_local)
         assert may_hold == (simulated is True or (hold_real_rig and is_local))
 
 

@@ -63,7 +63,9 @@ class IdealDevice:
         self._axes = (SimulatedAxis("insertion"), SimulatedAxis("rotation"))
         self._supervisor = MotionSupervisor(*self._axes, limits)
         run_at_once(self._supervisor.configure(0.0))
-        self._rows = DeviceInterface(self._supervisor, name, simulated=True, not_ready=lambda: self._ended)
+        self._rows = DeviceInterface(
+            self._supervisor, name, simulated=True, not_ready=lambda: self._ended
+        )
         self.inputs: Sequence[Input] = self._rows.inputs
         self.outputs: Sequence[Output] = self._rows.outputs
         self.services: Sequence[Service] = self._rows.services

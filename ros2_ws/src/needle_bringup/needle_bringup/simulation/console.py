@@ -55,12 +55,12 @@ def console(options: ConsoleOptions) -> int:
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
     from needle_console.console import PAGE, Console  # noqa: PLC0415
     from needle_console.console_parameters import ConsoleParameters  # noqa: PLC0415
-    from needle_console.page.web_server import ServedDesk  # noqa: PLC0415
+    from needle_console.page.web_server import ServedPagePort  # noqa: PLC0415
     from needle_core.runners.paced import PacedRunner  # noqa: PLC0415
 
     settings = ConsoleParameters(address=LOOPBACK, port=options.port, hold_port=options.port + 1)
     with EndRequest() as end:
-        desk = ServedDesk(settings)
+        desk = ServedPagePort(settings)
         rig, ports = _make_rig(rig_parameters(options))
         components = [*rig, Console(settings)]
         runner = PacedRunner(components, options.rig.seed, ports={PAGE: desk, **ports})
@@ -71,7 +71,7 @@ def console(options: ConsoleOptions) -> int:
                     (name, ended), *_ = runner.exits.items()
                     print(f"error: {name} ended: {ended.text}", file=sys.stderr)
                     return EXIT_MISSED
-                desk.note_lag(runner.lag)
+                desk.set_lag(runner.lag)
         return EXIT_INTERRUPTED
 
 

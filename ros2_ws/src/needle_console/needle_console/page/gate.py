@@ -1,11 +1,11 @@
-"""Lets nobody to the page whom `access` does not: every request passes here, upgrades too."""
+"""Access control of the page: checks every request, also upgrades to WebSockets."""
 
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any, TypeAlias
 
-from needle_console.access.access import Access
+from needle_console.access import Access
 
 _Scope: TypeAlias = MutableMapping[str, Any]
 _Receive: TypeAlias = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -14,14 +14,14 @@ _App: TypeAlias = Callable[[_Scope, _Receive, _Send], Awaitable[None]]
 
 
 class Gate:
-    """An ASGI application around another.
+    """ASGI application that checks requests before another application.
 
     Parameters
     ----------
     app : callable
-        What is behind the gate; kept as the attribute `app`.
+        The other application; also an attribute.
     access : Access
-        Who may come in.
+        Checks the requests.
     """
 
     def __init__(self, app: _App, access: Access) -> None:
@@ -29,7 +29,7 @@ class Gate:
         self._access = access
 
     async def __call__(self, scope: _Scope, receive: _Receive, send: _Send) -> None:
-        """Answer, or hand on, one connection."""
+        """Refuse a connection, or pass it on."""
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
@@ -50,15 +50,15 @@ class Gate:
 
 
 def _forbid_framing(send: _Send) -> _Send:
-    """Forbid showing a page inside another one, which could lay it under a finger."""
+    """Forbid to show the page inside another one, which could redirect a press to it."""
 
-    async def send_so(message: MutableMapping[str, Any]) -> None:
+    async def send_with_header(message: MutableMapping[str, Any]) -> None:
         if message["type"] == "http.response.start":
             headers = [*message.get("headers", ()), (b"x-frame-options", b"DENY")]
             message = {**message, "headers": headers}
         await send(message)
 
-    return send_so
+    return send_with_header
 
 
 def _header(scope: _Scope, name: bytes) -> str:

@@ -1,4 +1,4 @@
-"""Advice on what to do next, and which buttons make sense."""
+"""Advice on the next step, and the buttons that have an effect."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import dataclasses
 import enum
 import math
 
-from needle_console.view.snapshot import Snapshot, trouble_of
+from needle_console.view.snapshot import Snapshot, stop_reason
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
-# As near to the home position the needle counts as out [m].
+# The needle is out if the insertion is smaller [m].
 _OUT = 1e-4
 STEERING = ("STEERING", "WAITING_FOR_TIP")
-"""States of a controller that steers."""
+"""States in which the controller steers."""
 
 
 class Button(enum.Enum):
@@ -31,16 +31,16 @@ class Button(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Advice:
-    """One sentence for the person, and the button that it is about.
+    """Advice to the person at the page.
 
     Attributes
     ----------
     headline : str
-        What is the case.
+        The situation.
     text : str
-        What to do next.
+        The next step.
     button : Button or None
-        The one to press; None: none, or it is no button's matter.
+        Button of the next step; None: it needs none.
     """
 
     headline: str
@@ -49,14 +49,14 @@ class Advice:
 
 
 def advise(snapshot: Snapshot, name: str) -> Advice:
-    """Return what to do next.
+    """Return the advice for a state of the rig.
 
     Parameters
     ----------
     snapshot : Snapshot
         The rig.
     name : str
-        Whose hold the console's is.
+        Source of the console's hold.
     """
     device = snapshot.device
     if device is None:
@@ -69,21 +69,21 @@ def advise(snapshot: Snapshot, name: str) -> Advice:
     steers = snapshot.controller is not None and snapshot.controller.state in STEERING
     if device.state == "HOLDING" and steers and device.press_again == name:
         return Advice("The press does not count", "Let go, then press and hold again.")
-    ways = {
+    advisers = {
         "UNCONFIGURED": _unconfigured,
         "ESTOPPED": _estopped,
         "FAULT": _fault,
         "DISABLED": _disabled,
         "HOLDING": _holding,
     }
-    way = ways.get(device.state)
-    if way is None:
+    adviser = advisers.get(device.state)
+    if adviser is None:
         return Advice(f"Device: {device.state}", "This state is not known here.")
-    return way(snapshot, device)
+    return adviser(snapshot, device)
 
 
 def usable_buttons(snapshot: Snapshot) -> frozenset[Button]:
-    """Return the buttons that have an effect in the present state; *Stop* always has."""
+    """Return the buttons that have an effect; *Stop* always has one."""
     device, controller = snapshot.device, snapshot.controller
     if device is None:
         return frozenset()
@@ -107,7 +107,7 @@ def usable_buttons(snapshot: Snapshot) -> frozenset[Button]:
 
 
 def _unconfigured(_: Snapshot, device: DeviceStatus) -> Advice:
-    return Advice("The drives are not set up", trouble_of(device) or "Configure device_driver.")
+    return Advice("The drives are not set up", stop_reason(device) or "Configure device_driver.")
 
 
 def _estopped(_: Snapshot, device: DeviceStatus) -> Advice:
@@ -120,7 +120,7 @@ def _estopped(_: Snapshot, device: DeviceStatus) -> Advice:
 
 def _fault(_: Snapshot, device: DeviceStatus) -> Advice:
     return Advice(
-        f"Fault: {trouble_of(device) or 'no reason given'}",
+        f"Fault: {stop_reason(device) or 'no reason given'}",
         "Put right what it says, let go of every hold, then press Reset.",
         Button.RESET,
     )

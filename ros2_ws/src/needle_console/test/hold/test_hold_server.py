@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from needle_console.access.access import Access
-from needle_console.hold.hold_state import RELEASED, HoldState
+from needle_console.access import Access
+from needle_console.hold.page_session import RELEASED, PageHold
 from needle_core.errors import UserError
 
 pytest.importorskip("websockets", reason="the console's lock is not installed: scripts/console")
@@ -30,7 +30,7 @@ class Rig:
     """A server whose clock stands still, and what it says."""
 
     def __init__(self) -> None:
-        self.states: list[HoldState] = []
+        self.states: list[PageHold] = []
         self.notices: list[str] = []
         self.asked: list[bool] = []
         self.server = HoldServer(
@@ -93,7 +93,7 @@ def test_foreign_pages_are_refused_before_a_word_and_counted(rig: Rig) -> None:
     connection: Any = SimpleNamespace(respond=lambda status, text: (int(status), text))
 
     def judged(path: str, *headers: tuple[str, str]) -> Any:
-        return rig.server._judge_request(connection, Request(path, Headers(headers)))
+        return rig.server._check_request(connection, Request(path, Headers(headers)))
 
     assert judged("/hold", HOST, ORIGIN) is None
     evil = ("Origin", "http://evil.example")

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from needle_console.hold.hold_state import Mode
-from needle_console.hold.page_message import GarbageError, PageMessage, read_message
+from needle_console.hold.page_session import Mode, PageHold, read_message
 
 GOOD: dict[str, Any] = {"count": 3, "pressed": True, "speed": 0.5, "mode": "retract"}
 WRONG: dict[str, list[Any]] = {
@@ -22,22 +21,22 @@ NO_OBJECTS = ["", "{", "[]", "1", "null", json.dumps(GOOD) + "x", "[" * 100_000,
 
 
 def test_a_message_is_read() -> None:
-    assert read_message(json.dumps(GOOD)) == PageMessage(3, True, 0.5, Mode.RETRACT)
+    assert read_message(json.dumps(GOOD)) == (3, PageHold(True, 0.5, Mode.RETRACT))
     for speed in (0, 1):
-        assert read_message(json.dumps({**GOOD, "speed": speed})).speed == float(speed)
+        assert read_message(json.dumps({**GOOD, "speed": speed}))[1].speed == float(speed)
 
 
 @pytest.mark.parametrize("key", WRONG)
 def test_a_field_that_is_wrong_too_many_or_missing_is_garbage(key: str) -> None:
     for value in WRONG[key]:
-        with pytest.raises(GarbageError):
+        with pytest.raises(ValueError):
             read_message(json.dumps({**GOOD, key: value}))
     if key in GOOD:
-        with pytest.raises(GarbageError):
+        with pytest.raises(ValueError):
             read_message(json.dumps({name: value for name, value in GOOD.items() if name != key}))
 
 
 @pytest.mark.parametrize("data", NO_OBJECTS, ids=range(len(NO_OBJECTS)))
 def test_what_is_no_json_object_is_garbage(data: str | bytes) -> None:
-    with pytest.raises(GarbageError):
+    with pytest.raises(ValueError):
         read_message(data)

@@ -10,24 +10,22 @@ import cv2
 import numpy as np
 import pytest
 
-from needle_console.view.camera_feed import CameraFeed
-from needle_console.view.chart import chart
-from needle_console.view.dial import dial
-from needle_console.view.overlay import draw_view
-from needle_console.view.snapshot import CoursePoint, SeenTip, Snapshot
+from needle_console.view.camera_view import CameraView, draw_view
+from needle_console.view.drawings import chart, dial
+from needle_console.view.snapshot import MeasuredTip, Snapshot, TrackPoint
 from needle_console.view.space import ellipsoid, plane_centre, plane_rotation, shaft_points, to_view
 from needle_console.view.targets import plane_pose, target_point
 from needle_core.errors import UserError
 from needle_core.status_messages import ControllerStatus
 
 COVARIANCE = np.diag([4e-8, 1e-8, 9e-8])
-TIP = SeenTip(np.array([0.002, 0.001, 0.06]), COVARIANCE, 0.0)
+TIP = MeasuredTip(np.array([0.002, 0.001, 0.06]), COVARIANCE, 0.0)
 
 
-def course(*depths: float) -> tuple[CoursePoint, ...]:
+def track(*depths: float) -> tuple[TrackPoint, ...]:
     places = [np.array([depth / 20, depth / 40, depth]) for depth in depths]
     return tuple(
-        CoursePoint(float(at[2]), float(at[0]) - 0.003, 2e-4, at, COVARIANCE) for at in places
+        TrackPoint(float(at[2]), float(at[0]) - 0.003, 2e-4, at, COVARIANCE) for at in places
     )
 
 
@@ -52,12 +50,12 @@ def test_shaft_tip_and_target_are_drawn_where_the_camera_sees_them() -> None:
     camera, size = Camera(), (960, 1280)
     target = (-0.01, 0.0, 0.08)
     controller = ControllerStatus(target_point_m=target)
-    snapshot = Snapshot(None, controller, insertion=1.0, tip=TIP, course=course(0.02, 0.04))
+    snapshot = Snapshot(None, controller, insertion=1.0, tip=TIP, track=track(0.02, 0.04))
     picture = view(snapshot, camera, size)
     assert picture.shape == (480, 640, 3)
     # A diamond is drawn around its place, the other marks on it.
     for place, reach, is_blue in (
-        (snapshot.course[0].position, 1, True),
+        (snapshot.track[0].position, 1, True),
         (TIP.position, 1, False),
         (np.array(target), 9, False),
     ):
@@ -70,8 +68,8 @@ def test_shaft_tip_and_target_are_drawn_where_the_camera_sees_them() -> None:
     # Without a fitting calibration nothing is drawn in; what cannot be seen does no harm.
     for unfit in (None, camera):
         assert view(snapshot, unfit, (480, 640)).max() < 10.0
-    beyond = SeenTip(np.array([5.0, 5.0, -5.0]), COVARIANCE, 0.0)
-    view(Snapshot(insertion=9.0, tip=beyond, course=course(0.1, 4.0)), camera, size)
+    beyond = MeasuredTip(np.array([5.0, 5.0, -5.0]), COVARIANCE, 0.0)
+    view(Snapshot(insertion=9.0, tip=beyond, track=track(0.1, 4.0)), camera, size)
 
 
 def test_views_are_drawn_for_who_asks_and_at_most_ten_times_a_second() -> None:
@@ -81,14 +79,14 @@ def test_views_are_drawn_for_who_asks_and_at_most_ten_times_a_second() -> None:
         drawn.append(Snapshot())
         return drawn[-1]
 
-    feed = CameraFeed({}, snapshot)
-    assert feed.picture("left", 10.0) is None
-    feed.put("left", np.zeros((48, 64), np.uint8), 20.0)
+    view = CameraView({}, snapshot)
+    assert view.jpeg("left", 10.0) is None
+    view.set_image("left", np.zeros((48, 64), np.uint8), 20.0)
     for now in np.arange(20.0, 21.0, 0.01):
-        assert feed.picture("left", float(now))
+        assert view.jpeg("left", float(now))
     assert 9 <= len(drawn) <= 10
-    assert feed.picture("left", 22.5) is None
-    assert feed.picture("right", 20.0) is None
+    assert view.jpeg("left", 22.5) is None
+    assert view.jpeg("right", 20.0) is None
 
 
 def read(points: str, picture: ElementTree.Element) -> np.ndarray:
@@ -108,7 +106,7 @@ def read(points: str, picture: ElementTree.Element) -> np.ndarray:
 
 
 def test_the_chart_has_r1_its_band_and_the_goal_in_mm() -> None:
-    picture = ElementTree.fromstring(chart(Snapshot(course=course(0.02, 0.04))))
+    picture = ElementTree.fromstring(chart(Snapshot(track=track(0.02, 0.04))))
     (line,), (band,) = picture.iter("polyline"), picture.iter("polygon")
     for points, meant in (
         (line.attrib["points"], [[20.0, -2.0], [40.0, -1.0]]),
@@ -122,7 +120,7 @@ def test_the_chart_has_r1_its_band_and_the_goal_in_mm() -> None:
 
 @pytest.mark.parametrize("deepest", [0.0005, 0.12, 0.45])
 def test_all_of_a_chart_lies_within_its_picture(deepest: float) -> None:
-    text = chart(Snapshot(course=course(*np.linspace(1e-4, deepest, 50))))
+    text = chart(Snapshot(track=track(*np.linspace(1e-4, deepest, 50))))
     picture = ElementTree.fromstring(text)
     _, _, width, height = map(float, picture.attrib["viewBox"].split())
     points = [point for part in picture.iter() for point in part.attrib.get("points", "").split()]
@@ -143,7 +141,7 @@ def test_space_keeps_right_handed_axes_and_lengths() -> None:
 def test_the_ellipsoid_is_two_sigma_of_the_covariance() -> None:
     assert ellipsoid(Snapshot()) is None
     for snapshot, place in (
-        (Snapshot(course=course(0.05), tip=TIP), course(0.05)[0].position),
+        (Snapshot(track=track(0.05), tip=TIP), track(0.05)[0].position),
         (Snapshot(tip=TIP), TIP.position),
     ):
         found = ellipsoid(snapshot)
@@ -157,7 +155,7 @@ def test_the_ellipsoid_is_two_sigma_of_the_covariance() -> None:
 
 
 def test_the_shaft_is_drawn_from_the_entry_to_the_tip() -> None:
-    snapshot = Snapshot(insertion=0.015, course=course(*np.arange(0.0005, 0.02, 0.0005)))
+    snapshot = Snapshot(insertion=0.015, track=track(*np.arange(0.0005, 0.02, 0.0005)))
     points = shaft_points(snapshot)
     assert points[0] == pytest.approx([0.0, 0.0, 0.0])
     assert points[-1][0] == pytest.approx(15.0)

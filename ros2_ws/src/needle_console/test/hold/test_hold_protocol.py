@@ -7,36 +7,34 @@ from typing import Any
 
 import pytest
 
-from needle_console.hold.hold_arbiter import SILENCE
-from needle_console.hold.hold_state import RELEASED, HoldState
-from needle_console.hold.hold_talk import ALONE_PERIOD, PERIOD, HoldTalk
-from needle_console.hold.page_session import ECHO_AGE_LIMIT
+from needle_console.hold.hold_protocol import IDLE_PERIOD, PERIOD, SILENCE, HoldProtocol
+from needle_console.hold.page_session import ECHO_AGE_LIMIT, RELEASED, PageHold
 
 
 class Scene:
     """A talk with one page, in a time of its own."""
 
     def __init__(self) -> None:
-        self.states: list[HoldState] = []
+        self.states: list[PageHold] = []
         self.notices: list[str] = []
-        self.talk = HoldTalk(lambda _: "", self.states.append, self.notices.append, 0.0)
+        self.protocol = HoldProtocol(lambda _: "", self.states.append, self.notices.append, 0.0)
 
     def come(self, now: float) -> None:
-        self.page = self.talk.open(now, is_local=True)
+        self.page = self.protocol.open(now, is_local=True)
 
     def told(self, now: float) -> dict[str, Any]:
-        told: dict[str, Any] = json.loads(self.talk.word_for(self.page, now))
+        told: dict[str, Any] = json.loads(self.protocol.message_for(self.page, now))
         return told
 
     def say(self, pressed: bool, now: float) -> None:
         count = self.told(now)["count"]
         message = {"count": count, "pressed": pressed, "speed": 0.5, "mode": "insert"}
-        self.talk.hear(self.page, json.dumps(message), now)
+        self.protocol.receive(self.page, json.dumps(message), now)
 
     def look_until(self, now: float, end: float) -> float:
         """Look as often as the talk asks for; return when it would look next."""
         while now < end:
-            now = self.talk.look(now)
+            now = self.protocol.update(now)
         return now
 
 
@@ -51,12 +49,12 @@ def test_after_a_stall_the_page_is_told_why_its_hold_has_ended(first: str) -> No
     if first == "message":
         scene.say(True, now)
     elif first == "look":
-        scene.talk.look(now)
+        scene.protocol.update(now)
     told = scene.told(now)
     assert not told["held"]
     assert told["why"].startswith("no echo from this page for 0.25 s")
-    assert scene.talk.refusals.counts()["hold lost"] == 1
-    scene.talk.look(now)
+    assert scene.protocol.counts()["hold lost"] == 1
+    scene.protocol.update(now)
     assert not scene.states[-1].pressed
 
 
@@ -64,11 +62,11 @@ def test_the_hold_is_handed_on_every_20_ms_and_without_a_page_every_80_ms() -> N
     scene = Scene()
     now = scene.look_until(0.0, 1.0)
     assert set(scene.states) == {RELEASED}
-    assert len(scene.states) == pytest.approx(1.0 / ALONE_PERIOD, abs=1)
+    assert len(scene.states) == pytest.approx(1.0 / IDLE_PERIOD, abs=1)
     # The first page is not kept waiting for the slower look.
-    now += 0.1 * PERIOD - ALONE_PERIOD
+    now += 0.1 * PERIOD - IDLE_PERIOD
     scene.come(now)
-    assert scene.talk.look(now) <= now + PERIOD
+    assert scene.protocol.update(now) <= now + PERIOD
     scene.states.clear()
     scene.look_until(now, now + 1.0)
     assert len(scene.states) == pytest.approx(1.0 / PERIOD, abs=1)
@@ -81,15 +79,15 @@ def test_a_hold_is_handed_on_at_once_when_it_begins_runs_out_or_its_page_goes() 
         begin = scene.look_until(0.0, 1.0) if end == "silence" else 2.0
         scene.say(False, begin)
         scene.say(True, begin)
-        assert scene.states[-1] == HoldState(True, 0.5, scene.states[-1].mode)
+        assert scene.states[-1] == PageHold(True, 0.5, scene.states[-1].mode)
         if end == "close":
-            scene.talk.close(scene.page, begin)
+            scene.protocol.close(scene.page, begin)
         else:
             scene.look_until(begin, begin + ECHO_AGE_LIMIT)
             assert scene.states[-1].pressed
             now = scene.look_until(begin, begin + ECHO_AGE_LIMIT + 1e-9)
             assert now <= begin + ECHO_AGE_LIMIT + 1e-3
-            scene.talk.look(now)
+            scene.protocol.update(now)
         assert scene.states[-1] == RELEASED
 
 
@@ -97,8 +95,8 @@ def test_what_is_refused_or_lost_is_counted_and_logged_once() -> None:
     scene = Scene()
     scene.come(0.0)
     for _ in range(3):
-        scene.talk.hear(scene.page, "{", 0.0)
-    assert not scene.talk.has_lost(scene.page, SILENCE)
-    assert scene.talk.has_lost(scene.page, SILENCE + 1.0)
-    assert scene.talk.refusals.counts() == {"message not understood": 3, "silent page": 1}
+        scene.protocol.receive(scene.page, "{", 0.0)
+    assert not scene.protocol.is_silent(scene.page, SILENCE)
+    assert scene.protocol.is_silent(scene.page, SILENCE + 1.0)
+    assert scene.protocol.counts() == {"message not understood": 3, "silent page": 1}
     assert scene.notices == ["hold: message not understood", "hold: silent page"]
