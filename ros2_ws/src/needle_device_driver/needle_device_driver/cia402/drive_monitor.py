@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import (
@@ -51,12 +52,12 @@ class Feedback:
         Steady time of its arrival [s].
     """
 
-    number: int
-    statusword: int
-    mode: int
-    inputs: int
-    position: int
-    following_error: int
+    number: int = 0
+    statusword: int = 0
+    mode: int = 0
+    inputs: int = 0
+    position: int = 0
+    following_error: int = 0
     syncs: int = 0
     time: float = 0.0
 
@@ -81,6 +82,8 @@ class DriveMonitor:
 
     Attributes
     ----------
+    feedback : Feedback
+        The newest process data.
     heartbeats : int
         Number of heartbeats since the last set-up began.
     rebooted : bool
@@ -91,18 +94,15 @@ class DriveMonitor:
 
     def __init__(self, link: FrameLink, node_id: int) -> None:
         self._link = link
-        self._number = 0
-        self._statusword = self._mode = self._inputs = self._position = 0
-        self._following_error = 0
         self._answers: set[int] = set()
         self._syncs = self._all_syncs = 0
-        self._syncs_and_time = 0, 0.0
         self._received = dict.fromkeys(_ANSWER, 0)
         self._fresh_time = -math.inf
         self._heartbeat_time = -math.inf
         self._nmt_state = NMT_BOOT_UP
         self._is_set_up = False
         self._outdated = False
+        self.feedback = Feedback()
         self.heartbeats = 0
         self.rebooted = False
         self.emergency: int | None = None
@@ -113,19 +113,6 @@ class DriveMonitor:
             (EMCY, self._on_emergency),
         ):
             link.subscribe(function_code + node_id, partial(self._receive, handler))
-
-    @property
-    def feedback(self) -> Feedback:
-        """The newest process data."""
-        return Feedback(
-            self._number,
-            self._statusword,
-            self._mode,
-            self._inputs,
-            self._position,
-            self._following_error,
-            *self._syncs_and_time,
-        )
 
     @property
     def fresh_time(self) -> float:
@@ -182,14 +169,14 @@ class DriveMonitor:
         Some drives answer a SYNC with data from the SYNC before. So the next answer counts as an
         answer, but its data are older than these values.
         """
-        self._statusword, self._mode, self._inputs = statusword, mode, inputs
-        self._position, self._following_error = position, 0
         self._answers = set(_ANSWER)
         self.discard_outstanding()
-        self._number += 1
         self._outdated = True
-        self._fresh_time = self._link.now
-        self._syncs_and_time = self._all_syncs, self._fresh_time
+        self._fresh_time = now = self._link.now
+        number = self.feedback.number + 1
+        self.feedback = Feedback(
+            number, statusword, mode, inputs, position, syncs=self._all_syncs, time=now
+        )
 
     def await_operational(self, before: int, timeout: float) -> Procedure[bool]:
         """Wait for a heartbeat after the first `before`; return whether it reports operational."""
@@ -211,10 +198,13 @@ class DriveMonitor:
         # Some drives send more answers than SYNCs.
         self._received[function_code] = min(self._received[function_code] + 1, self._syncs)
         if not self._is_waiting:
-            self._number += not self._outdated
+            number = self.feedback.number + (not self._outdated)
             self._outdated = False
             self._fresh_time = time
-            self._syncs_and_time = self._all_syncs, time
+            self._update(number=number, syncs=self._all_syncs, time=time)
+
+    def _update(self, **values: Any) -> None:
+        self.feedback = dataclasses.replace(self.feedback, **values)
 
     def _receive(self, handler: Callable[[bytes, float], None], data: bytes, time: float) -> None:
         try:
@@ -225,16 +215,20 @@ class DriveMonitor:
 
     def _on_status(self, data: bytes, time: float) -> None:
         if len(data) == _LENGTH_WITHOUT_INPUTS:
-            self._statusword, self._mode = STATUS_WITHOUT_INPUTS.unpack(data)
+            statusword, mode = STATUS_WITHOUT_INPUTS.unpack(data)
+            self._update(statusword=statusword, mode=mode)
         else:
-            self._statusword, self._mode, self._inputs = STATUS.unpack(data)
+            statusword, mode, inputs = STATUS.unpack(data)
+            self._update(statusword=statusword, mode=mode, inputs=inputs)
         self._answer(STATUS.function_code, time)
 
     def _on_position(self, data: bytes, time: float) -> None:
         if len(data) == _LENGTH_ALONE:
-            (self._position,) = POSITION_ALONE.unpack(data)
+            (position,) = POSITION_ALONE.unpack(data)
+            self._update(position=position)
         else:
-            self._position, self._following_error = POSITION.unpack(data)
+            position, following_error = POSITION.unpack(data)
+            self._update(position=position, following_error=following_error)
         self._answer(POSITION.function_code, time)
 
     def _on_heartbeat(self, data: bytes, time: float) -> None:
