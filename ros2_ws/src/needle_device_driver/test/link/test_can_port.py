@@ -122,6 +122,46 @@ def test_slcan_opens_with_the_bitrate_sends_frames_and_closes(adapter: Adapter) 
     second.until(lambda: second.changes[1:] == [""])
 
 
+def test_slcan_writes_the_rest_when_there_is_space_again(
+    adapter: Adapter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = Port("slcan", adapter.path)
+    adapter.read(b"O\r")
+    write, is_full, waits = os.write, [True], []
+
+    def write_some(fd: int, data: bytes) -> int:
+        is_full[0] = not is_full[0]
+        if is_full[0]:
+            raise BlockingIOError
+        return write(fd, data[:3])
+
+    def wait(reading: list[int], writing: list[int], _: list[int], timeout: float) -> Any:
+        waits.append(timeout)
+        return reading, writing, []
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", write_some)
+        patch.setattr(select, "select", wait)
+        port.send(0x201, b"\x0f\x00\x08")
+    assert adapter.read(b"\r") == b"t20130F0008\r"
+    assert len(waits) == 6
+    assert 0.0 < waits[0] <= 0.001
+    assert port.changes == [""]
+
+
+def test_close_ends_the_thread_and_releases_the_adapter(adapter: Adapter) -> None:
+    changes: list[Any] = []
+    port = CanPort(LinkSettings("slcan", adapter.path))
+    port.open(changes.append)
+    adapter.read(b"O\r")
+    for _ in range(2):
+        port.close()
+        assert not port._thread.is_alive()
+    assert adapter.read(b"C\r") == b"C\r"
+    assert changes == [PortChange()]
+    assert Port("slcan", adapter.path).changes == [""]
+
+
 def test_slcan_takes_what_comes_in_any_pieces_and_counts_what_is_no_frame(adapter: Adapter) -> None:
     port = Port("slcan", adapter.path)
     adapter.say(b"\r\rz\rt1812")

@@ -140,6 +140,7 @@ def test_it_sets_the_drives_up_homes_and_moves_them() -> None:
     bench.run(2)
     assert bench.bus.sent == [], "another device shows itself before"
     assert bench.call("home").text == "waiting for the drives"
+    assert {row.longest for row in bench.driver.inputs} == {4096}
     bench.ready()
     assert bench.status.simulated is False
     bench.said.clear()

@@ -92,6 +92,10 @@ REFUSED: list[tuple[Change, str]] = [
         all_of(tells({(0x6502, 0): 0x225}), refuses(RANGE, 0x6060)),
         "node 1 refuses to write 8 to 0x6060:0 mode of operation",
     ),
+    (
+        all_of(lacks(0x6502), has(modes={8})),
+        "node 1 has no homing mode (0x6060 = 6, 0x6061 = 0)",
+    ),
     (all_of(lacks(0x6502), refuses(RANGE, 0x6060, but=b"\x06")), "write 8 to 0x6060:0 mode"),
     (all_of(lacks(0x6502), refuses(RANGE, 0x6060, but=b"\x08")), "write 6 to 0x6060:0 mode"),
     (lacks(0x1016), "refuses to write 0 to 0x1016:1 consumer heartbeat time"),
