@@ -93,7 +93,7 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_a_hold_is_told_as_it_comes_with_a_lifetime_and_a_release_at_once(bench: Bench) -> None:
+def test_hold_is_published_with_lifetime_and_release_at_once(bench: Bench) -> None:
     (said,), calls = bench.hold(INSERT)
     assert (said.source, said.pressed, said.speed_scale, calls) == ("console", True, 0.5, [])
     # The promise of docs/safety.md. Nothing is repeated by itself: no timer says it.
@@ -106,7 +106,7 @@ def test_a_hold_is_told_as_it_comes_with_a_lifetime_and_a_release_at_once(bench:
     assert [hold.count for hold in (said, released, *late)] == [1, 2, 3, 4]
 
 
-def test_a_retraction_waits_for_the_end_of_steering_and_is_called_once(bench: Bench) -> None:
+def test_retraction_waits_for_the_end_of_steering(bench: Bench) -> None:
     bench.hear("needle/controller_status", ControllerStatus(state="STEERING"))
     for calls in ([Call("plane_controller/stop")], []):
         (said,), made = bench.hold(RETRACT)
@@ -139,7 +139,7 @@ def test_buttons_call_their_services_and_answers_are_shown(bench: Bench) -> None
         assert bench.snapshot().answer == shown
 
 
-def test_the_hands_server_that_falls_silent_is_named(bench: Bench) -> None:
+def test_silent_hold_server_is_reported(bench: Bench) -> None:
     bench.port.refusals = lambda: {"foreign Host": 3}
     for silent_for, level in ((0.9, Level.OK), (1.1, Level.ERROR)):
         bench.port.set_hold(RELEASED)
@@ -152,7 +152,7 @@ def test_the_hands_server_that_falls_silent_is_named(bench: Bench) -> None:
         assert health.diagnostic.values == {"refused foreign Host": "3"}
 
 
-def test_a_simulation_that_lags_is_named_while_it_does(bench: Bench) -> None:
+def test_growing_simulation_lag_is_reported(bench: Bench) -> None:
     for seconds, named in ((0.0, False), (0.01, False), (1.0, True)):
         bench.port.set_lag(seconds)
         assert bench.take() == []
@@ -165,7 +165,7 @@ def test_a_simulation_that_lags_is_named_while_it_does(bench: Bench) -> None:
     assert bench.snapshot().warnings == ()
 
 
-def test_what_is_heard_of_the_rig_is_shown_in_its_frames_only(bench: Bench) -> None:
+def test_messages_in_other_frames_are_ignored(bench: Bench) -> None:
     flat = tuple(np.diag([1e-8, 2e-8, 3e-8, 0.0, 0.0, 0.0]).ravel())
     bench.hear("joint_states", m.JointState(1, (m.ROTATION_JOINT, m.INSERTION_JOINT), (2.0, 0.01)))
     for frame, x in (("rig", 0.004), ("left_camera", 0.4)):
@@ -192,7 +192,7 @@ def test_what_is_heard_of_the_rig_is_shown_in_its_frames_only(bench: Bench) -> N
     assert bench.snapshot().controller is None
 
 
-def test_a_whole_image_is_shown_without_what_pads_its_rows(bench: Bench) -> None:
+def test_image_is_shown_without_row_padding(bench: Bench) -> None:
     def shown(encoding: str, step: int, size: int) -> list[Any]:
         image = m.Image(1, "left", 2, 3, encoding, step, bytes(range(size)))
         return bench.hear("stereo/left/image_raw", image)
@@ -204,7 +204,7 @@ def test_a_whole_image_is_shown_without_what_pads_its_rows(bench: Bench) -> None
         assert shown(*wrong) == []
 
 
-def test_targets_and_lines_for_the_log_go_through(bench: Bench) -> None:
+def test_targets_and_log_lines_are_passed_on(bench: Bench) -> None:
     bench.port.send_plane(plane_pose(4.0, 30.0))
     bench.port.send_point(target_point(10.0, -5.0, 100.0))
     bench.port.log("a line")
@@ -214,7 +214,7 @@ def test_targets_and_lines_for_the_log_go_through(bench: Bench) -> None:
     assert line == Log("warning", "a line")
 
 
-def test_of_holds_that_wait_the_newest_counts_unless_one_was_a_release_or_it_is_old(
+def test_newest_waiting_hold_counts_unless_released_or_old(
     bench: Bench,
 ) -> None:
     for states, waited, counts in (
@@ -230,14 +230,14 @@ def test_of_holds_that_wait_the_newest_counts_unless_one_was_a_release_or_it_is_
         assert bench.events() == []
 
 
-def test_wishes_of_pages_that_nobody_takes_are_not_piled_up(bench: Bench) -> None:
+def test_page_events_are_bounded(bench: Bench) -> None:
     for _ in range(1000):
         bench.port.press(Button.HOME)
     assert 0 < len(bench.events()) < 100
     assert bench.events() == []
 
 
-def test_images_are_wanted_while_a_page_asks_for_views(bench: Bench) -> None:
+def test_images_are_subscribed_while_a_page_requests_views(bench: Bench) -> None:
     both = ("stereo/left/image_raw", "stereo/right/image_raw")
     bench.port.view("left")
     assert listened(bench.take()) == dict.fromkeys(both, True)
@@ -247,7 +247,7 @@ def test_images_are_wanted_while_a_page_asks_for_views(bench: Bench) -> None:
         assert bench.check()[1] == left
 
 
-def test_its_end_releases_the_hold(bench: Bench) -> None:
+def test_exit_releases_the_hold(bench: Bench) -> None:
     release, end = bench.console.on_stop(bench.at)
     assert isinstance(release, Publish)
     assert not release.message.pressed

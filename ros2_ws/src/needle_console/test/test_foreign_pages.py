@@ -19,7 +19,7 @@ LOOPBACK = Access("127.0.0.1", 8080)
 HOST, ORIGIN = ("host", "127.0.0.1:8080"), ("origin", "http://127.0.0.1:8080")
 
 
-def test_loopback_is_known_by_its_own_names_only() -> None:
+def test_loopback_accepts_only_its_own_names() -> None:
     for host in ("localhost", "127.0.0.1", "127.0.0.1:8081", "LOCALHOST:8081", "[::1]:8081"):
         assert LOOPBACK.why_not_host(host) == ""
     for foreign in (
@@ -29,7 +29,7 @@ def test_loopback_is_known_by_its_own_names_only() -> None:
         assert LOOPBACK.why_not_host(foreign) == "foreign Host"
 
 
-def test_only_the_page_of_the_same_port_is_no_foreign_page() -> None:
+def test_only_origins_with_the_page_port_are_accepted() -> None:
     for origin in ("http://localhost:8080", "http://127.0.0.1:8080", "https://[::1]:8080"):
         assert LOOPBACK.why_not_origin(origin) == ""
     for foreign in (
@@ -44,7 +44,7 @@ def test_only_the_page_of_the_same_port_is_no_foreign_page() -> None:
     assert access.why_not_origin("https://rig.lab") == "foreign Origin"
 
 
-def test_beyond_this_machine_it_takes_a_name() -> None:
+def test_other_machines_need_a_host_name() -> None:
     with pytest.raises(UserError, match="hosts must name"):
         Access("0.0.0.0", 8080)
     with pytest.raises(UserError, match="neither an IP address"):
@@ -72,7 +72,7 @@ def asked(*headers: tuple[str, str], kind: str = "http", method: str = "GET") ->
     return said[0]
 
 
-def test_the_gate_refuses_foreign_pages_and_an_upgrade_or_post_without_an_origin() -> None:
+def test_gate_refuses_foreign_pages_and_missing_origins() -> None:
     for headers in (
         (),
         (("host", "evil.example:8080"),),
@@ -88,16 +88,14 @@ def test_the_gate_refuses_foreign_pages_and_an_upgrade_or_post_without_an_origin
     assert asked(kind="lifespan")["status"] == 200
 
 
-def test_no_page_is_shown_inside_another_one() -> None:
+def test_page_cannot_be_framed() -> None:
     for start in (asked(HOST), asked()):
         assert (b"x-frame-options", b"DENY") in start["headers"]
 
 
 @pytest.mark.parametrize("is_local", [True, False])
 @pytest.mark.parametrize("hold_real_rig", [True, False])
-def test_a_real_rig_is_held_at_its_own_machine_where_that_is_allowed(
-    hold_real_rig: bool, is_local: bool
-) -> None:
+def test_real_rig_is_held_only_locally_and_if_allowed(hold_real_rig: bool, is_local: bool) -> None:
     port = PagePort(ConsoleParameters(hold_real_rig=hold_real_rig))
     # A device that is not heard may be a real one.
     assert (port.why_no_hold(is_local) == "") == (hold_real_rig and is_local)
@@ -107,6 +105,6 @@ def test_a_real_rig_is_held_at_its_own_machine_where_that_is_allowed(
         assert may_hold == (simulated is True or (hold_real_rig and is_local))
 
 
-def test_one_port_cannot_serve_both() -> None:
+def test_page_and_hold_need_two_ports() -> None:
     with pytest.raises(UserError, match="8081, wants two"):
         ConsoleParameters(port=8081)

@@ -26,7 +26,7 @@ def page(scene: Scene) -> int:
     return scene.page()
 
 
-def test_a_press_after_a_release_counts_with_its_speed_and_mode(scene: Scene, page: int) -> None:
+def test_press_after_a_release_counts(scene: Scene, page: int) -> None:
     assert scene.say(page, True) is HoldRefusal.NEW_PRESS
     assert scene.protocol.state(scene.now) == RELEASED
     assert scene.say(page, False) is None
@@ -38,9 +38,7 @@ def test_a_press_after_a_release_counts_with_its_speed_and_mode(scene: Scene, pa
     assert scene.protocol.state(scene.now) == RELEASED
 
 
-def test_a_hold_goes_on_while_it_is_confirmed_and_ends_with_silence(
-    scene: Scene, page: int
-) -> None:
+def test_hold_lasts_while_echoed_and_ends_with_silence(scene: Scene, page: int) -> None:
     # The bound of docs/safety.md: 300 ms, transport and the device's cycle included.
     assert ECHO_AGE_LIMIT + PERIOD < 0.3
     scene.press(page)
@@ -61,9 +59,7 @@ def test_a_hold_goes_on_while_it_is_confirmed_and_ends_with_silence(
     assert scene.told(page)["why"] == ""
 
 
-def test_a_hold_counts_from_when_its_count_was_sent_however_late_the_echo(
-    scene: Scene, page: int
-) -> None:
+def test_hold_age_counts_from_the_sent_count(scene: Scene, page: int) -> None:
     scene.press(page)
     begin, held_up = scene.now, []
     while scene.now + PERIOD < begin + ECHO_AGE_LIMIT:
@@ -80,7 +76,7 @@ def test_a_hold_counts_from_when_its_count_was_sent_however_late_the_echo(
 
 @pytest.mark.parametrize("holds", [True, False])
 @pytest.mark.parametrize("held_up", [[True] * 12, [False, True]])
-def test_a_burst_after_a_stall_does_not_count_then_or_later(
+def test_burst_after_a_stall_does_not_count(
     scene: Scene, page: int, held_up: list[bool], holds: bool
 ) -> None:
     if holds:
@@ -96,7 +92,7 @@ def test_a_burst_after_a_stall_does_not_count_then_or_later(
     scene.press(page)
 
 
-def test_an_echo_counts_once_and_a_release_may_repeat_the_last(scene: Scene, page: int) -> None:
+def test_echo_counts_once_except_for_a_release(scene: Scene, page: int) -> None:
     assert scene.say(page, False, count=1) is HoldRefusal.ECHO, "nothing was sent"
     scene.press(page)
     count = scene.count(page)
@@ -111,7 +107,7 @@ def test_an_echo_counts_once_and_a_release_may_repeat_the_last(scene: Scene, pag
     assert scene.say(page, False, count=count) is HoldRefusal.ECHO
 
 
-def test_an_echo_of_another_connection_does_not_count(scene: Scene, page: int) -> None:
+def test_echo_of_another_connection_does_not_count(scene: Scene, page: int) -> None:
     other = scene.page()
     scene.say(page, False)
     counts = [scene.count(which) for which in (page, other, page)]
@@ -135,7 +131,7 @@ def test_an_echo_of_another_connection_does_not_count(scene: Scene, page: int) -
         (lambda scene, page: scene.say(page, True, speed=float("nan")), HoldRefusal.INVALID),
     ],
 )
-def test_what_is_no_confirmation_ends_a_hold_and_takes_a_new_press(
+def test_invalid_message_ends_the_hold(
     scene: Scene, page: int, act: Callable[[Scene, int], HoldRefusal | None], refusal: HoldRefusal
 ) -> None:
     scene.press(page)
@@ -150,7 +146,7 @@ def test_what_is_no_confirmation_ends_a_hold_and_takes_a_new_press(
 
 
 @pytest.mark.parametrize("is_local", [True, False])
-def test_a_barred_page_holds_nothing_and_is_told_why(scene: Scene, is_local: bool) -> None:
+def test_barred_page_gets_the_reason(scene: Scene, is_local: bool) -> None:
     page = scene.page(is_local=is_local)
     scene.bars[not is_local] = "of no concern"
     scene.press(page)
@@ -164,7 +160,7 @@ def test_a_barred_page_holds_nothing_and_is_told_why(scene: Scene, is_local: boo
     scene.press(page)
 
 
-def test_one_page_owns_the_hold_until_it_is_gone_or_idle(scene: Scene) -> None:
+def test_page_owns_the_hold_until_it_disconnects_or_idles(scene: Scene) -> None:
     first, second, third = scene.page(), scene.page(), scene.page()
     scene.press(first)
     scene.say(first, False)
@@ -190,7 +186,7 @@ def test_one_page_owns_the_hold_until_it_is_gone_or_idle(scene: Scene) -> None:
     assert not scene.pressed
 
 
-def test_an_owner_that_holds_for_long_is_not_idle(scene: Scene) -> None:
+def test_owner_that_holds_is_not_idle(scene: Scene) -> None:
     first, second = scene.page(), scene.page()
     scene.press(first)
     for _ in range(round(IDLE / 0.2) + 2):
@@ -201,7 +197,7 @@ def test_an_owner_that_holds_for_long_is_not_idle(scene: Scene) -> None:
     assert scene.pressed
 
 
-def test_a_page_is_gone_when_it_is_silent(scene: Scene, page: int) -> None:
+def test_silent_page_is_lost(scene: Scene, page: int) -> None:
     scene.wait(SILENCE)
     assert not scene.protocol.is_silent(page, scene.now)
     scene.wait(JUST)
@@ -290,7 +286,7 @@ class Witness(Scene):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_nothing_resumes_by_itself_whatever_comes(seed: int) -> None:
+def test_nothing_resumes_by_itself(seed: int) -> None:
     rng = random.Random(seed)
     for _ in range(30):
         witness = Witness()

@@ -39,7 +39,7 @@ class Scene:
 
 
 @pytest.mark.parametrize("first", ["word", "message", "look"])
-def test_after_a_stall_the_page_is_told_why_its_hold_has_ended(first: str) -> None:
+def test_page_gets_the_reason_after_a_stall(first: str) -> None:
     scene = Scene()
     scene.come(0.0)
     scene.say(False, 1.0)
@@ -58,7 +58,7 @@ def test_after_a_stall_the_page_is_told_why_its_hold_has_ended(first: str) -> No
     assert not scene.states[-1].pressed
 
 
-def test_the_hold_is_handed_on_every_20_ms_and_without_a_page_every_80_ms() -> None:
+def test_hold_is_reported_every_20_ms_or_80_ms_without_a_page() -> None:
     scene = Scene()
     now = scene.look_until(0.0, 1.0)
     assert set(scene.states) == {RELEASED}
@@ -72,7 +72,7 @@ def test_the_hold_is_handed_on_every_20_ms_and_without_a_page_every_80_ms() -> N
     assert len(scene.states) == pytest.approx(1.0 / PERIOD, abs=1)
 
 
-def test_a_hold_is_handed_on_at_once_when_it_begins_runs_out_or_its_page_goes() -> None:
+def test_changes_of_the_hold_are_reported_at_once() -> None:
     scene = Scene()
     scene.come(0.0)
     for end in ("silence", "close"):
@@ -91,7 +91,7 @@ def test_a_hold_is_handed_on_at_once_when_it_begins_runs_out_or_its_page_goes() 
         assert scene.states[-1] == RELEASED
 
 
-def test_what_is_refused_or_lost_is_counted_and_logged_once() -> None:
+def test_refusals_are_counted_and_logged_once() -> None:
     scene = Scene()
     scene.come(0.0)
     for _ in range(3):

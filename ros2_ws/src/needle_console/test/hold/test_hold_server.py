@@ -74,14 +74,14 @@ class Page:
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "192.168.1.9"])
-def test_a_page_that_goes_releases_and_is_known_by_its_address(rig: Rig, address: str) -> None:
+def test_disconnected_page_releases_the_hold(rig: Rig, address: str) -> None:
     page: Any = Page(False, True, True, address=address)
     rig.server._loop.run_until_complete(rig.server._serve_page(page))
     assert [state.pressed for state in rig.states] == [True, False]
     assert set(rig.asked) == {address == "127.0.0.1"}
 
 
-def test_the_last_that_the_server_hands_on_is_a_release(rig: Rig) -> None:
+def test_server_ends_with_a_release(rig: Rig) -> None:
     rig.server._end()
     rig.server.start()
     rig.server.close()
@@ -89,7 +89,7 @@ def test_the_last_that_the_server_hands_on_is_a_release(rig: Rig) -> None:
     assert not rig.server.is_alive
 
 
-def test_foreign_pages_are_refused_before_a_word_and_counted(rig: Rig) -> None:
+def test_foreign_pages_are_refused_and_counted(rig: Rig) -> None:
     connection: Any = SimpleNamespace(respond=lambda status, text: (int(status), text))
 
     def judged(path: str, *headers: tuple[str, str]) -> Any:
@@ -111,6 +111,6 @@ def test_foreign_pages_are_refused_before_a_word_and_counted(rig: Rig) -> None:
     assert rig.notices == [f"hold: {kind}" for kind in counts]
 
 
-def test_a_port_that_is_taken_is_said(rig: Rig) -> None:
+def test_taken_port_is_reported(rig: Rig) -> None:
     with pytest.raises(UserError, match=rf"hold: 127.0.0.1 port {rig.server.port}: "):
         HoldServer(Access("127.0.0.1", 8080), rig.server.port, lambda _: "", print, print)

@@ -20,14 +20,14 @@ WRONG: dict[str, list[Any]] = {
 NO_OBJECTS = ["", "{", "[]", "1", "null", json.dumps(GOOD) + "x", "[" * 100_000, b"\0", b"\xff\xfe"]
 
 
-def test_a_message_is_read() -> None:
+def test_valid_message_is_read() -> None:
     assert read_message(json.dumps(GOOD)) == (3, PageHold(True, 0.5, Mode.RETRACT))
     for speed in (0, 1):
         assert read_message(json.dumps({**GOOD, "speed": speed}))[1].speed == float(speed)
 
 
 @pytest.mark.parametrize("key", WRONG)
-def test_a_field_that_is_wrong_too_many_or_missing_is_garbage(key: str) -> None:
+def test_invalid_extra_or_missing_field_is_refused(key: str) -> None:
     for value in WRONG[key]:
         with pytest.raises(ValueError):
             read_message(json.dumps({**GOOD, key: value}))
@@ -37,6 +37,6 @@ def test_a_field_that_is_wrong_too_many_or_missing_is_garbage(key: str) -> None:
 
 
 @pytest.mark.parametrize("data", NO_OBJECTS, ids=range(len(NO_OBJECTS)))
-def test_what_is_no_json_object_is_garbage(data: str | bytes) -> None:
+def test_other_data_than_a_json_object_is_refused(data: str | bytes) -> None:
     with pytest.raises(ValueError):
         read_message(data)

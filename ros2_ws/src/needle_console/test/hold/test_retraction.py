@@ -9,7 +9,7 @@ INSERT = PageHold(True, 1.0, Mode.INSERT)
 OUT = PageHold(True, 1.0, Mode.RETRACT)
 
 
-def test_an_insertion_is_passed_on_as_it_is() -> None:
+def test_insertion_is_passed_on_unchanged() -> None:
     retraction = Retraction()
     for steering in (True, False):
         assert retraction.update(INSERT, 0.0, steering=steering, hold_counts=True) == HoldOrder(
@@ -20,7 +20,7 @@ def test_an_insertion_is_passed_on_as_it_is() -> None:
         )
 
 
-def test_steering_ends_before_the_hold_is_passed_on_and_each_call_is_made_once() -> None:
+def test_retraction_stops_steering_first_and_calls_each_service_once() -> None:
     retraction = Retraction()
     assert retraction.update(OUT, 0.0, steering=True, hold_counts=False) == HoldOrder(
         False, (STOP_STEERING,)
@@ -41,7 +41,7 @@ def test_steering_ends_before_the_hold_is_passed_on_and_each_call_is_made_once()
     )
 
 
-def test_a_needle_that_is_out_already_leaves_no_hold() -> None:
+def test_retraction_of_a_needle_that_is_out_ends_the_hold() -> None:
     retraction = Retraction()
     assert retraction.update(OUT, 0.0, steering=False, hold_counts=True) == HoldOrder(
         True, (RETRACT,)

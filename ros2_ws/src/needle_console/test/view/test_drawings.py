@@ -46,7 +46,7 @@ def view(snapshot: Snapshot, camera: Any, size: tuple[int, int]) -> np.ndarray:
     return np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), dtype=float)
 
 
-def test_shaft_tip_and_target_are_drawn_where_the_camera_sees_them() -> None:
+def test_shaft_tip_and_target_are_drawn_at_their_pixels() -> None:
     camera, size = Camera(), (960, 1280)
     target = (-0.01, 0.0, 0.08)
     controller = ControllerStatus(target_point_m=target)
@@ -72,7 +72,7 @@ def test_shaft_tip_and_target_are_drawn_where_the_camera_sees_them() -> None:
     view(Snapshot(insertion=9.0, tip=beyond, track=track(0.1, 4.0)), camera, size)
 
 
-def test_views_are_drawn_for_who_asks_and_at_most_ten_times_a_second() -> None:
+def test_views_are_drawn_at_most_ten_times_per_second() -> None:
     drawn: list[Snapshot] = []
 
     def snapshot() -> Snapshot:
@@ -105,7 +105,7 @@ def read(points: str, picture: ElementTree.Element) -> np.ndarray:
     return np.column_stack([np.polyval(s, p) for s, p in zip(scales, places, strict=True)])
 
 
-def test_the_chart_has_r1_its_band_and_the_goal_in_mm() -> None:
+def test_chart_shows_r1_sigma_and_goal_in_mm() -> None:
     picture = ElementTree.fromstring(chart(Snapshot(track=track(0.02, 0.04))))
     (line,), (band,) = picture.iter("polyline"), picture.iter("polygon")
     for points, meant in (
@@ -119,7 +119,7 @@ def test_the_chart_has_r1_its_band_and_the_goal_in_mm() -> None:
 
 
 @pytest.mark.parametrize("deepest", [0.0005, 0.12, 0.45])
-def test_all_of_a_chart_lies_within_its_picture(deepest: float) -> None:
+def test_chart_stays_within_its_frame(deepest: float) -> None:
     text = chart(Snapshot(track=track(*np.linspace(1e-4, deepest, 50))))
     picture = ElementTree.fromstring(text)
     _, _, width, height = map(float, picture.attrib["viewBox"].split())
@@ -131,14 +131,14 @@ def test_all_of_a_chart_lies_within_its_picture(deepest: float) -> None:
     assert "nan" not in chart(Snapshot())
 
 
-def test_space_keeps_right_handed_axes_and_lengths() -> None:
+def test_view_transform_is_a_rotation_in_mm() -> None:
     axes = to_view(np.eye(3)) / 1e3
     assert np.linalg.det(axes) == pytest.approx(1.0)
     assert axes[2] == pytest.approx([1.0, 0.0, 0.0])
     assert axes[0] == pytest.approx([0.0, 0.0, 1.0])
 
 
-def test_the_ellipsoid_is_two_sigma_of_the_covariance() -> None:
+def test_ellipsoid_is_two_sigma() -> None:
     assert ellipsoid(Snapshot()) is None
     for snapshot, place in (
         (Snapshot(track=track(0.05), tip=TIP), track(0.05)[0].position),
@@ -154,7 +154,7 @@ def test_the_ellipsoid_is_two_sigma_of_the_covariance() -> None:
         assert np.sqrt(np.diag(spread)) == pytest.approx([0.6, 0.2, 0.4])
 
 
-def test_the_shaft_is_drawn_from_the_entry_to_the_tip() -> None:
+def test_shaft_reaches_from_entry_to_tip() -> None:
     snapshot = Snapshot(insertion=0.015, track=track(*np.arange(0.0005, 0.02, 0.0005)))
     points = shaft_points(snapshot)
     assert points[0] == pytest.approx([0.0, 0.0, 0.0])
@@ -163,7 +163,7 @@ def test_the_shaft_is_drawn_from_the_entry_to_the_tip() -> None:
     assert len(shaft_points(Snapshot())) == 1
 
 
-def test_a_tilted_plane_lies_where_it_was_asked_for() -> None:
+def test_tilted_plane_position() -> None:
     pose = plane_pose(4.0, 30.0)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
     snapshot = Snapshot(T_rig_plane=pose)
@@ -175,7 +175,7 @@ def test_a_tilted_plane_lies_where_it_was_asked_for() -> None:
     assert plane_centre(snapshot, 0.12)[2] > 4.0
 
 
-def test_a_target_out_of_bounds_is_refused() -> None:
+def test_target_out_of_bounds_is_refused() -> None:
     for plane in ((math.nan, 0.0), (50.1, 0.0), (-50.1, 0.0), (0.0, 45.1), (0.0, math.inf)):
         with pytest.raises(UserError):
             plane_pose(*plane)
@@ -185,7 +185,7 @@ def test_a_target_out_of_bounds_is_refused() -> None:
             target_point(*point)
 
 
-def test_the_dial_points_up_at_0_and_to_the_right_after_a_quarter_turn() -> None:
+def test_dial_pointer_direction() -> None:
     assert 'x2="24.00" y2="6.00"' in dial(0.0)
     assert 'x2="42.00" y2="24.00"' in dial(math.pi / 2)
     assert "#0072b2" not in dial(math.nan)

@@ -28,14 +28,14 @@ def seen(*depths: float) -> RigPicture:
     return picture
 
 
-def test_joints_that_fall_silent_are_not_shown_as_if_they_were_there() -> None:
+def test_outdated_joints_are_not_shown() -> None:
     picture = seen(0.01)
     assert picture.snapshot(0.9).insertion == 0.01
     assert math.isnan(picture.snapshot(1.1).insertion)
     assert readings(picture.snapshot(1.1))["Depth"] == NONE
 
 
-def test_estimates_are_placed_in_rig_by_the_plane_in_force() -> None:
+def test_estimates_are_transformed_by_the_current_plane() -> None:
     (point,) = seen(0.05).snapshot(0.0).track
     assert point.r1 == pytest.approx(-0.002)
     assert point.position == pytest.approx([0.001, 0.0, 0.05])
@@ -52,7 +52,7 @@ def test_estimates_are_placed_in_rig_by_the_plane_in_force() -> None:
     assert point.covariance == pytest.approx(1e-6 * np.outer(along, along))
 
 
-def test_a_plane_that_the_controller_did_not_take_is_not_shown() -> None:
+def test_plane_is_shown_only_if_the_controller_accepted_it() -> None:
     picture = seen(0.01)
     tilted = plane_pose(9.0, 36.0)
     picture.set_plane(tilted)
@@ -61,7 +61,7 @@ def test_a_plane_that_the_controller_did_not_take_is_not_shown() -> None:
     assert picture.snapshot(0.0).T_rig_plane == pytest.approx(tilted)
 
 
-def test_why_the_device_ended_a_hold_outlasts_that_the_press_goes_on() -> None:
+def test_reason_of_an_ended_hold_is_kept_while_pressed() -> None:
     moving = DeviceStatus(state="MOVING", hold_owner="console")
     silent = DeviceStatus(state="HOLDING", reason="no hold message for 0.105 s, limit 0.1 s")
     again = DeviceStatus(reason="hold of 'console' does not count (hold_new_press)")
@@ -80,7 +80,7 @@ def test_why_the_device_ended_a_hold_outlasts_that_the_press_goes_on() -> None:
         assert stop_reason(device) == why
 
 
-def test_a_controller_that_is_gone_steers_no_longer() -> None:
+def test_missing_controller_is_cleared() -> None:
     picture = seen(0.01)
     picture.clear_controller()
     assert picture.latest().controller is None
@@ -88,7 +88,7 @@ def test_a_controller_that_is_gone_steers_no_longer() -> None:
     assert picture.snapshot(0.0).controller == STEERING
 
 
-def test_a_course_goes_deeper_only_and_a_new_start_begins_a_new_one() -> None:
+def test_track_deepens_and_restarts() -> None:
     picture = seen(0.010, 0.011, 0.0111, 0.012)
     assert [point.depth for point in picture.snapshot(0.0).track] == [0.010, 0.0111, 0.012]
     picture.set_joints(0.0105, 0.1, now=0.0)
@@ -99,7 +99,7 @@ def test_a_course_goes_deeper_only_and_a_new_start_begins_a_new_one() -> None:
     assert picture.snapshot(0.0).track == ()
 
 
-def test_a_tip_says_for_how_long_it_is_lost_or_old() -> None:
+def test_age_of_a_lost_or_old_tip() -> None:
     picture = seen(0.01)
     picture.set_tip(np.array([0.0, -0.001, 0.01]), COVARIANCE, now=1.0)
     for now, text in ((1.5, f"0.0, {MINUS}1.0, 10.0 mm"), (2.9, "no images for 2 s")):
@@ -110,7 +110,7 @@ def test_a_tip_says_for_how_long_it_is_lost_or_old() -> None:
     assert readings(picture.snapshot(4.5))["Tip"] == "not found for 2.5 s"
 
 
-def test_numbers_that_are_none_change_nothing() -> None:
+def test_non_finite_values_are_ignored() -> None:
     picture = seen(0.01)
     before = picture.snapshot(0.5)
     picture.set_joints(math.nan, 0.0, now=0.5)
@@ -122,7 +122,7 @@ def test_numbers_that_are_none_change_nothing() -> None:
     assert np.isfinite(after.T_rig_plane).all()
 
 
-def test_troubles_end_when_they_are_mended_or_no_longer_told() -> None:
+def test_warnings_end_when_resolved_or_outdated() -> None:
     picture = RigPicture()
     picture.set_health("a: x", bad=True, message="broken\x07", now=0.0)
     picture.set_health("b: y", bad=True, message="late", now=0.0)
@@ -132,7 +132,7 @@ def test_troubles_end_when_they_are_mended_or_no_longer_told() -> None:
     assert picture.snapshot(9.0).warnings == ()
 
 
-def test_readings_are_in_mm_and_degrees_and_a_dash_where_nothing_is_known() -> None:
+def test_readings_are_in_mm_and_degrees() -> None:
     assert set(readings(Snapshot(DeviceStatus(), ControllerStatus())).values()) == {NONE}
     picture = seen(0.05)
     told = dataclasses.replace(STEERING, depth_m=0.12, r1_low_m=-0.0025, r1_high_m=-0.0015)

@@ -55,7 +55,7 @@ def fits(word: int, pattern: str) -> bool:
     return all(bit in ("x", value) for bit, value in zip(bits, f"{word & 0xFF:08b}", strict=True))
 
 
-def test_statuswords_controlwords_and_transitions_are_the_standards() -> None:
+def test_states_commands_and_transitions_match_the_standard() -> None:
     for word in range(256):
         # The upper byte and bits 4 and 7 say nothing about the state.
         wanted = [name for pattern, name in PATTERNS.items() if fits(word, pattern)]
@@ -67,7 +67,7 @@ def test_statuswords_controlwords_and_transitions_are_the_standards() -> None:
     assert {(a.name, c.name, b.name) for (a, c), b in TRANSITIONS.items()} == wanted_ways
 
 
-def test_the_way_to_every_goal_ends_there_and_acknowledges_no_fault() -> None:
+def test_commands_reach_every_goal_without_fault_reset() -> None:
     ends = {
         Goal.ON: {DriveState.OPERATION_ENABLED},
         Goal.OFF: {DriveState.SWITCH_ON_DISABLED},
@@ -85,7 +85,7 @@ def test_the_way_to_every_goal_ends_there_and_acknowledges_no_fault() -> None:
         assert next_command(goal, state, at_rest=True) is order
 
 
-def test_a_moving_axis_is_never_left_to_coast() -> None:
+def test_moving_axis_never_coasts() -> None:
     for goal in (Goal.OFF, Goal.STOPPED):
         for state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE):
             assert next_command(goal, state, at_rest=False) is DriveCommand.QUICK_STOP
@@ -96,7 +96,7 @@ def test_a_moving_axis_is_never_left_to_coast() -> None:
     assert next_command(Goal.STOPPED, None, at_rest=True) is DriveCommand.QUICK_STOP
 
 
-def test_the_watch_names_what_nobody_ordered_but_not_what_crosses_on_the_bus_nor_a_fault() -> None:
+def test_transition_monitor_reports_unexplained_transitions() -> None:
     watch = TransitionMonitor()
     for state, command in (
         (DriveState.NOT_READY_TO_SWITCH_ON, DriveCommand.DISABLE_VOLTAGE),

@@ -32,7 +32,7 @@ class Named:
         return self._name
 
 
-def test_one_drive_that_does_not_say_emulated_is_real() -> None:
+def test_drives_count_as_real_unless_all_report_emulated() -> None:
     for second, emulated in (
         (b"Emulated rotation drive", True),
         (b"EL7041", False),

@@ -42,7 +42,7 @@ def enabled(machine: DriveMachine, position: int = 0) -> None:
 
 
 @pytest.mark.parametrize("goal", [Goal.OFF, Goal.ON])
-def test_after_a_quick_stop_nothing_is_ordered_before_the_axis_stands(
+def test_no_command_after_a_quick_stop_before_the_axis_rests(
     machine: DriveMachine, goal: Goal
 ) -> None:
     enabled(machine)
@@ -57,14 +57,14 @@ def test_after_a_quick_stop_nothing_is_ordered_before_the_axis_stands(
     assert machine.target == 1009
 
 
-def test_a_stop_on_the_way_off_ends_off(machine: DriveMachine) -> None:
+def test_stop_while_switching_off_ends_off(machine: DriveMachine) -> None:
     enabled(machine)
     machine.set_goal(Goal.OFF)
     machine.stop()
     assert orders(machine, *[said(QUICK_STOP)] * 4)[-1] is DriveCommand.DISABLE_VOLTAGE
 
 
-def test_a_stop_holds_until_the_drive_has_said_that_it_took_it(machine: DriveMachine) -> None:
+def test_stop_is_repeated_until_the_drive_confirms_it(machine: DriveMachine) -> None:
     enabled(machine)
     machine.stop()
     machine.set_goal(Goal.ON)
@@ -73,9 +73,7 @@ def test_a_stop_holds_until_the_drive_has_said_that_it_took_it(machine: DriveMac
 
 
 @pytest.mark.parametrize("behind", [3, -3])
-def test_a_stopped_axis_that_its_drive_would_pull_on_is_switched_off(
-    machine: DriveMachine, behind: int
-) -> None:
+def test_blocked_axis_is_released_when_stopped(machine: DriveMachine, behind: int) -> None:
     enabled(machine)
     machine.stop()
     places = (400, 500, 500, 500, 500)
@@ -102,7 +100,7 @@ def test_a_stopped_axis_that_its_drive_would_pull_on_is_switched_off(
         ([8, -8] * 10, False),
     ],
 )
-def test_a_drive_that_runs_on_in_its_quick_stop_is_switched_off(
+def test_drive_that_moves_on_in_its_quick_stop_is_switched_off(
     machine: DriveMachine, ways: list[int], off: bool
 ) -> None:
     for _ in range(2):
@@ -137,7 +135,7 @@ def test_the_mode_changes_only_while_the_drive_is_off(machine: DriveMachine) -> 
     assert (machine.powered, machine.ready) == (True, False)
 
 
-def test_an_axis_that_never_comes_to_rest_is_switched_off_all_the_same(
+def test_axis_that_never_rests_is_switched_off(
     machine: DriveMachine,
 ) -> None:
     enabled(machine)
@@ -147,7 +145,7 @@ def test_an_axis_that_never_comes_to_rest_is_switched_off_all_the_same(
     assert given == [DriveCommand.QUICK_STOP] * 50 + [DriveCommand.DISABLE_VOLTAGE]
 
 
-def test_a_drive_that_ignores_the_stop_is_switched_off_later(machine: DriveMachine) -> None:
+def test_drive_that_ignores_the_stop_is_switched_off(machine: DriveMachine) -> None:
     enabled(machine)
     machine.stop()
     given = orders(machine, *(said(ENABLED, 100 * count) for count in range(35)))
@@ -155,7 +153,9 @@ def test_a_drive_that_ignores_the_stop_is_switched_off_later(machine: DriveMachi
     assert "runs on when stopped" in machine.problem
 
 
-def test_a_fault_is_left_alone_and_a_word_of_no_state_is_trouble(machine: DriveMachine) -> None:
+def test_fault_is_not_acknowledged_and_unknown_statusword_is_a_problem(
+    machine: DriveMachine,
+) -> None:
     enabled(machine)
     assert orders(machine, said(FAULT)) == [DriveCommand.DISABLE_VOLTAGE]
     assert machine.problem == ""
@@ -165,7 +165,7 @@ def test_a_fault_is_left_alone_and_a_word_of_no_state_is_trouble(machine: DriveM
     assert (machine.problem, machine.target, machine.switching) == ("", 7, False)
 
 
-def test_a_drive_that_leaves_its_mode_has_as_long_as_one_that_is_switched_on(
+def test_time_limit_of_a_drive_that_leaves_its_mode(
     machine: DriveMachine,
 ) -> None:
     enabled(machine)
@@ -176,7 +176,7 @@ def test_a_drive_that_leaves_its_mode_has_as_long_as_one_that_is_switched_on(
 
 
 @pytest.mark.parametrize(("statusword", "told"), [(0x0250, False), (0x0050, True)])
-def test_a_drive_that_does_not_listen_to_the_bus_is_told(
+def test_drive_without_remote_bit_is_reported(
     machine: DriveMachine, statusword: int, told: bool
 ) -> None:
     machine.set_goal(Goal.ON)

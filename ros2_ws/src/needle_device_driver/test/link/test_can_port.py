@@ -162,7 +162,7 @@ def test_close_ends_the_thread_and_releases_the_adapter(adapter: Adapter) -> Non
     assert Port("slcan", adapter.path).changes == [""]
 
 
-def test_slcan_takes_what_comes_in_any_pieces_and_counts_what_is_no_frame(adapter: Adapter) -> None:
+def test_slcan_receives_frames_in_any_pieces(adapter: Adapter) -> None:
     port = Port("slcan", adapter.path)
     adapter.say(b"\r\rz\rt1812")
     adapter.say(b"37")
@@ -177,7 +177,7 @@ def test_slcan_takes_what_comes_in_any_pieces_and_counts_what_is_no_frame(adapte
     assert port.changes == [""]
 
 
-def test_slcan_that_is_silent_is_told_to_open_again(adapter: Adapter) -> None:
+def test_slcan_sets_up_a_silent_adapter_again(adapter: Adapter) -> None:
     # It starts when its port is opened, and hears nothing meanwhile.
     port = Port("slcan", adapter.path, bitrate=125_000)
     assert adapter.read(b"O\r") == b"\rC\rS4\r\rO\r"
@@ -196,7 +196,7 @@ def test_slcan_that_is_silent_is_told_to_open_again(adapter: Adapter) -> None:
     assert adapter.read(b"t0800\r") == b"t0800\r"
 
 
-def test_slcan_unplugged_is_told_and_opened_again() -> None:
+def test_slcan_reopens_an_unplugged_adapter() -> None:
     adapter = Adapter()
     port = Port("slcan", adapter.path)
     adapter.unplug()
@@ -226,7 +226,7 @@ def test_slcan_unplugged_is_told_and_opened_again() -> None:
         ("socketcand", "can0"),
     ],
 )
-def test_what_is_not_there_is_told_in_one_line_and_once(kind: str, channel: str) -> None:
+def test_missing_adapter_is_reported_once_in_one_line(kind: str, channel: str) -> None:
     port = Port(kind, channel, port=1)
     port.port.step()
     (why,) = port.changes
@@ -234,7 +234,7 @@ def test_what_is_not_there_is_told_in_one_line_and_once(kind: str, channel: str)
     assert "\n" not in why
 
 
-def test_virtual_carries_frames_both_ways_and_not_those_of_others() -> None:
+def test_virtual_passes_data_frames_both_ways() -> None:
     port = Port("virtual", "test_can_port")
     with can.Bus(interface="virtual", channel="test_can_port") as peer:
         for message in (
@@ -273,7 +273,7 @@ class Daemon:
         self.peer.close()
 
 
-def test_socketcand_carries_frames_and_its_end_is_a_lost_link(
+def test_socketcand_passes_frames_and_detects_a_closed_connection(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     daemon = Daemon(monkeypatch)
@@ -294,7 +294,7 @@ def test_socketcand_carries_frames_and_its_end_is_a_lost_link(
 
 
 @pytest.mark.parametrize("length", [1, 7, 250, 1000])
-def test_socketcand_frames_may_come_with_the_answer_in_any_pieces(
+def test_socketcand_receives_frames_in_any_pieces(
     monkeypatch: pytest.MonkeyPatch, length: int
 ) -> None:
     daemon = Daemon(monkeypatch, b"< hi >< ok >< ok >< frame 181 1.5 3702 >< frame 18")
@@ -313,7 +313,7 @@ def test_socketcand_frames_may_come_with_the_answer_in_any_pieces(
     daemon.close()
 
 
-def test_socketcand_that_is_none_is_refused_and_hangs_nobody(
+def test_socketcand_refuses_another_server(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for said, why in (

@@ -21,7 +21,7 @@ from needle_device_driver.parameters import DeviceDriverParameters
 DRIVE = DeviceDriverParameters().drive("insertion")
 
 
-def test_entries_and_pdos_are_packed_little_endian_in_their_order() -> None:
+def test_entries_and_pdos_are_packed_little_endian() -> None:
     assert od.CONTROLWORD.mapping == 0x60400010
     assert od.LOWER_LIMIT.mapping == 0x607D0120
     assert od.COMMAND.pack(0x0F, 8) == b"\x0f\x00\x08"
@@ -42,13 +42,13 @@ def test_entries_and_pdos_are_packed_little_endian_in_their_order() -> None:
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(st.floats(-0.2, 0.2), st.booleans())
-def test_a_position_comes_back_to_half_a_count(position: float, reverse: bool) -> None:
+def test_position_round_trip_is_accurate_to_half_a_count(position: float, reverse: bool) -> None:
     drive = dataclasses.replace(DRIVE, reverse=reverse)
     back = drive.position(drive.counts(position))
     assert abs(back - position) <= 0.5 / drive.counts_per_unit * (1 + 1e-9)
 
 
-def test_a_drive_that_counts_in_reverse_has_its_limits_the_other_way_round() -> None:
+def test_reverse_drive_swaps_its_limits() -> None:
     reverse = dataclasses.replace(DRIVE, reverse=True)
     assert DRIVE.limits_counts == (-20_000, 4_020_000)
     assert reverse.limits_counts == (-4_020_000, 20_000)
@@ -57,7 +57,7 @@ def test_a_drive_that_counts_in_reverse_has_its_limits_the_other_way_round() -> 
     assert dataclasses.replace(DRIVE, counts_per_unit=1.0).magnitude(0.005) == 1
 
 
-def test_what_no_drive_and_no_rig_can_have_is_refused() -> None:
+def test_invalid_settings_and_parameters_are_refused() -> None:
     values: list[dict[str, Any]] = [
         {"counts_per_unit": 0.0},
         {"counts_per_unit": math.nan},
@@ -83,7 +83,7 @@ def test_what_no_drive_and_no_rig_can_have_is_refused() -> None:
             DeviceDriverParameters(**changes)
 
 
-def test_the_drives_bounds_follow_the_supervisors_and_the_example_is_a_configuration() -> None:
+def test_drive_bounds_follow_the_limits_and_the_example_is_valid() -> None:
     parameters = DeviceDriverParameters(max_depth=0.1, max_speed=0.002, max_turns=1.0)
     insertion, rotation = parameters.drive("insertion"), parameters.drive("rotation")
     assert (insertion.lower, insertion.upper) == pytest.approx((-0.001, 0.101))
@@ -98,7 +98,7 @@ def test_the_drives_bounds_follow_the_supervisors_and_the_example_is_a_configura
     assert (example.max_torque, example.counts(2 * math.pi)) == (0.5, 65536)
 
 
-def test_error_codes_have_words() -> None:
+def test_error_codes_have_texts() -> None:
     assert describe_error(0x8611) == "0x8611 following error"
     assert describe_error(0x4299) == "0x4299 temperature"
     assert describe_error(0x0001) == "0x0001 unknown error"

@@ -53,7 +53,7 @@ class Wire:
         return at_once(self.client.upload(index, subindex))
 
 
-def test_only_an_answer_to_this_very_request_is_one() -> None:
+def test_only_the_response_to_the_request_counts() -> None:
     for late in (
         # To an earlier request, about another subindex, to a request to write.
         "4300100092010200",
@@ -68,14 +68,14 @@ def test_only_an_answer_to_this_very_request_is_one() -> None:
     assert Wire("4102650004000000", "07a1000000000000").upload(0x6502) == b"\xa1\0\0\0"
 
 
-def test_the_heartbeat_goes_on_while_a_drive_takes_its_time() -> None:
+def test_heartbeat_continues_during_a_slow_transfer() -> None:
     wire = Wire()
     wire.on_beat = MODES
     assert wire.upload(0x6502) == b"\xa1\0\0\0"
     assert (wire.beats, wire.sent) == (5, [READ_MODES])
 
 
-def test_a_lost_request_is_sent_again_once_and_then_given_up() -> None:
+def test_request_is_repeated_once() -> None:
     assert Wire("", MODES).upload(0x6502) == b"\xa1\0\0\0"
     wire = Wire()
     with pytest.raises(SdoTimeoutError):
@@ -91,7 +91,7 @@ def test_a_lost_request_is_sent_again_once_and_then_given_up() -> None:
     assert wire.sent == [READ_MODES]
 
 
-def test_a_refusal_has_its_code_and_canopens_words() -> None:
+def test_abort_texts_match_canopen() -> None:
     with pytest.raises(SdoAbortedError) as caught:
         Wire("8002650000000206").upload(0x6502)
     assert caught.value.code == 0x0602_0000
@@ -102,7 +102,7 @@ def test_a_refusal_has_its_code_and_canopens_words() -> None:
     assert str(SdoAbortedError(1)) == "Code 0x00000001"
 
 
-def test_an_answer_may_leave_out_the_bytes_that_it_does_not_need() -> None:
+def test_response_may_omit_unused_bytes() -> None:
     wire = Wire("4b4160003702", "60406000")
     assert wire.upload(0x6041) == b"\x37\x02"
     at_once(wire.client.download(0x6040, 0, b"\x06\x00"))
@@ -133,7 +133,7 @@ class Server(canopen.LocalNode):
 
 
 @pytest.mark.parametrize("size", [1, 4, 5, 7, 8, 14, 100])
-def test_what_it_sends_and_reads_is_what_canopen_does(size: int) -> None:
+def test_frames_match_canopen(size: int) -> None:
     data = bytes(range(1, size + 1))
     ours, theirs = Server(), Server()
     client = SdoClient(1, ours.send_message, lambda: None, 0.001)
@@ -158,7 +158,7 @@ def test_what_it_sends_and_reads_is_what_canopen_does(size: int) -> None:
 # ---- the link -----------------------------------------------------------------------------------
 
 
-def test_the_link_counts_errors_hands_on_frames_and_names_refusals_where_nobody_answers() -> None:
+def test_link_counts_errors_passes_frames_and_reports_refusals() -> None:
     link = FrameLink("virtual test")
     link.open()
     heard: list[tuple[bytes, float]] = []

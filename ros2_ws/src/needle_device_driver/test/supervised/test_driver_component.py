@@ -135,7 +135,7 @@ class DriverBench:
         self.do(self.driver.on_peers(Peers(topics), self.at))
 
 
-def test_it_sets_the_drives_up_homes_and_moves_them() -> None:
+def test_driver_sets_up_homes_and_moves_the_drives() -> None:
     bench = DriverBench()
     bench.run(2)
     assert bench.bus.sent == [], "another device shows itself before"
@@ -158,7 +158,7 @@ def test_it_sets_the_drives_up_homes_and_moves_them() -> None:
     assert (health.message, health.values["unanswered_syncs"]) == ("connected", "0")
 
 
-def test_an_emergency_stop_and_a_release_are_heard_between_cycles() -> None:
+def test_estop_and_release_act_between_cycles() -> None:
     bench = DriverBench().moving()
     bench.hold(False)
     assert bench.outcomes == ["aborted: hold released"]
@@ -176,7 +176,7 @@ def test_an_emergency_stop_and_a_release_are_heard_between_cycles() -> None:
     assert bench.status.state == "DISABLED"
 
 
-def test_its_end_in_the_middle_of_a_step_leaves_the_drives_off_without_watchdog() -> None:
+def test_exit_during_a_step_switches_the_drives_off() -> None:
     bench = DriverBench().moving()
     bench.do(bench.driver.on_stop(bench.at))
     bench.run(10)
@@ -186,7 +186,7 @@ def test_its_end_in_the_middle_of_a_step_leaves_the_drives_off_without_watchdog(
     assert bench.call("enable", True).text == "waiting for the drives"
 
 
-def test_one_device_and_command_one_publisher_count_who_is_there() -> None:
+def test_one_device_and_command_one_publisher_count_peers() -> None:
     bench = DriverBench().ready()
     bench.hears_of(commands=2)
     bench.step()
@@ -206,7 +206,7 @@ def test_one_device_and_command_one_publisher_count_who_is_there() -> None:
     assert (code, "/sim_rig" in text) == (2, True)
 
 
-def test_drives_that_are_not_there_are_waited_for_and_those_that_refuse_are_not() -> None:
+def test_driver_waits_for_missing_drives_and_exits_on_refusal() -> None:
     bench = DriverBench(connect_timeout=3.0)
     bench.drives[1].silent = True
     bench.run(150)
@@ -223,7 +223,7 @@ def test_drives_that_are_not_there_are_waited_for_and_those_that_refuse_are_not(
     assert (code, "refuses to write 0 to 0x1016:1" in text) == (2, True)
 
 
-def test_link_loss_is_a_fault_at_once_and_a_reset_opens_it_anew() -> None:
+def test_link_loss_is_an_immediate_fault_until_reset() -> None:
     bench = DriverBench().moving()
     port = bench.driver.ports[0]
     bench.do(port.on_change(PortChange("unplugged"), bench.at))
@@ -242,7 +242,7 @@ def test_link_loss_is_a_fault_at_once_and_a_reset_opens_it_anew() -> None:
     assert bench.status.state == "DISABLED"
 
 
-def test_a_master_heard_before_the_link_broke_is_no_fault_once_it_is_opened_anew() -> None:
+def test_second_master_is_forgotten_when_the_link_is_reopened() -> None:
     bench = DriverBench()
     port = bench.driver.ports[0]
     bench.drives[1].silent = True
@@ -256,7 +256,7 @@ def test_a_master_heard_before_the_link_broke_is_no_fault_once_it_is_opened_anew
 
 
 @pytest.mark.parametrize("how", ["stop", "disable", "emergency stop", "silence"])
-def test_an_order_that_takes_its_time_is_called_off(how: str) -> None:
+def test_slow_procedure_is_cancelled(how: str) -> None:
     bench = DriverBench().set_up()
     bench.call("confirm_needle_out", True)
     bench.drives[1].silent = True
@@ -285,7 +285,7 @@ def _breaks(*_: Any) -> Any:
     raise ZeroDivisionError("planted")
 
 
-def test_what_raises_stops_both_axes_and_a_cycle_ends_the_driver(
+def test_internal_error_stops_both_axes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bench = DriverBench().moving()
@@ -307,7 +307,7 @@ def test_what_raises_stops_both_axes_and_a_cycle_ends_the_driver(
     assert bench.of(Reply)[-1].text == "called off: internal error"
 
 
-def test_positions_alone_change_the_status_seldom() -> None:
+def test_status_rate_is_limited_for_positions() -> None:
     bench = DriverBench().moving()
     told = []
     for _ in range(40):

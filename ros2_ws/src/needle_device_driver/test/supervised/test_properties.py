@@ -104,7 +104,7 @@ class Witness(Bench):
     is_ready=st.booleans(),
     events=st.lists(st.one_of(_cycles, _cycles, _commands, _others), max_size=40),
 )
-def test_never_without_hold_never_beyond_limits(is_ready: bool, events: list[Event]) -> None:
+def test_no_motion_without_hold_or_beyond_limits(is_ready: bool, events: list[Event]) -> None:
     bench = Witness()
     if is_ready:
         bench.ready()

@@ -163,9 +163,7 @@ REFUSED: list[tuple[Change, str]] = [
 
 
 @pytest.mark.parametrize(("change", "text"), REFUSED)
-def test_a_drive_that_lacks_what_is_needed_is_refused_by_value_and_wish(
-    change: Change, text: str
-) -> None:
+def test_drive_without_a_required_object_or_value_is_refused(change: Change, text: str) -> None:
     bench = DriveBench()
     change(bench.insertion)
     bench.sdo_time = 0.02
@@ -177,7 +175,7 @@ def test_a_drive_that_lacks_what_is_needed_is_refused_by_value_and_wish(
     assert bench.state == "FAULT"
 
 
-def test_the_other_drive_is_judged_alike_and_may_be_set_up_once_the_first_is_mended() -> None:
+def test_refused_rotation_drive_can_be_set_up_after_repair() -> None:
     bench = DriveBench()
     change, text = in_unit(0x60A9, 0x0001_0300, "m/s")
     change(bench.rotation)
@@ -273,7 +271,7 @@ TAKEN: list[Row] = [
 
 
 @pytest.mark.parametrize(("change", "wanted", "missing"), TAKEN)
-def test_a_drive_of_any_maker_is_set_up_as_it_is_and_steps(
+def test_drives_of_many_makers_are_set_up_and_move(
     change: Change, wanted: Values, missing: str
 ) -> None:
     bench = DriveBench()
@@ -285,7 +283,7 @@ def test_a_drive_of_any_maker_is_set_up_as_it_is_and_steps(
     assert told[0].startswith(f"insertion drive {missing}") if missing else told == ()
 
 
-def test_parameters_go_before_what_a_drive_tells() -> None:
+def test_parameters_override_reported_units() -> None:
     bench = DriveBench(insertion_counts_per_turn=50_000.0, rotation_max_torque=0.8)
     fed(360, 1)(bench.insertion)
     bench.configured()
@@ -299,14 +297,14 @@ def test_parameters_go_before_what_a_drive_tells() -> None:
     assert bench.rotation.holds(0x6085) == 955
 
 
-def test_who_is_set_up_again_is_homed_again() -> None:
+def test_new_set_up_needs_a_new_homing() -> None:
     bench = DriveBench().homed()
     assert bench.run(bench.supervisor.deconfigure()).success
     bench.configured()
     assert not bench.is_homed()
 
 
-def test_a_drive_that_started_anew_is_asked_anew() -> None:
+def test_rebooted_drive_reports_its_units_again() -> None:
     bench = DriveBench()
     bench.insertion.tells(IN_RPM)
     bench.configured()
@@ -318,14 +316,14 @@ def test_a_drive_that_started_anew_is_asked_anew() -> None:
     assert bench.insertion.holds(0x6085) == 60_000
 
 
-def test_where_it_stands_has_two_numbers() -> None:
+def test_homing_method_35_replaces_37() -> None:
     bench = DriveBench()
     refuses(RANGE, 0x6098, but=b"\x23")(bench.rotation)
     bench.steps()
     assert bench.rotation.holds(0x6098) == 35
 
 
-def test_an_encoder_of_a_hand_moved_axis_needs_positions_in_counts_alone() -> None:
+def test_axis_without_motor_needs_only_position_units() -> None:
     bench = DriveBench(insertion_drive="hand")
     bench.insertion.tells({(0x60A9, 0): 0x0001_0300, (0x60AA, 0): 0})
     bench.configured()
@@ -335,7 +333,7 @@ def test_an_encoder_of_a_hand_moved_axis_needs_positions_in_counts_alone() -> No
     assert "insertion axis: the drive counts positions in m (0x60A8" in bench.refusal()
 
 
-def test_a_homing_that_is_slower_than_the_unit_of_the_drive_is_refused() -> None:
+def test_homing_slower_than_one_speed_unit_is_refused() -> None:
     bench = DriveBench(homing_speed=1e-5)
     bench.insertion.tells(IN_RPM)
     bench.configured()
@@ -347,7 +345,7 @@ def test_a_homing_that_is_slower_than_the_unit_of_the_drive_is_refused() -> None
 # ---- software limits ----------------------------------------------------------------------------
 
 
-def test_no_limits_are_as_wide_as_the_drive_counts() -> None:
+def test_disabled_limits_fit_the_range_of_the_drive() -> None:
     bench = DriveBench()
     bench.insertion.refuses = lambda index, sub, value: (
         RANGE * (index == 0x607D and abs(int.from_bytes(value, "little", signed=True)) > 2**30)
@@ -356,7 +354,7 @@ def test_no_limits_are_as_wide_as_the_drive_counts() -> None:
     assert [bench.insertion.holds(0x607D, sub) for sub in (1, 2)] == [-(2**30), 2**30 - 1]
 
 
-def test_limits_that_a_homed_drive_does_not_take_keep_it_from_being_switched_on() -> None:
+def test_drive_that_refuses_its_limits_is_not_switched_on() -> None:
     bench = DriveBench().homing()
     refuses(RANGE, 0x607D)(bench.insertion)
     bench.wait(30)
@@ -370,7 +368,7 @@ def test_limits_that_a_homed_drive_does_not_take_keep_it_from_being_switched_on(
     assert "refuses to write -20000 to 0x607D:1" in bench.status.fault
 
 
-def test_between_homing_and_its_limits_nothing_is_switched_on() -> None:
+def test_nothing_is_switched_on_before_the_limits_are_written() -> None:
     bench = DriveBench().homing()
     while not (bench.is_homed() and bench.enable().success):
         # Whoever is in a hurry is asked to call again, and breaks nothing.
@@ -380,7 +378,7 @@ def test_between_homing_and_its_limits_nothing_is_switched_on() -> None:
     assert bench.insertion.holds(0x607D, 1) == -20_000
 
 
-def test_limits_are_taken_from_slow_drives_with_few_heartbeats() -> None:
+def test_slow_drives_with_few_heartbeats_accept_limits() -> None:
     bench = DriveBench().configured()
     bench.sdo_time, bench.insertion.beats, bench.rotation.beats = 0.09, False, False
     assert bench.home().success

@@ -56,7 +56,7 @@ def fault_and_reset(bench: DriveBench) -> None:
 
 
 @pytest.mark.parametrize("scene", [set_up, home, move, quick_stop, fault_and_reset])
-def test_the_bytes_are_those_of_the_transcript(scene: Callable[[DriveBench], None]) -> None:
+def test_frames_match_the_transcript(scene: Callable[[DriveBench], None]) -> None:
     bench = DriveBench()
     scene(bench)
     # Heartbeats are test_bus_rules' concern.

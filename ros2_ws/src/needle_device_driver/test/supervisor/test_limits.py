@@ -54,7 +54,7 @@ HARD = {
 }
 
 
-def test_bounds_of_the_driver_are_those_of_the_document_and_parameters_of_their_name() -> None:
+def test_default_limits_and_their_parameters() -> None:
     assert dataclasses.asdict(SafetyLimits.of(DeviceDriverParameters())) == BOUNDS
     for name, bound in BOUNDS.items():
         changed: dict[str, Any] = {name: 0.9 * bound}
@@ -66,7 +66,7 @@ def test_bounds_of_the_driver_are_those_of_the_document_and_parameters_of_their_
     assert SafetyLimits().longest_homings == pytest.approx((150.0, 1.5 * 20.0 * math.pi))
 
 
-def test_a_bound_is_finite_positive_and_no_more_than_the_hard_one() -> None:
+def test_limits_are_finite_positive_and_capped() -> None:
     for name, bound in HARD.items():
         assert getattr(SafetyLimits(**{name: bound}), name) == bound
         with pytest.raises(OutOfBoundsError, match=name):
@@ -78,7 +78,7 @@ def test_a_bound_is_finite_positive_and_no_more_than_the_hard_one() -> None:
                 SafetyLimits(**{name: bad})
 
 
-def test_a_flood_of_notices_is_counted_and_not_told_but_for_other_rules_and_faults() -> None:
+def test_notices_of_one_rule_are_limited_and_counted() -> None:
     limit, refused = NoticeLimit(), Notice("refused", Rule.TIP_AGE)
     told = [limit.admit(refused, 100.0 + number * 1e-3) for number in range(999)]
     assert [text for text in told if text] == ["refused [tip_age]"] * 5

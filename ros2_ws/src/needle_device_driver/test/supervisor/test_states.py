@@ -30,7 +30,7 @@ WAYS = {
 }
 
 
-def test_each_pair_leads_where_it_should_or_nowhere() -> None:
+def test_transition_table() -> None:
     found = {f"{t.value}: {a.value}-{b.value}" for (a, t), b in TRANSITIONS.items()}
     assert found == {f"{t}: {way}" for t, ways in WAYS.items() for way in ways.split()}
     assert next_state(State.HOLDING, Trigger.MOTION_START) is State.MOVING

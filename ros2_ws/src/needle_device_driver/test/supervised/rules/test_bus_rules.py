@@ -16,7 +16,7 @@ from ..drive_bench import DriveBench
 WATCHDOG = 127 << 16 | 100
 
 
-def test_loop_heartbeat_comes_first_in_each_cycle_and_before_each_request() -> None:
+def test_loop_heartbeat_is_sent_in_each_cycle_and_before_each_request() -> None:
     bench = DriveBench().configured()
     cobs = [cob for cob, _ in bench.bus.sent]
     requests = [number for number, cob in enumerate(cobs) if cob in (0x601, 0x602)]
@@ -27,7 +27,7 @@ def test_loop_heartbeat_comes_first_in_each_cycle_and_before_each_request() -> N
     assert bench.bus.sent[0][0] == 0x77F
 
 
-def test_link_loss_is_named_and_reset_opens_the_link_anew() -> None:
+def test_link_loss_is_reported_and_reset_reopens_the_link() -> None:
     bench = DriveBench().moving()
     bench.broken = "takes nothing for 0.05 s"
     bench.go()
@@ -45,7 +45,7 @@ def test_link_loss_is_named_and_reset_opens_the_link_anew() -> None:
     assert bench.insertion.holds(0x1016, 1) == WATCHDOG
 
 
-def test_link_loss_while_nothing_is_sent_and_before_the_start() -> None:
+def test_link_loss_while_idle_and_before_the_set_up() -> None:
     bench = DriveBench().configured()
     bench.link.set_port_error("gone")
     bench.supervisor.observe(bench.now)
@@ -61,7 +61,7 @@ def test_link_loss_while_nothing_is_sent_and_before_the_start() -> None:
 # ---- answers that do not come, or late ----------------------------------------------------------
 
 
-def test_reply_age_a_cut_bus_reports_nothing_and_is_found() -> None:
+def test_reply_age_detects_a_cut_bus() -> None:
     bench = DriveBench().moving()
     bench.bus.cut = True
     bench.go()
@@ -76,7 +76,7 @@ def test_reply_age_a_cut_bus_reports_nothing_and_is_found() -> None:
     bench.stopped("reply_age", "no reply")
 
 
-def test_reply_age_a_heartbeat_keeps_positions_fresh_only_while_no_sync_is_unanswered() -> None:
+def test_reply_age_heartbeats_renew_only_answered_positions() -> None:
     bench = DriveBench().configured()
     for _ in range(5):
         bench.now += 0.05
@@ -105,7 +105,7 @@ def test_reply_age_a_heartbeat_keeps_positions_fresh_only_while_no_sync_is_unans
     ],
     ids=["80 ms", "100 ms", "growing"],
 )
-def test_reply_age_joints_are_no_older_than_answers_are_late(
+def test_reply_age_includes_late_answers(
     late: Callable[[int], int], cycles: int, rule: str
 ) -> None:
     bench = DriveBench().ready()
@@ -142,7 +142,7 @@ def test_reply_age_joints_are_no_older_than_answers_are_late(
     assert rule or bench.drives.unanswered == cycles
 
 
-def test_reply_age_lost_answers_are_counted_and_given_up_after_a_pause() -> None:
+def test_reply_age_lost_answers_are_discarded_after_a_pause() -> None:
     bench = DriveBench().moving()
     for _ in range(3):
         bench.insertion.loses = 1
@@ -181,7 +181,7 @@ def set_up_again(bench: DriveBench) -> None:
     bench.enabled()
 
 
-def test_drive_reboot_is_a_fault_and_leaves_the_way_out_by_the_depth_known_before() -> None:
+def test_drive_reboot_allows_retraction_by_the_last_depth() -> None:
     bench = DriveBench().moving()
     bench.go(20)
     # Deeper than the software limits reach outward: un-homed, they do not count.
@@ -206,7 +206,7 @@ def test_drive_reboot_is_a_fault_and_leaves_the_way_out_by_the_depth_known_befor
     assert bench.retract().message == "the needle is out"
 
 
-def test_drive_reboot_one_that_starts_by_itself_is_set_up_anew_all_the_same() -> None:
+def test_drive_reboot_of_a_self_starting_drive_needs_a_new_set_up() -> None:
     bench = DriveBench().homed()
     for drive in (bench.insertion, bench.rotation):
         drive.reboot()
@@ -220,7 +220,7 @@ def test_drive_reboot_one_that_starts_by_itself_is_set_up_anew_all_the_same() ->
     assert not bench.is_homed()
 
 
-def test_drive_reboot_a_node_that_left_operational_is_found_by_its_heartbeat() -> None:
+def test_drive_reboot_is_detected_by_the_nmt_state() -> None:
     bench = DriveBench().moving()
     bench.rotation.nmt = 0x7F
     bench.drives.beat()
@@ -228,7 +228,7 @@ def test_drive_reboot_a_node_that_left_operational_is_found_by_its_heartbeat() -
     bench.failed("drive_reboot", "left the operational state")
 
 
-def test_drive_reboot_within_its_set_up_voids_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_reboot_voids_its_set_up(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = DriveBench().homed()
     reboots = [True]
     switch_off = drive_setup._switch_off_unused_pdos
@@ -258,9 +258,7 @@ def test_drive_reboot_within_its_set_up_voids_it(monkeypatch: pytest.MonkeyPatch
         (0x77F, b"\x05", "the heartbeat of node 127"),
     ],
 )
-def test_one_master_another_on_the_bus_is_named_and_stops_both(
-    cob_id: int, data: bytes, what: str
-) -> None:
+def test_one_master_second_master_stops_both(cob_id: int, data: bytes, what: str) -> None:
     bench = DriveBench().moving()
     bench.bus.put(cob_id, data)
     bench.go()

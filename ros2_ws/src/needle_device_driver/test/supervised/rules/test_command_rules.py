@@ -21,7 +21,7 @@ Point = tuple[float, float, float]
 # ---- state --------------------------------------------------------------------------------------
 
 
-def test_command_state_only_in_holding_and_with_power() -> None:
+def test_command_state_requires_holding_and_power() -> None:
     bench = Bench().homed()
     bench.step()
     assert bench.rule == "command_state"
@@ -34,7 +34,7 @@ def test_command_state_only_in_holding_and_with_power() -> None:
     assert bench.status.commands_refused == 1
 
 
-def test_command_state_a_second_command_leaves_the_running_step_alone() -> None:
+def test_command_state_second_command_does_not_affect_the_step() -> None:
     bench = Bench().ready()
     stamp = bench.step()
     bench.go(5)
@@ -49,7 +49,7 @@ def test_command_state_a_second_command_leaves_the_running_step_alone() -> None:
 
 
 @pytest.mark.parametrize("which", ["insertion", "rotation"])
-def test_reply_age_no_step_begins_where_an_axis_is_silent(which: str) -> None:
+def test_reply_age_no_step_begins_with_a_silent_axis(which: str) -> None:
     bench = Bench().ready()
     bench.axis(which).silent_since = bench.now - 0.101
     bench.step()
@@ -122,7 +122,7 @@ def test_command_form() -> None:
         assert form(names, *points) == "command_form", (names, points)
 
 
-def test_command_form_is_checked_and_told_in_short_and_joints_come_in_any_order() -> None:
+def test_command_form_reason_is_short_and_joints_have_any_order() -> None:
     bench = Bench().ready()
     point = TrajectoryPoint((0.1, 0.001), 0.5)
     names = tuple("joint\n" * 1000 for _ in range(300))
@@ -161,7 +161,7 @@ def test_command_newer_than_the_last() -> None:
     assert bench.state == "MOVING"
 
 
-def test_command_newer_a_reset_keeps_no_stamp_out_that_would_have_counted() -> None:
+def test_command_newer_reset_rejects_no_valid_stamp() -> None:
     bench = Bench().ready()
     bench.step()
     bench.go(25)
@@ -171,7 +171,7 @@ def test_command_newer_a_reset_keeps_no_stamp_out_that_would_have_counted() -> N
     assert bench.state == "MOVING"
 
 
-def test_tip_age_counts_steady_seconds_whatever_ros_time_does() -> None:
+def test_tip_age_is_independent_of_ros_time() -> None:
     bench = Bench().ready()
     # It stands still.
     stamp = bench.ros_ns
@@ -189,7 +189,7 @@ def test_tip_age_counts_steady_seconds_whatever_ros_time_does() -> None:
     assert bench.state == "MOVING"
 
 
-def test_tip_age_is_told_however_long_ros_time_stands_still() -> None:
+def test_tip_age_while_ros_time_stands_still() -> None:
     bench = Bench().ready()
     # Longer than notes are kept, and more cycles than are kept of it.
     for _ in range(1500):
@@ -260,14 +260,14 @@ def test_max_step_length_also_in_the_wrong_unit() -> None:
     bench.refused("max_depth")
 
 
-def test_max_speed_of_5_mm_a_second_is_a_hard_cap() -> None:
+def test_max_speed_is_capped_at_5_mm_per_s() -> None:
     # 1 um of the way is the tolerance; a message's time is whole nanoseconds.
     bounded("max_speed", (0.001001, 0.0, 0.2), (0.001001, 0.0, 0.199_999))
     with pytest.raises(OutOfBoundsError, match="max_speed"):
         SafetyLimits(max_speed=0.00501)
 
 
-def test_max_rotation_step_counts_from_where_the_rotation_is() -> None:
+def test_max_rotation_step_counts_from_the_set_point() -> None:
     bounded("max_rotation_step", (0.001, 1.2001, 0.5), (0.001, 1.20011, 0.5))
     bounded("max_rotation_step", (0.001, -1.2001, 0.5), (0.001, -1.20011, 0.5))
     bench = Bench().ready()

@@ -15,7 +15,7 @@ from ..supervisor_bench import PERIOD
 QUICK_STOP = b"\x02\x00\x08"
 
 
-def test_quick_stop_goes_out_at_once_stays_and_forgets_the_set_point() -> None:
+def test_quick_stop_is_sent_at_once_and_discards_the_set_point() -> None:
     bench = DriveBench().moving()
     bench.bus.sent.clear()
     bench.hold(False)
@@ -29,7 +29,7 @@ def test_quick_stop_goes_out_at_once_stays_and_forgets_the_set_point() -> None:
     assert bench.outcomes == ["aborted: hold released", "succeeded"]
 
 
-def test_quick_stop_that_a_drive_only_says_switches_both_off() -> None:
+def test_quick_stop_without_deceleration_switches_both_off() -> None:
     bench = DriveBench().moving()
     # A ramp that is none: 1 mm/s, as long as it has power.
     bench.insertion.drift = {"quick stop": 400}
@@ -90,7 +90,7 @@ UNSTOPPED: dict[str, Row] = {
 
 
 @pytest.mark.parametrize("name", UNSTOPPED)
-def test_quick_stop_a_drive_that_ignores_an_emergency_stop_is_told_while_it_lasts(
+def test_quick_stop_ignored_after_estop_is_reported_while_it_lasts(
     name: str,
 ) -> None:
     which, changes, cycles, end = UNSTOPPED[name]
@@ -121,7 +121,7 @@ def test_quick_stop_a_drive_that_ignores_an_emergency_stop_is_told_while_it_last
     assert bench.status.fault == ""
 
 
-def test_quick_stop_a_drive_that_ignores_the_stop_of_a_fault_is_told_too() -> None:
+def test_quick_stop_ignored_after_a_fault_is_reported() -> None:
     bench = DriveBench().moving()
     bench.insertion.drift = {"quick stop": 400, "disabled": 400}
     bench.after(lambda: bench.rotation.fail(0x2310))
@@ -130,7 +130,7 @@ def test_quick_stop_a_drive_that_ignores_the_stop_of_a_fault_is_told_too() -> No
     assert bench.status.fault == f"{reports}; insertion axis still moving"
 
 
-def test_quick_stop_of_a_drive_that_answers_again_at_a_reset_nothing_is_told_any_more() -> None:
+def test_quick_stop_report_ends_when_the_drive_answers_a_reset() -> None:
     bench = DriveBench().moving()
     bench.rotation.silent = True
     bench.supervisor.receive_estop(True)
@@ -145,7 +145,7 @@ def test_quick_stop_of_a_drive_that_answers_again_at_a_reset_nothing_is_told_any
     assert (bench.state, bench.status.fault) == ("DISABLED", "")
 
 
-def test_quick_stop_at_the_end_a_drive_has_time_to_answer_between_two_cycles() -> None:
+def test_quick_stop_at_exit_leaves_time_for_answers() -> None:
     bench = DriveBench().moving()
     sync, times = bench.insertion.sync, []
 
@@ -164,7 +164,7 @@ def test_quick_stop_at_the_end_a_drive_has_time_to_answer_between_two_cycles() -
 # ---- watchdog and emergencies -------------------------------------------------------------------
 
 
-def test_drive_watchdog_is_armed_last_and_released_at_the_end() -> None:
+def test_drive_watchdog_is_armed_last_and_disarmed_at_exit() -> None:
     bench = DriveBench().configured()
     for drive in (bench.insertion, bench.rotation):
         assert (drive.holds(0x6007), drive.holds(0x605E)) == (1, 2)
@@ -181,7 +181,7 @@ def test_drive_watchdog_is_armed_last_and_released_at_the_end() -> None:
         bench.axes[0].start_move(0.0, 0.001)
 
 
-def test_drive_watchdog_that_tripped_has_its_name_also_before_the_start() -> None:
+def test_drive_watchdog_trip_is_named_also_before_the_set_up() -> None:
     bench = DriveBench().moving()
     bench.after(lambda: bench.rotation.fail(0x8130))
     bench.stopped("drive_watchdog", "heartbeat was missed")
@@ -202,7 +202,7 @@ def test_drive_watchdog_that_tripped_has_its_name_also_before_the_start() -> Non
     assert bench.state == "DISABLED"
 
 
-def test_drive_emergency_stops_both_says_why_and_is_acknowledged_in_the_process_data() -> None:
+def test_drive_emergency_stops_both_and_is_acknowledged_by_pdo() -> None:
     bench = DriveBench().moving()
     for drive in (bench.insertion, bench.rotation):
         drive.ignores_sdo_orders = True
@@ -229,7 +229,7 @@ def test_drive_emergency_stops_both_says_why_and_is_acknowledged_in_the_process_
 @pytest.mark.parametrize(
     ("lacking", "why"), [(set(), ": 0x7121 motor blocked"), ({0x603F}, "")], ids=["code", "none"]
 )
-def test_drive_emergency_that_stays_keeps_the_device_in_fault(lacking: set[int], why: str) -> None:
+def test_drive_emergency_that_persists_keeps_the_fault(lacking: set[int], why: str) -> None:
     bench = DriveBench().homed()
     drive = bench.insertion
     drive.deaf_to_reset, drive.missing_objects = True, lacking
@@ -247,9 +247,7 @@ def test_drive_emergency_that_stays_keeps_the_device_in_fault(lacking: set[int],
 
 
 @pytest.mark.parametrize(("seconds", "leaves"), [(0.9, True), (1.1, False)])
-def test_drive_emergency_a_drive_may_take_a_second_to_leave_its_fault(
-    seconds: float, leaves: bool
-) -> None:
+def test_drive_emergency_reset_may_take_a_second(seconds: float, leaves: bool) -> None:
     bench = DriveBench().homed()
     bench.after(lambda: bench.insertion.fail(0x7121))
     bench.hold(False)
@@ -259,7 +257,7 @@ def test_drive_emergency_a_drive_may_take_a_second_to_leave_its_fault(
     assert bench.reset().success is leaves
 
 
-def test_drive_emergency_that_only_an_answer_from_before_the_reset_tells_is_over() -> None:
+def test_drive_emergency_in_an_outdated_answer_is_ignored() -> None:
     bench = DriveBench().homed()
     # It answers with what it sampled at the SYNC before.
     bench.insertion.tells_late = True
@@ -271,7 +269,7 @@ def test_drive_emergency_that_only_an_answer_from_before_the_reset_tells_is_over
     assert bench.state == "DISABLED", bench.status.fault
 
 
-def test_drive_emergency_between_two_cycles_refuses_a_retraction() -> None:
+def test_drive_emergency_between_cycles_refuses_a_retraction() -> None:
     bench = DriveBench().moving()
     bench.press()
     bench.insertion.fail(0x7305)
@@ -281,7 +279,7 @@ def test_drive_emergency_between_two_cycles_refuses_a_retraction() -> None:
     assert (bench.state, bench.rule) == ("FAULT", "drive_emergency")
 
 
-def test_one_fault_stops_both_a_drive_that_switches_itself_off() -> None:
+def test_one_fault_stops_both_if_a_drive_switches_itself_off() -> None:
     bench = DriveBench().moving()
     bench.after(lambda: setattr(bench.rotation, "state", "disabled"))
     bench.failed("one_fault_stops_both", "went from OPERATION_ENABLED to SWITCH_ON_DISABLED by its")

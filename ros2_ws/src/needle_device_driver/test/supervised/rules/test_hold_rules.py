@@ -38,7 +38,7 @@ def enabled() -> Bench:
     return bench
 
 
-def test_hold_to_run_without_it_nothing_begins_and_a_release_discards_the_step() -> None:
+def test_hold_to_run_is_required_and_release_aborts_the_step() -> None:
     bench = enabled()
     bench.step()
     bench.wait(3)
@@ -57,9 +57,7 @@ def test_hold_to_run_without_it_nothing_begins_and_a_release_discards_the_step()
 
 
 @pytest.mark.parametrize(("lifetime", "lives"), [(math.inf, 0.25), (5.0, 0.25), (0.1, 0.1)])
-def test_hold_age_a_message_counts_as_long_as_it_says_and_a_quarter_of_a_second(
-    lifetime: float, lives: float
-) -> None:
+def test_hold_age_limit_and_lifetime_of_a_message(lifetime: float, lives: float) -> None:
     bench = Bench().ready()
     bench.step(0.002, 0.1, 2.0)
     bench.hold(lifetime=lifetime)
@@ -80,14 +78,14 @@ def test_hold_age_a_message_counts_as_long_as_it_says_and_a_quarter_of_a_second(
 
 
 @pytest.mark.parametrize("start", [0.0, 0.1, 1e6])
-def test_hold_age_is_told_alike_however_long_the_steady_clock_has_run(start: float) -> None:
+def test_hold_age_text_is_independent_of_the_clock_offset(start: float) -> None:
     hold = Hold(0.25)
     hold.receive(HoldState("a", "", 1, True, 1.0, math.inf), start, counting=True)
     assert hold.end_if_stale(start + 0.249) == ""
     assert hold.end_if_stale(start + 0.251) == "no hold message for 0.251 s, limit 0.25 s"
 
 
-def test_hold_age_one_that_lives_for_no_time_is_a_release() -> None:
+def test_hold_age_message_without_lifetime_is_a_release() -> None:
     bench = Bench().ready()
     for lifetime in (0.0, -1.0, math.nan):
         bench.press()
@@ -95,7 +93,7 @@ def test_hold_age_one_that_lives_for_no_time_is_a_release() -> None:
     assert bench.hold(lifetime=1e-9) == "a"
 
 
-def test_hold_age_a_gap_that_no_cycle_saw_counts_all_the_same() -> None:
+def test_hold_age_gap_between_cycles_counts() -> None:
     bench = Bench().ready()
     bench.insertion.position = 0.001
     come_backs: tuple[Callable[[], object], ...] = (
@@ -114,7 +112,7 @@ def test_hold_age_a_gap_that_no_cycle_saw_counts_all_the_same() -> None:
     assert bench.status.watchdog_trips == 0, "nothing moved"
 
 
-def test_hold_age_one_that_fell_silent_pressed_keeps_no_reset_out() -> None:
+def test_hold_age_expired_press_does_not_block_reset() -> None:
     bench = Bench().ready()
     bench.supervisor.fail("test")
     bench.hold()
@@ -129,7 +127,7 @@ def test_hold_age_one_that_fell_silent_pressed_keeps_no_reset_out() -> None:
 
 
 @pytest.mark.parametrize("press_before", ["enable", "reset", "stop", "homing", "disable", "fault"])
-def test_hold_new_press_one_from_before_does_not_count(press_before: str) -> None:
+def test_hold_new_press_earlier_press_does_not_count(press_before: str) -> None:
     bench = Bench()
     bench.insertion.position = 0.0005 * (press_before == "homing")
     bench.homed()
@@ -160,7 +158,7 @@ def test_hold_new_press_one_from_before_does_not_count(press_before: str) -> Non
     assert bench.status.press_again == ""
 
 
-def test_hold_new_press_is_asked_of_nobody_who_is_silent_or_presses_beside_the_owner() -> None:
+def test_hold_new_press_is_required_only_of_an_active_press_without_owner() -> None:
     bench = Bench().ready()
     bench.hold(sender="b")
     assert (bench.status.hold_owner, bench.status.press_again) == ("a", "")
@@ -171,7 +169,7 @@ def test_hold_new_press_is_asked_of_nobody_who_is_silent_or_presses_beside_the_o
     assert bench.status.press_again == ""
 
 
-def test_hold_new_press_a_first_press_counts_only_without_a_session() -> None:
+def test_hold_new_press_first_press_counts_only_without_session() -> None:
     bench = enabled()
     assert says(bench, "b/s+") == "-"
     assert bench.rule == "hold_new_press"
@@ -187,7 +185,7 @@ def test_hold_one_owner_until_released() -> None:
     assert says(bench, "b+ a- b+ b- b+") == "a - - - b"
 
 
-def test_hold_one_owner_sixteen_sources_are_known_unless_they_are_silent() -> None:
+def test_hold_one_owner_remembers_sixteen_sources() -> None:
     bench = enabled()
     others = " ".join(f"s{number}-" for number in range(15))
     says(bench, f"a- {others}")
@@ -211,7 +209,7 @@ def test_speed_scale_outside_0_to_1_is_a_release(scale: float) -> None:
     assert bench.rule == "speed_scale"
 
 
-def test_speed_scale_slows_and_0_stands_still() -> None:
+def test_speed_scale_slows_and_0_stops() -> None:
     bench = enabled()
     assert bench.status.speed_scale == 0.0
     bench.hold(scale=0.5)
@@ -239,7 +237,7 @@ def in_session() -> Bench:
     return bench
 
 
-def test_hold_in_order_a_press_that_comes_twice_keeps_nothing_alive_and_is_said_once() -> None:
+def test_hold_in_order_repeated_press_extends_nothing() -> None:
     bench = in_session()
     for _ in range(20):
         says(bench, "a/s#3+")
@@ -251,7 +249,7 @@ def test_hold_in_order_a_press_that_comes_twice_keeps_nothing_alive_and_is_said_
     assert rules == ["hold_in_order", "hold_age"]
 
 
-def test_hold_in_order_what_was_overtaken_changes_nothing() -> None:
+def test_hold_in_order_overtaken_message_changes_nothing() -> None:
     bench = in_session()
     says(bench, "a/s#5+ a/s#4-")
     assert bench.state == "MOVING"
@@ -265,7 +263,7 @@ def test_hold_in_order_what_was_overtaken_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("later", ["t", ""])
-def test_hold_in_order_a_new_session_takes_the_place_of_the_one_before_for_good(later: str) -> None:
+def test_hold_in_order_new_session_ends_the_previous(later: str) -> None:
     bench = in_session()
     assert says(bench, f"a/{later}#1+") == "-"
     assert bench.outcomes == ["aborted: hold released"]
@@ -277,7 +275,7 @@ def test_hold_in_order_a_new_session_takes_the_place_of_the_one_before_for_good(
     assert says(bench, f"a/{later}#5- a/s#102- a/s#103+") == "- - -"
 
 
-def test_hold_in_order_sixteen_sessions_are_remembered_of_each_source() -> None:
+def test_hold_in_order_remembers_sixteen_sessions_per_source() -> None:
     bench = in_session()
     says(bench, " ".join(f"a/t{number}#1-" for number in range(16)))
     assert says(bench, "a/s#100- a/s#101+") == "- -"
@@ -288,7 +286,7 @@ def test_hold_in_order_sixteen_sessions_are_remembered_of_each_source() -> None:
 # ---- what a reset lets in again -----------------------------------------------------------------
 
 
-def test_hold_in_order_a_reset_lets_in_a_source_without_session_that_was_ahead() -> None:
+def test_hold_in_order_reset_accepts_lower_stamps_without_session() -> None:
     bench = enabled()
     says(bench, f"#{10**18}- b/s#10- - +")
     assert bench.rule == "hold_in_order"
@@ -306,7 +304,7 @@ def back_to(bench: Bench, ros_ns: int) -> None:
 
 
 @pytest.mark.parametrize("back_ns", [3_600_000_000_000, 1_000_000_000])
-def test_command_newer_a_reset_lets_commands_in_after_time_went_back(back_ns: int) -> None:
+def test_command_newer_reset_accepts_commands_after_time_went_back(back_ns: int) -> None:
     bench = Bench()
     back_to(bench, 2 * back_ns)
     bench.ready()
@@ -323,7 +321,7 @@ def test_command_newer_a_reset_lets_commands_in_after_time_went_back(back_ns: in
     assert bench.state == "MOVING"
 
 
-def test_command_newer_tells_of_time_that_went_back_only_where_it_did() -> None:
+def test_command_newer_hint_on_time_that_went_back() -> None:
     bench = Bench().ready()
     last = bench.step()
     bench.go(25)
@@ -335,7 +333,7 @@ def test_command_newer_tells_of_time_that_went_back_only_where_it_did() -> None:
         assert ("ROS time went back" in bench.outcomes[-1]) is told, back_ns
 
 
-def test_command_newer_no_stamp_is_used_twice_though_time_went_back() -> None:
+def test_command_newer_stamps_are_used_once() -> None:
     bench = Bench().ready()
     used = bench.step()
     bench.go(2)

@@ -37,7 +37,7 @@ def until_fault(bench: DriveBench, rule: str) -> str:
 
 
 @pytest.mark.parametrize("mm_s", [-150.0, 150.0, -3.55])
-def test_axis_speed_a_homing_that_is_too_fast_is_stopped_in_two_cycles(mm_s: float) -> None:
+def test_axis_speed_stops_a_fast_homing_in_two_cycles(mm_s: float) -> None:
     bench = DriveBench()
     way = round(mm_s * MM_S)
     bench.insertion.searches(forever=way)
@@ -58,7 +58,7 @@ def test_axis_speed_a_homing_that_is_too_fast_is_stopped_in_two_cycles(mm_s: flo
     assert bench.reset().success
 
 
-def test_axis_speed_a_homing_at_its_speed_goes_on_also_where_answers_are_lost() -> None:
+def test_axis_speed_allows_homing_with_lost_answers() -> None:
     for mm_s, loses, state in ((-3.45, 0, "MOVING"), (-2.0, 1, "MOVING"), (-20.0, 1, "FAULT")):
         bench = DriveBench()
         bench.insertion.searches(forever=round(mm_s * MM_S))
@@ -70,7 +70,7 @@ def test_axis_speed_a_homing_at_its_speed_goes_on_also_where_answers_are_lost() 
         assert bench.state == state, bench.status.fault
 
 
-def test_axis_speed_a_drive_that_counts_anew_at_its_home_is_not_fast() -> None:
+def test_axis_speed_ignores_the_new_zero_at_home() -> None:
     bench = DriveBench()
     bench.insertion.position = 1_234_567
     bench.homed()
@@ -94,7 +94,7 @@ def test_axis_speed_of_the_rotation_axis() -> None:
     assert "rotation axis: moves at 1.611 rad/s, at most 1.6 rad/s" in bench.status.fault
 
 
-def test_axis_speed_an_axis_that_drifts_while_nothing_is_commanded() -> None:
+def test_axis_speed_of_a_drifting_axis() -> None:
     for mm_s, state in ((0.49, "HOLDING"), (0.51, "FAULT")):
         bench = DriveBench().ready()
         # What was commanded before fades.
@@ -106,7 +106,7 @@ def test_axis_speed_an_axis_that_drifts_while_nothing_is_commanded() -> None:
 
 
 @pytest.mark.parametrize("drive", ["motor", "hand"])
-def test_axis_speed_an_axis_that_is_off_or_that_a_hand_moves_is_not_judged(drive: str) -> None:
+def test_axis_speed_ignores_axes_without_power_or_motor(drive: str) -> None:
     bench = DriveBench(insertion_drive=drive).configured()
     for _ in range(20):
         bench.insertion.position += 100 * MM_S
@@ -138,7 +138,7 @@ class Answers:
         return self.watch.check(before, self.at, powered=True)
 
 
-def test_axis_speed_is_judged_by_elapsed_sync_periods() -> None:
+def test_axis_speed_uses_elapsed_sync_periods() -> None:
     for syncs, numbers, seconds, periods in (
         # Jitter of an answer counts for nothing, that of a SYNC by half its period.
         (1, 1, 0.001, 1),
@@ -159,7 +159,7 @@ def test_axis_speed_is_judged_by_elapsed_sync_periods() -> None:
         assert answers.watch.problem
 
 
-def test_axis_speed_once_too_fast_is_forgiven_and_what_was_commanded_fades() -> None:
+def test_axis_speed_tolerates_one_fast_cycle() -> None:
     answers = Answers()
     for mm in (1.0, 0.04) * 5:
         answers.answer(mm)
@@ -191,7 +191,7 @@ def test_axis_speed_once_too_fast_is_forgiven_and_what_was_commanded_fades() -> 
         ({"insertion_homing_method": 20}, 12.0),
     ],
 )
-def test_homing_time_an_axis_goes_no_farther_than_its_own_travel_and_a_fifth(
+def test_homing_time_bounds_the_distance_by_the_travel(
     parameters: dict[str, Any], most_mm: float
 ) -> None:
     bench = DriveBench(max_depth=0.01, **parameters)
@@ -205,7 +205,7 @@ def test_homing_time_an_axis_goes_no_farther_than_its_own_travel_and_a_fifth(
 
 
 @pytest.mark.parametrize(("method", "switch"), [(17, 1), (18, 2)])
-def test_homing_time_a_drive_that_goes_away_from_its_switch_is_stopped(
+def test_homing_time_stops_a_drive_that_moves_away_from_its_switch(
     method: int, switch: int
 ) -> None:
     away = 1 if method == 17 else -1
@@ -234,9 +234,7 @@ def test_homing_time_a_drive_that_goes_away_from_its_switch_is_stopped(
 
 
 @pytest.mark.parametrize(("counts", "is_away"), [(1, True), (-1, False)])
-def test_homing_time_a_count_is_away_from_the_switch_where_it_is_more_than_the_bound(
-    counts: int, is_away: bool
-) -> None:
+def test_homing_time_tolerance_of_the_direction(counts: int, is_away: bool) -> None:
     settings = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
     settings = dataclasses.replace(settings, counts_per_unit=1000.0)
     homing = HomingRun(settings, 0.002, has_inputs=True)
@@ -245,7 +243,7 @@ def test_homing_time_a_count_is_away_from_the_switch_where_it_is_more_than_the_b
     assert ("went 1 mm away from the limit switch" in homing.problem) is is_away
 
 
-def test_homing_time_a_drive_that_reports_a_failure_has_no_other_name() -> None:
+def test_homing_time_is_not_the_rule_of_a_reported_failure() -> None:
     bench = DriveBench()
     bench.insertion.searches()
     bench.homing()
