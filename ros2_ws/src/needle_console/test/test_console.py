@@ -1,4 +1,4 @@
-"""The console as a component, called directly: what a page does, and what the rig is told."""
+"""The console as a component: events of pages, messages of the rig."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from needle_core.status_messages import ControllerStatus, DeviceStatus
 INSERT = PageHold(True, 0.5, Mode.INSERT)
 RETRACT = PageHold(True, 0.5, Mode.RETRACT)
 TURN = (0.0, float(np.sin(np.pi / 12)), 0.0, float(np.cos(np.pi / 12)))
-"""By 30 degrees, as a plane's that rises inwards."""
+"""Orientation of a plane that rises inwards by 30 degrees."""
 
 
 class Bench:

@@ -1,4 +1,4 @@
-"""Who may open a connection, load the page, and hold."""
+"""Access control: connections, the page, and the hold of a real rig."""
 
 from __future__ import annotations
 

@@ -95,9 +95,9 @@ def _axis(
             counts_per_unit, f"counts/{unit}", "Position counts of the drive.", 1.0, 1e12
         ),
         "counts_per_turn": fixed_parameter(
-            0.0, "counts", "In a turn, of a drive in rpm; 0: as it says (0x608F).", 0.0, 1e9
+            0.0, "counts", "Counts per turn of a drive in rpm; 0: as it reports (0x608F).", 0.0, 1e9
         ),
-        "reverse": fixed_parameter(False, "-", "Whether the drive counts the other way."),
+        "reverse": fixed_parameter(False, "-", "Whether the drive counts in reverse."),
         "acceleration": fixed_parameter(acceleration, ramp, "Ramp of homing.", 1e-4, 1e4),
         "quick_stop_deceleration": fixed_parameter(quick_stop, ramp, "Ramp of a stop.", 1e-4, 1e4),
         "homing_method": fixed_parameter(
@@ -105,12 +105,14 @@ def _axis(
         ),
         "following_error": limit_parameter(f"{axis}_following_error"),
         "following_error_time": fixed_parameter(
-            0.05, "s", "How long the drive itself lets that be exceeded.", 0.001, 10.0
+            0.05, "s", "Time for which the drive tolerates more.", 0.001, 10.0
         ),
         "max_torque": fixed_parameter(
-            0.0, "-", "Share of rated torque; 0: as the drive has it.", 0.0, 5.0
+            0.0, "-", "Share of rated torque; 0: the drive's own setting.", 0.0, 5.0
         ),
-        "tolerance": fixed_parameter(tolerance, unit, "An axis so close has arrived.", 1e-7, 1.0),
+        "tolerance": fixed_parameter(
+            tolerance, unit, "Position tolerance at the target.", 1e-7, 1.0
+        ),
     }
     return [(f"{axis}_{name}", type(f.default), f) for name, f in fields.items()]
 

@@ -1,4 +1,4 @@
-"""Procedures between events: they go on when what they wait for is there, or its time is over."""
+"""Procedures: conditions, time-outs, cancellation."""
 
 from __future__ import annotations
 

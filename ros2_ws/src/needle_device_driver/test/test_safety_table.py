@@ -1,4 +1,4 @@
-"""docs/safety.md and the code name the same rules, and each rule has a test."""
+"""docs/safety.md and the code have the same rules, and each rule has a test."""
 
 from __future__ import annotations
 

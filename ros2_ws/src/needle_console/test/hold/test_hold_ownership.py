@@ -1,4 +1,4 @@
-"""The rules of the console's hold (docs/safety.md): whose press counts, and until when."""
+"""Rules of the console's hold (docs/safety.md)."""
 
 from __future__ import annotations
 

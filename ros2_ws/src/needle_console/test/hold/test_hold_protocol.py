@@ -1,4 +1,4 @@
-"""What pages and the taker of their hold are told, and when."""
+"""Messages to pages, and the reports of the hold."""
 
 from __future__ import annotations
 

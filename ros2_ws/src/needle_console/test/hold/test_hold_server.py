@@ -1,4 +1,4 @@
-"""The hold's server: whom it lets in, and what a page that goes leaves behind."""
+"""Server of the hold: access control, and the end of a connection."""
 
 from __future__ import annotations
 

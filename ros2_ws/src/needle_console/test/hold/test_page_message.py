@@ -1,4 +1,4 @@
-"""What a page may say: exactly what is agreed, and nothing else is raised than that it is not."""
+"""Messages of a page: anything outside the protocol is a ValueError."""
 
 from __future__ import annotations
 

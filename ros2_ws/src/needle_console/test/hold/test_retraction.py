@@ -1,4 +1,4 @@
-"""What a press to retract asks of the rig."""
+"""Hold and service calls of a retraction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Words and buttons follow from the states: the sequence of a run, its faults and its ways out."""
+"""Advice and buttons in each state of the rig."""
 
 from __future__ import annotations
 

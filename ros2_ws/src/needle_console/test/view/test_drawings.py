@@ -1,4 +1,4 @@
-"""Chart, space, dial, views and targets: numbers and pixels where they belong."""
+"""Chart, dial, 3D view, camera views and targets."""
 
 from __future__ import annotations
 

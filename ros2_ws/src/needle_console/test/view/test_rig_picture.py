@@ -1,4 +1,4 @@
-"""What is heard becomes snapshots and readings; what is old or makes no sense does not."""
+"""Snapshots and readings from messages of the rig."""
 
 from __future__ import annotations
 

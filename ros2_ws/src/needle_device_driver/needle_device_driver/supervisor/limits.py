@@ -17,7 +17,7 @@ HARD_HOLD_TIMEOUT_CAP = 0.5
 HARD_STEP_TIME_CAP = 600.0
 _SMALLEST = 1e-5
 _FOLLOWING = "Largest distance from the set-point."
-_TOLERANCE = "An axis so close has arrived."
+_TOLERANCE = "Position tolerance at the target."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +77,7 @@ class SafetyLimits:
     hold_timeout: float = fixed_parameter(
         0.25,
         "s",
-        "A hold message counts so long after its arrival, steady clock.",
+        "Lifetime of a hold message after its arrival, steady clock.",
         0.05,
         HARD_HOLD_TIMEOUT_CAP,
     )
@@ -85,23 +85,23 @@ class SafetyLimits:
         2.0, "s", "A command is refused if the tip behind it is older, steady clock.", 0.05, 60.0
     )
     reply_age_limit: float = fixed_parameter(
-        0.1, "s", "A drive silent for longer has failed.", 0.05, 0.5
+        0.1, "s", "A drive that is silent for longer has failed.", 0.05, 0.5
     )
     retraction_speed: float = fixed_parameter(
-        0.002, "m/s", "Speed at which the needle is drawn out.", _SMALLEST, HARD_SPEED_CAP
+        0.002, "m/s", "Speed of a retraction.", _SMALLEST, HARD_SPEED_CAP
     )
     homing_speed: float = fixed_parameter(
-        0.002, "m/s", "Towards the insertion switch.", _SMALLEST, HARD_SPEED_CAP
+        0.002, "m/s", "Speed towards the insertion switch.", _SMALLEST, HARD_SPEED_CAP
     )
     homing_rotation_rate: float = fixed_parameter(
-        1.0, "rad/s", "Towards the rotation switch.", 0.01, 20.0
+        1.0, "rad/s", "Speed towards the rotation switch.", 0.01, 20.0
     )
     insertion_following_error: float = fixed_parameter(0.0005, "m", _FOLLOWING, 1e-6, 10.0)
     rotation_following_error: float = fixed_parameter(0.1, "rad", _FOLLOWING, 1e-6, 10.0)
     insertion_tolerance: float = fixed_parameter(1e-6, "m", _TOLERANCE, 1e-7, 1.0)
     rotation_tolerance: float = fixed_parameter(1e-4, "rad", _TOLERANCE, 1e-7, 1.0)
     settling_time: float = fixed_parameter(
-        1.0, "s", "To reach the target after the last set-point.", 0.1, 10.0
+        1.0, "s", "Longest time to the target after the last set-point.", 0.1, 10.0
     )
 
     def __post_init__(self) -> None:
@@ -143,6 +143,6 @@ class SafetyLimits:
 
 
 def limit_parameter(name: str) -> Any:
-    """Declare the field `name` of `SafetyLimits` as a field of a parameter dataclass."""
+    """Return the field `name` of `SafetyLimits` for a parameter dataclass."""
     (field,) = (field for field in dataclasses.fields(SafetyLimits) if field.name == name)
     return dataclasses.field(default=field.default, metadata=field.metadata)

@@ -1,4 +1,4 @@
-"""The coordinated motion, free of the supervisor around it."""
+"""Coordinated motion without a supervisor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The drive's state machine: statuswords, transitions, the way to each goal."""
+"""State machine of a drive: statuswords, transitions, commands to each goal."""
 
 from __future__ import annotations
 

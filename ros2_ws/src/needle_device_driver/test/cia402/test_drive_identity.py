@@ -1,4 +1,4 @@
-"""What a drive says that it is."""
+"""Identity of emulated drives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The way of one drive to its goal, fed with statuswords by hand."""
+"""State machine of one drive, with scripted statuswords."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which settings a drive can have."""
+"""Valid settings of a drive."""
 
 from __future__ import annotations
 

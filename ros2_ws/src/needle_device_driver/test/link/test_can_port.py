@@ -1,4 +1,4 @@
-"""Links: slcan over a pseudo-terminal, virtual, socketcand; opened, lost, opened again.
+"""CAN port on slcan over a pseudo-terminal, virtual and socketcand.
 
 The port's thread is not started: each test takes its steps, when what it waits for is there.
 """

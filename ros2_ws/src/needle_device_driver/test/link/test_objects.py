@@ -1,4 +1,4 @@
-"""Entries, PDOs, units, error words and parameters."""
+"""Entries, PDOs, units, error codes and parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The SDO client: byte for byte as canopen's, late answers, and the heartbeat while it waits."""
+"""SDO client: frames as canopen's, late responses, heartbeat during a transfer."""
 
 from __future__ import annotations
 

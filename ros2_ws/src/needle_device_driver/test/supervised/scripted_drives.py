@@ -1,4 +1,4 @@
-"""CiA 402 drives as a script, behind a CAN bus."""
+"""Scripted CiA 402 drives behind a CAN bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A supervisor in a time of its own, whatever its axes are."""
+"""A supervisor with virtual time."""
 
 from __future__ import annotations
 

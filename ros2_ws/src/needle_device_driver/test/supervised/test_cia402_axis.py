@@ -1,4 +1,4 @@
-"""A pair of drives on a scripted bus: what the axes make of it, homing, and a hand that pushes."""
+"""Axes on scripted drives: set-points, homing, an axis without motor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""device_driver as a component, on scripted drives: what it hears, says, and when it ends."""
+"""device_driver as a component, on scripted drives."""
 
 from __future__ import annotations
 

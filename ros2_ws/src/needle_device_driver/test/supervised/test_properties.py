@@ -1,4 +1,4 @@
-"""Whatever comes in whatever order, the needle never moves when or where it must not."""
+"""Random sequences of events never cause a forbidden motion."""
 
 from __future__ import annotations
 

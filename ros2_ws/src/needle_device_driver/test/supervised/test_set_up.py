@@ -1,4 +1,4 @@
-"""What the set-up makes of drives of any maker: what it writes, does without, or refuses."""
+"""Set-up of drives of many makers: written objects, missing objects, refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long a set-up waits for a drive, and how far that may round what it is told."""
+"""Set-up of a drive: time limits and rounding."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""What goes over the wire, byte by byte: `transcripts/*.txt`, each line a frame as candump has it.
+"""Frames on the bus, compared byte by byte with `transcripts/*.txt`, in the format of candump.
 
-The files were checked by hand against CiA 301 and CiA 402; a change of a byte is a change of what
-drives are told. Lines that begin with # explain.
+The files were checked by hand against CiA 301 and CiA 402. Lines that begin with # are comments.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Bounds are those of docs/safety.md, and the hard ones cannot be configured away."""
+"""Limits of docs/safety.md, and their caps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Links, cables and drives that are lost, named as in docs/safety.md."""
+"""Rules for lost links and drives, named as in docs/safety.md."""
 
 from __future__ import annotations
 
@@ -162,6 +162,8 @@ def test_reply_age_lost_answers_are_discarded_after_a_pause() -> None:
     assert bench.insertion.next_target > waiting
     bench.go(60)
     assert bench.outcomes == ["succeeded"] * 2
+    syncs = [cob for cob, _ in bench.bus.sent].count(0x80)
+    assert bench.axes[0].monitor.feedback.syncs == syncs
     count = bench.drives.unanswered
     health = bench.drives.health("")
     assert health.message == f"{count} SYNCs were not answered in their cycle"

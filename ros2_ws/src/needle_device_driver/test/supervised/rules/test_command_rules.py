@@ -1,4 +1,4 @@
-"""Which commands are refused, named as in docs/safety.md."""
+"""Rules for commands, named as in docs/safety.md."""
 
 from __future__ import annotations
 

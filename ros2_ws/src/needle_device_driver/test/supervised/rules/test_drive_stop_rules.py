@@ -1,4 +1,4 @@
-"""How drives stop, what stops both, and those that ignore it, named as in docs/safety.md."""
+"""Rules for stops, watchdogs and emergencies of drives, named as in docs/safety.md."""
 
 from __future__ import annotations
 

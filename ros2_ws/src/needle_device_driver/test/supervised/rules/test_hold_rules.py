@@ -1,4 +1,4 @@
-"""Who may let the needle move, and which messages count, named as in docs/safety.md."""
+"""Rules for the hold, named as in docs/safety.md."""
 
 from __future__ import annotations
 

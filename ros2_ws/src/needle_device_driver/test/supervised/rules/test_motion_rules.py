@@ -1,4 +1,4 @@
-"""Steps, retraction and homing, named as in docs/safety.md."""
+"""Rules for steps, retraction and homing, named as in docs/safety.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Paths: several points, replaced without a stop, at rest at their end; named as in safety.md."""
+"""Rules for paths, named as in docs/safety.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a drive may be told to go to, named as in docs/safety.md."""
+"""Rules for set-points, named as in docs/safety.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How fast and how far an axis goes that its drive moves, named as in docs/safety.md."""
+"""Rules for speed and travel of an axis, named as in docs/safety.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ends every motion, named as in docs/safety.md."""
+"""Rules that end every motion, named as in docs/safety.md."""
 
 from __future__ import annotations
 
