@@ -26,14 +26,14 @@ class Scene:
     def page(self, *, is_local: bool = True) -> int:
         return self.protocol.open(self.now, is_local=is_local)
 
-    def told(self, page: int) -> dict[str, Any]:
+    def message_to(self, page: int) -> dict[str, Any]:
         """Send a page a message now; return it."""
         told: dict[str, Any] = json.loads(self.protocol.message_for(page, self.now))
         return told
 
     def count(self, page: int) -> int:
         """Send a page a count now."""
-        return int(self.told(page)["count"])
+        return int(self.message_to(page)["count"])
 
     def message(self, page: int, pressed: bool, count: int | None = None, **changes: Any) -> str:
         count = self.count(page) if count is None else count

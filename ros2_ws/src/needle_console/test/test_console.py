@@ -38,7 +38,7 @@ TURN = (0.0, float(np.sin(np.pi / 12)), 0.0, float(np.cos(np.pi / 12)))
 
 
 class Bench:
-    """A console, and the port of its page with a clock of its own."""
+    """A console and its page port, with virtual time."""
 
     def __init__(self) -> None:
         self.now = 10.0
@@ -51,28 +51,28 @@ class Bench:
     def at(self) -> Moment:
         return Moment(self.now, 1)
 
-    def hear(self, topic: str, message: Any) -> list[Any]:
+    def receive(self, topic: str, message: Any) -> list[Any]:
         (row,) = (row for row in self.console.inputs if row.topic == topic)
         return list(row.handler(message, self.at))
 
     def events(self) -> list[PageEvent]:
-        """Return what the port hands over now."""
+        """Return the waiting events of the port."""
         batches, self._batches[:] = [batch() for batch in self._batches], []
         return [event for batch in batches for event in batch]
 
-    def take(self, *events: PageEvent) -> list[Any]:
-        """Let the console take what a page does; return what it does."""
+    def handle(self, *events: PageEvent) -> list[Any]:
+        """Pass events of a page to the console; return its actions."""
         (port,) = self.console.ports
         return list(port.handler(events or self.events(), self.at))
 
     def hold(self, *states: PageHold) -> tuple[list[m.HoldState], list[Call]]:
-        """Let hands be taken in one batch; return what is said of the hold, and the calls."""
-        actions = self.take(*map(HoldRequest, states))
+        """Pass holds in one batch; return the published holds, and the calls."""
+        actions = self.handle(*map(HoldRequest, states))
         said = [one.message for one in actions if isinstance(one, Publish)]
         return said, [one for one in actions if isinstance(one, Call)]
 
     def check(self) -> tuple[Diagnose, dict[str, bool]]:
-        """Return what the console checks once a second: health, and topics that it leaves."""
+        """Run the check of the console; return the health and the unsubscribed topics."""
         diagnose, *listens = self.console.timers[1].handler(self.at)
         assert isinstance(diagnose, Diagnose)
         return diagnose, listened(listens)
@@ -96,25 +96,25 @@ def bench() -> Bench:
 def test_hold_is_published_with_lifetime_and_release_at_once(bench: Bench) -> None:
     (said,), calls = bench.hold(INSERT)
     assert (said.source, said.pressed, said.speed_scale, calls) == ("console", True, 0.5, [])
-    # The promise of docs/safety.md. Nothing is repeated by itself: no timer says it.
+    # As in docs/safety.md. No timer repeats it.
     assert said.lifetime == m.HOLD_LIFETIME == 0.1
     (released,), _ = bench.hold(RELEASED)
     assert (released.pressed, released.speed_scale) == (False, 0.0)
-    # A press that had to wait is none of now.
+    # An earlier press of the batch does not count.
     late, _ = bench.hold(INSERT, RELEASED, INSERT)
     assert [hold.pressed for hold in late] == [False, True]
     assert [hold.count for hold in (said, released, *late)] == [1, 2, 3, 4]
 
 
 def test_retraction_waits_for_the_end_of_steering(bench: Bench) -> None:
-    bench.hear("needle/controller_status", ControllerStatus(state="STEERING"))
+    bench.receive("needle/controller_status", ControllerStatus(state="STEERING"))
     for calls in ([Call("plane_controller/stop")], []):
         (said,), made = bench.hold(RETRACT)
         assert (said.pressed, made) == (False, calls)
-    bench.hear("needle/controller_status", ControllerStatus(state="IDLE"))
-    bench.hear("device/status", DeviceStatus(state="MOVING", hold_owner="pedal"))
+    bench.receive("needle/controller_status", ControllerStatus(state="IDLE"))
+    bench.receive("device/status", DeviceStatus(state="MOVING", hold_owner="pedal"))
     assert bench.hold(RETRACT)[1] == []
-    bench.hear("device/status", DeviceStatus(state="HOLDING", hold_owner="console"))
+    bench.receive("device/status", DeviceStatus(state="HOLDING", hold_owner="console"))
     for calls in ([Call("device/retract")], []):
         (said,), made = bench.hold(RETRACT)
         assert (said.pressed, made) == (True, calls)
@@ -129,7 +129,7 @@ def test_buttons_call_their_services_and_answers_are_shown(bench: Bench) -> None
         (Button.RESET, Call("device/reset")),
     ):
         bench.port.press(button)
-        assert bench.take() == [call]
+        assert bench.handle() == [call]
     for answer, shown in (
         (Answer("device/home", True, "homes"), "device/home: homes"),
         (Answer("device/home", False, "not now"), "device/home: refused: not now"),
@@ -143,8 +143,8 @@ def test_silent_hold_server_is_reported(bench: Bench) -> None:
     bench.port.refusals = lambda: {"foreign Host": 3}
     for silent_for, level in ((0.9, Level.OK), (1.1, Level.ERROR)):
         bench.port.set_hold(RELEASED)
-        back = [one for one in bench.take() if isinstance(one, Diagnose)]
-        # That it is there again is told at once.
+        back = [one for one in bench.handle() if isinstance(one, Diagnose)]
+        # Its return is reported at once.
         assert [one.diagnostic.level for one in back] == ([Level.OK] if level == Level.OK else [])
         bench.now += silent_for
         health, _ = bench.check()
@@ -155,28 +155,30 @@ def test_silent_hold_server_is_reported(bench: Bench) -> None:
 def test_growing_simulation_lag_is_reported(bench: Bench) -> None:
     for seconds, named in ((0.0, False), (0.01, False), (1.0, True)):
         bench.port.set_lag(seconds)
-        assert bench.take() == []
+        assert bench.handle() == []
         assert bool(bench.snapshot().warnings) is named
     (text,) = bench.snapshot().warnings
     assert "1.0 s behind the clock" in text
-    # It lags no more than it did.
+    # The lag does not grow.
     bench.now += 4.0
-    bench.take(SimulationLag(1.0))
+    bench.handle(SimulationLag(1.0))
     assert bench.snapshot().warnings == ()
 
 
 def test_messages_in_other_frames_are_ignored(bench: Bench) -> None:
     flat = tuple(np.diag([1e-8, 2e-8, 3e-8, 0.0, 0.0, 0.0]).ravel())
-    bench.hear("joint_states", m.JointState(1, (m.ROTATION_JOINT, m.INSERTION_JOINT), (2.0, 0.01)))
+    bench.receive(
+        "joint_states", m.JointState(1, (m.ROTATION_JOINT, m.INSERTION_JOINT), (2.0, 0.01))
+    )
     for frame, x in (("rig", 0.004), ("left_camera", 0.4)):
-        bench.hear("target_plane", m.Pose(0, frame, (x, 0.0, 0.0), TURN))
-        bench.hear("needle/tip_pose", m.PoseWithCovariance(1, frame, (x, 0.0, 0.01), TURN, flat))
-    bench.hear("needle/controller_status", ControllerStatus(state="STEERING"))
+        bench.receive("target_plane", m.Pose(0, frame, (x, 0.0, 0.0), TURN))
+        bench.receive("needle/tip_pose", m.PoseWithCovariance(1, frame, (x, 0.0, 0.01), TURN, flat))
+    bench.receive("needle/controller_status", ControllerStatus(state="STEERING"))
     for frame, x in (("target_plane", 0.0), ("rig", 0.4)):
         estimate = m.PoseWithCovariance(1, frame, (x, 0.0, 0.01), TURN, flat)
-        bench.hear("needle/estimate", estimate)
+        bench.receive("needle/estimate", estimate)
     sick = m.Status("sim_rig", "loop", Level.WARN, "slow", {})
-    bench.hear("/diagnostics", m.Diagnostics(1, (sick,)))
+    bench.receive("/diagnostics", m.Diagnostics(1, (sick,)))
     shown = bench.snapshot()
     assert (shown.insertion, shown.rotation) == (0.01, 2.0)
     assert shown.tip is not None
@@ -187,7 +189,7 @@ def test_messages_in_other_frames_are_ignored(bench: Bench) -> None:
     (point,) = shown.track
     assert point.position == pytest.approx([0.004 + 0.005, 0.0, 0.01 * np.sqrt(0.75)])
     assert shown.warnings == ("sim_rig: loop: slow",)
-    # One that was killed while it steered must not keep the needle in.
+    # A killed controller must not block a retraction.
     assert list(bench.console.on_peers(Peers(), bench.at)) == []
     assert bench.snapshot().controller is None
 
@@ -195,7 +197,7 @@ def test_messages_in_other_frames_are_ignored(bench: Bench) -> None:
 def test_image_is_shown_without_row_padding(bench: Bench) -> None:
     def shown(encoding: str, step: int, size: int) -> list[Any]:
         image = m.Image(1, "left", 2, 3, encoding, step, bytes(range(size)))
-        return bench.hear("stereo/left/image_raw", image)
+        return bench.receive("stereo/left/image_raw", image)
 
     (sent,) = shown("mono8", 4, 8)
     (view,) = sent.batch
@@ -208,7 +210,7 @@ def test_targets_and_log_lines_are_passed_on(bench: Bench) -> None:
     bench.port.send_plane(plane_pose(4.0, 30.0))
     bench.port.send_point(target_point(10.0, -5.0, 100.0))
     bench.port.log("a line")
-    plane, point, line = bench.take()
+    plane, point, line = bench.handle()
     assert plane.message.orientation == pytest.approx(TURN)
     assert point == Publish("target_point", m.Point(0, "rig", (0.01, -0.005, 0.1)))
     assert line == Log("warning", "a line")
@@ -240,7 +242,7 @@ def test_page_events_are_bounded(bench: Bench) -> None:
 def test_images_are_subscribed_while_a_page_requests_views(bench: Bench) -> None:
     both = ("stereo/left/image_raw", "stereo/right/image_raw")
     bench.port.view("left")
-    assert listened(bench.take()) == dict.fromkeys(both, True)
+    assert listened(bench.handle()) == dict.fromkeys(both, True)
     assert {row.topic for row in bench.console.inputs if row.lazy} == {*both}
     for waited, left in ((1.9, {}), (0.2, dict.fromkeys(both, False))):
         bench.now += waited

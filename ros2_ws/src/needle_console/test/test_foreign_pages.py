@@ -38,7 +38,7 @@ def test_only_origins_with_the_page_port_are_accepted() -> None:
         *("http://user@localhost:8080", "file://localhost:8080", "http://localhost:99999"),
     ):
         assert LOOPBACK.why_not_origin(foreign) == "foreign Origin"
-    # A default port needs not be said.
+    # A default port is left out.
     access = Access("192.168.1.5", 80, ["rig.lab"])
     assert access.why_not_origin("http://rig.lab") == ""
     assert access.why_not_origin("https://rig.lab") == "foreign Origin"
@@ -49,14 +49,14 @@ def test_other_machines_need_a_host_name() -> None:
         Access("0.0.0.0", 8080)
     with pytest.raises(UserError, match="neither an IP address"):
         Access("rig.lab", 8080)
-    # What is listened on is a name of its own; loopback's names are another machine's here.
+    # The address counts as a host name; loopback names would be another machine.
     access = ConsoleParameters(address="192.168.1.5").access()
     assert access.why_not_host("192.168.1.5:8081") == ""
     assert access.why_not_host("localhost:8081") == "foreign Host"
 
 
 def asked(*headers: tuple[str, str], kind: str = "http", method: str = "GET") -> dict[str, Any]:
-    """Return what the gate, or the page behind it, answers first."""
+    """Return the first answer of the gate, or of the page behind it."""
     said: list[dict[str, Any]] = []
 
     async def page(scope: Any, receive: Any, send: Any) -> None:
@@ -97,7 +97,7 @@ def test_page_cannot_be_framed() -> None:
 @pytest.mark.parametrize("hold_real_rig", [True, False])
 def test_real_rig_is_held_only_locally_and_if_allowed(hold_real_rig: bool, is_local: bool) -> None:
     port = PagePort(ConsoleParameters(hold_real_rig=hold_real_rig))
-    # A device that is not heard may be a real one.
+    # An unknown device may be a real one.
     assert (port.why_no_hold(is_local) == "") == (hold_real_rig and is_local)
     for simulated in (True, False, None):
         port.send((Snapshot(device=DeviceStatus(simulated=simulated)),))

@@ -17,7 +17,7 @@ from needle_device_driver.procedure import (
 
 
 class Script:
-    """A procedure of two waits, and how far it got."""
+    """A procedure of two waits that records its progress."""
 
     def __init__(self) -> None:
         self.is_there = False
@@ -50,7 +50,7 @@ def test_procedure_resumes_by_condition_or_time_out() -> None:
     script = Script()
     running = Running(script.procedure())
     running.advance(0.0)
-    # 25 periods of 0.02 s make no more than 0.5 s, however they are rounded
+    # 25 periods of 0.02 s are at most 0.5 s in spite of rounding
     running.advance(sum([0.02] * 25))
     assert script.steps == ["first", "second"]
 
@@ -106,7 +106,7 @@ def test_side_by_side_an_error_cancels_the_others() -> None:
     with pytest.raises(ValueError, match="refused"):
         running.advance(0.1)
     assert one.steps == ["first", "end"]
-    # So does a cancellation end all.
+    # A cancellation ends all.
     scripts = Script(), Script()
     running = Running(side_by_side(*(script.procedure() for script in scripts)))
     running.advance(0.0)

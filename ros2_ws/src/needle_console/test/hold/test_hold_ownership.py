@@ -39,7 +39,7 @@ def test_press_after_a_release_counts(scene: Scene, page: int) -> None:
 
 
 def test_hold_lasts_while_echoed_and_ends_with_silence(scene: Scene, page: int) -> None:
-    # The bound of docs/safety.md: 300 ms, transport and the device's cycle included.
+    # docs/safety.md: 300 ms, including transport and a device cycle.
     assert ECHO_AGE_LIMIT + PERIOD < 0.3
     scene.press(page)
     for _ in range(20):
@@ -48,15 +48,15 @@ def test_hold_lasts_while_echoed_and_ends_with_silence(scene: Scene, page: int) 
         assert scene.say(page, True) is None
     scene.wait(ECHO_AGE_LIMIT + JUST)
     assert not scene.pressed
-    # The finger that is still there counts for nothing, and the first reason stays.
+    # A continued press does not count, and the first reason stays.
     for _ in range(10):
         assert scene.say(page, True) is HoldRefusal.NEW_PRESS
         assert not scene.pressed
-        assert scene.told(page)["why"] == STALLED
+        assert scene.message_to(page)["why"] == STALLED
         scene.wait(PERIOD)
     assert scene.protocol.counts()["hold lost"] == 1
     scene.press(page)
-    assert scene.told(page)["why"] == ""
+    assert scene.message_to(page)["why"] == ""
 
 
 def test_hold_age_counts_from_the_sent_count(scene: Scene, page: int) -> None:
@@ -101,7 +101,6 @@ def test_echo_counts_once_except_for_a_release(scene: Scene, page: int) -> None:
     assert scene.say(page, True, count=count) is HoldRefusal.ECHO
     assert scene.say(page, False, count=count) is None
     assert not scene.pressed
-    # A press that did not count when it came does not count later.
     assert scene.say(page, True, count=count) is HoldRefusal.ECHO
     assert scene.say(page, True) is HoldRefusal.NEW_PRESS
     assert scene.say(page, False, count=count) is HoldRefusal.ECHO
@@ -114,7 +113,7 @@ def test_echo_of_another_connection_does_not_count(scene: Scene, page: int) -> N
     assert counts == sorted(set(counts))
     assert scene.say(page, True, count=counts[1]) is HoldRefusal.ECHO
     assert scene.say(page, False, count=counts[2]) is None
-    # A page that comes again is another connection, and has to release first.
+    # A reconnected page has to release first.
     scene.protocol.close(page, scene.now)
     again = scene.page()
     before = scene.count(again)
@@ -138,7 +137,7 @@ def test_invalid_message_ends_the_hold(
     assert act(scene, page) is refusal
     assert not scene.pressed
     assert scene.say(page, True) is HoldRefusal.NEW_PRESS
-    # It takes back a release that was heard before it, too.
+    # It also invalidates an earlier release.
     scene.say(page, False)
     act(scene, page)
     assert scene.say(page, True) is HoldRefusal.NEW_PRESS
@@ -153,7 +152,7 @@ def test_barred_page_gets_the_reason(scene: Scene, is_local: bool) -> None:
     scene.bars[is_local] = "only watching"
     assert scene.say(page, True) is HoldRefusal.BARRED
     assert not scene.pressed
-    told = scene.told(page)
+    told = scene.message_to(page)
     assert (told["bar"], told["why"]) == ("only watching", "only watching")
     scene.bars[is_local] = ""
     assert scene.say(page, True) is HoldRefusal.NEW_PRESS
@@ -164,21 +163,21 @@ def test_page_owns_the_hold_until_it_disconnects_or_idles(scene: Scene) -> None:
     first, second, third = scene.page(), scene.page(), scene.page()
     scene.press(first)
     scene.say(first, False)
-    assert scene.told(first)["bar"] == ""
+    assert scene.message_to(first)["bar"] == ""
     scene.say(second, False)
     assert scene.say(second, True) is HoldRefusal.BARRED
-    assert scene.told(second)["why"] == OTHER_PAGE
+    assert scene.message_to(second)["why"] == OTHER_PAGE
     scene.protocol.close(first, scene.now)
-    # The finger that is still there counts for nothing.
+    # A continued press does not count.
     assert scene.say(second, True) is HoldRefusal.NEW_PRESS
     scene.press(second)
     scene.say(second, False)
     scene.wait(IDLE)
-    assert scene.told(third)["bar"] == OTHER_PAGE
+    assert scene.message_to(third)["bar"] == OTHER_PAGE
     scene.wait(JUST)
     scene.press(third)
-    assert scene.told(second)["bar"] == OTHER_PAGE
-    # What an earlier owner says or does is nothing to the hold; the owner takes its hold along.
+    assert scene.message_to(second)["bar"] == OTHER_PAGE
+    # An earlier owner does not affect the hold; the owner ends it by disconnecting.
     scene.say(second, False)
     scene.protocol.close(second, scene.now)
     assert scene.pressed
@@ -207,16 +206,16 @@ def test_silent_page_is_lost(scene: Scene, page: int) -> None:
 
 
 class Witness(Scene):
-    """Keeps a record of its own, and judges each hold by it."""
+    """Checks each hold with an independent record."""
 
     def __init__(self) -> None:
         super().__init__()
         self.pages = [self.page(), self.page()]
         self.written: list[str] = []
-        # Count -> the page that it went to, and when.
+        # Count to page and time.
         self._sent: dict[int, tuple[int, float]] = {}
-        # By page: highest count echoed; when the newest count of a pressed message was sent; at
-        # which event a fresh release was heard, and at which a hold was over.
+        # By page: highest echoed count; time of the newest count echoed by a press; event
+        # of the last fresh release, and of the last end of a hold.
         self._heard: dict[int, int] = {}
         self._proof: dict[int, float] = {}
         self._released: dict[int, int] = {}
@@ -245,15 +244,15 @@ class Witness(Scene):
         self.look()
 
     def look(self) -> None:
-        """Look at the hold now, and judge it."""
-        holders = [page for page in self.pages if self.told(page)["held"]]
+        """Check the hold now."""
+        holders = [page for page in self.pages if self.message_to(page)["held"]]
         assert len(holders) == self.pressed
         holder = holders[0] if holders else None
         if holder is not None:
-            # Somebody pressed this page's button no longer ago than that, by our own clock.
+            # The button was pressed within the limit.
             assert self.now - self._proof[holder] <= ECHO_AGE_LIMIT
             if self._holder is None:
-                # And it was seen released since its last hold was over.
+                # And it was released since its last hold.
                 assert self._released[holder] >= self._over.get(holder, -1)
             else:
                 assert holder == self._holder
@@ -263,7 +262,7 @@ class Witness(Scene):
         self._event += 1
 
     def act(self, rng: random.Random) -> None:
-        """Do one thing that pages, networks or strangers may do."""
+        """Perform one random action of pages, network or other senders."""
         number, pressed = rng.randrange(2), rng.random() < 0.6
         match rng.choice(("echo", "echo", "echo", "wait", "write", "replay", "end")):
             case "echo":
@@ -275,7 +274,7 @@ class Witness(Scene):
             case "write":
                 self.write(self.pages[number], pressed)
             case "replay" if self.written:
-                # At some later time, more than once, to any page.
+                # Later, repeatedly, to any page.
                 self.deliver(self.pages[number], rng.choice(self.written[-8:]))
             case "end" if pressed:
                 self.protocol.receive(self.pages[number], "{", self.now)

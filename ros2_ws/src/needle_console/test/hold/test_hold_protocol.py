@@ -12,7 +12,7 @@ from needle_console.hold.page_session import ECHO_AGE_LIMIT, RELEASED, PageHold
 
 
 class Scene:
-    """A talk with one page, in a time of its own."""
+    """A protocol with one page and virtual time."""
 
     def __init__(self) -> None:
         self.states: list[PageHold] = []
@@ -22,17 +22,17 @@ class Scene:
     def come(self, now: float) -> None:
         self.page = self.protocol.open(now, is_local=True)
 
-    def told(self, now: float) -> dict[str, Any]:
+    def message_to(self, now: float) -> dict[str, Any]:
         told: dict[str, Any] = json.loads(self.protocol.message_for(self.page, now))
         return told
 
     def say(self, pressed: bool, now: float) -> None:
-        count = self.told(now)["count"]
+        count = self.message_to(now)["count"]
         message = {"count": count, "pressed": pressed, "speed": 0.5, "mode": "insert"}
         self.protocol.receive(self.page, json.dumps(message), now)
 
     def look_until(self, now: float, end: float) -> float:
-        """Look as often as the talk asks for; return when it would look next."""
+        """Update at the requested times; return the time of the next update."""
         while now < end:
             now = self.protocol.update(now)
         return now
@@ -50,7 +50,7 @@ def test_page_gets_the_reason_after_a_stall(first: str) -> None:
         scene.say(True, now)
     elif first == "look":
         scene.protocol.update(now)
-    told = scene.told(now)
+    told = scene.message_to(now)
     assert not told["held"]
     assert told["why"].startswith("no echo from this page for 0.25 s")
     assert scene.protocol.counts()["hold lost"] == 1
@@ -63,7 +63,7 @@ def test_hold_is_reported_every_20_ms_or_80_ms_without_a_page() -> None:
     now = scene.look_until(0.0, 1.0)
     assert set(scene.states) == {RELEASED}
     assert len(scene.states) == pytest.approx(1.0 / IDLE_PERIOD, abs=1)
-    # The first page is not kept waiting for the slower look.
+    # The first page shortens the period at once.
     now += 0.1 * PERIOD - IDLE_PERIOD
     scene.come(now)
     assert scene.protocol.update(now) <= now + PERIOD

@@ -27,7 +27,7 @@ HOST, ORIGIN = ("Host", "127.0.0.1:8081"), ("Origin", "http://127.0.0.1:8080")
 
 
 class Rig:
-    """A server whose clock stands still, and what it says."""
+    """A server with a stopped clock that records its reports."""
 
     def __init__(self) -> None:
         self.states: list[PageHold] = []
@@ -52,7 +52,7 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
 
 
 class Page:
-    """A connection: echoes what it is sent, as often as it is told, and goes."""
+    """A connection that echoes counts, then closes."""
 
     def __init__(self, *pressed: bool, address: str = "127.0.0.1") -> None:
         self.local_address, self.remote_address = ("127.0.0.1", 1), (address, 2)

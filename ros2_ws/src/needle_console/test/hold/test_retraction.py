@@ -31,7 +31,7 @@ def test_retraction_stops_steering_first_and_calls_each_service_once() -> None:
         True, (RETRACT,)
     )
     assert retraction.update(OUT, 0.0, steering=False, hold_counts=True) == HoldOrder(True)
-    # The needle is out, the finger is still there: no second time, and no hold either.
+    # The needle is out and the button still pressed: no second call, and no hold.
     assert retraction.update(OUT, 8.0, steering=False, hold_counts=False) == HoldOrder(True)
     assert retraction.update(OUT, 8.1, steering=False, hold_counts=True) == HoldOrder(False)
     assert retraction.update(OUT, 8.2, steering=True, hold_counts=False) == HoldOrder(False)
@@ -48,7 +48,7 @@ def test_retraction_of_a_needle_that_is_out_ends_the_hold() -> None:
     )
     assert retraction.update(OUT, 0.9, steering=False, hold_counts=True) == HoldOrder(True)
     assert retraction.update(OUT, 1.1, steering=False, hold_counts=True) == HoldOrder(False)
-    # A controller that steers meanwhile is left alone: nothing is held that it could answer.
+    # Steering that begins now gets no hold.
     assert retraction.update(OUT, 1.2, steering=True, hold_counts=False) == HoldOrder(False)
 
 

@@ -30,7 +30,7 @@ def track(*depths: float) -> tuple[TrackPoint, ...]:
 
 
 class Camera:
-    """Sees x upwards and z to the right; what lies behind the entry not at all."""
+    """Projects x upwards and z to the right; points behind the entry are invisible."""
 
     def __init__(self) -> None:
         self.camera, self.width, self.height = self, 1280, 960
@@ -41,7 +41,7 @@ class Camera:
 
 
 def view(snapshot: Snapshot, camera: Any, size: tuple[int, int]) -> np.ndarray:
-    """Return what is drawn into a black image of a size (height, width)."""
+    """Return the drawing in a black image of a size (height, width)."""
     jpeg = draw_view(np.zeros(size, np.uint8), snapshot, camera)
     return np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), dtype=float)
 
@@ -53,7 +53,7 @@ def test_shaft_tip_and_target_are_drawn_at_their_pixels() -> None:
     snapshot = Snapshot(None, controller, insertion=1.0, tip=TIP, track=track(0.02, 0.04))
     picture = view(snapshot, camera, size)
     assert picture.shape == (480, 640, 3)
-    # A diamond is drawn around its place, the other marks on it.
+    # A diamond is drawn around its point, the other marks on it.
     for place, reach, is_blue in (
         (snapshot.track[0].position, 1, True),
         (TIP.position, 1, False),
@@ -65,7 +65,7 @@ def test_shaft_tip_and_target_are_drawn_at_their_pixels() -> None:
         assert (blue > red) == is_blue
         assert spot.max() > 90.0
     assert (picture.sum(axis=2) > 60.0).mean() < 0.02
-    # Without a fitting calibration nothing is drawn in; what cannot be seen does no harm.
+    # Without a matching calibration nothing is drawn; invisible points do no harm.
     for unfit in (None, camera):
         assert view(snapshot, unfit, (480, 640)).max() < 10.0
     beyond = MeasuredTip(np.array([5.0, 5.0, -5.0]), COVARIANCE, 0.0)
@@ -90,14 +90,14 @@ def test_views_are_drawn_at_most_ten_times_per_second() -> None:
 
 
 def read(points: str, picture: ElementTree.Element) -> np.ndarray:
-    """Return what points of a chart mean [mm], by the numbers along its edges."""
+    """Return the values of points in a chart [mm], by its axis labels."""
     marks = [
         (text.attrib, float(str(text.text)))
         for text in picture.iter("text")
         if str(text.text).lstrip("-").replace(".", "", 1).isdigit()
     ]
     below = [(float(at["x"]), n) for at, n in marks if at["text-anchor"] == "middle"]
-    # What is written stands 4 below its line.
+    # Labels are 4 px below their lines.
     beside = [(float(at["y"]) - 4, n) for at, n in marks if at["text-anchor"] == "end"]
     assert len(below) > 3 and len(beside) > 3
     places = np.array([point.split(",") for point in points.split()], dtype=float).T

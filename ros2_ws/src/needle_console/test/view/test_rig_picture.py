@@ -68,7 +68,7 @@ def test_reason_of_an_ended_hold_is_kept_while_pressed() -> None:
     stamps = DeviceStatus(reason="hold of 'console' does not count (hold_in_order)")
     for told, why in (
         ((moving, silent, again, again), silent.reason),
-        # Where the console stood still itself, it heard no more than that.
+        # A stalled console did not receive more.
         ((moving, again), again.reason),
         ((moving, again, stamps), stamps.reason),
     ):

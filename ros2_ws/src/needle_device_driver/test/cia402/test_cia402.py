@@ -15,7 +15,7 @@ from needle_device_driver.cia402.cia402 import (
     next_command,
 )
 
-# CiA 402-2: bits 6, 5 and 3..0 of the statusword; x is any.
+# CiA 402-2: bits 6, 5 and 3..0 of the statusword; x: any value.
 PATTERNS = {
     "x0xx 0000": "NOT_READY_TO_SWITCH_ON",
     "x1xx 0000": "SWITCH_ON_DISABLED",
@@ -26,7 +26,7 @@ PATTERNS = {
     "x0xx 1111": "FAULT_REACTION_ACTIVE",
     "x0xx 1000": "FAULT",
 }
-# Every way that a controlword opens, by the standard's numbers.
+# Transitions by controlword, with the standard's numbers.
 WAYS = {
     (2,): "SWITCH_ON_DISABLED SHUTDOWN READY_TO_SWITCH_ON",
     (3,): "READY_TO_SWITCH_ON SWITCH_ON SWITCHED_ON",
@@ -57,7 +57,7 @@ def fits(word: int, pattern: str) -> bool:
 
 def test_states_commands_and_transitions_match_the_standard() -> None:
     for word in range(256):
-        # The upper byte and bits 4 and 7 say nothing about the state.
+        # The upper byte and bits 4 and 7 do not encode the state.
         wanted = [name for pattern, name in PATTERNS.items() if fits(word, pattern)]
         found = drive_state(word | 0x1600)
         assert ([found.name] if found else []) == wanted
@@ -73,7 +73,7 @@ def test_commands_reach_every_goal_without_fault_reset() -> None:
         Goal.OFF: {DriveState.SWITCH_ON_DISABLED},
         Goal.STOPPED: {DriveState.QUICK_STOP_ACTIVE, DriveState.SWITCH_ON_DISABLED},
     }
-    # A drive leaves the first by itself (transition 1).
+    # A drive leaves the first state by itself (transition 1).
     ways = [s for s in DriveState if s not in (*FAULTS, DriveState.NOT_READY_TO_SWITCH_ON)]
     for start, (goal, wanted) in itertools.product(ways, ends.items()):
         at: DriveState = start
@@ -91,7 +91,7 @@ def test_moving_axis_never_coasts() -> None:
             assert next_command(goal, state, at_rest=False) is DriveCommand.QUICK_STOP
     on = next_command(Goal.ON, DriveState.QUICK_STOP_ACTIVE, at_rest=False)
     assert on is DriveCommand.QUICK_STOP
-    # What no statusword explains disables.
+    # An unknown state disables.
     assert next_command(Goal.ON, None, at_rest=True) is DriveCommand.DISABLE_VOLTAGE
     assert next_command(Goal.STOPPED, None, at_rest=True) is DriveCommand.QUICK_STOP
 

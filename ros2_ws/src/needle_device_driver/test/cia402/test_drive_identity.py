@@ -11,7 +11,7 @@ from needle_device_driver.procedure import Procedure, run_at_once
 
 
 class Named:
-    """A bus on which each node has a name, or refuses to say it, or is not there."""
+    """A bus on which each node has a name, refuses to report it, or is missing."""
 
     def __init__(self, *names: bytes | Exception) -> None:
         self._names = names

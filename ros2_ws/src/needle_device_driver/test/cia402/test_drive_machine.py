@@ -24,7 +24,7 @@ def machine() -> DriveMachine:
 
 
 def orders(machine: DriveMachine, *answers: Feedback) -> list[DriveCommand]:
-    """Return what is ordered after each answer."""
+    """Return the command after each answer."""
     machine.next_order()
     given = []
     for answer in answers:
@@ -48,7 +48,7 @@ def test_no_command_after_a_quick_stop_before_the_axis_rests(
     enabled(machine)
     machine.stop()
     machine.set_goal(goal)
-    # It trembles by two counts at last, for three cycles.
+    # Jitter of two counts in the last three cycles.
     ways = [*itertools.accumulate((400, 300, 200, 100, 3, 2, 2))]
     given = orders(machine, *(said(QUICK_STOP, position) for position in ways))
     assert given == [DriveCommand.QUICK_STOP] * 7
@@ -91,11 +91,11 @@ def test_blocked_axis_is_released_when_stopped(machine: DriveMachine, behind: in
 @pytest.mark.parametrize(
     ("ways", "off"),
     [
-        # It runs on; it slows down too late; it creeps at the edge of what counts as rest.
+        # It moves on; it slows down too late; it creeps at the limit of rest.
         ([100] * 20, True),
         ([100] * 9 + [80, 60, 40, 20, 0, 0, 0, 0, 0, 0, 0], True),
         ([2] * 20, False),
-        # It stops on its ramp; it trembles by more than it may at rest.
+        # It stops on its ramp; its jitter exceeds rest.
         ([100, 60, 20] + [0] * 17, False),
         ([8, -8] * 10, False),
     ],
@@ -107,7 +107,7 @@ def test_drive_that_moves_on_in_its_quick_stop_is_switched_off(
         enabled(machine)
         machine.stop()
         given = orders(machine, *(said(QUICK_STOP, at) for at in itertools.accumulate(ways)))
-        # 50 ms of ramp are 3 cycles, 2 more for late answers, and 5 to see where it goes.
+        # 3 cycles for a ramp of 50 ms, 2 for late answers, 5 to observe the motion.
         assert given[:9] == [DriveCommand.QUICK_STOP] * 9
         late = DriveCommand.DISABLE_VOLTAGE if off else DriveCommand.QUICK_STOP
         assert given[9:] == [late] * 11
@@ -119,7 +119,7 @@ def test_the_mode_changes_only_while_the_drive_is_off(machine: DriveMachine) -> 
     enabled(machine)
     machine.mode = Mode.HOMING
     position = Mode.CYCLIC_SYNCHRONOUS_POSITION
-    # It has stood since it was enabled.
+    # The axis rests since it was enabled.
     assert machine.next_order() == (DriveCommand.QUICK_STOP, position)
     for answer, order in (
         (said(QUICK_STOP), (DriveCommand.DISABLE_VOLTAGE, position)),
@@ -140,7 +140,7 @@ def test_axis_that_never_rests_is_switched_off(
 ) -> None:
     enabled(machine)
     machine.set_goal(Goal.OFF)
-    # On and on, but never far: it is no drive that runs on.
+    # Jitter, which is no motion.
     given = orders(machine, *(said(QUICK_STOP, 8 + 8 * (count % 2)) for count in range(51)))
     assert given == [DriveCommand.QUICK_STOP] * 50 + [DriveCommand.DISABLE_VOLTAGE]
 

@@ -27,7 +27,7 @@ CONNECT = socket.create_connection
 
 
 class Port:
-    """A port, and what has come through it."""
+    """A port that records frames and changes."""
 
     def __init__(self, kind: str, channel: str = "can0", **settings: Any) -> None:
         self.now = 0.0
@@ -62,7 +62,7 @@ class Port:
         self.port.send((CanFrame(cob_id, data),))
 
     def fill(self) -> None:
-        """Send until the port tells that it is lost."""
+        """Send until the port is lost."""
         while "takes nothing for 0.001 s" not in self.changes:
             self.port.send((CanFrame(0x201, bytes(8)),) * 1000)
 
@@ -77,7 +77,7 @@ def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 class Adapter:
-    """The far end of a pseudo-terminal, where a serial CAN adapter would be."""
+    """A serial CAN adapter at the other end of a pseudo-terminal."""
 
     def __init__(self) -> None:
         self.master, self.slave = os.openpty()
@@ -85,7 +85,7 @@ class Adapter:
         self.path = os.ttyname(self.slave)
 
     def read(self, wanted: bytes) -> bytes:
-        """Return what was written, up to what is wanted, or as far as it goes."""
+        """Return the written data up to the wanted ones, or all."""
         data = b""
         while wanted not in data and select.select([self.master], [], [], 1.0)[0]:
             data += os.read(self.master, 4096)
@@ -109,12 +109,12 @@ def adapter() -> Iterator[Adapter]:
 def test_slcan_opens_with_the_bitrate_sends_frames_and_closes(adapter: Adapter) -> None:
     assert set(SLCAN_BITRATES) == set(SlcanBus._BITRATES)
     port = Port("slcan", adapter.path, bitrate=1_000_000)
-    # First the end of a line that a killed predecessor may have left.
+    # First it ends a line of an earlier program.
     assert adapter.read(b"O\r") == b"\rC\rS8\r\rO\r"
     port.send(0x201, b"\x0f\x00\x08")
     port.send(0x80)
     assert adapter.read(b"t0800\r") == b"t20130F0008\rt0800\r"
-    # The port is one program's alone.
+    # The port is locked.
     second = Port("slcan", adapter.path)
     assert second.changes == ["another program uses it"]
     port.port.close()
@@ -167,7 +167,6 @@ def test_slcan_receives_frames_in_any_pieces(adapter: Adapter) -> None:
     adapter.say(b"\r\rz\rt1812")
     adapter.say(b"37")
     adapter.say(b"02\rt1812ABCD\rt18\rnonsense\rt181xZZ\r\x07" + b"?" * 100 + b"\rt1810\r")
-    # Lines may end with a line feed, too.
     adapter.say(b"\r\n\r\nt18123702\r\nz\r\n\nt1811aB12F4\r\n\x07")
     port.until(lambda: len(port.frames) == 5 and port.refusals == 2)
     assert port.frames == [b"\x37\x02", b"\xab\xcd", b"", b"\x37\x02", b"\xab"]
@@ -178,7 +177,7 @@ def test_slcan_receives_frames_in_any_pieces(adapter: Adapter) -> None:
 
 
 def test_slcan_sets_up_a_silent_adapter_again(adapter: Adapter) -> None:
-    # It starts when its port is opened, and hears nothing meanwhile.
+    # The adapter restarts when its port is opened.
     port = Port("slcan", adapter.path, bitrate=125_000)
     assert adapter.read(b"O\r") == b"\rC\rS4\r\rO\r"
     port.now = 0.4
@@ -189,7 +188,7 @@ def test_slcan_sets_up_a_silent_adapter_again(adapter: Adapter) -> None:
     port.now = 0.8
     adapter.say(b"t1810\r")
     port.until(lambda: port.frames == [b""])
-    # Not once it was heard.
+    # Not after a frame arrived.
     port.now = 1.1
     port.port.step()
     port.send(0x80)
@@ -202,7 +201,7 @@ def test_slcan_reopens_an_unplugged_adapter() -> None:
     adapter.unplug()
     port.until(lambda: len(port.changes) == 2)
     assert port.changes[1]
-    # Nothing to send through, and nothing raised.
+    # Sending without an adapter raises no error.
     port.send(0x80)
     again = Adapter()
     port.port._settings = LinkSettings("slcan", again.path)
@@ -210,7 +209,7 @@ def test_slcan_reopens_an_unplugged_adapter() -> None:
     again.read(b"O\r")
     port.send(0x80)
     assert again.read(b"t0800\r") == b"t0800\r"
-    # One that takes nothing is lost, and hangs nobody.
+    # A stuck adapter is lost.
     port.port._lose(OSError("test"))
     port.until(lambda: port.changes[-1] == "")
     port.fill()
@@ -253,7 +252,7 @@ def test_virtual_passes_data_frames_both_ways() -> None:
 
 
 class Daemon:
-    """A socketcand that has said all that it says to a client before it is asked."""
+    """A socketcand server that sends all its replies in advance."""
 
     def __init__(
         self, monkeypatch: pytest.MonkeyPatch, said: bytes = b"< hi >< ok >< ok >"
@@ -284,7 +283,7 @@ def test_socketcand_passes_frames_and_detects_a_closed_connection(
     daemon.peer.sendall(b"< frame 181 12.5 3702 >")
     port.until(lambda: port.frames == [b"\x37\x02"])
     daemon.peer.close()
-    # Noticed without a word sent.
+    # Detected without sending.
     port.until(lambda: "the server hung up" in port.changes)
     daemon.close()
     daemon = Daemon(monkeypatch)

@@ -28,7 +28,7 @@ def test_entries_and_pdos_are_packed_little_endian() -> None:
     assert od.SET_POINT.pack(-2) == b"\xfe\xff\xff\xff"
     assert od.STATUS.unpack(b"\x37\x02\x08\x01\x00\x00\x00") == (0x0237, 8, 1)
     assert od.POSITION.unpack(b"\xff\xff\xff\xff\x02\x00\x00\x00") == (-1, 2)
-    # A long answer is cut, a short one and a PDO of another length refused.
+    # Extra bytes of an entry are ignored; missing bytes, and any other PDO length, are errors.
     assert od.STATUSWORD.unpack(b"\x37\x02\x00\x00") == 0x0237
     with pytest.raises(ValueError, match="2 bytes, wanted 4"):
         od.POSITION_ACTUAL.unpack(b"\x00\x00")
@@ -53,7 +53,7 @@ def test_reverse_drive_swaps_its_limits() -> None:
     assert DRIVE.limits_counts == (-20_000, 4_020_000)
     assert reverse.limits_counts == (-4_020_000, 20_000)
     assert reverse.magnitude(0.005) == 100_000
-    # No bound becomes the zero that means none.
+    # A bound never becomes 0, which means "no bound".
     assert dataclasses.replace(DRIVE, counts_per_unit=1.0).magnitude(0.005) == 1
 
 

@@ -26,7 +26,7 @@ def at_once(procedure: Procedure[T]) -> T:
 
 
 class Wire:
-    """Takes requests, and answers with what it was given, some frames for each."""
+    """Answers each request with given frames."""
 
     def __init__(self, *answers: str) -> None:
         self.answers = list(answers)
@@ -55,7 +55,7 @@ class Wire:
 
 def test_only_the_response_to_the_request_counts() -> None:
     for late in (
-        # To an earlier request, about another subindex, to a request to write.
+        # Responses to an earlier request, for another subindex, to a write request.
         "4300100092010200",
         "8000100000000206",
         "4302650100000000",
@@ -81,9 +81,9 @@ def test_request_is_repeated_once() -> None:
     with pytest.raises(SdoTimeoutError):
         wire.upload(0x6502)
     assert wire.sent == [READ_MODES, READ_MODES, "8000000000000405"]
-    # 0.5 s each.
+    # 0.5 s for each attempt.
     assert wire.beats == 1000
-    # One that is called off sends nothing more.
+    # A cancelled transfer sends nothing more.
     wire = Wire()
     transfer = wire.client.upload(0x6502, 0)
     next(transfer)
@@ -109,7 +109,7 @@ def test_response_may_omit_unused_bytes() -> None:
 
 
 class Server(canopen.LocalNode):
-    """canopen's own server, and a bus that carries frames to it and back at once."""
+    """canopen's server behind a bus without delay."""
 
     def __init__(self) -> None:
         objects = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]

@@ -23,7 +23,7 @@ def command(stamp_ns: int, *points: tuple[float, float, float]) -> Trajectory:
 
 
 class SupervisorBench(abc.ABC):
-    """Drives a supervisor cycle by cycle and remembers what it tells."""
+    """Runs the cycles of a supervisor and records its events."""
 
     supervisor: MotionSupervisor
 
@@ -89,14 +89,14 @@ class SupervisorBench(abc.ABC):
         count: int | None = None,
         lifetime: float = math.inf,
     ) -> str:
-        """Send a hold message; return whose press counts then."""
+        """Send a hold message; return the owner."""
         number = next(self.stamps) if count is None else count
         message = HoldState(sender, session, number, pressed, scale, lifetime)
         self.supervisor.receive_hold(message, self.now)
         return self.status.hold_owner
 
     def press(self) -> None:
-        """Release and press anew."""
+        """Release and press again."""
         self.hold(False)
         self.hold()
 
@@ -137,7 +137,7 @@ class SupervisorBench(abc.ABC):
             self.exchange()
 
     def wait(self, cycles: int = 1) -> None:
-        """Run cycles without a word from who holds."""
+        """Run cycles without hold messages."""
         for _ in range(cycles):
             self._tick()
             self.exchange()

@@ -77,7 +77,7 @@ def test_drive_without_feedback_has_no_joints_and_needs_no_cycles() -> None:
 
 
 def again(bench: DriveBench, position: int, home_after: int) -> DriveBench:
-    """Begin to home a drive that says all along that it attained the homing before."""
+    """Begin to home a drive that reports the previous homing as attained."""
     bench.homed()
     drive = bench.insertion
     drive.position, drive.home_after, drive.stale_homing = position, home_after, True
@@ -100,7 +100,7 @@ def test_homing_ends_by_target_reached_if_attained_is_always_set() -> None:
 
 @pytest.mark.parametrize(("parameters", "cycles"), [({}, 25), ({"insertion_homing_method": 37}, 5)])
 def test_homing_within_one_cycle_ends(parameters: dict[str, int], cycles: int) -> None:
-    """On the edge of its switch a drive is through between two answers."""
+    """At the edge of its switch a drive homes within one cycle."""
     bench = again(DriveBench(**parameters), 0, 0)
     stood = 0
     while not bench.is_homed():
@@ -145,7 +145,7 @@ def test_axis_without_motor_gets_no_motion_commands_and_no_watchdog(home: int) -
     assert bench.outcomes == ["aborted: hold released"]
     assert not [cob for cob, _ in bench.bus.sent if cob in (0x201, 0x301)]
     assert (0x605A, 0) not in bench.insertion.objects
-    assert bench.insertion.holds(0x1016, 1) == 0
+    assert bench.insertion.value(0x1016, 1) == 0
     # A fault of its drive is acknowledged by SDO.
     bench.after(lambda: bench.insertion.fail(0x7305))
     assert bench.state == "FAULT"

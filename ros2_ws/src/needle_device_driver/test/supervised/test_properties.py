@@ -23,7 +23,7 @@ def _named(name: str, event: Event) -> Event:
 
 def _homeless(bench: Bench) -> None:
     bench.insertion.homed = False
-    # The supervisor cannot know before the axis' next reply.
+    # The supervisor knows only after the next feedback of the axis.
     bench.supervisor.observe(bench.now)
 
 
@@ -64,7 +64,7 @@ _others = st.sampled_from([_named(name, event) for name, event in _EVENTS.items(
 
 
 class Witness(Bench):
-    """Watches every cycle with a model of the hold of its own, from what was sent alone."""
+    """Checks every cycle with an independent model of the hold."""
 
     def __init__(self) -> None:
         self.heard: dict[str, tuple[float, bool]] = {}

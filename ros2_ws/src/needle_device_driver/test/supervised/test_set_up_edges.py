@@ -11,7 +11,7 @@ from .drive_bench import DriveBench
 
 
 def stored(index: int, made: int, at: int, value: bytes) -> bytes:
-    """Return what a drive makes of a value."""
+    """Return the stored value."""
     return made.to_bytes(len(value), "little") if at == index else value
 
 
@@ -38,7 +38,7 @@ def test_drive_has_half_a_second_to_display_an_unlisted_mode(seconds: float, has
     def sending() -> None:
         drive.mode = 8 if bench.now >= due else 0
 
-    drive.tells({(0x6502, 0): 0x225})
+    drive.set_objects({(0x6502, 0): 0x225})
     drive.modes, drive.refuses, bench.bus.sending = set(), refuses, sending
     bench.sdo_time = 0.02
     reply = bench.configure()
@@ -62,6 +62,6 @@ def test_drive_may_round_a_bound_but_not_halve_it(
         bench = DriveBench(**parameter)
         bench.insertion.stores = partial(stored, index, made)
         if is_taken:
-            assert bench.configured().insertion.holds(index) == made
+            assert bench.configured().insertion.value(index) == made
         else:
             assert f"took {wanted} for 0x{index:04X}" in bench.refusal()

@@ -58,7 +58,7 @@ def fault_and_reset(bench: DriveBench) -> None:
 def test_frames_match_the_transcript(scene: Callable[[DriveBench], None]) -> None:
     bench = DriveBench()
     scene(bench)
-    # Heartbeats are test_bus_rules' concern.
+    # test_bus_rules checks the heartbeats.
     sent = [f"{cob:03X}#{data.hex().upper()}" for cob, data in bench.bus.sent if cob != 0x77F]
     lines = (FOLDER / f"{scene.__name__}.txt").read_text("utf-8").splitlines()
     assert sent == [line.split()[0] for line in lines if line and not line.startswith("#")]

@@ -60,7 +60,7 @@ def test_default_limits_and_their_parameters() -> None:
         changed: dict[str, Any] = {name: 0.9 * bound}
         given = SafetyLimits.of(DeviceDriverParameters(**changed))
         assert dataclasses.asdict(given) == BOUNDS | {name: 0.9 * bound}
-    # Ideal axes come nearer to their targets.
+    # Ideal axes have smaller tolerances.
     ideal = BOUNDS | {"insertion_tolerance": 1e-6, "rotation_tolerance": 1e-4}
     assert dataclasses.asdict(SafetyLimits()) == ideal
     assert SafetyLimits().longest_homings == pytest.approx((150.0, 1.5 * 20.0 * math.pi))

@@ -32,9 +32,9 @@ def test_link_loss_is_reported_and_reset_reopens_the_link() -> None:
     bench.broken = "takes nothing for 0.05 s"
     bench.go()
     bench.failed("link_loss", "link virtual test is lost: takes nothing")
-    # Without a computer the drives' watchdogs trip, and nobody knows what else happened to them.
+    # Without the computer the drives' watchdogs trip, and their state is unknown.
     bench.insertion.state = bench.rotation.state = "fault"
-    bench.insertion.tells({(0x1016, 1): 0})
+    bench.insertion.set_objects({(0x1016, 1): 0})
     bench.hold(False)
     bench.no_adapter = True
     assert "cannot open" in bench.reset().message
@@ -42,7 +42,7 @@ def test_link_loss_is_reported_and_reset_reopens_the_link() -> None:
     bench.no_adapter = False
     bench.stopped("link_loss", "takes nothing")
     assert bench.link.openings == 2
-    assert bench.insertion.holds(0x1016, 1) == WATCHDOG
+    assert bench.insertion.value(0x1016, 1) == WATCHDOG
 
 
 def test_link_loss_while_idle_and_before_the_set_up() -> None:
@@ -86,7 +86,7 @@ def test_reply_age_heartbeats_renew_only_answered_positions() -> None:
     bench.insertion.syncs = False
     bench.wait(8)
     assert (bench.state, bench.rule) == ("FAULT", "reply_age")
-    # Nor do the heartbeats of a drive that left the operational state.
+    # Heartbeats in another state than operational do not count.
     bench = DriveBench().configured()
     bench.insertion.nmt = 0x7F
     bench.now += 0.2
@@ -113,8 +113,8 @@ def test_reply_age_includes_late_answers(
     take, sync = drive.take, drive.sync
 
     def without_heartbeats(cob_id: int, data: bytes) -> None:
-        # No heartbeat brings an answer.
-        drive.say(0x700, bytes([drive.nmt])) if cob_id == 0x77F else take(cob_id, data)
+        # A heartbeat does not replace an answer.
+        drive.emit(0x700, bytes([drive.nmt])) if cob_id == 0x77F else take(cob_id, data)
 
     def noted() -> None:
         nonlocal at
@@ -153,7 +153,7 @@ def test_reply_age_lost_answers_are_discarded_after_a_pause() -> None:
     bench.go(5)
     bench.insertion.loses = 2
     bench.go(3)
-    # The third answer may be to the first SYNC: nothing is sent on, for two cycles.
+    # The third answer may belong to the first SYNC: no set-point for two cycles.
     waiting, syncs = bench.insertion.next_target, len(bench.bus.sent)
     bench.go(2)
     assert bench.insertion.next_target == waiting
@@ -186,24 +186,24 @@ def set_up_again(bench: DriveBench) -> None:
 def test_drive_reboot_allows_retraction_by_the_last_depth() -> None:
     bench = DriveBench().moving()
     bench.go(20)
-    # Deeper than the software limits reach outward: un-homed, they do not count.
+    # Farther than the outer software limit: without home, it is off.
     deep, drawn_out = bench.insertion.position, 0
     assert deep > 20_000
-    # A second one on the way out leaves what is left of the way.
+    # After a second reboot, the remaining distance is allowed.
     for cycles in (10, 100):
         bench.after(bench.insertion.reboot)
         bench.failed("drive_reboot", "home position is lost")
         assert not bench.is_homed()
         set_up_again(bench)
         assert bench.insertion.nmt == 0x05
-        assert bench.insertion.holds(0x1016, 1) == WATCHDOG
-        assert bench.insertion.holds(0x607D, 1) == -(2**31)
+        assert bench.insertion.value(0x1016, 1) == WATCHDOG
+        assert bench.insertion.value(0x607D, 1) == -(2**31)
         bench.step()
         assert bench.rule == "homed_first"
         assert bench.retract().success
         bench.go(cycles)
         drawn_out -= bench.insertion.position
-    # What was last heard is a cycle old.
+    # The last feedback is a cycle old.
     assert drawn_out == pytest.approx(deep, abs=4000)
     assert bench.retract().message == "the needle is out"
 
@@ -213,12 +213,12 @@ def test_drive_reboot_of_a_self_starting_drive_needs_a_new_set_up() -> None:
     for drive in (bench.insertion, bench.rotation):
         drive.reboot()
         drive.nmt = 0x05
-        drive.tells({(0x1016, 1): 0})
+        drive.set_objects({(0x1016, 1): 0})
     bench.bus.flush()
     bench.wait(5)
     assert bench.state == "FAULT"
     assert bench.reset().success
-    assert bench.insertion.holds(0x1016, 1) == bench.rotation.holds(0x1016, 1) == WATCHDOG
+    assert bench.insertion.value(0x1016, 1) == bench.rotation.value(0x1016, 1) == WATCHDOG
     assert not bench.is_homed()
 
 
@@ -245,7 +245,7 @@ def test_drive_reboot_voids_its_set_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drive_setup, "_switch_off_unused_pdos", reboots_once)
     bench.after(bench.insertion.reboot)
     bench.hold(False)
-    # What it was told before it started anew is gone: only a whole set-up counts.
+    # The reboot undoes the first part of the set-up: only a complete one counts.
     assert "started anew while it was set up" in bench.reset().message
     assert bench.reset().success
     bench.wait(5)

@@ -39,7 +39,7 @@ def test_command_state_second_command_does_not_affect_the_step() -> None:
     stamp = bench.step()
     bench.go(5)
     other = bench.step(0.002, 1.0)
-    # Its own stamp would tell its sender that the running one has ended.
+    # With its own stamp, the result would mean the end of the running step.
     bench.step(0.002, 1.0, stamp_ns=stamp)
     assert bench.reset().message == "a step is under way"
     bench.go(20)
@@ -173,14 +173,14 @@ def test_command_newer_reset_rejects_no_valid_stamp() -> None:
 
 def test_tip_age_is_independent_of_ros_time() -> None:
     bench = Bench().ready()
-    # It stands still.
+    # ROS time stands still.
     stamp = bench.ros_ns
     bench.now += 2.1
     bench.press()
     bench.supervisor.note_time(stamp, bench.now)
     bench.step(stamp_ns=stamp)
     assert "2.100 s old, limit 2 s" in bench.outcomes[-1]
-    # It runs fast.
+    # ROS time runs fast.
     bench = Bench().ready()
     for second in range(100):
         bench.supervisor.note_time(stamp + second * 1000 * MS, bench.now + second * 0.002)
@@ -191,7 +191,7 @@ def test_tip_age_is_independent_of_ros_time() -> None:
 
 def test_tip_age_while_ros_time_stands_still() -> None:
     bench = Bench().ready()
-    # Longer than notes are kept, and more cycles than are kept of it.
+    # Longer than the horizon, and more cycles than are kept.
     for _ in range(1500):
         bench.now += PERIOD
         bench.supervisor.note_time(bench.ros_ns, bench.now)
@@ -230,7 +230,7 @@ def test_tip_age_bound_is_two_seconds() -> None:
 
 
 def bounded(rule: str, within: Point, beyond: Point, **limits: float) -> None:
-    """Check that a step just beyond a bound is refused by its rule, and one just within goes."""
+    """Check that a step just beyond a bound is refused, and one within is accepted."""
     bench = Bench(**limits).ready()
     bench.submit(beyond)
     assert "is beyond" in bench.refused(rule)
@@ -261,7 +261,7 @@ def test_max_step_length_also_in_the_wrong_unit() -> None:
 
 
 def test_max_speed_is_capped_at_5_mm_per_s() -> None:
-    # 1 um of the way is the tolerance; a message's time is whole nanoseconds.
+    # With the tolerance of 1 um; a message's time has whole nanoseconds.
     bounded("max_speed", (0.001001, 0.0, 0.2), (0.001001, 0.0, 0.199_999))
     with pytest.raises(OutOfBoundsError, match="max_speed"):
         SafetyLimits(max_speed=0.00501)

@@ -21,7 +21,6 @@ def test_quick_stop_is_sent_at_once_and_discards_the_set_point() -> None:
     bench.hold(False)
     assert bench.bus.sent == [(0x201, QUICK_STOP), (0x202, QUICK_STOP)]
     at = bench.positions
-    # However long.
     bench.go(105)
     assert bench.insertion.state == bench.rotation.state == "quick stop"
     assert bench.positions == at
@@ -31,7 +30,7 @@ def test_quick_stop_is_sent_at_once_and_discards_the_set_point() -> None:
 
 def test_quick_stop_without_deceleration_switches_both_off() -> None:
     bench = DriveBench().moving()
-    # A ramp that is none: 1 mm/s, as long as it has power.
+    # The drive does not decelerate: 1 mm/s as long as it has power.
     bench.insertion.drift = {"quick stop": 400}
     at = bench.insertion.position
     bench.hold(False)
@@ -49,32 +48,32 @@ def test_quick_stop_without_deceleration_switches_both_off() -> None:
     assert bench.insertion.state == "disabled"
 
 
-# What the drive does after an emergency stop; what is said of it after so many cycles; its end.
+# Behaviour of the drive after an emergency stop; report after a number of cycles; final state.
 Row = tuple[str, dict[str, Any], list[tuple[int, str]], str]
 UNSTOPPED: dict[str, Row] = {
     "stops": ("insertion", {}, [(cycle, "") for cycle in (1, 8, 9, 45, 52)], "disabled"),
     "only says": ("insertion", {"drift": {"quick stop": 400}}, [(20, ""), (10, "")], "disabled"),
     "ignores the stop": (
         "insertion",
-        {"drift": {"enabled": 400}, "deaf_to": {"quick stop"}},
+        {"drift": {"enabled": 400}, "ignored_orders": {"quick stop"}},
         [(12, "still moving"), (30, ""), (10, "")],
         "disabled",
     ),
     "keeps its power": (
         "rotation",
-        {"deaf_to": {"off"}},
+        {"ignored_orders": {"off"}},
         [(49, ""), (5, "still powered"), (0, "still powered")],
         "quick stop",
     ),
     "stands and takes no stop": (
         "insertion",
-        {"deaf_to": {"quick stop"}},
+        {"ignored_orders": {"quick stop"}},
         [(50, ""), (2, "still powered"), (53, "")],
         "disabled",
     ),
     "runs on powered": (
         "insertion",
-        {"drift": {"enabled": 400}, "deaf_to": {"quick stop", "off"}},
+        {"drift": {"enabled": 400}, "ignored_orders": {"quick stop", "off"}},
         [(60, "still powered and moving")],
         "enabled",
     ),
@@ -110,7 +109,7 @@ def test_quick_stop_ignored_after_estop_is_reported_while_it_lasts(
     assert drive.state == end
     said = [str(notice) for notice in bench.notices if notice.fault][1:]
     assert said == [f"{fault[16:]} [quick_stop]" for fault in told[1:]]
-    # It ends when the drive is mended, and with a reset.
+    # The report ends with the cause, and with a reset.
     bench.supervisor.receive_estop(False)
     bench.hold(False)
     drive.drift, drive.silent, drive.state = {}, False, "disabled"
@@ -138,7 +137,7 @@ def test_quick_stop_report_ends_when_the_drive_answers_a_reset() -> None:
     assert bench.status.fault == "emergency stop; rotation axis silent"
     bench.supervisor.receive_estop(False)
     bench.hold(False)
-    # No cycle sees it before the reset does.
+    # No cycle runs before the reset.
     bench.rotation.silent, bench.rotation.state = False, "disabled"
     assert bench.reset().success
     bench.wait(2)
@@ -157,7 +156,7 @@ def test_quick_stop_at_exit_leaves_time_for_answers() -> None:
     bench.run(bench.axes[0].close())
     assert bench.insertion.state == "disabled"
     assert len(times) > 3
-    # Half a cycle: each SYNC is answered at once.
+    # Half a cycle, as each SYNC is answered at once.
     assert np.diff(times) == pytest.approx([PERIOD / 2] * (len(times) - 1))
 
 
@@ -167,16 +166,16 @@ def test_quick_stop_at_exit_leaves_time_for_answers() -> None:
 def test_drive_watchdog_is_armed_last_and_disarmed_at_exit() -> None:
     bench = DriveBench().configured()
     for drive in (bench.insertion, bench.rotation):
-        assert (drive.holds(0x6007), drive.holds(0x605E)) == (1, 2)
+        assert (drive.value(0x6007), drive.value(0x605E)) == (1, 2)
         sent = [d for c, d in bench.bus.sent if c == 0x600 + drive.node and d[0] & 0xE0 == 0x20]
         assert sent[-1] == bytes.fromhex("2316100164007f00")
     bench = DriveBench().moving()
-    # One that does not say that it is off keeps it.
+    # A drive that does not report off keeps its watchdog.
     bench.insertion.syncs = False
     assert not bench.run(bench.supervisor.deconfigure()).success
     assert "insertion axis: does not say that it is off" in bench.notices[-1].text
-    assert bench.insertion.holds(0x1016, 1) == 127 << 16 | 100
-    assert (bench.rotation.holds(0x1016, 1), bench.rotation.state) == (0, "disabled")
+    assert bench.insertion.value(0x1016, 1) == 127 << 16 | 100
+    assert (bench.rotation.value(0x1016, 1), bench.rotation.state) == (0, "disabled")
     with pytest.raises(AxisError, match="insertion axis is not configured"):
         bench.axes[0].start_move(0.0, 0.001)
 
@@ -195,9 +194,9 @@ def test_drive_watchdog_trip_is_named_also_before_the_set_up() -> None:
     assert bench.reset().success
     bench.wait(3)
     assert bench.state == "DISABLED"
-    # What a drive told before its set-up, and is over, is none.
+    # An error from before the set-up that is over does not count.
     bench = DriveBench()
-    bench.insertion.say(0x80, bytes.fromhex("0573000000000000"))
+    bench.insertion.emit(0x80, bytes.fromhex("0573000000000000"))
     bench.configured()
     assert bench.state == "DISABLED"
 
@@ -206,8 +205,8 @@ def test_drive_emergency_stops_both_and_is_acknowledged_by_pdo() -> None:
     bench = DriveBench().moving()
     for drive in (bench.insertion, bench.rotation):
         drive.ignores_sdo_orders = True
-        # They answer with what they sampled at the SYNC before.
-        drive.tells_late = True
+        # The drives answer with samples of the previous SYNC.
+        drive.answers_previous_sample = True
     bench.after(lambda: bench.insertion.fail(0x7305))
     assert bench.rotation.state == "quick stop"
     with pytest.raises(AxisError, match="encoder error"):
@@ -220,7 +219,7 @@ def test_drive_emergency_stops_both_and_is_acknowledged_by_pdo() -> None:
     assert (reset.success, reset.message) == (False, stopping)
     assert bench.state == "FAULT"
     bench.stopped("drive_emergency", "the drive reports 0x7305 encoder error")
-    # A fault without message counts, too.
+    # A fault without an emergency message counts, too.
     bench.rotation.state = "fault"
     bench.go(2)
     bench.failed("drive_emergency", "rotation axis: the drive is in FAULT")
@@ -232,7 +231,7 @@ def test_drive_emergency_stops_both_and_is_acknowledged_by_pdo() -> None:
 def test_drive_emergency_that_persists_keeps_the_fault(lacking: set[int], why: str) -> None:
     bench = DriveBench().homed()
     drive = bench.insertion
-    drive.deaf_to_reset, drive.missing_objects = True, lacking
+    drive.ignores_reset, drive.missing_objects = True, lacking
     bench.after(lambda: drive.fail(0x7121))
     bench.hold(False)
     bench.wait(5)
@@ -241,8 +240,8 @@ def test_drive_emergency_that_persists_keeps_the_fault(lacking: set[int], why: s
     wanted = f"insertion axis: the drive does not leave its fault{why}"
     assert (reset.success, reset.message) == (False, wanted)
     assert bench.state == "FAULT"
-    # The edge counts: the order before was one to reset, too.
-    drive.deaf_to_reset, drive.missing_objects = False, set()
+    # Only the edge counts: the last command was a reset already.
+    drive.ignores_reset, drive.missing_objects = False, set()
     assert bench.reset().success
 
 
@@ -259,8 +258,8 @@ def test_drive_emergency_reset_may_take_a_second(seconds: float, leaves: bool) -
 
 def test_drive_emergency_in_an_outdated_answer_is_ignored() -> None:
     bench = DriveBench().homed()
-    # It answers with what it sampled at the SYNC before.
-    bench.insertion.tells_late = True
+    # The drive answers with samples of the previous SYNC.
+    bench.insertion.answers_previous_sample = True
     bench.after(lambda: bench.insertion.fail(0x7305))
     bench.hold(False)
     bench.wait(5)

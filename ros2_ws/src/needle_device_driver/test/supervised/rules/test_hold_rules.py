@@ -16,7 +16,7 @@ from ..ideal_axes import Bench
 MS = 1_000_000
 
 
-def says(bench: Bench, words: str) -> str:
+def send_holds(bench: Bench, words: str) -> str:
     """Send holds, `sender/session#count` and + for a press or - for a release; a, no session, next.
 
     Returns
@@ -74,7 +74,7 @@ def test_hold_age_limit_and_lifetime_of_a_message(lifetime: float, lives: float)
     assert bench.status.reason == silence
     assert bench.status.watchdog_trips == 1
     bench.now = arrival + lives + 0.001
-    assert says(bench, "+ - +") == "- - a"
+    assert send_holds(bench, "+ - +") == "- - a"
 
 
 @pytest.mark.parametrize("start", [0.0, 0.1, 1e6])
@@ -134,7 +134,7 @@ def test_hold_new_press_earlier_press_does_not_count(press_before: str) -> None:
     bench.go(30)
     assert bench.enable().success
     if press_before not in ("enable", "homing"):
-        assert says(bench, "- +") == "- a"
+        assert send_holds(bench, "- +") == "- a"
     if press_before == "reset":
         assert bench.reset().success
     elif press_before == "stop":
@@ -145,16 +145,16 @@ def test_hold_new_press_earlier_press_does_not_count(press_before: str) -> None:
         assert bench.enable().success
     elif press_before == "fault":
         bench.supervisor.fail("test")
-        assert says(bench, "+ -") == "- -"
+        assert send_holds(bench, "+ -") == "- -"
         assert bench.reset().success
         bench.hold()
         assert bench.enable().success
     bench.go(5)
     assert (bench.status.hold_owner, bench.status.speed_scale) == ("", 0.0)
     assert bench.status.press_again == "a"
-    assert says(bench, "-") == "-"
+    assert send_holds(bench, "-") == "-"
     assert bench.status.press_again == ""
-    assert says(bench, "+") == "a"
+    assert send_holds(bench, "+") == "a"
     assert bench.status.press_again == ""
 
 
@@ -171,31 +171,31 @@ def test_hold_new_press_is_required_only_of_an_active_press_without_owner() -> N
 
 def test_hold_new_press_first_press_counts_only_without_session() -> None:
     bench = enabled()
-    assert says(bench, "b/s+") == "-"
+    assert send_holds(bench, "b/s+") == "-"
     assert bench.rule == "hold_new_press"
     assert bench.status.reason == "hold of 'b/s' does not count (hold_new_press)"
-    assert says(bench, "by_hand+") == "by_hand"
+    assert send_holds(bench, "by_hand+") == "by_hand"
 
 
 def test_hold_one_owner_until_released() -> None:
     bench = enabled()
-    assert says(bench, "a+ b+") == "a a"
+    assert send_holds(bench, "a+ b+") == "a a"
     assert bench.rule == "hold_one_owner"
-    # A press while another has it takes nothing over later; one after a release of its own does.
-    assert says(bench, "b+ a- b+ b- b+") == "a - - - b"
+    # A press beside the owner does not count later; one after an own release does.
+    assert send_holds(bench, "b+ a- b+ b- b+") == "a - - - b"
 
 
 def test_hold_one_owner_remembers_sixteen_sources() -> None:
     bench = enabled()
     others = " ".join(f"s{number}-" for number in range(15))
-    says(bench, f"a- {others}")
+    send_holds(bench, f"a- {others}")
     bench.now += 0.25
-    says(bench, others)
-    assert says(bench, "late+") == "-"
+    send_holds(bench, others)
+    assert send_holds(bench, "late+") == "-"
     assert bench.rule == "hold_one_owner"
     bench.now += 0.001
-    # It takes the place of the one that was silent longest, and of nobody else.
-    assert says(bench, "late+ late- s3+") == "late - s3"
+    # It replaces only the source that was silent longest.
+    assert send_holds(bench, "late+ late- s3+") == "late - s3"
 
 
 # ---- speed --------------------------------------------------------------------------------------
@@ -231,7 +231,7 @@ def test_speed_scale_slows_and_0_stops() -> None:
 def in_session() -> Bench:
     """Return a device that moves by the third message of session `s`."""
     bench = enabled()
-    assert says(bench, "a/s#1- a/s#2- a/s#3+") == "- - a"
+    assert send_holds(bench, "a/s#1- a/s#2- a/s#3+") == "- - a"
     bench.step(0.002, 0.1, 2.0)
     assert bench.state == "MOVING"
     return bench
@@ -240,7 +240,7 @@ def in_session() -> Bench:
 def test_hold_in_order_repeated_press_extends_nothing() -> None:
     bench = in_session()
     for _ in range(20):
-        says(bench, "a/s#3+")
+        send_holds(bench, "a/s#3+")
         bench.wait()
     assert bench.state == "HOLDING"
     assert bench.outcomes[-1].startswith("aborted: no hold message")
@@ -251,36 +251,36 @@ def test_hold_in_order_repeated_press_extends_nothing() -> None:
 
 def test_hold_in_order_overtaken_message_changes_nothing() -> None:
     bench = in_session()
-    says(bench, "a/s#5+ a/s#4-")
+    send_holds(bench, "a/s#5+ a/s#4-")
     assert bench.state == "MOVING"
-    assert says(bench, "a/s#7- a/s#6+ a/s#7+") == "- - -"
+    assert send_holds(bench, "a/s#7- a/s#6+ a/s#7+") == "- - -"
     assert bench.outcomes == ["aborted: hold released"]
     assert (bench.status.press_again, bench.status.holds_ignored) == ("", 3)
-    assert says(bench, "a/s#8+") == "a"
-    # A release that comes late lets no press count that was there before the stop.
+    assert send_holds(bench, "a/s#8+") == "a"
+    # After a late release, a press from before the stop does not count.
     bench.supervisor.stop()
-    assert says(bench, "a/s#10+ a/s#9- a/s#11+") == "- - -"
+    assert send_holds(bench, "a/s#10+ a/s#9- a/s#11+") == "- - -"
 
 
 @pytest.mark.parametrize("later", ["t", ""])
 def test_hold_in_order_new_session_ends_the_previous(later: str) -> None:
     bench = in_session()
-    assert says(bench, f"a/{later}#1+") == "-"
+    assert send_holds(bench, f"a/{later}#1+") == "-"
     assert bench.outcomes == ["aborted: hold released"]
     assert bench.rule == "hold_new_press"
-    # It must send a release first.
-    assert says(bench, f"a/{later}#2+ a/{later}#3- a/{later}#4+") == "- - a"
-    assert says(bench, "a/s#4- a/s#5+ a/s#100- a/s#101+") == "a a a a"
+    # The new session must release first.
+    assert send_holds(bench, f"a/{later}#2+ a/{later}#3- a/{later}#4+") == "- - a"
+    assert send_holds(bench, "a/s#4- a/s#5+ a/s#100- a/s#101+") == "a a a a"
     assert bench.status.holds_ignored == 4
-    assert says(bench, f"a/{later}#5- a/s#102- a/s#103+") == "- - -"
+    assert send_holds(bench, f"a/{later}#5- a/s#102- a/s#103+") == "- - -"
 
 
 def test_hold_in_order_remembers_sixteen_sessions_per_source() -> None:
     bench = in_session()
-    says(bench, " ".join(f"a/t{number}#1-" for number in range(16)))
-    assert says(bench, "a/s#100- a/s#101+") == "- -"
-    # With a seventeenth the first is forgotten; another source's session is another one.
-    assert says(bench, "a/t16#1- a/s#1- a/s#2+ b/s#1- b/t#1- a/s#3+") == "- - a a a a"
+    send_holds(bench, " ".join(f"a/t{number}#1-" for number in range(16)))
+    assert send_holds(bench, "a/s#100- a/s#101+") == "- -"
+    # The seventeenth replaces the first; sessions of another source are separate.
+    assert send_holds(bench, "a/t16#1- a/s#1- a/s#2+ b/s#1- b/t#1- a/s#3+") == "- - a a a a"
 
 
 # ---- what a reset lets in again -----------------------------------------------------------------
@@ -288,12 +288,12 @@ def test_hold_in_order_remembers_sixteen_sessions_per_source() -> None:
 
 def test_hold_in_order_reset_accepts_lower_stamps_without_session() -> None:
     bench = enabled()
-    says(bench, f"#{10**18}- b/s#10- - +")
+    send_holds(bench, f"#{10**18}- b/s#10- - +")
     assert bench.rule == "hold_in_order"
     assert bench.status.reason.endswith("(hold_in_order); device/reset ends this")
     assert bench.reset().success
-    # But no earlier message of a session.
-    assert says(bench, "- + - b/s#8- b/s#9+") == "- a - - -"
+    # Earlier messages of a session stay rejected.
+    assert send_holds(bench, "- + - b/s#8- b/s#9+") == "- a - - -"
     assert bench.status.holds_ignored == 4
 
 
@@ -325,7 +325,7 @@ def test_command_newer_hint_on_time_that_went_back() -> None:
     bench = Bench().ready()
     last = bench.step()
     bench.go(25)
-    # As far as a stamp may be ahead of its arrival it is no time that went back.
+    # Within the tolerated lead, time did not go back.
     for back_ns, told in ((-MS, False), (0, False), (100 * MS, False), (100 * MS + 1, True)):
         bench.supervisor.note_time(last - back_ns, bench.now)
         bench.step(stamp_ns=last)

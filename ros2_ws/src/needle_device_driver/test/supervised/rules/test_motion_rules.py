@@ -61,7 +61,7 @@ def test_settling_time_limit_and_tolerance(which: str, tolerance: float) -> None
 
 @pytest.mark.parametrize(("which", "end", "tolerance"), [("insertion", 9, 20), ("rotation", 1, 10)])
 def test_settling_time_tolerance_is_inclusive(which: str, end: int, tolerance: int) -> None:
-    # Powers of two: what lies between them is exact.
+    # Powers of two, whose differences are exact.
     for off, state in ((2.0**-tolerance, "HOLDING"), (1.001 * 2.0**-tolerance, "MOVING")):
         bench = Bench(insertion_tolerance=2.0**-20, rotation_tolerance=2.0**-10).ready()
         bench.step(2.0**-9, 2.0**-1)
@@ -76,7 +76,7 @@ def test_settling_time_tolerance_is_inclusive(which: str, end: int, tolerance: i
 
 
 def inserted(*, homed: bool = True) -> Bench:
-    """Return a device 3 mm deep; or one that lost its home there, and counts from 0 again."""
+    """Return a device at a depth of 3 mm, with home, or without home and a new zero."""
     bench = Bench().ready()
     for _ in range(3):
         bench.go()
@@ -134,7 +134,7 @@ def test_unhomed_outward_only_by_the_last_known_depth() -> None:
     assert bench.rule == "homed_first"
     assert bench.retract().success
     bench.go(40)
-    # Counted where it stands now, what was drawn out is out.
+    # Only the remaining distance is allowed.
     bench.press()
     assert bench.retract().message == "retracting 1.4 mm while the hold lasts"
     bench.go(100)
@@ -211,7 +211,7 @@ def test_homing_needle_out_can_be_stopped() -> None:
     ("which", "longest"), [("insertion", 1.5 * 0.002 / 0.002), ("rotation", 1.5 * 0.62832 / 1.0)]
 )
 def test_homing_time_bound_of_each_axis(which: str, longest: float) -> None:
-    # The other axis has a long way, and may take its time; on the switch it counts a quarter.
+    # The other axis has a long travel; time at the switch counts a quarter.
     depth, turns = (0.002, 10.0) if which == "insertion" else (0.2, 0.1)
     for switch, factor in ((False, 1.0), (True, 4.0)):
         bench = Bench(max_depth=depth, max_turns=turns)

@@ -41,7 +41,7 @@ def test_coordinated_path_replaces_another_without_a_stop() -> None:
     first = path(bench, (0.0, 0.0), (1.0, 0.3), (2.0, 0.3))
     bench.go(4)
     here = bench.positions[0] * 1e3
-    # It began where the needle has been: what is left of its first leg takes its share of time.
+    # It begins behind the needle: the rest of its first leg takes its share of time.
     second = path(bench, (0.1, 0.0), (1.1, -0.2), (here + 2.0, -0.2))
     before = bench.positions
     bench.go()
@@ -52,7 +52,7 @@ def test_coordinated_path_replaces_another_without_a_stop() -> None:
     while bench.state == "MOVING":
         bench.go()
     assert bench.results == [(first, "replaced"), (second, "succeeded")]
-    # One of its knots may be where the needle is.
+    # A knot may coincide with the needle position.
     bench = Bench().ready()
     path(bench, (-1.0, 0.0), (0.0, 0.2), (1.0, 0.3))
     bench.go(5)
@@ -90,7 +90,7 @@ def test_max_rotation_rate_slows_the_insertion() -> None:
     bench.refused("max_rotation_rate")
     path(bench, (0.0, 0.0), (1.0, 0.5), (2.0, 0.5))
     bench.go(10)
-    # What is left of the first leg, 0.05 mm, is now to be 0.9 rad away.
+    # The rest of the first leg, 0.05 mm, has a rotation of 0.9 rad.
     path(bench, (0.8, -0.4), (1.05, -0.42), (2.0, -0.42))
     for _ in range(5):
         before = bench.positions
@@ -137,7 +137,7 @@ def test_max_step_length_bounds_the_end_of_a_path() -> None:
     bench = Bench().ready()
     path(bench, (0.0, 0.0), (1.0, 0.0), (2.0011, 0.0))
     bench.refused("max_step_length")
-    # Beside where they were told to be, the axes rest by their tolerance.
+    # The axes may rest beside their set-points by the tolerance.
     path(bench, (0.001, 0.0), (1.001, 0.0), (2.001, 0.0))
     assert bench.state == "MOVING"
 

@@ -21,7 +21,7 @@ def refused(bench: DriveBench, target: float, rule: Rule, axis: int = 0) -> str:
 
 def test_look_ahead_refuses_a_farther_set_point() -> None:
     bench = DriveBench().moving()
-    # A cycle's way at 5 mm/s, 1 % and a count.
+    # One cycle at 5 mm/s, plus 1 % and a count.
     at = bench.joint()
     why = "set-point 0.0001011 ahead in a cycle at 0.005/s, at most 0.00010105"
     assert why in refused(bench, at + 2022 / 20e6, Rule.LOOK_AHEAD)
@@ -45,11 +45,11 @@ def test_look_ahead_counts_from_the_last_set_point(
     left_over: int,
 ) -> None:
     bench = DriveBench(retraction_speed=0.005).ready()
-    # As much as its tolerance has room for.
+    # Up to the tolerance.
     bench.insertion.left_over, bench.rotation.left_over = left_over, left_over // 10
     bench.go()
     for number in (1, 2):
-        # As far and as fast as may be, from where the last step was to end.
+        # The longest and fastest step, from the last set-point.
         bench.submit((0.002 * number, 1.1999 * number, 0.4))
         bench.go(30)
     assert bench.outcomes == ["succeeded", "succeeded"]
@@ -63,7 +63,7 @@ def test_look_ahead_drive_stops_without_new_set_points() -> None:
     bench = DriveBench().moving()
     last = bench.insertion.next_target
     for _ in range(10):
-        # The computer is dead; something else still sends SYNC.
+        # The computer fails while another device sends SYNC.
         bench.insertion.sync()
     assert bench.insertion.position == last
 
@@ -76,7 +76,6 @@ def test_look_ahead_no_set_point_without_an_answer() -> None:
     bench.go(2)
     assert (bench.insertion.next_target, bench.rotation.next_target) == waiting
     assert bench.state == "MOVING"
-    # It was but a moment.
     bench.rotation.syncs = True
     bench.go(50)
     assert bench.outcomes == ["succeeded"]
@@ -86,7 +85,7 @@ def test_look_ahead_no_set_point_without_an_answer() -> None:
 def test_following_error_uses_the_set_point_of_the_answer(
     late: bool,
 ) -> None:
-    # Half a cycle's way: a position that is a cycle too old would break it.
+    # Half a cycle: a position that is one cycle too old would exceed the bound.
     bench = DriveBench(insertion_following_error=5e-5).ready()
     bench.step(0.001, 0.1, 0.2)
     bench.bus.late = late
@@ -104,7 +103,7 @@ def test_following_error_of_a_blocked_motor() -> None:
     assert bench.insertion.next_target - bench.insertion.position <= 0.7e-3 * 20e6
     bench.failed("following_error", "mm off its set-point")
     bench.insertion.blocked = False
-    # A motor that comes free has no power to go on.
+    # A released motor has no power.
     bench.stopped("following_error", "mm off its set-point")
 
 
@@ -141,7 +140,7 @@ def test_software_limits_of_the_drives_follow_homing() -> None:
 
     def limits() -> list[int]:
         drives = bench.insertion, bench.rotation
-        return [drive.holds(0x607D, sub) for drive in drives for sub in (1, 2)]
+        return [drive.value(0x607D, sub) for drive in drives for sub in (1, 2)]
 
     none = [-(2**31), 2**31 - 1] * 2
     assert limits() == none
@@ -178,12 +177,12 @@ def test_software_limits_without_home_are_the_counter_range(reverse: bool, at: i
 
 def test_no_motion_by_itself_on_set_up_enable_and_reset() -> None:
     bench = DriveBench()
-    # Where the drive was left, with a set-point of someone else's.
+    # The drive has an earlier set-point of another program.
     bench.insertion.position, bench.insertion.next_target = 12_345, 99_999
     bench.configured()
     bench.wait(5)
     assert bench.insertion.position == 12_345
-    # Someone turns the motor while it is off.
+    # A person turns the motor while it is off.
     bench.insertion.position = 55_555
     bench.wait()
     assert bench.enable().success

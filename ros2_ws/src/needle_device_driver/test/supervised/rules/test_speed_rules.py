@@ -20,7 +20,7 @@ MM_S = 400
 
 
 def until_fault(bench: DriveBench, rule: str) -> str:
-    """Run cycles until there is a fault, of this rule; return its text."""
+    """Run cycles until a fault of this rule; return its text."""
     for _ in range(1000):
         if bench.state == "FAULT":
             break
@@ -28,7 +28,7 @@ def until_fault(bench: DriveBench, rule: str) -> str:
     assert bench.rule == rule
     at = bench.positions
     bench.wait(10)
-    # One that was under way.
+    # Plus the cycle under way.
     assert abs(bench.positions[0] - at[0]) <= 150 * MM_S
     return bench.status.fault
 
@@ -52,7 +52,7 @@ def test_axis_speed_stops_a_fast_homing_in_two_cycles(mm_s: float) -> None:
     assert (bench.state, stops) == ("FAULT", [0x201, 0x202])
     text = f"insertion axis: moves at {abs(mm_s):.4g} mm/s, at most 3.5 mm/s where 2 mm/s are comm"
     assert text in until_fault(bench, "axis_speed")
-    # Two cycles that are seen, one that was under way.
+    # Two observed cycles, plus the cycle under way.
     assert abs(bench.insertion.position) == 3 * abs(way)
     assert bench.insertion.state == bench.rotation.state == "disabled"
     assert bench.reset().success
@@ -74,7 +74,7 @@ def test_axis_speed_ignores_the_new_zero_at_home() -> None:
     bench = DriveBench()
     bench.insertion.position = 1_234_567
     bench.homed()
-    # A homing whose end comes later than its new count, as where the edge is latched.
+    # The homing ends after its new zero, as with a latched edge.
     bench.insertion.position = 500_000
     bench.wait(5)
     bench.insertion.searches(*[-2 * MM_S] * 20, -2_000_000, *[MM_S // 2] * 20)
@@ -97,7 +97,7 @@ def test_axis_speed_of_the_rotation_axis() -> None:
 def test_axis_speed_of_a_drifting_axis() -> None:
     for mm_s, state in ((0.49, "HOLDING"), (0.51, "FAULT")):
         bench = DriveBench().ready()
-        # What was commanded before fades.
+        # The earlier commanded speed decays.
         bench.go(60)
         for _ in range(4):
             bench.insertion.left_over += round(mm_s * MM_S)
@@ -115,7 +115,7 @@ def test_axis_speed_ignores_axes_without_power_or_motor(drive: str) -> None:
 
 
 class Answers:
-    """Feedback of an axis that goes at a speed, by the time of each answer."""
+    """Feedback of an axis at a speed."""
 
     def __init__(self) -> None:
         settings = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
@@ -125,7 +125,7 @@ class Answers:
     def answer(
         self, mm: float, syncs: int = 1, numbers: int = 1, seconds: float = PERIOD, to: float = 2e-3
     ) -> bool:
-        """Return whether the next answer is plausible, where a speed is commanded [m/s]."""
+        """Return whether the next answer is plausible at a commanded speed [m/s]."""
         before = self.at
         self.at = dataclasses.replace(
             before,
@@ -140,16 +140,16 @@ class Answers:
 
 def test_axis_speed_uses_elapsed_sync_periods() -> None:
     for syncs, numbers, seconds, periods in (
-        # Jitter of an answer counts for nothing, that of a SYNC by half its period.
+        # Jitter of an answer is ignored, that of a SYNC up to half a period.
         (1, 1, 0.001, 1),
         (1, 1, 0.029, 1),
         (1, 1, 0.031, 2),
-        # A SYNC that was not answered; two answers after one SYNC; a driver that stood still.
+        # An unanswered SYNC; two answers after one SYNC; a stalled driver.
         (2, 1, 0.040, 2),
         (1, 2, 0.020, 2),
         (0, 1, 0.005, 1),
         (1, 1, 0.100, 5),
-        # A simulation that is faster than its time.
+        # A simulation faster than real time.
         (3, 1, 0.001, 3),
     ):
         answers = Answers()
@@ -164,7 +164,7 @@ def test_axis_speed_tolerates_one_fast_cycle() -> None:
     for mm in (1.0, 0.04) * 5:
         answers.answer(mm)
         assert not answers.watch.problem
-    # Ten cycles are a time constant: 0.5 mm/s, and 3 mm/s that fade.
+    # Ten cycles are a time constant: 0.5 mm/s, and 3 mm/s that decay.
     for _ in range(10):
         answers.answer(0.0, to=0.0)
     assert answers.answer((0.5 + 3.0 * math.exp(-1.1)) * PERIOD - 1e-4, to=0.0)
@@ -184,7 +184,7 @@ def test_axis_speed_tolerates_one_fast_cycle() -> None:
     ("parameters", "most_mm"),
     [
         ({}, 12.0),
-        # A screw of 1 mm, that the drive tells or the parameter; a method without index pulse.
+        # A screw of 1 mm, from the drive or the parameter; a method without index pulse.
         ({"insertion_homing_method": 1}, 13.0),
         ({"insertion_homing_method": 33}, 13.0),
         ({"insertion_homing_method": 2, "insertion_counts_per_turn": 40_000.0}, 14.0),
@@ -195,12 +195,12 @@ def test_homing_time_bounds_the_distance_by_the_travel(
     parameters: dict[str, Any], most_mm: float
 ) -> None:
     bench = DriveBench(max_depth=0.01, **parameters)
-    bench.insertion.tells({(0x608F, 1): 20_000, (0x608F, 2): 1})
+    bench.insertion.set_objects({(0x608F, 1): 20_000, (0x608F, 2): 1})
     bench.insertion.searches(forever=-3 * MM_S)
     bench.homing()
     text = f"without finding its home, at most {most_mm:.4g} mm"
     assert text in until_fault(bench, "homing_time")
-    # One cycle to see it, one that was under way.
+    # One observed cycle, plus the cycle under way.
     assert most_mm < abs(bench.insertion.position) / 2e4 <= most_mm + 2 * 0.06
 
 
@@ -212,13 +212,13 @@ def test_homing_time_stops_a_drive_that_moves_away_from_its_switch(
     for reverse in (False, True):
         bench = DriveBench(insertion_homing_method=method, insertion_reverse=reverse)
         bench.insertion.searches(forever=away * 2 * MM_S)
-        # Its other switches say nothing about this one.
+        # The other switches do not matter.
         bench.insertion.inputs = 7 - switch
         bench.homing()
         text = f"away from the limit switch of homing method {method}"
         assert text in until_fault(bench, "homing_time")
         assert 10_000 < abs(bench.insertion.position) <= 10_000 + 3 * MM_S, "0.5 mm, two cycles"
-    # Off its switch it goes the other way; one that tells no switches is not judged.
+    # Off its switch the axis moves the other way; a drive without inputs is not checked.
     for tells in (True, False):
         bench = DriveBench(insertion_homing_method=method)
         if not tells:

@@ -78,7 +78,7 @@ def test_one_device_refuses_everything_until_the_conflict_ends() -> None:
     assert bench.state == "FAULT"
     assert bench.reset().success
     assert bench.positions == at
-    # Whoever said that a needle is out may have meant the other's.
+    # The confirmation may have been meant for the other device.
     supervisor.confirm_needle_out(True)
     supervisor.report_conflicting_device(other)
     supervisor.report_conflicting_device("")
@@ -110,7 +110,7 @@ def test_one_fault_stops_both(which: str, change: dict[str, Any], text: str) -> 
     assert [str(notice) for notice in faults] == [f"{text.format(which)} [one_fault_stops_both]"]
     assert bench.outcomes == [f"aborted: {text.format(which)}"]
     assert other.orders[-2:] == ["stop", "off"]
-    # What was ordered before the fault showed: one period at most.
+    # At most the motion of one period, ordered before the fault.
     at = other.position
     assert abs(at - before) <= {"insertion": 1e-3, "rotation": 2e-5}[which] + 1e-9
     bench.go(10)
