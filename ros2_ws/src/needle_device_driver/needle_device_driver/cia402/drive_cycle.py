@@ -167,7 +167,6 @@ class DriveCycle:
         self._paused += 1
         if self._paused <= _PAUSE:
             return True
-        self._paused = self._outstanding = 0
         for axis in self._axes:
             axis.monitor.discard_outstanding()
         return False
