@@ -29,7 +29,7 @@ HELP = {
     ),
     NoTip.UNCERTAIN.value: "what lies over the end; cameras farther apart",
 }
-"""Causes that a person can do something about, and what helps, as in docs/images.md."""
+"""Causes that a person can do something about, and what helps, as in docs/own_rig.md."""
 
 
 def shows_end(end: ImageEnd | None) -> bool:
@@ -85,7 +85,7 @@ class SeenCounts:
         lines += [f"  no tip {n:6d} x  {cause}" for cause, n in self.missing.most_common()]
         for cause, _ in self.missing.most_common():
             if cause in HELP:
-                lines.append(f"  most often `{cause}`, helps: {HELP[cause]} (docs/images.md)")
+                lines.append(f"  most often `{cause}`, helps: {HELP[cause]} (docs/own_rig.md)")
                 break
         return "\n".join(lines)
 
