@@ -67,7 +67,7 @@ class Access:
         return "" if (header or "").lower() in self._origins else "foreign Origin"
 
 
-def listen(address: str, port: int) -> socket.socket:
+def listening_socket(address: str, port: int) -> socket.socket:
     """Return a listening socket; port 0 selects a free port.
 
     Connections before the server starts wait, they are not refused.

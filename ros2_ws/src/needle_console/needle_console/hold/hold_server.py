@@ -14,7 +14,7 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from needle_console.access import Access, listen
+from needle_console.access import Access, listening_socket
 from needle_console.hold.hold_protocol import PERIOD, HoldProtocol
 from needle_console.hold.page_session import HoldRefusal, PageHold
 
@@ -51,7 +51,7 @@ class HoldServer:
     ) -> None:
         self._access = access
         self._protocol = HoldProtocol(why_not, on_state, on_notice, time.monotonic())
-        self._socket = listen(access.address, port)
+        self._socket = listening_socket(access.address, port)
         self._loop = asyncio.new_event_loop()
         self._woken = asyncio.Event()
         self._is_ended = False

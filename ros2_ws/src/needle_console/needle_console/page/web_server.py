@@ -11,7 +11,7 @@ import uvicorn
 from fastapi import FastAPI, Response
 from nicegui import app, ui
 
-from needle_console.access import Access, listen
+from needle_console.access import Access, listening_socket
 from needle_console.console_parameters import ConsoleParameters
 from needle_console.hold.hold_server import HoldServer
 from needle_console.page.console_page import ConsolePage
@@ -51,7 +51,7 @@ class WebServer:
     def __init__(
         self, page_port: PagePort, access: Access, *, address: str, port: int, hold_port: int
     ) -> None:
-        self._socket = listen(address, port)
+        self._socket = listening_socket(address, port)
         self.port = int(self._socket.getsockname()[1])
         server = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 

@@ -109,7 +109,7 @@ class DriveMachine:
 
     @property
     def stop_failure(self) -> str:
-        """How the drive still moves or has power long after the goal OFF; empty: it does not."""
+        """Report on a drive that moves or has power long after the goal OFF; otherwise empty."""
         powered = self.state in (*POWERED, DriveState.FAULT_REACTION_ACTIVE)
         late = self._cycles > self._max_stop + _WINDOW
         # A hand may move an axis without power that has come to rest before.
