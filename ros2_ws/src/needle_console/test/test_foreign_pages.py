@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from needle_console.access import Access
+from needle_console.access import Access, Gate
 from needle_console.console_parameters import ConsoleParameters
-from needle_console.page.gate import Gate
 from needle_console.page.page_port import PagePort
 from needle_console.view.snapshot import Snapshot
 from needle_core.errors import UserError

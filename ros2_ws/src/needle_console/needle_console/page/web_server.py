@@ -11,11 +11,10 @@ import uvicorn
 from fastapi import FastAPI, Response
 from nicegui import app, ui
 
-from needle_console.access import Access, listening_socket
+from needle_console.access import Access, Gate, listening_socket
 from needle_console.console_parameters import ConsoleParameters
 from needle_console.hold.hold_server import HoldServer
 from needle_console.page.console_page import ConsolePage
-from needle_console.page.gate import Gate
 from needle_console.page.page_port import PagePort
 from needle_console.view.camera_view import SIDES
 from needle_core.component import Batch
