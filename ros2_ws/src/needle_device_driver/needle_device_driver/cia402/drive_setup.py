@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from needle_device_driver.cia402.cia402 import (
     POWERED,
     SUPPORTS_CYCLIC_POSITION,
@@ -106,16 +108,13 @@ def set_up(
 
 def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) -> Procedure[None]:
     """Write the drive's software limits; without home, which they count from, none."""
-    refusals = []
-    for lower, upper in [settings.limits_counts] if homed else od.NO_LIMITS:
-        try:
-            yield from access.write_checked(od.LOWER_LIMIT, lower, variable=True)
-            yield from access.write_checked(od.UPPER_LIMIT, upper, variable=True)
-        except DriveRefusalError as error:
-            refusals.append(error)
-        else:
-            return
-    raise refusals[0]
+
+    def write(lower: int, upper: int) -> Procedure[None]:
+        yield from access.write_checked(od.LOWER_LIMIT, lower, variable=True)
+        yield from access.write_checked(od.UPPER_LIMIT, upper, variable=True)
+
+    limits = [settings.limits_counts] if homed else od.NO_LIMITS
+    yield from _first_accepted(write(lower, upper) for lower, upper in limits)
 
 
 def write_homing(access: ObjectAccess, settings: DriveSettings, speed: float) -> Procedure[None]:
@@ -232,15 +231,9 @@ def _try_mode(link: FrameLink, access: ObjectAccess, node: int, mode: Mode) -> P
 
 
 def _write_homing_method(access: ObjectAccess, method: int) -> Procedure[None]:
-    try:
-        yield from access.write(od.HOMING_METHOD, method)
-    except DriveRefusalError:
-        if method not in HERE:
-            raise
-        # The standard's older edition has another number, 35, for "where it stands".
-        for other in HERE:
-            if other != method:
-                yield from access.write(od.HOMING_METHOD, other)
+    # The standard's older edition has another number, 35, for "where it stands".
+    others = [other for other in HERE if other != method] if method in HERE else []
+    yield from _first_accepted(access.write(od.HOMING_METHOD, one) for one in (method, *others))
 
 
 def _write_heartbeat(access: ObjectAccess) -> Procedure[None]:
@@ -315,10 +308,15 @@ def _write_transmission(access: ObjectAccess, pdo: Pdo) -> Procedure[None]:
     if pdo.communication < _FIRST_TRANSMIT_PDO:
         # A received PDO may also take effect at once: all PDOs of a cycle are sent together.
         types += [od.ASYNCHRONOUS, od.ASYNCHRONOUS_BY_MANUFACTURER]
+    yield from _first_accepted(access.write(transmission, number) for number in types)
+
+
+def _first_accepted(attempts: Iterable[Procedure[None]]) -> Procedure[None]:
+    """Run procedures until the drive accepts one; raise the first refusal if it accepts none."""
     refusals = []
-    for number in types:
+    for attempt in attempts:
         try:
-            yield from access.write(transmission, number)
+            yield from attempt
         except DriveRefusalError as error:
             refusals.append(error)
         else:
