@@ -125,7 +125,7 @@ class DeviceInterface:
 
     @property
     def is_busy(self) -> bool:
-        """Tell whether a procedure is under way."""
+        """Whether a procedure is under way."""
         return self._task is not None
 
     def begin(self, procedure: Procedure[ServiceResult], then: Then, at: Moment) -> Actions:

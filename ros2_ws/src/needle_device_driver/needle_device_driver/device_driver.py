@@ -169,7 +169,7 @@ class DeviceDriver(Component):
 
     @property
     def is_busy(self) -> bool:
-        """Tell whether a procedure or a cycle is under way."""
+        """Whether a procedure or a cycle is under way."""
         return self._device.is_busy or self._cycle is not None
 
     def _on_frames(self, items: Sequence[CanFrame | CanErrors], at: Moment) -> Actions:

@@ -113,7 +113,7 @@ class Running(Generic[T]):
         self.deadline = 0.0
 
     def is_ready(self) -> bool:
-        """Tell whether the procedure can resume."""
+        """Return whether the procedure can resume."""
         return self._wait is None or self._wait.until()
 
     def advance(self, now: float) -> bool:

@@ -151,22 +151,22 @@ class PairSnapshot:
 
     @property
     def homed(self) -> bool:
-        """Tell whether both axes are homed."""
+        """Whether both axes are homed."""
         return self.insertion.homed and self.rotation.homed
 
     @property
     def powered(self) -> bool:
-        """Tell whether both axes are able to move."""
+        """Whether both axes are able to move."""
         return self.insertion.powered and self.rotation.powered
 
     @property
     def ready(self) -> bool:
-        """Tell whether both axes would begin to move at once."""
+        """Whether both axes would begin to move at once."""
         return self.insertion.ready and self.rotation.ready
 
     @property
     def answered(self) -> bool:
-        """Tell whether both axes have answered all requests."""
+        """Whether both axes have answered all requests."""
         return self.insertion.answered and self.rotation.answered
 
     @property

@@ -62,7 +62,7 @@ class CoordinatedMotion:
 
     @property
     def complete(self) -> bool:
-        """Tell whether the last set-point was returned."""
+        """Whether the last set-point was returned."""
         return self._is_last and self._progress >= 1.0
 
     def advance(self, period: float, speed_scale: float) -> SetPoint:

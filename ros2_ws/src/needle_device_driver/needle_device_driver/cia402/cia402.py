@@ -99,12 +99,6 @@ _ON = {
     DriveState.OPERATION_ENABLED: DriveCommand.ENABLE_OPERATION,
     DriveState.QUICK_STOP_ACTIVE: DriveCommand.ENABLE_OPERATION,
 }
-# A moving axis is stopped before it is switched off: it must not coast.
-_OFF_MOVING = {
-    DriveState.OPERATION_ENABLED: DriveCommand.QUICK_STOP,
-    DriveState.QUICK_STOP_ACTIVE: DriveCommand.QUICK_STOP,
-}
-_OFF_AT_REST = {DriveState.OPERATION_ENABLED: DriveCommand.QUICK_STOP}
 
 
 def drive_state(statusword: int) -> DriveState | None:
@@ -137,7 +131,10 @@ def next_command(goal: Goal, state: DriveState | None, *, at_rest: bool) -> Driv
         if state is DriveState.QUICK_STOP_ACTIVE and not at_rest:
             return DriveCommand.QUICK_STOP
         return _ON.get(state, DriveCommand.DISABLE_VOLTAGE)
-    return (_OFF_AT_REST if at_rest else _OFF_MOVING).get(state, DriveCommand.DISABLE_VOLTAGE)
+    # A moving axis is stopped before it is switched off: it must not coast.
+    is_moving = state is DriveState.QUICK_STOP_ACTIVE and not at_rest
+    stop_first = state is DriveState.OPERATION_ENABLED or is_moving
+    return DriveCommand.QUICK_STOP if stop_first else DriveCommand.DISABLE_VOLTAGE
 
 
 class TransitionMonitor:

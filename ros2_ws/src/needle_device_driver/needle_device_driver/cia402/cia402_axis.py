@@ -243,7 +243,7 @@ class Cia402Axis(Axis):
 
     @property
     def needs_cycles(self) -> bool:
-        """Tell whether the drive still executes an order other than a set-point."""
+        """Whether the drive still executes an order other than a set-point."""
         if not self.actuated or self._fault is not None:
             return False
         return self._machine.switching or self._homing is not None or self._limits_due

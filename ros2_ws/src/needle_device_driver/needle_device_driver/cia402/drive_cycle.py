@@ -87,7 +87,7 @@ class DriveCycle:
 
     @property
     def needs_cycles(self) -> bool:
-        """Tell whether a drive still executes an order other than a set-point."""
+        """Whether a drive still executes an order other than a set-point."""
         return any(axis.needs_cycles for axis in self._axes)
 
     def health(self, waiting: str) -> Diagnostic:

@@ -87,7 +87,7 @@ class DriveMachine:
 
     @property
     def ready(self) -> bool:
-        """Tell whether the drive would follow a set-point."""
+        """Whether the drive would follow a set-point."""
         return (
             self._goal is Goal.ON
             and not self._stopping
@@ -97,14 +97,14 @@ class DriveMachine:
 
     @property
     def powered(self) -> bool:
-        """Tell whether the drive is on by the present order, moving or stopped."""
+        """Whether the drive is on by the present order, moving or stopped."""
         # Excludes a drive that is still on from before, or in another mode.
         on = self.state in POWERED and self.at.mode == self.mode
         return self._goal is not Goal.OFF and (on or self._via_off)
 
     @property
     def released_after_block(self) -> bool:
-        """Tell whether the drive is switched off because the axis was stopped while blocked."""
+        """Whether the drive is switched off because the axis was stopped while blocked."""
         return self._goal is Goal.STOPPED and self._via_off
 
     @property
@@ -119,7 +119,7 @@ class DriveMachine:
 
     @property
     def switching(self) -> bool:
-        """Tell whether the drive has not reached its goal yet."""
+        """Whether the drive has not reached its goal yet."""
         if self._goal is Goal.ON:
             return not self.ready
         if self._goal is Goal.STOPPED:
@@ -142,7 +142,7 @@ class DriveMachine:
         self._stopping = True
 
     def restart(self, at: Feedback) -> None:
-        """Start anew after a set-up or reset, with the goal OFF."""
+        """Restart after a set-up or reset, with the goal OFF."""
         self._transitions = TransitionMonitor()
         self.set_goal(Goal.OFF)
         self._stopping = False
@@ -184,7 +184,7 @@ class DriveMachine:
 
     @property
     def _keeps_moving(self) -> bool:
-        """Tell whether the axis leaves its place; jitter around it does not count."""
+        """Whether the axis leaves its place; jitter around it does not count."""
         track = self._track
         return len(track) > _WINDOW and abs(track[-1] - track[0]) > _WINDOW * self._rest_counts
 

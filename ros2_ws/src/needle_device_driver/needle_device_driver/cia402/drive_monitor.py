@@ -123,7 +123,7 @@ class DriveMonitor:
 
     @property
     def left_operational(self) -> bool:
-        """Tell whether the node's heartbeat reports another NMT state than operational."""
+        """Whether the node's heartbeat reports another NMT state than operational."""
         return self._is_set_up and self._nmt_state != NMT_OPERATIONAL
 
     def answered(self) -> bool:

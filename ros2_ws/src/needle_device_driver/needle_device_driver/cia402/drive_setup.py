@@ -207,7 +207,7 @@ def _check_modes(link: FrameLink, access: ObjectAccess, node: int) -> Procedure[
     """Check that a drive, which is off, has both modes.
 
     Without 0x6502 each mode is tried. Cyclic synchronous position is also tried if 0x6502 does not
-    list it: an EPOS4 supports it all the same.
+    list it, because an EPOS4 supports it without listing it.
     """
     listed = yield from access.read_optional(od.SUPPORTED_MODES)
     if listed is not None and not listed & SUPPORTS_HOMING:

@@ -67,7 +67,7 @@ class SpeedMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew, without a commanded speed."""
+        """Restart without a commanded speed."""
         self._commanded = 0.0
         self._fast_cycles = 0
         self.problem = ""

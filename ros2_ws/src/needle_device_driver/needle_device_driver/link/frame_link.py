@@ -75,7 +75,7 @@ class FrameLink:
 
     @property
     def is_open(self) -> bool:
-        """Tell whether frames pass."""
+        """Whether frames pass."""
         return self._is_open and not self.lost
 
     def open(self) -> None:

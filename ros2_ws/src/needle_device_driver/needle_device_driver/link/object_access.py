@@ -32,7 +32,7 @@ class DriveRefusalError(DriveError):
 
     @property
     def object_is_missing(self) -> bool:
-        """Tell whether the drive does not have the entry at all."""
+        """Whether the drive does not have the entry at all."""
         return self.code in NO_SUCH_OBJECT
 
 

@@ -86,7 +86,7 @@ class DeviceCore:
 
     @property
     def needs_hold(self) -> bool:
-        """Tell whether the motion under way needs the hold."""
+        """Whether the motion under way needs the hold."""
         return self.activity in (Activity.STEP, Activity.RETRACTION)
 
     @property
