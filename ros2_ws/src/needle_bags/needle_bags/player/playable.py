@@ -1,4 +1,4 @@
-"""Which recorded topics can be played with the message types that are installed."""
+"""Check whether a recorded topic can be played with the installed message types."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from needle_core.files.bag_topic import BagTopic
 
 
 def unplayable(topic: BagTopic) -> str:
-    """Return why a topic cannot be played here; an empty text if it can."""
+    """Return why a topic cannot be played; an empty text if it can."""
     try:
         installed = full_definition(topic.type_name)
         message_class(topic.type_name)

@@ -145,5 +145,5 @@ def test_losses_and_topics_that_cannot_be_recorded_are_told(graph: Graph) -> Non
     assert graph.topics.lost == {JOINTS: 2}
     subscription.lost(SimpleNamespace(total_count=7))
     assert graph.topics.lost == {JOINTS: 7}
-    graph.topics.leave()
+    graph.topics.unsubscribe()
     assert graph.subscriptions == []

@@ -23,7 +23,7 @@ from trajectory_msgs.msg import JointTrajectory
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition
-from needle_bags.player.terminal_keys import FASTER, ON, PAUSE, Keys
+from needle_bags.player.terminal_keys import FASTER, FORWARD, PAUSE, Keys
 from needle_bags.ros import player as node
 from needle_core.files.bag_topic import BagTopic
 
@@ -195,7 +195,7 @@ def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
     scene.when(15, lambda: scene.change(seek=4.0))
     scene.when(4, lambda: scene.change(seek=4.0))
     # From 4 five seconds on; then a pause that takes no time of the bag's.
-    scene.when(5, lambda: scene.pressed.append(ON))
+    scene.when(5, lambda: scene.pressed.append(FORWARD))
     scene.when(11, lambda: scene.pressed.append(PAUSE))
     scene.when(11, lambda: scene.at(10.0, lambda: scene.pressed.extend([PAUSE, FASTER])))
     assert scene.play("--regex ^/n|plane --exclude-regex noisy") == 0

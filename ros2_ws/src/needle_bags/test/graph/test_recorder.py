@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -21,11 +20,11 @@ from std_msgs.msg import Int32, String
 from std_srvs.srv import Trigger
 
 from needle_bags.format.bag_writer import BagWriter
-from needle_bags.reading.bag_files import read_contents, read_messages
-from needle_bags.recording.free_space import FreeSpace
-from needle_bags.recording.recording import Recording
-from needle_bags.recording.worker import Do, Job
-from needle_bags.ros import graph_topics, question
+from needle_bags.reading.bag_messages import read_contents, read_messages
+from needle_bags.recording.recording import FreeSpace, Recording
+from needle_bags.recording.worker import Job, RunJob
+from needle_bags.recovery.bag_recovery import recover_bag
+from needle_bags.ros import graph_topics, repeated_request
 from needle_bags.ros import recorder as node
 from needle_bags.ros.recorder_parameters import RecorderParameters
 from needle_core.errors import UserError
@@ -40,7 +39,7 @@ class AtOnce:
 
     waiting = 0
 
-    def __init__(self, do: Do, end: Job) -> None:
+    def __init__(self, do: RunJob, end: Job) -> None:
         self._do, self._ends = do, [end]
 
     def put(self, job: Job) -> None:
@@ -55,7 +54,7 @@ class Scene(PlayedGraph):
     """A recorder that begins and ends when the test says so."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-        super().__init__(monkeypatch, node, graph_topics, question)
+        super().__init__(monkeypatch, node, graph_topics, repeated_request)
         self.bag = folder / "bag"
 
         def begin(bag: Path, *, reserve: int, **how: Any) -> Recording:
@@ -196,12 +195,11 @@ def test_a_disk_that_fills_ends_the_recording_and_nothing_else(
     assert f"cannot write {scene.bag}/bag_0.mcap: No space left on device" in said.message
     assert sum("recording ended" in line for line in scene.logged) == 1
     errors = capsys.readouterr().err
-    assert "the bag is whole up to there" in errors
+    assert f"`ros2 run needle_bags recover {scene.bag}`" in errors
     assert 'messages lost: {"/numbered": 3}' in errors
+    monkeypatch.undo()
+    recover_bag(scene.bag)
     assert scene.numbers("/numbered") == [0, 1, 2, 3, 4, 5]
-    custom = read_contents(scene.bag).custom_data
-    assert "No space left" in custom["recording_ended"]
-    assert json.loads(custom["messages_lost"]) == {"/numbered": 3}
 
 
 def test_snapshots_when_asked_and_a_second_after_a_fault(scene: Scene) -> None:

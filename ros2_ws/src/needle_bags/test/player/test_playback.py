@@ -11,7 +11,7 @@ import pytest
 from needle_bags.player.playback import READ_AHEAD, PlaybackClock, ReadAhead
 from needle_bags.player.player_options import parse_options
 from needle_bags.player.replay_names import is_guarded, marks_a_rig, played_name
-from needle_bags.player.terminal_keys import BACK, FASTER, ON, PAUSE, SLOWER, keys_in
+from needle_bags.player.terminal_keys import BACK, FASTER, FORWARD, PAUSE, SLOWER, keys_in
 from needle_core.errors import UserError
 
 SECOND = 1_000_000_000
@@ -42,7 +42,7 @@ def test_a_pause_takes_no_time() -> None:
 
 
 def test_arrows_are_keys_of_their_own() -> None:
-    assert keys_in(" \x1b[A\x1bOBx\x1b[C\x1b[D") == [PAUSE, FASTER, SLOWER, "x", ON, BACK]
+    assert keys_in(" \x1b[A\x1bOBx\x1b[C\x1b[D") == [PAUSE, FASTER, SLOWER, "x", FORWARD, BACK]
 
 
 def test_reading_ahead_keeps_order_and_bounds_and_hands_on_errors() -> None:

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_bags.format.bag_copy import BagCopy, standard_topic
-from needle_bags.format.bag_writer import BagWriter
-from needle_bags.reading.bag_files import read_contents
-from needle_bags.reading.bag_order import raw_as_sent
+from needle_bags.format.bag_writer import BagCopy, BagWriter, standard_topic
+from needle_bags.reading.bag_messages import raw_as_sent, read_contents
 from needle_bags.reading.bag_reader import _Collector, read_run
 from needle_core.errors import UserError
 from needle_core.files.bag_topic import BagTopic
@@ -69,7 +67,7 @@ def test_health_is_the_chosen_rigs() -> None:
         ("/bench/", ["sim_rig: a", "sim_rig: b", "camera/left: c"]),
     ):
         collected = _Collector(namespace, ["/", "/bench/"])
-        collected.take_diagnostics(0, SimpleNamespace(status=[status(name) for name in names]))
+        collected.add_diagnostics(0, SimpleNamespace(status=[status(name) for name in names]))
         assert [event.part for event in collected.health] == kept
 
 
@@ -79,7 +77,7 @@ def test_holds_of_two_sessions_are_both_kept_at_the_times_of_their_arrival() -> 
         # The first message of each.
         header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=1), frame_id=f"me/{session}")
         joy = SimpleNamespace(header=header, axes=[0.5], buttons=[1])
-        collected.takers()["device/hold"](time, joy)
+        collected.handlers()["device/hold"](time, joy)
     holds = collected.series("holds", 2)
     assert holds.stamps.tolist() == holds.received.tolist() == [10, 20]
 

@@ -71,7 +71,7 @@ def test_rows_have_what_the_typed_reader_has(rows: dict[str, list[dict[str, Any]
 
 def test_what_frames_need_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(UserError, match=r"pandas is not installed; docs/notebooks\.md"):
+    with pytest.raises(UserError, match=r"pandas is not installed; docs/viewers\.md"):
         read_frames(BAG)
     monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace())
     with pytest.raises(UserError, match=r"no topic /needle/top \(it has /device/hold, "):

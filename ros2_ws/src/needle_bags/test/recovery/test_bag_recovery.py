@@ -17,9 +17,8 @@ from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as OtherWriter
 
-from needle_bags.format.bag_copy import standard_text, standard_topic
-from needle_bags.format.bag_writer import BagWriter
-from needle_bags.reading.bag_files import read_contents, read_messages
+from needle_bags.format.bag_writer import BagWriter, standard_text, standard_topic
+from needle_bags.reading.bag_messages import read_contents, read_messages
 from needle_bags.reading.bag_reader import read_run
 from needle_bags.recovery import bag_recovery, recover
 from needle_bags.recovery.bag_recovery import recover_bag
@@ -199,7 +198,7 @@ class Interruption(Exception):
 
 
 @pytest.mark.parametrize(
-    "step", ["_read_through", "write_metadata", "_set_aside", "sync_directory"]
+    "step", ["_read_through", "write_metadata", "_keep_original", "sync_directory"]
 )
 def test_an_interrupted_recovery_is_done_again_alike(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str

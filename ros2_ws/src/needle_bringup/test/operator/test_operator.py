@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from needle_bringup.operator.component import INPUT_DEVICE, PERIOD, Operator
-from needle_bringup.operator.controls import Controls
-from needle_bringup.operator.hand import Hand, Lost, Reading
+from needle_bringup.operator.controls import Controls, InputLost, InputReading, InputState
 from needle_bringup.operator.parameters import OperatorParameters
 from needle_core import messages as m
 from needle_core.component import (
@@ -31,7 +30,7 @@ from needle_core.status_messages import DeviceStatus
 PEDAL = OperatorParameters(device="/dev/input/pedal", key=48, retract_key=49, stop_key=50)
 JOYSTICK = OperatorParameters(source="joy", key=0, retract_key=1, stop_key=2, speed_axis=0)
 STOP_STEERING, RETRACT, STOP = "plane_controller/stop", "device/retract", "device/stop"
-NEUTRAL, OUT = Hand(), Hand(retract=True)
+NEUTRAL, OUT = InputState(), InputState(retract=True)
 
 
 class Scene:
@@ -62,13 +61,13 @@ class Scene:
             else:
                 assert isinstance(action, Diagnose)
 
-    def look(self, reading: Reading = NEUTRAL, **status: Any) -> m.HoldState:
+    def update(self, reading: InputReading = NEUTRAL, **status: Any) -> m.HoldState:
         """Let the device say something, then the hand at the port do."""
         self.now += PERIOD
         (row,), (port,) = self.operator.inputs, self.operator.ports
         if status:
             self.take(row.handler(DeviceStatus(**status), self.at))
-        self.take(port.handler((Lost("an older reading"), reading), self.at))
+        self.take(port.handler((InputLost("an older reading"), reading), self.at))
         return self.holds[-1]
 
     def joy(self, *down: int, silent: bool = False) -> m.HoldState:
@@ -84,16 +83,16 @@ class Scene:
 
 def test_a_pedal_at_the_port_is_held_until_it_is_lost() -> None:
     scene = Scene(PEDAL)
-    assert not scene.look().pressed
-    held = scene.look(Hand(insert=True, speed=0.5))
+    assert not scene.update().pressed
+    held = scene.update(InputState(insert=True, speed=0.5))
     assert (held.source, held.pressed, held.speed_scale) == ("operator", True, 0.5)
     assert held.lifetime == m.HOLD_LIFETIME
-    scene.look(Hand(insert=True), press_again="operator")
+    scene.update(InputState(insert=True), press_again="operator")
     assert "the device does not take this press" in scene.logs[-1]
-    assert not scene.look(Lost("unplugged")).pressed
+    assert not scene.update(InputLost("unplugged")).pressed
     assert scene.logs[-1] == "nothing is held: unplugged"
     for _ in range(2):
-        assert not scene.look(Hand(insert=True)).pressed
+        assert not scene.update(InputState(insert=True)).pressed
     # What does not change is said once.
     assert [text for text in scene.logs if "what is held does not count" in text] == scene.logs[-1:]
     assert [hold.count for hold in scene.holds] == list(range(1, len(scene.holds) + 1))
@@ -118,19 +117,19 @@ def test_a_joystick_holds_at_its_axis_speed_stops_and_must_go_on_talking() -> No
 
 def test_the_controller_is_stopped_before_the_needle_is_drawn_out() -> None:
     scene = Scene(PEDAL)
-    scene.look()
+    scene.update()
     # The hold of this look was made before the answer came.
-    assert not scene.look(OUT).pressed
+    assert not scene.update(OUT).pressed
     assert scene.called == [STOP_STEERING]
-    assert scene.look(OUT).pressed
+    assert scene.update(OUT).pressed
     assert scene.logs[-1] == "held to draw the needle out"
-    scene.look(OUT, hold_owner="operator")
+    scene.update(OUT, hold_owner="operator")
     assert scene.called == [STOP_STEERING, RETRACT]
-    assert scene.look(OUT, hold_owner="operator", activity="retraction").pressed
-    assert not scene.look(OUT, activity="none").pressed
-    scene.look()
+    assert scene.update(OUT, hold_owner="operator", activity="retraction").pressed
+    assert not scene.update(OUT, activity="none").pressed
+    scene.update()
     for _ in range(60):
-        scene.look(OUT)
+        scene.update(OUT)
     # Nobody takes the hold.
     assert not scene.holds[-1].pressed
     assert "not drawn out: the device does not take the hold" in scene.logs[-1]

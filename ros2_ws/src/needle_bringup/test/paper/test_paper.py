@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 
 from needle_bags.reading.bag_reader import Run, read_run
-from needle_bringup.paper import paper_results, paper_runs
+from needle_bringup.paper import paper_runs
 from needle_bringup.paper.paper import main
 from needle_bringup.paper.paper_figures import common_r1, converged_share
 from needle_bringup.paper.paper_results import Floats, SteeringTrial, missed_later, settled_mm
 from needle_bringup.paper.paper_runs import Columns, Laboratory
-from needle_bringup.studies.limit_study import LimitRow, Reached
 from needle_bringup.workplace import checkout
 from needle_core.commands.cli import JsonValue
 from needle_core.errors import UserError
@@ -145,10 +144,8 @@ class MadeUpLaboratory(Laboratory):
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder with all that `paper` writes of made-up runs."""
     folder = tmp_path_factory.mktemp("paper")
-    row = LimitRow(Reached(0.14, 0.2, 0.999), Reached(0.11, 0.15, 1.0))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_runs, "Laboratory", MadeUpLaboratory)
-        patch.setattr(paper_results, "limits", lambda *_: {"noise ±1 mm": row})
         words = ["--quick", "--out", str(folder / "out"), "--json", str(folder / "figures.json")]
         assert main(words) == 0
     return folder
@@ -161,7 +158,6 @@ def test_the_page_has_the_paper_s_values_beside_those_of_the_runs(written: Path)
         "| 98.56 % | 99.00 % / 98.50 % |",
         "| 144 of 10,000; none diverged | 4 of 400; 3 of them within ±1 mm at 240 mm, the worst 2",
         "| 12.2 cm | 12.10 cm (95 %: 118.5 to 124.5 mm) |",
-        "0.14 mm, 0.20 mm, 99.9 %; limit 0.11 mm, 0.15 mm, 100.0 %",
     ):
         assert cells in page
     images = sorted((written / "out" / "images").glob("*.png"))
@@ -172,5 +168,4 @@ def test_the_page_has_the_paper_s_values_beside_those_of_the_runs(written: Path)
         assert np.ptp(image) > 200
     values = json.loads((written / "figures.json").read_text())
     assert (values["endpoint_missed"], values["endpoint_missed_also_later"]) == (4, 1)
-    assert values["limit_noise_1_mm_point_rms_mm"] == 0.15
     assert all(math.isfinite(value) for value in values.values())

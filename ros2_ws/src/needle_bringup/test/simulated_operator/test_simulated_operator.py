@@ -6,8 +6,10 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
-from needle_bringup.simulated_operator.component import SimulatedOperator
-from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
+from needle_bringup.simulated_operator.component import (
+    SimulatedOperator,
+    SimulatedOperatorParameters,
+)
 from needle_bringup.simulated_operator.progress import Shown
 from needle_core import messages as m
 from needle_core.component import Action, Answer, Call, Exit, Moment, Peers, Publish, Send

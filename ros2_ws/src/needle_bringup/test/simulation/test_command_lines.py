@@ -9,15 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from needle_bringup.simulation.console import rig_parameters
-from needle_bringup.simulation.console_options import parse_console
-from needle_bringup.simulation.own_component import own_component
+from needle_bringup.simulation.console import parse_console, rig_parameters
 from needle_bringup.simulation.simulate_options import (
     CONTROLLERS,
     SimulateOptions,
     command_of,
     parse,
 )
+from needle_bringup.simulation.virtual_run import own_component
 from needle_controller.presets.steering_settings import PRESETS
 from needle_core.errors import UserError
 

@@ -12,11 +12,9 @@ from unittest import mock
 
 import pytest
 
-from needle_bringup.simulation import console_graph, node_graph, node_process, simulate
-from needle_bringup.simulation.console import rig_parameters
-from needle_bringup.simulation.console_options import parse_console
-from needle_bringup.simulation.node_graph import NodeFailedError, NodeGraph
-from needle_bringup.simulation.node_process import NodeProcess, stop
+from needle_bringup.simulation import console, node_graph, simulate
+from needle_bringup.simulation.console import parse_console, rig_parameters
+from needle_bringup.simulation.node_graph import NodeFailedError, NodeGraph, NodeProcess, stop
 from needle_bringup.simulation.rig_configuration import PACKAGES
 from needle_bringup.simulation.simulate_options import parse
 from needle_core.errors import UserError
@@ -70,7 +68,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> None:
     for kept in (Played.all, Played.sent, Played.ended):
         kept.clear()
     monkeypatch.setattr(node_graph, "NodeProcess", Played)
-    monkeypatch.setattr(node_process, "TERMINATE_GRACE", 0.0)
+    monkeypatch.setattr(node_graph, "TERMINATE_GRACE", 0.0)
 
 
 def test_every_executable_is_a_node_that_parameter_files_know() -> None:
@@ -193,13 +191,14 @@ def test_the_console_s_graph_has_the_page_and_a_live_view_and_no_stand_in(
 ) -> None:
     end = EndRequest()
 
-    def wait(nodes: Sequence[NodeProcess], _: float) -> None:
+    def wait(nodes: Sequence[NodeProcess], _: float) -> list[NodeProcess]:
         end.wanted = True
+        return []
 
-    monkeypatch.setattr(console_graph, "wait_for", wait)
+    monkeypatch.setattr(node_graph, "wait_for", wait)
     options = parse_console(["--graph", "--port", "9000"])
     with end, mock.patch.dict(os.environ):
-        assert console_graph.run_console_graph(options, rig_parameters(options), end) == 130
+        assert console.run_nodes(options, rig_parameters(options), end) == 130
     rig = ["sim_rig", "stereo_tracker", "plane_controller"]
     assert list(Played.all) == [*rig, "console", "live_view"]
     assert "http://127.0.0.1:9000/" in capsys.readouterr().out

@@ -10,18 +10,16 @@ from typing import Any
 import pytest
 import yaml
 
-from needle_bringup.simulation.needle_options import (
-    CURVATURE,
-    PRE_BEND,
-    SHARED,
-    contradictions,
-    needle_parameters,
-)
 from needle_bringup.simulation.rig_configuration import (
+    CURVATURE,
     NODES,
     PACKAGES,
+    PRE_BEND,
+    SHARED,
     command_line_parameters,
+    contradictions,
     merge,
+    needle_parameters,
     nodes_of,
     refuse_reserved,
     write_parameters,

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from needle_analysis.ros import rerun
-from needle_analysis.run.run_summary import stop_cause, summarize
 from needle_bags.reading.bag_reader import HealthEvent, Run, Status, read_run
+from needle_bags.ros import rerun
+from needle_bags.run.run_summary import stop_cause, summarize
 from needle_bringup.simulated_operator.progress import Progress
 from needle_bringup.simulation import simulate
 from needle_bringup.simulation.rig_configuration import command_line_parameters, run_info
@@ -171,7 +171,7 @@ def test_progress_is_a_line_a_quarter_or_a_bar_and_a_wait_is_said_once_each_time
             shown.show(insertion, 0.004)
         shown.show(1.0, 0.0)
         for reason in ("", "no tip", "no tip", "", "no tip"):
-            shown.tell_wait(reason)
+            shown.show_wait(reason)
         shown.close("done")
     waits = ["waiting: no tip"] * 2
     lines = ["  1.0 of 4.0 mm", "  3.0 of 4.0 mm", "  4.0 of 4.0 mm", *waits, "done"]

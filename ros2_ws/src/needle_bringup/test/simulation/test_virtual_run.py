@@ -13,8 +13,8 @@ from typing import Any
 import cv2
 import pytest
 
-from needle_analysis.ros import rerun
 from needle_bags.recording.bag_tap import BagTap
+from needle_bags.ros import rerun
 from needle_bringup.simulation.rig_configuration import command_line_parameters, run_info
 from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.virtual_run import COMPUTE, make_components
