@@ -11,7 +11,7 @@ from needle_core.commands.cli import EXIT_BAD_INPUT
 from needle_core.ros.main import run_component
 
 HELP = """\
-console: serves a page that shows what the rig sees and believes, with a hold to steer it by.
+console: serves a page that shows the state of the rig and has a hold to steer the needle.
 
 Publishes   device/hold (always; pressed only while a person holds), target_plane, target_point
 Subscribes  device/status, needle/controller_status, joint_states, needle/tip_pose, needle/estimate,
