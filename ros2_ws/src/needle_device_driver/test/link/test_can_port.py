@@ -300,7 +300,7 @@ def test_socketcand_receives_frames_in_any_pieces(
     port = Port("socketcand")
     # A malformed frame, an invalid one, two messages without end, and an error of the bus.
     rest = b"1 1.6  >\xff\xfe>< frame x y z >" + b"?" * 300 + b">< error 004 1.7 >"
-    rest += b"< frame 181 1.8 ab >" + b"?" * 300 + b"< frame 181 1.9 cd >"
+    rest += b"< frame 181 1.8 ab >" + b"?" * 190 + b"< frame 181 1.9 cd >"
     for start in range(0, len(rest), length):
         daemon.peer.sendall(rest[start : start + length])
         port.port.step()

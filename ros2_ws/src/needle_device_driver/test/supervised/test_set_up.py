@@ -104,6 +104,8 @@ REFUSED: list[tuple[Change, str]] = [
     (all_of(tells({(0x1017, 0): 0}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
     (all_of(tells({(0x1017, 0): 201}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
     *(needs(index) for index in (0x605A, 0x605E, 0x6007, 0x6065, 0x6085, 0x60C2, 0x607C, 0x6098)),
+    # A method to a switch is never replaced by one where the axis stands.
+    (refuses(RANGE, 0x6098, but=b"\x25"), "refuses to write 17 to 0x6098:0"),
     # It happens to have the values for a drive without home.
     (
         all_of(tells({(0x607D, 1): 2**31, (0x607D, 2): 2**31 - 1}), refuses(READ_ONLY, 0x607D)),
