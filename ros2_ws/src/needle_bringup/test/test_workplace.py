@@ -14,7 +14,7 @@ from needle_bringup.workplace import ending_descendants, make_folder, ran, tempo
 from needle_core.errors import UserError
 
 
-def test_descendants_are_ended_and_killed_if_they_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_descendants_are_terminated_then_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     alive, sent = {1: "orderly", 2: "stubborn"}, []
     now = iter(range(0, 1000, 4))
 
@@ -39,7 +39,7 @@ def test_descendants_are_ended_and_killed_if_they_stay(monkeypatch: pytest.Monke
     assert f"NEEDLE_STARTED_BY_{os.getpid()}" not in os.environ
 
 
-def test_a_command_that_fails_is_told_by_its_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_command_is_reported_with_its_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess(command, 2, "done\n", "one\nno rig\n")
 

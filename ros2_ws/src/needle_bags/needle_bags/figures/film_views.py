@@ -153,8 +153,8 @@ def _plan_view(run: Run, frames: Sequence[Frame], axis: int, name: str) -> View:
             band = ((plane - GOAL) * MM, (plane + GOAL) * MM)
             axes.axhspan(*band, color=GOAL_BAND, alpha=0.16, lw=0)
             axes.axhline(plane * MM, color=GOAL_BAND, lw=1.3)
-        way = (run.truth if len(run.truth) else finite_tips(run)).values * MM
-        axes.plot(way[:, 2], way[:, axis], color=TRUTH, lw=0.9, ls=(0, (2, 3)))
+        path = (run.truth if len(run.truth) else finite_tips(run)).values * MM
+        axes.plot(path[:, 2], path[:, axis], color=TRUTH, lw=0.9, ls=(0, (2, 3)))
         axes.set(xlabel="z, insertion [mm]", ylabel=("x, up [mm]", "y, beside [mm]")[axis])
         buffer = io.BytesIO()
         save(figure, buffer)

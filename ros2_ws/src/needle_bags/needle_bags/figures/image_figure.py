@@ -21,14 +21,14 @@ _HALF_WIDTH_PX = 110
 
 def frames_shown(run: Run, frames: Sequence[Frame]) -> list[int]:
     """Return the frames to show: some with a measured tip, spread over the insertion."""
-    seen = [index for index, frame in enumerate(frames) if len(frame.shaft)]
-    if not seen:
+    visible = [index for index, frame in enumerate(frames) if len(frame.shaft)]
+    if not visible:
         return []
-    depth = run.insertion_at(np.array([frames[index].stamp for index in seen]))
+    depth = run.insertion_at(np.array([frames[index].stamp for index in visible]))
     if np.isnan(depth).all():
-        return seen[-SHOWN:]
+        return visible[-SHOWN:]
     wanted = np.linspace(0.0, 1.0, SHOWN + 1)[1:] * np.nanmax(depth)
-    nearest = {seen[int(np.nanargmin(np.abs(depth - target)))] for target in wanted}
+    nearest = {visible[int(np.nanargmin(np.abs(depth - target)))] for target in wanted}
     return sorted(nearest)
 
 

@@ -157,18 +157,18 @@ def error_figure(run: Run) -> Figure:
             tip.plot(insertion, error[:, column], **style, label=name)
         tip.set(title="Measured tip minus truth", ylabel="mm")
         tip.legend(loc="best", ncols=2)
-        stamps, off = estimate_error(run, run.reduced_state)
+        stamps, error = estimate_error(run, run.reduced_state)
         insertion = run.insertion_at(stamps) * MM
         angles = difference.twinx()
         angles.grid(visible=False)
         angles.spines["right"].set_visible(True)
-        lines = difference.plot(insertion, off[:, 0] * MM, **THIN, label="r1 [mm]")
-        turned = np.degrees(off)
+        lines = difference.plot(insertion, error[:, 0] * MM, **THIN, label="r1 [mm]")
+        degrees = np.degrees(error)
         lines += angles.plot(
-            insertion, turned[:, 1], color=PLUM, lw=1.1, ls=DASHED, label="r2 [deg]"
+            insertion, degrees[:, 1], color=PLUM, lw=1.1, ls=DASHED, label="r2 [deg]"
         )
         lines += angles.plot(
-            insertion, turned[:, 2], color=TEAL, lw=1.1, ls=DOTTED, label="r3 [deg]"
+            insertion, degrees[:, 2], color=TEAL, lw=1.1, ls=DOTTED, label="r3 [deg]"
         )
         difference.set(title="Estimate minus truth", ylabel="mm", xlabel="insertion [mm]")
         angles.set_ylabel("deg")

@@ -142,10 +142,10 @@ def _errors(runs: tuple[Run, Run]) -> Figure:
             insertion = run.insertion_at(tips.stamps[here]) * MM
             distance = np.linalg.norm(tip_error(run), axis=1) * MM
             tip.plot(insertion, distance, color=color, lw=1.2, label=letter)
-            stamps, off = estimate_error(run, run.reduced_state)
+            stamps, error = estimate_error(run, run.reduced_state)
             insertion = run.insertion_at(stamps) * MM
-            r1.plot(insertion, off[:, 0] * MM, color=color, lw=1.2)
-            roll.plot(insertion, np.degrees(off[:, 2]), color=color, lw=1.2)
+            r1.plot(insertion, error[:, 0] * MM, color=color, lw=1.2)
+            roll.plot(insertion, np.degrees(error[:, 2]), color=color, lw=1.2)
         for axes in (r1, roll):
             axes.axhline(0.0, color=GREY, lw=0.8)
         tip.set(title="Measured tip: 3D distance from the truth", ylabel="mm")

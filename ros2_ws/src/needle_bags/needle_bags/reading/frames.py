@@ -77,15 +77,17 @@ def _rows(message: Any) -> Iterator[dict[str, Any]]:
         yield dict(_flat(message, ()))
 
 
-def _flat(value: Any, way: Sequence[str], joints: Sequence[str] = ()) -> Iterator[tuple[str, Any]]:
+def _flat(
+    value: Any, parts: Sequence[str], joints: Sequence[str] = ()
+) -> Iterator[tuple[str, Any]]:
     """Yield the columns of a field."""
     kind = getattr(value, "__msgtype__", "")
     if kind == "builtin_interfaces/msg/Time":
         stamp = value.sec + value.nanosec * 1e-9
         # Stamp of the header, or of a message that is a header itself.
-        yield (INDEX if way[:-1] in ((), ("header",)) else ".".join(way)), stamp
+        yield (INDEX if parts[:-1] in ((), ("header",)) else ".".join(parts)), stamp
     elif kind == "builtin_interfaces/msg/Duration":
-        yield ".".join(way), value.sec + value.nanosec * 1e-9
+        yield ".".join(parts), value.sec + value.nanosec * 1e-9
     elif kind:
         # Fields with a default are constants of the type.
         fields = {
@@ -95,18 +97,18 @@ def _flat(value: Any, way: Sequence[str], joints: Sequence[str] = ()) -> Iterato
         }
         named = [fields.pop(name) for name in _NAMES if isinstance(fields.get(name), list)]
         for name, each in fields.items():
-            yield from _flat(each, (*way, name), named[0] if named else joints)
+            yield from _flat(each, (*parts, name), named[0] if named else joints)
     elif isinstance(value, str | bytes) or not hasattr(value, "__len__"):
-        yield ".".join(way), value
+        yield ".".join(parts), value
     elif not len(value):
         return
     elif getattr(value[0], "__msgtype__", "") == "diagnostic_msgs/msg/KeyValue":
-        yield from ((".".join((*way, pair.key)), pair.value) for pair in value)
+        yield from ((".".join((*parts, pair.key)), pair.value) for pair in value)
     elif len(value) <= _MAX_ELEMENTS:
         are_joints = len(joints) == len(value) and not hasattr(value[0], "__msgtype__")
         for k, each in enumerate(value):
             name = joints[k] if are_joints else str(k)
-            yield from _flat(each, (*way, name), joints)
+            yield from _flat(each, (*parts, name), joints)
 
 
 def _frame(pd: Any, rows: list[dict[str, Any]]) -> Any:
@@ -115,7 +117,7 @@ def _frame(pd: Any, rows: list[dict[str, Any]]) -> Any:
         if name.startswith("values."):
             # Convert the column if all its values are numbers.
             numbers = pd.to_numeric(frame[name], errors="coerce")
-            nothing = frame[name].isna() | (frame[name] == "")
-            if not nothing.all() and (numbers.isna() == nothing).all():
+            empty = frame[name].isna() | (frame[name] == "")
+            if not empty.all() and (numbers.isna() == empty).all():
                 frame[name] = numbers
     return frame

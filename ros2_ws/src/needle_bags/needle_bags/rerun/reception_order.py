@@ -1,7 +1,7 @@
 """Messages of a bag in the order in which the controller received them.
 
 needle/controller_status lists the messages received since the previous status
-(`needle_controller.protocol.heard_messages`).
+(`needle_controller.controller_status`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.reading.bag_messages import SentMessage
-from needle_controller.protocol.heard_messages import HeardMessage, heard_messages
+from needle_controller.controller_status import ReceivedMessage, received_messages
 
 _STATUS = "needle/controller_status"
 _STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -62,9 +62,9 @@ def in_reception_order(
 
 def _statuses(
     messages: Iterable[SentMessage], namespace: str
-) -> Iterator[tuple[SentMessage, list[HeardMessage]]]:
+) -> Iterator[tuple[SentMessage, list[ReceivedMessage]]]:
     for message in messages:
         if message.topic == namespace + _STATUS:
             status: Any = _STORE.deserialize_cdr(message.data, message.type_name)
             values = {pair.key: pair.value for pair in status.values}
-            yield message, heard_messages(values.get("heard", ""))
+            yield message, received_messages(values.get("heard", ""))

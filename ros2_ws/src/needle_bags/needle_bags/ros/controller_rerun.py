@@ -20,8 +20,8 @@ from needle_controller.plane_controller import (
     joint_sample,
 )
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.actions import SteeringState
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import SteeringState
 from needle_core.component import Actions, Input, Moment, Publish
 from needle_core.convert import from_ros
 from needle_core.errors import UserError
@@ -108,7 +108,7 @@ class ControllerStage:
 
     def _handle_target(self, topic: str, message: Any, sent_ns: int) -> Actions:
         actions = list(_deliver(self._rows[topic], message, sent_ns))
-        if complaint := self._controller.complaints.get(topic):
+        if complaint := self._controller.problems.get(topic):
             self.notes.append(f"{topic} refused: {complaint}")
         return actions
 

@@ -133,12 +133,12 @@ def _run(words: Sequence[str]) -> int:
     if given.preset is not None and given.preset not in PRESETS:
         raise UserError(f"--preset {given.preset!r} is not one of {', '.join(PRESETS)}")
     named = {key: getattr(given, key) for key in ("preset", *GROUPS)}
-    asked = {key: name for key, name in named.items() if name is not None}
+    overrides = {key: name for key, name in named.items() if name is not None}
     run = read_run(given.bag, given.namespace)
     params = (given.params, sections)
     tracker_node = _node(run, TRACKER, params, {}) if has_images(run) else None
-    controller_node = _node(run, CONTROLLER, params, asked)
-    reached = controller_node.given.difference(asked) or (tracker_node and tracker_node.given)
+    controller_node = _node(run, CONTROLLER, params, overrides)
+    reached = controller_node.given.difference(overrides) or (tracker_node and tracker_node.given)
     if given.params is not None and not reached:
         print(f"warning: {none_for(*params, controller_node.name)}", file=sys.stderr)
     calibration = run.calibration if tracker_node is None else _calibration(run, tracker_node)
@@ -214,7 +214,7 @@ def _node(
     run: Run,
     name: str,
     params: tuple[Path | None, Sections],
-    asked: Mapping[str, str],
+    overrides: Mapping[str, str],
     *,
     has_defaults: bool = False,
 ) -> Node:
@@ -222,7 +222,7 @@ def _node(
     found = [full for full in recorded if full.rsplit("/", maxsplit=1)[-1] == name]
     own = f"{run.namespace}{name}"
     full_name = found[0] if found and own not in found else own
-    given = {**(values_for(*params, full_name, name) or {}), **asked}
+    given = {**(values_for(*params, full_name, name) or {}), **overrides}
     if not (found or given or has_defaults):
         raise UserError(
             f"{run.path} has no parameters of {name} (recorded by another recorder?): give them "

@@ -44,7 +44,7 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
     error = tip_error(run)
     final = float(r1[-1]) if len(r1) else None
     missed = point_error(run)
-    off = missed if missed is not None else final
+    target_distance = missed if missed is not None else final
     done = reached_depth(run)
     steps = _steps(run)
     insertion = run.joints.values[:, 0]
@@ -55,7 +55,7 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
         "rerun_of": rerun_of(run),
         "seed": _whole(run.run_info.get("seed"), run.parameter("sim_rig", "seed")),
         "steps": steps,
-        "converged": off is not None and abs(off) <= GOAL and done,
+        "converged": target_distance is not None and abs(target_distance) <= GOAL and done,
         "reached_depth": done,
         "r1_initial_mm": _mm(float(r1[0])) if len(r1) else None,
         "r1_final_mm": _mm(final),
@@ -102,8 +102,8 @@ def target_offset(run: Run) -> float:
     try:
         return float(run.last_status("target_offset_m"))
     except ValueError:
-        told = run.parameter("plane_controller", "target_offset")
-        return float(told) if isinstance(told, (int, float)) else 0.0
+        configured = run.parameter("plane_controller", "target_offset")
+        return float(configured) if isinstance(configured, (int, float)) else 0.0
 
 
 def point_error(run: Run) -> float | None:

@@ -102,26 +102,26 @@ def _first_sent(run: Run) -> dict[str, dict[int, int]]:
 
 def _received_commands(run: Run) -> tuple[Times, Times]:
     """Return the times of device statuses, (N,), and the latest command stamps in them."""
-    said, heard = [], []
+    reported_at, latest_stamps = [], []
     status = run.namespace + _STATUS
     for sent, message in messages_as_sent(run.path, status.__eq__, lambda _: False):
         values = {pair.key: pair.value for pair in message.values}
-        said.append(sent.time)
-        heard.append(int(values.get("command_ns") or 0))
-    return np.array(said, np.int64), np.maximum.accumulate(np.array(heard, np.int64))
+        reported_at.append(sent.time)
+        latest_stamps.append(int(values.get("command_ns") or 0))
+    return np.array(reported_at, np.int64), np.maximum.accumulate(np.array(latest_stamps, np.int64))
 
 
 def _set_points(
     commands: dict[int, int], received_commands: tuple[Times, Times], joints: dict[int, int]
 ) -> dict[int, int]:
     """Return the time of the first set-points on the bus by command stamp [ns]."""
-    said, heard = received_commands
+    reported_at, latest_stamps = received_commands
     cycles = sorted((sent, stamp) for stamp, sent in joints.items())
     ends = np.array([sent for sent, _ in cycles], np.int64)
     set_points = {}
     for stamp, time in commands.items():
-        first = int(np.searchsorted(heard, stamp))
-        known = time if first == len(said) else max(int(said[first]), time)
+        first = int(np.searchsorted(latest_stamps, stamp))
+        known = time if first == len(reported_at) else max(int(reported_at[first]), time)
         cycle = int(np.searchsorted(ends, known))
         if cycle < len(cycles):
             sent, sync = cycles[cycle]

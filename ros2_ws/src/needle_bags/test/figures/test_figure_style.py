@@ -51,7 +51,7 @@ def lab(rgb: np.ndarray) -> np.ndarray:
     return np.array([116.0 * f[1] - 16.0, 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])])
 
 
-def test_every_line_stands_out_from_its_ground() -> None:
+def test_lines_contrast_with_the_background() -> None:
     for name, line in LINES.items():
         color, white = srgb(line), np.ones(3)
         assert contrast(color, white) >= 3.0, name
@@ -59,7 +59,7 @@ def test_every_line_stands_out_from_its_ground() -> None:
 
 
 @pytest.mark.parametrize("vision", VISION)
-def test_any_two_lines_can_be_told_apart(vision: str) -> None:
+def test_line_colours_are_distinguishable(vision: str) -> None:
     matrix = np.array(VISION[vision])
     for one, other in itertools.combinations(LINES, 2):
         for mode in (lambda color: color, in_the_dark):

@@ -72,7 +72,7 @@ def test_definitions_hash_as_rosbags_computes() -> None:
         full_definition("no_such_msgs/msg/Thing")
 
 
-def test_rosbags_reads_the_messages_and_what_is_said_of_their_topic(texts: Path) -> None:
+def test_rosbags_reads_messages_and_qos(texts: Path) -> None:
     with Reader(texts) as reader:
         messages = list(reader.messages())
         (connection,) = reader.connections
@@ -107,7 +107,7 @@ def test_mcap_reads_the_file_alone(texts: Path) -> None:
     assert attachment.data == b"left: {}\n"
 
 
-def test_a_bag_is_begun_where_none_is_and_replaces_none(texts: Path, tmp_path: Path) -> None:
+def test_an_existing_bag_is_not_replaced(texts: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds a bag already"):
         BagWriter(texts)
     (tmp_path / "parameters.yaml").write_text("{}")
@@ -133,7 +133,7 @@ class _FullFile(io.FileIO):
         return super().write(data[:room])
 
 
-def test_a_disk_that_takes_nothing_is_said_at_the_start(
+def test_a_disk_that_refuses_data_is_an_error_at_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not after a run of which nothing was kept; and nothing stands in the way of the next try."""
@@ -164,7 +164,7 @@ def test_recover_completes_the_bag_of_a_disk_that_refused_data(
     assert 0 < kept == recovery.messages < 2000
 
 
-def test_a_recording_ends_in_order_before_its_disk_is_full_or_at_what_it_cannot_write(
+def test_a_recording_ends_in_order_before_its_disk_is_full_or_at_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The thread that writes may not end in silence: all that comes after would wait for ever."""
@@ -203,7 +203,7 @@ class HeldWorker(list[Job]):
         self._end()
 
 
-def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(tmp_path: Path) -> None:
+def test_a_recording_keeps_room_for_small_messages_and_counts_dropped_ones(tmp_path: Path) -> None:
     """Images fill the memory that there is, commands still get in."""
     limit = 1_000_000
     bag, space = BagWriter(tmp_path / "bag"), FreeSpace(tmp_path, 0)
@@ -228,7 +228,7 @@ def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(tmp_p
     assert counts == {"/image": 12 - dropped["/image"], "/command": 1050 - dropped["/command"]}
 
 
-def test_health_tells_the_worst_first() -> None:
+def test_health_reports_the_worst_problem() -> None:
     space = SimpleNamespace(reserve=1_000_000, usable=lambda: 10**9)
     told: Any = SimpleNamespace(error=None, bytes_received=0, bytes_waiting=0, space=space)
     health = RecorderHealth(told, Path("bag"))

@@ -23,7 +23,7 @@ def test_gaps(numbers: tuple[int, ...], missing: int) -> None:
     assert gaps.missing == missing
 
 
-def test_a_jump_just_before_another_publisher_is_known_is_no_gap() -> None:
+def test_a_jump_before_the_discovery_of_a_publisher_is_no_gap() -> None:
     gaps = SequenceGaps()
     for number in (1, 2, 3, 50):
         gaps.add(number)
@@ -32,7 +32,7 @@ def test_a_jump_just_before_another_publisher_is_known_is_no_gap() -> None:
     assert gaps.missing == 0
 
 
-def test_a_gap_stays_when_publishers_change_later() -> None:
+def test_a_gap_remains_after_a_change_of_publishers() -> None:
     gaps = SequenceGaps()
     for number in (1, *range(4, 5 + CERTAIN_AFTER)):
         gaps.add(number)

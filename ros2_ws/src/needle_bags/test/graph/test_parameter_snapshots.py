@@ -40,7 +40,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     return Bench(monkeypatch)
 
 
-def test_a_request_that_is_lost_is_sent_again_and_a_late_answer_counts(bench: Bench) -> None:
+def test_a_lost_request_is_repeated_and_a_late_answer_accepted(bench: Bench) -> None:
     assert bench.taken == {"/recorder": {"own": 1}}
     names, values = bench.clients
     bench.waits()
@@ -55,7 +55,7 @@ def test_a_request_that_is_lost_is_sent_again_and_a_late_answer_counts(bench: Be
     assert bench.snapshots.document()[OTHER] == {"ros__parameters": VALUES}
 
 
-def test_a_node_that_is_long_in_answering_is_given_up_only_when_it_has_gone(bench: Bench) -> None:
+def test_a_slow_node_is_asked_until_it_disappears(bench: Bench) -> None:
     for _ in range(3 * repeated_request.MAX_PENDING):
         bench.waits()
     # What the last minutes asked is not all kept.

@@ -98,7 +98,7 @@ def scene(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Scene:
     return Scene(monkeypatch, tmp_path)
 
 
-def test_all_that_is_sent_is_in_the_bag_with_what_repeats_the_run(
+def test_the_bag_has_all_messages_and_what_a_rerun_needs(
     scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration = tmp_path / "calibration.yaml"
@@ -141,7 +141,7 @@ def test_all_that_is_sent_is_in_the_bag_with_what_repeats_the_run(
     assert scene.health("parameters_of").message == "/recorder, /source"
 
 
-def test_what_cannot_be_understood_is_told_recorded_and_ends_nothing(scene: Scene) -> None:
+def test_malformed_messages_are_reported_and_recorded(scene: Scene) -> None:
     scene.offer(EVENTS, ParameterEvent)
     malformed = (b"\0\1\0\0" + bytes(8) + b"\xff\xff\xff\x7fmore", b"\xff" * 8)
 
@@ -166,7 +166,7 @@ def test_what_cannot_be_understood_is_told_recorded_and_ends_nothing(scene: Scen
     assert len(scene.logged) == 3
 
 
-def test_a_disk_that_fills_ends_the_recording_and_nothing_else(
+def test_a_full_disk_ends_the_recording_and_not_the_node(
     scene: Scene, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene.offer("/numbered", Int32)
@@ -202,7 +202,7 @@ def test_a_disk_that_fills_ends_the_recording_and_nothing_else(
     assert scene.numbers("/numbered") == [0, 1, 2, 3, 4, 5]
 
 
-def test_snapshots_when_asked_and_a_second_after_a_fault(scene: Scene) -> None:
+def test_snapshots_on_request_and_a_second_after_a_fault(scene: Scene) -> None:
     scene.offer("/plane", Int32, LATCHED)
     scene.offer("/numbered", Int32)
     scene.offer(STATUS, DiagnosticStatus, LATCHED)
@@ -241,7 +241,7 @@ def test_snapshots_when_asked_and_a_second_after_a_fault(scene: Scene) -> None:
     assert read_contents(scene.bag).counts[STATUS] == 3
 
 
-def test_which_topics_are_recorded_or_why_the_parameters_are_refused() -> None:
+def test_topic_selection_and_invalid_parameters() -> None:
     topics = ("/a/annotated_image", "/rig/live_view/path", "/rig/one", "/rig/two", "/other")
     named: Any = {"topics": ("a/annotated_image",), "regex": "^/rig/", "exclude_regex": "two|view"}
     for settings, chosen in (({}, topics[2:]), (named, (topics[0], topics[2]))):

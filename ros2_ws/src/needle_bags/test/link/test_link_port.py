@@ -36,7 +36,7 @@ def read(connection: socket.socket, count: int) -> bytes:
     return b"".join(connection.recv(1) for _ in range(count))
 
 
-def test_all_hear_the_same_whatever_another_sends(server: LinkServer) -> None:
+def test_all_clients_receive_the_same_whatever_another_sends(server: LinkServer) -> None:
     with pytest.raises(UserError, match=rf"127\.0\.0\.1, port {server.port}: Address already"):
         LinkServer("127.0.0.1", server.port)
     with listener(server) as good:
@@ -57,7 +57,7 @@ def test_all_hear_the_same_whatever_another_sends(server: LinkServer) -> None:
         assert good.recv(1) == b""
 
 
-def test_more_than_there_is_room_for_are_turned_away(server: LinkServer) -> None:
+def test_clients_beyond_the_limit_are_turned_away(server: LinkServer) -> None:
     with contextlib.ExitStack() as stack:
         for _ in range(MAX_CLIENTS + 1):
             last = stack.enter_context(listener(server))
@@ -65,7 +65,9 @@ def test_more_than_there_is_room_for_are_turned_away(server: LinkServer) -> None
         assert (server.clients, server.turned_away) == (MAX_CLIENTS, 1)
 
 
-def test_who_does_not_read_holds_nobody_up_and_is_let_go(server: LinkServer) -> None:
+def test_a_client_that_does_not_read_delays_no_other_and_is_disconnected(
+    server: LinkServer,
+) -> None:
     data = bytes(20_000_000)
     with listener(server) as asleep:
         server.send(data, 1.0)

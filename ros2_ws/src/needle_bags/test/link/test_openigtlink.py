@@ -73,7 +73,7 @@ def pose(stamp_ns: int, sigma: float = 1e-4) -> m.PoseWithCovariance:
     return m.PoseWithCovariance(stamp_ns, "rig", TIP, (x, y, z, w), covariance)
 
 
-def test_slicer_hears_the_needle_in_mm(component: OpenIGTLink) -> None:
+def test_messages_are_in_mm(component: OpenIGTLink) -> None:
     assert says(component) == {"NeedleStatus": ("nothing heard of the needle", 7.0)}
     status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
     hear(component, "needle/controller_status", status)
@@ -107,7 +107,7 @@ def test_slicer_hears_the_needle_in_mm(component: OpenIGTLink) -> None:
         assert not said.keys() & {"NeedleTipToRig", "NeedleShaft"}
 
 
-def test_the_port_tells_who_listens_and_nothing_is_packed_for_nobody() -> None:
+def test_the_port_reports_clients_and_without_any_nothing_is_packed() -> None:
     component = OpenIGTLink(OpenIGTLinkParameters(port=0))
     (timer,), (row,) = component.timers, component.ports
     assert list(timer.handler(AT)) == [Send(LINK, (b"",))]
@@ -122,7 +122,7 @@ def test_the_port_tells_who_listens_and_nothing_is_packed_for_nobody() -> None:
         assert arrived == [(log,), (Listeners(0, 0),)]
 
 
-def test_without_pyigtl_it_says_so(
+def test_missing_pyigtl_is_an_error(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)

@@ -33,7 +33,7 @@ def inserted() -> ShaftTrail:
     return trail
 
 
-def test_the_shaft_lies_where_the_tip_went() -> None:
+def test_the_shaft_follows_the_path_of_the_tip() -> None:
     shaft = inserted().shaft(0.08, arc(0.08))
     assert shaft[0] == pytest.approx(np.zeros(3))
     assert shaft[-1] == pytest.approx(arc(0.08))
@@ -42,7 +42,7 @@ def test_the_shaft_lies_where_the_tip_went() -> None:
     assert 70 < len(shaft) < 90
 
 
-def test_a_needle_drawn_back_lies_in_its_way_which_stays_until_it_is_out() -> None:
+def test_a_withdrawn_needle_stays_on_its_path_until_it_is_out() -> None:
     trail = inserted()
     way = trail.path
     trail.add(0.03, arc(0.03))
@@ -56,7 +56,7 @@ def test_a_needle_drawn_back_lies_in_its_way_which_stays_until_it_is_out() -> No
     assert trail.path[-1] == pytest.approx(-arc(0.002))
 
 
-def test_the_ellipsoid_holds_as_many_as_it_says() -> None:
+def test_the_ellipsoid_contains_95_percent() -> None:
     rng = np.random.default_rng(5)
     for turned in Rotation.random(4, random_state=5).as_matrix():
         covariance = turned @ np.diag([1e-8, 4e-8, 9e-6]) @ turned.T
@@ -69,7 +69,7 @@ def test_the_ellipsoid_holds_as_many_as_it_says() -> None:
         assert lengths.max() == pytest.approx(SIGMAS * 3e-3)
 
 
-def test_what_is_believed_in_the_plane_is_shown_in_the_rig() -> None:
+def test_the_estimate_is_transformed_to_the_rig() -> None:
     turned = Rotation.from_euler("xyz", [0.2, 0.1, -0.3]).as_matrix()
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = turned, [0.003, 0.001, 0.0]
@@ -87,7 +87,7 @@ def test_what_is_believed_in_the_plane_is_shown_in_the_rig() -> None:
     assert turned.T @ belief.covariance @ turned == pytest.approx(covariance)
 
 
-def test_the_plane_that_is_in_force_counts_not_one_that_was_refused() -> None:
+def test_a_rejected_plane_is_ignored() -> None:
     needle: Any = LiveNeedle()
     assert [needle.plane] == [None]
     asked = np.eye(4)
@@ -100,7 +100,7 @@ def test_the_plane_that_is_in_force_counts_not_one_that_was_refused() -> None:
     assert needle.target_point is None
 
 
-def test_a_tip_that_is_not_found_leaves_the_last_one_and_says_so() -> None:
+def test_without_a_tip_the_last_one_is_kept() -> None:
     needle: Any = LiveNeedle()
     assert [needle.shaft] == [None]
     needle.set_insertion(0.02)
@@ -114,7 +114,7 @@ def blank(value: int = 0) -> NDArray[np.uint8]:
     return np.full((120, 160), value, np.uint8)
 
 
-def test_an_image_is_drawn_once_with_its_own_answer_or_late_without() -> None:
+def test_an_image_is_shown_once_with_its_answer_or_late_without() -> None:
     images = LatestImages()
 
     def drawn(answered: int | None, now: float) -> tuple[int, bool] | None:
@@ -142,7 +142,7 @@ def test_an_image_is_drawn_once_with_its_own_answer_or_late_without() -> None:
     assert drawn(None, 5.7) is None
 
 
-def test_shaft_and_tip_are_drawn_where_they_are() -> None:
+def test_shaft_and_tip_are_drawn_at_their_pixels() -> None:
     def coloured(shaft: NDArray[np.float64]) -> NDArray[np.bool_]:
         data = np.frombuffer(draw_needle(blank(), shaft, ""), np.uint8)
         picture = cv2.imdecode(data, cv2.IMREAD_COLOR)

@@ -122,7 +122,7 @@ def shown(markers: m.Markers) -> dict[str, m.Marker]:
     return {marker.namespace: marker for marker in markers.markers if marker.action == ADD}
 
 
-def test_what_is_known_is_drawn_and_the_rest_is_taken_away() -> None:
+def test_known_quantities_are_drawn_and_the_others_deleted() -> None:
     scene = Scene()
     seen = scene.look_at(live_view.MARKERS, live_view.TIP, live_view.PATH).seen
     markers = seen[live_view.MARKERS]
@@ -149,7 +149,7 @@ def test_what_is_known_is_drawn_and_the_rest_is_taken_away() -> None:
     assert shown(markers[-1])["tip"].colour == (0.7, 0.7, 0.7, 1.0)
 
 
-def test_nothing_is_sent_that_nobody_looks_at() -> None:
+def test_topics_without_subscriber_are_not_published() -> None:
     scene = steered()
     assert scene.published == []
     scene.look_at(live_view.PATH)
@@ -169,7 +169,7 @@ def test_nothing_is_sent_that_nobody_looks_at() -> None:
     assert {row.topic for row in scene.view.outputs} == topics
 
 
-def test_what_cannot_be_is_refused_by_name_and_changes_nothing() -> None:
+def test_implausible_messages_are_rejected() -> None:
     scene = steered()
     markers = scene.look_at(live_view.MARKERS).seen[live_view.MARKERS]
     before = shown(markers[-1])
@@ -231,7 +231,7 @@ def test_an_image_is_drawn_with_its_answer(left_view: Projection) -> None:
     assert (ring[..., 2].astype(int) - ring[..., 0] > 100).sum() > 20
 
 
-def test_images_of_another_camera_or_from_before_anybody_looked_are_not_shown() -> None:
+def test_images_of_another_camera_or_before_a_subscription_are_not_shown() -> None:
     scene = Scene()
     scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
     scene.say(RAW, black(1))
@@ -257,7 +257,7 @@ def test_images_of_another_camera_or_from_before_anybody_looked_are_not_shown() 
 # ---- transforms
 
 
-def test_transforms_are_sent_where_there_is_a_message_for_them() -> None:
+def test_transforms_are_published_if_the_message_type_is_installed() -> None:
     scene = Scene(transforms=True)
     assert Output(live_view.TF_STATIC, m.Transforms, LATCHED) in scene.view.outputs
     scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))

@@ -37,7 +37,7 @@ def published() -> dict[str, str]:
     return {one["name"]: one["type"] for one in recorded} | OUTPUTS | health
 
 
-def test_the_rviz_configuration_and_the_help_show_what_is_there() -> None:
+def test_the_rviz_configuration_and_the_help_have_the_published_topics() -> None:
     document = yaml.safe_load((CONFIG / "live_view.rviz").read_text("utf-8"))
     manager, there = document["Visualization Manager"], published()
     kinds = {one["Class"].partition("/")[2]: one for one in manager["Displays"]}
@@ -53,7 +53,7 @@ def test_the_rviz_configuration_and_the_help_show_what_is_there() -> None:
     assert all(topic.replace("/live_view", "~") in executable.HELP for topic in OUTPUTS)
 
 
-def test_the_foxglove_layout_shows_what_is_there() -> None:
+def test_the_foxglove_layout_has_the_published_topics() -> None:
     layout = json.loads((CONFIG / "live_view.json").read_text("utf-8"))
     there = published()
     shown: set[str] = set()

@@ -48,14 +48,14 @@ def test_a_late_question_still_comes_before_its_answer(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("skew", [-20 * MILLISECOND, 5_000 * MILLISECOND])
-def test_another_clock_orders_nothing(tmp_path: Path, skew: int) -> None:
+def test_with_another_clock_the_order_of_reception_is_kept(tmp_path: Path, skew: int) -> None:
     """The answerer's clock is off: its messages were received when they were, not when it says."""
     write(tmp_path / "bag", lambda topic, _: skew if topic == ANSWERS else 0)
     received = [m.log_time for m in raw_as_sent(tmp_path / "bag", lambda _: True, LARGE.__eq__)]
     assert received == sorted(received)
 
 
-def test_messages_are_those_of_the_bag(tmp_path: Path) -> None:
+def test_messages_are_unchanged(tmp_path: Path) -> None:
     write(tmp_path / "bag", lambda _, number: number % 2 * MILLISECOND, count=5)
     found = list(raw_as_sent(tmp_path / "bag", ANSWERS.__eq__, LARGE.__eq__))
     assert [m.time - START for m in found] == [(10 * n + 2) * MILLISECOND for n in range(5)]

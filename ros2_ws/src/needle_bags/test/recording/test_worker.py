@@ -7,7 +7,7 @@ import queue
 from needle_bags.recording.worker import Job, WorkerThread, no_op
 
 
-def test_jobs_are_done_in_order_with_looks_between_and_the_end_after_all() -> None:
+def test_jobs_run_in_order_with_periodic_wake_ups() -> None:
     done: list[str] = []
     looked: queue.SimpleQueue[Job] = queue.SimpleQueue()
 
@@ -31,7 +31,7 @@ def test_jobs_are_done_in_order_with_looks_between_and_the_end_after_all() -> No
     assert done[-2:] == [names[-1], "end"]
 
 
-def test_a_job_ends_the_wait_for_what_is_due_much_later() -> None:
+def test_a_job_ends_the_wait_for_the_next_wake_up() -> None:
     done: queue.SimpleQueue[int] = queue.SimpleQueue()
 
     def do(job: Job) -> float:

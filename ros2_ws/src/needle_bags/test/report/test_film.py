@@ -37,7 +37,7 @@ def with_depth(run: Run, depth: np.ndarray) -> Run:
     return dataclasses.replace(run, joints=dataclasses.replace(run.joints, values=values))
 
 
-def test_frames_are_exposures_evenly_apart_that_end_where_their_tip_is(made_up: Run) -> None:
+def test_frames_are_equally_spaced_and_end_at_their_tip(made_up: Run) -> None:
     frames = film_of(made_up)
     assert [frame.stamp for frame in frames] == [2 * STEP_NS * n for n in range(MAX_FRAMES)]
     depths = [float(frame.readings[0].removesuffix(" mm")) for frame in frames]
@@ -53,7 +53,7 @@ def test_frames_are_exposures_evenly_apart_that_end_where_their_tip_is(made_up: 
         assert np.array_equal(seen.needle, frame.shaft)
 
 
-def test_no_frame_is_spent_where_the_needle_rests(made_up: Run) -> None:
+def test_a_resting_needle_takes_no_frames(made_up: Run) -> None:
     run = with_depth(made_up, np.minimum(made_up.joints.values[:, 0], 0.1))
     frames = film_of(run)
     insertions = run.insertion_at(np.array([frame.stamp for frame in frames]))
@@ -64,7 +64,7 @@ def test_no_frame_is_spent_where_the_needle_rests(made_up: Run) -> None:
     assert film_of(with_depth(made_up, there_and_back))[-1].stamp == made_up.tips.stamps[-1]
 
 
-def test_readings_are_those_of_the_frame(made_up: Run) -> None:
+def test_readings_belong_to_their_frame(made_up: Run) -> None:
     told = dict(zip(READINGS, film_of(made_up)[-1].readings, strict=True))
     assert list(told.values()) == [
         *("120.0 mm", "-0.25 mm", "-0.15 mm", told["Pitch, estimated"], "+1 deg"),
@@ -79,7 +79,7 @@ def test_readings_are_those_of_the_frame(made_up: Run) -> None:
     assert (doubtful[2], doubtful[-1]) == ("-0.15 mm ± 1.50", "doubtful")
 
 
-def test_the_drawings_show_the_needle_where_it_is(made_up: Run) -> None:
+def test_the_drawings_are_to_scale(made_up: Run) -> None:
     frames = film_of(made_up)
     side, above = plan_views(made_up, frames)
     true = np.array([frame.needle[-1] for frame in frames])
@@ -94,7 +94,7 @@ def test_the_drawings_show_the_needle_where_it_is(made_up: Run) -> None:
         assert np.all(ends < np.array(view.size))
 
 
-def test_the_film_has_the_pictures_of_the_bag_in_order(make_run: Callable[..., Path]) -> None:
+def test_the_film_has_the_images_in_order(make_run: Callable[..., Path]) -> None:
     run = read_run(make_run(image_height=3, steps=60, bad_tip=30))
     frames = film_of(run)
     # A tip that is not a number is no needle.
@@ -107,7 +107,7 @@ def test_the_film_has_the_pictures_of_the_bag_in_order(make_run: Callable[..., P
         assert np.abs(np.array(shades) - np.arange(MAX_FRAMES)).max() <= 2.0
 
 
-def test_the_film_of_real_cameras_has_the_tip_where_it_is_seen(
+def test_the_film_marks_the_tip_in_camera_images(
     reported: tuple[Run, str],
 ) -> None:
     run, page = reported
@@ -134,7 +134,7 @@ def test_the_film_of_real_cameras_has_the_tip_where_it_is_seen(
 
 
 @pytest.mark.parametrize("shape", [(768, 1024), (2000, 300), (7, 5)])
-def test_a_picture_is_small_whatever_it_shows(shape: tuple[int, int]) -> None:
+def test_a_picture_of_noise_is_small(shape: tuple[int, int]) -> None:
     noise = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
     data = _small_jpeg(noise)
     assert 0 < len(data) <= MAX_BYTES

@@ -52,7 +52,7 @@ def assert_leads_nowhere_else(page: str) -> None:
     assert set(re.findall(r'href="#([^"]+)"', page)) <= set(names)
 
 
-def test_the_report_is_one_file_with_all_there_is_to_see(reported: tuple[Run, str]) -> None:
+def test_the_report_is_one_self_contained_file(reported: tuple[Run, str]) -> None:
     run, page = reported
     assert_leads_nowhere_else(page)
     # Two drawings of the film beside the figures, which are files, too.
@@ -69,7 +69,7 @@ def test_the_report_is_one_file_with_all_there_is_to_see(reported: tuple[Run, st
     assert "Converged" in page
 
 
-def test_texts_from_the_bag_are_shown_as_they_are_and_cannot_be_markup(
+def test_texts_from_the_bag_are_escaped(
     reported: tuple[Run, str],
 ) -> None:
     run, page = reported
@@ -80,7 +80,7 @@ def test_texts_from_the_bag_are_shown_as_they_are_and_cannot_be_markup(
     assert f"needle_bags rerun {run.path}\n" in section
 
 
-def test_without_truth_or_command_it_says_so_in_the_folder_that_is_named(
+def test_a_report_without_truth_or_command(
     make_run: MakeRun, tmp_path: Path, drawn: list[Figure]
 ) -> None:
     bag, out, figures = (
@@ -112,9 +112,7 @@ def test_two_bags_are_compared(make_run: MakeRun, tmp_path: Path, drawn: list[Fi
     assert values["difference_r1_initial_mm"] == 0.0
 
 
-def test_a_rerun_says_that_nothing_was_steered(
-    make_run: MakeRun, tmp_path: Path, drawn: list[Figure]
-) -> None:
+def test_the_report_of_a_rerun(make_run: MakeRun, tmp_path: Path, drawn: list[Figure]) -> None:
     bag = make_run("steered", steps=20, command=COMMAND)
     run, again = read_run(bag), tmp_path / "again"
     write_rerun(run, again, [], {"/plane_controller": {"preset": "best"}}, "")
@@ -144,7 +142,7 @@ def test_a_rerun_says_that_nothing_was_steered(
     assert "what the needle did is the same in both" in page
 
 
-def test_troubles_and_lanes_show_what_went_wrong_and_not_how_every_run_starts(
+def test_events_omit_the_warnings_of_the_start(
     made_up: Run,
 ) -> None:
     begin = made_up.first_command
@@ -209,7 +207,7 @@ def test_verdicts(make_run: MakeRun) -> None:
         assert told(nothing)["point_error_mm"] is None
 
 
-def test_a_term_is_explained_once_where_it_stands_first() -> None:
+def test_a_term_is_explained_at_its_first_use() -> None:
     glossary = Glossary()
     first = glossary.explain("The [roll] is < [turned|roll] by the [hold].")
     assert first.count('id="term-roll"') == 1

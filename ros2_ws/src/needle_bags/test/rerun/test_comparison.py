@@ -29,7 +29,7 @@ def differing(comparison: Comparison) -> dict[str, int]:
     return {field.field: field.differing for field in comparison.fields if field.differing}
 
 
-def test_equal_messages_agree_to_the_last_bit_and_a_number_never_with_none() -> None:
+def test_equal_messages_agree_and_a_number_differs_from_nan() -> None:
     records = [state(1, 0.1, math.nan, math.inf), state(2)]
     result = compare(records, list(reversed(records)))
     assert not result.changed
@@ -41,7 +41,7 @@ def test_equal_messages_agree_to_the_last_bit_and_a_number_never_with_none() -> 
             assert result.fields[0].largest == math.inf
 
 
-def test_the_tolerance_is_where_it_is_said_to_be() -> None:
+def test_the_tolerance_is_applied_at_its_bound() -> None:
     for member, field, tolerance in (("x", "r1", LENGTH), ("z", "r3", ANGLE)):
         allowed = tolerance.absolute + tolerance.relative * 0.5
         for factor, changed in ((0.99, False), (1.01, True), (-0.99, False), (-1.01, True)):

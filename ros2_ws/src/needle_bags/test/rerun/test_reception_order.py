@@ -7,7 +7,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.reading.bag_messages import SentMessage
 from needle_bags.rerun.reception_order import in_reception_order
-from needle_controller.protocol.heard_messages import HeardMessages
+from needle_controller.controller_status import ReceptionLog
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 HEADER, STATUS = "std_msgs/msg/Header", "diagnostic_msgs/msg/DiagnosticStatus"
@@ -22,10 +22,10 @@ def sent(time: int, topic: str) -> SentMessage:
 
 def status(time: int, *heard: tuple[str, int]) -> SentMessage:
     """What the controller said; `("joints", 7)` is that it had heard the joints sent at 7."""
-    told = HeardMessages()
+    told = ReceptionLog()
     for topic, sent_ns in heard:
         told.add(topic, sent_ns)
-    values = [PAIR(key="heard", value=told.take_text())]
+    values = [PAIR(key="heard", value=told.pop_text())]
     message = STORE.types[STATUS](level=0, name="", message="", hardware_id="", values=values)
     data = bytes(STORE.serialize_cdr(message, STATUS))
     return SentMessage(time, time, "/rig/needle/controller_status", STATUS, data)
@@ -62,7 +62,7 @@ SENT = partial(map, lambda pair: sent(*pair))
         ),
     ],
 )
-def test_the_order_is_that_of_hearing(
+def test_the_order_is_that_of_reception(
     messages: list[SentMessage], heard: list[tuple[str, int]]
 ) -> None:
     found = in_reception_order(list(messages), "/rig/")

@@ -89,7 +89,9 @@ def paper_bag(tmp_path_factory: pytest.TempPathFactory, eight_steps: Path) -> Pa
     return bag
 
 
-def test_todays_code_does_what_it_did(untouched: tuple[int, str], regression: Path) -> None:
+def test_unchanged_code_gives_unchanged_outputs(
+    untouched: tuple[int, str], regression: Path
+) -> None:
     code, said = untouched
     assert code == 0, f"{said}\nmeant? scripts/renew_regression_bag"
     assert "6 image pairs through stereo_tracker, 121 tips through plane_controller" in said
@@ -99,7 +101,7 @@ def test_todays_code_does_what_it_did(untouched: tuple[int, str], regression: Pa
     assert len(rows) == read_contents(regression).counts["/needle/estimate"]
 
 
-def test_a_sign_in_the_projection_is_seen(mirrored: tuple[int, str]) -> None:
+def test_a_wrong_sign_in_the_projection_is_detected(mirrored: tuple[int, str]) -> None:
     code, said = mirrored
     assert code == 1
     assert "needle/tip: 1 recorded but not today (at 30.0 mm" in said
@@ -113,7 +115,7 @@ def test_a_sign_in_the_projection_is_seen(mirrored: tuple[int, str]) -> None:
         ("step_length", "device_joint_trajectory_insertion"),
     ],
 )
-def test_a_hundredth_of_a_parameter_is_seen(
+def test_a_parameter_off_by_a_hundredth_is_detected(
     eight_steps: Path, tmp_path: Path, parameter: str, field: str
 ) -> None:
     value = 1.01 * read_run(eight_steps).parameter("plane_controller", parameter)
@@ -122,7 +124,7 @@ def test_a_hundredth_of_a_parameter_is_seen(
     assert field in changed_fields(result)
 
 
-def test_a_gain_that_is_off_by_a_hundredth_is_seen(
+def test_a_gain_off_by_a_hundredth_is_detected(
     paper_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     designed = SteeringSettings.gains
@@ -139,7 +141,7 @@ def test_a_gain_that_is_off_by_a_hundredth_is_seen(
     assert "needle_control_input_v" in changed_fields(result)
 
 
-def test_code_that_breaks_is_told_from_code_that_changed(
+def test_an_exception_gives_another_exit_code_than_a_change(
     eight_steps: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     def mistaken(*_: object) -> None:
@@ -168,9 +170,7 @@ def test_another_preset_is_a_run_of_its_own(eight_steps: Path, paper_bag: Path) 
     assert lines[0].split()[:3] == ["insertion_mm", "tip_x_mm", "tip_y_mm"]
 
 
-def test_tips_whose_images_are_not_in_the_bag_stay_as_they_were(
-    eight_steps: Path, tmp_path: Path
-) -> None:
+def test_tips_without_images_are_kept(eight_steps: Path, tmp_path: Path) -> None:
     run, topic = read_run(eight_steps), "/needle/tip"
     tips = [message for _, _, message in read_messages(eight_steps, topic.__eq__)]
     tips[3].point.x = 0.5
@@ -193,7 +193,7 @@ def shown(first_pictures: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
     return bag, said
 
 
-def test_viewers_see_the_recorded_needle_and_nothing_is_compared(
+def test_viewers_show_the_recorded_needle_without_comparison(
     shown: tuple[Path, str], first_pictures: Path
 ) -> None:
     bag, said = shown
@@ -229,9 +229,7 @@ def shown_again(shown: tuple[Path, str], tmp_path_factory: pytest.TempPathFactor
     return bag, file, said
 
 
-def test_what_viewers_showed_before_is_replaced(
-    shown: tuple[Path, str], shown_again: Shown
-) -> None:
+def test_recorded_viewer_topics_are_replaced(shown: tuple[Path, str], shown_again: Shown) -> None:
     bag, file, said = shown_again
     counts = read_contents(shown[0]).counts
     assert json.loads(file.read_text())["live_view_path_sent"] == counts["/live_view/path"]
@@ -254,7 +252,7 @@ def copied(bag: Path, target: Path, custom: dict[str, str], topic: str, kind: st
     return writing()
 
 
-def test_parameters_as_nodes_announced_them_do_as_well(eight_steps: Path, tmp_path: Path) -> None:
+def test_announced_parameters_are_sufficient(eight_steps: Path, tmp_path: Path) -> None:
     """What ROS 2's own recorder leaves: no custom data, but /parameter_events."""
     with copied(eight_steps, tmp_path / "bag", {}, "/parameter_events", EVENT) as put:
         node = "/plane_controller"
@@ -282,7 +280,7 @@ def event(node: str, parameters: dict[str, Any]) -> bytes:
     return bytes(STORE.serialize_cdr(types[EVENT](stamp, node, new, [], []), EVENT))
 
 
-def test_the_calibration_that_the_tracker_told_or_that_is_given_is_used(
+def test_the_calibration_is_that_of_the_tracker_or_of_params(
     eight_steps: Path, first_pictures: Path, tmp_path: Path
 ) -> None:
     """The tracker says it on a topic of its own: nobody has to tell the recorder."""
@@ -312,7 +310,7 @@ def test_the_calibration_that_the_tracker_told_or_that_is_given_is_used(
     assert seen == [text, other.read_text()]
 
 
-def test_bad_input_is_one_line(
+def test_bad_input_gives_a_one_line_error(
     eight_steps: Path, make_run: Callable[..., Path], tmp_path: Path, capsys: Capture
 ) -> None:
     table: dict[tuple[object, ...], str] = {
@@ -340,7 +338,7 @@ def test_bad_input_is_one_line(
         assert words in line
 
 
-def test_parameters_reach_the_node_or_that_is_said(
+def test_parameters_reach_the_node_or_give_a_warning(
     eight_steps: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     file = given(tmp_path, "curvature: 8.0", "/rig1/plane_controller")

@@ -43,7 +43,7 @@ def data_outside(bag: Path) -> None:
 
 
 @pytest.mark.parametrize("harm", [data_pipe, data_outside])
-def test_every_tool_says_in_one_line_that_data_are_no_file_of_the_bag(
+def test_every_command_gives_a_one_line_error_for_a_file_that_is_no_bag(
     make_run: MakeRun, capsys: pytest.CaptureFixture[str], harm: Callable[[Path], None]
 ) -> None:
     bag = make_run(steps=3)
@@ -55,7 +55,7 @@ def test_every_tool_says_in_one_line_that_data_are_no_file_of_the_bag(
         assert said.err.count("\n") == 1
 
 
-def test_an_image_of_another_size_than_it_says_is_one_line(
+def test_an_image_of_a_wrong_size_gives_a_one_line_error(
     make_run: MakeRun, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for height in (7, 2**32 - 1):

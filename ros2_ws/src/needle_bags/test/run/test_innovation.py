@@ -103,7 +103,7 @@ def test_innovation_is_measured_minus_expected() -> None:
     assert innovations(make_run(parameters={})) is None
 
 
-def test_an_uncertain_heading_widens_what_is_expected_across_the_needle() -> None:
+def test_an_uncertain_heading_widens_the_prediction_across_the_needle() -> None:
     covariance = np.zeros((STEPS + 1, 6, 6))
     covariance[:, 3:, 3:] = np.eye(3) * 0.2**2
     sigmas = found_in(make_run(estimate_covariances=series(covariance.reshape(-1, 36)))).sigmas
@@ -111,7 +111,7 @@ def test_an_uncertain_heading_widens_what_is_expected_across_the_needle() -> Non
     assert sigmas[0, 2] == pytest.approx(1e-4, rel=1e-2)
 
 
-def test_room_to_the_gate() -> None:
+def test_margin_to_the_gate() -> None:
     run = moved(make_run(), 10, (0.0, 0.0, 5e-3))
     room = gate_room(run)
     assert room.margin == 4e-3
@@ -121,7 +121,7 @@ def test_room_to_the_gate() -> None:
     assert room.reach.argmax() == 10
 
 
-def test_refused_and_missed_tips_are_found() -> None:
+def test_rejected_and_missed_tips_are_found() -> None:
     statuses = [
         Status(7 * 10**9 + 2 * MICROSECOND, {"tips_rejected": "1"}),
         Status(8 * 10**9 + 2 * MICROSECOND, {"tips_rejected": "1"}),

@@ -36,7 +36,7 @@ def test_summary_of_a_known_run(made_up: Run) -> None:
     assert summarize(run)["watchdog_trips"] == 3 + 1
 
 
-def test_a_run_that_stopped_on_its_way_has_not_converged(make_run: MakeRun) -> None:
+def test_a_stopped_run_has_not_converged(make_run: MakeRun) -> None:
     summary = summarize(read_run(make_run(steps=110, done=False, bad_tip=60)))
     assert abs(float(str(summary["r1_final_mm"]))) < 1.0
     assert (summary["converged"], summary["reached_depth"]) == (False, False)
@@ -54,7 +54,7 @@ def test_without_truth_its_figures_are_null(made_up: Run) -> None:
     assert (summary["converged"], summary["steps"]) == (False, 120)
 
 
-def test_turns_are_from_where_the_base_was(made_up: Run) -> None:
+def test_commanded_rotations_start_at_the_measured_one(made_up: Run) -> None:
     commands = made_up.joints.values + np.array([1e-3, 0.25])
     commands = dataclasses.replace(made_up.joints, values=commands)
     insertion, begin, end = commanded_rotation(dataclasses.replace(made_up, commands=commands)).T

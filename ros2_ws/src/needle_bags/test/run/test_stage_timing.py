@@ -62,7 +62,7 @@ def write(directory: Path, exposure: str) -> Any:
 
 
 @pytest.mark.parametrize("exposure", [LEFT, "sim/tip_pose"])
-def test_stages_take_what_they_took(tmp_path: Path, exposure: str) -> None:
+def test_durations_of_the_stages(tmp_path: Path, exposure: str) -> None:
     timings = {timing.name: timing for timing in stage_timings(write(tmp_path / "bag", exposure))}
     for name, milliseconds in {
         "tracker": TRACKER,
@@ -76,7 +76,7 @@ def test_stages_take_what_they_took(tmp_path: Path, exposure: str) -> None:
         assert len(timings[name].stamps) == (STEPS - 1 if name == "camera" else STEPS)
 
 
-def test_from_the_later_image_to_the_sync_of_the_first_cycle_that_knew_the_command(
+def test_latency_from_the_later_image_to_the_sync_of_the_first_cycle(
     tmp_path: Path,
 ) -> None:
     bag = BagCopy(tmp_path / "bag", "jazzy", {})

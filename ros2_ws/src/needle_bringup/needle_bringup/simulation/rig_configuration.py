@@ -199,7 +199,7 @@ def command_line_parameters(
 def _obstacles(path: Path) -> list[float]:
     """Return the obstacles of a file as plane_controller's parameter."""
     # Importing compiled code takes half a second.
-    from needle_controller.planning.obstacle_files import read_obstacles  # noqa: PLC0415
+    from needle_controller.planning.obstacles import read_obstacles  # noqa: PLC0415
 
     return [float(value) for value in read_obstacles(path).table.ravel()]
 

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from needle_controller.curvature.circle_fit import circle_curvature
-from needle_controller.curvature.curvature_fit import fit_curvature
+from needle_controller.curvature.curvature_fit import circle_curvature, fit_curvature
 
 Floats = npt.NDArray[np.float64]
 

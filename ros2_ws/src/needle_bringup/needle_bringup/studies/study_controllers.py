@@ -40,7 +40,7 @@ from needle_controller.presets.steering_settings import (
     PRESETS,
     SteeringSettings,
 )
-from needle_controller.protocol.trust import point_missed
+from needle_controller.protocol.confidence import point_miss_probability
 from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
@@ -162,7 +162,7 @@ class NeedlesToPoints(SteeredNeedles):
             return belief
         assert self._estimators is not None
         tips, covariances = self._estimators.tips()
-        missed = point_missed(tips - self._motion.last, covariances)
+        missed = point_miss_probability(tips - self._motion.last, covariances)
         return dataclasses.replace(belief, missed=missed)
 
     def _command(self, estimators: Any, _: float) -> FloatArray:

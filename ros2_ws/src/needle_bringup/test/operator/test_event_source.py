@@ -109,7 +109,7 @@ LOOKS: tuple[tuple[tuple[tuple[int, ...], InputState], ...], ...] = (
 )
 
 
-def test_a_look_tells_what_is_held_and_not_what_repeats() -> None:
+def test_a_reading_ignores_key_repeat() -> None:
     for looks in LOOKS:
         desk = Desk()
         assert desk.read() == NOTHING
@@ -119,7 +119,7 @@ def test_a_look_tells_what_is_held_and_not_what_repeats() -> None:
             assert desk.read() == wanted
 
 
-def test_what_is_down_at_the_start_counts_only_when_pressed_again() -> None:
+def test_a_key_down_at_the_start_must_be_pressed_again() -> None:
     desk = Desk(CONTROLS, KEY)
     for _ in range(5):
         assert desk.held() is HoldKind.NOTHING
@@ -140,7 +140,7 @@ def test_events_that_the_kernel_dropped_may_have_been_a_release() -> None:
     assert desk.read() == HELD
 
 
-def test_an_unplugged_pedal_is_lost_at_once_and_pressed_anew_when_it_is_back() -> None:
+def test_an_unplugged_pedal_is_lost_and_must_be_pressed_again() -> None:
     desk = Desk()
     desk.held()
     old = desk.device
@@ -166,7 +166,7 @@ def test_an_unplugged_pedal_is_lost_at_once_and_pressed_anew_when_it_is_back() -
     assert desk.held() is HoldKind.INSERT
 
 
-def test_a_device_that_is_not_there_or_without_the_key_is_named() -> None:
+def test_a_missing_device_or_key_is_named() -> None:
     desk = Desk()
     desk.is_there = False
     assert desk.read() == InputLost("/dev/input/pedal: No such file or directory")
@@ -184,7 +184,7 @@ def test_an_axis_sets_the_speed_up_to_the_scale() -> None:
         assert read.speed == pytest.approx(0.8 * share)
 
 
-def test_bytes_may_be_cut_anywhere() -> None:
+def test_bytes_may_be_split_anywhere() -> None:
     whole = key(KEY, DOWN) + key(RETRACT, REPEAT) + key(KEY, UP) + key(STOP, DOWN)
     assert EventReader().decode(whole) == KeyChanges(frozenset({KEY, STOP}), frozenset({KEY}))
     for cut in range(len(whole)):
@@ -194,13 +194,13 @@ def test_bytes_may_be_cut_anywhere() -> None:
         assert one.released | two.released == {KEY}
 
 
-def test_a_file_that_is_no_input_device_is_refused() -> None:
+def test_a_file_that_is_no_input_device_is_rejected() -> None:
     for path in ("/dev/null", "/dev/input/that_is_not_there"):
         with pytest.raises(OSError, match=r"no input device|No such file"):
             InputDevice(path)
 
 
-def test_an_open_device_is_asked_as_the_kernel_wants_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ioctls_of_an_input_device(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
     def answer(file: int, request: int, data: bytes) -> bytes:

@@ -40,7 +40,7 @@ def counts(seen: list[tuple[InputReading, float]]) -> HoldKind:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(moments, min_size=1, max_size=30))
-def test_only_a_fresh_press_out_of_neutral_counts_and_as_long_as_it_lasts(
+def test_only_a_new_press_from_neutral_is_accepted(
     seen: list[tuple[InputReading, float]],
 ) -> None:
     debouncer, now = HoldDebouncer(), 0.0
@@ -53,7 +53,7 @@ def test_only_a_fresh_press_out_of_neutral_counts_and_as_long_as_it_lasts(
         assert bool(decision.trouble) is isinstance(reading, InputLost)
 
 
-def test_a_stop_is_asked_for_once_a_press_and_ends_what_is_held() -> None:
+def test_a_stop_is_requested_once_per_press_and_ends_the_hold() -> None:
     debouncer = HoldDebouncer()
     readings = (NEUTRAL, INSERT, STOPPED, STOPPED, INSERT, NEUTRAL, InputState(stop=True))
     decisions = [
@@ -75,7 +75,7 @@ def test_a_stop_is_asked_for_once_a_press_and_ends_what_is_held() -> None:
     ]
 
 
-def test_a_stop_that_is_pressed_when_the_source_comes_back_is_asked_for_anew() -> None:
+def test_a_stop_pressed_after_a_loss_is_requested_again() -> None:
     debouncer = HoldDebouncer()
     pressed = InputState(stop=True)
     readings: list[InputReading] = [pressed, InputLost("unplugged"), pressed, pressed]
@@ -85,7 +85,7 @@ def test_a_stop_that_is_pressed_when_the_source_comes_back_is_asked_for_anew() -
     assert [one.stop for one in decisions] == [True, False, True, False]
 
 
-def test_who_stands_still_begins_anew_and_the_speed_is_that_of_now() -> None:
+def test_a_suspended_process_requires_a_new_press() -> None:
     debouncer = HoldDebouncer()
     debouncer.update(NEUTRAL, 0.0)
     for number, speed in enumerate((0.2, 0.0, 1.0), start=1):
@@ -99,7 +99,7 @@ def joystick(publishers: int = 1) -> JoySource:
     return JoySource(CONTROLS, lambda: 0.5, lambda: publishers)
 
 
-def test_the_last_message_of_a_joystick_counts_while_it_is_fresh() -> None:
+def test_the_last_message_of_a_joystick_is_used_while_recent() -> None:
     source = joystick()
     assert isinstance(source.read(0.0), InputLost)
     source.receive([0.0, 1.0], [1, 0, 0], 5.0)
@@ -110,7 +110,7 @@ def test_the_last_message_of_a_joystick_counts_while_it_is_fresh() -> None:
     assert source.read(6.0) == InputState(retract=True, speed=0.25)
 
 
-def test_a_message_that_was_overtaken_does_not_count_and_keeps_nothing_alive() -> None:
+def test_an_overtaken_message_is_ignored() -> None:
     source = joystick()
     source.receive([0.0, 1.0], [1, 0, 0], 5.00, stamp=100.00)
     source.receive([0.0, 1.0], [0, 0, 0], 5.05, stamp=99.98)
@@ -123,7 +123,7 @@ def test_a_message_that_was_overtaken_does_not_count_and_keeps_nothing_alive() -
     assert source.read(5.13) == InputState(insert=True, speed=0.5)
 
 
-def test_a_message_that_cannot_be_meant_is_no_hand() -> None:
+def test_an_invalid_message_is_a_loss_of_the_joystick() -> None:
     for publishers, axes, buttons, why in NO_HANDS:
         source = joystick(publishers)
         source.receive(axes, buttons, 5.0)

@@ -81,7 +81,7 @@ class Scene:
         return self.holds[-1]
 
 
-def test_a_pedal_at_the_port_is_held_until_it_is_lost() -> None:
+def test_a_pedal_is_held_until_it_is_lost() -> None:
     scene = Scene(PEDAL)
     assert not scene.update().pressed
     held = scene.update(InputState(insert=True, speed=0.5))
@@ -99,7 +99,7 @@ def test_a_pedal_at_the_port_is_held_until_it_is_lost() -> None:
     assert len({hold.session for hold in scene.holds}) == 1
 
 
-def test_a_joystick_holds_at_its_axis_speed_stops_and_must_go_on_talking() -> None:
+def test_a_joystick_holds_sets_the_speed_stops_and_times_out() -> None:
     scene = Scene(JOYSTICK)
     # Pressed from the start on: it does not count.
     assert not scene.joy(0).pressed
@@ -115,7 +115,7 @@ def test_a_joystick_holds_at_its_axis_speed_stops_and_must_go_on_talking() -> No
     assert scene.called == [STOP]
 
 
-def test_the_controller_is_stopped_before_the_needle_is_drawn_out() -> None:
+def test_the_controller_is_stopped_before_a_withdrawal() -> None:
     scene = Scene(PEDAL)
     scene.update()
     # The hold of this look was made before the answer came.
@@ -135,7 +135,7 @@ def test_the_controller_is_stopped_before_the_needle_is_drawn_out() -> None:
     assert "not drawn out: the device does not take the hold" in scene.logs[-1]
 
 
-def test_a_new_speed_reaches_the_hand_and_whoever_ends_releases() -> None:
+def test_a_new_speed_is_applied_and_the_end_releases() -> None:
     operator, at = Operator(PEDAL), Moment(1.0, 1)
     faster = dataclasses.replace(PEDAL, speed_scale=0.25)
     assert list(operator.on_settings(faster, at)) == [Send(INPUT_DEVICE, (0.25,))]
@@ -144,7 +144,7 @@ def test_a_new_speed_reaches_the_hand_and_whoever_ends_releases() -> None:
     assert end == Exit(0)
 
 
-def test_what_nobody_could_hold_is_refused() -> None:
+def test_invalid_parameters_are_rejected() -> None:
     assert OperatorParameters(key=48, device="/x").controls == Controls(insert=48)
     refused: list[tuple[dict[str, Any], str]] = [
         ({"key": -1}, "key = -1"),

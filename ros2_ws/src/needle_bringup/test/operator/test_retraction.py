@@ -44,7 +44,7 @@ def at_step(steps: int) -> RetractionSequence:
     return retraction
 
 
-def test_the_hold_ends_with_the_retraction_though_the_button_is_held() -> None:
+def test_the_hold_ends_with_the_retraction() -> None:
     for answer_last in (False, True):
         retraction = at_step(2 if answer_last else 3)
         retraction.handle_device("operator", "retraction", 1.15)
@@ -58,13 +58,13 @@ def test_the_hold_ends_with_the_retraction_though_the_button_is_held() -> None:
         assert retraction.trouble == ""
 
 
-def test_without_a_controller_the_hold_is_given_at_once() -> None:
+def test_without_a_controller_the_hold_starts_immediately() -> None:
     retraction = RetractionSequence("operator")
     assert retraction.update(True, 1.0, controller=False) is None
     assert holds(retraction)
 
 
-def test_a_release_ends_it_and_a_new_press_begins_it_anew() -> None:
+def test_a_release_ends_the_sequence_and_a_new_press_restarts_it() -> None:
     retraction = at_step(3)
     assert retraction.update(False, 2.0, controller=True) is None
     # What was asked for before comes too late.
@@ -73,7 +73,7 @@ def test_a_release_ends_it_and_a_new_press_begins_it_anew() -> None:
     assert retraction.update(True, 3.0, controller=True) == STOP_STEERING
 
 
-def test_a_refusal_ends_the_hold_and_is_said() -> None:
+def test_a_refusal_ends_the_hold_and_is_reported() -> None:
     for steps, service in ((0, STOP_STEERING), (2, RETRACT)):
         retraction = at_step(steps)
         retraction.handle_answer(service, False, "not now", 1.2)
@@ -81,7 +81,7 @@ def test_a_refusal_ends_the_hold_and_is_said() -> None:
         assert retraction.trouble == f"{service} was refused: not now"
 
 
-def test_what_does_not_come_ends_the_hold() -> None:
+def test_a_timeout_ends_the_hold() -> None:
     for steps, said in enumerate(IN_VAIN):
         retraction = at_step(steps)
         assert retraction.update(True, 1.0 + 0.99 * STEP_TIMEOUT, controller=True) is None

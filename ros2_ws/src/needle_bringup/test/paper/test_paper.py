@@ -42,7 +42,7 @@ def test_settled_is_the_last_entry_into_the_band() -> None:
     assert settled_mm(insertion, np.full(6, 2.0)) == np.inf
 
 
-def test_runs_that_missed_are_looked_at_again_farther_in() -> None:
+def test_missed_runs_are_evaluated_again_farther_in() -> None:
     runs = {"r1_final_mm": np.array([0.5, -1.5, 3.0, 1.2])}
     longer = {"r1_final_mm": np.array([5.0, 0.2, -2.0, 0.9])}
     # the first had not missed: what it does later does not count
@@ -50,7 +50,7 @@ def test_runs_that_missed_are_looked_at_again_farther_in() -> None:
     assert missed_later({"r1_final_mm": np.zeros(2)}, {"r1_final_mm": np.zeros(2)}) == (0, 0, 0.0)
 
 
-def test_trials_are_averaged_where_all_are_and_cells_hold_their_own_share() -> None:
+def test_trials_are_averaged_over_their_common_range() -> None:
     one = trial(np.arange(11.0), np.arange(11.0))
     other = trial(np.arange(0.0, 9.0, 2.0), np.zeros(5))
     insertion, r1 = common_r1([one, other])
@@ -65,7 +65,7 @@ def test_trials_are_averaged_where_all_are_and_cells_hold_their_own_share() -> N
     np.testing.assert_allclose(shares, [[0.5, np.nan], [np.nan, 1.0]])
 
 
-def test_what_is_there_is_not_run_again_and_words_and_empty_cells_are_no_numbers(
+def test_existing_results_are_reused(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "one.json").write_text(json.dumps({"runs": 2}), "utf-8")
@@ -78,7 +78,7 @@ def test_what_is_there_is_not_run_again_and_words_and_empty_cells_are_no_numbers
     assert set(runs) == {"x_mm", "settle_mm"}
 
 
-def test_what_runs_is_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_are_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[list[str]] = []
     monkeypatch.setattr(paper_runs, "_run", lambda name, command, good: asked.append(command))
     laboratory = Laboratory(["simulate", "-q"], tmp_path)
@@ -96,7 +96,7 @@ def test_what_runs_is_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert (asked[1][1:3], asked[2][1:4]) == (["--draws", "1"], [bag, "--from-mm", "5"])
 
 
-def test_bad_arguments_are_one_line_and_exit_2(
+def test_bad_arguments_give_a_one_line_error_and_exit_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("", "utf-8")
@@ -151,7 +151,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_page_has_the_paper_s_values_beside_those_of_the_runs(written: Path) -> None:
+def test_the_page_has_both_values(written: Path) -> None:
     page = (written / "out" / "paper.md").read_text("utf-8")
     for cells in (
         "endpoint grid: within ±1 mm at 120 mm",

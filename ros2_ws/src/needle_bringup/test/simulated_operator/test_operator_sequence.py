@@ -83,7 +83,7 @@ def reach(
     return sequence
 
 
-def test_it_prepares_holds_until_done_and_releases() -> None:
+def test_it_prepares_holds_and_releases() -> None:
     sequence = reach()
     hear(sequence, 2.0)
     assert sequence.hold()
@@ -105,7 +105,7 @@ def test_it_calls_nothing_while_a_partner_is_missing() -> None:
     assert not sequence.touched
 
 
-def test_it_asks_again_where_the_rig_is_not_ready_yet_and_gives_up_where_it_refuses() -> None:
+def test_it_repeats_calls_until_the_rig_is_ready_or_refuses() -> None:
     sequence = reach(CONFIRM)
     not_yet = "waiting for a subscriber of joint_states"
     sequence.handle_answer(CONFIRM, False, not_yet, 1.0)
@@ -124,7 +124,7 @@ def test_a_service_that_never_answers_is_named() -> None:
     assert "no answer from device/confirm_needle_out" in why(sequence)
 
 
-def test_a_call_whose_answer_was_lost_is_made_again_and_a_late_one_is_to_it_alone() -> None:
+def test_a_call_is_repeated_if_its_answer_is_lost() -> None:
     for call in PREPARATION:
         sequence = reach(call)
         assert sequence.next_call(0.9 + CALL_TIMEOUT) is None
@@ -141,7 +141,7 @@ def test_a_call_whose_answer_was_lost_is_made_again_and_a_late_one_is_to_it_alon
             assert sequence.next_call(2.5) is None
 
 
-def test_a_homing_is_waited_for_whatever_was_heard_before_it() -> None:
+def test_an_earlier_status_does_not_end_the_homing() -> None:
     sequence = reach(HOME)
     sequence.handle_answer(HOME, True, "homing", 1.0)
     assert sequence.next_call(1.0) is None
@@ -153,7 +153,7 @@ def test_a_homing_is_waited_for_whatever_was_heard_before_it() -> None:
     assert sequence.next_call(3.0) == ENABLE
 
 
-def test_the_end_of_a_homing_may_overtake_its_answer_or_stand_for_it() -> None:
+def test_a_status_may_replace_the_answer_of_homing() -> None:
     overtaken, lost, stale = reach(HOME), reach(HOME), reach(HOME)
     see(overtaken, DISABLED)
     overtaken.handle_answer(HOME, True, "homing", 1.0)
@@ -179,7 +179,7 @@ def test_a_start_whose_answer_was_lost_is_known_from_the_status() -> None:
     assert sequence.next_call(9.0) is None
 
 
-def test_nothing_is_started_before_the_controller_has_said_how_often_it_was() -> None:
+def test_start_requires_a_controller_status() -> None:
     sequence = unheard()
     sequence.handle_devices(["/sim_rig"])
     see(sequence, DISABLED)
@@ -195,7 +195,7 @@ def test_nothing_is_started_before_the_controller_has_said_how_often_it_was() ->
     assert outcome(sequence) is None
 
 
-def test_what_ends_the_run_is_its_reason() -> None:
+def test_the_outcome_names_the_reason() -> None:
     for state, reason in (("FAULT", "curvature lost"), ("IDLE", "stopped by hand")):
         sequence = reach()
         hear(sequence)
@@ -210,7 +210,7 @@ def test_what_ends_the_run_is_its_reason() -> None:
     assert why(sequence) == "interrupted"
 
 
-def test_what_was_said_before_this_start_is_of_another_run() -> None:
+def test_statuses_before_the_start_are_ignored() -> None:
     for state in ("DONE", "FAULT", "IDLE"):
         sequence = fresh()
         hear(sequence, 0.5, state=state)
@@ -223,7 +223,7 @@ def test_what_was_said_before_this_start_is_of_another_run() -> None:
         assert sequence.outcome.done
 
 
-def test_a_start_that_ends_at_once_is_not_waited_for() -> None:
+def test_a_start_that_ends_immediately() -> None:
     """STEERING, then IDLE: a latched status of depth 1 may show the second alone."""
     for state, overtakes in itertools.product(("FAULT", "IDLE"), (False, True)):
         sequence = fresh()
@@ -249,7 +249,7 @@ def test_no_progress_releases_the_hold() -> None:
     assert "no progress for 60 s at 3.0 mm" in why(sequence)
 
 
-def test_a_press_that_does_not_count_is_released_and_pressed_again() -> None:
+def test_an_ignored_press_is_released_and_repeated() -> None:
     for counted_before in (False, True):
         sequence = reach()
         if counted_before:
@@ -266,7 +266,7 @@ def test_a_press_that_does_not_count_is_released_and_pressed_again() -> None:
         assert sequence.presses_again == 1
 
 
-def test_a_device_that_is_real_ends_it_whenever_it_is_heard() -> None:
+def test_a_real_device_ends_the_run() -> None:
     for wanted in (*PREPARATION, None):
         sequence = reach(wanted)
         sequence.handle_device(
@@ -275,7 +275,7 @@ def test_a_device_that_is_real_ends_it_whenever_it_is_heard() -> None:
         assert "/device_driver is a real device" in why(sequence)
 
 
-def test_it_acts_only_on_a_device_that_is_alone_and_has_said_that_it_is_simulated() -> None:
+def test_it_acts_only_on_a_single_simulated_device() -> None:
     sequence = unheard()
     sequence.handle_devices(["/device_driver"])
     assert sequence.next_call(1.0) is None, "nothing is known of it yet"
@@ -288,7 +288,7 @@ def test_it_acts_only_on_a_device_that_is_alone_and_has_said_that_it_is_simulate
     assert "/sim_rig, /device_driver" in why(sequence)
 
 
-def test_a_second_device_ends_it_and_one_that_took_the_place_is_not_held() -> None:
+def test_a_second_device_ends_the_run() -> None:
     sequence = reach()
     sequence.handle_devices(["/device_driver"])
     assert not sequence.hold(), "it has not said what it is"
@@ -296,7 +296,7 @@ def test_a_second_device_ends_it_and_one_that_took_the_place_is_not_held() -> No
     assert "more than one device: /device_driver, /sim_rig" in why(sequence)
 
 
-def test_figures_that_are_none_end_nothing() -> None:
+def test_missing_values_are_tolerated() -> None:
     for text in ("nan", "two"):
         sequence = reach(START)
         said = {"state": "STEERING", "starts": text, "insertion_m": text, "depth_m": text}

@@ -79,7 +79,7 @@ def test_an_exposure_becomes_images_and_a_tip_near_the_truth(
     assert "has ended" in lost.lost
 
 
-def test_exposures_that_come_too_fast_are_lost_and_what_fails_is_not_waited_for() -> None:
+def test_fast_exposures_are_dropped_and_failures_raised() -> None:
     tracker, seen = RemoteTracker(), exposure(0.0)
     hand_on = {port.name: port.handler for port in tracker.ports}
     (row,), (timer,) = tracker.inputs, tracker.timers

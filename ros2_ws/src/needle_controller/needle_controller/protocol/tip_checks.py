@@ -1,4 +1,4 @@
-"""Which measured tips may move the needle."""
+"""Checks of measured tips: which of them may be used for steering."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from needle_controller.model.target_plane import RIG
 from needle_controller.protocol.joint_history import JointSample
 
 LARGEST_SCALE = 1.15
-"""How much farther than the stage moves a needle may go in: a stage's scale can be wrong."""
+"""Largest insertion of the needle per insertion of the stage, whose scale may be wrong."""
 STAMP_AHEAD_NS = 1_000_000_000
-"""A tip's stamp farther ahead of the joints' than this is no time to wait for [ns]."""
-
+"""Largest time by which a tip's stamp may be ahead of the joints [ns]."""
 _ASYMMETRY = 1e-9
 """Largest difference across the diagonal of a covariance, as a share of its largest entry."""
 
 
-class Fault(enum.Enum):
-    """Faults of a tip; each is counted and logged for itself."""
+class TipFault(enum.Enum):
+    """Reasons to reject a tip; each is counted and logged separately."""
 
     FRAME = "frame"
     NOT_FINITE = "not_finite"
@@ -38,7 +37,7 @@ class Fault(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class TipMeasurement:
-    """A measured tip as it came.
+    """A measured tip as received.
 
     Attributes
     ----------
@@ -66,7 +65,7 @@ class TipCovariance:
     frame_id : str
         Frame of the covariance; must be `rig`.
     matrix : ndarray, shape (3, 3)
-        Of the position [m^2]; infinite where no tip was found.
+        Of the position [m^2]; infinite if no tip was found.
     """
 
     stamp_ns: int
@@ -74,7 +73,7 @@ class TipCovariance:
     matrix: Array
 
     def problem(self) -> str:
-        """Return why no tip can be used with this, empty if one can."""
+        """Return why the covariance cannot be used; empty if it can."""
         if self.frame_id != RIG:
             return f"needle/tip_pose in frame '{self.frame_id}', wants '{RIG}'"
         if np.any(np.isinf(self.matrix)):
@@ -95,16 +94,16 @@ class TipCovariance:
 
 @dataclasses.dataclass(frozen=True)
 class AcceptedTip:
-    """A tip to be used, with the joints at its exposure.
+    """A tip that may be used, with the joint positions at its exposure.
 
     Attributes
     ----------
     tip : TipMeasurement
-        As it came.
+        As received.
     joints : JointSample
-        The joints at its exposure.
+        Joint positions at its exposure.
     covariance : TipCovariance or None
-        What came with it; None for the configured noise.
+        Its covariance; None for the configured noise.
     """
 
     tip: TipMeasurement
@@ -113,16 +112,16 @@ class AcceptedTip:
 
 
 @dataclasses.dataclass(frozen=True)
-class RefusedTip:
-    """A tip that is not used, and why."""
+class RejectedTip:
+    """A tip that must not be used, and the reason."""
 
     tip: TipMeasurement
-    fault: Fault
+    fault: TipFault
     text: str
 
 
-def refuse_message(tip: TipMeasurement, last: AcceptedTip | None) -> RefusedTip | None:
-    """Return why a tip cannot be used whatever the needle did, None if it can.
+def check_message(tip: TipMeasurement, last: AcceptedTip | None) -> RejectedTip | None:
+    """Check what does not depend on the joints; return the rejection, or None.
 
     Parameters
     ----------
@@ -132,54 +131,54 @@ def refuse_message(tip: TipMeasurement, last: AcceptedTip | None) -> RefusedTip 
         The last tip that was used.
     """
     if tip.frame_id != RIG:
-        return RefusedTip(tip, Fault.FRAME, f"tip in frame '{tip.frame_id}', wants '{RIG}'")
+        return RejectedTip(tip, TipFault.FRAME, f"tip in frame '{tip.frame_id}', wants '{RIG}'")
     if not np.all(np.isfinite(tip.position)):
-        return RefusedTip(tip, Fault.NOT_FINITE, f"tip is not finite: {tip.position}")
+        return RejectedTip(tip, TipFault.NOT_FINITE, f"tip is not finite: {tip.position}")
     if last is not None and tip.stamp_ns <= last.tip.stamp_ns:
         behind = (last.tip.stamp_ns - tip.stamp_ns) * 1e-9
         text = f"tip's stamp is not newer than the last used one's ({behind:g} s behind)"
-        return RefusedTip(tip, Fault.NOT_NEWER, text)
+        return RejectedTip(tip, TipFault.NOT_NEWER, text)
     return None
 
 
-def refuse_stamp(
+def check_stamp(
     tip: TipMeasurement, oldest: JointSample | None, latest: JointSample | None
-) -> RefusedTip | None:
-    """Return why the joints at a tip's exposure will never be known, None if they may be.
+) -> RejectedTip | None:
+    """Check that the joint positions at a tip's exposure can be known; return the rejection.
 
     Parameters
     ----------
     tip : TipMeasurement
-        A tip that the joints kept do not bracket.
+        A tip whose stamp lies outside the joint history.
     oldest, latest : JointSample or None
-        The ends of what is kept.
+        Ends of the history.
     """
     if oldest is not None and tip.stamp_ns < oldest.stamp_ns:
-        return RefusedTip(tip, Fault.BEFORE_JOINTS, "tip is older than any joint_states kept")
+        return RejectedTip(tip, TipFault.BEFORE_JOINTS, "tip is older than any joint_states kept")
     if latest is not None and tip.stamp_ns > latest.stamp_ns + STAMP_AHEAD_NS:
         ahead = (tip.stamp_ns - latest.stamp_ns) * 1e-9
         text = f"tip's stamp is {ahead:.4g} s ahead of joint_states"
-        return RefusedTip(tip, Fault.AHEAD_OF_JOINTS, text)
+        return RejectedTip(tip, TipFault.AHEAD_OF_JOINTS, text)
     return None
 
 
-def refuse_position(
+def check_position(
     tip: TipMeasurement, joints: JointSample, last: AcceptedTip | None, margin: float
-) -> RefusedTip | None:
-    """Return why no needle with these joints can have its tip there, None if one can.
+) -> RejectedTip | None:
+    """Check that a needle at these joint positions can have its tip there; return the rejection.
 
     Parameters
     ----------
     tip : TipMeasurement
         A finite tip in `rig`, whose origin is the entry point.
     joints : JointSample
-        The joints at its exposure.
+        Joint positions at its exposure.
     last : AcceptedTip or None
         The last tip that was used.
     margin : float
-        What noise may add [m].
+        Tolerance for measurement noise [m].
     """
-    # Not numpy's norm: what others publish may be too large to be squared.
+    # Not numpy's norm: the square of a huge received value would overflow.
     distance = math.hypot(*tip.position)
     reach = LARGEST_SCALE * max(joints.insertion, 0.0) + margin
     if distance > reach:
@@ -187,14 +186,15 @@ def refuse_position(
             f"tip is {distance:.4g} m from the entry point, wants <= {reach:.4g} m "
             f"({LARGEST_SCALE:g} insertion {joints.insertion:.4g} m + margin {margin:.4g} m)"
         )
-        return RefusedTip(tip, Fault.TOO_FAR, text)
-    if last is not None:
-        jump = math.hypot(*(tip.position - last.tip.position))
-        allowed = abs(joints.insertion - last.joints.insertion) + margin
-        if jump > allowed:
-            text = (
-                f"tip jumped {jump:.4g} m since the last used one, wants <= {allowed:.4g} m "
-                f"(insertion since then + margin {margin:.4g} m)"
-            )
-            return RefusedTip(tip, Fault.JUMP, text)
-    return None
+        return RejectedTip(tip, TipFault.TOO_FAR, text)
+    if last is None:
+        return None
+    jump = math.hypot(*(tip.position - last.tip.position))
+    allowed = abs(joints.insertion - last.joints.insertion) + margin
+    if jump <= allowed:
+        return None
+    text = (
+        f"tip jumped {jump:.4g} m since the last used one, wants <= {allowed:.4g} m "
+        f"(insertion since then + margin {margin:.4g} m)"
+    )
+    return RejectedTip(tip, TipFault.JUMP, text)
