@@ -1,39 +1,47 @@
-"""An arbiter of holds and its pages, in a time of their own."""
+"""Pages and the protocol of their hold, in a time of their own."""
 
 from __future__ import annotations
 
 import json
 from typing import Any
 
-from needle_console.hold.hold_arbiter import HoldArbiter
-from needle_console.hold.refusals import Refusal
+from needle_console.hold.hold_protocol import HoldProtocol
+from needle_console.hold.page_session import HoldRefusal, PageHold
 
 
 class Scene:
-    """An arbiter and its pages, in a time of their own.
+    """A hold protocol and its pages, in a time of their own.
 
-    `bars` says why a page may not hold, by whether it is on the rig's machine.
+    `bars` has why a page may not hold, by whether it is on the rig's machine.
     """
 
     def __init__(self) -> None:
         self.bars = {True: "", False: ""}
-        self.arbiter = HoldArbiter(lambda is_local: self.bars[is_local])
         self.now = 100.0
+        self.reported: list[PageHold] = []
+        self.protocol = HoldProtocol(
+            lambda is_local: self.bars[is_local], self.reported.append, lambda _: None, self.now
+        )
 
     def page(self, *, is_local: bool = True) -> int:
-        return self.arbiter.open(self.now, is_local=is_local)
+        return self.protocol.open(self.now, is_local=is_local)
+
+    def message_to(self, page: int) -> dict[str, Any]:
+        """Send a page a message now; return it."""
+        told: dict[str, Any] = json.loads(self.protocol.message_for(page, self.now))
+        return told
 
     def count(self, page: int) -> int:
         """Send a page a count now."""
-        return int(str(self.arbiter.tell(page, self.now)["count"]))
+        return int(self.message_to(page)["count"])
 
     def message(self, page: int, pressed: bool, count: int | None = None, **changes: Any) -> str:
         count = self.count(page) if count is None else count
         fields = {"count": count, "pressed": pressed, "speed": 0.5, "mode": "insert"}
         return json.dumps({**fields, **changes})
 
-    def say(self, page: int, pressed: bool, **changes: Any) -> Refusal | None:
-        return self.arbiter.receive(page, self.message(page, pressed, **changes), self.now)
+    def say(self, page: int, pressed: bool, **changes: Any) -> HoldRefusal | None:
+        return self.protocol.receive(page, self.message(page, pressed, **changes), self.now)
 
     def press(self, page: int) -> None:
         assert self.say(page, False) is None
@@ -45,4 +53,4 @@ class Scene:
 
     @property
     def pressed(self) -> bool:
-        return self.arbiter.state(self.now).pressed
+        return self.protocol.state(self.now).pressed

@@ -20,12 +20,12 @@ from needle_device_driver import device_driver
 from needle_device_driver.cia402 import cia402_axis
 from needle_device_driver.cia402.drive_machine import DriveMachine
 from needle_device_driver.cia402.drive_monitor import Feedback
-from needle_device_driver.device import DeviceRows
+from needle_device_driver.device import DeviceInterface
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_device_driver.supervisor.reports import Reply
+from needle_device_driver.supervisor.reports import ServiceResult
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
@@ -84,8 +84,8 @@ def _twice(drive: Any, *given: Any) -> None:
     drive(*given)
 
 
-def _kept_quiet(is_news: Any, rows: DeviceRows, status: Any, now: float) -> bool:
-    return status.state != State.MOVING.value and bool(is_news(rows, status, now))
+def _kept_quiet(is_new: Any, device: DeviceInterface, status: Any, now: float) -> bool:
+    return status.state != State.MOVING.value and bool(is_new(device, status, now))
 
 
 def _too_deep(say: Any, steering: Any, *more: Any) -> Any:
@@ -94,7 +94,7 @@ def _too_deep(say: Any, steering: Any, *more: Any) -> Any:
 
 def _refuse(*_: Any) -> Any:
     yield from ()
-    return Reply(False, "no")
+    return ServiceResult(False, "no")
 
 
 def _away(law: Any, *given: Any) -> Any:
@@ -131,12 +131,12 @@ _PLANTED: dict[str, tuple[Any, ...]] = {
     ),
     "a page's lost press that goes on": (
         "hold_is_of_now",
-        wrapped(PageSession, "lapses", _forgiving),
+        wrapped(PageSession, "end_if_stale", _forgiving),
         15,
     ),
     "a screw of twice the lead": ("none_beyond_limits", _axis_scaled("insertion", 2.0), 1),
     "a cycle that orders twice": ("none_beyond_limits", wrapped(DeviceCore, "drive", _twice), 1),
-    "a motion kept quiet": ("status_is_true", wrapped(DeviceRows, "_is_news", _kept_quiet), 1),
+    "a motion kept quiet": ("status_is_true", wrapped(DeviceInterface, "_is_new", _kept_quiet), 1),
     "a fault without a word": (
         "faults_are_named",
         wrapped(DeviceCore, "fail", lambda fail, core, _, rule=None: fail(core, "", rule)),
@@ -172,7 +172,7 @@ def _unaware(update: Any, machine: DriveMachine, at: Feedback) -> None:
 
 def _forgetful(await_start: Any, link: Any, monitor: Any, *others: Any) -> Any:
     yield from await_start(link, monitor, *others)
-    monitor.forget_start()
+    monitor.clear_reboot()
 
 
 def _unstamped(
@@ -213,7 +213,7 @@ _MENDED: dict[str, tuple[str, Plant]] = {
     ),
     "an_emergency_stop_while_drives_are_waited_for": (
         "the_way_goes_on",
-        wrapped(DeviceDriver, "_setting_up", _unless_stopped),
+        wrapped(DeviceDriver, "_set_up_drives", _unless_stopped),
     ),
     "blocked_when_the_hold_is_let_go": (
         "no_motion_without_hold",

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from campaign.trials.console.chromium import Chromium, chromium
-from needle_console.hold.hold_state import HoldState
+from needle_console.hold.page_session import PageHold
 
 pytest.importorskip("websockets", reason="the console's lock is not installed: scripts/console")
 
@@ -31,7 +31,7 @@ class Scene:
         self,
         browser: Chromium,
         url: str,
-        states: list[HoldState],
+        states: list[PageHold],
         counts: Callable[[], dict[str, int]],
     ):
         self.browser, self.tab = browser, browser.open(url)
@@ -101,7 +101,7 @@ class Scene:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     folder: Path = tmp_path_factory.mktemp("browser")
-    states: list[HoldState] = []
+    states: list[PageHold] = []
     with serving_button(states.append, lambda _: None) as (page_port, hold):
         browser = Chromium(folder / "profile")
         try:

@@ -84,7 +84,7 @@ class Driver:
     def __init__(self, channel: str) -> None:
         values = DeviceDriverParameters()
         settings = LinkSettings("slcan", channel, BITRATE)
-        self._link = FrameLink(settings)
+        self._link = FrameLink(settings.link_name)
         self._arrived: queue.SimpleQueue[Batch | PortChange] = queue.SimpleQueue()
         self._port = CanPort(settings)
         self._port.open(self._arrived.put)
@@ -92,7 +92,7 @@ class Driver:
             Cia402Axis(name, values.drive(name), self._link, period=PERIOD, watchdog=0.5)
             for name in ("insertion", "rotation")
         ]
-        self._cycle = DriveCycle(self._link, self._axes)
+        self._cycle = DriveCycle(self._link, self._axes, PERIOD)
         for axis in self._axes:
             self._run(axis.configure())
             axis.power(True)
@@ -125,13 +125,13 @@ class Driver:
 
     def _wait(self, is_there: Callable[[], bool], seconds: float) -> None:
         """Send what is to be sent, and take what comes."""
-        self._port.send(self._link.take_sent())
+        self._port.send(self._link.pop_outgoing())
         until = self._now() + seconds
         with contextlib.suppress(queue.Empty):
             while not is_there():
                 item = self._arrived.get(timeout=max(until - self._now(), 0.0))
                 if isinstance(item, PortChange):
-                    self._link.change(item.lost)
+                    self._link.set_port_error(item.lost)
                 else:
                     self._link.receive(item)
 

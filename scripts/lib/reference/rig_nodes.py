@@ -22,10 +22,10 @@ from std_msgs.msg import String
 from code_lines import ROOT
 from needle_bags.player.player_options import parse_options
 from needle_bags.reading.bag_messages import read_contents
-from needle_console.console import OF_BUTTON, PAGE, Console
+from needle_console.console import CALLS, PAGE, Console
 from needle_console.console_parameters import ConsoleParameters
-from needle_console.hold.hold_state import HoldState, Mode
-from needle_console.page.desk import Desk
+from needle_console.hold.page_session import Mode, PageHold
+from needle_console.page.page_port import PagePort
 from needle_console.view.advice import Button
 from needle_core.component import Call
 from needle_core.convert import from_ros, ros_type
@@ -207,17 +207,17 @@ def _console(_: ModuleType) -> Node:
         return Console(settings)
 
     return ComponentNode(
-        Console.name, ConsoleParameters, make, lambda settings: {PAGE: Desk(settings)}
+        Console.name, ConsoleParameters, make, lambda settings: {PAGE: PagePort(settings)}
     )
 
 
 def _look_at_page(node: Any, noted: Noted) -> None:
     desk = node._ports[PAGE]
-    desk.picture("left")
+    desk.view("left")
     for button in Button:
-        if button in OF_BUTTON:
+        if button in CALLS:
             desk.press(button)
-    desk.hold(HoldState(True, 1.0, Mode.RETRACT))
+    desk.set_hold(PageHold(True, 1.0, Mode.RETRACT))
     node._handle_arrived()
     for timer in node.component.timers:
         node._handle(lambda timer=timer: timer.handler(node._moment()))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from needle_console.console import PAGE, Hand
-from needle_console.hold.hold_state import HoldState
-from needle_console.hold.hold_talk import PERIOD, HoldTalk
+from needle_console.console import PAGE, HoldRequest
+from needle_console.hold.hold_protocol import PERIOD, HoldProtocol
+from needle_console.hold.page_session import PageHold
 from needle_core.component import Action, Actions, Component, Log, Moment, Port, Send, Timer
 from scenario.faults import PAGE_LINE
 from scenario.parts.page import CONNECT, Said
@@ -21,14 +21,14 @@ class HoldServer(Component):
 
     def __init__(self) -> None:
         self._actions: list[Action] = []
-        self._talk = HoldTalk(lambda _: "", self._tell, self._notice, 0.0)
+        self._protocol = HoldProtocol(lambda _: "", self._tell, self._notice, 0.0)
         # Connection to the page's number.
         self._pages: dict[int, int] = {}
         self.ports = (Port(PAGE_LINE, self._take), Port(PAGE, lambda *_: ()))
         self.timers = (Timer(_LOOK, self._look), Timer(PERIOD, self._send_counts))
 
-    def _tell(self, state: HoldState) -> None:
-        self._actions.append(Send(PAGE, (Hand(state, self._talk.refusals.counts()),)))
+    def _tell(self, state: PageHold) -> None:
+        self._actions.append(Send(PAGE, (HoldRequest(state, self._protocol.counts()),)))
 
     def _notice(self, text: str) -> None:
         self._actions.append(Log("warning", text))
@@ -38,7 +38,7 @@ class HoldServer(Component):
         return actions
 
     def _look(self, at: Moment) -> Actions:
-        self._talk.look(at.steady)
+        self._protocol.update(at.steady)
         return self._told()
 
     def _take(self, batch: Sequence[Said], at: Moment) -> Actions:
@@ -53,19 +53,19 @@ class HoldServer(Component):
             if page is not None:
                 self._close(said.connection, now)
         elif page is not None:
-            self._talk.hear(page, said.text, now)
+            self._protocol.receive(page, said.text, now)
         elif said.text == CONNECT:
-            self._pages[said.connection] = self._talk.open(now, is_local=True)
+            self._pages[said.connection] = self._protocol.open(now, is_local=True)
         else:
             # Of a connection that nobody knows, as after a restart.
             yield self._abort(said.connection, now)
 
     def _send_counts(self, at: Moment) -> Actions:
         for connection, page in tuple(self._pages.items()):
-            if self._talk.has_lost(page, at.steady):
+            if self._protocol.is_silent(page, at.steady):
                 yield self._abort(connection, at.steady)
             else:
-                word = self._talk.word_for(page, at.steady)
+                word = self._protocol.message_for(page, at.steady)
                 yield Send(PAGE_LINE, (Said(connection, word),))
         yield from self._told()
 
@@ -75,4 +75,4 @@ class HoldServer(Component):
         return Send(PAGE_LINE, (Said(connection),))
 
     def _close(self, connection: int, now: float) -> None:
-        self._talk.close(self._pages.pop(connection), now)
+        self._protocol.close(self._pages.pop(connection), now)

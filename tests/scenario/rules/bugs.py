@@ -10,21 +10,19 @@ from typing import Any
 import pytest
 
 from needle_core.messages import HoldState
-from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
+from needle_device_driver.axes.axis import AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import CoordinatedMotion, Leg
 from needle_device_driver.cia402 import cia402_axis
-from needle_device_driver.cia402.axis_speed import SpeedWatch
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_settings import DriveSettings
+from needle_device_driver.cia402.drive_watch import SpeedMonitor
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.link.frame_link import FrameLink
-from needle_device_driver.supervisor import command, command_desk
-from needle_device_driver.supervisor.command_desk import CommandDesk
+from needle_device_driver.supervisor import command, command_handler
+from needle_device_driver.supervisor.command_handler import CommandHandler
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold
-from needle_device_driver.supervisor.homing_times import HomingTimes
-from needle_device_driver.supervisor.motion_run import MotionRun
-from needle_device_driver.supervisor.retraction_bound import RetractionBound
+from needle_device_driver.supervisor.motion_run import HomingTimes, MotionRun, RetractionBound
 from needle_device_driver.supervisor.states import Activity, State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
@@ -62,7 +60,7 @@ def _of_context(**wrong: Any) -> Plant:
     def checked(check: Any, asked: Any, context: Any, limits: Any) -> Any:
         return check(asked, dataclasses.replace(context, **wrong), limits)
 
-    return wrapped(command_desk, "check_command", checked)
+    return wrapped(command_handler, "check_command", checked)
 
 
 def _of_messages(change: Callable[[Hold, HoldState], HoldState]) -> Plant:
@@ -111,7 +109,7 @@ def _enabling_moves(patch: pytest.MonkeyPatch) -> None:
         "may_move",
         lambda supervisor, now: supervisor.state is State.MOVING or may_move(supervisor, now),
     )
-    patch.setattr(DeviceCore, "moves_with_hold", property(lambda _: False))
+    patch.setattr(DeviceCore, "needs_hold", property(lambda _: False))
     patch.setattr(Hold, "speed_scale", property(lambda _: 1.0))
 
 
@@ -148,7 +146,7 @@ _set_points_far_ahead = _all_of(
     wrapped(DriveSettings, "magnitude", lambda f, settings, value: 20 * f(settings, value)),
     _motion_unwatched,
 )
-_homing_takes_for_ever = _all_of(_faults_unheard, set_to(HomingTimes, count=lambda *_: ""))
+_homing_takes_for_ever = _all_of(_faults_unheard, set_to(HomingTimes, advance=lambda *_: ""))
 _axes_drift_apart = _all_of(_motion_unwatched, _faults_unheard)
 
 BUGS: dict[str, Plant] = {
@@ -158,9 +156,11 @@ BUGS: dict[str, Plant] = {
     "hold_one_owner": _of_messages(_owner_is_robbed),
     "hold_in_order": _of_messages(_order_is_made_up),
     "speed_scale": _of_messages(_scale_is_one),
-    "one_device": set_to(MotionSupervisor, see_others=_unheard),
+    "one_device": set_to(MotionSupervisor, report_conflicting_device=_unheard),
     "no_motion_by_itself": _enabling_moves,
-    "command_state": set_to(CommandDesk, _ready_for=lambda desk, _, now: desk._core.poll(now)),
+    "command_state": set_to(
+        CommandHandler, _check_device=lambda handler, _, now: handler._core.poll(now)
+    ),
     "command_one_publisher": _of_context(publishers=1),
     "command_form": set_to(command, check_form=_unheard),
     "command_finite": set_to(math, isfinite=lambda _: True),
@@ -176,7 +176,7 @@ BUGS: dict[str, Plant] = {
     "max_turns": _any_bounds,
     "coordinated": wrapped(CoordinatedMotion, "advance", _rotation_comes_late),
     "following_error": _axes_drift_apart,
-    "retraction": set_to(DeviceCore, way_out=property(lambda _: 0.0)),
+    "retraction": set_to(DeviceCore, retraction_distance=property(lambda _: 0.0)),
     "unhomed_outward_only": set_to(RetractionBound, target=lambda _, at: at.position),
     "homing_needle_out": wrapped(MotionSupervisor, "home", _homing_needs_no_word),
     "homing_time": _homing_takes_for_ever,
@@ -184,7 +184,7 @@ BUGS: dict[str, Plant] = {
     "one_fault_stops_both": set_to(AxisPair, each=_only_insertion_is_told),
     "inner_limit_switch": _motion_unwatched,
     "reply_age": set_to(PairSnapshot, age=lambda *_: 0.0),
-    "axis_speed": set_to(SpeedWatch, judge=lambda *_, **__: True),
+    "axis_speed": set_to(SpeedMonitor, check=lambda *_, **__: True),
     "settling_time": _motion_unwatched,
     "link_loss": set_to(DeviceDriver, _on_port_change=_nothing_sent),
     "one_master": _faults_unheard,

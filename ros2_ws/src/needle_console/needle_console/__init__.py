@@ -1,1 +1,1 @@
-"""The web console: what the rig sees and believes, and a hold to steer it by."""
+"""Web console: shows the state of the rig, and has a hold to steer the needle."""

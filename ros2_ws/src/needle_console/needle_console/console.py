@@ -1,4 +1,4 @@
-"""console as a component: the rig into a picture for pages, a person's wishes into messages."""
+"""console as a component: shows the rig on pages, and publishes what a person orders there."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_console.console_parameters import ConsoleParameters
-from needle_console.hold.hold_state import OWNER, HoldState
+from needle_console.hold.page_session import OWNER, PageHold
 from needle_console.hold.retraction import Retraction
 from needle_console.view.advice import STEERING, Button
-from needle_console.view.camera_feed import SIDES
+from needle_console.view.camera_view import SIDES
 from needle_console.view.rig_picture import RigPicture
 from needle_console.view.snapshot import Array, Snapshot
 from needle_core import messages as m
@@ -48,7 +48,7 @@ from needle_tracker.sources.image_encodings import ENCODINGS, bytes_per_pixel, g
 PAGE = "page"
 """Name of the port."""
 DEVICE_STATUS, CONTROLLER_STATUS = "device/status", "needle/controller_status"
-OF_BUTTON: Mapping[Button, Call] = {
+CALLS: Mapping[Button, Call] = {
     Button.CONFIRM: Call("device/confirm_needle_out", True),
     Button.HOME: Call("device/home"),
     Button.ENABLE: Call("device/enable", True),
@@ -57,58 +57,58 @@ OF_BUTTON: Mapping[Button, Call] = {
     Button.RESET: Call("device/reset"),
     Button.STOP: Call("device/stop"),
 }
-"""Button to the call that it makes."""
-_VIEWS = {side: f"stereo/{side}/image_raw" for side in SIDES}
+"""Service call of each button."""
+_IMAGES = {side: f"stereo/{side}/image_raw" for side in SIDES}
 _HOLD, _PLANE, _POINT, _RIG = "device/hold", "target_plane", "target_point", "rig"
 _SHOW_PERIOD, _CHECK_PERIOD = 0.1, 1.0
-_HAND_WITHIN = 1.0
-"""The hold's server says at least 12 times a second that it is there [s]."""
-_LOOKS_WITHIN = 2.0
-"""Who has a page open asks for views again within this time [s]."""
-_LAG_GROWS = 0.05
-"""A simulation that falls behind by so much from one report to the next is named [s]."""
+_HOLD_SERVER_TIMEOUT = 1.0
+"""The hold's server reports at least 12 times a second [s]."""
+_VIEW_TIMEOUT = 2.0
+"""An open page requests its views again within this time [s]."""
+_LAG_INCREASE = 0.05
+"""A simulation whose lag grows by this from report to report is too slow [s]."""
 
 
-# ---- what the page's port hands over, beside a Button, a target (Pose, Point) and a Log ----------
-
-
-@dataclasses.dataclass(frozen=True)
-class Hand:
-    """The hold that a person asks for, and how often the hold's server refused or lost what."""
-
-    state: HoldState
-    refused: Mapping[str, int] = dataclasses.field(default_factory=dict)
+# ---- events from the port, beside Button, Pose, Point and Log ------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
-class Looked:
-    """Somebody has asked for a camera's view."""
+class HoldRequest:
+    """The hold of the pages, and the number of refusals of each kind by the hold's server."""
+
+    hold: PageHold
+    refusals: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
-class Lag:
-    """Time by which a simulation is behind the clock up to now [s]."""
+class ViewRequest:
+    """A page has requested a camera view."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulationLag:
+    """Lag of a simulation behind the clock [s]."""
 
     seconds: float
 
 
-# ---- what it takes ------------------------------------------------------------------------------
+# ---- updates to the port, beside Snapshot -------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
+class CameraImage:
     """A camera's image, grey, shape (height, width)."""
 
     side: str
     image: NDArray[np.uint8]
 
 
-PageEvent = Hand | Looked | Lag | Button | m.Pose | m.Point | Log
-Shown = Snapshot | View
+PageEvent = HoldRequest | ViewRequest | SimulationLag | Button | m.Pose | m.Point | Log
+PageUpdate = Snapshot | CameraImage
 
 
 class Console(Component):
-    """Shows the rig on pages, and does what a person at one asks for.
+    """Shows the rig on pages, and publishes what a person orders there.
 
     Parameters
     ----------
@@ -123,9 +123,9 @@ class Console(Component):
         self._picture = RigPicture()
         self._retraction = Retraction()
         self._session = HoldSession(OWNER)
-        self._hand_at = -math.inf
-        self._refused: Mapping[str, int] = {}
-        self._looked_at = -math.inf
+        self._hold_at = -math.inf
+        self._refusals: Mapping[str, int] = {}
+        self._viewed_at = -math.inf
         self._lag = 0.0
         self.inputs = (
             Input(DEVICE_STATUS, DeviceStatus, self._on_device, LATCHED),
@@ -137,7 +137,7 @@ class Console(Component):
             Input("/diagnostics", m.Diagnostics, self._on_health),
             *(
                 Input(topic, m.Image, partial(self._on_image, side), IMAGES_BEST_EFFORT, lazy=True)
-                for side, topic in _VIEWS.items()
+                for side, topic in _IMAGES.items()
             ),
         )
         self.outputs = (
@@ -149,115 +149,115 @@ class Console(Component):
         self.timers = (Timer(_SHOW_PERIOD, self._show), Timer(_CHECK_PERIOD, self._check))
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note whether a controller is there.
+        """Note whether there is a controller.
 
-        One that was killed while it steered must not keep the needle in: a press to retract waits
-        until steering has ended.
+        A retraction waits until steering has ended, so a controller that was killed while it
+        steered must not block it.
         """
         if CONTROLLER_STATUS not in peers.publishers:
-            self._picture.lose_controller()
+            self._picture.clear_controller()
         return ()
 
     def on_answer(self, answer: Answer, at: Moment) -> Actions:
-        """Show what a call was answered."""
+        """Show the answer of a service."""
         refused = "refused: " if answer.answered and not answer.success else ""
-        self._picture.see_answer(f"{answer.service}: {refused}{answer.text}")
+        self._picture.set_answer(f"{answer.service}: {refused}{answer.text}")
         return ()
 
     def on_stop(self, at: Moment) -> Actions:
-        """Release the hold, and end."""
-        yield self._hold(at, pressed=False)
+        """Release the hold, and exit."""
+        yield self._publish_hold(at, pressed=False)
         yield Exit(0)
 
     # ---- the page -------------------------------------------------------------------------------
 
     def _on_page(self, events: Sequence[PageEvent], at: Moment) -> Actions:
-        hands = [event for event in events if isinstance(event, Hand)]
+        requests = [event for event in events if isinstance(event, HoldRequest)]
         for event in events:
             match event:
-                case Hand(HoldState(pressed=True)) if event is not hands[-1]:
-                    # A press that had to wait is none of now; a release always counts.
+                case HoldRequest(PageHold(pressed=True)) if event is not requests[-1]:
+                    # An earlier press of the batch is outdated; a release always counts.
                     continue
-                case Hand():
-                    yield from self._on_hand(event, at)
+                case HoldRequest():
+                    yield from self._on_hold(event, at)
                 case Button():
-                    yield OF_BUTTON[event]
+                    yield CALLS[event]
                 case m.Pose():
                     yield Publish(_PLANE, event)
                 case m.Point():
                     yield Publish(_POINT, event)
                 case Log():
                     yield event
-                case Looked():
-                    self._looked_at = at.steady
-                    yield from (Listen(topic, True) for topic in _VIEWS.values())
-                case Lag(seconds):
+                case ViewRequest():
+                    self._viewed_at = at.steady
+                    yield from (Listen(topic, True) for topic in _IMAGES.values())
+                case SimulationLag(seconds):
                     self._on_lag(seconds, at)
 
-    def _on_hand(self, hand: Hand, at: Moment) -> Actions:
-        is_back = at.steady - self._hand_at > _HAND_WITHIN
-        self._hand_at, self._refused = at.steady, hand.refused
-        rig, state = self._picture.states(), hand.state
-        todo = self._retraction.update(
-            state,
+    def _on_hold(self, request: HoldRequest, at: Moment) -> Actions:
+        was_silent = at.steady - self._hold_at > _HOLD_SERVER_TIMEOUT
+        self._hold_at, self._refusals = at.steady, request.refusals
+        rig, hold = self._picture.latest(), request.hold
+        order = self._retraction.update(
+            hold,
             at.steady,
             steering=rig.controller is not None and rig.controller.state in STEERING,
             hold_counts=rig.device is not None
             and rig.device.hold_owner == OWNER
             and rig.device.activity == "none",
         )
-        yield self._hold(at, pressed=todo.press, speed=state.speed)
-        yield from map(Call, todo.calls)
-        if is_back:
+        yield self._publish_hold(at, pressed=order.press, speed=hold.speed)
+        yield from map(Call, order.calls)
+        if was_silent:
             yield from self._check(at)
 
-    def _hold(self, at: Moment, *, pressed: bool, speed: float = 0.0) -> Publish:
+    def _publish_hold(self, at: Moment, *, pressed: bool, speed: float = 0.0) -> Publish:
         return Publish(_HOLD, self._session.next_message(at.stamp_ns, pressed=pressed, speed=speed))
 
     def _on_lag(self, seconds: float, at: Moment) -> None:
-        if seconds - self._lag >= _LAG_GROWS:
+        if seconds - self._lag >= _LAG_INCREASE:
             text = f"too slow for this computer, {seconds:.1f} s behind the clock"
-            self._picture.see_health("simulation", bad=True, message=text, now=at.steady)
+            self._picture.set_health("simulation", bad=True, message=text, now=at.steady)
         self._lag = seconds
 
     def _show(self, at: Moment) -> Actions:
         yield Send(PAGE, (self._picture.snapshot(at.steady),))
 
     def _check(self, at: Moment) -> Actions:
-        served = at.steady - self._hand_at <= _HAND_WITHIN
+        served = at.steady - self._hold_at <= _HOLD_SERVER_TIMEOUT
         message = "served" if served else "the hold's server does not answer"
-        counts = {f"refused {reason}": str(count) for reason, count in self._refused.items()}
+        counts = {f"refused {reason}": str(count) for reason, count in self._refusals.items()}
         level = Level.OK if served else Level.ERROR
         yield Diagnose("hold", Diagnostic(level, message, counts))
-        if at.steady - self._looked_at > _LOOKS_WITHIN:
-            yield from (Listen(topic, False) for topic in _VIEWS.values())
+        if at.steady - self._viewed_at > _VIEW_TIMEOUT:
+            yield from (Listen(topic, False) for topic in _IMAGES.values())
 
     # ---- the rig --------------------------------------------------------------------------------
 
     def _on_device(self, message: DeviceStatus, at: Moment) -> Actions:
-        self._picture.see_device(message)
+        self._picture.set_device(message)
         return ()
 
     def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
-        self._picture.see_controller(message)
+        self._picture.set_controller(message)
         return ()
 
     def _on_joints(self, message: m.JointState, at: Moment) -> Actions:
-        places = dict(zip(message.names, message.positions, strict=False))
+        positions = dict(zip(message.names, message.positions, strict=False))
         insertion, rotation = (
-            places.get(name, math.nan) for name in (m.INSERTION_JOINT, m.ROTATION_JOINT)
+            positions.get(name, math.nan) for name in (m.INSERTION_JOINT, m.ROTATION_JOINT)
         )
-        self._picture.see_joints(insertion, rotation, at.steady)
+        self._picture.set_joints(insertion, rotation, at.steady)
         return ()
 
     def _on_tip(self, message: m.PoseWithCovariance, at: Moment) -> Actions:
         if message.frame_id == _RIG:
-            self._picture.see_tip(*_position(message), at.steady)
+            self._picture.set_tip(*_position(message), at.steady)
         return ()
 
     def _on_estimate(self, message: m.PoseWithCovariance, at: Moment) -> Actions:
         if message.frame_id == _PLANE:
-            self._picture.see_estimate(*_position(message))
+            self._picture.add_estimate(*_position(message))
         return ()
 
     def _on_plane(self, message: m.Pose, at: Moment) -> Actions:
@@ -267,14 +267,14 @@ class Console(Component):
             pose = np.eye(4)
             pose[:3, :3] = rotation_matrix(quaternion / norm)
             pose[:3, 3] = message.position
-            self._picture.see_plane(pose)
+            self._picture.set_plane(pose)
         return ()
 
     def _on_health(self, message: m.Diagnostics, at: Moment) -> Actions:
         for status in message.statuses:
             bad = status.level in (Level.WARN, Level.ERROR)
             part = ": ".join(filter(None, (status.source, status.part)))
-            self._picture.see_health(part, bad=bad, message=status.text, now=at.steady)
+            self._picture.set_health(part, bad=bad, message=status.text, now=at.steady)
         return ()
 
     def _on_image(self, side: str, message: m.Image, at: Moment) -> Actions:
@@ -285,10 +285,10 @@ class Console(Component):
             return
         rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
         image = grey_image(rows, message.width, message.encoding)
-        yield Send(PAGE, (View(side, np.ascontiguousarray(image)),))
+        yield Send(PAGE, (CameraImage(side, np.ascontiguousarray(image)),))
 
 
 def _position(message: m.PoseWithCovariance) -> tuple[Array, Array]:
-    """Return a pose's position and its covariance, shapes (3,) and (3, 3), nothing checked."""
+    """Return a pose's position and its covariance, shapes (3,) and (3, 3), unchecked."""
     covariance = np.asarray(message.covariance, dtype=float).reshape(6, 6)
     return np.array(message.position), covariance[:3, :3]

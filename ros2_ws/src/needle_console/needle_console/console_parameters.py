@@ -1,10 +1,10 @@
-"""The console's parameters."""
+"""Parameters of the console."""
 
 from __future__ import annotations
 
 import dataclasses
 
-from needle_console.access.access import Access
+from needle_console.access import Access
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 
@@ -13,7 +13,7 @@ from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 class ConsoleParameters:
     """Parameters of the console, fixed at start."""
 
-    address: str = fixed_parameter("127.0.0.1", "-", "Where page and hold are served.")
+    address: str = fixed_parameter("127.0.0.1", "-", "Address of page and hold.")
     port: int = fixed_parameter(8080, "-", "Port of the page.", 1, 65535)
     hold_port: int = fixed_parameter(8081, "-", "Port of the hold.", 1, 65535)
     hold_real_rig: bool = fixed_parameter(
@@ -30,24 +30,24 @@ class ConsoleParameters:
     )
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be served.
+        """Check the parameters.
 
         Raises
         ------
         UserError
-            A parameter out of bounds, or one port for both.
+            A parameter out of bounds, or the same port twice.
         """
         check_fields(self)
         if self.port == self.hold_port:
             raise UserError(f"port and hold_port are both {self.port}, wants two")
 
     def why_no_hold(self, simulated: bool | None, *, is_local: bool) -> str:
-        """Return why a page may only watch, and stop; empty: it may hold.
+        """Return why a page may only watch and stop; empty: it may hold.
 
         Parameters
         ----------
         simulated : bool or None
-            What the device says of itself; None: nothing.
+            Whether the device reports that it is simulated; None: unknown.
         is_local : bool
             Whether the page is shown on the rig's own machine.
         """
@@ -58,6 +58,6 @@ class ConsoleParameters:
         return "only watching: hold_real_rig is off, and this is no simulation"
 
     def access(self) -> Access:
-        """Return who may connect; errors as of `Access`."""
+        """Return the access control; raises as `Access`."""
         hosts = [host for host in self.hosts if host]
         return Access(self.address, self.port, hosts)

@@ -1,4 +1,4 @@
-"""The console as a component, called directly: what a page does, and what the rig is told."""
+"""The console as a component: events of pages, messages of the rig."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_console.console import Console, Hand, Lag, PageEvent
+from needle_console.console import Console, HoldRequest, PageEvent, SimulationLag
 from needle_console.console_parameters import ConsoleParameters
-from needle_console.hold.hold_state import RELEASED, HoldState, Mode
-from needle_console.page.desk import Desk
+from needle_console.hold.page_session import RELEASED, Mode, PageHold
+from needle_console.page.page_port import PagePort
 from needle_console.view.advice import Button
 from needle_console.view.snapshot import Snapshot
 from needle_console.view.targets import plane_pose, target_point
@@ -31,48 +31,48 @@ from needle_core.component import (
 from needle_core.diagnostics import Level
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
-INSERT = HoldState(True, 0.5, Mode.INSERT)
-RETRACT = HoldState(True, 0.5, Mode.RETRACT)
+INSERT = PageHold(True, 0.5, Mode.INSERT)
+RETRACT = PageHold(True, 0.5, Mode.RETRACT)
 TURN = (0.0, float(np.sin(np.pi / 12)), 0.0, float(np.cos(np.pi / 12)))
-"""By 30 degrees, as a plane's that rises inwards."""
+"""Orientation of a plane that rises inwards by 30 degrees."""
 
 
 class Bench:
-    """A console, and the desk of its page with a clock of its own."""
+    """A console and its page port, with virtual time."""
 
     def __init__(self) -> None:
         self.now = 10.0
         self.console = Console(ConsoleParameters())
-        self.desk = Desk(ConsoleParameters(), lambda: self.now)
+        self.port = PagePort(ConsoleParameters(), lambda: self.now)
         self._batches: list[Any] = []
-        self.desk.open(self._batches.append)
+        self.port.open(self._batches.append)
 
     @property
     def at(self) -> Moment:
         return Moment(self.now, 1)
 
-    def hear(self, topic: str, message: Any) -> list[Any]:
+    def receive(self, topic: str, message: Any) -> list[Any]:
         (row,) = (row for row in self.console.inputs if row.topic == topic)
         return list(row.handler(message, self.at))
 
     def events(self) -> list[PageEvent]:
-        """Return what the desk hands over now."""
+        """Return the waiting events of the port."""
         batches, self._batches[:] = [batch() for batch in self._batches], []
         return [event for batch in batches for event in batch]
 
-    def take(self, *events: PageEvent) -> list[Any]:
-        """Let the console take what a page does; return what it does."""
+    def handle(self, *events: PageEvent) -> list[Any]:
+        """Pass events of a page to the console; return its actions."""
         (port,) = self.console.ports
         return list(port.handler(events or self.events(), self.at))
 
-    def hold(self, *states: HoldState) -> tuple[list[m.HoldState], list[Call]]:
-        """Let hands be taken in one batch; return what is said of the hold, and the calls."""
-        actions = self.take(*map(Hand, states))
+    def hold(self, *states: PageHold) -> tuple[list[m.HoldState], list[Call]]:
+        """Pass holds in one batch; return the published holds, and the calls."""
+        actions = self.handle(*map(HoldRequest, states))
         said = [one.message for one in actions if isinstance(one, Publish)]
         return said, [one for one in actions if isinstance(one, Call)]
 
     def check(self) -> tuple[Diagnose, dict[str, bool]]:
-        """Return what the console checks once a second: health, and topics that it leaves."""
+        """Run the check of the console; return the health and the unsubscribed topics."""
         diagnose, *listens = self.console.timers[1].handler(self.at)
         assert isinstance(diagnose, Diagnose)
         return diagnose, listened(listens)
@@ -80,8 +80,8 @@ class Bench:
     def snapshot(self) -> Snapshot:
         (sent,) = self.console.timers[0].handler(self.at)
         assert isinstance(sent, Send)
-        self.desk.send(sent.batch)
-        return self.desk.snapshot()
+        self.port.send(sent.batch)
+        return self.port.snapshot()
 
 
 def listened(actions: Actions) -> dict[str, bool]:
@@ -93,28 +93,28 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_a_hold_is_told_as_it_comes_with_a_lifetime_and_a_release_at_once(bench: Bench) -> None:
+def test_hold_is_published_with_lifetime_and_release_at_once(bench: Bench) -> None:
     (said,), calls = bench.hold(INSERT)
     assert (said.source, said.pressed, said.speed_scale, calls) == ("console", True, 0.5, [])
-    # The promise of docs/safety.md. Nothing is repeated by itself: no timer says it.
+    # As in docs/safety.md. No timer repeats it.
     assert said.lifetime == m.HOLD_LIFETIME == 0.1
     (released,), _ = bench.hold(RELEASED)
     assert (released.pressed, released.speed_scale) == (False, 0.0)
-    # A press that had to wait is none of now.
+    # An earlier press of the batch does not count.
     late, _ = bench.hold(INSERT, RELEASED, INSERT)
     assert [hold.pressed for hold in late] == [False, True]
     assert [hold.count for hold in (said, released, *late)] == [1, 2, 3, 4]
 
 
-def test_a_retraction_waits_for_the_end_of_steering_and_is_called_once(bench: Bench) -> None:
-    bench.hear("needle/controller_status", ControllerStatus(state="STEERING"))
+def test_retraction_waits_for_the_end_of_steering(bench: Bench) -> None:
+    bench.receive("needle/controller_status", ControllerStatus(state="STEERING"))
     for calls in ([Call("plane_controller/stop")], []):
         (said,), made = bench.hold(RETRACT)
         assert (said.pressed, made) == (False, calls)
-    bench.hear("needle/controller_status", ControllerStatus(state="IDLE"))
-    bench.hear("device/status", DeviceStatus(state="MOVING", hold_owner="pedal"))
+    bench.receive("needle/controller_status", ControllerStatus(state="IDLE"))
+    bench.receive("device/status", DeviceStatus(state="MOVING", hold_owner="pedal"))
     assert bench.hold(RETRACT)[1] == []
-    bench.hear("device/status", DeviceStatus(state="HOLDING", hold_owner="console"))
+    bench.receive("device/status", DeviceStatus(state="HOLDING", hold_owner="console"))
     for calls in ([Call("device/retract")], []):
         (said,), made = bench.hold(RETRACT)
         assert (said.pressed, made) == (True, calls)
@@ -128,8 +128,8 @@ def test_buttons_call_their_services_and_answers_are_shown(bench: Bench) -> None
         (Button.STOP, Call("device/stop")),
         (Button.RESET, Call("device/reset")),
     ):
-        bench.desk.press(button)
-        assert bench.take() == [call]
+        bench.port.press(button)
+        assert bench.handle() == [call]
     for answer, shown in (
         (Answer("device/home", True, "homes"), "device/home: homes"),
         (Answer("device/home", False, "not now"), "device/home: refused: not now"),
@@ -139,12 +139,12 @@ def test_buttons_call_their_services_and_answers_are_shown(bench: Bench) -> None
         assert bench.snapshot().answer == shown
 
 
-def test_the_hands_server_that_falls_silent_is_named(bench: Bench) -> None:
-    bench.desk.refused = lambda: {"foreign Host": 3}
+def test_silent_hold_server_is_reported(bench: Bench) -> None:
+    bench.port.refusals = lambda: {"foreign Host": 3}
     for silent_for, level in ((0.9, Level.OK), (1.1, Level.ERROR)):
-        bench.desk.hold(RELEASED)
-        back = [one for one in bench.take() if isinstance(one, Diagnose)]
-        # That it is there again is told at once.
+        bench.port.set_hold(RELEASED)
+        back = [one for one in bench.handle() if isinstance(one, Diagnose)]
+        # Its return is reported at once.
         assert [one.diagnostic.level for one in back] == ([Level.OK] if level == Level.OK else [])
         bench.now += silent_for
         health, _ = bench.check()
@@ -152,31 +152,33 @@ def test_the_hands_server_that_falls_silent_is_named(bench: Bench) -> None:
         assert health.diagnostic.values == {"refused foreign Host": "3"}
 
 
-def test_a_simulation_that_lags_is_named_while_it_does(bench: Bench) -> None:
+def test_growing_simulation_lag_is_reported(bench: Bench) -> None:
     for seconds, named in ((0.0, False), (0.01, False), (1.0, True)):
-        bench.desk.note_lag(seconds)
-        assert bench.take() == []
-        assert bool(bench.snapshot().troubles) is named
-    (text,) = bench.snapshot().troubles
+        bench.port.set_lag(seconds)
+        assert bench.handle() == []
+        assert bool(bench.snapshot().warnings) is named
+    (text,) = bench.snapshot().warnings
     assert "1.0 s behind the clock" in text
-    # It lags no more than it did.
+    # The lag does not grow.
     bench.now += 4.0
-    bench.take(Lag(1.0))
-    assert bench.snapshot().troubles == ()
+    bench.handle(SimulationLag(1.0))
+    assert bench.snapshot().warnings == ()
 
 
-def test_what_is_heard_of_the_rig_is_shown_in_its_frames_only(bench: Bench) -> None:
+def test_messages_in_other_frames_are_ignored(bench: Bench) -> None:
     flat = tuple(np.diag([1e-8, 2e-8, 3e-8, 0.0, 0.0, 0.0]).ravel())
-    bench.hear("joint_states", m.JointState(1, (m.ROTATION_JOINT, m.INSERTION_JOINT), (2.0, 0.01)))
+    bench.receive(
+        "joint_states", m.JointState(1, (m.ROTATION_JOINT, m.INSERTION_JOINT), (2.0, 0.01))
+    )
     for frame, x in (("rig", 0.004), ("left_camera", 0.4)):
-        bench.hear("target_plane", m.Pose(0, frame, (x, 0.0, 0.0), TURN))
-        bench.hear("needle/tip_pose", m.PoseWithCovariance(1, frame, (x, 0.0, 0.01), TURN, flat))
-    bench.hear("needle/controller_status", ControllerStatus(state="STEERING"))
+        bench.receive("target_plane", m.Pose(0, frame, (x, 0.0, 0.0), TURN))
+        bench.receive("needle/tip_pose", m.PoseWithCovariance(1, frame, (x, 0.0, 0.01), TURN, flat))
+    bench.receive("needle/controller_status", ControllerStatus(state="STEERING"))
     for frame, x in (("target_plane", 0.0), ("rig", 0.4)):
         estimate = m.PoseWithCovariance(1, frame, (x, 0.0, 0.01), TURN, flat)
-        bench.hear("needle/estimate", estimate)
+        bench.receive("needle/estimate", estimate)
     sick = m.Status("sim_rig", "loop", Level.WARN, "slow", {})
-    bench.hear("/diagnostics", m.Diagnostics(1, (sick,)))
+    bench.receive("/diagnostics", m.Diagnostics(1, (sick,)))
     shown = bench.snapshot()
     assert (shown.insertion, shown.rotation) == (0.01, 2.0)
     assert shown.tip is not None
@@ -184,18 +186,18 @@ def test_what_is_heard_of_the_rig_is_shown_in_its_frames_only(bench: Bench) -> N
     assert np.diag(shown.tip.covariance) == pytest.approx([1e-8, 2e-8, 3e-8])
     assert shown.T_rig_plane[:3, :3] == pytest.approx(plane_pose(0.0, 30.0)[:3, :3])
     assert shown.T_rig_plane[:3, 3] == pytest.approx([0.004, 0.0, 0.0])
-    (point,) = shown.course
+    (point,) = shown.track
     assert point.position == pytest.approx([0.004 + 0.005, 0.0, 0.01 * np.sqrt(0.75)])
-    assert shown.troubles == ("sim_rig: loop: slow",)
-    # One that was killed while it steered must not keep the needle in.
+    assert shown.warnings == ("sim_rig: loop: slow",)
+    # A killed controller must not block a retraction.
     assert list(bench.console.on_peers(Peers(), bench.at)) == []
     assert bench.snapshot().controller is None
 
 
-def test_a_whole_image_is_shown_without_what_pads_its_rows(bench: Bench) -> None:
+def test_image_is_shown_without_row_padding(bench: Bench) -> None:
     def shown(encoding: str, step: int, size: int) -> list[Any]:
         image = m.Image(1, "left", 2, 3, encoding, step, bytes(range(size)))
-        return bench.hear("stereo/left/image_raw", image)
+        return bench.receive("stereo/left/image_raw", image)
 
     (sent,) = shown("mono8", 4, 8)
     (view,) = sent.batch
@@ -204,17 +206,17 @@ def test_a_whole_image_is_shown_without_what_pads_its_rows(bench: Bench) -> None
         assert shown(*wrong) == []
 
 
-def test_targets_and_lines_for_the_log_go_through(bench: Bench) -> None:
-    bench.desk.send_plane(plane_pose(4.0, 30.0))
-    bench.desk.send_point(target_point(10.0, -5.0, 100.0))
-    bench.desk.notice("a line")
-    plane, point, line = bench.take()
+def test_targets_and_log_lines_are_passed_on(bench: Bench) -> None:
+    bench.port.send_plane(plane_pose(4.0, 30.0))
+    bench.port.send_point(target_point(10.0, -5.0, 100.0))
+    bench.port.log("a line")
+    plane, point, line = bench.handle()
     assert plane.message.orientation == pytest.approx(TURN)
     assert point == Publish("target_point", m.Point(0, "rig", (0.01, -0.005, 0.1)))
     assert line == Log("warning", "a line")
 
 
-def test_of_holds_that_wait_the_newest_counts_unless_one_was_a_release_or_it_is_old(
+def test_newest_waiting_hold_counts_unless_released_or_old(
     bench: Bench,
 ) -> None:
     for states, waited, counts in (
@@ -224,30 +226,30 @@ def test_of_holds_that_wait_the_newest_counts_unless_one_was_a_release_or_it_is_
         ((INSERT,), 1.01, RELEASED),
     ):
         for state in states:
-            bench.desk.hold(state)
+            bench.port.set_hold(state)
         bench.now += waited * m.HOLD_LIFETIME
-        assert bench.events() == [Hand(counts)]
+        assert bench.events() == [HoldRequest(counts)]
         assert bench.events() == []
 
 
-def test_wishes_of_pages_that_nobody_takes_are_not_piled_up(bench: Bench) -> None:
+def test_page_events_are_bounded(bench: Bench) -> None:
     for _ in range(1000):
-        bench.desk.press(Button.HOME)
+        bench.port.press(Button.HOME)
     assert 0 < len(bench.events()) < 100
     assert bench.events() == []
 
 
-def test_images_are_wanted_while_a_page_asks_for_views(bench: Bench) -> None:
+def test_images_are_subscribed_while_a_page_requests_views(bench: Bench) -> None:
     both = ("stereo/left/image_raw", "stereo/right/image_raw")
-    bench.desk.picture("left")
-    assert listened(bench.take()) == dict.fromkeys(both, True)
+    bench.port.view("left")
+    assert listened(bench.handle()) == dict.fromkeys(both, True)
     assert {row.topic for row in bench.console.inputs if row.lazy} == {*both}
     for waited, left in ((1.9, {}), (0.2, dict.fromkeys(both, False))):
         bench.now += waited
         assert bench.check()[1] == left
 
 
-def test_its_end_releases_the_hold(bench: Bench) -> None:
+def test_exit_releases_the_hold(bench: Bench) -> None:
     release, end = bench.console.on_stop(bench.at)
     assert isinstance(release, Publish)
     assert not release.message.pressed

@@ -1,4 +1,4 @@
-"""Who may open a connection, load the page, and hold."""
+"""Access control: connections, the page, and the hold of a real rig."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 
-from needle_console.access.access import Access
+from needle_console.access import Access, Gate
 from needle_console.console_parameters import ConsoleParameters
-from needle_console.page.desk import Desk
-from needle_console.page.gate import Gate
+from needle_console.page.page_port import PagePort
 from needle_console.view.snapshot import Snapshot
 from needle_core.errors import UserError
 from needle_core.status_messages import DeviceStatus
@@ -19,7 +18,7 @@ LOOPBACK = Access("127.0.0.1", 8080)
 HOST, ORIGIN = ("host", "127.0.0.1:8080"), ("origin", "http://127.0.0.1:8080")
 
 
-def test_loopback_is_known_by_its_own_names_only() -> None:
+def test_loopback_accepts_only_its_own_names() -> None:
     for host in ("localhost", "127.0.0.1", "127.0.0.1:8081", "LOCALHOST:8081", "[::1]:8081"):
         assert LOOPBACK.why_not_host(host) == ""
     for foreign in (
@@ -29,7 +28,7 @@ def test_loopback_is_known_by_its_own_names_only() -> None:
         assert LOOPBACK.why_not_host(foreign) == "foreign Host"
 
 
-def test_only_the_page_of_the_same_port_is_no_foreign_page() -> None:
+def test_only_origins_with_the_page_port_are_accepted() -> None:
     for origin in ("http://localhost:8080", "http://127.0.0.1:8080", "https://[::1]:8080"):
         assert LOOPBACK.why_not_origin(origin) == ""
     for foreign in (
@@ -38,25 +37,25 @@ def test_only_the_page_of_the_same_port_is_no_foreign_page() -> None:
         *("http://user@localhost:8080", "file://localhost:8080", "http://localhost:99999"),
     ):
         assert LOOPBACK.why_not_origin(foreign) == "foreign Origin"
-    # A default port needs not be said.
+    # A default port is left out.
     access = Access("192.168.1.5", 80, ["rig.lab"])
     assert access.why_not_origin("http://rig.lab") == ""
     assert access.why_not_origin("https://rig.lab") == "foreign Origin"
 
 
-def test_beyond_this_machine_it_takes_a_name() -> None:
+def test_other_machines_need_a_host_name() -> None:
     with pytest.raises(UserError, match="hosts must name"):
         Access("0.0.0.0", 8080)
     with pytest.raises(UserError, match="neither an IP address"):
         Access("rig.lab", 8080)
-    # What is listened on is a name of its own; loopback's names are another machine's here.
+    # The address counts as a host name; loopback names would be another machine.
     access = ConsoleParameters(address="192.168.1.5").access()
     assert access.why_not_host("192.168.1.5:8081") == ""
     assert access.why_not_host("localhost:8081") == "foreign Host"
 
 
 def asked(*headers: tuple[str, str], kind: str = "http", method: str = "GET") -> dict[str, Any]:
-    """Return what the gate, or the page behind it, answers first."""
+    """Return the first answer of the gate, or of the page behind it."""
     said: list[dict[str, Any]] = []
 
     async def page(scope: Any, receive: Any, send: Any) -> None:
@@ -72,7 +71,7 @@ def asked(*headers: tuple[str, str], kind: str = "http", method: str = "GET") ->
     return said[0]
 
 
-def test_the_gate_refuses_foreign_pages_and_an_upgrade_or_post_without_an_origin() -> None:
+def test_gate_refuses_foreign_pages_and_missing_origins() -> None:
     for headers in (
         (),
         (("host", "evil.example:8080"),),
@@ -88,25 +87,23 @@ def test_the_gate_refuses_foreign_pages_and_an_upgrade_or_post_without_an_origin
     assert asked(kind="lifespan")["status"] == 200
 
 
-def test_no_page_is_shown_inside_another_one() -> None:
+def test_page_cannot_be_framed() -> None:
     for start in (asked(HOST), asked()):
         assert (b"x-frame-options", b"DENY") in start["headers"]
 
 
 @pytest.mark.parametrize("is_local", [True, False])
 @pytest.mark.parametrize("hold_real_rig", [True, False])
-def test_a_real_rig_is_held_at_its_own_machine_where_that_is_allowed(
-    hold_real_rig: bool, is_local: bool
-) -> None:
-    desk = Desk(ConsoleParameters(hold_real_rig=hold_real_rig))
-    # A device that is not heard may be a real one.
-    assert (desk.why_no_hold(is_local) == "") == (hold_real_rig and is_local)
+def test_real_rig_is_held_only_locally_and_if_allowed(hold_real_rig: bool, is_local: bool) -> None:
+    port = PagePort(ConsoleParameters(hold_real_rig=hold_real_rig))
+    # An unknown device may be a real one.
+    assert (port.why_no_hold(is_local) == "") == (hold_real_rig and is_local)
     for simulated in (True, False, None):
-        desk.send((Snapshot(device=DeviceStatus(simulated=simulated)),))
-        may_hold = not desk.why_no_hold(is_local)
+        port.send((Snapshot(device=DeviceStatus(simulated=simulated)),))
+        may_hold = not port.why_no_hold(is_local)
         assert may_hold == (simulated is True or (hold_real_rig and is_local))
 
 
-def test_one_port_cannot_serve_both() -> None:
+def test_page_and_hold_need_two_ports() -> None:
     with pytest.raises(UserError, match="8081, wants two"):
         ConsoleParameters(port=8081)

@@ -1,4 +1,4 @@
-"""The `device/...` interface of a motion supervisor as rows of a component.
+"""Interface of a device: the topics and services of a motion supervisor.
 
 It is the same for real, emulated and simulated axes; a component adds its cycle.
 """
@@ -22,65 +22,59 @@ from needle_core.component import (
     Output,
     Peers,
     Publish,
+    Reply,
     Service,
 )
-from needle_core.component import Reply as ServiceReply
 from needle_core.process.ros_domain import CONFLICT_HINT
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.procedure import Procedure, Running
-from needle_device_driver.supervisor.command import Command, CommandPoint
-from needle_device_driver.supervisor.reports import (
-    Notice,
-    NoticeLimit,
-    Reply,
-    StepResult,
-)
+from needle_device_driver.supervisor.reports import Notice, NoticeLimit, ServiceResult
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
 COMMANDS, HOLD, EMERGENCY_STOP = "device/joint_trajectory", "device/hold", "device/estop"
 STATUS, RESULT, JOINTS = "device/status", "device/result", "joint_states"
-STOP = "device/stop"
-# Every message counts, also while somebody floods the topic.
+# No message may be lost, even if another node floods the topic.
 HOLDS = Delivery(depth=100, reliable=False)
 _EMERGENCY_STOPS = Delivery(depth=1000)
-# Turning a message into Python takes up to 200 ns a byte [bytes].
-_LONGEST = 4096
-# Positions, or messages that are ignored, alone change device/status so often at most [s].
+# Longer messages are rejected: the conversion takes up to 200 ns per byte [bytes].
+_MAX_MESSAGE = 4096
+# If only these fields change, the status is published once in this period [s].
 _STATUS_PERIOD = 0.5
-_OFTEN = {"insertion_m", "rotation_rad", "holds_ignored"}
-_SELDOM = operator.attrgetter(*({row.name for row in dataclasses.fields(DeviceStatus)} - _OFTEN))
+_FREQUENT = {"insertion_m", "rotation_rad", "holds_ignored"}
+_OTHERS = operator.attrgetter(*({row.name for row in dataclasses.fields(DeviceStatus)} - _FREQUENT))
+
+Then = Callable[[ServiceResult, Moment], Actions]
 
 
 @dataclasses.dataclass(frozen=True)
-class _Order:
-    """An order under way, what follows it, and how many stops there were before it."""
+class _Task:
+    """A procedure under way, the handler of its result, and the number of stops before it."""
 
-    running: Running[Reply]
-    then: Callable[[Reply, Moment], Actions]
+    running: Running[ServiceResult]
+    then: Then
     stops: int
 
 
-class DeviceRows:
-    """Rows that connect a motion supervisor to topics and services.
+class DeviceInterface:
+    """Inputs, outputs and services that connect a motion supervisor to the graph.
 
     Parameters
     ----------
     supervisor : MotionSupervisor
-        What they speak for.
+        The motion supervisor.
     name : str
         Name of the component.
     simulated : bool or None
-        Whether no real needle can move; None until that is known.
-    refuse : callable
-        Returns why services are not ready yet, empty when they are; a stop and a disabling are
-        never refused.
+        Whether no real needle can move; None: not known yet.
+    not_ready : callable
+        Returns why services are not ready, empty if they are; stopping and disabling always are.
 
     Attributes
     ----------
     simulated : bool or None
-        As given; a component may change it.
-    others : str
-        Who else is a device on these topics; empty: nobody.
+        As given; the component may change it.
+    conflict : str
+        Another device on the same topics; empty: there is none.
     """
 
     def __init__(
@@ -89,27 +83,27 @@ class DeviceRows:
         name: str,
         *,
         simulated: bool | None,
-        refuse: Callable[[], str] = lambda: "",
+        not_ready: Callable[[], str] = lambda: "",
     ) -> None:
         self.simulated = simulated
-        self.others = ""
+        self.conflict = ""
         self._supervisor = supervisor
         self._name = name
-        self._refuse = refuse
+        self._not_ready = not_ready
         self._command_publishers = 1
-        self._told: DeviceStatus | None = None
-        self._told_at = 0.0
+        self._published: DeviceStatus | None = None
+        self._published_at = 0.0
         self._notices = NoticeLimit()
-        self._order: _Order | None = None
+        self._task: _Task | None = None
         self.inputs: Sequence[Input] = (
-            Input(COMMANDS, m.Trajectory, self._on_command, max_bytes=_LONGEST),
-            Input(HOLD, m.HoldState, self._on_hold, HOLDS, _LONGEST),
+            Input(COMMANDS, m.Trajectory, self._on_command, max_bytes=_MAX_MESSAGE),
+            Input(HOLD, m.HoldState, self._on_hold, HOLDS, _MAX_MESSAGE),
             Input(
                 EMERGENCY_STOP,
                 m.EmergencyStop,
                 self._on_emergency_stop,
                 _EMERGENCY_STOPS,
-                _LONGEST,
+                _MAX_MESSAGE,
             ),
         )
         self.outputs: Sequence[Output] = (
@@ -119,85 +113,85 @@ class DeviceRows:
         )
         call = supervisor
         self.services: Sequence[Service] = (
-            self._trigger("home", lambda at: call.home(at.steady)),
-            self._trigger("retract", lambda at: call.retract(at.steady)),
-            self._trigger("reset", lambda at: call.reset(at.steady)),
-            self._trigger("stop", lambda at: call.stop(), always=True),
-            self._switch("enable", lambda on, at: call.enable(on, at.steady)),
-            self._switch("confirm_needle_out", lambda on, at: call.confirm_needle_out(on)),
+            self._service("home", lambda _, at: call.home(at.steady)),
+            self._service("retract", lambda _, at: call.retract(at.steady)),
+            self._service("reset", lambda _, at: call.reset(at.steady)),
+            self._service("stop", lambda _, at: call.stop()),
+            self._service("enable", lambda on, at: call.enable(on, at.steady), switch=True),
+            self._service(
+                "confirm_needle_out", lambda on, at: call.confirm_needle_out(on), switch=True
+            ),
         )
 
     @property
     def is_busy(self) -> bool:
-        """Tell whether an order takes its time."""
-        return self._order is not None
+        """Whether a procedure is under way."""
+        return self._task is not None
 
-    def begin(
-        self, order: Procedure[Reply], then: Callable[[Reply, Moment], Actions], at: Moment
-    ) -> Actions:
-        """Begin an order that may take its time; `then` gets its reply.
+    def begin(self, procedure: Procedure[ServiceResult], then: Then, at: Moment) -> Actions:
+        """Begin a procedure; `then` handles its result.
 
-        A stop, an emergency stop and a fault call it off, and so does disabling.
+        A stop, an emergency stop, a fault and disabling cancel it.
         """
-        self._order = _Order(Running(order), then, self._supervisor.stops)
+        self._task = _Task(Running(procedure), then, self._supervisor.stops)
         yield from self.advance(at)
 
     def advance(self, at: Moment) -> Actions:
-        """Go on with the order under way; call it after all that may have changed something."""
-        order = self._order
-        if order is None:
+        """Resume the procedure under way; call it after each event that may concern it."""
+        task = self._task
+        if task is None:
             return
-        if self._supervisor.stops > order.stops:
-            yield from self.call_off(self._supervisor.fault, at)
+        if self._supervisor.stops > task.stops:
+            yield from self.cancel(self._supervisor.fault, at)
             return
         try:
-            has_ended = order.running.advance(at.steady)
+            has_ended = task.running.advance(at.steady)
         except Exception:
-            yield from self.call_off("internal error", at)
+            yield from self.cancel("internal error", at)
             raise
         if has_ended:
-            self._order = None
+            self._task = None
             yield from self.report(at)
-            yield from order.then(order.running.result[0], at)
+            yield from task.then(task.running.result[0], at)
 
-    def call_off(self, why: str, at: Moment) -> Actions:
-        """End the order under way where it is; its reply says why."""
-        order, self._order = self._order, None
-        if order is not None:
-            order.running.cancel()
-            yield from order.then(Reply(False, f"called off: {why}"), at)
+    def cancel(self, reason: str, at: Moment) -> Actions:
+        """Cancel the procedure under way; its result has the reason."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.running.cancel()
+            yield from task.then(ServiceResult(False, f"called off: {reason}"), at)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note who else is a device on these topics, and how many send commands."""
+        """Check for another device, and count the publishers of commands."""
         self._command_publishers = len(peers.publishers.get(COMMANDS, ()))
         others = [name for name in peers.publishers.get(STATUS, ()) if name != self._name]
         names = ", ".join(others)
-        self.others = (
+        self.conflict = (
             f"another device is there: {names} publishes {STATUS}; {CONFLICT_HINT}"
             if others
             else ""
         )
-        self._supervisor.see_others(self.others)
+        self._supervisor.report_conflicting_device(self.conflict)
         return self.report(at)
 
     def report(self, at: Moment) -> Actions:
-        """Return results, notices and a changed status; call it after each cycle."""
+        """Publish results and a changed status, log notices; call it after each cycle."""
         for event in self._supervisor.take_events():
             match event:
-                case StepResult(stamp_ns, outcome):
-                    yield Publish(RESULT, m.CommandResult(stamp_ns, outcome))
+                case m.CommandResult():
+                    yield Publish(RESULT, event)
                 case Notice():
                     text = self._notices.admit(event, at.steady)
                     if text:
                         yield Log("error" if event.fault else "warning", text)
         status = self._supervisor.status(at.steady, self._name, simulated=self.simulated)
-        if self._is_news(status, at.steady):
-            self._told, self._told_at = status, at.steady
+        if self._is_new(status, at.steady):
+            self._published, self._published_at = status, at.steady
             yield Publish(STATUS, status)
             yield Diagnose("device", status.diagnostic)
 
     def joint_states(self, at: Moment) -> Actions:
-        """Return the measured joints, unless they are stale."""
+        """Publish the measured joints, unless they are stale."""
         joints = self._supervisor.joints(at.steady)
         if joints is not None:
             axes = (joints.insertion, joints.rotation)
@@ -209,19 +203,14 @@ class DeviceRows:
             )
             yield Publish(JOINTS, message)
 
-    def _is_news(self, status: DeviceStatus, now: float) -> bool:
-        told = self._told
-        if told is None or now - self._told_at > _STATUS_PERIOD:
-            return told != status
-        return _SELDOM(told) != _SELDOM(status)
+    def _is_new(self, status: DeviceStatus, now: float) -> bool:
+        published = self._published
+        if published is None or now - self._published_at > _STATUS_PERIOD:
+            return published != status
+        return _OTHERS(published) != _OTHERS(status)
 
     def _on_command(self, message: m.Trajectory, at: Moment) -> Actions:
-        points = tuple(
-            CommandPoint(point.positions, point.others, point.time_from_start)
-            for point in message.points
-        )
-        command = Command(message.stamp_ns, message.joint_names, points)
-        self._supervisor.submit(command, at.steady, self._command_publishers)
+        self._supervisor.submit(message, at.steady, self._command_publishers)
         return self.report(at)
 
     def _on_hold(self, message: m.HoldState, at: Moment) -> Actions:
@@ -233,45 +222,29 @@ class DeviceRows:
         yield from self.advance(at)
         yield from self.report(at)
 
-    def _trigger(
+    def _service(
         self,
         name: str,
-        call: Callable[[Moment], Reply | Procedure[Reply]],
+        call: Callable[[bool, Moment], ServiceResult | Procedure[ServiceResult]],
         *,
-        always: bool = False,
+        switch: bool = False,
     ) -> Service:
-        def answer(_: bool | None, number: int, at: Moment) -> Actions:
-            return self._answer(number, at, lambda: call(at), always=always)
+        """Return a service; `switch` means that its request has a Boolean."""
 
-        return Service(f"device/{name}", answer)
+        def handle(on: bool | None, number: int, at: Moment) -> Actions:
+            def reply(result: ServiceResult, _: Moment) -> Actions:
+                yield Reply(number, result.success, result.message)
 
-    def _switch(self, name: str, call: Callable[[bool, Moment], Reply]) -> Service:
-        def answer(on: bool | None, number: int, at: Moment) -> Actions:
-            return self._answer(number, at, lambda: call(bool(on), at), always=not on)
+            not_ready = self._not_ready() or ("another order is under way" if self.is_busy else "")
+            # Stopping and switching off always work, and cancel a procedure.
+            if name == "stop" or (switch and not on):
+                yield from self.cancel("stopped on request", at)
+                not_ready = ""
+            result = ServiceResult(False, not_ready) if not_ready else call(bool(on), at)
+            if isinstance(result, ServiceResult):
+                yield from self.report(at)
+                yield from reply(result, at)
+            else:
+                yield from self.begin(result, reply, at)
 
-        return Service(f"device/{name}", answer, has_argument=True)
-
-    def _answer(
-        self,
-        number: int,
-        at: Moment,
-        call: Callable[[], Reply | Procedure[Reply]],
-        *,
-        always: bool,
-    ) -> Actions:
-        def answer(reply: Reply, _: Moment) -> Actions:
-            yield ServiceReply(number, reply.success, reply.message)
-
-        if always:
-            yield from self.call_off("stopped on request", at)
-        why_not = "" if always else self._refuse() or self._under_way
-        outcome = Reply(False, why_not) if why_not else call()
-        if isinstance(outcome, Reply):
-            yield from self.report(at)
-            yield from answer(outcome, at)
-        else:
-            yield from self.begin(outcome, answer, at)
-
-    @property
-    def _under_way(self) -> str:
-        return "another order is under way" if self.is_busy else ""
+        return Service(f"device/{name}", handle, has_argument=switch)

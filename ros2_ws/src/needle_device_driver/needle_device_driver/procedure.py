@@ -1,6 +1,6 @@
-"""Procedures: what takes several frames, as generators that say what they wait for.
+"""Procedures: tasks that take several frames, as generators that yield the next wait condition.
 
-A generator does not wait itself: whoever runs it does, and may do everything else meanwhile.
+A procedure does not block: the caller resumes it, and does other work meanwhile.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
 _ROUNDING = 1e-9
-"""Of sums of times [s]."""
+"""Bound on the rounding error of sums of times [s]."""
 
 
 @dataclass(frozen=True)
 class Wait:
-    """Condition on which a procedure goes on, and its time-out.
+    """Condition for which a procedure waits, with its time-out.
 
     Attributes
     ----------
     until : callable
-        It goes on as soon as this returns true.
+        The procedure resumes as soon as this returns true.
     seconds : float
-        It goes on after this time at the latest [s].
+        It resumes after this time at the latest [s].
     """
 
     until: Callable[[], bool]
@@ -31,7 +31,7 @@ class Wait:
 
 
 Procedure = Generator[Wait, float, T]
-"""Sent the steady time at which it goes on [s]."""
+"""It yields waits, and each `send` passes the steady time at which it resumes [s]."""
 
 
 def run(
@@ -39,21 +39,21 @@ def run(
     wait: Callable[[Callable[[], bool], float], Any],
     clock: Callable[[], float],
 ) -> T:
-    """Run a procedure to its end.
+    """Run a procedure to its end, and block meanwhile.
 
     Parameters
     ----------
     procedure : Procedure
-        What is run.
+        The procedure.
     wait : callable
-        Waits until what it is given returns true, at most so long [s].
+        Waits until its first argument returns true, at most for the second one [s].
     clock : callable
         Steady time [s].
 
     Returns
     -------
     object
-        What the procedure returns.
+        The result of the procedure.
     """
     running = Running(procedure)
     while not running.advance(clock()):
@@ -62,12 +62,12 @@ def run(
 
 
 def run_at_once(procedure: Procedure[T]) -> T:
-    """Run a procedure that waits for nothing, such as an ideal axis has.
+    """Run a procedure that waits for nothing, such as those of an ideal axis.
 
     Raises
     ------
     RuntimeError
-        If it does wait.
+        If it waits.
     """
     running = Running(procedure)
     if not running.advance(0.0):
@@ -76,13 +76,13 @@ def run_at_once(procedure: Procedure[T]) -> T:
 
 
 def side_by_side(*procedures: Procedure[Any]) -> Procedure[None]:
-    """Run procedures at the same time; where one raises, the others end where they are."""
+    """Run procedures at the same time; if one raises, the others are cancelled."""
     under_way = [Running(procedure) for procedure in procedures]
     now = yield Wait(lambda: True, 0.0)
     try:
         while under_way := [running for running in under_way if not running.advance(now)]:
             deadline = min(running.deadline for running in under_way)
-            # A hair later: then theirs is over, too.
+            # Slightly later than the deadline, so that it has passed in spite of rounding.
             seconds = deadline - now + 1.5 * _ROUNDING
             now = yield Wait(lambda: any(running.is_ready() for running in under_way), seconds)
     finally:
@@ -91,19 +91,19 @@ def side_by_side(*procedures: Procedure[Any]) -> Procedure[None]:
 
 
 class Running(Generic[T]):
-    """A procedure under way between events.
+    """A procedure under way.
 
     Parameters
     ----------
     procedure : Procedure
-        What is run.
+        The procedure.
 
     Attributes
     ----------
     result : list
-        What the procedure returned; empty until it has ended.
+        The result of the procedure; empty until it has ended.
     deadline : float
-        Steady time at which it goes on at the latest [s].
+        Steady time at which it resumes at the latest [s].
     """
 
     def __init__(self, procedure: Procedure[T]) -> None:
@@ -113,11 +113,11 @@ class Running(Generic[T]):
         self.deadline = 0.0
 
     def is_ready(self) -> bool:
-        """Tell whether what it waits for is there."""
+        """Return whether the procedure can resume."""
         return self._wait is None or self._wait.until()
 
     def advance(self, now: float) -> bool:
-        """Go on as far as possible at steady time `now` [s]; return whether it has ended."""
+        """Resume as far as possible at steady time `now` [s]; return whether it has ended."""
         while self.is_ready() or now >= self.deadline:
             first = self._wait is None
             try:
@@ -129,5 +129,5 @@ class Running(Generic[T]):
         return False
 
     def cancel(self) -> None:
-        """End it where it is; it sends nothing more."""
+        """Cancel the procedure."""
         self._procedure.close()

@@ -1,4 +1,4 @@
-"""The names of all safety rules: each refusal, abort and fault carries the one it comes from."""
+"""Names of the safety rules; each refusal, abort and fault carries one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import enum
 
 
 class Rule(enum.Enum):
-    """A safety rule; docs/safety.md has the bound and the reason of each."""
+    """A safety rule; docs/safety.md has its bound and reason."""
 
     HOLD_TO_RUN = "hold_to_run"
     HOLD_AGE = "hold_age"

@@ -1,4 +1,4 @@
-"""Procedures between events: they go on when what they wait for is there, or its time is over."""
+"""Procedures: conditions, time-outs, cancellation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from needle_device_driver.procedure import (
 
 
 class Script:
-    """A procedure of two waits, and how far it got."""
+    """A procedure of two waits that records its progress."""
 
     def __init__(self) -> None:
         self.is_there = False
@@ -34,7 +34,7 @@ class Script:
             self.steps.append("end")
 
 
-def test_it_goes_on_when_what_it_waits_for_is_there_or_its_time_is_over() -> None:
+def test_procedure_resumes_by_condition_or_time_out() -> None:
     script = Script()
     running = Running(script.procedure())
     assert script.steps == []
@@ -50,12 +50,12 @@ def test_it_goes_on_when_what_it_waits_for_is_there_or_its_time_is_over() -> Non
     script = Script()
     running = Running(script.procedure())
     running.advance(0.0)
-    # 25 periods of 0.02 s make no more than 0.5 s, however they are rounded
+    # 25 periods of 0.02 s are at most 0.5 s in spite of rounding
     running.advance(sum([0.02] * 25))
     assert script.steps == ["first", "second"]
 
 
-def test_one_that_is_cancelled_does_nothing_more() -> None:
+def test_cancelled_procedure_does_nothing_more() -> None:
     script = Script()
     running = Running(script.procedure())
     running.advance(0.0)
@@ -64,7 +64,7 @@ def test_one_that_is_cancelled_does_nothing_more() -> None:
     assert running.result == []
 
 
-def test_run_waits_for_it_and_run_at_once_refuses_to() -> None:
+def test_run_waits_and_run_at_once_refuses_to() -> None:
     waits: list[float] = []
 
     def wait(_: Callable[[], bool], seconds: float) -> None:
@@ -79,7 +79,7 @@ def test_run_waits_for_it_and_run_at_once_refuses_to() -> None:
 # ---- side by side ------------------------------------------------------------------------------
 
 
-def test_side_by_side_each_goes_on_by_itself() -> None:
+def test_side_by_side_procedures_are_independent() -> None:
     one, other = Script(), Script()
     running = Running(side_by_side(one.procedure(), other.procedure()))
     running.advance(0.0)
@@ -95,7 +95,7 @@ def test_side_by_side_each_goes_on_by_itself() -> None:
     assert one.steps == ["first", "second", "end"]
 
 
-def test_side_by_side_the_others_end_where_one_raises() -> None:
+def test_side_by_side_an_error_cancels_the_others() -> None:
     def refused() -> Procedure[None]:
         yield Wait(lambda: False, 0.1)
         raise ValueError("refused")
@@ -106,7 +106,7 @@ def test_side_by_side_the_others_end_where_one_raises() -> None:
     with pytest.raises(ValueError, match="refused"):
         running.advance(0.1)
     assert one.steps == ["first", "end"]
-    # So does a cancellation end all.
+    # A cancellation ends all.
     scripts = Script(), Script()
     running = Running(side_by_side(*(script.procedure() for script in scripts)))
     running.advance(0.0)

@@ -1,4 +1,4 @@
-"""docs/safety.md and the code name the same rules, and each rule has a test."""
+"""docs/safety.md and the code have the same rules, and each rule has a test."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ HERE = Path(__file__).resolve().parent
 TABLE = (HERE.parents[3] / "docs" / "safety.md").read_text("utf-8")
 
 
-def test_the_table_has_each_rule_once_and_each_rule_a_test_that_begins_with_its_name() -> None:
+def test_safety_table_lists_each_rule_and_each_rule_has_a_test() -> None:
     rules = sorted(rule.value for rule in Rule)
     assert sorted(re.findall(r"^\| `(\w+)` \|", TABLE, re.MULTILINE)) == rules
     tests = "".join(f.read_text("utf-8") for f in HERE.glob("supervised/rules/test_*_rules.py"))

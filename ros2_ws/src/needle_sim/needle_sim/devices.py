@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from needle_core import messages as m
 from needle_core.component import Actions, Input, Moment, Output, Peers, Publish, Service
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
-from needle_device_driver.device import EMERGENCY_STOP, DeviceRows
+from needle_device_driver.device import EMERGENCY_STOP, DeviceInterface
 from needle_device_driver.procedure import Procedure, run_at_once
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
@@ -144,8 +144,8 @@ class IdealDevice:
         self._axes = (SimulatedAxis("insertion"), SimulatedAxis("rotation"))
         self._supervisor = MotionSupervisor(*self._axes, limits)
         run_at_once(self._supervisor.configure(0.0))
-        self._rows = DeviceRows(
-            self._supervisor, name, simulated=True, refuse=lambda: self._failure
+        self._rows = DeviceInterface(
+            self._supervisor, name, simulated=True, not_ready=lambda: self._failure
         )
         self.inputs: Sequence[Input] = self._rows.inputs
         self.outputs: Sequence[Output] = self._rows.outputs

@@ -12,9 +12,9 @@ from functools import partial
 from pathlib import Path
 
 import needle_console
-from needle_console.access.access import Access
+from needle_console.access import Access
 from needle_console.hold.hold_server import HoldServer
-from needle_console.hold.hold_state import HoldState
+from needle_console.hold.page_session import PageHold
 
 BUTTON = (100.0, 50.0)
 """Middle of the page's button [px]."""
@@ -37,7 +37,7 @@ _PAGE = """<!doctype html>
 
 @contextlib.contextmanager
 def serving_button(
-    on_state: Callable[[HoldState], None], on_notice: Callable[[str], None]
+    on_state: Callable[[PageHold], None], on_notice: Callable[[str], None]
 ) -> Iterator[tuple[int, HoldServer]]:
     """Serve it; yields the page's port, and the hold's server.
 

@@ -156,11 +156,11 @@ def _run_components(options: ConsoleOptions, parameters: Parameters, end: Shutdo
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
     from needle_console.console import PAGE, Console  # noqa: PLC0415
     from needle_console.console_parameters import ConsoleParameters  # noqa: PLC0415
-    from needle_console.page.web_server import ServedDesk  # noqa: PLC0415
+    from needle_console.page.web_server import ServedPagePort  # noqa: PLC0415
     from needle_core.runners.paced import PacedRunner  # noqa: PLC0415
 
     settings = ConsoleParameters(address=LOOPBACK, port=options.port, hold_port=options.port + 1)
-    desk = ServedDesk(settings)
+    desk = ServedPagePort(settings)
     rig, ports = _make_rig(parameters)
     components = [*rig, Console(settings)]
     runner = PacedRunner(components, options.rig.seed, ports={PAGE: desk, **ports})
@@ -171,7 +171,7 @@ def _run_components(options: ConsoleOptions, parameters: Parameters, end: Shutdo
                 (name, ended), *_ = runner.exits.items()
                 print(f"error: {name} ended: {ended.text}", file=sys.stderr)
                 return EXIT_MISSED
-            desk.note_lag(runner.lag)
+            desk.set_lag(runner.lag)
     return EXIT_INTERRUPTED
 
 

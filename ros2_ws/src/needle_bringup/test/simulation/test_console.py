@@ -31,7 +31,7 @@ class PlayedDesk:
         self.settings = settings
         self.lag = 0.0
 
-    def note_lag(self, lag: float) -> None:
+    def set_lag(self, lag: float) -> None:
         self.lag = lag
 
 
@@ -61,7 +61,7 @@ def run(monkeypatch: pytest.MonkeyPatch, ends: Ends, port: int = 9000) -> int:
     monkeypatch.setattr(paced, "PacedRunner", PlayedRunner)
     monkeypatch.setattr(PlayedRunner, "ends", staticmethod(ends), raising=False)
     server = types.ModuleType("needle_console.page.web_server")
-    server.ServedDesk = PlayedDesk  # type: ignore[attr-defined]
+    server.ServedPagePort = PlayedDesk  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, server.__name__, server)
     with mock.patch.dict(os.environ):
         return console.main(["--level", "tip", "--port", str(port)])

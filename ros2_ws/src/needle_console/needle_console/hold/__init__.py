@@ -1,1 +1,1 @@
-"""Hold to run over a WebSocket of its own."""
+"""Hold to run over a WebSocket."""

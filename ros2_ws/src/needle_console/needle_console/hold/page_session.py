@@ -1,131 +1,201 @@
-"""One page's hold: which of its messages count, and until when."""
+"""Hold of one page: which of its messages count, and until when."""
 
 from __future__ import annotations
 
 import collections
+import dataclasses
+import enum
+import json
 import math
 
-from needle_console.hold.hold_state import RELEASED, HoldState, Mode
-from needle_console.hold.page_message import PageMessage
-from needle_console.hold.refusals import Refusal
+OWNER = "console"
+"""Source of the console's hold messages."""
 
-# Browsers on a busy machine stall for more than 0.1 s; a page's hold must end within 0.3 s.
+# The hold must end within 0.3 s. A shorter limit would end it on a busy machine, where browsers
+# stall for more than 0.1 s.
 ECHO_AGE_LIMIT = 0.25
-"""A message counts so long after the count that it echoes was sent: a press then is all that it
-proves [s]."""
+"""A message counts for this time after the count that it echoes was sent [s]."""
 
-# Counts that are remembered, five seconds of them: who echoes none for so long is far behind.
+# Number of counts that are remembered: five seconds.
 _MAX_SENT = 250
+
+_KEYS = {"count", "pressed", "speed", "mode"}
+
+
+class Mode(enum.Enum):
+    """Purpose of a press."""
+
+    INSERT = "insert"
+    RETRACT = "retract"
+
+
+@dataclasses.dataclass(frozen=True)
+class PageHold:
+    """State of a page's hold button.
+
+    Attributes
+    ----------
+    pressed : bool
+        Whether it is pressed.
+    speed : float
+        Share of the nominal speed, 0..1.
+    mode : Mode
+        Purpose of the press.
+    """
+
+    pressed: bool
+    speed: float
+    mode: Mode
+
+
+RELEASED = PageHold(False, 0.0, Mode.INSERT)
+
+
+class HoldRefusal(enum.Enum):
+    """Reasons why a connection or message does not count; the value is shown to the user."""
+
+    HOST = "foreign Host"
+    ORIGIN = "foreign Origin"
+    PATH = "unknown path"
+    INVALID = "message not understood"
+    ECHO = "no new echo of this connection"
+    STALE = "message too old"
+    NEW_PRESS = "press again"
+    BARRED = "page may not hold"
+    LOST = "hold lost"
+    SILENT = "silent page"
+
+
+def read_message(data: str | bytes) -> tuple[int, PageHold]:
+    """Read a page's message: the newest count that it received, and its button.
+
+    Raises
+    ------
+    ValueError
+        If anything differs from the protocol: keys, types, or a speed outside 0..1.
+    """
+    try:
+        fields = json.loads(data)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+    if not isinstance(fields, dict) or fields.keys() != _KEYS:
+        raise ValueError("other keys")
+    count, pressed, speed = fields["count"], fields["pressed"], fields["speed"]
+    if type(count) is not int or type(pressed) is not bool or type(speed) not in (int, float):
+        raise ValueError("other types")
+    if not 0.0 <= speed <= 1.0:
+        raise ValueError("speed outside 0..1")
+    return count, PageHold(pressed, float(speed), Mode(fields["mode"]))
 
 
 class PageSession:
-    """Judges what one connection of a page says. `now` is everywhere the steady clock [s].
+    """Checks the messages of one connection; `now` is the steady time [s] in every method.
 
-    A message that came late proves a press of long ago, however it was held up: by page, browser,
-    network or this server. So a hold ends `ECHO_AGE_LIMIT` after the newest count that a pressed
-    message has echoed was sent, and a burst after a stall does not prolong it.
+    A message may be delayed by page, browser, network or server, so it only proves that the button
+    was pressed when the count that it echoes was sent. A hold therefore ends `ECHO_AGE_LIMIT`
+    after the newest echoed count was sent, and a burst after a stall does not extend it.
 
     Parameters
     ----------
     now : float
-        When the page came.
+        Time of the connection.
 
     Attributes
     ----------
-    heard : int
-        The newest count that was echoed; 0 before.
-    heard_at : float
-        When the page was last heard, or came [s].
+    echoed : int
+        The newest echoed count; 0: none yet.
+    received_at : float
+        Time of the last message, or of the connection [s].
+    until : float
+        Time at which the hold ends unless a new message arrives [s]; minus infinity: no hold.
     """
 
     def __init__(self, now: float) -> None:
-        self.heard = 0
-        self.heard_at = now
-        # Counts that were sent on this connection, and when; from the last echoed one on.
+        self.echoed = 0
+        self.received_at = now
+        self.until = -math.inf
+        # Counts that were sent on this connection, with their times, from the last echoed one on.
         self._sent: collections.deque[tuple[int, float]] = collections.deque(maxlen=_MAX_SENT)
         self._armed = False
-        self._until = -math.inf
-        self._speed = 0.0
-        self._mode = Mode.INSERT
+        self._hold = RELEASED
 
-    @property
-    def until(self) -> float:
-        """Time at which the hold ends unless more comes [s]; minus infinity without one."""
-        return self._until
+    def state(self, now: float) -> PageHold:
+        """Return the hold of this page."""
+        return RELEASED if now > self.until else self._hold
 
-    def state(self, now: float) -> HoldState:
-        """Return what this page's hand says."""
-        if now > self._until:
-            return RELEASED
-        return HoldState(True, self._speed, self._mode)
-
-    def lapses(self, now: float) -> bool:
-        """Return True once when a hold has ended by itself; it takes a release and a new press."""
-        if self._until == -math.inf or now <= self._until:
+    def end_if_stale(self, now: float) -> bool:
+        """End a hold that has expired, and return whether it had; it needs a new press."""
+        if self.until == -math.inf or now <= self.until:
             return False
         self.end()
         return True
 
     def end(self) -> None:
-        """End the hold, if there is one; it takes a release and a new press."""
-        self._until = -math.inf
+        """End the hold; the next one needs a release and a new press."""
+        self.until = -math.inf
         self._armed = False
 
-    def send(self, count: int, now: float) -> None:
-        """Note that a count is sent; it is above all before, on whatever connection."""
+    def note_sent(self, count: int, now: float) -> None:
+        """Note that a count is sent; it is greater than all before, on any connection."""
         self._sent.append((count, now))
 
-    def receive(self, message: PageMessage, now: float, *, free: bool) -> Refusal | None:
-        """Take a message.
+    def receive(
+        self, count: int, hold: PageHold, now: float, *, may_hold: bool
+    ) -> HoldRefusal | None:
+        """Receive a message.
 
         Parameters
         ----------
-        message : PageMessage
-            What was received.
+        count : int
+            Count that it echoes.
+        hold : PageHold
+            State of its button.
         now : float
-            Its arrival.
-        free : bool
+            Time of its arrival [s].
+        may_hold : bool
             Whether this page may hold now.
 
         Returns
         -------
-        Refusal or None
-            Why it does not count. A release ends the hold all the same.
+        HoldRefusal or None
+            Why it does not count. A release ends the hold in any case.
         """
-        self.heard_at = now
-        sent, refusal = self._judge(message, now)
-        if not message.pressed:
+        self.received_at = now
+        sent, refusal = self._check_echo(count, hold, now)
+        if not hold.pressed:
             self.end()
-            # Only a release of now lets the next press count.
+            # Only a fresh release allows that the next press counts.
             self._armed = refusal is None
             return refusal
-        if refusal is None and not free:
-            refusal = Refusal.BARRED
+        if refusal is None and not may_hold:
+            refusal = HoldRefusal.BARRED
             self.end()
-        if now > self._until:
-            # A press that does not count when it comes does not count later either.
+        if now > self.until:
+            # A press that does not count on arrival does not count later either.
             armed, self._armed = self._armed, False
             if refusal is None and not armed:
-                refusal = Refusal.NEW_PRESS
-        elif refusal is None and message.mode is not self._mode:
-            refusal = Refusal.NEW_PRESS
+                refusal = HoldRefusal.NEW_PRESS
+        elif refusal is None and hold.mode is not self._hold.mode:
+            refusal = HoldRefusal.NEW_PRESS
             self.end()
         if refusal is None:
-            self._until = max(self._until, sent + ECHO_AGE_LIMIT)
-            self._speed, self._mode = message.speed, message.mode
+            self.until = max(self.until, sent + ECHO_AGE_LIMIT)
+            self._hold = hold
         return refusal
 
-    def _judge(self, message: PageMessage, now: float) -> tuple[float, Refusal | None]:
-        """Return when the count that a message echoes was sent, and why it does not count."""
-        # A release comes at once, without waiting for the next count: it may repeat the last echo.
-        least = self.heard + 1 if message.pressed else self.heard
-        if not self._sent or not least <= message.count <= self._sent[-1][0]:
-            return -math.inf, Refusal.ECHO
-        while self._sent[0][0] < message.count:
+    def _check_echo(
+        self, count: int, hold: PageHold, now: float
+    ) -> tuple[float, HoldRefusal | None]:
+        """Return when the echoed count was sent, and why it does not count."""
+        # A page sends a release at once, so it may repeat the last echo.
+        least = self.echoed + 1 if hold.pressed else self.echoed
+        if not self._sent or not least <= count <= self._sent[-1][0]:
+            return -math.inf, HoldRefusal.ECHO
+        while self._sent[0][0] < count:
             self._sent.popleft()
-        count, sent = self._sent[0]
-        if count != message.count:
-            # That one went to another connection.
-            return -math.inf, Refusal.ECHO
-        self.heard = count
-        return sent, Refusal.STALE if now - sent > ECHO_AGE_LIMIT else None
+        found, sent = self._sent[0]
+        if found != count:
+            # The count was sent on another connection.
+            return -math.inf, HoldRefusal.ECHO
+        self.echoed = count
+        return sent, HoldRefusal.STALE if now - sent > ECHO_AGE_LIMIT else None

@@ -1,25 +1,25 @@
-"""Drawing the needle out by a held button: hold and calls in their order."""
+"""Retraction of the needle by a held button: hold and service calls in their order."""
 
 from __future__ import annotations
 
 import dataclasses
 
-from needle_console.hold.hold_state import HoldState, Mode
+from needle_console.hold.page_session import Mode, PageHold
 
 STOP_STEERING = "plane_controller/stop"
 RETRACT = "device/retract"
 BEGINS_WITHIN = 1.0
-"""A retraction that is not under way so long after its call has ended, or was none [s]."""
+"""A retraction that is not under way after this time has ended, or was not needed [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Todo:
-    """Hold to publish and services to call now.
+class HoldOrder:
+    """Hold to publish, and services to call.
 
     Attributes
     ----------
     press : bool
-        What `device/hold` says.
+        Whether `device/hold` is pressed.
     calls : tuple of str
         Services to call.
     """
@@ -29,46 +29,45 @@ class Todo:
 
 
 class Retraction:
-    """Draws the needle out while a person holds.
+    """Retracts the needle while a person holds.
 
-    A controller that steers sends its next step as soon as somebody holds: a press that is meant to
-    draw the needle out would push it first. So the hold is not passed on before steering has ended.
-    The device takes `retract` only while a hold counts; each service is called once a press. When
-    the needle is out the hold ends with that: who goes on holding the button then holds nothing
-    that could push it in again.
+    A controller that steers sends its next step as soon as the hold counts, which would first push
+    the needle farther in. So the hold is not passed on before steering has ended. The device
+    accepts `retract` only while a hold counts. Each service is called once per press. After the
+    retraction the hold ends: a button that is still pressed must not insert the needle again.
     """
 
     def __init__(self) -> None:
         self._called: dict[str, float] = {}
         self._over = False
 
-    def update(self, state: HoldState, now: float, *, steering: bool, hold_counts: bool) -> Todo:
-        """Return what to do.
+    def update(self, hold: PageHold, now: float, *, steering: bool, hold_counts: bool) -> HoldOrder:
+        """Return the hold to publish and the services to call.
 
         Parameters
         ----------
-        state : HoldState
-            The person's hand.
+        hold : PageHold
+            State of the button.
         now : float
             Steady time [s].
         steering : bool
-            Whether a controller is there and steers.
+            Whether a controller steers.
         hold_counts : bool
-            Whether the device counts our hold and nothing moves.
+            Whether the console owns the device's hold and nothing moves.
         """
-        if not state.pressed or state.mode is not Mode.RETRACT:
+        if not hold.pressed or hold.mode is not Mode.RETRACT:
             self._called.clear()
             self._over = False
-            return Todo(state.pressed)
+            return HoldOrder(hold.pressed)
         if steering and RETRACT not in self._called:
-            return Todo(False, self._once(STOP_STEERING, now))
+            return HoldOrder(False, self._call_once(STOP_STEERING, now))
         if hold_counts and now - self._called.get(RETRACT, now) > BEGINS_WITHIN:
             self._over = True
         if self._over:
-            return Todo(False)
-        return Todo(True, self._once(RETRACT, now) if hold_counts else ())
+            return HoldOrder(False)
+        return HoldOrder(True, self._call_once(RETRACT, now) if hold_counts else ())
 
-    def _once(self, service: str, now: float) -> tuple[str, ...]:
+    def _call_once(self, service: str, now: float) -> tuple[str, ...]:
         if service in self._called:
             return ()
         self._called[service] = now

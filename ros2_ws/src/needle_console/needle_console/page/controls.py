@@ -7,17 +7,17 @@ from typing import Any
 
 from nicegui import events, ui
 
-from needle_console.hold.hold_state import OWNER
-from needle_console.page.desk import Desk
+from needle_console.hold.page_session import OWNER
+from needle_console.page.page_port import PagePort
 from needle_console.view.advice import Button, advise, usable_buttons
-from needle_console.view.snapshot import Snapshot, trouble_of
+from needle_console.view.snapshot import Snapshot, stop_reason
 from needle_console.view.targets import plane_pose, target_point
 from needle_core.errors import UserError
 
 _STEPS = (Button.CONFIRM, Button.HOME, Button.ENABLE, Button.START)
 _OTHERS = (Button.RESET, Button.SWITCH_OFF)
 _HOLDS = {Button.INSERT: "insert", Button.RETRACT: "retract"}
-_LET_GO = "() => window.needleHold && window.needleHold.release()"
+_RELEASE = "() => window.needleHold && window.needleHold.release()"
 _SET_SPEED = "(value) => window.needleHold && window.needleHold.setSpeed(value / 100)"
 
 
@@ -26,16 +26,16 @@ class Controls:
 
     Parameters
     ----------
-    desk : Desk
-        What they act on.
+    port : PagePort
+        The port to the component.
     """
 
     SPEED = 0.5
-    """Share of the nominal speed that a new page begins with."""
+    """Share of the nominal speed on a new page."""
 
-    def __init__(self, desk: Desk) -> None:
-        self._desk = desk
-        # Until its hold has a connection, a page may only watch.
+    def __init__(self, port: PagePort) -> None:
+        self._port = port
+        # A page may only watch until its hold is connected.
         self._bar = "no hold: not connected"
         self._buttons: dict[Button, Any] = {}
         with ui.element("section").classes("controls").props('aria-label="Controls"'):
@@ -45,7 +45,7 @@ class Controls:
             with ui.element("div").classes("pairs"):
                 for button in _STEPS:
                     self._add_button(button)
-            self._build_hold(desk)
+            self._build_hold(port)
             with ui.element("div").classes("pairs"):
                 for button in _OTHERS:
                     self._add_button(button)
@@ -54,26 +54,26 @@ class Controls:
         ui.on("hold_bar", self._on_bar)
 
     def show(self, snapshot: Snapshot) -> None:
-        """Show what to do next, and which buttons make sense."""
+        """Show the next step, and enable the buttons that have an effect."""
         advice = advise(snapshot, OWNER)
         self._headline.set_text(advice.headline)
         self._text.set_text(advice.text)
         self._answer.set_text(snapshot.answer)
         possible = usable_buttons(snapshot)
         device = snapshot.device
-        must_let_go = device is not None and device.press_again == OWNER
-        why = trouble_of(device) if device is not None and must_let_go else ""
+        must_release = device is not None and device.press_again == OWNER
+        why = stop_reason(device) if device is not None and must_release else ""
         self._not_counted.set_text(f"not counted by the device since: {why}" if why else "")
         for button, element in self._buttons.items():
             usable = button in possible and not self._bar
             if button not in _HOLDS:
                 element.set_enabled(usable)
-            # What is held must stay what it is until it is let go: no hold is ever disabled.
+            # A hold button that is pressed must not change: hold buttons are never disabled.
             _mark(element, "dim", not usable)
-            _mark(element, "again", must_let_go and button in _HOLDS)
+            _mark(element, "again", must_release and button in _HOLDS)
             _mark(element, "next", button is advice.button and usable)
 
-    def _build_hold(self, desk: Desk) -> None:
+    def _build_hold(self, port: PagePort) -> None:
         for button, mode in _HOLDS.items():
             hold = ui.element("button").props(f'type="button" data-hold="{mode}"')
             hold.classes(f"hold {mode}")
@@ -81,15 +81,15 @@ class Controls:
                 ui.label(button.value)
                 if button is Button.INSERT:
                     self._not_counted = ui.label().classes("not-counted")
-                    # hold.js' words, written by page.js.
+                    # page.js writes the status of the hold here.
                     ui.element("div").props('id="hold-words"')
             self._buttons[button] = hold
-        # Grey, and no more than its name: it is no emergency stop (docs/safety.md).
+        # Grey, with a plain label: it is no emergency stop (docs/safety.md).
         stop = ui.button(
-            Button.STOP.value, color="grey-7", on_click=lambda: desk.press(Button.STOP)
+            Button.STOP.value, color="grey-7", on_click=lambda: port.press(Button.STOP)
         )
         stop.props('id="stop" no-caps unelevated').classes("stop")
-        stop.on("click", js_handler=_LET_GO)
+        stop.on("click", js_handler=_RELEASE)
         with ui.element("div").classes("speed"):
             ui.label("Speed")
             slider = ui.slider(min=5, max=100, step=5, value=self.SPEED * 100)
@@ -103,14 +103,14 @@ class Controls:
             tilt = _number("Tilt [deg]", 0.0)
             self._add_target(
                 "Set plane",
-                lambda: self._desk.send_plane(plane_pose(_typed(offset), _typed(tilt))),
+                lambda: self._port.send_plane(plane_pose(_typed(offset), _typed(tilt))),
             )
         with ui.element("div").classes("targets point"):
             x, y = _number("Point x [mm]", 10.0), _number("y [mm]", -5.0)
             z = _number("z [mm]", 100.0)
             self._add_target(
                 "Set point",
-                lambda: self._desk.send_point(target_point(_typed(x), _typed(y), _typed(z))),
+                lambda: self._port.send_point(target_point(_typed(x), _typed(y), _typed(z))),
             )
 
     def _add_button(self, button: Button) -> None:
@@ -131,7 +131,7 @@ class Controls:
 
     def _press(self, button: Button) -> None:
         if not self._bar:
-            self._desk.press(button)
+            self._port.press(button)
 
     def _on_bar(self, event: events.GenericEventArguments) -> None:
         self._bar = str(event.args)
@@ -142,12 +142,12 @@ def _number(label: str, value: float) -> ui.number:
 
 
 def _typed(field: ui.number) -> float:
-    """Return what was typed; nothing is no number."""
+    """Return the number that was typed."""
     if field.value is None:
         raise UserError("a number is missing")
     return float(field.value)
 
 
-def _mark(element: Any, name: str, there: bool) -> None:
-    if there != (name in element.classes):
-        element.classes(add=name) if there else element.classes(remove=name)
+def _mark(element: Any, name: str, present: bool) -> None:
+    if present != (name in element.classes):
+        element.classes(add=name) if present else element.classes(remove=name)

@@ -1,4 +1,4 @@
-"""The needle in space, with plane, target and uncertainty."""
+"""3D view of the needle with plane, target and uncertainty."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from needle_console.view.chart import BLUE, GREY, ORANGE
+from needle_console.view.drawings import BLUE, GREY, ORANGE
 from needle_console.view.snapshot import Array, Snapshot
 from needle_console.view.space import (
     ellipsoid,
@@ -18,28 +18,28 @@ from needle_console.view.space import (
     to_view,
 )
 
-_LENGTH = 0.12  # of the plane that is drawn [m]
+_LENGTH = 0.12  # of the drawn plane [m]
 _HALF_WIDTH_MM, _MESH_MM = 20.0, 10.0
 _SHAFT_MM, _TARGET_MM = 0.6, 1.5
-# A smaller ellipsoid would not be seen.
-_LEAST_MM = 0.8
+# A smaller ellipsoid would be invisible.
+_MIN_RADIUS_MM = 0.8
 
 
 class NeedleScene:
-    """The 3D view; only what has changed is sent."""
+    """The 3D view; it sends only changes to the browser."""
 
     def __init__(self) -> None:
         self._pieces: list[tuple[tuple[float, ...], Any]] = []
         self._target: Any = None
         self._cloud: Any = None
-        self._told: dict[str, tuple[float, ...]] = {}
+        self._sent: dict[str, tuple[float, ...]] = {}
         with ui.element("figure").classes("tile space"):
             self._scene = ui.scene(grid=False, background_color="#b4bdc8", fps=10)
             self._scene.classes("drawing").props(
                 'role="img" aria-label="The needle in space with its target and uncertainty"'
             )
             with self._scene as scene:
-                # Where the needle enters, and which way: the axis of the insertion.
+                # Entry point and axis of the insertion.
                 scene.line([0.0, 0.0, 0.0], [_LENGTH * 1e3, 0.0, 0.0]).material(GREY)
                 scene.sphere(_SHAFT_MM * 1.5).material("#222222")
             self._scene.move_camera(
@@ -53,7 +53,7 @@ class NeedleScene:
         self._show_uncertainty(snapshot)
 
     def _show_target(self, snapshot: Snapshot) -> None:
-        """Show the point where there is one, else the plane: that is then no target."""
+        """Show the target point, or the target plane if there is none."""
         point = snapshot.controller.target_point_m if snapshot.controller is not None else None
         centre, rotation = plane_centre(snapshot, _LENGTH), plane_rotation(snapshot)
         wanted = [centre, rotation] if point is None else [to_view(np.array(point))]
@@ -71,8 +71,8 @@ class NeedleScene:
     def _show_shaft(self, points: Array) -> None:
         ends = [(*_floats(a), *_floats(b)) for a, b in pairwise(points)]
         same = 0
-        for (told, _), wanted in zip(self._pieces, ends, strict=False):
-            if told != wanted:
+        for (sent, _), wanted in zip(self._pieces, ends, strict=False):
+            if sent != wanted:
                 break
             same += 1
         for _, piece in self._pieces[same:]:
@@ -92,18 +92,18 @@ class NeedleScene:
                 with self._scene as scene:
                     self._cloud = scene.sphere(1.0).material(ORANGE, opacity=0.55)
             self._cloud.move(*_floats(centre)).rotate_R(rotation.tolist())
-            self._cloud.scale(*_floats(np.maximum(half, _LEAST_MM)))
+            self._cloud.scale(*_floats(np.maximum(half, _MIN_RADIUS_MM)))
 
     def _is_new(self, name: str, *arrays: Array) -> bool:
-        """Tell whether numbers differ, in hundredths, from what was last sent under a name."""
+        """Return whether values differ, rounded to 0.01, from those last sent under a name."""
         wanted = tuple(np.round(np.concatenate([a.ravel() for a in arrays]), 2).tolist())
-        is_new = self._told.get(name) != wanted
-        self._told[name] = wanted
+        is_new = self._sent.get(name) != wanted
+        self._sent[name] = wanted
         return is_new
 
 
 def _grid(scene: Any) -> Any:
-    """Draw a plane as lines: what is filled would hide what is behind it, however clear it is."""
+    """Draw a plane as lines: a filled one would hide what is behind it."""
     half, steps = 0.5 * _LENGTH * 1e3, int(_LENGTH * 1e3 / _MESH_MM)
     with scene.group() as grid:
         for x in np.linspace(-half, half, steps + 1):
@@ -117,7 +117,7 @@ def _grid(scene: Any) -> Any:
 
 
 def _piece(scene: Any, ends: Array) -> Any:
-    """Draw a straight piece: a cylinder, which lies along its own y."""
+    """Draw a straight piece of the shaft: a cylinder, whose axis is its own y."""
     along = ends[1] - ends[0]
     length = float(np.linalg.norm(along))
     y = along / length if length > 0.0 else np.array([0.0, 1.0, 0.0])

@@ -1,1 +1,1 @@
-"""The console's node: what it hears becomes a snapshot, what a person wants becomes messages."""
+"""Node of the console."""

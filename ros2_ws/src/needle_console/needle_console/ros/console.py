@@ -1,4 +1,4 @@
-"""The `console` executable: the component `Console` as a ROS node, and the servers of its page."""
+"""The `console` executable: `Console` as a ROS node, with the servers of its page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from needle_core.commands.cli import EXIT_BAD_INPUT
 from needle_core.ros.main import run_component
 
 HELP = """\
-console: serves a page that shows what the rig sees and believes, with a hold to steer it by.
+console: serves a page that shows the state of the rig and has a hold to steer the needle.
 
 Publishes   device/hold (always; pressed only while a person holds), target_plane, target_point
 Subscribes  device/status, needle/controller_status, joint_states, needle/tip_pose, needle/estimate,
@@ -26,15 +26,15 @@ def main() -> int:
     if importlib.util.find_spec("nicegui") is None:
         print("error: NiceGUI is not installed; scripts/console installs it", file=sys.stderr)
         return EXIT_BAD_INPUT
-    # What cannot be imported without NiceGUI is imported where it is there.
-    from needle_console.page.web_server import ServedDesk  # noqa: PLC0415
+    # This import needs NiceGUI.
+    from needle_console.page.web_server import ServedPagePort  # noqa: PLC0415
 
     return run_component(
         Console.name,
         ConsoleParameters,
         lambda settings, _: Console(settings),
         help_text=HELP,
-        ports=lambda settings: {PAGE: ServedDesk(settings)},
+        ports=lambda settings: {PAGE: ServedPagePort(settings)},
     )
 
 

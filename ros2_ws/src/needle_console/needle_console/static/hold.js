@@ -1,11 +1,10 @@
-// Hold to run over a WebSocket of its own: the server's count is echoed with the state of the
-// button, 50 times a second; a release is said at once. The server alone decides what counts
-// (docs/safety.md).
+// Hold to run over a WebSocket: 50 times a second, the page echoes the server's count with the state
+// of the button. It sends a release at once. The server alone decides what counts (docs/safety.md).
 //
-// Elements with data-hold="insert" or data-hold="retract" are the buttons; they may come and go.
+// The buttons are the elements with data-hold="insert" or data-hold="retract", also later ones.
 
 const RETRY = 1000; // [ms]
-const SILENCE = 500; // Without a word for so long the link is not called open [ms].
+const SILENCE = 500; // The connection counts as lost after this time without a message [ms].
 const UNCONNECTED = "no hold: not connected";
 const HIDDEN = "the page is hidden";
 const UNFOCUSED = "the window lost the focus";
@@ -20,13 +19,13 @@ class Hold {
   #socket = null;
   // The server's newest count, which each message echoes; 0: none on this connection.
   #count = 0;
-  // The press under way: { mode, button, pointer (null: the space bar), after (the newest count when
-  // it began: an echo above it has told of it), counted (whether it was a hold) }.
+  // The current press: { mode, button, pointer (null: the space bar), after (the newest count when
+  // it began: a later echo includes it), counted (whether it was a hold) }.
   #press = null;
-  // Why the last press ended by itself, until a new one begins; empty: it did not.
+  // Why the last press ended without a release, until a new one begins; empty: it did not.
   #ended = "";
-  #told = { held: false, bar: "", why: "" };
-  #heardAt = 0;
+  #state = { held: false, bar: "", why: "" };
+  #receivedAt = 0;
   #shown = "";
 
   constructor(port, speed) {
@@ -43,20 +42,20 @@ class Hold {
     if (typeof speed === "number" && speed >= 0 && speed <= 1) this.#speed = speed;
   }
 
-  // `why` is given where the hand did not let go itself.
+  // `why` is the reason if the person did not release the button.
   release(why = "") {
     if (!this.#press) return;
-    this.#drop(why);
+    this.#endPress(why);
     this.#send();
     this.#show();
   }
 
   get status() {
-    const open = this.#count > 0 && performance.now() - this.#heardAt < SILENCE;
+    const open = this.#count > 0 && performance.now() - this.#receivedAt < SILENCE;
     return {
-      // Why this page may only watch, and stop; empty: it may hold.
-      bar: open ? this.#told.bar : UNCONNECTED,
-      held: open && this.#told.held && this.#press !== null,
+      // Why this page may only watch and stop; empty: it may hold.
+      bar: open ? this.#state.bar : UNCONNECTED,
+      held: open && this.#state.held && this.#press !== null,
       mode: this.#press ? this.#press.mode : "insert",
       why: open ? this.#ended : "",
     };
@@ -67,26 +66,26 @@ class Hold {
   #connect() {
     const socket = new WebSocket(this.#address);
     this.#socket = socket;
-    socket.onmessage = (event) => this.#hear(JSON.parse(event.data));
+    socket.onmessage = (event) => this.#receive(JSON.parse(event.data));
     socket.onclose = () => {
-      this.#drop("connection to the console lost");
+      this.#endPress("connection to the console lost");
       this.#count = 0;
       this.#show();
       setTimeout(() => this.#connect(), RETRY);
     };
   }
 
-  #hear(told) {
-    this.#count = told.count;
-    this.#told = told;
-    this.#heardAt = performance.now();
-    if (this.#press && told.heard > this.#press.after) {
-      // Once lost, a press is over, whatever the finger does.
-      if (told.held) this.#press.counted = true;
-      else this.#drop(told.why || "press again");
+  #receive(state) {
+    this.#count = state.count;
+    this.#state = state;
+    this.#receivedAt = performance.now();
+    if (this.#press && state.heard > this.#press.after) {
+      // A lost press is over, even if the button is still pressed.
+      if (state.held) this.#press.counted = true;
+      else this.#endPress(state.why || "press again");
     }
-    const gone = this.#press && this.#whyGone();
-    if (gone) this.#drop(gone);
+    const interruption = this.#press && this.#interruption();
+    if (interruption) this.#endPress(interruption);
     this.#send();
     this.#show();
   }
@@ -103,8 +102,8 @@ class Hold {
     );
   }
 
-  // What should have come as an event, and may not have: a button that is taken away says nothing.
-  #whyGone() {
+  // Return why the press must end although no event reported it, as for a removed button.
+  #interruption() {
     const { button } = this.#press;
     if (!button.isConnected || buttonOf(button) !== button) return "its button was switched off";
     if (document.visibilityState !== "visible") return HIDDEN;
@@ -113,20 +112,20 @@ class Hold {
 
   #begin(button, pointer) {
     this.#ended = "";
-    // The next count is answered with it: an echo must be above the last one to count.
+    // The echo of the next count reports the press.
     const after = this.#count;
     this.#press = { mode: button.dataset.hold, button, pointer, after, counted: false };
     this.#show();
   }
 
-  // End the press; `why` is empty where the hand let go.
-  #drop(why) {
+  // End the press; `why` is empty after a release.
+  #endPress(why) {
     if (!this.#press) return;
     this.#ended = why && `${this.#press.counted ? "hold ended" : "no hold"}: ${why}`;
     this.#press = null;
   }
 
-  // ---- the hand --------------------------------------------------------------------------------
+  // ---- input -----------------------------------------------------------------------------------
 
   #listen() {
     const style = document.createElement("style");
@@ -150,18 +149,18 @@ class Hold {
     on(window, "pagehide", hide);
     on(document, "visibilitychange", hide);
     on(document, "freeze", hide);
-    // A long touch is a hold, no request for a menu. And Chromium keeps messages of sockets back for
-    // 100 ms after a touch that it may still have to scroll by: the hold would be lost each time.
+    // A long touch must not open a menu. And after a touch that may become a scroll, Chromium delays
+    // socket messages by 100 ms, which would end the hold.
     for (const type of ["touchstart", "contextmenu", "dragstart"]) {
-      const mine = (event) => {
+      const prevent = (event) => {
         if (buttonOf(event.target)) event.preventDefault();
       };
-      window.addEventListener(type, mine, { capture: true, passive: false });
+      window.addEventListener(type, prevent, { capture: true, passive: false });
     }
   }
 
   #pointerDown(event) {
-    // A second finger, wherever it is, ends the hold.
+    // A second finger anywhere ends the hold.
     if (this.#press) {
       this.release(OTHER_POINTER);
       return;
@@ -173,7 +172,7 @@ class Hold {
   }
 
   #pointerMoved(event) {
-    // A second button of a mouse comes as a movement.
+    // A second mouse button is reported as a movement.
     if (this.#press && event.pointerId === this.#press.pointer && event.buttons !== 1) {
       this.release(event.buttons ? OTHER_POINTER : "");
     }
@@ -200,7 +199,7 @@ class Hold {
     if (this.#press && this.#press.pointer === null) this.release();
   }
 
-  // ---- what is shown ---------------------------------------------------------------------------
+  // ---- display ---------------------------------------------------------------------------------
 
   #show() {
     const status = this.status;
@@ -217,13 +216,13 @@ class Hold {
   }
 }
 
-// Return the button that an element belongs to; null: none, or one that is switched off.
+// Return the hold button that contains an element; null: none, or a disabled one.
 function buttonOf(element) {
   const button = element instanceof Element ? element.closest("[data-hold]") : null;
   return button && !button.matches(":disabled, [aria-disabled=true], .disabled") ? button : null;
 }
 
-// Return the button that the space bar holds: the focused one, or without any focus `insert`.
+// Return the button for the space bar: the focused one, or `insert` without a focus.
 function focused() {
   const element = document.activeElement;
   if (!element || element === document.body || element === document.documentElement) {
@@ -232,7 +231,7 @@ function focused() {
   return buttonOf(element);
 }
 
-// Connect to the hold's server, and make the page's hold buttons work.
+// Connect to the hold's server and activate the page's hold buttons.
 export function startHold({ port, speed }) {
   return new Hold(port, speed);
 }

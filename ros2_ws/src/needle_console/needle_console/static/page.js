@@ -1,4 +1,4 @@
-// The page's own part: the hold's words, the camera views, Escape for Stop.
+// Browser part of the page: status of the hold, camera views, Escape for Stop.
 import { startHold } from "./hold.js";
 
 const VIEW_PERIOD = 100; // ms between two images of a view
@@ -13,46 +13,46 @@ export function startPage(options) {
   loop();
 }
 
-let toldBar = null;
+let sentBar = null;
 
 function showHold(status) {
   const words = document.getElementById("hold-words");
-  if (words) words.textContent = holdWords(status);
-  // NiceGUI takes no event before it has drawn the page: its elements are there then.
-  if (words && status.bar !== toldBar) {
-    toldBar = status.bar;
+  if (words) words.textContent = holdText(status);
+  // NiceGUI handles events only after it has drawn the page, when its elements exist.
+  if (words && status.bar !== sentBar) {
+    sentBar = status.bar;
     window.emitEvent("hold_bar", status.bar);
   }
 }
 
-function holdWords(status) {
+function holdText(status) {
   if (status.why) return status.why;
   if (status.bar) return status.bar;
   if (status.held) return "held: let go to stop";
   return "pointer, touch or space bar";
 }
 
-// A view asks for its next image when the last has come: a slow link gets fewer of them.
+// A view requests its next image after the last one has arrived, so a slow link gets fewer.
 function loop() {
   for (const view of document.querySelectorAll("img[data-view]")) {
     if (view.dataset.started) continue;
     view.dataset.started = "true";
     let number = 0;
-    const ask = () => {
-      if (document.visibilityState !== "visible") return setTimeout(ask, RETRY_PERIOD);
+    const request = () => {
+      if (document.visibilityState !== "visible") return setTimeout(request, RETRY_PERIOD);
       view.src = `/view/${view.dataset.view}.jpg?n=${number++}`;
     };
     view.addEventListener("load", () => {
       view.parentElement.dataset.image = "there";
-      setTimeout(ask, VIEW_PERIOD);
+      setTimeout(request, VIEW_PERIOD);
     });
     view.addEventListener("error", () => {
       view.parentElement.dataset.image = "missing";
-      setTimeout(ask, RETRY_PERIOD);
+      setTimeout(request, RETRY_PERIOD);
     });
-    ask();
+    request();
   }
-  // NiceGUI draws the page after this script has begun, and once more after a reconnection.
+  // NiceGUI draws the page after the start of this script, and again after a reconnection.
   showHold(window.needleHold.status);
   setTimeout(loop, RETRY_PERIOD);
 }

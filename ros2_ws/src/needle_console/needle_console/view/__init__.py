@@ -1,1 +1,1 @@
-"""Drawings and texts made from snapshots of plain data."""
+"""Drawings and texts from snapshots of the rig."""

@@ -1,4 +1,4 @@
-"""Advice on what to do next, and which buttons make sense."""
+"""Advice on the next step, and the buttons that have an effect."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import dataclasses
 import enum
 import math
 
-from needle_console.view.snapshot import Snapshot, trouble_of
+from needle_console.view.snapshot import Snapshot, stop_reason
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
-# As near to the home position the needle counts as out [m].
+# The needle is out if the insertion is smaller [m].
 _OUT = 1e-4
 STEERING = ("STEERING", "WAITING_FOR_TIP")
-"""States of a controller that steers."""
+"""States in which the controller steers."""
 
 
 class Button(enum.Enum):
@@ -31,16 +31,16 @@ class Button(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Advice:
-    """One sentence for the person, and the button that it is about.
+    """Advice to the person at the page.
 
     Attributes
     ----------
     headline : str
-        What is the case.
+        The situation.
     text : str
-        What to do next.
+        The next step.
     button : Button or None
-        The one to press; None: none, or it is no button's matter.
+        Button of the next step; None: it needs none.
     """
 
     headline: str
@@ -48,42 +48,47 @@ class Advice:
     button: Button | None = None
 
 
-def advise(snapshot: Snapshot, name: str) -> Advice:
-    """Return what to do next.
+def advise(snapshot: Snapshot, name: str) -> Advice:  # noqa: PLR0911 - each return is an advice
+    """Return the advice for a state of the rig.
 
     Parameters
     ----------
     snapshot : Snapshot
-        The rig.
+        State of the rig.
     name : str
-        Whose hold the console's is.
+        Source of the console's hold.
     """
-    device = snapshot.device
+    device, controller = snapshot.device, snapshot.controller
     if device is None:
         return Advice("No device", "Start device_driver, or sim_rig for a simulated needle.")
-    if device.state == "MOVING":
-        return _moving(device)
-    if device.state in ("DISABLED", "HOLDING") and math.isnan(snapshot.insertion):
-        what = "Its joints are not heard: nodes are starting, or gone."
-        return Advice("Waiting for the rig", what)
-    steers = snapshot.controller is not None and snapshot.controller.state in STEERING
-    if device.state == "HOLDING" and steers and device.press_again == name:
-        return Advice("The press does not count", "Let go, then press and hold again.")
-    ways = {
-        "UNCONFIGURED": _unconfigured,
-        "ESTOPPED": _estopped,
-        "FAULT": _fault,
-        "DISABLED": _disabled,
-        "HOLDING": _holding,
-    }
-    way = ways.get(device.state)
-    if way is None:
-        return Advice(f"Device: {device.state}", "This state is not known here.")
-    return way(snapshot, device)
+    match device.state:
+        case "UNCONFIGURED":
+            text = stop_reason(device) or "Configure device_driver."
+            return Advice("The drives are not set up", text)
+        case "ESTOPPED":
+            text = "Find out why. Release the emergency stop and every hold, then press Reset."
+            return Advice("Emergency stop", text, Button.RESET)
+        case "FAULT":
+            text = "Put right what it says, let go of every hold, then press Reset."
+            headline = f"Fault: {stop_reason(device) or 'no reason given'}"
+            return Advice(headline, text, Button.RESET)
+        case "MOVING":
+            return _moving(device)
+        case "DISABLED" | "HOLDING" if math.isnan(snapshot.insertion):
+            text = "Its joints are not heard: nodes are starting, or gone."
+            return Advice("Waiting for the rig", text)
+        case "DISABLED":
+            return _disabled(device)
+        case "HOLDING":
+            steers = controller is not None and controller.state in STEERING
+            if steers and device.press_again == name:
+                return Advice("The press does not count", "Let go, then press and hold again.")
+            return _holding(snapshot, device)
+    return Advice(f"Device: {device.state}", "This state is not known here.")
 
 
 def usable_buttons(snapshot: Snapshot) -> frozenset[Button]:
-    """Return the buttons that have an effect in the present state; *Stop* always has."""
+    """Return the buttons that have an effect; *Stop* always has one."""
     device, controller = snapshot.device, snapshot.controller
     if device is None:
         return frozenset()
@@ -106,26 +111,6 @@ def usable_buttons(snapshot: Snapshot) -> frozenset[Button]:
     return frozenset(found)
 
 
-def _unconfigured(_: Snapshot, device: DeviceStatus) -> Advice:
-    return Advice("The drives are not set up", trouble_of(device) or "Configure device_driver.")
-
-
-def _estopped(_: Snapshot, device: DeviceStatus) -> Advice:
-    return Advice(
-        "Emergency stop",
-        "Find out why. Release the emergency stop and every hold, then press Reset.",
-        Button.RESET,
-    )
-
-
-def _fault(_: Snapshot, device: DeviceStatus) -> Advice:
-    return Advice(
-        f"Fault: {trouble_of(device) or 'no reason given'}",
-        "Put right what it says, let go of every hold, then press Reset.",
-        Button.RESET,
-    )
-
-
 def _moving(device: DeviceStatus) -> Advice:
     if device.activity == "homing":
         return Advice("Homing", "The axes look for their switches. Keep clear; Stop ends it.")
@@ -133,7 +118,7 @@ def _moving(device: DeviceStatus) -> Advice:
     return Advice(f"The needle {what}", "Let go to stop it.")
 
 
-def _disabled(_: Snapshot, device: DeviceStatus) -> Advice:
+def _disabled(device: DeviceStatus) -> Advice:
     if device.homed:
         return Advice("Ready, switched off", "Switching on moves nothing.", Button.ENABLE)
     if not device.needle_out_confirmed:
@@ -157,7 +142,7 @@ def _holding(snapshot: Snapshot, device: DeviceStatus) -> Advice:
     if controller is None:
         return Advice("No controller", "Start plane_controller.")
     if controller.state in STEERING:
-        return _steering(snapshot, controller, device)
+        return _steering(controller, device)
     return _not_steering(controller, is_in=snapshot.insertion > _OUT)
 
 
@@ -178,7 +163,7 @@ def _not_steering(controller: ControllerStatus, *, is_in: bool) -> Advice:
     return Advice("Ready to steer", "Starting moves nothing yet.", Button.START)
 
 
-def _steering(snapshot: Snapshot, controller: ControllerStatus, device: DeviceStatus) -> Advice:
+def _steering(controller: ControllerStatus, device: DeviceStatus) -> Advice:
     if controller.state == "WAITING_FOR_TIP":
         return Advice(
             f"The tip is not seen: {controller.reason or 'no reason given'}",

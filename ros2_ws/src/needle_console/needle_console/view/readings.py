@@ -1,4 +1,4 @@
-"""Figures of a snapshot as a person reads them: mm and degrees."""
+"""Readings of a snapshot as text, in mm and degrees."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ _MM = 1e3
 
 
 def readings(snapshot: Snapshot) -> dict[str, str]:
-    """Return what is shown as text, by its label, always with the same labels.
+    """Return the texts by label; the labels are always the same.
 
     Parameters
     ----------
     snapshot : Snapshot
-        The rig.
+        State of the rig.
     """
     return {
         "Depth": _depth(snapshot),
@@ -29,7 +29,7 @@ def readings(snapshot: Snapshot) -> dict[str, str]:
 
 
 def mm(value: float, digits: int = 2) -> str:
-    """Return a length in [m] as mm, with a true minus sign; a dash for NaN."""
+    """Return a length [m] as text in mm, with a true minus sign; a dash for NaN."""
     if math.isnan(value):
         return NONE
     return f"{value * _MM:.{digits}f} mm".replace("-", "\N{MINUS SIGN}")
@@ -44,9 +44,9 @@ def _depth(snapshot: Snapshot) -> str:
 
 
 def _off_plane(snapshot: Snapshot) -> str:
-    if not snapshot.course:
+    if not snapshot.track:
         return NONE
-    last, controller = snapshot.course[-1], snapshot.controller
+    last, controller = snapshot.track[-1], snapshot.controller
     text = mm(last.r1)
     if controller is None or controller.r1_low_m is None or controller.r1_high_m is None:
         return text

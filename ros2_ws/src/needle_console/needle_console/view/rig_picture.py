@@ -1,4 +1,4 @@
-"""Collects what is heard of the rig and hands out snapshots."""
+"""Collects messages of the rig, and returns snapshots of its state."""
 
 from __future__ import annotations
 
@@ -7,83 +7,83 @@ import math
 
 import numpy as np
 
-from needle_console.view.snapshot import Array, CoursePoint, SeenTip, Snapshot, trouble_of
+from needle_console.view.snapshot import Array, MeasuredTip, Snapshot, TrackPoint, stop_reason
 from needle_core.diagnostics import sanitize
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
-# Estimates that are closer together are drawn as one [m].
+# Estimates that are closer together are merged [m].
 SPACING = 2.5e-4
-MOST_POINTS = 1000
-JOINTS_COUNT_FOR = 1.0
-# Health is told once a second; who is silent for longer has nothing to say any more [s].
-_TROUBLE_COUNTS_FOR = 3.0
-_MOST_TROUBLES = 6
+MAX_POINTS = 1000
+JOINTS_TIMEOUT = 1.0
+# Nodes report their health once a second; an older warning is outdated [s].
+_WARNING_TIMEOUT = 3.0
+_MAX_WARNINGS = 6
 _SAME_OFFSET = 1e-6
 
 
 class RigPicture:
-    """The rig as heard up to now.
+    """State of the rig from its messages.
 
-    All times are readings of one steady clock [s].
+    All times are steady [s].
     """
 
     def __init__(self) -> None:
-        self._told = Snapshot()
+        self._latest = Snapshot()
         self._joints_at = -math.inf
         self._tip_at = -math.inf
         self._lost_since: float | None = None
-        self._heard_plane: Array | None = None
-        self._course: list[CoursePoint] = []
-        self._troubles: dict[str, tuple[str, float]] = {}
+        self._sent_plane: Array | None = None
+        self._track: list[TrackPoint] = []
+        self._warnings: dict[str, tuple[str, float]] = {}
 
     def snapshot(self, now: float) -> Snapshot:
-        """Return the rig as it is known at `now`."""
-        told = self._told
-        joints_count = now - self._joints_at <= JOINTS_COUNT_FOR
-        fresh = [text for text, at in self._troubles.values() if now - at <= _TROUBLE_COUNTS_FOR]
+        """Return the state of the rig at `now`."""
+        latest = self._latest
+        joints_count = now - self._joints_at <= JOINTS_TIMEOUT
+        fresh = [text for text, at in self._warnings.values() if now - at <= _WARNING_TIMEOUT]
         return dataclasses.replace(
-            told,
-            insertion=told.insertion if joints_count else math.nan,
-            rotation=told.rotation if joints_count else math.nan,
-            tip=told.tip and dataclasses.replace(told.tip, age=now - self._tip_at),
+            latest,
+            insertion=latest.insertion if joints_count else math.nan,
+            rotation=latest.rotation if joints_count else math.nan,
+            tip=latest.tip and dataclasses.replace(latest.tip, age=now - self._tip_at),
             tip_lost_for=0.0 if self._lost_since is None else now - self._lost_since,
-            course=tuple(self._course),
-            troubles=tuple(fresh[:_MOST_TROUBLES]),
+            track=tuple(self._track),
+            warnings=tuple(fresh[:_MAX_WARNINGS]),
         )
 
-    def states(self) -> Snapshot:
-        """Return what device and controller last said; all else may be old."""
-        return self._told
+    def latest(self) -> Snapshot:
+        """Return the last status of device and controller; all other fields may be outdated."""
+        return self._latest
 
-    def see_device(self, state: DeviceStatus) -> None:
-        """Take what the device says."""
-        before = self._told.device
+    def set_device(self, state: DeviceStatus) -> None:
+        """Set the status of the device."""
+        before = self._latest.device
         if before is not None and "(hold_new_press)" in state.reason:
-            # Only says that the press goes on; the status before said why it no longer counts.
-            state = dataclasses.replace(state, reason=trouble_of(before) or state.reason)
-        self._tell(device=state)
+            # The press continues; the status before has the reason why it no longer counts.
+            state = dataclasses.replace(state, reason=stop_reason(before) or state.reason)
+        self._update(device=state)
 
-    def see_controller(self, state: ControllerStatus) -> None:
-        """Take what the controller says; a new start begins a new course."""
-        before = self._told.controller
+    def set_controller(self, state: ControllerStatus) -> None:
+        """Set the status of the controller; a new start begins a new track."""
+        before = self._latest.controller
         if before is not None and state.starts != before.starts:
-            self._course.clear()
-        self._told = dataclasses.replace(
-            self._told, controller=state, T_rig_plane=self._plane(state.target_offset_m)
+            self._track.clear()
+        self._latest = dataclasses.replace(
+            self._latest, controller=state, T_rig_plane=self._plane(state.target_offset_m)
         )
 
-    def lose_controller(self) -> None:
-        """Take that there is no controller any more: what it said last holds no longer."""
-        self._tell(controller=None)
+    def clear_controller(self) -> None:
+        """Discard the status of a controller that is gone."""
+        self._update(controller=None)
 
-    def see_joints(self, insertion: float, rotation: float, now: float) -> None:
-        """Take the joints [m], [rad]; numbers that are none are left out."""
+    def set_joints(self, insertion: float, rotation: float, now: float) -> None:
+        """Set the joints [m], [rad]; values that are not finite are ignored."""
         if math.isfinite(insertion) and math.isfinite(rotation):
             self._joints_at = now
-            self._tell(insertion=insertion, rotation=rotation)
+            self._update(insertion=insertion, rotation=rotation)
 
-    def see_tip(self, position: Array, covariance: Array, now: float) -> None:
-        """Take an answer of the cameras; an infinite covariance says that no tip was found.
+    def set_tip(self, position: Array, covariance: Array, now: float) -> None:
+        """Set the measured tip; an infinite covariance means that no tip was found.
 
         Parameters
         ----------
@@ -92,17 +92,17 @@ class RigPicture:
         covariance : ndarray, shape (3, 3)
             Of the position [m^2].
         now : float
-            When it came.
+            Time of its arrival.
         """
         if np.isfinite(position).all() and np.isfinite(covariance).all():
             self._tip_at = now
             self._lost_since = None
-            self._tell(tip=SeenTip(position, covariance, 0.0))
+            self._update(tip=MeasuredTip(position, covariance, 0.0))
         elif self._lost_since is None:
             self._lost_since = now
 
-    def see_estimate(self, position: Array, covariance: Array) -> None:
-        """Take an estimate of the tip in the frame of the target plane.
+    def add_estimate(self, position: Array, covariance: Array) -> None:
+        """Add an estimate of the tip in the frame of the target plane.
 
         Parameters
         ----------
@@ -113,55 +113,55 @@ class RigPicture:
         """
         if not (np.isfinite(position).all() and np.isfinite(covariance).all()):
             return
-        depth = self._told.insertion
+        depth = self._latest.insertion
         if not math.isfinite(depth):
             return
-        rotation, origin = self._told.T_rig_plane[:3, :3], self._told.T_rig_plane[:3, 3]
-        point = CoursePoint(
+        rotation, origin = self._latest.T_rig_plane[:3, :3], self._latest.T_rig_plane[:3, 3]
+        point = TrackPoint(
             depth=depth,
             r1=float(position[0]),
             sigma=math.sqrt(max(float(covariance[0, 0]), 0.0)),
             position=rotation @ position + origin,
             covariance=rotation @ covariance @ rotation.T,
         )
-        # Of estimates at one place, and where the needle was drawn back, the last counts.
-        while self._course and self._course[-1].depth > depth - SPACING:
-            self._course.pop()
-        self._course.append(point)
-        del self._course[:-MOST_POINTS]
+        # Replace estimates at the same depth, and deeper ones after a retraction.
+        while self._track and self._track[-1].depth > depth - SPACING:
+            self._track.pop()
+        self._track.append(point)
+        del self._track[:-MAX_POINTS]
 
-    def see_plane(self, T_rig_plane: Array) -> None:  # noqa: N803
-        """Take the pose that somebody sent as `target_plane`, shape (4, 4)."""
+    def set_plane(self, T_rig_plane: Array) -> None:  # noqa: N803
+        """Set the pose of a `target_plane` message, shape (4, 4)."""
         if not np.isfinite(T_rig_plane).all():
             return
-        self._heard_plane = T_rig_plane
-        state = self._told.controller
+        self._sent_plane = T_rig_plane
+        state = self._latest.controller
         if state is not None:
             plane = self._plane(state.target_offset_m)
-            self._told = dataclasses.replace(self._told, T_rig_plane=plane)
+            self._latest = dataclasses.replace(self._latest, T_rig_plane=plane)
 
-    def see_health(self, name: str, *, bad: bool, message: str, now: float) -> None:
-        """Take one line of /diagnostics: `node: part`, whether it warns, and what it says."""
-        self._troubles.pop(name, None)
+    def set_health(self, name: str, *, bad: bool, message: str, now: float) -> None:
+        """Set one status of /diagnostics: `node: part`, whether it is a warning, and its text."""
+        self._warnings.pop(name, None)
         if bad:
-            self._troubles[name] = (f"{sanitize(name)}: {sanitize(message, 160)}", now)
-        while len(self._troubles) > MOST_POINTS:
-            del self._troubles[next(iter(self._troubles))]
+            self._warnings[name] = (f"{sanitize(name)}: {sanitize(message, 160)}", now)
+        while len(self._warnings) > MAX_POINTS:
+            del self._warnings[next(iter(self._warnings))]
 
-    def see_answer(self, text: str) -> None:
-        """Take what a service call was answered."""
-        self._tell(answer=sanitize(text, 200))
+    def set_answer(self, text: str) -> None:
+        """Set the answer of the last service call."""
+        self._update(answer=sanitize(text, 200))
 
-    def _tell(self, **news: object) -> None:
-        self._told = dataclasses.replace(self._told, **news)  # type: ignore[arg-type]
+    def _update(self, **changes: object) -> None:
+        self._latest = dataclasses.replace(self._latest, **changes)  # type: ignore[arg-type]
 
     def _plane(self, offset: float | None) -> Array:
-        """Return the plane in force: what was sent if the controller took it, else the default."""
-        heard = self._heard_plane
-        if heard is not None and (
-            offset is None or abs(float(heard[:3, 0] @ heard[:3, 3]) - offset) < _SAME_OFFSET
+        """Return the current plane: the sent one if the controller accepted it, or the default."""
+        sent = self._sent_plane
+        if sent is not None and (
+            offset is None or abs(float(sent[:3, 0] @ sent[:3, 3]) - offset) < _SAME_OFFSET
         ):
-            return heard
+            return sent
         plane = np.eye(4)
         plane[0, 3] = 0.0 if offset is None else offset
         return plane

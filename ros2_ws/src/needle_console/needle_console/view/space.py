@@ -1,4 +1,4 @@
-"""Places and shapes of the 3D view: mm, its z up, its x along the insertion."""
+"""Positions and shapes in the 3D view: in mm, z up, x along the insertion."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from needle_console.view.snapshot import Array, Snapshot
 
-# Takes directions of `rig` (x up, z inwards) to those of the view; a rotation.
+# Rotation from `rig` (x up, z inwards) to the view.
 R_VIEW_RIG = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
 SIGMAS = 2.0
 _MM = 1e3
-# Pieces of the shaft are drawn straight, so long [m].
+# Length of a straight piece of the drawn shaft [m].
 _PIECE = 2e-3
 
 
@@ -22,7 +22,7 @@ def to_view(points: Array) -> Array:
 
 
 def shaft_points(snapshot: Snapshot) -> Array:
-    """Return points of the shaft in the view, shape (n, 3) [mm], 2 mm apart and one at the tip."""
+    """Return points of the shaft in the view, shape (n, 3) [mm]: every 2 mm, and the tip."""
     shaft = snapshot.shaft
     chosen = [0]
     for index, point in enumerate(shaft):
@@ -34,7 +34,7 @@ def shaft_points(snapshot: Snapshot) -> Array:
 
 
 def ellipsoid(snapshot: Snapshot) -> tuple[Array, Array, Array] | None:
-    """Return where the tip is thought to be, to 2 sigma: centre, half axes [mm], rotation.
+    """Return the 2-sigma ellipsoid of the tip: centre, half axes [mm], rotation.
 
     Returns
     -------
@@ -42,8 +42,8 @@ def ellipsoid(snapshot: Snapshot) -> tuple[Array, Array, Array] | None:
         Shapes (3,), (3,) and (3, 3), in the view; the half axes are the rotation's columns. None
         without an estimate or a measured tip.
     """
-    if snapshot.course:
-        position, covariance = snapshot.course[-1].position, snapshot.course[-1].covariance
+    if snapshot.track:
+        position, covariance = snapshot.track[-1].position, snapshot.track[-1].covariance
     elif snapshot.tip is not None:
         position, covariance = snapshot.tip.position, snapshot.tip.covariance
     else:
@@ -56,9 +56,9 @@ def ellipsoid(snapshot: Snapshot) -> tuple[Array, Array, Array] | None:
 
 
 def plane_rotation(snapshot: Snapshot) -> Array:
-    """Return the rotation that lays a flat box (its z thin) into the target plane, (3, 3)."""
+    """Return the rotation of a flat box (thin along z) into the target plane, (3, 3)."""
     R = snapshot.T_rig_plane[:3, :3]  # noqa: N806
-    # The box's x along the plane's z, its z along the plane's normal.
+    # The box's x is the plane's z, its z the plane's normal.
     return np.asarray(R_VIEW_RIG @ R @ R_VIEW_RIG.T)
 
 

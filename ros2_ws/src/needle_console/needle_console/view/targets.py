@@ -1,4 +1,4 @@
-"""Targets as a person types them, mm and degrees, checked; as poses and points in `rig`."""
+"""Checks targets in mm and degrees, as a person types them; converts them to `rig`."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ LARGEST_OFFSET_MM, LARGEST_TILT_DEG, LARGEST_MM = 50.0, 45.0, 150.0
 
 
 def plane_pose(offset_mm: float, tilt_deg: float) -> Array:
-    """Return the frame of the plane that lies above the entry and rises inwards.
+    """Return the frame of a plane above the entry that rises inwards.
 
     Parameters
     ----------
     offset_mm : float
         Height of the plane above the entry, along its normal.
     tilt_deg : float
-        How much it rises along the insertion.
+        Angle by which it rises along the insertion.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The hold's server: whom it lets in, and what a page that goes leaves behind."""
+"""Server of the hold: access control, and the end of a connection."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from needle_console.access.access import Access
-from needle_console.hold.hold_state import RELEASED, HoldState
+from needle_console.access import Access
+from needle_console.hold.page_session import RELEASED, PageHold
 from needle_core.errors import UserError
 
 pytest.importorskip("websockets", reason="the console's lock is not installed: scripts/console")
@@ -27,10 +27,10 @@ HOST, ORIGIN = ("Host", "127.0.0.1:8081"), ("Origin", "http://127.0.0.1:8080")
 
 
 class Rig:
-    """A server whose clock stands still, and what it says."""
+    """A server with a stopped clock that records its reports."""
 
     def __init__(self) -> None:
-        self.states: list[HoldState] = []
+        self.states: list[PageHold] = []
         self.notices: list[str] = []
         self.asked: list[bool] = []
         self.server = HoldServer(
@@ -52,7 +52,7 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
 
 
 class Page:
-    """A connection: echoes what it is sent, as often as it is told, and goes."""
+    """A connection that echoes counts, then closes."""
 
     def __init__(self, *pressed: bool, address: str = "127.0.0.1") -> None:
         self.local_address, self.remote_address = ("127.0.0.1", 1), (address, 2)
@@ -74,14 +74,14 @@ class Page:
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "192.168.1.9"])
-def test_a_page_that_goes_releases_and_is_known_by_its_address(rig: Rig, address: str) -> None:
+def test_disconnected_page_releases_the_hold(rig: Rig, address: str) -> None:
     page: Any = Page(False, True, True, address=address)
     rig.server._loop.run_until_complete(rig.server._serve_page(page))
     assert [state.pressed for state in rig.states] == [True, False]
     assert set(rig.asked) == {address == "127.0.0.1"}
 
 
-def test_the_last_that_the_server_hands_on_is_a_release(rig: Rig) -> None:
+def test_server_ends_with_a_release(rig: Rig) -> None:
     rig.server._end()
     rig.server.start()
     rig.server.close()
@@ -89,11 +89,11 @@ def test_the_last_that_the_server_hands_on_is_a_release(rig: Rig) -> None:
     assert not rig.server.is_alive
 
 
-def test_foreign_pages_are_refused_before_a_word_and_counted(rig: Rig) -> None:
+def test_foreign_pages_are_refused_and_counted(rig: Rig) -> None:
     connection: Any = SimpleNamespace(respond=lambda status, text: (int(status), text))
 
     def judged(path: str, *headers: tuple[str, str]) -> Any:
-        return rig.server._judge_request(connection, Request(path, Headers(headers)))
+        return rig.server._check_request(connection, Request(path, Headers(headers)))
 
     assert judged("/hold", HOST, ORIGIN) is None
     evil = ("Origin", "http://evil.example")
@@ -111,6 +111,6 @@ def test_foreign_pages_are_refused_before_a_word_and_counted(rig: Rig) -> None:
     assert rig.notices == [f"hold: {kind}" for kind in counts]
 
 
-def test_a_port_that_is_taken_is_said(rig: Rig) -> None:
-    with pytest.raises(UserError, match=rf"hold: 127.0.0.1 port {rig.server.port}: "):
+def test_taken_port_is_reported(rig: Rig) -> None:
+    with pytest.raises(UserError, match=rf"cannot listen on 127.0.0.1:{rig.server.port}: "):
         HoldServer(Access("127.0.0.1", 8080), rig.server.port, lambda _: "", print, print)

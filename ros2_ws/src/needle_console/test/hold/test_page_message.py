@@ -1,4 +1,4 @@
-"""What a page may say: exactly what is agreed, and nothing else is raised than that it is not."""
+"""Messages of a page: anything outside the protocol is a ValueError."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from needle_console.hold.hold_state import Mode
-from needle_console.hold.page_message import GarbageError, PageMessage, read_message
+from needle_console.hold.page_session import Mode, PageHold, read_message
 
 GOOD: dict[str, Any] = {"count": 3, "pressed": True, "speed": 0.5, "mode": "retract"}
 WRONG: dict[str, list[Any]] = {
@@ -21,23 +20,23 @@ WRONG: dict[str, list[Any]] = {
 NO_OBJECTS = ["", "{", "[]", "1", "null", json.dumps(GOOD) + "x", "[" * 100_000, b"\0", b"\xff\xfe"]
 
 
-def test_a_message_is_read() -> None:
-    assert read_message(json.dumps(GOOD)) == PageMessage(3, True, 0.5, Mode.RETRACT)
+def test_valid_message_is_read() -> None:
+    assert read_message(json.dumps(GOOD)) == (3, PageHold(True, 0.5, Mode.RETRACT))
     for speed in (0, 1):
-        assert read_message(json.dumps({**GOOD, "speed": speed})).speed == float(speed)
+        assert read_message(json.dumps({**GOOD, "speed": speed}))[1].speed == float(speed)
 
 
 @pytest.mark.parametrize("key", WRONG)
-def test_a_field_that_is_wrong_too_many_or_missing_is_garbage(key: str) -> None:
+def test_invalid_extra_or_missing_field_is_refused(key: str) -> None:
     for value in WRONG[key]:
-        with pytest.raises(GarbageError):
+        with pytest.raises(ValueError):
             read_message(json.dumps({**GOOD, key: value}))
     if key in GOOD:
-        with pytest.raises(GarbageError):
+        with pytest.raises(ValueError):
             read_message(json.dumps({name: value for name, value in GOOD.items() if name != key}))
 
 
 @pytest.mark.parametrize("data", NO_OBJECTS, ids=range(len(NO_OBJECTS)))
-def test_what_is_no_json_object_is_garbage(data: str | bytes) -> None:
-    with pytest.raises(GarbageError):
+def test_other_data_than_a_json_object_is_refused(data: str | bytes) -> None:
+    with pytest.raises(ValueError):
         read_message(data)

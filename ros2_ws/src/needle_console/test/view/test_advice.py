@@ -1,4 +1,4 @@
-"""Words and buttons follow from the states: the sequence of a run, its faults and its ways out."""
+"""Advice and buttons in each state of the rig."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ STEPS = [
 ]
 
 
-def test_a_run_is_led_from_button_to_button() -> None:
+def test_advised_buttons_of_a_run() -> None:
     for snapshot, button in STEPS:
         assert advise(snapshot, "console").button is button, snapshot
 
 
-def test_faults_and_who_holds_are_named() -> None:
+def test_advice_names_faults_and_the_hold_owner() -> None:
     waits = ControllerStatus(state="WAITING_FOR_TIP", reason="too dark")
     for snapshot, words in (
         (Snapshot(DeviceStatus(state="FAULT", fault="[reply_age] no reply")), "[reply_age] no rep"),
@@ -52,14 +52,14 @@ def test_faults_and_who_holds_are_named() -> None:
         assert words in advise(snapshot, "console").headline
 
 
-def test_a_press_that_does_not_count_is_told_to_whose_it_is() -> None:
+def test_ignored_press_is_explained_to_its_source() -> None:
     device = dataclasses.replace(ENABLED, press_again="console")
     snapshot = Snapshot(device, STEERING, insertion=0.01)
     assert "press and hold again" in advise(snapshot, "console").text
     assert "press and hold again" not in advise(snapshot, "pedal").text
 
 
-def test_every_state_has_words_and_no_button_that_cannot_be_pressed() -> None:
+def test_every_state_has_advice_with_a_usable_button() -> None:
     states = ("UNCONFIGURED", "DISABLED", "HOLDING", "MOVING", "FAULT", "ESTOPPED", "NEW")
     steered = ("IDLE", "STEERING", "WAITING_FOR_TIP", "DONE", "FAULT")
     controllers = (None, *(ControllerStatus(state=state) for state in steered))

@@ -1,4 +1,4 @@
-"""What is heard becomes snapshots and readings; what is old or makes no sense does not."""
+"""Snapshots and readings from messages of the rig."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from needle_console.view.readings import readings
 from needle_console.view.rig_picture import RigPicture
-from needle_console.view.snapshot import Snapshot, trouble_of
+from needle_console.view.snapshot import Snapshot, stop_reason
 from needle_console.view.targets import plane_pose
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
@@ -21,128 +21,128 @@ MINUS, NONE = "\N{MINUS SIGN}", "\N{EN DASH}"
 
 def seen(*depths: float) -> RigPicture:
     picture = RigPicture()
-    picture.see_controller(STEERING)
+    picture.set_controller(STEERING)
     for depth in depths:
-        picture.see_joints(depth, 0.1, now=0.0)
-        picture.see_estimate(np.array([-0.003 + depth / 50, 0.0, depth]), COVARIANCE)
+        picture.set_joints(depth, 0.1, now=0.0)
+        picture.add_estimate(np.array([-0.003 + depth / 50, 0.0, depth]), COVARIANCE)
     return picture
 
 
-def test_joints_that_fall_silent_are_not_shown_as_if_they_were_there() -> None:
+def test_outdated_joints_are_not_shown() -> None:
     picture = seen(0.01)
     assert picture.snapshot(0.9).insertion == 0.01
     assert math.isnan(picture.snapshot(1.1).insertion)
     assert readings(picture.snapshot(1.1))["Depth"] == NONE
 
 
-def test_estimates_are_placed_in_rig_by_the_plane_in_force() -> None:
-    (point,) = seen(0.05).snapshot(0.0).course
+def test_estimates_are_transformed_by_the_current_plane() -> None:
+    (point,) = seen(0.05).snapshot(0.0).track
     assert point.r1 == pytest.approx(-0.002)
     assert point.position == pytest.approx([0.001, 0.0, 0.05])
     assert point.sigma == pytest.approx(1e-4)
     picture = seen()
-    picture.see_plane(plane_pose(3.0, 30.0))
-    picture.see_joints(0.05, 0.1, now=0.0)
+    picture.set_plane(plane_pose(3.0, 30.0))
+    picture.set_joints(0.05, 0.1, now=0.0)
     # On the plane, 50 mm along it.
-    picture.see_estimate(np.array([0.0, 0.0, 0.05]), np.diag([0.0, 0.0, 1e-6]))
-    (point,) = picture.snapshot(0.0).course
+    picture.add_estimate(np.array([0.0, 0.0, 0.05]), np.diag([0.0, 0.0, 1e-6]))
+    (point,) = picture.snapshot(0.0).track
     along = np.array([0.5, 0.0, math.sqrt(0.75)])
     normal = np.array([math.sqrt(0.75), 0.0, -0.5])
     assert point.position == pytest.approx(0.003 * normal + 0.05 * along)
     assert point.covariance == pytest.approx(1e-6 * np.outer(along, along))
 
 
-def test_a_plane_that_the_controller_did_not_take_is_not_shown() -> None:
+def test_plane_is_shown_only_if_the_controller_accepted_it() -> None:
     picture = seen(0.01)
     tilted = plane_pose(9.0, 36.0)
-    picture.see_plane(tilted)
+    picture.set_plane(tilted)
     assert picture.snapshot(0.0).T_rig_plane[0, 3] == pytest.approx(0.003)
-    picture.see_controller(dataclasses.replace(STEERING, target_offset_m=0.009))
+    picture.set_controller(dataclasses.replace(STEERING, target_offset_m=0.009))
     assert picture.snapshot(0.0).T_rig_plane == pytest.approx(tilted)
 
 
-def test_why_the_device_ended_a_hold_outlasts_that_the_press_goes_on() -> None:
+def test_reason_of_an_ended_hold_is_kept_while_pressed() -> None:
     moving = DeviceStatus(state="MOVING", hold_owner="console")
     silent = DeviceStatus(state="HOLDING", reason="no hold message for 0.105 s, limit 0.1 s")
     again = DeviceStatus(reason="hold of 'console' does not count (hold_new_press)")
     stamps = DeviceStatus(reason="hold of 'console' does not count (hold_in_order)")
     for told, why in (
         ((moving, silent, again, again), silent.reason),
-        # Where the console stood still itself, it heard no more than that.
+        # A stalled console did not receive more.
         ((moving, again), again.reason),
         ((moving, again, stamps), stamps.reason),
     ):
         picture = RigPicture()
         for status in told:
-            picture.see_device(status)
-        device = picture.states().device
+            picture.set_device(status)
+        device = picture.latest().device
         assert device is not None
-        assert trouble_of(device) == why
+        assert stop_reason(device) == why
 
 
-def test_a_controller_that_is_gone_steers_no_longer() -> None:
+def test_missing_controller_is_cleared() -> None:
     picture = seen(0.01)
-    picture.lose_controller()
-    assert picture.states().controller is None
-    picture.see_controller(STEERING)
+    picture.clear_controller()
+    assert picture.latest().controller is None
+    picture.set_controller(STEERING)
     assert picture.snapshot(0.0).controller == STEERING
 
 
-def test_a_course_goes_deeper_only_and_a_new_start_begins_a_new_one() -> None:
+def test_track_deepens_and_restarts() -> None:
     picture = seen(0.010, 0.011, 0.0111, 0.012)
-    assert [point.depth for point in picture.snapshot(0.0).course] == [0.010, 0.0111, 0.012]
-    picture.see_joints(0.0105, 0.1, now=0.0)
+    assert [point.depth for point in picture.snapshot(0.0).track] == [0.010, 0.0111, 0.012]
+    picture.set_joints(0.0105, 0.1, now=0.0)
     assert len(picture.snapshot(0.0).shaft) == 2
-    picture.see_estimate(np.array([0.0, 0.0, 0.0105]), COVARIANCE)
-    assert [point.depth for point in picture.snapshot(0.0).course] == [0.010, 0.0105]
-    picture.see_controller(ControllerStatus(state="STEERING", starts=2))
-    assert picture.snapshot(0.0).course == ()
+    picture.add_estimate(np.array([0.0, 0.0, 0.0105]), COVARIANCE)
+    assert [point.depth for point in picture.snapshot(0.0).track] == [0.010, 0.0105]
+    picture.set_controller(ControllerStatus(state="STEERING", starts=2))
+    assert picture.snapshot(0.0).track == ()
 
 
-def test_a_tip_says_for_how_long_it_is_lost_or_old() -> None:
+def test_age_of_a_lost_or_old_tip() -> None:
     picture = seen(0.01)
-    picture.see_tip(np.array([0.0, -0.001, 0.01]), COVARIANCE, now=1.0)
+    picture.set_tip(np.array([0.0, -0.001, 0.01]), COVARIANCE, now=1.0)
     for now, text in ((1.5, f"0.0, {MINUS}1.0, 10.0 mm"), (2.9, "no images for 2 s")):
         assert readings(picture.snapshot(now))["Tip"] == text
     for now in (2.0, 3.0):
-        picture.see_tip(np.zeros(3), np.full((3, 3), np.inf), now=now)
+        picture.set_tip(np.zeros(3), np.full((3, 3), np.inf), now=now)
     assert picture.snapshot(4.5).tip_lost_for == pytest.approx(2.5)
     assert readings(picture.snapshot(4.5))["Tip"] == "not found for 2.5 s"
 
 
-def test_numbers_that_are_none_change_nothing() -> None:
+def test_non_finite_values_are_ignored() -> None:
     picture = seen(0.01)
     before = picture.snapshot(0.5)
-    picture.see_joints(math.nan, 0.0, now=0.5)
-    picture.see_estimate(np.array([math.inf, 0.0, 0.0]), COVARIANCE)
-    picture.see_plane(np.full((4, 4), math.nan))
+    picture.set_joints(math.nan, 0.0, now=0.5)
+    picture.add_estimate(np.array([math.inf, 0.0, 0.0]), COVARIANCE)
+    picture.set_plane(np.full((4, 4), math.nan))
     after = picture.snapshot(0.5)
     assert after.insertion == before.insertion
-    assert len(after.course) == len(before.course)
+    assert len(after.track) == len(before.track)
     assert np.isfinite(after.T_rig_plane).all()
 
 
-def test_troubles_end_when_they_are_mended_or_no_longer_told() -> None:
+def test_warnings_end_when_resolved_or_outdated() -> None:
     picture = RigPicture()
-    picture.see_health("a: x", bad=True, message="broken\x07", now=0.0)
-    picture.see_health("b: y", bad=True, message="late", now=0.0)
-    assert picture.snapshot(0.1).troubles == ("a: x: broken?", "b: y: late")
-    picture.see_health("b: y", bad=False, message="ok", now=0.2)
-    assert picture.snapshot(0.3).troubles == ("a: x: broken?",)
-    assert picture.snapshot(9.0).troubles == ()
+    picture.set_health("a: x", bad=True, message="broken\x07", now=0.0)
+    picture.set_health("b: y", bad=True, message="late", now=0.0)
+    assert picture.snapshot(0.1).warnings == ("a: x: broken?", "b: y: late")
+    picture.set_health("b: y", bad=False, message="ok", now=0.2)
+    assert picture.snapshot(0.3).warnings == ("a: x: broken?",)
+    assert picture.snapshot(9.0).warnings == ()
 
 
-def test_readings_are_in_mm_and_degrees_and_a_dash_where_nothing_is_known() -> None:
+def test_readings_are_in_mm_and_degrees() -> None:
     assert set(readings(Snapshot(DeviceStatus(), ControllerStatus())).values()) == {NONE}
     picture = seen(0.05)
     told = dataclasses.replace(STEERING, depth_m=0.12, r1_low_m=-0.0025, r1_high_m=-0.0015)
-    picture.see_controller(dataclasses.replace(told, reachable=True, reachable_depth_m=0.043))
+    picture.set_controller(dataclasses.replace(told, reachable=True, reachable_depth_m=0.043))
     shown = readings(picture.snapshot(0.0))
     assert shown["Depth"] == "50.0 mm of 120 mm"
     assert shown["Off the plane"] == f"{MINUS}2.00 mm (95 %: {MINUS}2.50 to {MINUS}1.50)"
     assert shown["Turn of the base"].startswith("5.7")
     assert shown["Reach"] == "the plane can be reached, from 43 mm on"
-    picture.see_controller(
+    picture.set_controller(
         dataclasses.replace(
             told, reachable=False, target_point_m=(0.0, 0.0, 0.1), trusted="trusted"
         )

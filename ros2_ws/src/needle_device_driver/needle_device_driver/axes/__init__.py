@@ -1,1 +1,1 @@
-"""Interface of the motion supervisor to the axes, whatever moves them."""
+"""Axes and their coordinated motion."""

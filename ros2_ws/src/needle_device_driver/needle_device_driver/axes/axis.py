@@ -1,23 +1,24 @@
-"""Interface of the motion supervisor to an axis, whatever moves it."""
+"""Interface of the motion supervisor to an axis, and to both axes together."""
 
 from __future__ import annotations
 
 import abc
 import dataclasses
+from collections.abc import Callable
 
-from needle_device_driver.procedure import Procedure
+from needle_device_driver.procedure import Procedure, side_by_side
 from needle_device_driver.rules import Rule
 
 
 class AxisError(Exception):
-    """An axis could not take an order; the text says which axis and why.
+    """An axis cannot execute an order; the text names the axis and the reason.
 
     Parameters
     ----------
     text : str
         One sentence.
     rule : Rule
-        The rule behind it.
+        The rule behind the error.
     """
 
     def __init__(self, text: str, rule: Rule = Rule.ONE_FAULT_STOPS_BOTH) -> None:
@@ -27,45 +28,45 @@ class AxisError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class AxisSnapshot:
-    """The last that an axis said about itself.
+    """The newest feedback of an axis.
 
     Attributes
     ----------
     time : float
-        When the reply arrived, on the steady clock [s].
+        Steady time at which the feedback arrived [s].
     position : float
-        Measured position [m or rad]; only relative while not `homed`.
+        Measured position [m or rad]; relative unless `homed`.
     set_point : float
-        Where it was last told to be, counted like `position`; at rest they differ by what the axis'
-        controller leaves over. Of an axis that a hand moves: `position`.
+        The last set-point [m or rad]. At rest it differs from `position` by the controller's
+        steady-state error; on an axis without a motor they are equal.
     velocity : float
         Measured velocity [m/s or rad/s].
     powered : bool
         Whether the axis is able to move.
     homed : bool
-        Whether `position` counts from the home switch.
+        Whether `position` is measured from the home switch.
     moving : bool
-        Whether an order (move, homing) is under way.
+        Whether an order (move, homing) is being executed.
     at_home_switch : bool
-        Whether the home switch is touched.
+        Whether the home switch is active.
     at_inner_switch : bool
-        Whether the limit switch at the far end is touched.
+        Whether the limit switch at the far end is active.
     fault : str
         Why the axis refuses to move; empty: no fault.
     fault_rule : Rule
         The rule behind the fault.
     ready : bool
-        Whether a move would begin at once: not while a powered axis still comes to rest.
+        Whether a move would begin at once; False while a powered axis comes to rest.
     answered : bool
-        Whether the axis has answered to all that it was asked: until then, where it is is not known
-        well enough to send it on.
-    let_go : bool
-        Whether a stopped axis is switched off until the next order to move, since it was blocked
-        short of where its controller wants it.
-    unstopped : str
-        State of an axis that should have stopped and switched off long ago; empty: it did.
+        Whether the axis has answered all requests. Otherwise its position is too uncertain for a
+        new set-point.
+    released_after_block : bool
+        Whether the axis was stopped while it was blocked, and is therefore switched off until the
+        next order to move.
+    stop_failure : str
+        How a stopped axis still moves or has power after its stop time; empty: it does not.
     origin : int
-        Changes whenever `position` begins to count from elsewhere.
+        Changes whenever the zero of `position` changes.
     """
 
     time: float
@@ -81,22 +82,21 @@ class AxisSnapshot:
     fault_rule: Rule = Rule.ONE_FAULT_STOPS_BOTH
     ready: bool = True
     answered: bool = True
-    let_go: bool = False
-    unstopped: str = ""
+    released_after_block: bool = False
+    stop_failure: str = ""
     origin: int = 0
 
 
 class Axis(abc.ABC):
-    """One axis. Positions in m or rad, speeds in m/s or rad/s, never negative.
+    """One axis. Positions in m or rad, speeds in m/s or rad/s, not negative.
 
-    No order that moves waits until it is carried out; `poll` tells. `configure`, `home`, `reset`
-    and `close` are procedures: they take several frames, and do nothing before they are run. Any
-    may raise `AxisError`.
+    An order to move returns at once; `poll` shows its progress. `configure`, `home`, `reset` and
+    `close` are procedures. Every method but `poll` may raise `AxisError`.
 
     Attributes
     ----------
     actuated : bool
-        Whether the axis moves by itself; one that a hand moves only says where it is.
+        Whether the axis has a motor; otherwise a hand moves it and the axis only measures.
     """
 
     actuated = True
@@ -107,31 +107,160 @@ class Axis(abc.ABC):
 
     @abc.abstractmethod
     def power(self, on: bool) -> None:
-        """Switch the axis on, its target being where it comes to rest, or off; moves nothing."""
+        """Switch the axis on, with its resting position as target, or off; moves nothing."""
 
     @abc.abstractmethod
     def home(self, speed: float) -> Procedure[None]:
-        """Start to look for the home switch, at most at `speed`; position 0 is there.
+        """Start to search for the home switch, at most at `speed`; position 0 is there.
 
-        The axis is not homed from the order on until the switch is found.
+        The axis is not homed until it has found the switch.
         """
 
     @abc.abstractmethod
     def start_move(self, target: float, speed: float) -> None:
-        """Go to `target` at `speed` and end there by itself; replaces the move before."""
+        """Move to `target` at `speed` and stop there; replaces an earlier move."""
 
     @abc.abstractmethod
     def stop(self) -> None:
-        """Stop as fast as the axis can and forget the target; `power` makes it ready again."""
+        """Stop as fast as possible and discard the target; `power` makes the axis ready again."""
 
     @abc.abstractmethod
     def reset(self) -> Procedure[None]:
-        """Acknowledge a fault and wait for the axis' answer; moves nothing."""
+        """Acknowledge a fault and wait until it is gone; moves nothing."""
 
     @abc.abstractmethod
     def poll(self, now: float) -> AxisSnapshot:
-        """Return the newest reply; `now` is the steady time [s]. Sends and waits for nothing."""
+        """Return the newest feedback at steady time `now` [s]; sends nothing and does not wait."""
 
     @abc.abstractmethod
     def close(self) -> Procedure[None]:
-        """Stop, switch off and let go of the link. May be called twice."""
+        """Stop, switch off and release the axis. May be called twice."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PairSnapshot:
+    """The newest feedback of both axes."""
+
+    insertion: AxisSnapshot
+    rotation: AxisSnapshot
+
+    @property
+    def by_name(self) -> dict[str, AxisSnapshot]:
+        """Insertion and rotation, by name."""
+        return {"insertion": self.insertion, "rotation": self.rotation}
+
+    @property
+    def homed(self) -> bool:
+        """Whether both axes are homed."""
+        return self.insertion.homed and self.rotation.homed
+
+    @property
+    def powered(self) -> bool:
+        """Whether both axes are able to move."""
+        return self.insertion.powered and self.rotation.powered
+
+    @property
+    def ready(self) -> bool:
+        """Whether both axes would begin to move at once."""
+        return self.insertion.ready and self.rotation.ready
+
+    @property
+    def answered(self) -> bool:
+        """Whether both axes have answered all requests."""
+        return self.insertion.answered and self.rotation.answered
+
+    @property
+    def released_after_block(self) -> str:
+        """Names of the axes that are switched off after a block; empty: none."""
+        return " and ".join(name for name, at in self.by_name.items() if at.released_after_block)
+
+    def stop_failures(self, oldest: float) -> str:
+        """Return which axes did not stop, or do not answer, and how; empty: none.
+
+        Parameters
+        ----------
+        oldest : float
+            Steady time of the oldest feedback that counts as an answer [s].
+        """
+        return "; ".join(
+            f"{name} axis {at.stop_failure or 'silent'}"
+            for name, at in self.by_name.items()
+            if at.stop_failure or at.time < oldest
+        )
+
+    def age(self, now: float) -> float:
+        """Return the age of the older feedback [s]."""
+        return now - min(self.insertion.time, self.rotation.time)
+
+    @property
+    def fault(self) -> str:
+        """The faults of both axes; empty: none."""
+        return "; ".join(
+            f"{name} axis: {at.fault}" for name, at in self.by_name.items() if at.fault
+        )
+
+    @property
+    def fault_rule(self) -> Rule:
+        """The rule behind the first fault."""
+        axis = self.insertion if self.insertion.fault else self.rotation
+        return axis.fault_rule
+
+
+class AxisPair:
+    """Gives orders to both axes; an error of one does not keep the order from the other.
+
+    Parameters
+    ----------
+    insertion, rotation : Axis
+        The two axes.
+    """
+
+    def __init__(self, insertion: Axis, rotation: Axis) -> None:
+        self.insertion = insertion
+        self.rotation = rotation
+
+    def each(self, order: Callable[[Axis], None]) -> None:
+        """Give an order to both axes.
+
+        Raises
+        ------
+        AxisError
+            With the errors of both axes, after both got the order.
+        """
+        errors: list[AxisError] = []
+        for axis in (self.insertion, self.rotation):
+            try:
+                order(axis)
+            except AxisError as error:
+                errors.append(error)
+        _raise_all(errors)
+
+    def side_by_side(self, order: Callable[[Axis], Procedure[None]]) -> Procedure[None]:
+        """Run a procedure of both axes at the same time; raises as `each`."""
+        errors: list[AxisError] = []
+        axes = self.insertion, self.rotation
+        yield from side_by_side(*(_collect_error(order(axis), errors) for axis in axes))
+        _raise_all(errors)
+
+    def close(self) -> Procedure[None]:
+        """Close one axis after the other, because each sends its own SYNCs; raises as `each`."""
+        errors: list[AxisError] = []
+        for axis in (self.insertion, self.rotation):
+            yield from _collect_error(axis.close(), errors)
+        _raise_all(errors)
+
+    def poll(self, now: float) -> PairSnapshot:
+        """Return the newest feedback at steady time `now` [s]."""
+        return PairSnapshot(self.insertion.poll(now), self.rotation.poll(now))
+
+
+def _collect_error(procedure: Procedure[None], errors: list[AxisError]) -> Procedure[None]:
+    try:
+        yield from procedure
+    except AxisError as error:
+        errors.append(error)
+
+
+def _raise_all(errors: list[AxisError]) -> None:
+    if errors:
+        raise AxisError("; ".join(map(str, errors)), errors[0].rule)

@@ -1,4 +1,4 @@
-"""Both joints on one way of straight legs, in proportion at every moment."""
+"""Coordinated motion of both joints along straight legs."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from collections.abc import Sequence
 
 @dataclasses.dataclass(frozen=True)
 class Leg:
-    """A straight piece of a way: where it ends, and in what time at full speed.
+    """A straight piece of a path.
 
     Attributes
     ----------
     insertion, rotation : float
-        Where both joints are at its end [m], [rad].
+        Joint positions at its end [m], [rad].
     duration : float
         At full speed [s].
     """
@@ -26,7 +26,7 @@ class Leg:
 
 @dataclasses.dataclass(frozen=True)
 class SetPoint:
-    """Set-point: places of the joints after the next period, and their speeds.
+    """Joint positions after the next period, and the speeds to get there.
 
     Attributes
     ----------
@@ -43,26 +43,26 @@ class SetPoint:
 
 
 class CoordinatedMotion:
-    """A motion whose progress is one number, so that the joints cannot part when speed changes.
+    """Motion along legs; one number is the progress of both joints, so they stay in proportion.
 
     Parameters
     ----------
     start : tuple of float
         Insertion [m] and rotation [rad].
     legs : sequence of Leg
-        The way from there, at least one leg.
+        The path from there, at least one leg.
     """
 
     def __init__(self, start: tuple[float, float], legs: Sequence[Leg]) -> None:
         self._start = self._at = start
         self._legs = tuple(legs)
         self._leg = 0
-        # Of the leg under way.
+        # Within the current leg, 0..1.
         self._progress = 0.0
 
     @property
     def complete(self) -> bool:
-        """Tell whether the last set-point was given."""
+        """Whether the last set-point was returned."""
         return self._is_last and self._progress >= 1.0
 
     def advance(self, period: float, speed_scale: float) -> SetPoint:
@@ -73,7 +73,7 @@ class CoordinatedMotion:
             left -= (1.0 - self._progress) / rate
             self._next_leg()
             rate = speed_scale / self._legs[self._leg].duration
-        # Progress sums up rounding; without the margin a step could take a period of nothing more.
+        # The margin absorbs rounding errors, which could otherwise add a period without motion.
         self._progress += rate * left
         if self._progress > 1.0 - 1e-9:
             self._progress = 1.0
@@ -84,15 +84,15 @@ class CoordinatedMotion:
     def follow(self, insertion: float, max_rotation_rate: float, period: float) -> SetPoint:
         """Return the set-point for an insertion that a hand has reached.
 
-        The rotation never goes back, and no faster than `max_rotation_rate` [rad/s] over the
-        `period` [s]: after a push that was faster it comes in late.
+        The rotation never reverses. Its rate is at most `max_rotation_rate` [rad/s] over the
+        `period` [s], so it lags behind a faster push.
         """
         turn = max_rotation_rate * period
         while True:
             leg = self._legs[self._leg]
-            way, whole = leg.insertion - self._start[0], abs(leg.rotation - self._start[1])
-            # A hand may have passed the leg before it began.
-            part = (insertion - self._start[0]) / way if way > 0.0 else 1.0
+            length, whole = leg.insertion - self._start[0], abs(leg.rotation - self._start[1])
+            # A hand may have passed the leg before its rotation began.
+            part = (insertion - self._start[0]) / length if length > 0.0 else 1.0
             reached = min(max(part, self._progress), 1.0)
             step = min(reached - self._progress, turn / whole if whole > 0.0 else 1.0)
             self._progress += step
@@ -102,7 +102,7 @@ class CoordinatedMotion:
             self._next_leg()
 
     def rotation_at(self, insertion: float) -> float:
-        """Return the rotation that belongs to an insertion; at the ends that of the end [rad]."""
+        """Return the rotation that belongs to an insertion, clamped to the path [rad]."""
         start = self._start
         for leg in self._legs[self._leg :]:
             if insertion < leg.insertion:
@@ -121,10 +121,10 @@ class CoordinatedMotion:
         self._leg += 1
         self._progress = 0.0
 
-    def _place(self) -> tuple[float, float]:
+    def _position(self) -> tuple[float, float]:
         leg = self._legs[self._leg]
         if self._progress >= 1.0:
-            # Exactly the target at the end: start + (end - start) is not.
+            # Exactly the target: start + (end - start) may differ from it by rounding.
             return leg.insertion, leg.rotation
         insertion, rotation = self._start
         return (
@@ -134,12 +134,12 @@ class CoordinatedMotion:
 
     def _set_point(self, rate: float) -> SetPoint:
         leg, start = self._legs[self._leg], self._start
-        self._at = self._place()
+        self._at = self._position()
         speeds = rate * abs(leg.insertion - start[0]), rate * abs(leg.rotation - start[1])
         return SetPoint(*self._at, *speeds)
 
     def _set_point_after(self, period: float) -> SetPoint:
-        before, self._at = self._at, self._place()
+        before, self._at = self._at, self._position()
         speeds = [abs(b - a) / period for a, b in zip(before, self._at, strict=True)]
         return SetPoint(*self._at, *speeds)
 
@@ -151,14 +151,14 @@ def slowed_legs(
     max_speed: float,
     max_rotation_rate: float = math.inf,
 ) -> tuple[Leg, ...]:
-    """Return legs that take long enough for both bounds: insertion waits where rotation is slow.
+    """Return the legs with durations that respect both bounds.
 
     Parameters
     ----------
     start : tuple of float
-        Insertion [m] and rotation [rad] where the first begins.
+        Insertion [m] and rotation [rad] at the start of the first leg.
     legs : sequence of Leg
-        The way.
+        The path.
     max_speed, max_rotation_rate : float
         The bounds [m/s], [rad/s].
     """

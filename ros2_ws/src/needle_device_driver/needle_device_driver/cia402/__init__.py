@@ -1,1 +1,1 @@
-"""Axes whose drives speak CiA 402."""
+"""Axes on CiA 402 drives."""

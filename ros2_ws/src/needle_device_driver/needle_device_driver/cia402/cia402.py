@@ -1,4 +1,4 @@
-"""The state machine of a CiA 402 drive, as the driver sees and steers it."""
+"""State machine of a CiA 402 drive."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import deque
 
 
 class DriveState(enum.Enum):
-    """States of the statusword: its value under its mask."""
+    """States of a drive: mask and value of the statusword."""
 
     NOT_READY_TO_SWITCH_ON = (0x4F, 0x00)
     SWITCH_ON_DISABLED = (0x4F, 0x40)
@@ -20,7 +20,7 @@ class DriveState(enum.Enum):
 
 
 class DriveCommand(enum.IntEnum):
-    """Orders of the controlword, as it is sent in RPDO1."""
+    """Commands: values of the controlword."""
 
     DISABLE_VOLTAGE = 0x00
     QUICK_STOP = 0x02
@@ -38,15 +38,15 @@ class Mode(enum.IntEnum):
 
 
 class Goal(enum.Enum):
-    """Goals that the driver has for a drive."""
+    """Goals of the driver for a drive."""
 
     OFF = "off"
     ON = "on"
     STOPPED = "stopped"
 
 
-# Controlword in homing mode: begin. Statusword: whether the drive listens to the bus; bits whose
-# meaning depends on the mode.
+# Bit of the controlword that begins a homing. Bits of the statusword: whether the drive executes
+# the controlword, then bits whose meaning depends on the mode.
 START_HOMING = 1 << 4
 REMOTE = 1 << 9
 TARGET_REACHED = 1 << 10
@@ -60,8 +60,8 @@ SUPPORTS_CYCLIC_POSITION = 1 << 7
 FAULTS = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
 POWERED = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE})
 
-# CiA 402-2, the transitions that a controlword causes; the numbers are the standard's. A drive
-# makes 0, 1 (start), 13 and 14 (fault) by itself.
+# Transitions that a controlword causes, with their numbers in CiA 402-2. A drive makes 0 and 1
+# (start), 13 and 14 (fault) by itself.
 _S, _C = DriveState, DriveCommand
 TRANSITIONS: dict[tuple[DriveState, DriveCommand], DriveState] = {
     (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 2
@@ -81,7 +81,7 @@ TRANSITIONS: dict[tuple[DriveState, DriveCommand], DriveState] = {
     (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): _S.OPERATION_ENABLED,  # 16
 }
 
-# The bits of a statusword that tell a state, and the states by them.
+# Bits of the statusword that encode the state, and the states by their value.
 _STATE_BITS = 0x6F
 _STATES = {
     word: state
@@ -90,7 +90,7 @@ _STATES = {
     if word & state.value[0] == state.value[1]
 }
 
-# The next command on the way to a goal. A fault is never acknowledged on the way.
+# The next command towards a goal. It never acknowledges a fault.
 _ON = {
     DriveState.NOT_READY_TO_SWITCH_ON: DriveCommand.DISABLE_VOLTAGE,
     DriveState.SWITCH_ON_DISABLED: DriveCommand.SHUTDOWN,
@@ -99,16 +99,10 @@ _ON = {
     DriveState.OPERATION_ENABLED: DriveCommand.ENABLE_OPERATION,
     DriveState.QUICK_STOP_ACTIVE: DriveCommand.ENABLE_OPERATION,
 }
-# Off comes after a quick stop, never by letting a moving axis coast.
-_OFF_MOVING = {
-    DriveState.OPERATION_ENABLED: DriveCommand.QUICK_STOP,
-    DriveState.QUICK_STOP_ACTIVE: DriveCommand.QUICK_STOP,
-}
-_OFF_AT_REST = {DriveState.OPERATION_ENABLED: DriveCommand.QUICK_STOP}
 
 
 def drive_state(statusword: int) -> DriveState | None:
-    """Return the state that a statusword tells; None for a pattern that the standard lacks."""
+    """Return the state that a statusword encodes; None for a value outside the standard."""
     return _STATES.get(statusword & _STATE_BITS)
 
 
@@ -118,16 +112,16 @@ def next_command(goal: Goal, state: DriveState | None, *, at_rest: bool) -> Driv
     Parameters
     ----------
     goal : Goal
-        What is wanted.
+        The goal.
     state : DriveState or None
-        What the drive said last; None: nothing that is understood.
+        State of the drive; None: unknown.
     at_rest : bool
         Whether the axis stands still.
 
     Returns
     -------
     DriveCommand
-        A quick stop for STOPPED, whatever the state: a statusword may be older than a command.
+        For STOPPED always a quick stop: the statusword may be older than the last command.
     """
     if goal is Goal.STOPPED:
         return DriveCommand.QUICK_STOP
@@ -137,29 +131,32 @@ def next_command(goal: Goal, state: DriveState | None, *, at_rest: bool) -> Driv
         if state is DriveState.QUICK_STOP_ACTIVE and not at_rest:
             return DriveCommand.QUICK_STOP
         return _ON.get(state, DriveCommand.DISABLE_VOLTAGE)
-    return (_OFF_AT_REST if at_rest else _OFF_MOVING).get(state, DriveCommand.DISABLE_VOLTAGE)
+    # A moving axis is stopped before it is switched off: it must not coast.
+    is_moving = state is DriveState.QUICK_STOP_ACTIVE and not at_rest
+    stop_first = state is DriveState.OPERATION_ENABLED or is_moving
+    return DriveCommand.QUICK_STOP if stop_first else DriveCommand.DISABLE_VOLTAGE
 
 
-class TransitionWatch:
-    """Tells a change of state that no command of the driver explains.
+class TransitionMonitor:
+    """Detects changes of state that no command explains.
 
-    Commands and statuswords cross on the bus, so the last few commands count, in their order.
+    Commands and statuswords cross on the bus, so the last six commands count, in their order.
     """
 
     def __init__(self) -> None:
         self._sent: deque[DriveCommand] = deque(maxlen=6)
-        self._seen: DriveState | None = None
+        self._state: DriveState | None = None
 
-    def sent(self, command: DriveCommand) -> None:
-        """Take a command that goes out."""
+    def note_command(self, command: DriveCommand) -> None:
+        """Note a command that is sent."""
         self._sent.append(command)
 
     def unexplained(self, state: DriveState) -> str:
-        """Take the state now; return what the drive did by itself, empty when nothing.
+        """Return which transition to `state` the drive made by itself; empty: none.
 
-        Faults have a name of their own and are not told here.
+        Faults do not count here: they are reported as such.
         """
-        before, self._seen = self._seen, state
+        before, self._state = self._state, state
         if before is None or before is state or state in FAULTS or before in FAULTS:
             return ""
         if before is DriveState.NOT_READY_TO_SWITCH_ON:

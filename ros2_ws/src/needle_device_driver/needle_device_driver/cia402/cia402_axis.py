@@ -1,4 +1,4 @@
-"""An axis whose drive speaks CiA 402 over CAN."""
+"""Axis on a CiA 402 drive."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 from collections.abc import Iterator
 
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
-from needle_device_driver.cia402.axis_speed import SpeedWatch
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
     POWERED,
@@ -15,8 +14,7 @@ from needle_device_driver.cia402.cia402 import (
     Goal,
     Mode,
 )
-from needle_device_driver.cia402.drive_fault import Fault, drive_fault
-from needle_device_driver.cia402.drive_machine import LONGEST_REST, DriveMachine
+from needle_device_driver.cia402.drive_machine import MAX_REST, DriveMachine
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.cia402.drive_setup import NO_INPUTS, set_up, write_homing, write_limits
@@ -28,28 +26,34 @@ from needle_device_driver.cia402.drive_upkeep import (
     disarm_watchdog,
     reset_fault,
 )
-from needle_device_driver.cia402.homing_run import HomingRun, HomingStep
+from needle_device_driver.cia402.drive_watch import (
+    Fault,
+    HomingRun,
+    HomingStep,
+    SpeedMonitor,
+    drive_fault,
+)
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.frame_link import FrameLink, LinkError
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
 from needle_device_driver.procedure import Procedure, Wait
 from needle_device_driver.rules import Rule
 
-# In cycles without an answer: a drive that is switched off at the end is given up.
-_SILENT = 15
+# Number of cycles without an answer after which `close` stops waiting for the drive.
+_MAX_SILENT = 15
 
 
 class Cia402Axis(Axis):
-    """Steers one drive: a state machine towards a goal, set-points in cyclic position mode.
+    """Axis on one drive in cyclic synchronous position mode.
 
-    Orders are taken at once and carried out by `transmit` and `update`, once a cycle each, around
-    a SYNC; a stop goes out immediately. The drive runs to the last set-point and ends there: when
-    none comes, nothing moves on.
+    Orders return at once. In each cycle, `transmit` sends the next command and set-point before the
+    SYNC, and `update` handles the answer; only a stop is sent immediately. The drive stops at the
+    last set-point if no further one arrives.
 
     Parameters
     ----------
     name : str
-        What errors call it.
+        Name in error messages.
     settings : DriveSettings
         The drive.
     link : FrameLink
@@ -57,23 +61,21 @@ class Cia402Axis(Axis):
     period : float
         Of the SYNC [s].
     watchdog : float
-        How long the drive goes without the computer's heartbeat [s].
+        The drive stops after this time without the computer's heartbeat [s].
 
     Attributes
     ----------
-    name : str
-        As given.
     monitor : DriveMonitor
-        What the drive sends.
+        Receives the frames of the drive.
     missing_optional_objects : tuple of str
-        What the drive lacks that it could be set up without.
+        Optional objects that the drive lacks.
     """
 
     def __init__(
         self, name: str, settings: DriveSettings, link: FrameLink, *, period: float, watchdog: float
     ) -> None:
         self.name = name
-        # As given, and with the units that the drive tells.
+        # As given, and with the units of the drive.
         self._given = self._settings = settings
         self.actuated = settings.actuated
         self._link, self._period, self._watchdog = link, period, watchdog
@@ -81,14 +83,14 @@ class Cia402Axis(Axis):
         self.missing_optional_objects: tuple[str, ...] = ()
         rest, stop_time = settings.magnitude(settings.tolerance), settings.stop_time
         self._machine = DriveMachine(rest, period, stop_time, self.monitor.feedback)
-        self._speed = SpeedWatch(settings, period)
+        self._speed = SpeedMonitor(settings, period)
         self._homing: HomingRun | None = None
         self._configured = self._homed = self._limits_due = False
         self._opening = self._origin = self._zero = 0
         self._velocity = 0.0
 
     def probe(self) -> Procedure[None]:
-        """Ask the drive whether it is there, from whatever state its node was left in.
+        """Request an answer of the drive, in any state of its node.
 
         Raises
         ------
@@ -97,7 +99,7 @@ class Cia402Axis(Axis):
         """
         node = self._settings.node_id
         with self._as_axis_error():
-            # A stopped node answers to nothing else.
+            # A node in the state "stopped" answers no SDO.
             self._link.send(od.NMT, bytes([od.NMT_PRE_OPERATIONAL, node]))
             yield from ObjectAccess(self._link, node).read(od.DEVICE_TYPE)
 
@@ -111,7 +113,7 @@ class Cia402Axis(Axis):
         self._configured = True
 
     def power(self, on: bool) -> None:
-        """Begin to switch the drive on, where it stands, or off."""
+        """Begin to switch the drive on, without motion, or off."""
         if not self.actuated:
             return
         if on:
@@ -121,10 +123,10 @@ class Cia402Axis(Axis):
         else:
             self._homing = None
             self._machine.mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
-        self._machine.want(Goal.ON if on else Goal.OFF)
+        self._machine.set_goal(Goal.ON if on else Goal.OFF)
 
     def home(self, speed: float) -> Procedure[None]:
-        """Begin to home; an axis that a hand moves takes where it is as 0."""
+        """Begin to home; without a motor, the present position becomes 0."""
         self._refuse_fault()
         if not self.actuated:
             self._zero = self._machine.at.position
@@ -135,11 +137,11 @@ class Cia402Axis(Axis):
             yield from write_limits(self._access, self._settings, homed=False)
             yield from write_homing(self._access, self._settings, speed)
         self._machine.mode = Mode.HOMING
-        switches = NO_INPUTS not in self.missing_optional_objects
-        self._homing = HomingRun(self._settings, speed, switches=switches)
+        has_inputs = NO_INPUTS not in self.missing_optional_objects
+        self._homing = HomingRun(self._settings, speed, has_inputs=has_inputs)
 
     def start_move(self, target: float, speed: float) -> None:
-        """Set the set-point of the next cycle; `speed` follows from the cycle's length."""
+        """Set the set-point of the next cycle; it implies the speed."""
         self._refuse_fault()
         if not self._machine.ready:
             raise AxisError(f"{self.name} axis is not ready to move")
@@ -147,7 +149,7 @@ class Cia402Axis(Axis):
         counts = settings.counts(target)
         lower, upper = settings.limits_counts if self._homed else od.NO_LIMITS[0]
         if not lower <= counts <= upper:
-            # How a drive goes on beyond its last count is its own: on, back all the way, or not.
+            # Beyond its last count a drive may continue, stop, or return all the way.
             raise AxisError(
                 f"{self.name} axis: target {target:.6g} is outside the drive's "
                 f"{settings.limits if self._homed else 'counter; home it, or set it nearer 0'}",
@@ -165,7 +167,7 @@ class Cia402Axis(Axis):
         self._speed.command(step / settings.counts_per_unit / self._period)
 
     def stop(self) -> None:
-        """Order a quick stop now, without waiting for the next cycle."""
+        """Send a quick stop immediately."""
         if not self.actuated or not self._configured:
             return
         self._homing = None
@@ -174,8 +176,8 @@ class Cia402Axis(Axis):
             self._send_order()
 
     def reset(self) -> Procedure[None]:
-        """Open a lost link, set a rebooted drive up again, acknowledge its fault; moves nothing."""
-        self._machine.want(Goal.OFF)
+        """Open a lost link, set up a rebooted drive, acknowledge a fault; moves nothing."""
+        self._machine.set_goal(Goal.OFF)
         self._homing = None
         with self._as_axis_error():
             self._link.open()
@@ -188,20 +190,20 @@ class Cia402Axis(Axis):
             try:
                 yield from reset_fault(self._link, self._settings)
             except StuckFaultError:
-                # What it was told in its set-up may have got lost: the next reset tells it again.
+                # Frames of the set-up may be lost: let the next reset repeat it.
                 self._opening = 0
                 raise
             yield from self._refresh()
 
     def poll(self, now: float) -> AxisSnapshot:
-        """Return the newest reply."""
+        """Return the newest feedback."""
         machine, fault = self._machine, self._fault
         position = self._settings.position(machine.at.position - self._zero)
-        told = self._settings.position(machine.target - self._zero)
+        set_point = self._settings.position(machine.target - self._zero)
         return AxisSnapshot(
             time=self.monitor.fresh_time,
             position=position,
-            set_point=told if self.actuated else position,
+            set_point=set_point if self.actuated else position,
             velocity=self._velocity,
             powered=not self.actuated or machine.powered,
             homed=self._homed and not self.monitor.rebooted,
@@ -212,25 +214,25 @@ class Cia402Axis(Axis):
             fault_rule=Rule.ONE_FAULT_STOPS_BOTH if fault is None else fault[0],
             ready=not self.actuated or machine.ready,
             answered=self.monitor.answered(),
-            let_go=machine.let_go,
-            unstopped=machine.unstopped,
+            released_after_block=machine.released_after_block,
+            stop_failure=machine.stop_failure,
             origin=self._origin,
         )
 
     def close(self) -> Procedure[None]:
-        """Stop, switch off and release the drive's watchdog; the link is its owner's to close.
+        """Stop, switch off and disarm the drive's watchdog; the caller closes the link.
 
         Raises
         ------
         AxisError
-            If the drive does not say that it is off: its watchdog stays, and will switch it off.
+            If the drive does not report that it is off: its watchdog, still armed, switches it off.
         """
         if not self._configured:
             return
         self._homing = None
         try:
             with self._as_axis_error():
-                self._machine.want(Goal.OFF)
+                self._machine.set_goal(Goal.OFF)
                 if not (yield from self._switch_off_now()):
                     raise DriveError("does not say that it is off; its watchdog will switch it off")
                 yield from disarm_watchdog(self._link, self._settings)
@@ -241,23 +243,17 @@ class Cia402Axis(Axis):
 
     @property
     def needs_cycles(self) -> bool:
-        """Tell whether the drive is on its way to where it was ordered, apart from set-points."""
+        """Whether the drive still executes an order other than a set-point."""
         if not self.actuated or self._fault is not None:
             return False
         return self._machine.switching or self._homing is not None or self._limits_due
 
     def transmit(self) -> Procedure[None]:
-        """Send this cycle's command and set-point.
-
-        Raises
-        ------
-        LinkError
-            If the link is lost.
-        """
+        """Send this cycle's command and set-point; raises `LinkError` if the link is lost."""
         if not self.actuated or not self._configured:
             return
         if self._limits_due and self._machine.state not in POWERED:
-            # Before the SYNC: a drive may take its time, and is then judged by a fresh answer.
+            # Before the SYNC: the drive may be slow, and its next feedback must be fresh.
             yield from self._write_limits()
         self._send_order()
         self._link.send(
@@ -266,7 +262,7 @@ class Cia402Axis(Axis):
         )
 
     def update(self) -> None:
-        """Take what the drive answered to the SYNC; nothing new where nothing came."""
+        """Handle the drive's answer to the SYNC, if there is one."""
         before, at = self._machine.at, self.monitor.feedback
         if at.number == before.number or not self._configured:
             return
@@ -277,11 +273,11 @@ class Cia402Axis(Axis):
         self._machine.update(at)
         if self._homing is not None:
             self._speed.command(self._homing.speed)
-        plausible = self._speed.judge(before, at, powered=self._machine.state in POWERED)
+        plausible = self._speed.check(before, at, powered=self._machine.state in POWERED)
         if self._homing is not None:
             self._homing.update(at, at.position - before.position if plausible else 0)
             if self._homing.step is HomingStep.DONE:
-                # The drive's own limits count from home: now that it has one, and once it is off.
+                # The drive's software limits count from home; they are written when it is off.
                 self._limits_due = True
                 self._count_from_home()
 
@@ -299,9 +295,10 @@ class Cia402Axis(Axis):
         try:
             yield from write_limits(self._access, self._settings, homed=True)
         except LinkError:
-            return  # its loss has a name of its own
+            # Reported as the loss of the link.
+            return
         except DriveError as error:
-            self._machine.trouble = str(error)
+            self._machine.problem = str(error)
             return
         self._limits_due = False
 
@@ -309,7 +306,7 @@ class Cia402Axis(Axis):
         self._homing, self._homed = None, True
         self._origin += 1
 
-    # ---- what is the matter -------------------------------------------------------------------
+    # ---- faults ---------------------------------------------------------------------------------
 
     @property
     def _access(self) -> ObjectAccess:
@@ -334,7 +331,7 @@ class Cia402Axis(Axis):
 
     @contextlib.contextmanager
     def _as_axis_error(self) -> Iterator[None]:
-        """Raise what goes wrong with link or drive as the axis' own error."""
+        """Raise errors of link and drive as `AxisError`."""
         try:
             yield
         except (LinkError, DriveError) as error:
@@ -353,47 +350,47 @@ class Cia402Axis(Axis):
         yield from await_start(self._link, self.monitor, self._settings, self._period)
         yield from arm_watchdog(self._link, self._settings, self._watchdog)
         if self.monitor.rebooted:
-            # What it was told before is gone.
+            # The reboot has undone the first part of the set-up.
             raise DriveError(f"node {self._settings.node_id} started anew while it was set up")
         self.monitor.end_set_up()
         self._opening = self._link.openings
         yield from self._refresh()
 
     def _refresh(self) -> Procedure[None]:
-        """Ask for what the next SYNC would bring, and forget what was before."""
+        """Read the process data by SDO, and discard the state from before."""
         access = self._access
-        self.monitor.take(
+        self.monitor.set_feedback(
             (yield from access.read(od.STATUSWORD)),
             (yield from access.read(od.MODE_DISPLAY)),
             self._machine.at.inputs,
             (yield from access.read(od.POSITION_ACTUAL)),
         )
-        self._machine.begin_anew(self.monitor.feedback)
-        # From one reading to the next it may count from elsewhere.
+        self._machine.restart(self.monitor.feedback)
+        # The zero of the position may have changed.
         self._origin += 1
-        self._speed.forget()
+        self._speed.reset()
         self._velocity = 0.0
         if self._machine.state in FAULTS:
-            # A fault from before has sent its message to nobody.
-            self.monitor.emergency = (yield from access.ask(od.ERROR_CODE)) or None
+            # The emergency message of an earlier fault was not received.
+            self.monitor.emergency = (yield from access.read_optional(od.ERROR_CODE)) or None
 
     def _switch_off_now(self) -> Procedure[bool]:
-        """Run cycles of its own until the drive is off: nobody else will. Return whether it is."""
+        """Run own cycles until the drive is off; return whether it is."""
         if not self.actuated:
             return True
         silent = 0
-        for _ in range(LONGEST_REST + _SILENT):
+        for _ in range(MAX_REST + _MAX_SILENT):
             self._link.beat()
             self._send_order()
             self.monitor.expect_answer()
             self._link.send(od.SYNC)
             yield Wait(self.monitor.answered, self._period)
             answered = self.monitor.answered()
-            # Not as fast as the bus goes: a drive has this cycle's length.
+            # A drive needs about one period between two SYNCs.
             yield Wait(lambda: bool(self._link.lost), self._period / 2.0)
             self.update()
             silent = 0 if answered else silent + 1
-            if silent > _SILENT:
+            if silent > _MAX_SILENT:
                 return False
             if answered and self._machine.state not in POWERED:
                 return True

@@ -1,4 +1,4 @@
-"""Frames that one drive sends by itself, each with the time of its arrival."""
+"""Frames that one drive sends: process data, heartbeats, emergencies."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import (
@@ -21,9 +22,10 @@ from needle_device_driver.link.objects import (
 from needle_device_driver.procedure import Procedure, Wait
 
 _ANSWER = (STATUS.function_code, POSITION.function_code)
-# One answer may be lost; with more missing, what comes may be an answer to a SYNC of long ago.
-_MAY_LACK = 1
-_FORGIVEN_AFTER = 25
+# One answer may be lost. If more are missing, the next one may answer a much earlier SYNC.
+_MAX_MISSING = 1
+# Number of SYNCs after which an earlier loss is forgotten.
+_FORGET_AFTER = 25
 
 _LENGTH_WITHOUT_INPUTS = len(STATUS_WITHOUT_INPUTS.pack(0, 0))
 _LENGTH_ALONE = len(POSITION_ALONE.pack(0))
@@ -36,64 +38,72 @@ class Feedback:
     Attributes
     ----------
     number : int
-        Counts complete answers to a SYNC.
+        Number of complete answers to a SYNC.
     statusword, mode, inputs : int
         As sent.
     position : int
         Position actual value [counts].
     following_error : int
-        How far the axis is short of where its drive wants it [counts]; 0 of a drive that does not
-        tell.
+        Demand of the drive's controller minus position [counts]; 0 if the drive does not report
+        it.
     syncs : int
-        Counts the SYNCs that were sent until it came.
+        Number of SYNCs that were sent before it arrived.
     time : float
-        When it came, steady clock [s].
+        Steady time of its arrival [s].
     """
 
-    number: int
-    statusword: int
-    mode: int
-    inputs: int
-    position: int
-    following_error: int
+    number: int = 0
+    statusword: int = 0
+    mode: int = 0
+    inputs: int = 0
+    position: int = 0
+    following_error: int = 0
     syncs: int = 0
     time: float = 0.0
 
 
 class DriveMonitor:
-    """Listens to one node, and ages what it hears.
+    """Receives the frames of one node and measures their age.
 
-    Process data is as old as its arrival, unless it answers the last SYNC that was sent: then
-    nothing newer was asked for, and a heartbeat keeps it fresh. So positions do not grow stale
-    while a simulation's time stands still, and do as soon as a SYNC stays unanswered.
+    The age of process data counts from its arrival. If it answers the last SYNC, nothing newer was
+    requested, and each heartbeat renews it: positions stay fresh while the time of a simulation
+    stands still, and become stale as soon as a SYNC is unanswered.
 
-    An answer does not say which SYNC it answers, so they are counted: one that comes while two
-    earlier SYNCs are unanswered is taken for a late one, which keeps nothing fresh, until a pause
-    has shown that what is missing does not come any more.
+    An answer does not name its SYNC, so the monitor counts them. While two earlier SYNCs are
+    unanswered, an answer counts as late and renews nothing. A pause without SYNCs shows which
+    answers are lost.
 
     Parameters
     ----------
     link : FrameLink
         The bus.
     node_id : int
-        Whose frames.
+        The node.
+
+    Attributes
+    ----------
+    feedback : Feedback
+        The newest process data.
+    heartbeats : int
+        Number of heartbeats since the last set-up began.
+    rebooted : bool
+        Whether the node sent a boot-up message since the last set-up.
+    emergency : int or None
+        The first error code of the node.
     """
 
     def __init__(self, link: FrameLink, node_id: int) -> None:
         self._link = link
-        self._number = 0
-        self._statusword = self._mode = self._inputs = self._position = 0
-        self._following_error = 0
         self._answers: set[int] = set()
         self._syncs = self._all_syncs = 0
-        self._taken = 0, 0.0
         self._received = dict.fromkeys(_ANSWER, 0)
         self._fresh_time = -math.inf
         self._heartbeat_time = -math.inf
-        self._heartbeats = 0
         self._nmt_state = NMT_BOOT_UP
-        self._watching = False
+        self._is_set_up = False
         self._outdated = False
+        self.feedback = Feedback()
+        self.heartbeats = 0
         self.rebooted = False
         self.emergency: int | None = None
         for function_code, handler in (
@@ -102,144 +112,128 @@ class DriveMonitor:
             (HEARTBEAT, self._on_heartbeat),
             (EMCY, self._on_emergency),
         ):
-            link.subscribe(function_code + node_id, partial(self._take, handler))
-
-    @property
-    def feedback(self) -> Feedback:
-        """The newest process data."""
-        return Feedback(
-            self._number,
-            self._statusword,
-            self._mode,
-            self._inputs,
-            self._position,
-            self._following_error,
-            *self._taken,
-        )
+            link.subscribe(function_code + node_id, partial(self._receive, handler))
 
     @property
     def fresh_time(self) -> float:
-        """Time at which the drive last said where it is, steady clock [s]."""
-        return self._age_base()
+        """Steady time from which the age of the feedback counts [s]."""
+        if self._is_waiting or self._nmt_state != NMT_OPERATIONAL:
+            return self._fresh_time
+        return max(self._fresh_time, self._heartbeat_time)
 
     @property
     def left_operational(self) -> bool:
-        """Tell whether the node's own heartbeat says that it no longer exchanges process data."""
-        return self._watching and self._nmt_state != NMT_OPERATIONAL
-
-    @property
-    def heartbeats(self) -> int:
-        """Number of heartbeats since the last set-up began."""
-        return self._heartbeats
+        """Whether the node's heartbeat reports another NMT state than operational."""
+        return self._is_set_up and self._nmt_state != NMT_OPERATIONAL
 
     def answered(self) -> bool:
-        """Return whether all process data arrived since the last SYNC, and in its time."""
-        return not self._awaited()
+        """Return whether the answer to the last SYNC is complete, and not a late one."""
+        return not self._is_waiting
 
     @property
     def outstanding(self) -> int:
-        """Number of unanswered SYNCs, if too many before the last are; else 0."""
-        return self._syncs - min(self._received.values()) if self._is_behind() else 0
+        """Number of unanswered SYNCs if more than one before the last is; otherwise 0."""
+        return self._syncs - min(self._received.values()) if self._is_behind else 0
 
-    def give_up(self) -> None:
-        """Take what is outstanding for lost."""
-        self._count_anew()
+    def discard_outstanding(self) -> None:
+        """Treat the outstanding answers as lost."""
+        self._syncs = 0
+        self._received = dict.fromkeys(_ANSWER, 0)
 
     def expect_answer(self) -> None:
-        """Take note that a SYNC goes out now."""
-        self._fresh_time = self._age_base()
+        """Note that a SYNC is sent now."""
+        self._fresh_time = self.fresh_time
         self._answers.clear()
-        if self._syncs >= _FORGIVEN_AFTER and not self._is_behind():
-            self._count_anew()
+        if self._syncs >= _FORGET_AFTER and not self._is_behind:
+            self.discard_outstanding()
         self._syncs += 1
         self._all_syncs += 1
 
     def begin_set_up(self) -> None:
-        """Forget what was; the node is set up from the start."""
-        self._watching = False
-        self._heartbeats = 0
+        """Note that the set-up of the node begins."""
+        self._is_set_up = False
+        self.heartbeats = 0
 
-    def forget_start(self) -> None:
-        """Take note that the node answers: a start that it tells of from now on is another one."""
+    def clear_reboot(self) -> None:
+        """Note that the node answers; a later boot-up message is another reboot."""
         self.rebooted = False
 
     def end_set_up(self) -> None:
-        """Watch over the node from now on."""
-        self._watching = True
+        """Note that the node is set up: from now on it must stay operational."""
+        self._is_set_up = True
         self.emergency = None
 
-    def take(self, statusword: int, mode: int, inputs: int, position: int) -> None:
-        """Take what was read on request as if it had been sent.
+    def set_feedback(self, statusword: int, mode: int, inputs: int, position: int) -> None:
+        """Use values that were read by SDO as the newest process data.
 
-        The next answer to a SYNC is older in some drives, which answer with what they sampled at
-        the SYNC before: it counts as an answer, not for what it says.
+        Some drives answer a SYNC with data from the SYNC before. So the next answer counts as an
+        answer, but its data are older than these values.
         """
-        self._statusword, self._mode, self._inputs = statusword, mode, inputs
-        self._position, self._following_error = position, 0
         self._answers = set(_ANSWER)
-        self._count_anew()
-        self._number += 1
+        self.discard_outstanding()
         self._outdated = True
-        self._fresh_time = self._link.now
-        self._taken = self._all_syncs, self._fresh_time
+        self._fresh_time = now = self._link.now
+        number = self.feedback.number + 1
+        self.feedback = Feedback(
+            number, statusword, mode, inputs, position, syncs=self._all_syncs, time=now
+        )
 
     def await_operational(self, before: int, timeout: float) -> Procedure[bool]:
-        """Return whether, within `timeout` [s], one after `before` heartbeats says: operational."""
-        yield Wait(lambda: self._heartbeats > before, timeout)
-        return self._heartbeats > before and self._nmt_state == NMT_OPERATIONAL
+        """Wait for a heartbeat after the first `before`; return whether it reports operational."""
+        yield Wait(lambda: self.heartbeats > before, timeout)
+        return self.heartbeats > before and self._nmt_state == NMT_OPERATIONAL
 
-    def _awaited(self) -> bool:
-        return len(self._answers) < len(_ANSWER) or self._is_behind()
+    @property
+    def _is_waiting(self) -> bool:
+        return len(self._answers) < len(_ANSWER) or self._is_behind
 
+    @property
     def _is_behind(self) -> bool:
         outstanding = self._syncs - min(self._received.values())
-        # The answer to the last SYNC may be on its way.
-        return outstanding - (len(self._answers) < len(_ANSWER)) > _MAY_LACK
-
-    def _count_anew(self) -> None:
-        self._syncs = 0
-        self._received = dict.fromkeys(_ANSWER, 0)
-
-    def _age_base(self) -> float:
-        if self._awaited() or self._nmt_state != NMT_OPERATIONAL:
-            return self._fresh_time
-        return max(self._fresh_time, self._heartbeat_time)
+        # The answer to the last SYNC may be under way.
+        return outstanding - (len(self._answers) < len(_ANSWER)) > _MAX_MISSING
 
     def _answer(self, function_code: int, time: float) -> None:
         self._answers.add(function_code)
-        # Some drives say more than they are asked.
+        # Some drives send more answers than SYNCs.
         self._received[function_code] = min(self._received[function_code] + 1, self._syncs)
-        if not self._awaited():
-            self._number += not self._outdated
+        if not self._is_waiting:
+            number = self.feedback.number + (not self._outdated)
             self._outdated = False
             self._fresh_time = time
-            self._taken = self._all_syncs, time
+            self._update(number=number, syncs=self._all_syncs, time=time)
 
-    def _take(self, handler: Callable[[bytes, float], None], data: bytes, time: float) -> None:
-        """Take a frame; one that is not as its kind must be is counted by the link."""
+    def _update(self, **values: Any) -> None:
+        self.feedback = dataclasses.replace(self.feedback, **values)
+
+    def _receive(self, handler: Callable[[bytes, float], None], data: bytes, time: float) -> None:
         try:
             handler(data, time)
         except ValueError:
+            # The frame has a wrong length.
             self._link.error_frames += 1
-            return
 
     def _on_status(self, data: bytes, time: float) -> None:
         if len(data) == _LENGTH_WITHOUT_INPUTS:
-            self._statusword, self._mode = STATUS_WITHOUT_INPUTS.unpack(data)
+            statusword, mode = STATUS_WITHOUT_INPUTS.unpack(data)
+            self._update(statusword=statusword, mode=mode)
         else:
-            self._statusword, self._mode, self._inputs = STATUS.unpack(data)
+            statusword, mode, inputs = STATUS.unpack(data)
+            self._update(statusword=statusword, mode=mode, inputs=inputs)
         self._answer(STATUS.function_code, time)
 
     def _on_position(self, data: bytes, time: float) -> None:
         if len(data) == _LENGTH_ALONE:
-            (self._position,) = POSITION_ALONE.unpack(data)
+            (position,) = POSITION_ALONE.unpack(data)
+            self._update(position=position)
         else:
-            self._position, self._following_error = POSITION.unpack(data)
+            position, following_error = POSITION.unpack(data)
+            self._update(position=position, following_error=following_error)
         self._answer(POSITION.function_code, time)
 
     def _on_heartbeat(self, data: bytes, time: float) -> None:
         (state,) = data
-        self._heartbeats += 1
+        self.heartbeats += 1
         self._heartbeat_time = time
         # The upper bit toggles in the older protocol, node guarding.
         self._nmt_state = state & 0x7F

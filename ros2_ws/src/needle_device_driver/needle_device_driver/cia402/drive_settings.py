@@ -1,4 +1,4 @@
-"""One drive's settings in SI, and how they become counts."""
+"""Settings of one drive in SI units, and their conversion to counts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from needle_core.errors import OutOfBoundsError, UserError
 from needle_core.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
 from needle_device_driver.link import objects as od
 
-# Methods of CiA 402: to a limit switch or a home switch, or where the axis stands.
+# Homing methods of CiA 402: where the axis stands, with an index pulse, to a switch.
 HERE = (35, 37)
 INDEX_PULSE = (*range(1, 15), 33, 34)
 SWITCHES = tuple(range(1, 15)) + tuple(range(17, 31))
@@ -20,40 +20,40 @@ _Positive = Annotated[float, Bounds(ABOVE_0, math.inf, "SI")]
 
 @dataclasses.dataclass(frozen=True)
 class DriveSettings:
-    """One axis' drive; lengths in m or rad.
+    """Settings of an axis' drive; lengths in m or rad.
 
     Attributes
     ----------
     node_id : int
         CANopen node id, 1..126.
     counts_per_unit : float
-        Position counts a metre or radian, not negative.
+        Position counts per metre or radian.
     reverse : bool
-        Whether positive counts are the negative direction.
+        Whether the counts decrease in the positive direction.
     speed, acceleration, quick_stop_deceleration : float
-        Fastest motion [unit/s]; ramps [unit/s^2].
+        Greatest speed [unit/s]; ramps [unit/s^2].
     homing_method : int
         CiA 402 homing method.
     following_error : float
-        The drive's own bound.
+        Bound in the drive.
     following_error_time : float
-        How long the drive lets it be exceeded [s].
+        Time for which the drive tolerates a greater one [s].
     max_torque : float
-        Share of the rated torque; 0: as the drive has it.
+        Share of the rated torque; 0: the drive's own setting.
     lower, upper : float
         Software limits in the drive, from home.
     tolerance : float
-        An axis that moves less in a cycle stands still.
+        An axis stands still in a cycle if it moves no farther.
     unit : str
         Of the axis: m or rad.
     travel : float
-        How far from its home the axis may be; homing searches so far and a fifth more.
+        Greatest distance from home; homing searches a fifth farther.
     counts_per_turn : float
-        Position counts in a turn of the drive's shaft; 0: as it says, or not known.
+        Position counts per turn of the drive's shaft; 0: as the drive reports, or unknown.
     speed_unit, ramp_unit : float
-        Counts/s in one of the drive's units of speed, counts/s^2 in one of its ramps.
+        The drive's unit of speed [counts/s] and of ramps [counts/s^2].
     actuated : bool
-        False: a hand moves it, the drive only says where it is.
+        Whether the drive has a motor; otherwise a hand moves the axis.
     """
 
     node_id: Annotated[int, Bounds(1, 126, "-")]
@@ -77,12 +77,12 @@ class DriveSettings:
     actuated: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse what no drive can be set to.
+        """Check the settings.
 
         Raises
         ------
         UserError
-            A value that is not finite, not positive where it must be, or no homing method.
+            A value out of bounds, or an unknown homing method.
         """
         check_bounded_fields(self)
         if self.homing_method not in HOMING_METHODS:
@@ -92,11 +92,11 @@ class DriveSettings:
 
     @property
     def direction(self) -> int:
-        """1, or -1 where the drive counts the other way."""
+        """1, or -1 if the drive counts in reverse."""
         return -1 if self.reverse else 1
 
     def counts(self, position: float) -> int:
-        """Return the nearest count to a position; positions are absolute, so rounding stays."""
+        """Return the count nearest to a position [m or rad]."""
         return self.direction * round(position * self.counts_per_unit)
 
     def position(self, counts: int) -> float:
@@ -104,19 +104,19 @@ class DriveSettings:
         return self.direction * counts / self.counts_per_unit
 
     def magnitude(self, value: float, unit: float = 1.0) -> int:
-        """Return a distance, speed or ramp in counts, or in units of so many counts.
+        """Return a distance, speed or ramp in counts, or in units of `unit` counts.
 
-        It is at least 1: 0 often means "no limit".
+        It is at least 1: in a drive, 0 often means "no limit".
         """
         return max(1, round(value * self.counts_per_unit / unit))
 
-    def told(self, value: float) -> str:
-        """Return a position as messages have it."""
+    def text(self, value: float) -> str:
+        """Return a distance for messages."""
         return f"{value * 1e3:.4g} mm" if self.unit == "m" else f"{value:.4g} rad"
 
     @property
     def stop_time(self) -> float:
-        """Longest time of a quick stop [s]; a drive may round its ramp down to half."""
+        """Longest time of a quick stop [s]: a drive may round its ramp down to half."""
         return 2.0 * self.speed / self.quick_stop_deceleration
 
     @property
@@ -132,12 +132,12 @@ class DriveSettings:
 
     @property
     def outer_switches(self) -> int:
-        """Bits of the digital inputs that end the way out."""
-        # Outward is the drive's positive direction where it counts in reverse.
+        """Bits of the digital inputs that end an outward motion."""
+        # If the drive counts in reverse, outward is its positive direction.
         limit = od.POSITIVE_LIMIT_SWITCH if self.reverse else od.NEGATIVE_LIMIT_SWITCH
         return limit | od.HOME_SWITCH
 
     @property
     def inner_switch(self) -> int:
-        """Bit of the digital inputs that ends the way in."""
+        """Bit of the digital inputs that ends an inward motion."""
         return od.NEGATIVE_LIMIT_SWITCH if self.reverse else od.POSITIVE_LIMIT_SWITCH

@@ -1,6 +1,8 @@
-"""Set-up of a drive over SDO: limits, reactions, process data, watchdog."""
+"""Set-up of a drive over SDO: limits, reactions, process data."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 from needle_device_driver.cia402.cia402 import (
     POWERED,
@@ -13,19 +15,23 @@ from needle_device_driver.cia402.cia402 import (
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import HERE, DriveSettings
 from needle_device_driver.cia402.drive_units import read_units
-from needle_device_driver.cia402.pdo_setup import map_pdo, silence_unused
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.object_access import DriveError, DriveRefusalError, ObjectAccess
+from needle_device_driver.link.objects import Pdo
 from needle_device_driver.procedure import Procedure
 
-# Milliseconds between a drive's heartbeats: well inside the reply age limit.
+# Milliseconds between a drive's heartbeats: much shorter than the reply age limit.
 PRODUCER_HEARTBEAT_MS = 30
-# Where the drive's own is fixed: what a start, and a drive that stands still, are waited for.
-_SLOWEST_HEARTBEAT_MS = 200
+# Longest accepted period if the drive's own is fixed: the driver waits for these heartbeats when a
+# drive starts, and while it stands still.
+_MAX_HEARTBEAT_MS = 200
 # In seconds.
-_SWITCH_OFF_WAIT = 1.0
-_MODE_WAIT = 0.5
+_SWITCH_OFF_TIMEOUT = 1.0
+_MODE_TIMEOUT = 0.5
+# Two of the four transmit PDOs that CiA 402 drives have by default; they may be on.
+_UNUSED_PDOS = (0x1802, 0x1803)
+_FIRST_TRANSMIT_PDO = 0x1800
 
 _LEFT_OUT = "has no {}: check on the rig what it does there (docs/hardware.md)"
 _KEPT = "keeps its own {} (refused {}): check on the rig what it does there (docs/hardware.md)"
@@ -39,32 +45,32 @@ _NO_FOLLOWING_ERROR = (
 def set_up(
     link: FrameLink, monitor: DriveMonitor, settings: DriveSettings, *, period: float, homed: bool
 ) -> Procedure[tuple[DriveSettings, tuple[str, ...]]]:
-    """Set a drive up from whatever state it is in; moves nothing, switches a powered one off.
+    """Set a drive up from any state; moves nothing, switches a powered drive off.
 
     Parameters
     ----------
     link : FrameLink
         The bus, open.
     monitor : DriveMonitor
-        The drive's; a start that it hears of once the drive has answered voids the set-up.
+        The drive's; a reboot after the drive's first answer voids the set-up.
     settings : DriveSettings
-        What the drive shall be.
+        The wanted settings.
     period : float
         Of the SYNC [s].
     homed : bool
-        Whether its position counts from home, so that software limits mean something.
+        Whether the position counts from home, as the software limits do.
 
     Returns
     -------
     DriveSettings
         As given, with the units of the drive.
     tuple of str
-        What the drive lacks that it could be without.
+        What the drive lacks of the optional objects.
 
     Raises
     ------
     DriveError
-        If the node does not answer, is no CiA 402 drive, or lacks what is needed.
+        If the node does not answer, is no CiA 402 drive, or lacks a required object.
     LinkError
         If the link is lost.
     """
@@ -72,62 +78,57 @@ def set_up(
     access = ObjectAccess(link, node)
     link.send(od.NMT, bytes([od.NMT_PRE_OPERATIONAL, node]))
     profile = (yield from access.read(od.DEVICE_TYPE)) & 0xFFFF
-    monitor.forget_start()
+    monitor.clear_reboot()
     if profile != od.CIA402:
         raise DriveError(f"node {node} is of device profile {profile}, wanted {od.CIA402}")
-    # Not while this set-up keeps the loop from its heartbeat.
+    # The loop does not run during the set-up, so the watchdog must be off.
     yield from access.write(od.CONSUMER_HEARTBEAT, 0)
     settings, assumed = yield from read_units(access, settings)
     missing = [assumed] if assumed else []
     if settings.actuated:
         missing += yield from _set_up_motion(link, access, settings, period)
         yield from write_limits(access, settings, homed=homed)
-        yield from map_pdo(access, node, od.COMMAND)
-        yield from map_pdo(access, node, od.SET_POINT)
-    missing += yield from _map_full(access, node, od.STATUS, od.STATUS_WITHOUT_INPUTS, NO_INPUTS)
+        yield from _map_pdo(access, node, od.COMMAND)
+        yield from _map_pdo(access, node, od.SET_POINT)
+    missing += yield from _map_optional(
+        access, node, od.STATUS, od.STATUS_WITHOUT_INPUTS, NO_INPUTS
+    )
     if settings.actuated:
-        missing += yield from _map_full(
+        missing += yield from _map_optional(
             access, node, od.POSITION, od.POSITION_ALONE, _NO_FOLLOWING_ERROR
         )
     else:
-        yield from map_pdo(access, node, od.POSITION_ALONE)
-    yield from silence_unused(access)
-    yield from access.offer(od.CYCLE_PERIOD, round(period * 1e6))
+        yield from _map_pdo(access, node, od.POSITION_ALONE)
+    yield from _switch_off_unused_pdos(access)
+    yield from access.write_optional(od.CYCLE_PERIOD, round(period * 1e6))
     yield from _write_heartbeat(access)
     link.send(od.NMT, bytes([od.NMT_START, node]))
     return settings, tuple(missing)
 
 
 def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) -> Procedure[None]:
-    """Set the drive's software limits: none while un-homed, for they count from home."""
-    if homed:
-        yield from _write_limits(access, *settings.limits_counts)
-        return
-    refusals = []
-    for lower, upper in od.NO_LIMITS:
-        try:
-            yield from _write_limits(access, lower, upper)
-        except DriveRefusalError as error:
-            refusals.append(error)
-        else:
-            return
-    raise refusals[0]
+    """Write the drive's software limits; without home, which they count from, none."""
+
+    def write(lower: int, upper: int) -> Procedure[None]:
+        yield from access.write_checked(od.LOWER_LIMIT, lower, variable=True)
+        yield from access.write_checked(od.UPPER_LIMIT, upper, variable=True)
+
+    limits = [settings.limits_counts] if homed else od.NO_LIMITS
+    yield from _first_accepted(write(lower, upper) for lower, upper in limits)
 
 
 def write_homing(access: ObjectAccess, settings: DriveSettings, speed: float) -> Procedure[None]:
-    """Set the speeds of a homing; `speed` in unit/s, at least one of the drive's own units."""
+    """Write the speeds of a homing; `speed` [unit/s] is at least one of the drive's units."""
     if speed * settings.counts_per_unit < settings.speed_unit:
         raise DriveError(f"homing at {speed:g}/s is less than one of the drive's units of speed")
     yield from access.write(od.HOMING_SPEED_SWITCH, settings.magnitude(speed, settings.speed_unit))
-    # Slow on the edge that counts.
+    # Leave the switch slowly: its edge defines the position.
     yield from access.write(
         od.HOMING_SPEED_ZERO, settings.magnitude(speed / 4.0, settings.speed_unit)
     )
 
 
-def _write_limits(access: ObjectAccess, lower: int, upper: int) -> Procedure[None]:
-    yield from access.write_checked(od.LOWER_LIMIT, lower, variable=True)
-    yield from access.write_checked(od.UPPER_LIMIT, upper, variable=True)
+# ---- motion -------------------------------------------------------------------------------------
 
 
 def _set_up_motion(
@@ -135,19 +136,19 @@ def _set_up_motion(
 ) -> Procedure[list[str]]:
     yield from _switch_off(link, access, settings)
     yield from _check_modes(link, access, settings.node_id)
-    # Quick stop on its ramp, and stay: no set-point from before moves the axis afterwards.
+    # Quick stop on its ramp, then hold: an earlier set-point must not move the axis afterwards.
     yield from access.write_checked(od.QUICK_STOP_OPTION, 6)
-    # The node keeps its state: whether it exchanges process data tells a reboot.
-    yield from access.offer(od.ERROR_BEHAVIOUR, 1)
+    # Keep the NMT state on an error: the driver detects a reboot by that state.
+    yield from access.write_optional(od.ERROR_BEHAVIOUR, 1)
     yield from _write_homing_method(access, settings.homing_method)
     window = settings.magnitude(settings.following_error)
     speed = settings.magnitude(settings.speed, settings.speed_unit)
     ramp = settings.magnitude(settings.acceleration, settings.ramp_unit)
     stop_ramp = settings.magnitude(settings.quick_stop_deceleration, settings.ramp_unit)
-    # Entries that a drive may lack. Where a rule needs one: the least and the most that the drive
-    # may round it to; less or more is clipped.
+    # Objects that a drive may lack: value, and if a rule depends on the object, the least and
+    # greatest accepted value after rounding by the drive. Any other value was clipped.
     wanted: list[tuple[od.Entry, int, tuple[int, int] | None]] = [
-        # Ramps, never coasting; without the computer's heartbeat a fault, which latches.
+        # Stop on ramps, never coast; a missing heartbeat is a fault, which latches.
         (od.SHUTDOWN_OPTION, 1, None),
         (od.DISABLE_OPTION, 1, None),
         (od.FAULT_REACTION_OPTION, 2, (2, 2)),
@@ -168,28 +169,47 @@ def _set_up_motion(
         torque = round(settings.max_torque * 1e3)
         wanted.append((od.MAX_TORQUE, torque, (torque // 2 + 1, 2 * torque)))
     missing = []
-    for entry, value, taken in wanted:
-        missing.append((yield from _set(access, entry, value, taken)))
+    for entry, value, accepted in wanted:
+        missing.append((yield from _write_wanted(access, entry, value, accepted)))
     return [text for text in missing if text]
 
 
-def _write_heartbeat(access: ObjectAccess) -> Procedure[None]:
+def _write_wanted(
+    access: ObjectAccess, entry: od.Entry, value: int, accepted: tuple[int, int] | None
+) -> Procedure[str]:
+    """Write an object; return what the drive lacks. It may refuse one that no rule depends on."""
     try:
-        yield from access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
+        if accepted is None:
+            yield from access.write(entry, value)
+        else:
+            yield from access.write_checked(entry, value, accepted=accepted)
     except DriveRefusalError as error:
         if error.object_is_missing:
+            return _LEFT_OUT.format(entry)
+        if accepted is not None:
             raise
-        if not 0 < (yield from access.read(od.PRODUCER_HEARTBEAT)) <= _SLOWEST_HEARTBEAT_MS:
-            raise
+        return _KEPT.format(entry, value)
+    return ""
+
+
+def _switch_off(link: FrameLink, access: ObjectAccess, settings: DriveSettings) -> Procedure[None]:
+    """Switch a powered drive off: it may refuse settings."""
+    if drive_state((yield from access.read(od.STATUSWORD))) not in POWERED:
+        return
+    yield from access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
+    until = link.now + _SWITCH_OFF_TIMEOUT
+    while drive_state((yield from access.read(od.STATUSWORD))) in POWERED:
+        if link.now > until:
+            raise DriveError(f"node {settings.node_id} does not switch off")
 
 
 def _check_modes(link: FrameLink, access: ObjectAccess, node: int) -> Procedure[None]:
-    """Refuse a drive that lacks a mode; the drive is off.
+    """Check that a drive, which is off, has both modes.
 
-    Without 0x6502 each mode is tried. Cyclic synchronous position is also tried where 0x6502 does
-    not list it: an EPOS4 supports it all the same.
+    Without 0x6502 each mode is tried. Cyclic synchronous position is also tried if 0x6502 does not
+    list it, because an EPOS4 supports it without listing it.
     """
-    listed = yield from access.ask(od.SUPPORTED_MODES)
+    listed = yield from access.read_optional(od.SUPPORTED_MODES)
     if listed is not None and not listed & SUPPORTS_HOMING:
         raise DriveError(f"node {node} has no homing mode (0x6502 = 0x{listed:08X})")
     if listed is None:
@@ -199,9 +219,9 @@ def _check_modes(link: FrameLink, access: ObjectAccess, node: int) -> Procedure[
 
 
 def _try_mode(link: FrameLink, access: ObjectAccess, node: int, mode: Mode) -> Procedure[None]:
-    """Refuse a drive that does not take a mode, or does not show it."""
+    """Select a mode, and wait until the drive displays it."""
     yield from access.write(od.MODE_OF_OPERATION, mode)
-    until = link.now + _MODE_WAIT
+    until = link.now + _MODE_TIMEOUT
     while (shown := (yield from access.read(od.MODE_DISPLAY))) != mode:
         if link.now > until:
             raise DriveError(
@@ -210,57 +230,95 @@ def _try_mode(link: FrameLink, access: ObjectAccess, node: int, mode: Mode) -> P
             )
 
 
-def _set(
-    access: ObjectAccess, entry: od.Entry, value: int, taken: tuple[int, int] | None
-) -> Procedure[str]:
-    """Write an entry; return what the drive lacks. It may refuse an entry that no rule needs."""
+def _write_homing_method(access: ObjectAccess, method: int) -> Procedure[None]:
+    # The standard's older edition has another number, 35, for "where it stands".
+    others = [other for other in HERE if other != method] if method in HERE else []
+    yield from _first_accepted(access.write(od.HOMING_METHOD, one) for one in (method, *others))
+
+
+def _write_heartbeat(access: ObjectAccess) -> Procedure[None]:
     try:
-        if taken is None:
-            yield from access.write(entry, value)
-        else:
-            yield from access.write_checked(entry, value, taken=taken)
+        yield from access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
     except DriveRefusalError as error:
         if error.object_is_missing:
-            return _LEFT_OUT.format(entry)
-        if taken is not None:
             raise
-        return _KEPT.format(entry, value)
-    return ""
-
-
-def _switch_off(link: FrameLink, access: ObjectAccess, settings: DriveSettings) -> Procedure[None]:
-    """Switch off what another program left on: a powered drive takes no settings."""
-    if drive_state((yield from access.read(od.STATUSWORD))) not in POWERED:
-        return
-    yield from access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
-    until = link.now + _SWITCH_OFF_WAIT
-    while drive_state((yield from access.read(od.STATUSWORD))) in POWERED:
-        if link.now > until:
-            raise DriveError(f"node {settings.node_id} does not switch off")
-
-
-def _write_homing_method(access: ObjectAccess, method: int) -> Procedure[None]:
-    try:
-        yield from access.write(od.HOMING_METHOD, method)
-    except DriveRefusalError:
-        if method not in HERE:
+        if not 0 < (yield from access.read(od.PRODUCER_HEARTBEAT)) <= _MAX_HEARTBEAT_MS:
             raise
-        # Two numbers for "where it stands": 35 is the older edition's.
-        for other in HERE:
-            if other != method:
-                yield from access.write(od.HOMING_METHOD, other)
 
 
-def _map_full(
-    access: ObjectAccess, node: int, full: od.Pdo, without: od.Pdo, missing: str
+# ---- process data -------------------------------------------------------------------------------
+
+
+def _map_optional(
+    access: ObjectAccess, node: int, full: Pdo, without: Pdo, missing: str
 ) -> Procedure[list[str]]:
-    """Map a PDO with its last entry where the drive can; return what it lacks."""
+    """Map a PDO, without its last entry if the drive lacks it; return what it lacks."""
     try:
-        if (yield from access.ask(full.entries[-1])) is not None:
-            yield from map_pdo(access, node, full)
+        if (yield from access.read_optional(full.entries[-1])) is not None:
+            yield from _map_pdo(access, node, full)
             return []
     except DriveRefusalError:
-        # Either the entry cannot be mapped, or the next attempt tells what else it is.
+        # The entry cannot be mapped; any other reason also shows in the next attempt.
         pass
-    yield from map_pdo(access, node, without)
+    yield from _map_pdo(access, node, without)
     return [missing]
+
+
+def _map_pdo(access: ObjectAccess, node: int, pdo: Pdo) -> Procedure[None]:
+    """Map a PDO in the order of CiA 301: off, transmission type, mapping, on."""
+    cob_id, count = _cob_id(pdo.communication), od.Entry(pdo.mapping, 0, od.U8, "mapped entries")
+    address = pdo.function_code + node
+    try:
+        before = yield from access.read(cob_id)
+    except DriveRefusalError:
+        before = address
+    # The address may change only while the PDO is off. The bit for remote frames must stay.
+    yield from access.write(cob_id, od.PDO_OFF | before)
+    yield from _write_transmission(access, pdo)
+    if pdo.communication >= _FIRST_TRANSMIT_PDO:
+        # Send at once after a SYNC, and only then.
+        for subindex, name in ((3, "inhibit time"), (5, "event timer")):
+            entry = od.Entry(pdo.communication, subindex, od.U16, name)
+            yield from access.write_optional(entry, 0)
+    yield from access.write(count, 0)
+    for number, entry in enumerate(pdo.entries, start=1):
+        yield from access.write(
+            od.Entry(pdo.mapping, number, od.U32, f"mapping of {entry}"), entry.mapping
+        )
+    yield from access.write(count, len(pdo.entries))
+    yield from access.write(cob_id, before & od.PDO_NO_REMOTE | address)
+
+
+def _switch_off_unused_pdos(access: ObjectAccess) -> Procedure[None]:
+    """Switch the other transmit PDOs off, which may send on each change and load the bus."""
+    for communication in _UNUSED_PDOS:
+        cob_id = _cob_id(communication)
+        before = yield from access.read_optional(cob_id)
+        if before is not None and not before & od.PDO_OFF:
+            yield from access.write_optional(cob_id, od.PDO_OFF | before)
+
+
+def _cob_id(communication: int) -> od.Entry:
+    return od.Entry(communication, 1, od.U32, "COB-ID")
+
+
+def _write_transmission(access: ObjectAccess, pdo: Pdo) -> Procedure[None]:
+    transmission = od.Entry(pdo.communication, 2, od.U8, "transmission type")
+    types = [pdo.transmission]
+    if pdo.communication < _FIRST_TRANSMIT_PDO:
+        # A received PDO may also take effect at once: all PDOs of a cycle are sent together.
+        types += [od.ASYNCHRONOUS, od.ASYNCHRONOUS_BY_MANUFACTURER]
+    yield from _first_accepted(access.write(transmission, number) for number in types)
+
+
+def _first_accepted(attempts: Iterable[Procedure[None]]) -> Procedure[None]:
+    """Run procedures until the drive accepts one; raise the first refusal if it accepts none."""
+    refusals = []
+    for attempt in attempts:
+        try:
+            yield from attempt
+        except DriveRefusalError as error:
+            refusals.append(error)
+        else:
+            return
+    raise refusals[0]

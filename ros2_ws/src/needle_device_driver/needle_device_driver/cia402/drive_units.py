@@ -1,4 +1,4 @@
-"""Units in which a drive takes its speeds and ramps (CiA 402-3, codes of CiA 303-2)."""
+"""Units of a drive's speeds and ramps (CiA 402-3, codes of CiA 303-2)."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from needle_device_driver.link import objects as od
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
 from needle_device_driver.procedure import Procedure
 
-# Codes of numerators and denominators. A quantity without dimension is in counts.
+# Codes of numerators and denominators. A dimensionless quantity is in counts.
 _NUMERATORS = {0x00: "counts", 0x01: "m", 0x10: "rad", 0x41: "deg", 0xB4: "turns", 0xB5: "counts"}
 _DENOMINATORS = {0x00: "", 0x03: "/s", 0x47: "/min", 0x57: "/s^2"}
-_TURNED = {(0xB4, 0x47): "rpm", (0xC0, 0x03): "rpm/s"}
-# Quantity of each object, and the units that are accepted.
-_TAKEN = {
+_TURN_UNITS = {(0xB4, 0x47): "rpm", (0xC0, 0x03): "rpm/s"}
+# Quantity of each object, and the accepted units.
+_ACCEPTED = {
     od.POSITION_UNIT: ("positions", "counts"),
     od.SPEED_UNIT: ("speeds", "counts/s", "rpm"),
     od.RAMP_UNIT: ("ramps", "counts/s^2", "rpm/s"),
@@ -24,27 +24,27 @@ _TAKEN = {
 def read_units(
     access: ObjectAccess, settings: DriveSettings
 ) -> Procedure[tuple[DriveSettings, str]]:
-    """Return the settings of a drive with the units that it tells in 0x60A9 and 0x60AA.
+    """Return the settings of a drive with its units, from 0x60A9 and 0x60AA.
 
     Parameters
     ----------
     access : ObjectAccess
         The drive.
     settings : DriveSettings
-        Its settings so far; a `counts_per_turn` of theirs goes before 0x608F and 0x6091.
+        Its settings; a `counts_per_turn` above 0 replaces 0x608F and 0x6091.
 
     Returns
     -------
     DriveSettings
-        With units of counts/s or rpm, with any prefix; counts/s where the drive does not tell.
+        With units of counts/s or rpm, with any prefix; by default counts/s.
     str
-        What the drive does not tell, and what is assumed in its place; empty: nothing.
+        Units that the drive does not report, and the assumed ones; empty: none.
 
     Raises
     ------
     DriveError
-        If positions are not in counts, a unit is none of these, or the drive does not tell the
-        counts in a turn, or tells two numbers of them.
+        If positions are not in counts, a unit is another one, or the counts per turn are missing or
+        inconsistent.
     LinkError
         If the link is lost.
     """
@@ -57,54 +57,57 @@ def read_units(
     if factor not in (None, 1.0):
         raise DriveError(f"the drive scales speeds by {factor:g} (0x6096), wanted counts/s")
     ramps = "counts/s^2" if speed is None else "the unit of its speeds per second"
-    untold = ["counts/s (0x60A9)"] * (speed is None) + [f"{ramps} (0x60AA)"] * (ramp is None)
+    assumptions = ["counts/s (0x60A9)"] * (speed is None) + [f"{ramps} (0x60AA)"] * (ramp is None)
     assumed = (
-        f"does not tell its units; assumed: {', '.join(untold)}; "
+        f"does not tell its units; assumed: {', '.join(assumptions)}; "
         "home it without a needle first (docs/hardware.md)"
     )
     speed = speed or 1.0
-    # The bound of a homing to an index pulse includes one turn.
+    # Only the bound of a homing to an index pulse needs the turn.
     turn = 0.0
     if settings.homing_method in INDEX_PULSE:
         turn = yield from _counts_per_turn(access, settings)
     settings = dataclasses.replace(
         settings, counts_per_turn=turn, speed_unit=speed, ramp_unit=ramp or speed
     )
-    return settings, assumed if untold else ""
+    return settings, assumed if assumptions else ""
 
 
 def _counts_in(
     access: ObjectAccess, settings: DriveSettings, entry: od.Entry
 ) -> Procedure[float | None]:
-    """Return the counts, per second or its square, in one unit; None: the drive does not tell."""
-    code = yield from access.ask(entry)
+    """Return a unit of speed [counts/s] or ramps [counts/s^2]; None: not reported."""
+    code = yield from access.read_optional(entry)
     if not code:
         return None
-    # The upper byte is a power of ten, with a sign.
+    # The upper byte is a power of ten, signed.
     power, above, below = (code >> 24 ^ 0x80) - 0x80, code >> 16 & 0xFF, code >> 8 & 0xFF
-    unit = _TURNED.get((above, below)) or (
+    unit = _TURN_UNITS.get((above, below)) or (
         _NUMERATORS.get(above, f"unit 0x{above:02X}")
         + _DENOMINATORS.get(below, f" per unit 0x{below:02X}")
     )
-    what, *wanted = _TAKEN[entry]
-    turns = unit in _TURNED.values()
+    what, *wanted = _ACCEPTED[entry]
+    turns = unit in _TURN_UNITS.values()
     turn = (yield from _counts_per_turn(access, settings)) if turns else 60.0
     wanted = wanted[: 1 + bool(turn)]
     if unit not in wanted or (power and entry is od.POSITION_UNIT):
-        told = (f"10^{power} " if power else "") + f"{unit} (0x{entry.index:04X} = 0x{code:08X})"
+        scale = f"10^{power} " if power else ""
+        unit_text = f"{scale}{unit} (0x{entry.index:04X} = 0x{code:08X})"
         hint = "; *_counts_per_turn converts rpm without 0x608F" if turns else ""
-        raise DriveError(f"the drive counts {what} in {told}, wanted {' or '.join(wanted)}{hint}")
+        raise DriveError(
+            f"the drive counts {what} in {unit_text}, wanted {' or '.join(wanted)}{hint}"
+        )
     feed = None
     if turns and not settings.counts_per_turn:
         feed = yield from _ratio(access, od.FEED_CONSTANT)
     if feed and round(feed / turn, 6) != 1.0:
-        told = f"{turn:g} (0x608F, 0x6091) and {feed:g} (0x6092)"
-        raise DriveError(f"the drive tells {told} counts in a turn: *_counts_per_turn says which")
+        both = f"{turn:g} (0x608F, 0x6091) and {feed:g} (0x6092)"
+        raise DriveError(f"the drive tells {both} counts in a turn: *_counts_per_turn says which")
     return 10.0**power * turn / 60.0
 
 
 def _counts_per_turn(access: ObjectAccess, settings: DriveSettings) -> Procedure[float]:
-    """Return the counts in a turn of the drive's shaft; 0: not known."""
+    """Return the counts per turn of the drive's shaft; 0: unknown."""
     if settings.counts_per_turn:
         return settings.counts_per_turn
     resolution = yield from _ratio(access, od.ENCODER_RESOLUTION)
@@ -113,6 +116,6 @@ def _counts_per_turn(access: ObjectAccess, settings: DriveSettings) -> Procedure
 
 
 def _ratio(access: ObjectAccess, entries: tuple[od.Entry, od.Entry]) -> Procedure[float | None]:
-    above = yield from access.ask(entries[0])
-    below = yield from access.ask(entries[1])
+    above = yield from access.read_optional(entries[0])
+    below = yield from access.read_optional(entries[1])
     return above / below if above and below else None

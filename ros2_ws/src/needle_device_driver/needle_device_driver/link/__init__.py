@@ -1,1 +1,1 @@
-"""The CAN bus behind whatever adapter there is, and the objects read and written over it."""
+"""CAN bus and its adapters, and access to the objects of the drives."""

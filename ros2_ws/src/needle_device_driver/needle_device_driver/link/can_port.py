@@ -1,4 +1,4 @@
-"""The CAN bus behind whatever adapter there is: a port with a thread that opens and reads it."""
+"""Port on a CAN bus: a thread opens the adapter, receives frames, and reopens a lost adapter."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.link.slcan_bus import SlcanBus
 from needle_device_driver.link.socketcand_bus import SocketcandBus
 
-_RECEIVE_WAIT = 0.05
-_JOIN_WAIT = 1.0
-_OPEN_AGAIN = 0.1
-# An adapter from which nothing comes for so long may have started meanwhile, its channel closed.
+_RECEIVE_TIMEOUT = 0.05
+_JOIN_TIMEOUT = 1.0
+_REOPEN_PERIOD = 0.1
+# A silent adapter may have restarted with its channel closed; after this time it is set up again.
 _SILENCE = 0.4
-_LARGEST_BATCH = 50
+_MAX_BATCH = 50
 
 Batch = tuple[CanFrame | CanErrors, ...]
 
 
-def open_bus(settings: LinkSettings) -> can.BusABC:
-    """Open the adapter; raises what python-can and the operating system have."""
-    if settings.kind == "slcan":
+def open_bus(settings: LinkSettings, write_timeout: float) -> can.BusABC:
+    """Open the adapter; raises the errors of python-can and of the operating system."""
+    if settings.link == "slcan":
         return SlcanBus(
             settings.channel,
             bitrate=settings.bitrate,
             tty_baudrate=settings.tty_baudrate,
-            write_timeout=settings.write_timeout,
+            write_timeout=write_timeout,
         )
-    if settings.kind == "socketcand":
+    if settings.link == "socketcand":
         return SocketcandBus(
             settings.channel,
             host=settings.host,
             port=settings.port,
-            write_timeout=settings.write_timeout,
+            write_timeout=write_timeout,
         )
-    return can.Bus(interface=settings.kind, channel=settings.channel)
+    return can.Bus(interface=settings.link, channel=settings.channel)
 
 
-def _plainly(error: Exception) -> str:
-    """Return an error as a person reads it: the system's own word where it has one."""
+def _error_text(error: Exception) -> str:
+    """Return one line on an error: the operating system's text if there is one."""
     for cause in (error, error.__cause__, error.__context__):
         if isinstance(cause, OSError) and cause.errno is not None:
             return os.strerror(cause.errno)
@@ -54,40 +54,48 @@ def _plainly(error: Exception) -> str:
 
 
 class CanPort:
-    """A CAN bus behind an adapter, which its thread opens, reads, and opens again when it is lost.
+    """Port on a CAN bus.
 
     Parameters
     ----------
     settings : LinkSettings
-        Which adapter.
+        The adapter.
+    write_timeout : float
+        An adapter that accepts no frame for this time is lost [s].
     clock : callable
-        Steady time [s].
+        Returns the steady time [s].
     """
 
-    def __init__(self, settings: LinkSettings, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        settings: LinkSettings,
+        write_timeout: float = 0.05,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._settings = settings
+        self._write_timeout = write_timeout
         self._clock = clock
         self._closed = threading.Event()
-        self._heard_at = 0.0
-        # Of the adapter: the thread greets it while others send.
+        self._received_at = 0.0
+        # Protects the adapter: the thread may set it up while another thread sends.
         self._lock = threading.Lock()
         self._bus: can.BusABC | None = None
         self._errors = self._refusals = 0
-        self._told: PortChange | None = None
+        self._reported: PortChange | None = None
         self._thread = threading.Thread(target=self._run, name="can-receive", daemon=True)
 
     def open(self, arrive: Callable[[Batch | PortChange], None]) -> None:
-        """Begin, with one attempt at once; `arrive` is called by whatever thread."""
+        """Try once to open the adapter, then start the thread; any thread may call `arrive`."""
         self.begin(arrive)
         self._thread.start()
 
     def begin(self, arrive: Callable[[Batch | PortChange], None]) -> None:
-        """Open the adapter as `open` does, and leave it to the caller to `step`."""
+        """Open the adapter without the thread; the caller calls `step`."""
         self._arrive = arrive
         self._open()
 
     def send(self, frames: tuple[CanFrame, ...]) -> None:
-        """Send frames; an adapter that takes none for `write_timeout` is lost, and that is told."""
+        """Send frames; without an adapter they are dropped, and an error loses the adapter."""
         with self._lock:
             bus = self._bus
             if bus is None:
@@ -103,43 +111,43 @@ class CanPort:
                 self._lose(error)
 
     def close(self) -> None:
-        """Let go of the adapter. May be called twice."""
+        """End the thread and close the adapter. May be called twice."""
         self._closed.set()
         if self._thread.is_alive():
-            self._thread.join(_JOIN_WAIT)
+            self._thread.join(_JOIN_TIMEOUT)
         with self._lock:
-            self._let_go()
+            self._shut_down()
 
-    def _tell(self, change: PortChange) -> None:
-        if change != self._told:
-            self._told = change
+    def _report(self, change: PortChange) -> None:
+        if change != self._reported:
+            self._reported = change
             self._arrive(change)
 
     def _open(self) -> None:
         try:
-            bus = open_bus(self._settings)
+            bus = open_bus(self._settings, self._write_timeout)
         except (can.CanError, OSError, ValueError) as error:
-            self._tell(PortChange(_plainly(error)))
+            self._report(PortChange(_error_text(error)))
             return
         self._errors = self._refusals = 0
-        self._bus, self._heard_at = bus, self._clock()
-        self._tell(PortChange())
+        self._bus, self._received_at = bus, self._clock()
+        self._report(PortChange())
 
     def _lose(self, error: Exception) -> None:
-        """Let go of an adapter that failed, once."""
+        """Close an adapter that failed, and report the loss once."""
         if self._bus is not None:
-            self._let_go()
-            self._tell(PortChange(_plainly(error)))
+            self._shut_down()
+            self._report(PortChange(_error_text(error)))
 
-    def _let_go(self) -> None:
+    def _shut_down(self) -> None:
         bus, self._bus = self._bus, None
         if bus is None:
             return
-        # What is lost cannot be told to close.
+        # A lost adapter cannot execute the command to close its channel.
         with contextlib.suppress(can.CanError, OSError):
             bus.shutdown()
         if isinstance(bus, SlcanBus):
-            # Its shutdown tells the adapter first and keeps the port open where that fails.
+            # Where that command fails, python-can leaves the serial port open.
             with contextlib.suppress(OSError):
                 bus.serialPortOrig.close()
 
@@ -150,40 +158,39 @@ class CanPort:
             self.step()
 
     def step(self) -> None:
-        """Hand on what is there, once something is or a while is over; open what is lost."""
+        """Wait a short time for frames and pass them on; reopen a lost adapter."""
         bus = self._bus
         if bus is None:
-            if not self._closed.wait(_OPEN_AGAIN):
+            if not self._closed.wait(_REOPEN_PERIOD):
                 self._open()
             return
         try:
             batch = self._receive(bus)
             if batch:
-                self._heard_at = self._clock()
+                self._received_at = self._clock()
                 self._arrive(batch)
-            if self._clock() - self._heard_at > _SILENCE and isinstance(bus, SlcanBus):
-                self._heard_at = self._clock()
+            if self._clock() - self._received_at > _SILENCE and isinstance(bus, SlcanBus):
+                self._received_at = self._clock()
                 with self._lock:
-                    bus.greet()
-        # python-can's adapters raise what their operating system has.
+                    bus.set_up_channel()
+        # python-can's adapters raise whatever their operating system raises.
         except Exception as error:  # noqa: BLE001
             with self._lock:
                 if self._bus is bus:
                     self._lose(error)
 
     def _receive(self, bus: can.BusABC) -> Batch:
-        """Return what is there, once something is or a while is over."""
         items: list[CanFrame | CanErrors] = []
-        message, error_frames = bus.recv(_RECEIVE_WAIT), 0
+        message, error_frames = bus.recv(_RECEIVE_TIMEOUT), 0
         while message is not None:
             if message.is_error_frame:
                 error_frames += 1
             elif not (message.is_remote_frame or message.is_extended_id):
                 frame = CanFrame(message.arbitration_id, bytes(message.data), time=self._clock())
                 items.append(frame)
-            message = bus.recv(0.0) if len(items) < _LARGEST_BATCH else None
-        errors = bus.malformed if isinstance(bus, SlcanBus | SocketcandBus) else 0
-        refusals = bus.refused if isinstance(bus, SlcanBus) else 0
+            message = bus.recv(0.0) if len(items) < _MAX_BATCH else None
+        # python-can's own buses have no such counters.
+        errors, refusals = getattr(bus, "malformed", 0), getattr(bus, "refused", 0)
         if error_frames or (errors, refusals) != (self._errors, self._refusals):
             count = error_frames + errors - self._errors
             items.append(CanErrors(count, refusals - self._refusals))

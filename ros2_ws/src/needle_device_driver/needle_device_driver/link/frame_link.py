@@ -1,25 +1,24 @@
-"""The CAN bus as drives are steered through it: frames come and go in batches, between handlers."""
+"""CAN bus of the drives: components pass its frames in batches."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
 from needle_core.can_frame import CanErrors, CanFrame
-from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.link.objects import (
     HEARTBEAT,
     MASTER_NODE_ID,
     NMT,
     NMT_OPERATIONAL,
-    SDO_ANSWER,
+    SDO_RESPONSE,
     SYNC,
 )
 from needle_device_driver.link.sdo_client import SdoClient
 
 _HEARTBEAT_PERIOD = 0.02
 
-# What only a master sends, whom an adapter does not let hear itself.
-_OF_MASTERS = {
+# Frames that only a master sends. An adapter does not echo our own.
+_MASTER_FRAMES = {
     NMT: "NMT commands",
     SYNC: "SYNC",
     HEARTBEAT + MASTER_NODE_ID: f"the heartbeat of node {MASTER_NODE_ID}, the computer's own",
@@ -29,31 +28,37 @@ Callback = Callable[[bytes, float], None]
 
 
 class LinkError(Exception):
-    """The link cannot be opened or is lost; the text says which and why."""
+    """The link cannot be opened or is lost; the text names the link and the reason."""
 
 
 class FrameLink:
-    """One CAN bus, to be opened, lost and opened again; whoever runs the component carries frames.
+    """One CAN bus, which can be opened, lost and opened again.
 
-    What is lost stays lost until it is opened again, for the drives have missed something.
+    A lost link stays lost until `open` is called: the drives have missed frames.
 
     Parameters
     ----------
-    settings : LinkSettings
-        Only their text counts.
+    name : str
+        Name of the link in messages.
 
     Attributes
     ----------
     now : float
-        Steady time of the handler that runs [s].
+        Steady time of the running handler [s].
     lost : str
-        How the link was lost; empty: it is not.
+        Reason why the link was lost; empty: it was not.
     other_master : str
-        What another master was heard to send; empty: nobody's.
+        Frame of another master on the bus; empty: there is none.
+    openings : int
+        How often the link was opened.
+    frames_sent, frames_received, error_frames : int
+        Counters.
+    refused : int
+        Number of commands and frames that the adapter refused.
     """
 
-    def __init__(self, settings: LinkSettings) -> None:
-        self.settings = settings
+    def __init__(self, name: str) -> None:
+        self.name = name
         self.now = 0.0
         self.lost = ""
         self.other_master = ""
@@ -63,18 +68,18 @@ class FrameLink:
         self.error_frames = 0
         self.refused = 0
         self._is_open = False
-        self._why_not = ""
-        self._sent: list[CanFrame] = []
+        self._port_error = ""
+        self._outgoing: list[CanFrame] = []
         self._callbacks: dict[int, list[Callback]] = {}
-        self._sdo: dict[int, SdoClient] = {}
+        self._sdo_clients: dict[int, SdoClient] = {}
 
     @property
     def is_open(self) -> bool:
-        """Tell whether frames pass."""
+        """Whether frames pass."""
         return self._is_open and not self.lost
 
     def open(self) -> None:
-        """Let frames pass; a lost link begins anew.
+        """Open the link, also after a loss.
 
         Raises
         ------
@@ -83,59 +88,60 @@ class FrameLink:
         """
         if self.is_open:
             return
-        if self._why_not:
-            raise LinkError(f"cannot open {self.settings}: {self._why_not}")
+        if self._port_error:
+            raise LinkError(f"cannot open {self.name}: {self._port_error}")
         self._is_open = True
-        # What was asked before is not answered any more.
-        self._sdo = {}
+        # Requests from before get no response.
+        self._sdo_clients = {}
         self.lost = self.other_master = ""
         self.openings += 1
 
-    def change(self, why_not: str) -> None:
-        """Take that the port is open, or why it is not."""
-        self._why_not = why_not
-        if why_not and self.is_open:
-            self.lost = f"link {self.settings} is lost: {why_not}"
+    def set_port_error(self, error: str) -> None:
+        """Note why the port is not open; empty: it is open."""
+        self._port_error = error
+        if error and self.is_open:
+            self.lost = f"link {self.name} is lost: {error}"
 
     def close(self) -> None:
-        """Let no frame pass."""
+        """Close the link."""
         self._is_open = False
 
     def send(self, cob_id: int, data: bytes = b"") -> None:
-        """Send one frame with the batch of the handler that runs.
+        """Add one frame to the outgoing batch of the running handler.
 
         Raises
         ------
         LinkError
             If the link is closed or lost.
         """
-        if not self.is_open:
-            raise LinkError(self.lost or f"{self.settings} is not open")
-        self._sent.append(CanFrame(cob_id, data))
+        self._require_open()
+        self._outgoing.append(CanFrame(cob_id, data))
         self.frames_sent += 1
 
-    def take_sent(self) -> tuple[CanFrame, ...]:
+    def pop_outgoing(self) -> tuple[CanFrame, ...]:
         """Return the frames that were sent since the last call."""
-        frames = tuple(self._sent)
-        self._sent.clear()
+        frames = tuple(self._outgoing)
+        self._outgoing.clear()
         return frames
 
     def receive(self, items: Iterable[CanFrame | CanErrors]) -> None:
-        """Take what comes off the bus."""
+        """Receive frames and error counts from the port."""
         for item in items:
             if isinstance(item, CanErrors):
                 self.error_frames += item.frames + item.refusals
                 self.refused += item.refusals
             elif self.is_open and not item.remote:
                 time = self.now if item.time is None else item.time
-                self._take(item.identifier, item.data, time)
+                self._receive_frame(item.identifier, item.data, time)
 
     def subscribe(self, cob_id: int, callback: Callback) -> None:
         """Call `callback(data, time)` for each frame with this COB-ID, as it arrives."""
         self._callbacks.setdefault(cob_id, []).append(callback)
 
     def beat(self) -> None:
-        """Tell the drives' watchdogs that the control loop runs; only the loop itself may.
+        """Send the computer's heartbeat, which the drives' watchdogs need.
+
+        Only the control loop may call this: the heartbeat proves that the loop runs.
 
         Raises
         ------
@@ -144,27 +150,29 @@ class FrameLink:
         """
         self.send(HEARTBEAT + MASTER_NODE_ID, bytes([NMT_OPERATIONAL]))
 
-    def sdo(self, node_id: int) -> SdoClient:
-        """Return the SDO client of a node, on the present opening of the link.
+    def sdo_client(self, node_id: int) -> SdoClient:
+        """Return the SDO client of a node; each opening of the link has its own.
 
         Raises
         ------
         LinkError
             If the link is closed or lost.
         """
-        if not self.is_open:
-            raise LinkError(self.lost or f"{self.settings} is not open")
-        if node_id not in self._sdo:
-            self._sdo[node_id] = SdoClient(node_id, self.send, self.beat, _HEARTBEAT_PERIOD)
-        return self._sdo[node_id]
+        self._require_open()
+        if node_id not in self._sdo_clients:
+            self._sdo_clients[node_id] = SdoClient(node_id, self.send, self.beat, _HEARTBEAT_PERIOD)
+        return self._sdo_clients[node_id]
 
-    def _take(self, cob_id: int, data: bytes, time: float) -> None:
-        """Hand a frame that arrived at `time` [s] to whom it concerns."""
+    def _require_open(self) -> None:
+        if not self.is_open:
+            raise LinkError(self.lost or f"{self.name} is not open")
+
+    def _receive_frame(self, cob_id: int, data: bytes, time: float) -> None:
         self.frames_received += 1
-        if cob_id in _OF_MASTERS:
-            self.other_master = f"another master is on the bus: it sends {_OF_MASTERS[cob_id]}"
+        if cob_id in _MASTER_FRAMES:
+            self.other_master = f"another master is on the bus: it sends {_MASTER_FRAMES[cob_id]}"
         for callback in self._callbacks.get(cob_id, ()):
             callback(data, time)
-        client = self._sdo.get(cob_id - SDO_ANSWER)
+        client = self._sdo_clients.get(cob_id - SDO_RESPONSE)
         if client is not None:
             client.receive(data)

@@ -1,31 +1,27 @@
-"""A drive's object dictionary, read and written by SDO."""
+"""Read and write access to a drive's object dictionary by SDO."""
 
 from __future__ import annotations
 
 import contextlib
 
+from needle_device_driver.link.error_codes import NO_SUCH_OBJECT, WRONG_LENGTH
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import Entry
-from needle_device_driver.link.sdo_aborts import (
-    NO_SUCH_OBJECT,
-    OTHER_LENGTH,
-    SdoAbortedError,
-    SdoSilenceError,
-)
+from needle_device_driver.link.sdo_client import SdoAbortedError, SdoTimeoutError
 from needle_device_driver.procedure import Procedure
 
 
 class DriveError(Exception):
-    """A drive does not answer, or refuses; the text says what and why."""
+    """A drive does not answer, or refuses; the text names the entry and the reason."""
 
 
 class DriveRefusalError(DriveError):
-    """A drive refuses to have an entry read or written.
+    """A drive refuses to read or write an entry.
 
     Parameters
     ----------
     text : str
-        What and why.
+        The entry and the reason.
     code : int
         SDO abort code.
     """
@@ -36,22 +32,19 @@ class DriveRefusalError(DriveError):
 
     @property
     def object_is_missing(self) -> bool:
-        """Tell whether the drive does not have the entry at all."""
+        """Whether the drive does not have the entry at all."""
         return self.code in NO_SUCH_OBJECT
 
 
 class ObjectAccess:
-    """Reads and writes entries of one node; each transfer is a procedure that awaits its answer.
-
-    Before each transfer, and while it waits, the computer's heartbeat goes out, so that the
-    watchdog of the other drive does not trip while one is set up.
+    """Reads and writes entries of one node; each transfer is a procedure.
 
     Parameters
     ----------
     link : FrameLink
         The bus, open.
     node_id : int
-        Which node.
+        The node.
     """
 
     def __init__(self, link: FrameLink, node_id: int) -> None:
@@ -59,7 +52,7 @@ class ObjectAccess:
         self._node_id = node_id
 
     def read(self, entry: Entry) -> Procedure[int]:
-        """Return an entry's value.
+        """Return the value of an entry.
 
         Raises
         ------
@@ -74,11 +67,11 @@ class ObjectAccess:
             data = yield from self._upload(entry)
             narrower = entry.resized(len(data)) if len(data) < entry.size else None
             return (narrower or entry).unpack(data)
-        except (SdoAbortedError, SdoSilenceError, ValueError) as error:
+        except (SdoAbortedError, SdoTimeoutError, ValueError) as error:
             raise self._error("read", entry, error) from error
 
-    def ask(self, entry: Entry) -> Procedure[int | None]:
-        """Return an entry's value, None if the drive refuses to tell it; else raises as `read`."""
+    def read_optional(self, entry: Entry) -> Procedure[int | None]:
+        """Return the value of an entry, None if the drive refuses; otherwise raises as `read`."""
         try:
             return (yield from self.read(entry))
         except DriveRefusalError:
@@ -87,18 +80,18 @@ class ObjectAccess:
     def write(self, entry: Entry, value: int, *, variable: bool = False) -> Procedure[None]:
         """Write an entry; raises as `read`.
 
-        A drive in which it is wider or narrower than the standard has it gets it as wide as it has
-        it. A drive that refuses to be given what it has already has not refused, unless the entry
-        is `variable`: it will be given other values later.
+        If the entry's size in the drive differs from the standard, the drive's size is used. A
+        refusal is no error if the entry has the value already, unless the entry is `variable`,
+        that is, later gets other values.
         """
         try:
             yield from self._download(entry, entry.pack(value))
         except SdoAbortedError as error:
-            if error.code in OTHER_LENGTH and (yield from self._write_resized(entry, value)):
+            if error.code in WRONG_LENGTH and (yield from self._write_resized(entry, value)):
                 return
-            if variable or not (yield from self._holds(entry, value)):
+            if variable or not (yield from self._has_value(entry, value)):
                 raise self._error(f"write {value} to", entry, error) from error
-        except SdoSilenceError as error:
+        except SdoTimeoutError as error:
             raise self._error(f"write {value} to", entry, error) from error
 
     def write_checked(
@@ -106,7 +99,7 @@ class ObjectAccess:
         entry: Entry,
         value: int,
         *,
-        taken: tuple[int, int] | None = None,
+        accepted: tuple[int, int] | None = None,
         variable: bool = False,
     ) -> Procedure[None]:
         """Write an entry that a safety rule depends on, and read it back; raises as `read`.
@@ -114,37 +107,38 @@ class ObjectAccess:
         Parameters
         ----------
         entry : Entry
-            Where.
+            The entry.
         value : int
-            What it shall be.
-        taken : tuple of int, optional
-            The least and the most that a drive which rounds may make of it; otherwise nothing else.
+            Its new value.
+        accepted : tuple of int, optional
+            Least and greatest accepted value after rounding by the drive; by default `value`.
         variable : bool
-            As `write` has it.
+            As in `write`.
 
         Raises
         ------
         DriveError
-            Also if the drive has something else then.
+            Also if the entry then has another value.
         """
         yield from self.write(entry, value, variable=variable)
         got = yield from self.read(entry)
-        lower, upper = taken or (value, value)
+        lower, upper = accepted or (value, value)
         if not lower <= got <= upper:
             raise DriveError(f"node {self._node_id} took {value} for {entry} and has {got}")
 
-    def offer(self, entry: Entry, value: int) -> Procedure[None]:
-        """Write an entry that is good to have; a drive that refuses goes without."""
+    def write_optional(self, entry: Entry, value: int) -> Procedure[None]:
+        """Write an entry; a refusal is ignored."""
         with contextlib.suppress(DriveRefusalError):
             yield from self.write(entry, value)
 
     def _upload(self, entry: Entry) -> Procedure[bytes]:
         self._link.beat()
-        return (yield from self._link.sdo(self._node_id).upload(entry.index, entry.subindex))
+        client = self._link.sdo_client(self._node_id)
+        return (yield from client.upload(entry.index, entry.subindex))
 
     def _download(self, entry: Entry, data: bytes) -> Procedure[None]:
         self._link.beat()
-        client = self._link.sdo(self._node_id)
+        client = self._link.sdo_client(self._node_id)
         yield from client.download(entry.index, entry.subindex, data)
 
     def _write_resized(self, entry: Entry, value: int) -> Procedure[bool]:
@@ -153,26 +147,26 @@ class ObjectAccess:
             if resized is None:
                 return False
             yield from self._download(resized, resized.pack(value))
-        except (SdoAbortedError, SdoSilenceError):
+        except (SdoAbortedError, SdoTimeoutError):
             return False
         return True
 
-    def _holds(self, entry: Entry, value: int) -> Procedure[bool]:
+    def _has_value(self, entry: Entry, value: int) -> Procedure[bool]:
         try:
             return (yield from self.read(entry)) == value
         except DriveError:
             return False
 
-    def _error(self, what: str, entry: Entry, error: Exception) -> DriveError:
+    def _error(self, action: str, entry: Entry, error: Exception) -> DriveError:
         if isinstance(error, SdoAbortedError):
             return DriveRefusalError(
-                f"node {self._node_id} refuses to {what} {entry}: {error} "
+                f"node {self._node_id} refuses to {action} {entry}: {error} "
                 "(docs/hardware.md says what for)",
                 error.code,
             )
         if isinstance(error, ValueError):
             return DriveError(f"node {self._node_id} sends {error}")
-        why = (
+        hint = (
             "; the adapter refuses what it is told: bitrate, wiring?" if self._link.refused else ""
         )
-        return DriveError(f"node {self._node_id} does not answer ({what} {entry}){why}")
+        return DriveError(f"node {self._node_id} does not answer ({action} {entry}){hint}")

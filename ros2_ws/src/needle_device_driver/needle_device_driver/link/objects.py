@@ -1,4 +1,4 @@
-"""The entries of a CiA 402 drive's object dictionary that the driver reads and writes."""
+"""Entries and PDOs of a CiA 402 drive's object dictionary that the driver uses."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from needle_core.errors import OutOfBoundsError
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """One entry: where it is and what it holds.
+    """One entry of an object dictionary.
 
     Attributes
     ----------
     index, subindex : int
-        Its address.
+        Address.
     format : str
         `struct` format, little-endian.
     name : str
-        As in CiA 301 and CiA 402.
+        As in CiA 301 or CiA 402.
     """
 
     index: int
@@ -28,7 +28,7 @@ class Entry:
     name: str
 
     def __str__(self) -> str:
-        """Return address and name as messages have them."""
+        """Return address and name, for messages."""
         return f"0x{self.index:04X}:{self.subindex} {self.name}"
 
     @property
@@ -38,16 +38,16 @@ class Entry:
 
     @property
     def mapping(self) -> int:
-        """The entry as a PDO's mapping parameter names it."""
+        """Value of the entry in a PDO mapping."""
         return self.index << 16 | self.subindex << 8 | 8 * self.size
 
     def pack(self, value: int) -> bytes:
-        """Return a value as bytes.
+        """Encode a value.
 
         Raises
         ------
         OutOfBoundsError
-            If the entry cannot hold it.
+            If the value does not fit.
         """
         try:
             return struct.pack(self.format, value)
@@ -59,12 +59,12 @@ class Entry:
             raise OutOfBoundsError(str(self), value, lower, upper, "counts") from None
 
     def unpack(self, data: bytes) -> int:
-        """Return the value of bytes, which may be longer than the entry, as some drives send.
+        """Decode a value; extra bytes, which some drives send, are ignored.
 
         Raises
         ------
         ValueError
-            If they are shorter.
+            If bytes are missing.
         """
         if len(data) < self.size:
             raise ValueError(f"{self}: {len(data)} bytes, wanted {self.size}")
@@ -72,7 +72,7 @@ class Entry:
         return value
 
     def resized(self, size: int) -> Entry | None:
-        """Return the same entry `size` bytes wide; None where no number is."""
+        """Return the same entry with a size of 1, 2 or 4 bytes; None for other sizes."""
         wider = {1: "<b", 2: "<h", 4: "<i"}.get(size)
         if wider is None:
             return None
@@ -133,44 +133,44 @@ NEGATIVE_LIMIT_SWITCH = 1 << 0
 POSITIVE_LIMIT_SWITCH = 1 << 1
 HOME_SWITCH = 1 << 2
 
-# Software limits that are none; some drives count in less than the whole range.
+# Values that switch the software limits off; some drives accept only a part of the range.
 NO_LIMITS = ((-(2**31), 2**31 - 1), (-(2**31) + 1, 2**31 - 1), (-(2**30), 2**30 - 1))
 
-# Addresses of the predefined connection set: function code plus node id.
+# Function codes of the predefined connection set; a COB-ID is function code plus node id.
 NMT = 0x000
 SYNC = 0x080
 EMCY = 0x080
 TPDO1, TPDO2 = 0x180, 0x280
 RPDO1, RPDO2 = 0x200, 0x300
-SDO_ANSWER, SDO_REQUEST = 0x580, 0x600
+SDO_RESPONSE, SDO_REQUEST = 0x580, 0x600
 HEARTBEAT = 0x700
 
-# The computer's own node id, whose heartbeat the drives' watchdogs listen to.
+# The computer's own node id; the drives' watchdogs monitor its heartbeat.
 MASTER_NODE_ID = 127
 
 NMT_START, NMT_PRE_OPERATIONAL = 0x01, 0x80
 NMT_BOOT_UP, NMT_OPERATIONAL = 0x00, 0x05
 
-# Transmission types: at once (by the device's profile, or by its maker's word); at the next SYNC.
-ASYNCHRONOUS, ASYNCHRONOUS_BY_MAKER, SYNCHRONOUS = 255, 254, 1
-# Bits of a PDO's COB-ID: it does not exist; it cannot be asked for by a remote frame.
+# Transmission types: immediate (as the device profile or the manufacturer defines it); at SYNC.
+ASYNCHRONOUS, ASYNCHRONOUS_BY_MANUFACTURER, SYNCHRONOUS = 255, 254, 1
+# Bits of a PDO's COB-ID: the PDO is off; remote frames are not supported.
 PDO_OFF, PDO_NO_REMOTE = 1 << 31, 1 << 30
 
 
 @dataclasses.dataclass(frozen=True)
 class Pdo:
-    """A process data object as the driver sets it up.
+    """A process data object.
 
     Attributes
     ----------
     communication, mapping : int
-        Indices of its two records.
+        Indices of its communication and mapping records.
     function_code : int
-        Its COB-ID without the node id.
+        COB-ID without the node id.
     transmission : int
         Transmission type.
     entries : tuple of Entry
-        What it carries.
+        Mapped entries.
     """
 
     communication: int
@@ -180,11 +180,11 @@ class Pdo:
     entries: tuple[Entry, ...]
 
     def pack(self, *values: int) -> bytes:
-        """Return the values as the PDO's bytes."""
+        """Encode the values."""
         return b"".join(e.pack(v) for e, v in zip(self.entries, values, strict=True))
 
     def unpack(self, data: bytes) -> tuple[int, ...]:
-        """Return the values in a PDO's bytes.
+        """Decode the values.
 
         Raises
         ------
@@ -197,7 +197,7 @@ class Pdo:
         return struct.unpack(formats, data)
 
 
-# The order to stop acts when it arrives, the set-point with the SYNC of all axes.
+# A command takes effect on arrival, so that a stop does not wait; set-points at the SYNC.
 COMMAND = Pdo(0x1400, 0x1600, RPDO1, ASYNCHRONOUS, (CONTROLWORD, MODE_OF_OPERATION))
 SET_POINT = Pdo(0x1401, 0x1601, RPDO2, SYNCHRONOUS, (TARGET_POSITION,))
 STATUS = Pdo(0x1800, 0x1A00, TPDO1, SYNCHRONOUS, (STATUSWORD, MODE_DISPLAY, DIGITAL_INPUTS))

@@ -1,4 +1,4 @@
-"""A serial CAN adapter that speaks the Lawicel protocol, read in large pieces."""
+"""Serial CAN adapter that speaks the Lawicel protocol (slcan)."""
 
 from __future__ import annotations
 
@@ -11,30 +11,39 @@ import serial
 from can import CanInitializationError, CanOperationError, Message
 from can.interfaces.slcan import slcanBus
 
-_ENDS = (0x0D, 0x07)
+_LINE_ENDS = (0x0D, 0x07)
 _LINE_FEED = 0x0A
-_LONGEST_LINE = 64
+_MAX_LINE = 64
 
 
 class SlcanBus(slcanBus):
-    """python-can's slcan with five changes.
+    """python-can's slcan bus with five changes.
 
-    The serial port is read in whatever pieces it has; byte by byte, as python-can does, a loaded
-    machine falls up to 0.8 s behind. A write neither waits for the last bit to leave the port nor
-    long for room, so that an adapter that takes nothing cannot hang the control loop.
-    A line that is no frame is counted, not raised. Adapters that end their lines with CR and LF are
-    understood: to python-can, the LF hides the frame behind it. The port is this program's alone.
+    1. It reads the serial port in blocks: python-can reads byte by byte, which falls up to 0.8 s
+       behind on a loaded machine.
+    2. A write does not wait until the last bit has left the port, and waits at most
+       `write_timeout` for free space, so that a stuck adapter cannot stall the control loop.
+    3. It counts malformed lines; python-can raises an error.
+    4. It accepts lines that end with CR and LF; python-can loses the frame after the LF.
+    5. It locks the serial port against other programs.
 
     Parameters
     ----------
     channel : str
-        The serial port's device file.
+        Device file of the serial port.
     bitrate : int
         Of the CAN bus [bit/s].
     tty_baudrate : int
         Of the serial port [bit/s]; USB adapters ignore it.
     write_timeout : float
-        How long a write waits for room [s].
+        Longest wait of a write for free space [s].
+
+    Attributes
+    ----------
+    malformed : int
+        Number of malformed lines.
+    refused : int
+        Number of commands and frames that the adapter refused.
     """
 
     def __init__(
@@ -48,32 +57,29 @@ class SlcanBus(slcanBus):
         self._bitrate = bitrate
         super().__init__(channel, tty_baudrate=tty_baudrate, bitrate=bitrate, sleep_after_open=0)
 
-    def greet(self) -> None:
-        """Tell the adapter the bitrate and to open its channel, whatever it was told before."""
+    def set_up_channel(self) -> None:
+        """Set the bitrate and open the channel."""
         self.set_bitrate(self._bitrate)
 
     def set_bitrate(self, bitrate: int, data_bitrate: int | None = None) -> None:
-        """Set the bitrate and open the channel; an unfinished line of a predecessor ends first.
+        """Set the bitrate and open the channel.
 
         Raises
         ------
         CanInitializationError
-            If another program has the port: frames of two would tear each other apart.
+            If another program uses the port: frames of two programs would be mixed.
         """
-        if not self._lock_port():
-            raise CanInitializationError("another program uses it")
-        self._write("")
-        super().set_bitrate(bitrate, data_bitrate)
-
-    def _lock_port(self) -> bool:
         try:
             self.serialPortOrig.exclusive = True
         except serial.SerialException as error:
-            return error.errno not in (errno.EAGAIN, errno.EACCES)
-        return True
+            if error.errno in (errno.EAGAIN, errno.EACCES):
+                raise CanInitializationError("another program uses it") from None
+        # An earlier program may have left an unfinished line: end it.
+        self._write("")
+        super().set_bitrate(bitrate, data_bitrate)
 
     def open(self) -> None:
-        """Open the channel, once: adapters refuse the second order that python-can gives."""
+        """Open the channel once: python-can does it twice, and adapters refuse the second time."""
         if not self._channel_open:
             super().open()
             self._channel_open = True
@@ -83,18 +89,22 @@ class SlcanBus(slcanBus):
         self._channel_open = False
         super().close()
 
+    def send(self, msg: Message, timeout: float | None = None) -> None:
+        """Send a frame; `timeout` is ignored in favour of the write time-out of the bus."""
+        super().send(msg, self.serialPortOrig.write_timeout)
+
     def _write(self, string: str) -> None:
         data = string.encode() + self.LINE_TERMINATOR
         deadline = time.monotonic() + self._write_timeout
         try:
             port = self.serialPortOrig.fileno()
             while data:
-                data = data[_write_now(port, data) :]
+                data = data[_write_without_waiting(port, data) :]
                 wait = max(0.0, deadline - time.monotonic())
                 if data and not select.select([], [port], [], wait)[1]:
                     raise CanOperationError(f"takes nothing for {self._write_timeout:g} s")
         except (serial.SerialException, OSError, TypeError, ValueError) as error:
-            # pyserial raises TypeError where another thread has closed the port.
+            # pyserial raises TypeError if another thread has closed the port.
             raise CanOperationError(str(error)) from error
 
     def _read(self, timeout: float | None) -> str | None:
@@ -103,25 +113,25 @@ class SlcanBus(slcanBus):
             wait = None if deadline is None else deadline - time.monotonic()
             if wait is not None and wait < 0.0:
                 return None
-            self._read_piece(wait)
+            self._read_block(wait)
         return self._lines.pop(0)
 
-    def _read_piece(self, wait: float | None) -> None:
+    def _read_block(self, wait: float | None) -> None:
         port = self.serialPortOrig
         try:
             if not select.select([port.fileno()], [], [], wait)[0]:
                 return
-            piece = port.read(max(1, port.in_waiting))
+            block = port.read(max(1, port.in_waiting))
         except (serial.SerialException, OSError, TypeError, ValueError) as error:
             raise CanOperationError(str(error)) from error
-        for byte in piece:
+        for byte in block:
             if byte == _LINE_FEED:
                 continue
             self._buffer.append(byte)
-            if byte in _ENDS:
+            if byte in _LINE_ENDS:
                 self._lines.append(self._buffer.decode("ascii", errors="replace"))
                 self._buffer.clear()
-            elif len(self._buffer) > _LONGEST_LINE:
+            elif len(self._buffer) > _MAX_LINE:
                 self.malformed += 1
                 self._buffer.clear()
 
@@ -130,7 +140,6 @@ class SlcanBus(slcanBus):
         if line is None:
             return None, False
         if line.endswith("\a"):
-            # The adapter did not take a command or could not send a frame.
             self.refused += 1
             return None, False
         self._queue.put_nowait(line)
@@ -140,13 +149,9 @@ class SlcanBus(slcanBus):
             self.malformed += 1
             return None, False
 
-    def send(self, msg: Message, timeout: float | None = None) -> None:
-        """Send a frame; how long that may take is the bus's own."""
-        super().send(msg, self.serialPortOrig.write_timeout)
 
-
-def _write_now(port: int, data: bytes) -> int:
-    """Write what there is room for; return how many bytes that were."""
+def _write_without_waiting(port: int, data: bytes) -> int:
+    """Write as many bytes as there is space for; return their number."""
     try:
         return os.write(port, data)
     except BlockingIOError:

@@ -1,4 +1,4 @@
-"""A CAN interface of another machine, over TCP: socketcand in its raw mode."""
+"""CAN interface of another machine over TCP: socketcand in raw mode."""
 
 from __future__ import annotations
 
@@ -13,42 +13,44 @@ from can.interfaces.socketcand.socketcand import (
     convert_can_message_to_ascii_message,
 )
 
-# How long the server may take to be there, and to each of its answers [s].
-_CONNECT_WAIT = 1.0
-_ANSWER_WAIT = 1.0
-_LONGEST_MESSAGE = 200
+# Longest time to connect, and for each reply of the server [s].
+_CONNECT_TIMEOUT = 1.0
+_REPLY_TIMEOUT = 1.0
+_MAX_MESSAGE = 200
 
 
 class SocketcandBus(BusABC):
-    """socketcand's protocol with python-can's own words for frames.
+    """Client of the socketcand protocol that never blocks; python-can converts the frames.
 
-    python-can's bus waits for a server that says nothing for ever, takes no frame together with
-    the answer to its last order, and does not notice that the server hung up.
+    python-can's own client waits for a silent server without a time-out, rejects a frame that
+    arrives together with a reply, and does not detect that the server closed the connection.
 
     Parameters
     ----------
     channel : str
-        The server's name of the interface.
-    host : str
-        Where the server runs.
-    port : int
-        Where it listens.
+        Name of the interface on the server.
+    host, port : str, int
+        Address of the server.
     write_timeout : float
-        How long a frame may wait for room [s].
+        Longest wait of a frame for free space [s].
+
+    Attributes
+    ----------
+    malformed : int
+        Number of malformed messages.
     """
 
     def __init__(self, channel: str, *, host: str, port: int, write_timeout: float) -> None:
         self.malformed = 0
         self._write_timeout = write_timeout
-        self._piece = b""
-        self._too_long = False
-        self._said: deque[str] = deque()
-        self._socket = socket.create_connection((host, port), _CONNECT_WAIT)
+        self._buffer = b""
+        self._messages: deque[str] = deque()
+        self._socket = socket.create_connection((host, port), _CONNECT_TIMEOUT)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._expect("< hi >")
-            for order in (f"< open {channel} >", "< rawmode >"):
-                self._tell(order)
+            for command in (f"< open {channel} >", "< rawmode >"):
+                self._write(command)
                 self._expect("< ok >")
         except BaseException:
             self._socket.close()
@@ -58,73 +60,65 @@ class SocketcandBus(BusABC):
         super().__init__(channel=channel)
 
     def send(self, msg: Message, timeout: float | None = None) -> None:
-        """Send a frame; how long that may take is the bus's own."""
+        """Send a frame; `timeout` is ignored in favour of the write time-out of the bus."""
         del timeout
-        self._tell(convert_can_message_to_ascii_message(msg))
+        self._write(convert_can_message_to_ascii_message(msg))
 
     def shutdown(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         super().shutdown()
         self._socket.close()
 
     def fileno(self) -> int:
-        """Return the connection's file descriptor."""
+        """Return the file descriptor of the connection."""
         return self._socket.fileno()
 
     def _recv_internal(self, timeout: float | None) -> tuple[Message | None, bool]:
-        said = self._hear(timeout)
-        if said is None:
+        text = self._read_message(timeout)
+        if text is None:
             return None, False
         try:
-            message = convert_ascii_message_to_can_message(said)
+            message = convert_ascii_message_to_can_message(text)
         except (ValueError, IndexError):
             message = None
         self.malformed += message is None
         return message, False
 
-    def _tell(self, words: str) -> None:
+    def _write(self, message: str) -> None:
         try:
-            self._socket.sendall(words.encode("ascii"))
+            self._socket.sendall(message.encode("ascii"))
         except TimeoutError:
             raise CanOperationError(f"takes nothing for {self._write_timeout:g} s") from None
 
-    def _expect(self, answer: str) -> None:
-        said = self._hear(_ANSWER_WAIT)
-        if said != answer:
-            got = "nothing" if said is None else repr(said)
-            raise CanInitializationError(f"no socketcand: wanted {answer!r}, got {got}")
+    def _expect(self, reply: str) -> None:
+        received = self._read_message(_REPLY_TIMEOUT)
+        if received != reply:
+            got = "nothing" if received is None else repr(received)
+            raise CanInitializationError(f"no socketcand: wanted {reply!r}, got {got}")
 
-    def _hear(self, timeout: float | None) -> str | None:
-        """Return the next message, from < to >; None if none comes in time."""
+    def _read_message(self, timeout: float | None) -> str | None:
+        """Return the next message, from < to >; None if none arrives in time."""
         deadline = None if timeout is None else time.monotonic() + timeout
-        while not self._said:
+        while not self._messages:
             wait = None if deadline is None else max(0.0, deadline - time.monotonic())
             if not select.select([self._socket], [], [], wait)[0]:
                 return None
-            self._read()
-        return self._said.popleft()
+            self._read_block()
+        return self._messages.popleft()
 
-    def _read(self) -> None:
+    def _read_block(self) -> None:
         data = self._socket.recv(4096)
         if not data:
             raise CanOperationError("the server hung up")
-        # An answer at once, not with the next frame.
+        # Acknowledge at once: by default, Linux waits for the next frame that is sent.
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
-        *whole, piece = (self._piece + data).split(b">")
-        for message in whole:
-            too_long = self._is_too_long(message)
-            self._too_long = False
-            start = message.rfind(b"<", -_LONGEST_MESSAGE)
+        *complete, self._buffer = (self._buffer + data).split(b">")
+        for message in complete:
+            start = message.rfind(b"<", -_MAX_MESSAGE)
             if start >= 0:
-                self._said.append(message[start:].decode("ascii", errors="replace") + ">")
+                self._messages.append(message[start:].decode("ascii", errors="replace") + ">")
             else:
-                self.malformed += not too_long
-        self._too_long = self._is_too_long(piece)
-        self._piece = piece[-_LONGEST_MESSAGE:]
-
-    def _is_too_long(self, message: bytes) -> bool:
-        """Count what does not end, once: in whatever pieces it comes, it is one error."""
-        if self._too_long or len(message) <= _LONGEST_MESSAGE:
-            return self._too_long
-        self.malformed += 1
-        return True
+                self.malformed += 1
+        if len(self._buffer) > _MAX_MESSAGE:
+            self.malformed += 1
+            self._buffer = self._buffer[-_MAX_MESSAGE:]

@@ -1,1 +1,1 @@
-"""The `device/...` interface and the node on real drives."""
+"""Node of device_driver."""

@@ -29,26 +29,26 @@ off.
 Exit code   0 when ended, 2 when the adapter or a drive is missing, or for bad parameters
 """
 
-# Longer than a node takes to look at its surroundings [s].
-_LOOK_AROUND = 0.3
+# Longer than a node takes to discover its peers on the same machine [s].
+_LOCAL_DISCOVERY = 0.3
 
 
 def make_driver(settings: DriverParameters, name: str) -> DeviceDriver:
-    """Return the driver, which gives another device time to show itself."""
-    look_around = DISCOVERY if is_network_enabled() else _LOOK_AROUND
-    return DeviceDriver(settings, name, search_from=time.monotonic() + look_around)
+    """Return the driver, which searches for the drives after the discovery of other devices."""
+    discovery = DISCOVERY if is_network_enabled() else _LOCAL_DISCOVERY
+    return DeviceDriver(settings, name, search_from=time.monotonic() + discovery)
 
 
 def main() -> int:
     """Run device_driver; returns its exit code."""
-    # What python-can has to say comes as faults of the axes.
+    # python-can errors are reported as axis faults.
     logging.getLogger("can").addHandler(logging.NullHandler())
     return run_component(
         "device_driver",
         DeviceDriverParameters,
         make_driver,
         help_text=HELP,
-        ports=lambda settings: {CAN: CanPort(settings.link_settings)},
+        ports=lambda settings: {CAN: CanPort(settings, settings.write_timeout)},
         shared_memory=False,
     )
 

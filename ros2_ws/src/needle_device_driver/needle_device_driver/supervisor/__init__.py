@@ -1,1 +1,1 @@
-"""The motion supervisor: every safety rule of the rig, once."""
+"""Motion supervisor: every safety rule of the rig, once."""

@@ -1,56 +1,87 @@
-"""Which stamps a command may bear."""
+"""Age and novelty of the stamps of commands."""
 
 from __future__ import annotations
 
+import bisect
+import math
 from collections import deque
 
-from needle_device_driver.supervisor.stamp_ages import AHEAD_NS, StampAges
-
-# More than an insertion has.
-_REMEMBERED_STEPS = 2000
+# Tolerated lead of a sender's clock over the noted ROS time, for example by latency [ns].
+_MAX_LEAD_NS = 100_000_000
+# More steps than an insertion has.
+_MAX_REMEMBERED = 2000
 
 
 class CommandStamps:
-    """Remembers the stamps of accepted commands, and when they were the ROS time.
+    """Measures the age of stamps on the steady clock, and remembers the accepted ones.
+
+    ROS time may be simulated, stepped or paused: ages in it would make every tip look old, or an
+    old tip look fresh. So the class notes which ROS time it was at which steady time.
 
     Parameters
     ----------
     horizon : float
-        Up to which age stamps can be told apart [s].
+        How long notes are kept [s]; ages beyond are infinite.
     """
 
     def __init__(self, horizon: float) -> None:
-        self._ages = StampAges(horizon)
+        self._horizon = horizon
+        # Noted ROS times, and the steady time at which each was last observed.
+        self._ros_ns: list[int] = []
+        self._observed: list[float] = []
         self._last_ns: int | None = None
-        self._used_ns: deque[int] = deque(maxlen=_REMEMBERED_STEPS)
+        self._used_ns: deque[int] = deque(maxlen=_MAX_REMEMBERED)
 
     def note(self, ros_ns: int, now: float) -> None:
         """Note that ROS time is `ros_ns` [ns] at steady time `now` [s]."""
-        self._ages.note(ros_ns, now)
+        if self._ros_ns and ros_ns < self._ros_ns[-1]:
+            # ROS time was set back: the ages of earlier stamps are unknown.
+            self._ros_ns.clear()
+            self._observed.clear()
+        if self._ros_ns and ros_ns == self._ros_ns[-1]:
+            self._observed[-1] = now
+            return
+        self._ros_ns.append(ros_ns)
+        self._observed.append(now)
+        old = bisect.bisect_left(self._observed, now - self._horizon)
+        # Deleting costs time in proportion to the length of the list: do it rarely.
+        if old > 1000:
+            del self._ros_ns[: old - 1]
+            del self._observed[: old - 1]
 
     def age(self, stamp_ns: int, now: float) -> float:
-        """Return the age of a stamp as `StampAges.age` does [s]."""
-        return self._ages.age(stamp_ns, now)
+        """Return an upper bound on the time since `stamp_ns` was the ROS time [s].
 
-    def use(self, stamp_ns: int) -> None:
-        """Take the stamp of a command that is accepted."""
+        Returns
+        -------
+        float
+            Infinite for a stamp not newer than the first note; negative for a future stamp.
+        """
+        if self._ros_ns and stamp_ns > self._ros_ns[-1] + _MAX_LEAD_NS:
+            return (self._ros_ns[-1] - stamp_ns) * 1e-9
+        after = bisect.bisect_left(self._ros_ns, stamp_ns)
+        # The stamp was current at the earliest when the note before it was last observed.
+        return now - self._observed[after - 1] if after > 0 else math.inf
+
+    def accept(self, stamp_ns: int) -> None:
+        """Remember the stamp of an accepted command."""
         self._last_ns = stamp_ns
         self._used_ns.append(stamp_ns)
 
     def why_not_new(self, stamp_ns: int) -> str:
-        """Return why no command may bear a stamp any more; empty: one may."""
-        last, newest = self._last_ns, self._ages.newest_ns
+        """Return why a stamp is not new; empty: it is new."""
+        last = self._last_ns
         if last is not None and stamp_ns <= last:
-            went_back = newest is not None and last > newest + AHEAD_NS
-            way_out = "; ROS time went back, device/reset lets commands in again"
+            went_back = bool(self._ros_ns) and last > self._ros_ns[-1] + _MAX_LEAD_NS
+            hint = "; ROS time went back, device/reset lets commands in again"
             return f"stamp {stamp_ns} ns is not newer than the last, {last} ns" + (
-                way_out if went_back else ""
+                hint if went_back else ""
             )
         if stamp_ns in self._used_ns:
             return f"stamp {stamp_ns} ns is that of an earlier command"
         return ""
 
-    def readmit(self) -> None:
-        """Let in commands stamped after a time that went back; used stamps stay used."""
-        if self._last_ns is not None and self._ages.newest_ns is not None:
-            self._last_ns = min(self._last_ns, self._ages.newest_ns)
+    def clear_rejections(self) -> None:
+        """Accept commands from now on after ROS time went back; used stamps stay used."""
+        if self._last_ns is not None and self._ros_ns:
+            self._last_ns = min(self._last_ns, self._ros_ns[-1])

@@ -1,27 +1,30 @@
-"""The device's state, its axes and what moves them: every way from one state to another."""
+"""State, axes and motion of the device."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
 
-from needle_device_driver.axes.axis import Axis, AxisError
-from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
+from needle_core.messages import CommandResult
+from needle_device_driver.axes.axis import Axis, AxisError, AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import Leg
 from needle_device_driver.procedure import Procedure, side_by_side
 from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.homing_times import HomingTimes
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_device_driver.supervisor.motion_run import MotionRun, axes_problem
-from needle_device_driver.supervisor.reports import REPLACED, SUCCEEDED, Event, Notice, StepResult
-from needle_device_driver.supervisor.retraction_bound import RetractionBound
+from needle_device_driver.supervisor.motion_run import (
+    HomingTimes,
+    MotionRun,
+    RetractionBound,
+    axes_problem,
+)
+from needle_device_driver.supervisor.reports import REPLACED, SUCCEEDED, Event, Notice
 from needle_device_driver.supervisor.states import Activity, State, Trigger, next_state
 
-_WATCHED = (State.DISABLED, State.HOLDING, State.MOVING)
+_SUPERVISED = (State.DISABLED, State.HOLDING, State.MOVING)
 
 
 class DeviceCore:
-    """Carries out what the motion supervisor has allowed, and stops what must not go on.
+    """Executes what the motion supervisor allows, and stops the axes on a fault.
 
     Parameters
     ----------
@@ -30,26 +33,26 @@ class DeviceCore:
     limits : SafetyLimits
         The bounds of the rules.
     feedback_delay : int
-        How many cycles after its order a set-point shows in the axes' snapshots.
+        Number of cycles until a set-point shows in the feedback.
     on_stop : callable
-        Called whenever a fault or emergency stop ends everything.
+        Called on each fault and emergency stop.
 
     Attributes
     ----------
     state, activity : State, Activity
-        What the device may do, and what moves; only its own methods change this and what follows.
+        State of the device, and its motion.
     configured : bool
         Whether the axes are set up.
-    fault, reason : str
-        Why the state is FAULT or ESTOPPED; why the device last stopped, refused or waits.
+    reason : str
+        Why the device last stopped, refused something or waits.
     watchdog_trips : int
-        How often a hold, tip or reply was too old.
+        How often a hold, tip or feedback was too old.
     snapshot : PairSnapshot or None
-        The axes' newest replies.
+        Newest feedback of the axes.
     step_stamp_ns : int or None
         Stamp of the step under way [ns].
     stops : int
-        How many faults and emergency stops there were, also while there was one already.
+        Number of faults and emergency stops, including those in FAULT and ESTOPPED.
     """
 
     def __init__(
@@ -67,65 +70,61 @@ class DeviceCore:
         self._retraction_bound = RetractionBound(limits.max_depth)
         self._run: MotionRun | None = None
         self._homing_times = HomingTimes(limits)
-        self._seen_powered = False
+        self._was_powered = False
         self._pushed_too_fast = False
-        self._let_go = self._unstopped = ""
+        self._fault = self._released_after_block = self._stop_failures = ""
         self._events: list[Event] = []
         self.state = State.UNCONFIGURED
         self.activity = Activity.NONE
         self.configured = False
-        self.fault = ""
         self.reason = ""
         self.watchdog_trips = self.stops = 0
         self.snapshot: PairSnapshot | None = None
         self.step_stamp_ns: int | None = None
 
-    # ---- what is told -------------------------------------------------------------------------
+    # ---- reports ------------------------------------------------------------------------------
 
     @property
-    def moves_with_hold(self) -> bool:
-        """Tell whether something is under way that the hold lets go on."""
+    def needs_hold(self) -> bool:
+        """Whether the motion under way needs the hold."""
         return self.activity in (Activity.STEP, Activity.RETRACTION)
 
     @property
-    def way_out(self) -> float:
-        """Longest way that the needle may be drawn out [m]; none without a snapshot."""
+    def retraction_distance(self) -> float:
+        """Longest allowed retraction [m]; 0 without a snapshot."""
         if self.snapshot is None:
             return 0.0
         insertion = self.snapshot.insertion
         return insertion.position - self._retraction_bound.target(insertion)
 
     @property
-    def fault_now(self) -> str:
-        """Reason of FAULT or ESTOPPED, and the axes that did not stop."""
-        return f"{self.fault}; {self._unstopped}" if self._unstopped else self.fault
+    def fault(self) -> str:
+        """Reason of FAULT or ESTOPPED, with the axes that did not stop; otherwise empty."""
+        return f"{self._fault}; {self._stop_failures}" if self._stop_failures else self._fault
 
     @property
-    def rotation_owed(self) -> float:
-        """Lag of the rotation behind a needle that is pushed too fast for it [rad]."""
+    def rotation_lag(self) -> float:
+        """Lag of the rotation behind a needle that is pushed too fast, otherwise 0 [rad]."""
         if self._run is None or self.snapshot is None:
             return 0.0
-        owed = self._run.rotation_owed(self.snapshot)
-        return owed if owed > self._limits.rotation_following_error else 0.0
+        lag = self._run.rotation_lag(self.snapshot)
+        return lag if lag > self._limits.rotation_following_error else 0.0
 
     def notice(self, text: str, rule: Rule | None = None) -> None:
-        """Tell a person something once."""
+        """Add an event for the log."""
         self._events.append(Notice(text, rule))
 
-    def answer(self, stamp_ns: int, outcome: str) -> None:
-        """Tell the end of a command."""
-        self._events.append(StepResult(stamp_ns, outcome))
+    def explain(self, text: str, rule: Rule) -> None:
+        """Set the reason, and add it as an event for the log."""
+        self.reason = text
+        self.notice(text, rule)
 
-    def explain(self, reason: str) -> None:
-        """Take why the device last stopped, refused or waits."""
-        self.reason = reason
-
-    def count_watchdog_trip(self) -> None:
-        """Count a hold, tip or reply that was too old."""
-        self.watchdog_trips += 1
+    def report_result(self, stamp_ns: int, outcome: str) -> None:
+        """Report the outcome of a command."""
+        self._events.append(CommandResult(stamp_ns, outcome))
 
     def take_events(self) -> tuple[Event, ...]:
-        """Return what happened since the last call."""
+        """Return the events since the last call."""
         events = tuple(self._events)
         self._events.clear()
         return events
@@ -133,7 +132,7 @@ class DeviceCore:
     # ---- orders to both axes ------------------------------------------------------------------
 
     def order(self, order: Callable[[Axis], None]) -> str:
-        """Give both axes an order; a refusal is a fault, and its text is returned."""
+        """Give both axes an order; an error is a fault, and its text is returned."""
         try:
             self._axes.each(order)
         except AxisError as error:
@@ -142,37 +141,37 @@ class DeviceCore:
         return ""
 
     def power_on(self) -> str:
-        """Switch both axes on, where they stand; return what went wrong."""
-        self._seen_powered = False
+        """Switch both axes on without motion; return the error."""
+        self._was_powered = False
         return self.order(lambda axis: axis.power(True))
 
     def power_off(self) -> str:
-        """Switch both axes off; return what went wrong."""
+        """Switch both axes off; return the error."""
         return self.order(lambda axis: axis.power(False))
 
-    # ---- ways from state to state -------------------------------------------------------------
+    # ---- transitions --------------------------------------------------------------------------
 
-    def go(self, trigger: Trigger, reason: str) -> None:
+    def change_state(self, trigger: Trigger, reason: str) -> None:
         """Change the state."""
         self.state = next_state(self.state, trigger)
         self.reason = reason
 
     def configure(self) -> Procedure[str]:
-        """Set the axes up; return what went wrong."""
+        """Set the axes up; return the error."""
         try:
             yield from self._axes.side_by_side(lambda axis: axis.configure())
         except AxisError as error:
-            # The other axis may be set up, and would wait for a computer that says no more.
+            # The watchdog of the other axis may be armed already, and no heartbeat follows.
             with contextlib.suppress(AxisError):
                 yield from self._axes.close()
             self.fail(str(error), error.rule)
             return str(error)
         self.configured = True
-        self.go(Trigger.CONFIGURE, "configured")
+        self.change_state(Trigger.CONFIGURE, "configured")
         return ""
 
-    def let_go(self) -> Procedure[bool]:
-        """Switch the axes off and let go of them; return whether that was from DISABLED."""
+    def deconfigure(self) -> Procedure[bool]:
+        """Switch the axes off and release them; return whether the state was DISABLED."""
         if self.configured:
             self.configured = False
             try:
@@ -182,11 +181,11 @@ class DeviceCore:
         if self.state is not State.DISABLED:
             return False
         self.snapshot = None
-        self.go(Trigger.DECONFIGURE, "deconfigured")
+        self.change_state(Trigger.DECONFIGURE, "deconfigured")
         return True
 
     def reset(self, now: float) -> Procedure[str]:
-        """Leave a fault or emergency stop, the axes off; return what is still wrong."""
+        """Leave FAULT or ESTOPPED with the axes off; return the remaining problem."""
         trigger, reason = Trigger.RESET_UNCONFIGURED, "reset"
         if self.configured:
             try:
@@ -200,12 +199,12 @@ class DeviceCore:
             if problem is not None:
                 return problem[1]
             trigger, reason = Trigger.RESET, "reset; enable to go on"
-        self.fault = self._unstopped = ""
-        self.go(trigger, reason)
+        self._fault = self._stop_failures = ""
+        self.change_state(trigger, reason)
         return ""
 
     def start(self, activity: Activity, legs: Sequence[Leg], stamp_ns: int | None = None) -> None:
-        """Begin a step or retraction from where the axes are; the stamp is the command's [ns]."""
+        """Begin a step or retraction; the stamp is that of the command [ns]."""
         assert self.snapshot is not None
         self.activity, self.step_stamp_ns = activity, stamp_ns
         self._run = MotionRun(
@@ -216,30 +215,30 @@ class DeviceCore:
             feedback_delay=self._feedback_delay,
             pushed=not self._axes.insertion.actuated,
         )
-        self.go(Trigger.MOTION_START, "")
+        self.change_state(Trigger.MOTION_START, "")
         if not self.snapshot.ready:
-            # After a stop, an axis is made ready by the order to move, never by itself.
+            # A stopped axis becomes ready only by a new order.
             self.order(lambda axis: axis.power(True))
 
     def replace(self, legs: Sequence[Leg], stamp_ns: int) -> None:
-        """Go another way from where the axes were last told to be; the command before is answered.
+        """Replace the path under way from the last set-point on, and report that.
 
         Parameters
         ----------
         legs : sequence of Leg
-            The way.
+            The new path.
         stamp_ns : int
-            Of the command that takes the place of the one under way [ns].
+            Stamp of its command [ns].
         """
         assert self._run is not None
         assert self.snapshot is not None
         assert self.step_stamp_ns is not None
-        self.answer(self.step_stamp_ns, REPLACED)
+        self.report_result(self.step_stamp_ns, REPLACED)
         self._run.replace(legs, self.snapshot)
         self.step_stamp_ns = stamp_ns
 
     def start_homing(self) -> Procedure[str]:
-        """Begin to look for both home switches; return what went wrong."""
+        """Begin to home both axes; return the error."""
         if error := self.power_on():
             return error
         insertion = self._axes.insertion.home(self._limits.homing_speed)
@@ -250,73 +249,80 @@ class DeviceCore:
             self.fail(str(refusal), refusal.rule)
             return str(refusal)
         except GeneratorExit:
-            # Called off: the axes stay where they are, without power.
+            # Cancelled: the axes stay where they are, without power.
             self.power_off()
             raise
         self._homing_times = HomingTimes(self._limits)
         self.activity = Activity.HOMING
-        self.go(Trigger.HOMING_START, "homing")
+        self.change_state(Trigger.HOMING_START, "homing")
         return ""
 
-    def end_motion(self, outcome: str, *, stop: bool) -> None:
-        """End what is under way, whatever it is; a step's outcome is told."""
+    def _end_motion(self, outcome: str, *, stop: bool) -> None:
+        """End any motion; report the outcome of a step."""
         if stop:
             try:
                 self._axes.each(lambda axis: axis.stop())
             except AxisError as error:
                 self.notice(str(error), error.rule)
         if self.step_stamp_ns is not None:
-            self.answer(self.step_stamp_ns, outcome)
+            self.report_result(self.step_stamp_ns, outcome)
         self.activity = Activity.NONE
         self._run = self.step_stamp_ns = None
 
     def abort(self, reason: str) -> None:
-        """Stop what is under way."""
+        """Stop the motion under way."""
         homing = self.activity is Activity.HOMING
-        self.end_motion(f"aborted: {reason}", stop=True)
-        self.go(Trigger.HOMING_END if homing else Trigger.MOTION_END, reason)
+        self._end_motion(f"aborted: {reason}", stop=True)
+        self.change_state(Trigger.HOMING_END if homing else Trigger.MOTION_END, reason)
         if homing:
             self.power_off()
 
     def fail(self, reason: str, rule: Rule | None = None) -> None:
-        """Stop both axes for a fault; it takes a reset to go on."""
+        """Stop both axes for a fault, which lasts until a reset."""
         self.stops += 1
         if self.state not in (State.FAULT, State.ESTOPPED):
-            self._stop_for_good(Trigger.FAIL, reason, rule)
+            self._stop_and_latch(Trigger.FAIL, reason, rule)
 
     def emergency_stop(self) -> None:
-        """Stop both axes, whatever the state."""
+        """Stop both axes in any state."""
         self.stops += 1
         if self.state is not State.ESTOPPED:
-            self._stop_for_good(Trigger.ESTOP, "emergency stop", Rule.ESTOP_LATCHES)
+            self._stop_and_latch(Trigger.ESTOP, "emergency stop", Rule.ESTOP_LATCHES)
 
-    def _stop_for_good(self, trigger: Trigger, reason: str, rule: Rule | None) -> None:
+    def _stop_and_latch(self, trigger: Trigger, reason: str, rule: Rule | None) -> None:
         self._on_stop()
-        self.fault = reason
-        self.end_motion(f"aborted: {reason}", stop=True)
-        self.go(trigger, reason)
+        self._fault = reason
+        self._end_motion(f"aborted: {reason}", stop=True)
+        self.change_state(trigger, reason)
         self._events.append(Notice(reason, rule, fault=True))
         try:
-            # A drive that keeps its power pulls a blocked axis on as soon as it comes free.
+            # A drive with power would move a blocked axis as soon as it comes free.
             self._axes.each(lambda axis: axis.power(False))
         except AxisError as error:
             self.notice(str(error), error.rule)
 
     # ---- the cycle ----------------------------------------------------------------------------
 
+    def poll(self, now: float) -> PairSnapshot:
+        """Read the axes."""
+        self.snapshot = self._axes.poll(now)
+        self._retraction_bound.note(self.snapshot.insertion)
+        return self.snapshot
+
     def drive_homing(self, period: float) -> None:
-        """Let `period` [s] of a homing go by."""
+        """Count `period` [s] of a homing."""
         assert self.snapshot is not None
-        if text := self._homing_times.count(self.snapshot, period):
+        if text := self._homing_times.advance(self.snapshot, period):
             self.fail(text, Rule.HOMING_TIME)
 
     def drive(self, period: float, speed_scale: float, now: float) -> None:
-        """Order the set-points of the next `period` [s] of what is under way."""
+        """Order the set-points of the next `period` [s] of the motion under way."""
         if self._run is None:
             return
         at = self.poll(now)
         if not at.answered:
-            # Nothing is sent on that may have lost its way: silence stops, then is a fault.
+            # A missing answer may mean a lost set-point: send no further one. An axis that stays
+            # silent becomes a fault.
             return
         problem = self._run.problem(at)
         if problem is not None:
@@ -325,7 +331,7 @@ class DeviceCore:
         set_point = self._run.advance(at, period, speed_scale)
         if set_point is None:
             return
-        self._watch_pushing()
+        self._check_push_speed()
         try:
             if self._axes.insertion.actuated:
                 self._axes.insertion.start_move(set_point.insertion, set_point.insertion_speed)
@@ -334,63 +340,55 @@ class DeviceCore:
         except AxisError as error:
             self.fail(str(error), error.rule)
 
-    def _watch_pushing(self) -> None:
-        owed, told = self.rotation_owed, self._pushed_too_fast
-        self._pushed_too_fast = owed > 0.0
-        if owed > 0.0 and not told:
-            text = f"pushed too fast: the rotation is {owed:.2f} rad behind, push more slowly"
-            self.explain(text)
-            self.notice(text, Rule.MAX_ROTATION_RATE)
+    def _check_push_speed(self) -> None:
+        lag, reported = self.rotation_lag, self._pushed_too_fast
+        self._pushed_too_fast = lag > 0.0
+        if self._pushed_too_fast and not reported:
+            text = f"pushed too fast: the rotation is {lag:.2f} rad behind, push more slowly"
+            self.explain(text, Rule.MAX_ROTATION_RATE)
 
-    def _watch_letting_go(self, at: PairSnapshot) -> None:
-        told, self._let_go = self._let_go, at.let_go
-        if at.let_go and not told:
-            text = f"{at.let_go}: blocked when it was stopped; switched off until the next motion"
-            self.explain(text)
-            self.notice(text, Rule.FOLLOWING_ERROR)
-
-    def poll(self, now: float) -> PairSnapshot:
-        """Read the axes."""
-        self.snapshot = self._axes.poll(now)
-        self._retraction_bound.note(self.snapshot.insertion)
-        return self.snapshot
-
-    def watch_axes(self, now: float) -> None:
-        """Read the axes and stop both for what is wrong with one."""
+    def check_axes(self, now: float) -> None:
+        """Read the axes, and stop both if one has a problem."""
         at = self.poll(now)
-        if self.state not in _WATCHED:
-            # In FAULT the silence may be the fault itself.
-            oldest = now - self._limits.reply_age_limit if self.state is State.ESTOPPED else 0.0
-            told, self._unstopped = self._unstopped, at.unstopped(oldest)
-            if self._unstopped not in ("", told):
-                self._events.append(Notice(self._unstopped, Rule.QUICK_STOP, fault=True))
+        if self.state not in _SUPERVISED:
+            self._check_stopped(at, now)
             return
         on = self.state is not State.DISABLED
         problem = axes_problem(
             at,
             now,
             self._limits,
-            # Drives take a while to switch on: only a loss counts.
-            powered_wanted=on and self._seen_powered,
+            # Switching on takes time: only a loss of power counts.
+            powered_wanted=on and self._was_powered,
             homed_wanted=self.activity is Activity.STEP,
         )
-        self._seen_powered = on and (self._seen_powered or at.powered)
-        self._watch_letting_go(at)
+        self._was_powered = on and (self._was_powered or at.powered)
+        reported, self._released_after_block = self._released_after_block, at.released_after_block
+        if at.released_after_block and not reported:
+            text = "blocked when it was stopped; switched off until the next motion"
+            self.explain(f"{at.released_after_block}: {text}", Rule.FOLLOWING_ERROR)
         if problem is not None:
             self.watchdog_trips += problem[0] is Rule.REPLY_AGE
             self.fail(problem[1], problem[0])
 
-    def end_what_has_ended(self) -> None:
+    def _check_stopped(self, at: PairSnapshot, now: float) -> None:
+        # In FAULT, silence may be the fault itself.
+        oldest = now - self._limits.reply_age_limit if self.state is State.ESTOPPED else 0.0
+        reported, self._stop_failures = self._stop_failures, at.stop_failures(oldest)
+        if self._stop_failures not in ("", reported):
+            self._events.append(Notice(self._stop_failures, Rule.QUICK_STOP, fault=True))
+
+    def finish_completed_motion(self) -> None:
         """End a homing, step or retraction that has arrived."""
         at = self.snapshot
         if at is None:
             return
         if self.activity is Activity.HOMING:
             if at.homed and not (at.insertion.moving or at.rotation.moving):
-                self.end_motion("", stop=False)
-                self.go(Trigger.HOMING_END, "homed")
+                self._end_motion("", stop=False)
+                self.change_state(Trigger.HOMING_END, "homed")
                 self.power_off()
         elif self._run is not None and self._run.arrived(at):
-            # At the switch a retraction may have a target still.
-            self.end_motion(SUCCEEDED, stop=self.activity is Activity.RETRACTION)
-            self.go(Trigger.MOTION_END, "")
+            # A retraction that ends at the switch may still have a target.
+            self._end_motion(SUCCEEDED, stop=self.activity is Activity.RETRACTION)
+            self.change_state(Trigger.MOTION_END, "")

@@ -1,4 +1,4 @@
-"""Hold to run: whose press counts, how fresh it is, how fast it lets things go."""
+"""Hold to run: its owner, its age and its speed."""
 
 from __future__ import annotations
 
@@ -11,46 +11,46 @@ from needle_core.messages import HoldState
 from needle_device_driver.rules import Rule
 
 MAX_SOURCES = 16
-# Sessions of a source that are remembered as over. They cannot be told by their order: the clock
-# that names them may be set back. A message is late by seconds, and nobody restarts as often then.
-_MAX_REPLACED = 16
+# Number of ended sessions that are remembered per source. Sessions cannot be ordered by name,
+# because the clock behind the name may be set back. Messages arrive seconds late at most, and no
+# source restarts 16 times in that time.
+_MAX_ENDED = 16
 # Below every count.
-_NOTHING_HEARD = -1
+_NO_COUNT = -1
 
 
 @dataclasses.dataclass
 class _Source:
     session: str
-    # Whether a release came since the last press.
+    # Whether a release arrived since the last press.
     released: bool
     arrival: float
-    count: int = _NOTHING_HEARD
-    # Last moment of its press; minus infinity: it does not press.
+    count: int = _NO_COUNT
+    # End of its press; minus infinity: it does not press.
     until: float = -math.inf
-    replaced: collections.deque[str] = dataclasses.field(
-        default_factory=lambda: collections.deque(maxlen=_MAX_REPLACED)
+    ended: collections.deque[str] = dataclasses.field(
+        default_factory=lambda: collections.deque(maxlen=_MAX_ENDED)
     )
 
     def begin(self, session: str) -> None:
-        """Let a new session take the place of the present one, for good."""
-        self.replaced.append(self.session)
-        self.session, self.count = session, _NOTHING_HEARD
+        """Begin a new session; the present one has ended for good."""
+        self.ended.append(self.session)
+        self.session, self.count = session, _NO_COUNT
         self.released, self.until = False, -math.inf
 
 
 class Hold:
-    """The hold to run of whoever may have it, its age measured by arrival.
+    """State of the hold to run; its age is measured from the arrival of messages.
 
     Parameters
     ----------
     timeout : float
-        A message counts so long after its arrival [s], or as long as itself says if that is
-        shorter.
+        Longest lifetime of a message [s]; a message may have a shorter one.
 
     Attributes
     ----------
     ignored : int
-        How many messages came late, twice, or from a session that is over.
+        Number of messages that arrived late, twice, or from an ended session.
     """
 
     def __init__(self, timeout: float) -> None:
@@ -62,11 +62,11 @@ class Hold:
 
     @property
     def owner(self) -> str | None:
-        """Name of the holder; None without a press that counts."""
+        """Source whose press counts; None: there is none."""
         return self._owner
 
-    def unheeded(self, now: float) -> str | None:
-        """Return who presses while nobody's press counts, and must release first; None: nobody."""
+    def ignored_press(self, now: float) -> str | None:
+        """Return a source that presses without effect and must release first; None: none."""
         if self._owner is not None:
             return None
         return next((name for name, one in self._sources.items() if now <= one.until), None)
@@ -78,39 +78,39 @@ class Hold:
 
     @property
     def until(self) -> float:
-        """Last moment in which the owner's press counts [s]; minus infinity without owner."""
+        """Time at which the owner's press ends [s]; minus infinity without owner."""
         return -math.inf if self._owner is None else self._sources[self._owner].until
 
     def is_fresh(self, now: float) -> bool:
-        """Return whether there is an owner who was heard within the time-out."""
+        """Return whether there is an owner whose last message has not expired."""
         return now <= self.until
 
     def is_off(self, now: float) -> bool:
-        """Return whether nobody who was heard within the time-out presses."""
+        """Return whether no source presses; expired messages do not count."""
         return all(now > source.until for source in self._sources.values())
 
     def receive(self, message: HoldState, now: float, *, counting: bool) -> Rule | None:
-        """Take one message.
+        """Receive one message.
 
         Parameters
         ----------
         message : HoldState
-            What was received.
+            The message.
         now : float
-            Its arrival on the steady clock [s].
+            Steady time of its arrival [s].
         counting : bool
-            Whether a press may count at all in the device's present state.
+            Whether the state of the device allows that a press counts.
 
         Returns
         -------
         Rule or None
-            The rule that kept a message from counting.
+            Why the message does not count.
         """
         source = self._source_of(message, now)
         if source is None:
             return Rule.HOLD_ONE_OWNER
         is_owner = self._owner == message.source
-        if message.session != source.session and message.session not in source.replaced:
+        if message.session != source.session and message.session not in source.ended:
             source.begin(message.session)
             if is_owner:
                 self._owner = None
@@ -120,7 +120,7 @@ class Hold:
             return Rule.HOLD_IN_ORDER
         source.count, source.arrival = message.count, now
         scale = message.speed_scale
-        # What cannot be understood counts as the safe thing, a release.
+        # An invalid message counts as a release, which is safe.
         if not (message.pressed and 0.0 <= scale <= 1.0 and message.lifetime > 0.0):
             source.until, source.released = -math.inf, True
             if is_owner:
@@ -137,41 +137,41 @@ class Hold:
         self._speed_scale = scale
         return None
 
-    def lapse(self, now: float) -> str:
-        """End a hold whose owner fell silent for too long; return what to say, empty: it is none.
+    def end_if_stale(self, now: float) -> str:
+        """End the hold if the owner's last message has expired; return how, empty: it has not.
 
-        It takes a release and a new press.
+        The next hold needs a release and a new press.
         """
         if self._owner is None or self.is_fresh(now):
             return ""
         source = self._sources[self._owner]
         self.require_new_press()
-        lasted = source.until - source.arrival
-        return f"no hold message for {now - source.arrival:.3f} s, limit {lasted:g} s"
+        lifetime = source.until - source.arrival
+        return f"no hold message for {now - source.arrival:.3f} s, limit {lifetime:g} s"
 
     def require_new_press(self) -> None:
-        """Take the hold from its owner; who presses now must release first to count again."""
+        """End the hold; a source that presses must release before its press counts again."""
         self._owner = None
 
     def knows(self, source: str) -> bool:
-        """Return whether a source is among those whose hold may count."""
+        """Return whether the state of a source is remembered."""
         return source in self._sources
 
-    def readmit(self) -> None:
-        """Let in a source without a session whose stamps were once ahead; nobody's press counts.
+    def clear_rejections(self) -> None:
+        """End the hold, and accept any next stamp of sources without a session.
 
-        Who names a session begins with a count of its own, and needs no such way out.
+        A source with a session does not need this: each session starts a new count.
         """
         self.require_new_press()
         for source in self._sources.values():
             if not source.session:
-                source.count = _NOTHING_HEARD
+                source.count = _NO_COUNT
 
     def _source_of(self, message: HoldState, now: float) -> _Source | None:
-        """Return what is known of a message's source; None where there are too many.
+        """Return the state of a message's source; None if there are too many sources.
 
-        One that is first heard has to release before it counts. Only without a session, as typed by
-        hand, its first press counts.
+        The first press of a new source does not count before a release, except without a session,
+        that is, for messages that a person types.
         """
         source = self._sources.get(message.source)
         if source is not None:
@@ -180,27 +180,26 @@ class Hold:
             oldest = min(self._sources, key=lambda name: self._sources[name].arrival)
             if now - self._sources[oldest].arrival <= self._timeout:
                 return None
-            # Should it come back it is as if first heard.
             del self._sources[oldest]
         source = _Source(message.session, released=not message.session, arrival=now)
         self._sources[message.source] = source
         return source
 
 
-class HoldRefusals:
-    """Notices of holds that do not count: each once, until it changes."""
+class HoldNotices:
+    """Texts on holds that do not count, once until the reason changes."""
 
     def __init__(self) -> None:
-        # Those whose name is not known share one entry. What is ignored changes nothing, and may
-        # come between messages that count: it has an entry of its own.
+        # Unknown sources share one entry. Ignored messages have entries of their own, because they
+        # may arrive between messages that count.
         self._rules: dict[tuple[str | None, bool], Rule | None] = {}
 
     def clear(self) -> None:
-        """Begin anew: everything is worth saying again."""
+        """Report every reason again."""
         self._rules.clear()
 
-    def take(self, message: HoldState, rule: Rule | None, *, known: bool) -> str:
-        """Take what became of a message, and return what there is to say; empty: nothing."""
+    def text_for(self, message: HoldState, rule: Rule | None, *, known: bool) -> str:
+        """Return the text on a message that does not count by `rule`; empty: nothing new."""
         ignored = rule is Rule.HOLD_IN_ORDER
         key = message.source if known else None, ignored
         if rule is self._rules.get(key):
@@ -208,5 +207,5 @@ class HoldRefusals:
         self._rules[key] = rule
         if rule is None:
             return ""
-        way_out = "; device/reset ends this" if ignored and not message.session else ""
-        return f"hold of '{sanitize(message.sender)}' does not count ({rule.value}){way_out}"
+        hint = "; device/reset ends this" if ignored and not message.session else ""
+        return f"hold of '{sanitize(message.sender)}' does not count ({rule.value}){hint}"

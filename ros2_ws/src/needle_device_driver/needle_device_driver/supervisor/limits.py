@@ -1,4 +1,4 @@
-"""The bounds of the safety rules, each once: as limits, and as parameters of a node."""
+"""Bounds of the safety rules, as limits and as parameters of a node."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_core.settings.parameter_fields import fixed_parameter, specs
 
-# No configuration reaches beyond these: they are properties of the rig, not of a run.
+# Caps for every configuration: properties of the rig.
 HARD_SPEED_CAP = 0.005
 HARD_STEP_LENGTH_CAP = 0.005
 HARD_HOLD_TIMEOUT_CAP = 0.5
-# The longest step there is, at a hundredth of a millimetre a second, and some more [s].
+# Longest step: 5 mm at 0.01 mm/s, plus a margin [s].
 HARD_STEP_TIME_CAP = 600.0
 _SMALLEST = 1e-5
 _FOLLOWING = "Largest distance from the set-point."
-_TOLERANCE = "An axis so close has arrived."
+_TOLERANCE = "Position tolerance at the target."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,23 +39,23 @@ class SafetyLimits:
     max_turns : float
         Largest rotation either way from home, in turns [-].
     hold_timeout : float
-        A hold message counts so long after its arrival [s].
+        Lifetime of a hold message after its arrival [s].
     tip_age_limit : float
-        A command counts if the tip behind it is not older [s].
+        Greatest age of the tip behind a command [s].
     reply_age_limit : float
-        An axis that says nothing for longer has failed [s].
+        An axis that is silent for longer has failed [s].
     retraction_speed : float
-        Insertion axis, outward [m/s].
+        Of the insertion axis [m/s].
     homing_speed : float
-        Insertion axis, towards its switch, needle out [m/s].
+        Of the insertion axis towards its switch [m/s].
     homing_rotation_rate : float
-        Rotation axis, towards its switch, needle out [rad/s].
+        Of the rotation axis towards its switch [rad/s].
     insertion_following_error, rotation_following_error : float
         Largest distance of an axis from its set-point [m], [rad].
     insertion_tolerance, rotation_tolerance : float
-        A motion has ended when each axis is so close to its target [m], [rad].
+        A motion has ended when each axis is closer to its target [m], [rad].
     settling_time : float
-        How long an axis may take for that after its last set-point [s].
+        Longest time for that after the last set-point [s].
     """
 
     max_depth: float = fixed_parameter(0.2, "m", "Deepest insertion.", 0.001, 0.5)
@@ -77,7 +77,7 @@ class SafetyLimits:
     hold_timeout: float = fixed_parameter(
         0.25,
         "s",
-        "A hold message counts so long after its arrival, steady clock.",
+        "Lifetime of a hold message after its arrival, steady clock.",
         0.05,
         HARD_HOLD_TIMEOUT_CAP,
     )
@@ -85,44 +85,44 @@ class SafetyLimits:
         2.0, "s", "A command is refused if the tip behind it is older, steady clock.", 0.05, 60.0
     )
     reply_age_limit: float = fixed_parameter(
-        0.1, "s", "A drive silent for longer has failed.", 0.05, 0.5
+        0.1, "s", "A drive that is silent for longer has failed.", 0.05, 0.5
     )
     retraction_speed: float = fixed_parameter(
-        0.002, "m/s", "Speed at which the needle is drawn out.", _SMALLEST, HARD_SPEED_CAP
+        0.002, "m/s", "Speed of a retraction.", _SMALLEST, HARD_SPEED_CAP
     )
     homing_speed: float = fixed_parameter(
-        0.002, "m/s", "Towards the insertion switch.", _SMALLEST, HARD_SPEED_CAP
+        0.002, "m/s", "Speed towards the insertion switch.", _SMALLEST, HARD_SPEED_CAP
     )
     homing_rotation_rate: float = fixed_parameter(
-        1.0, "rad/s", "Towards the rotation switch.", 0.01, 20.0
+        1.0, "rad/s", "Speed towards the rotation switch.", 0.01, 20.0
     )
     insertion_following_error: float = fixed_parameter(0.0005, "m", _FOLLOWING, 1e-6, 10.0)
     rotation_following_error: float = fixed_parameter(0.1, "rad", _FOLLOWING, 1e-6, 10.0)
     insertion_tolerance: float = fixed_parameter(1e-6, "m", _TOLERANCE, 1e-7, 1.0)
     rotation_tolerance: float = fixed_parameter(1e-4, "rad", _TOLERANCE, 1e-7, 1.0)
     settling_time: float = fixed_parameter(
-        1.0, "s", "To reach the target after the last set-point.", 0.1, 10.0
+        1.0, "s", "Longest time to the target after the last set-point.", 0.1, 10.0
     )
 
     def __post_init__(self) -> None:
-        """Refuse bounds that bound nothing.
+        """Check the limits.
 
         Raises
         ------
         UserError
-            A limit that is not finite, not positive, or above the largest of its parameter.
+            A limit that is not finite, not positive, or above the bound of its parameter.
         """
-        for name, spec, _ in specs(self):
+        for name, spec, _ in specs(SafetyLimits):
             check_bounds(name, getattr(self, name), ABOVE_0, spec.upper, spec.unit)
 
     @classmethod
     def of(cls, parameters: Any) -> SafetyLimits:
-        """Return the limits that a parameter dataclass has; the others are the defaults.
+        """Return the limits among the fields of a parameter dataclass; the others are the defaults.
 
         Parameters
         ----------
         parameters : dataclass instance
-            Its fields that are called like limits are limits.
+            Fields with the name of a limit are limits.
         """
         own = {field.name for field in dataclasses.fields(parameters)}
         names = [field.name for field in dataclasses.fields(cls) if field.name in own]
@@ -135,7 +135,7 @@ class SafetyLimits:
 
     @property
     def longest_homings(self) -> tuple[float, float]:
-        """Homing of each axis over its whole travel, and half as much again [s]."""
+        """Longest homing of each axis: 1.5 times the time for its whole travel [s]."""
         return (
             1.5 * self.max_depth / self.homing_speed,
             1.5 * self.max_rotation / self.homing_rotation_rate,
@@ -143,6 +143,6 @@ class SafetyLimits:
 
 
 def limit_parameter(name: str) -> Any:
-    """Declare the field `name` of `SafetyLimits` as a field of a parameter dataclass."""
+    """Return the field `name` of `SafetyLimits` for a parameter dataclass."""
     (field,) = (field for field in dataclasses.fields(SafetyLimits) if field.name == name)
     return dataclasses.field(default=field.default, metadata=field.metadata)

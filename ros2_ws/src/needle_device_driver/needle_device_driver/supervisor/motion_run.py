@@ -1,11 +1,11 @@
-"""Axes and their motion under way: set-points, what is wrong with either, when it has ended."""
+"""Motion under way, and what bounds it: set-points, homing time, retraction distance."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
 
-from needle_device_driver.axes.axis_pair import PairSnapshot
+from needle_device_driver.axes.axis import AxisSnapshot, PairSnapshot
 from needle_device_driver.axes.motion import CoordinatedMotion, Leg, SetPoint, slowed_legs
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.limits import SafetyLimits
@@ -14,12 +14,14 @@ from needle_device_driver.supervisor.states import Activity
 Problem = tuple[Rule, str]
 
 INNER_SWITCH = "the insertion axis is at its inner limit switch"
+# Weight of the time at the switch: a drive leaves it at a quarter of the homing speed.
+_OFF_SWITCH = 0.25
 
 
 def axes_problem(
     at: PairSnapshot, now: float, limits: SafetyLimits, *, powered_wanted: bool, homed_wanted: bool
 ) -> Problem | None:
-    """Return the rule that the axes' newest replies break, and how."""
+    """Return the rule that the axes break, and how."""
     if at.fault:
         return at.fault_rule, at.fault
     if at.age(now) > limits.reply_age_limit:
@@ -35,22 +37,22 @@ def axes_problem(
 
 
 class MotionRun:
-    """Leads both axes along one way.
+    """Moves both axes along one path.
 
     Parameters
     ----------
     activity : Activity
-        STEP or RETRACTION; a retraction leaves the rotation axis alone.
+        STEP or RETRACTION; a retraction does not move the rotation axis.
     legs : sequence of Leg
-        The way.
+        The path.
     at : PairSnapshot
-        Where the axes are.
+        Feedback of the axes.
     limits : SafetyLimits
         The bounds.
     feedback_delay : int
-        How many cycles after its order a set-point shows in a snapshot.
+        Number of cycles until a set-point shows in the feedback.
     pushed : bool
-        Whether a hand moves the insertion axis: then rotation follows the measured insertion.
+        Whether a hand moves the insertion axis; rotation then follows the measured insertion.
     """
 
     def __init__(
@@ -76,7 +78,7 @@ class MotionRun:
         if not at.ready:
             return None
         if not self._due:
-            # The axes may have come to rest elsewhere since the order.
+            # The axes may have moved while they came to rest.
             self._motion = self._begin(at)
         if self._pushed:
             set_point = self._motion.follow(
@@ -90,13 +92,13 @@ class MotionRun:
         return set_point
 
     def replace(self, legs: Sequence[Leg], at: PairSnapshot) -> None:
-        """Go another way from the last set-point on, without a stop."""
+        """Continue along another path from the last set-point, without a stop."""
         self._legs = tuple(legs)
         self._motion = self._begin(at)
         self._settling = 0.0
 
-    def rotation_owed(self, at: PairSnapshot) -> float:
-        """Return by how much the rotation is behind a needle that a hand pushes [rad]."""
+    def rotation_lag(self, at: PairSnapshot) -> float:
+        """Return the lag of the rotation behind a needle that a hand pushes [rad]."""
         if not (self._pushed and self._due):
             return 0.0
         return abs(self._motion.rotation_at(at.insertion.position) - self._due[-1].rotation)
@@ -107,10 +109,11 @@ class MotionRun:
         if self.activity is Activity.STEP and at.insertion.at_inner_switch:
             return Rule.INNER_LIMIT_SWITCH, INNER_SWITCH
         if self._settling > limits.settling_time:
+            insertion, rotation = self._distance_to_end(at)
             return (
                 Rule.SETTLING_TIME,
                 f"the axes are not at their target {limits.settling_time:g} s after the last "
-                f"set-point: {self._off(at)}",
+                f"set-point: insertion {insertion * 1e3:.4f} mm, rotation {rotation:.5f} rad off",
             )
         if len(self._due) < (self._due.maxlen or 1):
             return None
@@ -133,24 +136,19 @@ class MotionRun:
 
     def arrived(self, at: PairSnapshot) -> bool:
         """Return whether the motion has ended; a retraction also ends at the home switch."""
-        if self.activity is Activity.RETRACTION and at.insertion.at_home_switch:
+        retracts = self.activity is Activity.RETRACTION
+        if retracts and at.insertion.at_home_switch:
             return True
-        end = self._legs[-1]
+        insertion, rotation = self._distance_to_end(at)
         return (
             self._motion.complete
-            and (
-                self._pushed
-                or abs(end.insertion - at.insertion.position) <= self._limits.insertion_tolerance
-            )
-            and (
-                self.activity is Activity.RETRACTION
-                or abs(end.rotation - at.rotation.position) <= self._limits.rotation_tolerance
-            )
+            and (self._pushed or insertion <= self._limits.insertion_tolerance)
+            and (retracts or rotation <= self._limits.rotation_tolerance)
         )
 
     def _begin(self, at: PairSnapshot) -> CoordinatedMotion:
-        # From the last set-point: a motor rests beside it, and counted from there the first
-        # set-point could be too far ahead.
+        # Start at the last set-point: a motor may rest beside it, and a path from the measured
+        # position could begin with a jump of the set-point.
         start = at.insertion.set_point, at.rotation.set_point
         if self.activity is Activity.RETRACTION:
             legs = slowed_legs(start, self._legs, max_speed=self._limits.retraction_speed)
@@ -163,8 +161,59 @@ class MotionRun:
             )
         return CoordinatedMotion(start, legs)
 
-    def _off(self, at: PairSnapshot) -> str:
+    def _distance_to_end(self, at: PairSnapshot) -> tuple[float, float]:
         end = self._legs[-1]
-        insertion = abs(end.insertion - at.insertion.position)
-        rotation = abs(end.rotation - at.rotation.position)
-        return f"insertion {insertion * 1e3:.4f} mm, rotation {rotation:.5f} rad off"
+        return (
+            abs(end.insertion - at.insertion.position),
+            abs(end.rotation - at.rotation.position),
+        )
+
+
+class HomingTimes:
+    """Rule `homing_time`: bounds the search of each axis for its home switch.
+
+    Parameters
+    ----------
+    limits : SafetyLimits
+        With the longest homings.
+    """
+
+    def __init__(self, limits: SafetyLimits) -> None:
+        self._longest = limits.longest_homings
+        self._times = [0.0, 0.0]
+
+    def advance(self, at: PairSnapshot, period: float) -> str:
+        """Count `period` [s]; return which axis has taken too long, empty: none."""
+        for k, (name, axis) in enumerate(at.by_name.items()):
+            self._times[k] += period * axis.moving * (_OFF_SWITCH if axis.at_home_switch else 1)
+            if self._times[k] > self._longest[k]:
+                return f"no home switch of the {name} axis in {self._longest[k]:.0f} s"
+        return ""
+
+
+class RetractionBound:
+    """Bounds a retraction: remembers the last known depth when the home position is lost.
+
+    Parameters
+    ----------
+    max_depth : float
+        Bound if the depth was never known [m].
+    """
+
+    def __init__(self, max_depth: float) -> None:
+        self._remaining = max_depth
+        self._before: AxisSnapshot | None = None
+
+    def note(self, insertion: AxisSnapshot) -> None:
+        """Note a snapshot of the insertion axis; call it with each one."""
+        before, self._before = self._before, insertion
+        if insertion.homed or before is None:
+            return
+        if before.homed:
+            self._remaining = max(before.position, 0.0)
+        elif before.origin == insertion.origin:
+            self._remaining += insertion.position - before.position
+
+    def target(self, insertion: AxisSnapshot) -> float:
+        """Return the position at which a retraction must end [m]."""
+        return 0.0 if insertion.homed else insertion.position - self._remaining

@@ -1,36 +1,22 @@
-"""Reports of the motion supervisor: answers, results, status."""
+"""Reports of the motion supervisor: results of commands, notices, results of service calls."""
 
 from __future__ import annotations
 
 import dataclasses
 from typing import TypeAlias
 
+from needle_core.messages import CommandResult
 from needle_device_driver.rules import Rule
 
 SUCCEEDED = "succeeded"
 REPLACED = "replaced"
-"""Of a path whose place another took before its end."""
-
-
-@dataclasses.dataclass(frozen=True)
-class StepResult:
-    """The end of a step, or of a command that never became one.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        The command's stamp [ns].
-    outcome : str
-        `succeeded`, `replaced` or `aborted: why`.
-    """
-
-    stamp_ns: int
-    outcome: str
+"""Outcome of a path that a newer one replaced before its end."""
+MAX_NOTICES, NOTICE_PERIOD = 5, 1.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Notice:
-    """Something a person should read once in the log.
+    """An event for the log.
 
     Attributes
     ----------
@@ -51,44 +37,41 @@ class Notice:
         return self.text if self.rule is None else f"{self.text} [{self.rule.value}]"
 
 
-MOST_NOTICES, NOTICE_PERIOD = 5, 1.0
+Event: TypeAlias = CommandResult | Notice
 
 
 class NoticeLimit:
-    """Lets through `MOST_NOTICES` of a rule in `NOTICE_PERIOD`, counts others; faults always."""
+    """Admits `MAX_NOTICES` of each rule in `NOTICE_PERIOD` and counts the others; faults always."""
 
     def __init__(self) -> None:
         self._since: dict[Rule | None, float] = {}
         self._count: dict[Rule | None, int] = {}
 
     def admit(self, notice: Notice, now: float) -> str:
-        """Return what to say of a notice at steady time `now` [s]; empty: nothing."""
+        """Return the text to log for a notice at steady time `now` [s]; empty: none."""
         if notice.fault:
             return str(notice)
         rule = notice.rule
-        left_out = 0
+        dropped = 0
         if now - self._since.get(rule, -NOTICE_PERIOD) >= NOTICE_PERIOD:
-            left_out = max(self._count.get(rule, 0) - MOST_NOTICES, 0)
+            dropped = max(self._count.get(rule, 0) - MAX_NOTICES, 0)
             self._since[rule], self._count[rule] = now, 0
         self._count[rule] = self._count.get(rule, 0) + 1
-        if self._count[rule] > MOST_NOTICES:
+        if self._count[rule] > MAX_NOTICES:
             return ""
-        return f"{notice} ({left_out} more were not told)" if left_out else str(notice)
-
-
-Event: TypeAlias = StepResult | Notice
+        return f"{notice} ({dropped} more were not told)" if dropped else str(notice)
 
 
 @dataclasses.dataclass(frozen=True)
-class Reply:
-    """The answer to a service.
+class ServiceResult:
+    """Result of a service call.
 
     Attributes
     ----------
     success : bool
-        Whether it was done or begun.
+        Whether the request was executed or begun.
     message : str
-        Why not, or what.
+        The reason, or what was done.
     """
 
     success: bool

@@ -1,4 +1,4 @@
-"""The states of the device and every way from one to another."""
+"""States of the device and the transitions between them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class State(enum.Enum):
 
 
 class Trigger(enum.Enum):
-    """Events that lead from one state to another."""
+    """Events that change the state."""
 
     CONFIGURE = "configure"
     ENABLE = "enable"
@@ -69,21 +69,19 @@ TRANSITIONS: dict[tuple[State, Trigger], State] = {
 
 
 class ForbiddenTransitionError(Exception):
-    """A way that the table does not have: an error in the program, not in its input."""
+    """A transition that is not in the table: a programming error."""
 
     def __init__(self, state: State, trigger: Trigger) -> None:
         super().__init__(f"no transition from {state.value} by {trigger.value}")
-        self.state = state
-        self.trigger = trigger
 
 
 def next_state(state: State, trigger: Trigger) -> State:
-    """Return the state that `trigger` leads to.
+    """Return the state after `trigger`.
 
     Raises
     ------
     ForbiddenTransitionError
-        If the table has no such way.
+        If the table has no such transition.
     """
     try:
         return TRANSITIONS[state, trigger]

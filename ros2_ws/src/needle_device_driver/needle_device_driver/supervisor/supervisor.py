@@ -1,23 +1,21 @@
-"""Safety rules of the rig, each once: who may move the needle, when, where to and how fast."""
+"""Motion supervisor: enforces every safety rule in one place."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from needle_core.diagnostics import Level, sanitize
-from needle_core.messages import HoldState
+from needle_core.messages import HoldState, Trajectory
 from needle_core.status_messages import DeviceStatus
-from needle_device_driver.axes.axis import Axis
-from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
+from needle_device_driver.axes.axis import Axis, AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import Leg
 from needle_device_driver.procedure import Procedure
 from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.command import Command
-from needle_device_driver.supervisor.command_desk import CommandDesk
+from needle_device_driver.supervisor.command_handler import CommandHandler
 from needle_device_driver.supervisor.device_core import DeviceCore
-from needle_device_driver.supervisor.hold import Hold, HoldRefusals
+from needle_device_driver.supervisor.hold import Hold, HoldNotices
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_device_driver.supervisor.reports import Event, Reply
+from needle_device_driver.supervisor.reports import Event, ServiceResult
 from needle_device_driver.supervisor.states import Activity, State, Trigger
 
 _LEVELS = {State.FAULT: Level.ERROR, State.ESTOPPED: Level.ERROR, State.UNCONFIGURED: Level.WARN}
@@ -25,10 +23,10 @@ _SWITCHING = "waiting for the axes to switch off"
 
 
 class MotionSupervisor:
-    """The only way to the axes. `now` is everywhere the steady clock [s].
+    """The only access to the axes; `now` is the steady time [s] in every method.
 
-    A cycle is `drive(period, now)`, which orders set-points, and `observe(now)`, which reads the
-    axes, watches over them and ends what has ended. `take_events` has what there is to tell.
+    A cycle is `drive(period, now)`, which orders set-points, then `observe(now)`, which reads and
+    checks the axes. `take_events` returns the reports.
 
     Parameters
     ----------
@@ -37,9 +35,9 @@ class MotionSupervisor:
     limits : SafetyLimits
         The bounds of the rules.
     feedback_delay : int
-        How many cycles after its order a set-point shows in the axes' snapshots.
-    switching : callable, optional
-        Returns whether an axis is on its way to where it was ordered, apart from set-points.
+        Number of cycles until a set-point shows in the feedback.
+    is_switching : callable, optional
+        Returns whether an axis still executes an order other than a set-point.
     """
 
     def __init__(
@@ -49,25 +47,25 @@ class MotionSupervisor:
         limits: SafetyLimits,
         *,
         feedback_delay: int = 0,
-        switching: Callable[[], bool] = lambda: False,
+        is_switching: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._switching = switching
+        self._is_switching = is_switching
         self._axes = AxisPair(insertion, rotation)
         self._limits = limits
         self._hold = Hold(limits.hold_timeout)
-        self._hold_refusals = HoldRefusals()
+        self._hold_notices = HoldNotices()
         self._estop_pressed = False
         self._needle_out = False
-        self._others = ""
+        self._conflict = ""
         self._core = DeviceCore(
             self._axes,
             limits,
             feedback_delay=feedback_delay,
             on_stop=self._hold.require_new_press,
         )
-        self._commands = CommandDesk(self._core, self._hold, limits)
+        self._commands = CommandHandler(self._core, self._hold, limits)
 
-    # ---- what is told -------------------------------------------------------------------------
+    # ---- reports ------------------------------------------------------------------------------
 
     @property
     def state(self) -> State:
@@ -81,42 +79,42 @@ class MotionSupervisor:
 
     @property
     def stops(self) -> int:
-        """Number of faults and emergency stops, also while there was one already."""
+        """Number of faults and emergency stops, including those in FAULT and ESTOPPED."""
         return self._core.stops
 
     @property
     def command_ns(self) -> int:
-        """Stamp of the newest command, whatever became of it [ns]; 0: none yet."""
+        """Stamp of the newest command, accepted or refused [ns]; 0: none yet."""
         return self._commands.newest_ns
-
-    def take_events(self) -> tuple[Event, ...]:
-        """Return what happened since the last call."""
-        return self._core.take_events()
-
-    def joints(self, now: float) -> PairSnapshot | None:
-        """Return the measured joints; None when there is no reply within the age limit."""
-        at = self._core.snapshot
-        return None if at is None or at.age(now) > self._limits.reply_age_limit else at
-
-    def held(self, now: float) -> bool:
-        """Return whether somebody holds who was heard within the time-out, at a speed above 0."""
-        return self._hold.is_fresh(now) and self._hold.speed_scale > 0.0
-
-    def may_move(self, now: float) -> bool:
-        """Return whether what is under way would go on if `drive` were called now."""
-        if self._core.activity is Activity.HOMING:
-            return True
-        return self._core.activity is not Activity.NONE and self.held(now)
 
     @property
     def fault(self) -> str:
-        """Reason for the state FAULT or ESTOPPED; else empty."""
-        return self._core.fault_now
+        """Reason for the state FAULT or ESTOPPED; otherwise empty."""
+        return self._core.fault
+
+    def take_events(self) -> tuple[Event, ...]:
+        """Return the events since the last call."""
+        return self._core.take_events()
+
+    def joints(self, now: float) -> PairSnapshot | None:
+        """Return the measured joints; None if the feedback is older than the age limit."""
+        at = self._core.snapshot
+        return None if at is None or at.age(now) > self._limits.reply_age_limit else at
+
+    def is_held(self, now: float) -> bool:
+        """Return whether the owner's press is fresh and its speed is above 0."""
+        return self._hold.is_fresh(now) and self._hold.speed_scale > 0.0
+
+    def may_move(self, now: float) -> bool:
+        """Return whether `drive` would continue the motion under way."""
+        if self._core.activity is Activity.HOMING:
+            return True
+        return self._core.activity is not Activity.NONE and self.is_held(now)
 
     def status(
         self, now: float, source: str = "", *, simulated: bool | None = None
     ) -> DeviceStatus:
-        """Return the device's status; name and `simulated` are known to its owner alone."""
+        """Return the device's status with the given source and `simulated`."""
         joints, state, fault = self.joints(now), self._core.state, self.fault
         return DeviceStatus(
             source=source,
@@ -126,7 +124,7 @@ class MotionSupervisor:
             activity=self._core.activity.value,
             homed=self._core.snapshot is not None and self._core.snapshot.homed,
             hold_owner=sanitize(self._hold.owner or ""),
-            press_again=sanitize(self._hold.unheeded(now) or ""),
+            press_again=sanitize(self._hold.ignored_press(now) or ""),
             speed_scale=self._hold.speed_scale,
             insertion_m=None if joints is None else joints.insertion.position,
             rotation_rad=None if joints is None else joints.rotation.position,
@@ -137,224 +135,219 @@ class MotionSupervisor:
             commands_refused=self._commands.refused,
             holds_ignored=self._hold.ignored,
             command_ns=self.command_ns,
-            rotation_owed_rad=self._core.rotation_owed,
+            rotation_owed_rad=self._core.rotation_lag,
             simulated=simulated,
         )
 
-    # ---- what comes from outside --------------------------------------------------------------
+    # ---- inputs -------------------------------------------------------------------------------
 
-    def configure(self, now: float) -> Procedure[Reply]:
+    def configure(self, now: float) -> Procedure[ServiceResult]:
         """Set the axes up; moves nothing."""
         if self._core.state is not State.UNCONFIGURED:
-            return self._not_in(State.UNCONFIGURED)
+            return self._wrong_state(State.UNCONFIGURED)
         if error := (yield from self._core.configure()):
-            return Reply(False, error)
+            return ServiceResult(False, error)
         self.observe(now)
-        return Reply(True, "configured")
+        return ServiceResult(True, "configured")
 
-    def deconfigure(self) -> Procedure[Reply]:
-        """Stop, switch the axes off and let go of them; a fault or emergency stop stays."""
+    def deconfigure(self) -> Procedure[ServiceResult]:
+        """Stop, switch the axes off and release them; a fault or emergency stop stays."""
         if self._core.state in (State.HOLDING, State.MOVING):
             self._disable()
-        if not (yield from self._core.let_go()):
-            return Reply(False, f"the device is {self._core.state.value}")
-        return Reply(True, "deconfigured")
+        if not (yield from self._core.deconfigure()):
+            return ServiceResult(False, f"the device is {self._core.state.value}")
+        return ServiceResult(True, "deconfigured")
 
     def note_time(self, ros_ns: int, now: float) -> None:
-        """Note that ROS time is `ros_ns` [ns] now; call it in each cycle."""
-        self._commands.note_time(ros_ns, now)
+        """Note that ROS time is `ros_ns` [ns]; call it in each cycle."""
+        self._commands.stamps.note(ros_ns, now)
 
     def receive_hold(self, message: HoldState, now: float) -> None:
-        """Take a hold message that arrived now."""
-        # A silence that nobody watched is one all the same.
-        self._watch_hold(now)
+        """Receive a hold message."""
+        # The cycle may not have checked the last gap between messages yet.
+        self._check_hold_age(now)
         counting = self._core.state in (State.HOLDING, State.MOVING)
         rule = self._hold.receive(message, now, counting=counting)
-        text = self._hold_refusals.take(message, rule, known=self._hold.knows(message.source))
-        if text and counting:
-            self._core.explain(text)
-            self._core.notice(text, rule)
-        if self._core.moves_with_hold and self._hold.owner is None:
+        text = self._hold_notices.text_for(message, rule, known=self._hold.knows(message.source))
+        if text and rule is not None and counting:
+            self._core.explain(text, rule)
+        if self._core.needs_hold and self._hold.owner is None:
             self._core.abort("hold released")
 
     def receive_estop(self, pressed: bool) -> None:
-        """Take the state of the emergency stop; pressed latches."""
+        """Receive the state of the emergency stop; pressed latches."""
         self._estop_pressed = pressed
         if pressed:
             self._core.emergency_stop()
 
-    def see_others(self, others: str) -> None:
-        """Take who else is a device on these topics; empty: nobody, as it must be."""
-        if others == self._others:
+    def report_conflicting_device(self, conflict: str) -> None:
+        """Fail if another device uses the same topics; an empty text means there is none."""
+        if conflict == self._conflict:
             return
-        self._others = others
-        if others:
-            # Whoever said that a needle is out may have meant the other's.
+        self._conflict = conflict
+        if conflict:
+            # The confirmation may have been meant for the other device.
             self._needle_out = False
-            self._core.fail(others, Rule.ONE_DEVICE)
+            self._core.fail(conflict, Rule.ONE_DEVICE)
 
     def fail(self, reason: str, rule: Rule | None = None) -> None:
-        """Stop both axes for a fault; it takes a reset to go on."""
+        """Stop both axes for a fault, which lasts until a reset."""
         self._core.fail(reason, rule)
 
-    def submit(self, command: Command, now: float, publishers: int = 1) -> None:
-        """Take a command: it starts, or is refused whole; a result tells which.
+    def submit(self, command: Trajectory, now: float, publishers: int = 1) -> None:
+        """Handle a command: it starts or is refused as a whole, and a result reports which.
 
-        A path takes the place of the one under way.
+        A path replaces the path under way.
 
         Parameters
         ----------
-        command : Command
-            As received, nothing checked.
+        command : Trajectory
+            As received, unchecked.
         now : float
             Steady time [s].
         publishers : int
-            How many publish commands at present.
+            Number of publishers of commands.
         """
-        self._watch_hold(now)
+        self._check_hold_age(now)
         if self._commands.submit(command, now, publishers):
             self._needle_out = False
 
-    def count_watchdog_trip(self) -> None:
-        """Count a watchdog of the supervisor's owner among its own."""
-        self._core.count_watchdog_trip()
-
     # ---- services -----------------------------------------------------------------------------
 
-    def enable(self, on: bool, now: float) -> Reply:
-        """Switch the axes on, where nothing moves, or off."""
+    def enable(self, on: bool, now: float) -> ServiceResult:
+        """Switch the axes on, without motion, or off."""
         if not on:
             return self._disable()
         if self._core.state is State.HOLDING:
-            return Reply(True, "already enabled")
+            return ServiceResult(True, "already enabled")
         if self._core.state is not State.DISABLED:
-            return self._not_in(State.DISABLED)
-        if self._switching():
-            return Reply(False, _SWITCHING)
+            return self._wrong_state(State.DISABLED)
+        if self._is_switching():
+            return ServiceResult(False, _SWITCHING)
         if error := self._core.power_on():
-            return Reply(False, error)
+            return ServiceResult(False, error)
         self._hold.require_new_press()
-        self._hold_refusals.clear()
-        self._core.go(Trigger.ENABLE, "enabled; hold to run")
+        self._hold_notices.clear()
+        self._core.change_state(Trigger.ENABLE, "enabled; hold to run")
         self.observe(now)
-        return Reply(True, "enabled; nothing moves without hold")
+        return ServiceResult(True, "enabled; nothing moves without hold")
 
-    def confirm_needle_out(self, confirmed: bool) -> Reply:
-        """Take a person's word that the needle is out of the tissue; a step ends its validity."""
+    def confirm_needle_out(self, confirmed: bool) -> ServiceResult:
+        """Note a person's confirmation that the needle is out; the next step ends it."""
         if self._core.activity is not Activity.NONE:
-            return Reply(False, f"a {self._core.activity.value} is under way")
-        if confirmed and self._others:
-            return Reply(False, self._others)
+            return ServiceResult(False, f"a {self._core.activity.value} is under way")
+        if confirmed and self._conflict:
+            return ServiceResult(False, self._conflict)
         self._needle_out = confirmed
-        return Reply(True, "needle out" if confirmed else "needle not out")
+        return ServiceResult(True, "needle out" if confirmed else "needle not out")
 
-    def home(self, now: float) -> Procedure[Reply]:
-        """Begin to look for both home switches; only with the needle out."""
+    def home(self, now: float) -> Procedure[ServiceResult]:
+        """Begin to home both axes; requires that the needle is out."""
         if self._core.state is not State.DISABLED:
-            return self._not_in(State.DISABLED)
+            return self._wrong_state(State.DISABLED)
         if not self._needle_out:
-            return Reply(False, "confirm first that the needle is out (confirm_needle_out)")
-        if self._switching():
-            return Reply(False, _SWITCHING)
+            return ServiceResult(False, "confirm first that the needle is out (confirm_needle_out)")
+        if self._is_switching():
+            return ServiceResult(False, _SWITCHING)
         if error := (yield from self._core.start_homing()):
-            return Reply(False, error)
+            return ServiceResult(False, error)
         self.observe(now)
-        return Reply(True, "homing" if self._core.activity is Activity.HOMING else "homed")
+        homing = self._core.activity is Activity.HOMING
+        return ServiceResult(True, "homing" if homing else "homed")
 
-    def retract(self, now: float) -> Reply:  # noqa: PLR0911 - each return is a reason
-        """Begin to draw the needle out: insertion axis only, slowly, while the hold lasts."""
-        self._watch_hold(now)
+    def retract(self, now: float) -> ServiceResult:  # noqa: PLR0911 - each return is a reason
+        """Begin to retract the needle: slowly, without rotation, while the hold lasts."""
+        self._check_hold_age(now)
         if self._core.state is not State.HOLDING:
-            return self._not_in(State.HOLDING)
+            return self._wrong_state(State.HOLDING)
         if self._hold.owner is None:
-            return Reply(False, "press and keep the hold first")
+            return ServiceResult(False, "press and keep the hold first")
         at = self._core.poll(now)
         if not at.powered:
-            return Reply(False, "the axes are not powered yet")
+            return ServiceResult(False, "the axes are not powered yet")
         if not self._axes.insertion.actuated:
-            return Reply(False, "the insertion axis is moved by hand: draw the needle out by hand")
-        distance = self._core.way_out
+            return ServiceResult(
+                False, "the insertion axis is moved by hand: draw the needle out by hand"
+            )
+        distance = self._core.retraction_distance
         if distance <= self._limits.insertion_tolerance or at.insertion.at_home_switch:
-            return Reply(True, "the needle is out")
+            return ServiceResult(True, "the needle is out")
         duration = distance / self._limits.retraction_speed
-        way = [Leg(at.insertion.position - distance, at.rotation.position, duration)]
-        self._core.start(Activity.RETRACTION, way)
+        leg = Leg(at.insertion.position - distance, at.rotation.position, duration)
+        self._core.start(Activity.RETRACTION, [leg])
         if self._core.activity is not Activity.RETRACTION:
-            return Reply(False, self._core.fault)
-        return Reply(True, f"retracting {distance * 1e3:.1f} mm while the hold lasts")
+            return ServiceResult(False, self._core.fault)
+        return ServiceResult(True, f"retracting {distance * 1e3:.1f} mm while the hold lasts")
 
-    def stop(self) -> Reply:
-        """Stop whatever moves; it takes a new press to move again."""
+    def stop(self) -> ServiceResult:
+        """Stop any motion; the next one needs a new press."""
         self._hold.require_new_press()
         if self._core.activity is Activity.NONE:
-            return Reply(True, "nothing moves")
+            return ServiceResult(True, "nothing moves")
         activity = self._core.activity.value
         self._core.abort("stopped on request")
-        return Reply(True, f"{activity} stopped")
+        return ServiceResult(True, f"{activity} stopped")
 
-    def reset(self, now: float) -> Procedure[Reply]:  # noqa: PLR0911 - each return is a reason
-        """Leave FAULT or ESTOPPED, let in whom old stamps shut out; moves and enables nothing."""
+    def reset(self, now: float) -> Procedure[ServiceResult]:  # noqa: PLR0911 - each is a reason
+        """Leave FAULT or ESTOPPED, and forget rejected stamps; moves and enables nothing."""
         if self._core.state is State.MOVING:
-            return Reply(False, f"a {self._core.activity.value} is under way")
-        self._hold.readmit()
-        self._hold_refusals.clear()
-        self._commands.readmit()
+            return ServiceResult(False, f"a {self._core.activity.value} is under way")
+        self._hold.clear_rejections()
+        self._hold_notices.clear()
+        self._commands.stamps.clear_rejections()
         if self._core.state not in (State.FAULT, State.ESTOPPED):
-            return Reply(True, "nothing to reset")
-        if self._others:
-            return Reply(False, self._others)
+            return ServiceResult(True, "nothing to reset")
+        if self._conflict:
+            return ServiceResult(False, self._conflict)
         if self._estop_pressed:
-            return Reply(False, "the emergency stop is still pressed")
+            return ServiceResult(False, "the emergency stop is still pressed")
         if not self._hold.is_off(now):
-            return Reply(False, "release the hold first")
+            return ServiceResult(False, "release the hold first")
         if problem := (yield from self._core.reset(now)):
-            return Reply(False, problem)
+            return ServiceResult(False, problem)
         if not self._core.configured:
-            return Reply(True, "reset; the device is not configured")
-        return Reply(True, self._core.reason)
+            return ServiceResult(True, "reset; the device is not configured")
+        return ServiceResult(True, self._core.reason)
 
     # ---- the cycle ----------------------------------------------------------------------------
 
     def drive(self, period: float, now: float) -> None:
-        """Order the set-points of the next `period` [s] of the axes' time, if anything may move."""
+        """Order the set-points of the next `period` [s] if the device may move."""
         if self._core.activity is Activity.HOMING:
             self._core.drive_homing(period)
             return
-        self._watch_hold(now)
-        self._commands.watch_path(now)
+        self._check_hold_age(now)
+        self._commands.check_path_age(now)
         if self.may_move(now):
             self._core.drive(period, self._hold.speed_scale, now)
 
     def observe(self, now: float) -> None:
-        """Read the axes, watch over them and the hold, and end what has ended."""
+        """Read the axes, check them and the hold, and finish a completed motion."""
         if not self._core.configured:
             return
-        self._core.watch_axes(now)
-        self._watch_hold(now)
-        self._core.end_what_has_ended()
+        self._core.check_axes(now)
+        self._check_hold_age(now)
+        self._core.finish_completed_motion()
 
-    def _watch_hold(self, now: float) -> None:
-        text = self._hold.lapse(now)
+    def _check_hold_age(self, now: float) -> None:
+        text = self._hold.end_if_stale(now)
         if not text:
             return
-        core = self._core
-        moving = core.moves_with_hold
-        core.notice(text, Rule.HOLD_AGE)
-        core.explain(text + ": release and press again")
+        moving = self._core.needs_hold
+        self._core.notice(text, Rule.HOLD_AGE)
+        self._core.reason = text + ": release and press again"
         if moving:
-            core.count_watchdog_trip()
-            core.abort(text)
+            self._core.watchdog_trips += 1
+            self._core.abort(text)
 
-    # ---- answers ------------------------------------------------------------------------------
+    def _wrong_state(self, wanted: State) -> ServiceResult:
+        return ServiceResult(False, f"the device is {self._core.state.value}, not {wanted.value}")
 
-    def _not_in(self, wanted: State) -> Reply:
-        return Reply(False, f"the device is {self._core.state.value}, not {wanted.value}")
-
-    def _disable(self) -> Reply:
+    def _disable(self) -> ServiceResult:
         self._hold.require_new_press()
         if self._core.activity is not Activity.NONE:
             self._core.abort("disabled on request")
         if self._core.state is State.HOLDING:
-            self._core.go(Trigger.DISABLE, "disabled on request")
+            self._core.change_state(Trigger.DISABLE, "disabled on request")
         error = self._core.power_off() if self._core.configured else ""
-        return Reply(False, error) if error else Reply(True, "disabled")
+        return ServiceResult(False, error) if error else ServiceResult(True, "disabled")

@@ -1,4 +1,4 @@
-"""The coordinated motion, free of the supervisor around it."""
+"""Coordinated motion without a supervisor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _places = st.tuples(st.floats(-0.2, 0.2), st.floats(-60.0, 60.0))
 
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(start=_places, end=_places, duration=st.floats(0.02, 1.0))
-def test_the_last_set_point_is_the_target_to_the_last_bit(
+def test_last_set_point_is_exactly_the_target(
     start: tuple[float, float], end: tuple[float, float], duration: float
 ) -> None:
     motion = CoordinatedMotion(start, [Leg(*end, duration)])
@@ -26,7 +26,7 @@ def test_the_last_set_point_is_the_target_to_the_last_bit(
     assert (set_point.insertion, set_point.rotation) == end
 
 
-def test_a_period_at_half_speed_goes_half_as_far_and_one_may_end_a_leg() -> None:
+def test_half_speed_covers_half_the_distance() -> None:
     motion = CoordinatedMotion((0.0, 0.0), [Leg(1.0, -2.0, 1.0), Leg(2.0, -2.0, 0.5)])
     assert motion.advance(0.2, 1.0) == SetPoint(0.2, -0.4, 1.0, 2.0)
     at = motion.advance(0.2, 0.5)
@@ -38,7 +38,7 @@ def test_a_period_at_half_speed_goes_half_as_far_and_one_may_end_a_leg() -> None
     assert motion.complete
 
 
-def test_what_a_leg_leaves_of_a_period_is_gone_at_the_speed_of_the_next() -> None:
+def test_rest_of_a_period_uses_the_speed_of_the_next_leg() -> None:
     motion = CoordinatedMotion((0.0, 0.0), [Leg(1.0, -2.0, 0.5), Leg(2.0, -2.0, 1.0)])
     motion.advance(0.4, 1.0)
     # The last fifth of the first leg takes 0.1 s, at half speed 0.2 s.
@@ -47,7 +47,7 @@ def test_what_a_leg_leaves_of_a_period_is_gone_at_the_speed_of_the_next() -> Non
         assert (at.insertion, at.rotation) == pytest.approx((reached, -2.0))
 
 
-def test_rotation_waits_for_a_hand_and_follows_it_no_faster_than_its_rate() -> None:
+def test_rotation_follows_a_pushed_needle_at_its_rate() -> None:
     motion = CoordinatedMotion((1.0, 0.0), [Leg(2.0, 1.0, 1.0), Leg(3.0, 0.0, 1.0)])
     for hand, rotation in ((0.5, 0.0), (1.25, 0.25), (1.1, 0.25), (2.5, 0.75), (2.5, 0.75)):
         assert motion.follow(hand, 1.0, 0.5).rotation == pytest.approx(rotation)

@@ -1,4 +1,4 @@
-"""The drive's state machine: statuswords, transitions, the way to each goal."""
+"""State machine of a drive: statuswords, transitions, commands to each goal."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from needle_device_driver.cia402.cia402 import (
     DriveCommand,
     DriveState,
     Goal,
-    TransitionWatch,
+    TransitionMonitor,
     drive_state,
     next_command,
 )
 
-# CiA 402-2: bits 6, 5 and 3..0 of the statusword; x is any.
+# CiA 402-2: bits 6, 5 and 3..0 of the statusword; x: any value.
 PATTERNS = {
     "x0xx 0000": "NOT_READY_TO_SWITCH_ON",
     "x1xx 0000": "SWITCH_ON_DISABLED",
@@ -26,7 +26,7 @@ PATTERNS = {
     "x0xx 1111": "FAULT_REACTION_ACTIVE",
     "x0xx 1000": "FAULT",
 }
-# Every way that a controlword opens, by the standard's numbers.
+# Transitions by controlword, with the standard's numbers.
 WAYS = {
     (2,): "SWITCH_ON_DISABLED SHUTDOWN READY_TO_SWITCH_ON",
     (3,): "READY_TO_SWITCH_ON SWITCH_ON SWITCHED_ON",
@@ -55,9 +55,9 @@ def fits(word: int, pattern: str) -> bool:
     return all(bit in ("x", value) for bit, value in zip(bits, f"{word & 0xFF:08b}", strict=True))
 
 
-def test_statuswords_controlwords_and_transitions_are_the_standards() -> None:
+def test_states_commands_and_transitions_match_the_standard() -> None:
     for word in range(256):
-        # The upper byte and bits 4 and 7 say nothing about the state.
+        # The upper byte and bits 4 and 7 do not encode the state.
         wanted = [name for pattern, name in PATTERNS.items() if fits(word, pattern)]
         found = drive_state(word | 0x1600)
         assert ([found.name] if found else []) == wanted
@@ -67,13 +67,13 @@ def test_statuswords_controlwords_and_transitions_are_the_standards() -> None:
     assert {(a.name, c.name, b.name) for (a, c), b in TRANSITIONS.items()} == wanted_ways
 
 
-def test_the_way_to_every_goal_ends_there_and_acknowledges_no_fault() -> None:
+def test_commands_reach_every_goal_without_fault_reset() -> None:
     ends = {
         Goal.ON: {DriveState.OPERATION_ENABLED},
         Goal.OFF: {DriveState.SWITCH_ON_DISABLED},
         Goal.STOPPED: {DriveState.QUICK_STOP_ACTIVE, DriveState.SWITCH_ON_DISABLED},
     }
-    # A drive leaves the first by itself (transition 1).
+    # A drive leaves the first state by itself (transition 1).
     ways = [s for s in DriveState if s not in (*FAULTS, DriveState.NOT_READY_TO_SWITCH_ON)]
     for start, (goal, wanted) in itertools.product(ways, ends.items()):
         at: DriveState = start
@@ -85,19 +85,19 @@ def test_the_way_to_every_goal_ends_there_and_acknowledges_no_fault() -> None:
         assert next_command(goal, state, at_rest=True) is order
 
 
-def test_a_moving_axis_is_never_left_to_coast() -> None:
+def test_moving_axis_never_coasts() -> None:
     for goal in (Goal.OFF, Goal.STOPPED):
         for state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE):
             assert next_command(goal, state, at_rest=False) is DriveCommand.QUICK_STOP
     on = next_command(Goal.ON, DriveState.QUICK_STOP_ACTIVE, at_rest=False)
     assert on is DriveCommand.QUICK_STOP
-    # What no statusword explains disables.
+    # An unknown state disables.
     assert next_command(Goal.ON, None, at_rest=True) is DriveCommand.DISABLE_VOLTAGE
     assert next_command(Goal.STOPPED, None, at_rest=True) is DriveCommand.QUICK_STOP
 
 
-def test_the_watch_names_what_nobody_ordered_but_not_what_crosses_on_the_bus_nor_a_fault() -> None:
-    watch = TransitionWatch()
+def test_transition_monitor_reports_unexplained_transitions() -> None:
+    watch = TransitionMonitor()
     for state, command in (
         (DriveState.NOT_READY_TO_SWITCH_ON, DriveCommand.DISABLE_VOLTAGE),
         (DriveState.SWITCH_ON_DISABLED, DriveCommand.SHUTDOWN),
@@ -109,11 +109,11 @@ def test_the_watch_names_what_nobody_ordered_but_not_what_crosses_on_the_bus_nor
         (DriveState.SWITCH_ON_DISABLED, DriveCommand.DISABLE_VOLTAGE),
     ):
         assert watch.unexplained(state) == ""
-        watch.sent(command)
+        watch.note_command(command)
     watch.unexplained(DriveState.OPERATION_ENABLED)
-    watch.sent(DriveCommand.QUICK_STOP)
+    watch.note_command(DriveCommand.QUICK_STOP)
     for _ in range(6):
-        watch.sent(DriveCommand.ENABLE_OPERATION)
+        watch.note_command(DriveCommand.ENABLE_OPERATION)
     by_itself = watch.unexplained(DriveState.SWITCH_ON_DISABLED)
     assert by_itself == "went from OPERATION_ENABLED to SWITCH_ON_DISABLED by itself"
     assert watch.unexplained(DriveState.FAULT_REACTION_ACTIVE) == ""

@@ -1,17 +1,17 @@
-"""What a drive says that it is."""
+"""Identity of emulated drives."""
 
 from __future__ import annotations
 
 from typing import Any, cast
 
-from needle_device_driver.cia402.drive_identity import are_emulated
+from needle_device_driver.cia402.drive_upkeep import are_emulated
 from needle_device_driver.link.frame_link import FrameLink
-from needle_device_driver.link.sdo_aborts import SdoAbortedError, SdoSilenceError
+from needle_device_driver.link.sdo_client import SdoAbortedError, SdoTimeoutError
 from needle_device_driver.procedure import Procedure, run_at_once
 
 
 class Named:
-    """A bus on which each node has a name, or refuses to say it, or is not there."""
+    """A bus on which each node has a name, refuses to report it, or is missing."""
 
     def __init__(self, *names: bytes | Exception) -> None:
         self._names = names
@@ -20,7 +20,7 @@ class Named:
     def beat(self) -> None:
         self.beats += 1
 
-    def sdo(self, node: int) -> Any:
+    def sdo_client(self, node: int) -> Any:
         self._name = self._names[node - 1]
         return self
 
@@ -32,13 +32,13 @@ class Named:
         return self._name
 
 
-def test_one_drive_that_does_not_say_emulated_is_real() -> None:
+def test_drives_count_as_real_unless_all_report_emulated() -> None:
     for second, emulated in (
         (b"Emulated rotation drive", True),
         (b"EL7041", False),
         (b"", False),
         (SdoAbortedError(0x0602_0000), False),
-        (SdoSilenceError(), False),
+        (SdoTimeoutError(), False),
     ):
         for nodes in ((1, 2), (2, 1)):
             bus = Named(b"Emulated insertion drive", second)

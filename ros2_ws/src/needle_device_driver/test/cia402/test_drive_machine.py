@@ -1,4 +1,4 @@
-"""The way of one drive to its goal, fed with statuswords by hand."""
+"""State machine of one drive, with scripted statuswords."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def machine() -> DriveMachine:
 
 
 def orders(machine: DriveMachine, *answers: Feedback) -> list[DriveCommand]:
-    """Return what is ordered after each answer."""
+    """Return the command after each answer."""
     machine.next_order()
     given = []
     for answer in answers:
@@ -34,7 +34,7 @@ def orders(machine: DriveMachine, *answers: Feedback) -> list[DriveCommand]:
 
 
 def enabled(machine: DriveMachine, position: int = 0) -> None:
-    machine.want(Goal.ON)
+    machine.set_goal(Goal.ON)
     assert machine.switching
     orders(machine, *(said(word, position) for word in (DISABLED, READY, ON, ENABLED)))
     assert machine.ready
@@ -42,13 +42,13 @@ def enabled(machine: DriveMachine, position: int = 0) -> None:
 
 
 @pytest.mark.parametrize("goal", [Goal.OFF, Goal.ON])
-def test_after_a_quick_stop_nothing_is_ordered_before_the_axis_stands(
+def test_no_command_after_a_quick_stop_before_the_axis_rests(
     machine: DriveMachine, goal: Goal
 ) -> None:
     enabled(machine)
     machine.stop()
-    machine.want(goal)
-    # It trembles by two counts at last, for three cycles.
+    machine.set_goal(goal)
+    # Jitter of two counts in the last three cycles.
     ways = [*itertools.accumulate((400, 300, 200, 100, 3, 2, 2))]
     given = orders(machine, *(said(QUICK_STOP, position) for position in ways))
     assert given == [DriveCommand.QUICK_STOP] * 7
@@ -57,71 +57,69 @@ def test_after_a_quick_stop_nothing_is_ordered_before_the_axis_stands(
     assert machine.target == 1009
 
 
-def test_a_stop_on_the_way_off_ends_off(machine: DriveMachine) -> None:
+def test_stop_while_switching_off_ends_off(machine: DriveMachine) -> None:
     enabled(machine)
-    machine.want(Goal.OFF)
+    machine.set_goal(Goal.OFF)
     machine.stop()
     assert orders(machine, *[said(QUICK_STOP)] * 4)[-1] is DriveCommand.DISABLE_VOLTAGE
 
 
-def test_a_stop_holds_until_the_drive_has_said_that_it_took_it(machine: DriveMachine) -> None:
+def test_stop_is_repeated_until_the_drive_confirms_it(machine: DriveMachine) -> None:
     enabled(machine)
     machine.stop()
-    machine.want(Goal.ON)
+    machine.set_goal(Goal.ON)
     assert orders(machine, *[said(ENABLED)] * 5) == [DriveCommand.QUICK_STOP] * 5
     assert not machine.ready
 
 
 @pytest.mark.parametrize("behind", [3, -3])
-def test_a_stopped_axis_that_its_drive_would_pull_on_is_switched_off(
-    machine: DriveMachine, behind: int
-) -> None:
+def test_blocked_axis_is_released_when_stopped(machine: DriveMachine, behind: int) -> None:
     enabled(machine)
     machine.stop()
     places = (400, 500, 500, 500, 500)
     given = orders(machine, *(said(QUICK_STOP, place, behind=behind // 3 * 2) for place in places))
-    assert (given, machine.let_go) == ([DriveCommand.QUICK_STOP] * 5, False)
+    assert (given, machine.released_after_block) == ([DriveCommand.QUICK_STOP] * 5, False)
     assert orders(machine, said(QUICK_STOP, 500, behind=behind)) == [DriveCommand.DISABLE_VOLTAGE]
-    assert machine.let_go
+    assert machine.released_after_block
     assert machine.powered, "it is stopped, it has not lost its power"
     assert orders(machine, said(DISABLED, 500)) == [DriveCommand.DISABLE_VOLTAGE]
-    assert machine.trouble == ""
+    assert machine.problem == ""
     enabled(machine, 500)
-    assert not machine.let_go
+    assert not machine.released_after_block
 
 
 @pytest.mark.parametrize(
     ("ways", "off"),
     [
-        # It runs on; it slows down too late; it creeps at the edge of what counts as rest.
+        # It moves on; it slows down too late; it creeps at the limit of rest.
         ([100] * 20, True),
         ([100] * 9 + [80, 60, 40, 20, 0, 0, 0, 0, 0, 0, 0], True),
         ([2] * 20, False),
-        # It stops on its ramp; it trembles by more than it may at rest.
+        # It stops on its ramp; its jitter exceeds rest.
         ([100, 60, 20] + [0] * 17, False),
         ([8, -8] * 10, False),
     ],
 )
-def test_a_drive_that_runs_on_in_its_quick_stop_is_switched_off(
+def test_drive_that_moves_on_in_its_quick_stop_is_switched_off(
     machine: DriveMachine, ways: list[int], off: bool
 ) -> None:
     for _ in range(2):
         enabled(machine)
         machine.stop()
         given = orders(machine, *(said(QUICK_STOP, at) for at in itertools.accumulate(ways)))
-        # 50 ms of ramp are 3 cycles, 2 more for late answers, and 5 to see where it goes.
+        # 3 cycles for a ramp of 50 ms, 2 for late answers, 5 to observe the motion.
         assert given[:9] == [DriveCommand.QUICK_STOP] * 9
         late = DriveCommand.DISABLE_VOLTAGE if off else DriveCommand.QUICK_STOP
         assert given[9:] == [late] * 11
-        assert ("runs on in its quick stop" in machine.trouble) is off
-        machine.begin_anew(said(DISABLED))
+        assert ("runs on in its quick stop" in machine.problem) is off
+        machine.restart(said(DISABLED))
 
 
 def test_the_mode_changes_only_while_the_drive_is_off(machine: DriveMachine) -> None:
     enabled(machine)
     machine.mode = Mode.HOMING
     position = Mode.CYCLIC_SYNCHRONOUS_POSITION
-    # It has stood since it was enabled.
+    # The axis rests since it was enabled.
     assert machine.next_order() == (DriveCommand.QUICK_STOP, position)
     for answer, order in (
         (said(QUICK_STOP), (DriveCommand.DISABLE_VOLTAGE, position)),
@@ -137,51 +135,53 @@ def test_the_mode_changes_only_while_the_drive_is_off(machine: DriveMachine) -> 
     assert (machine.powered, machine.ready) == (True, False)
 
 
-def test_an_axis_that_never_comes_to_rest_is_switched_off_all_the_same(
+def test_axis_that_never_rests_is_switched_off(
     machine: DriveMachine,
 ) -> None:
     enabled(machine)
-    machine.want(Goal.OFF)
-    # On and on, but never far: it is no drive that runs on.
+    machine.set_goal(Goal.OFF)
+    # Jitter, which is no motion.
     given = orders(machine, *(said(QUICK_STOP, 8 + 8 * (count % 2)) for count in range(51)))
     assert given == [DriveCommand.QUICK_STOP] * 50 + [DriveCommand.DISABLE_VOLTAGE]
 
 
-def test_a_drive_that_ignores_the_stop_is_switched_off_later(machine: DriveMachine) -> None:
+def test_drive_that_ignores_the_stop_is_switched_off(machine: DriveMachine) -> None:
     enabled(machine)
     machine.stop()
     given = orders(machine, *(said(ENABLED, 100 * count) for count in range(35)))
     assert given == [DriveCommand.QUICK_STOP] * 34 + [DriveCommand.DISABLE_VOLTAGE]
-    assert "runs on when stopped" in machine.trouble
+    assert "runs on when stopped" in machine.problem
 
 
-def test_a_fault_is_left_alone_and_a_word_of_no_state_is_trouble(machine: DriveMachine) -> None:
+def test_fault_is_not_acknowledged_and_unknown_statusword_is_a_problem(
+    machine: DriveMachine,
+) -> None:
     enabled(machine)
     assert orders(machine, said(FAULT)) == [DriveCommand.DISABLE_VOLTAGE]
-    assert machine.trouble == ""
+    assert machine.problem == ""
     machine.update(said(0x0025))
-    assert machine.trouble == "says 0x0025, no statusword of CiA 402"
-    machine.begin_anew(said(DISABLED, 7))
-    assert (machine.trouble, machine.target, machine.switching) == ("", 7, False)
+    assert machine.problem == "says 0x0025, no statusword of CiA 402"
+    machine.restart(said(DISABLED, 7))
+    assert (machine.problem, machine.target, machine.switching) == ("", 7, False)
 
 
-def test_a_drive_that_leaves_its_mode_has_as_long_as_one_that_is_switched_on(
+def test_time_limit_of_a_drive_that_leaves_its_mode(
     machine: DriveMachine,
 ) -> None:
     enabled(machine)
     orders(machine, *[said(ENABLED, mode=6)] * 100)
-    assert machine.trouble == ""
+    assert machine.problem == ""
     machine.update(said(ENABLED, mode=6))
-    assert machine.trouble == "is not on after 2 s: OPERATION_ENABLED, mode 6"
+    assert machine.problem == "is not on after 2 s: OPERATION_ENABLED, mode 6"
 
 
 @pytest.mark.parametrize(("statusword", "told"), [(0x0250, False), (0x0050, True)])
-def test_a_drive_that_does_not_listen_to_the_bus_is_told(
+def test_drive_without_remote_bit_is_reported(
     machine: DriveMachine, statusword: int, told: bool
 ) -> None:
-    machine.want(Goal.ON)
+    machine.set_goal(Goal.ON)
     orders(machine, *[said(statusword)] * 100)
-    assert machine.trouble == ""
+    assert machine.problem == ""
     machine.update(said(statusword))
-    assert "is not on after 2 s: SWITCH_ON_DISABLED, mode 8" in machine.trouble
-    assert ("not under the bus's control (bit 9)" in machine.trouble) is told
+    assert "is not on after 2 s: SWITCH_ON_DISABLED, mode 8" in machine.problem
+    assert ("not under the bus's control (bit 9)" in machine.problem) is told

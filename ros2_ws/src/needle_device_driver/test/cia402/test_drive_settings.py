@@ -1,4 +1,4 @@
-"""Which settings a drive can have."""
+"""Valid settings of a drive."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from needle_device_driver.parameters import DeviceDriverParameters
 SETTINGS = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
 
 
-def test_a_node_has_any_number_below_that_of_the_computer() -> None:
+def test_node_id_range() -> None:
     for node_id in (1, 126):
         assert dataclasses.replace(SETTINGS, node_id=node_id).node_id == node_id
     for node_id in (0, 127):
@@ -20,7 +20,7 @@ def test_a_node_has_any_number_below_that_of_the_computer() -> None:
             dataclasses.replace(SETTINGS, node_id=node_id)
 
 
-def test_homing_methods_are_those_of_the_standard_that_end_at_a_switch_an_index_or_here() -> None:
+def test_supported_homing_methods() -> None:
     methods = {*range(1, 15), *range(17, 31), 33, 34, 35, 37}
     for method in range(-1, 40):
         if method in methods:

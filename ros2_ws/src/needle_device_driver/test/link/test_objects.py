@@ -1,4 +1,4 @@
-"""Entries, PDOs, units, error words and parameters."""
+"""Entries, PDOs, units, error codes and parameters."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ import yaml
 from hypothesis import given, settings
 
 from needle_core.errors import OutOfBoundsError, UserError
-from needle_device_driver.cia402.cycle_times import CycleTimes
+from needle_device_driver.cia402.drive_cycle import CycleTimes
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.emergency import describe_error
+from needle_device_driver.link.error_codes import describe_error
 from needle_device_driver.parameters import DeviceDriverParameters
 
 DRIVE = DeviceDriverParameters().drive("insertion")
 
 
-def test_entries_and_pdos_are_packed_little_endian_in_their_order() -> None:
+def test_entries_and_pdos_are_packed_little_endian() -> None:
     assert od.CONTROLWORD.mapping == 0x60400010
     assert od.LOWER_LIMIT.mapping == 0x607D0120
     assert od.COMMAND.pack(0x0F, 8) == b"\x0f\x00\x08"
     assert od.SET_POINT.pack(-2) == b"\xfe\xff\xff\xff"
     assert od.STATUS.unpack(b"\x37\x02\x08\x01\x00\x00\x00") == (0x0237, 8, 1)
     assert od.POSITION.unpack(b"\xff\xff\xff\xff\x02\x00\x00\x00") == (-1, 2)
-    # A long answer is cut, a short one and a PDO of another length refused.
+    # Extra bytes of an entry are ignored; missing bytes, and any other PDO length, are errors.
     assert od.STATUSWORD.unpack(b"\x37\x02\x00\x00") == 0x0237
     with pytest.raises(ValueError, match="2 bytes, wanted 4"):
         od.POSITION_ACTUAL.unpack(b"\x00\x00")
@@ -42,22 +42,22 @@ def test_entries_and_pdos_are_packed_little_endian_in_their_order() -> None:
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(st.floats(-0.2, 0.2), st.booleans())
-def test_a_position_comes_back_to_half_a_count(position: float, reverse: bool) -> None:
+def test_position_round_trip_is_accurate_to_half_a_count(position: float, reverse: bool) -> None:
     drive = dataclasses.replace(DRIVE, reverse=reverse)
     back = drive.position(drive.counts(position))
     assert abs(back - position) <= 0.5 / drive.counts_per_unit * (1 + 1e-9)
 
 
-def test_a_drive_that_counts_in_reverse_has_its_limits_the_other_way_round() -> None:
+def test_reverse_drive_swaps_its_limits() -> None:
     reverse = dataclasses.replace(DRIVE, reverse=True)
     assert DRIVE.limits_counts == (-20_000, 4_020_000)
     assert reverse.limits_counts == (-4_020_000, 20_000)
     assert reverse.magnitude(0.005) == 100_000
-    # No bound becomes the zero that means none.
+    # A bound never becomes 0, which means "no bound".
     assert dataclasses.replace(DRIVE, counts_per_unit=1.0).magnitude(0.005) == 1
 
 
-def test_what_no_drive_and_no_rig_can_have_is_refused() -> None:
+def test_invalid_settings_and_parameters_are_refused() -> None:
     values: list[dict[str, Any]] = [
         {"counts_per_unit": 0.0},
         {"counts_per_unit": math.nan},
@@ -83,7 +83,7 @@ def test_what_no_drive_and_no_rig_can_have_is_refused() -> None:
             DeviceDriverParameters(**changes)
 
 
-def test_the_drives_bounds_follow_the_supervisors_and_the_example_is_a_configuration() -> None:
+def test_drive_bounds_follow_the_limits_and_the_example_is_valid() -> None:
     parameters = DeviceDriverParameters(max_depth=0.1, max_speed=0.002, max_turns=1.0)
     insertion, rotation = parameters.drive("insertion"), parameters.drive("rotation")
     assert (insertion.lower, insertion.upper) == pytest.approx((-0.001, 0.101))
@@ -92,13 +92,13 @@ def test_the_drives_bounds_follow_the_supervisors_and_the_example_is_a_configura
     file = Path(__file__).resolve().parents[2] / "config" / "drives.yaml"
     values = yaml.safe_load(file.read_text("utf-8"))["device_driver"]["ros__parameters"]
     example = DeviceDriverParameters(**values).drive("rotation")
-    link = DeviceDriverParameters(link="socketcand", channel="can0").link_settings
-    assert str(link) == "socketcand localhost:29536 can0"
+    link = DeviceDriverParameters(link="socketcand", channel="can0")
+    assert link.link_name == "socketcand localhost:29536 can0"
     assert link.write_timeout == 0.05
     assert (example.max_torque, example.counts(2 * math.pi)) == (0.5, 65536)
 
 
-def test_error_codes_have_words() -> None:
+def test_error_codes_have_texts() -> None:
     assert describe_error(0x8611) == "0x8611 following error"
     assert describe_error(0x4299) == "0x4299 temperature"
     assert describe_error(0x0001) == "0x0001 unknown error"

@@ -1,1 +1,1 @@
-"""The supervisor on ideal axes, and on drives behind a CAN bus."""
+"""Supervisor on ideal axes, and on drives behind a CAN bus."""

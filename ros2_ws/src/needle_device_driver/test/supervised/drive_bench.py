@@ -9,7 +9,6 @@ from typing import Any
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
 from needle_device_driver.link.frame_link import FrameLink
-from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
@@ -17,17 +16,17 @@ from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from .scripted_drives import ScriptedBus, ScriptedDrive
 from .supervisor_bench import PERIOD, SupervisorBench
 
-# Of the rotation drive: counts in a radian.
+# Counts per radian of the rotation drive.
 RAD = 65536 / 6.283185307179586
 _FRAME_TIME = 0.0005
 
 
 class BenchLink(FrameLink):
-    """A link in the bench's time, whose frames are answered while they are sent."""
+    """A link with virtual time; answers arrive while a frame is sent."""
 
-    def __init__(self, settings: LinkSettings, bench: DriveBench) -> None:
+    def __init__(self, name: str, bench: DriveBench) -> None:
         self._bench = bench
-        super().__init__(settings)
+        super().__init__(name)
 
     @property
     def now(self) -> float:
@@ -35,53 +34,53 @@ class BenchLink(FrameLink):
 
     @now.setter
     def now(self, value: float) -> None:
-        """Be what a component sets."""
+        """Ignore the time that a component sets."""
 
     def open(self) -> None:
         if not self.is_open:
-            self.change("no such file" if self._bench.no_adapter else "")
+            self.set_port_error("no such file" if self._bench.no_adapter else "")
             super().open()
             self._bench.broken = ""
 
     def send(self, cob_id: int, data: bytes = b"") -> None:
         super().send(cob_id, data)
-        self.take_sent()
+        self.pop_outgoing()
         if self._bench.broken:
-            self.change(self._bench.broken)
+            self.set_port_error(self._bench.broken)
             return
         self._bench.now += _FRAME_TIME + self._bench.sdo_time * (cob_id in (0x601, 0x602))
         self._bench.bus.send(cob_id, data)
 
 
 class DriveBench(SupervisorBench):
-    """Driver and supervisor on two scripted drives, cycle by cycle, in a time of their own."""
+    """Driver and supervisor on two scripted drives, with virtual time."""
 
     def __init__(self, **parameters: Any) -> None:
         super().__init__()
         self.insertion, self.rotation = ScriptedDrive(1), ScriptedDrive(2)
         self.no_adapter = False
-        # Why the adapter does not send; empty: it sends. How long an SDO transfer takes [s].
+        # Why the adapter does not send; empty: it sends. Duration of an SDO transfer [s].
         self.broken = ""
         self.sdo_time = 0.0
         self.settings = DeviceDriverParameters(link="virtual", channel="test", **parameters)
-        self.link = BenchLink(self.settings.link_settings, self)
+        self.link = BenchLink(self.settings.link_name, self)
         self.bus = ScriptedBus([self.insertion, self.rotation], lambda f: self.link.receive([f]))
         watchdog = self.settings.watchdog
         self.axes = [
             Cia402Axis(name, self.settings.drive(name), self.link, period=PERIOD, watchdog=watchdog)
             for name in ("insertion", "rotation")
         ]
-        self.drives = DriveCycle(self.link, self.axes)
+        self.drives = DriveCycle(self.link, self.axes, PERIOD)
         self.supervisor = MotionSupervisor(
             self.axes[0],
             self.axes[1],
-            self.settings.limits,
+            self.settings,
             feedback_delay=1,
-            switching=lambda: self.drives.needs_cycles,
+            is_switching=lambda: self.drives.needs_cycles,
         )
 
     def run(self, procedure: Procedure[T]) -> T:
-        """Run a procedure to its end: what is not there, nobody brings, and the time passes."""
+        """Run a procedure to its end; unfulfilled waits take their full time."""
 
         def wait(is_there: Callable[[], bool], seconds: float) -> None:
             self.now += 0.0 if is_there() else seconds
@@ -91,7 +90,7 @@ class DriveBench(SupervisorBench):
     def exchange(self) -> None:
         self.drives.collect()
         self.supervisor.drive(PERIOD, self.now)
-        # What is answered at once is here when the frame is sent.
+        # Immediate answers arrive while the frame is sent.
         self.run(self.drives.exchange(0.0))
         self.supervisor.observe(self.now)
 
@@ -100,13 +99,13 @@ class DriveBench(SupervisorBench):
         return self.insertion.position, self.rotation.position
 
     def joint(self, number: int = 0) -> float:
-        """Return where the driver last told a joint to be."""
+        """Return the last set-point of a joint."""
         return self.axes[number].poll(self.now).set_point
 
     # ---- ways into the middle of things ---------------------------------------------------------
 
     def refusal(self) -> str:
-        """Check that the set-up is refused and switches nothing on; return why."""
+        """Check that the set-up is refused without switching on; return the reason."""
         reply = self.configure()
         assert not reply.success
         assert not [data for cob, data in self.bus.sent if cob in (0x201, 0x202) and data[0] == 15]
@@ -138,7 +137,7 @@ class DriveBench(SupervisorBench):
         self.go()
 
     def ready(self) -> DriveBench:
-        """Be homed, enabled and held."""
+        """Home, enable and press the hold."""
         self.homed()
         self.enabled()
         return self
@@ -150,7 +149,7 @@ class DriveBench(SupervisorBench):
         self.submit((at[0] + length, at[1] + rotation, duration))
 
     def moving(self) -> DriveBench:
-        """Be in the middle of a step of 2 mm and 0.2 rad in 1 s."""
+        """Begin a step of 2 mm and 0.2 rad in 1 s."""
         self.ready()
         self.step(0.002, 0.2, 1.0)
         self.go(10)
@@ -159,13 +158,13 @@ class DriveBench(SupervisorBench):
         return self
 
     def after(self, event: Callable[[], None]) -> None:
-        """Let something happen to a drive, and the driver hear of it in the next cycle."""
+        """Change a drive, and run the next cycle."""
         event()
         self.bus.flush()
         self.go()
 
     def obeys_late(self, drive: ScriptedDrive, seconds: float) -> None:
-        """Let a drive be off so long after the last order, whatever it is [s]."""
+        """Delay every command of a drive; then it is off [s]."""
         due = math.inf
 
         def command(word: int) -> None:
@@ -181,7 +180,7 @@ class DriveBench(SupervisorBench):
     # ---- checks -------------------------------------------------------------------------------
 
     def failed(self, rule: str, text: str) -> None:
-        """Check that the device is in FAULT by a rule, and that nothing moves any more."""
+        """Check that the device is in FAULT by a rule, and nothing moves."""
         assert self.state == "FAULT"
         assert self.rule == rule
         assert text in self.status.fault
@@ -191,7 +190,7 @@ class DriveBench(SupervisorBench):
         assert self.state == "FAULT"
 
     def stopped(self, rule: str, text: str) -> None:
-        """Check that the step under way failed by a rule, and that only a new one moves again."""
+        """Check that the step failed by a rule, and only a new one moves."""
         assert self.outcomes[-1].startswith("aborted: ")
         self.failed(rule, text)
         at = self.positions
@@ -206,7 +205,7 @@ class DriveBench(SupervisorBench):
         self.steps()
 
     def steps(self) -> None:
-        """Take a step, from wherever the set-up is; it ends where it should."""
+        """Move one step, from any state, and check its end."""
         if self.state == "UNCONFIGURED":
             self.ready()
         at = self.positions

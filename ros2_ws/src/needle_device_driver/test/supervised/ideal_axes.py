@@ -13,7 +13,7 @@ from .supervisor_bench import PERIOD, SupervisorBench
 
 
 class IdealAxis(Axis):
-    """Goes where it is told; fails, lags or falls silent when told to."""
+    """Follows its set-points; fails, lags or is silent on demand."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -120,13 +120,13 @@ class Bench(SupervisorBench):
         return self.insertion.position, self.rotation.position
 
     def homed(self) -> Bench:
-        """Be configured, and homed or on the way."""
+        """Configure, and begin to home."""
         assert self.configure().success
         assert self.home().success
         return self
 
     def ready(self) -> Bench:
-        """Be enabled and held."""
+        """Enable, and press the hold."""
         self.homed()
         assert self.enable().success
         self.hold()
@@ -141,13 +141,13 @@ class Bench(SupervisorBench):
         stamp_ns: int | None = None,
         publishers: int = 1,
     ) -> int:
-        """Command a step from where the axes are; return its stamp."""
+        """Submit a step from the present positions; return its stamp."""
         at = self.positions
         point = at[0] + length, at[1] + rotation, duration
         return self.submit(point, stamp_ns=stamp_ns, publishers=publishers)
 
     def moving(self) -> Bench:
-        """Be in the middle of a step of 2 mm and 0.1 rad in 2 s."""
+        """Begin a step of 2 mm and 0.1 rad in 2 s."""
         self.ready()
         self.step(0.002, 0.1, 2.0)
         self.go(5)
@@ -155,7 +155,7 @@ class Bench(SupervisorBench):
         return self
 
     def refused(self, rule: str) -> str:
-        """Check that the last command was refused whole by a rule; return the reason."""
+        """Check that the last command was refused by a rule; return the reason."""
         self.go(3)
         assert self.rule == rule
         assert self.state != "MOVING"

@@ -1,4 +1,4 @@
-"""CiA 402 drives as a script, behind a CAN bus."""
+"""Scripted CiA 402 drives behind a CAN bus."""
 
 from __future__ import annotations
 
@@ -35,30 +35,30 @@ class ScriptedDrive:
             (0x60AA, 0): bytes.fromhex("0057b500"),
         }
         for number in range(4):
-            # As they come: two are on, the first told at each change; remote frames are not had.
+            # Defaults: two PDOs are on, the first sent on change; no remote frames.
             off = 0x80000000 * (number > 1)
             for index, cob_id in ((0x1400, 0x200), (0x1800, 0x40000180)):
                 value = off + cob_id + 0x100 * number + node
                 self.objects[index + number, 1] = value.to_bytes(4, "little")
         self.missing_objects: set[int] = set()
-        # Of a write: the abort code, or 0; what the drive makes of it.
+        # Abort code of a write, or 0; stored value of a write.
         self.refuses: Callable[[int, int, bytes], int] = lambda index, sub, value: 0
         self.stores: Callable[[int, bytes], bytes] = lambda index, value: value
         self.ignores_sdo_orders = False
-        # Answers to a SYNC with what it sampled at the one before.
-        self.tells_late = False
-        self.told: list[tuple[int, bytes]] = []
-        # So many of the computer's heartbeats pass before an answer; so many answers are lost.
+        # Whether it answers a SYNC with samples of the previous one.
+        self.answers_previous_sample = False
+        self.previous: list[tuple[int, bytes]] = []
+        # Number of computer heartbeats before an answer; number of lost answers.
         self.answers_late = 0
         self.loses = 0
         self.held_back: list[tuple[int, list[tuple[int, bytes]]]] = []
         self.state = "disabled"
         self.mode = 0
-        # What it takes by SDO.
+        # Modes that it accepts by SDO.
         self.modes = {6, 8}
         # Orders that it ignores; whether it answers to SYNC, and has heartbeats; counts that it
         # goes at each SYNC by itself, in a state and while it homes.
-        self.deaf_to: set[str] = set()
+        self.ignored_orders: set[str] = set()
         self.syncs = self.beats = True
         self.drift: dict[str, int] = {}
         self.search: Iterator[int] = iter(())
@@ -70,7 +70,7 @@ class ScriptedDrive:
         self.more_status = 0
         self.nmt = 0x7F
         self.silent = False
-        self.deaf_to_reset = False
+        self.ignores_reset = False
         self.blocked = False
         self.left_over = 0
         self.keeps_quick_stop = False
@@ -80,26 +80,26 @@ class ScriptedDrive:
         self.stale_homing = False
         self.out: list[tuple[int, bytes]] = []
 
-    def tells(self, values: dict[tuple[int, int], int], size: int = 4) -> None:
-        """Have these values in its objects."""
+    def set_objects(self, values: dict[tuple[int, int], int], size: int = 4) -> None:
+        """Set values of objects."""
         self.objects |= {at: value.to_bytes(size, "little") for at, value in values.items()}
 
-    def holds(self, index: int, sub: int = 0) -> int:
-        """Return what an object holds."""
+    def value(self, index: int, sub: int = 0) -> int:
+        """Return the value of an object."""
         return int.from_bytes(self.objects[index, sub], "little", signed=index == 0x607D)
 
-    def say(self, function: int, data: bytes) -> None:
+    def emit(self, function: int, data: bytes) -> None:
         if not self.silent and (self.beats or function != 0x700):
             self.out.append((function + self.node, data))
 
     def reboot(self) -> None:
         self.nmt, self.state, self.position, self.mode = 0x7F, "disabled", 0, 0
-        self.say(0x700, b"\x00")
+        self.emit(0x700, b"\x00")
 
     def fail(self, code: int) -> None:
         self.state = "fault"
         self.objects[0x603F, 0] = code.to_bytes(2, "little")
-        self.say(0x80, code.to_bytes(2, "little") + bytes(6))
+        self.emit(0x80, code.to_bytes(2, "little") + bytes(6))
 
     @property
     def statusword(self) -> int:
@@ -112,7 +112,7 @@ class ScriptedDrive:
         elif cob_id == 0 and data[1] == self.node:
             self.nmt = {0x01: 0x05, 0x80: 0x7F}[data[0]]
         elif cob_id == 0x77F:
-            self.say(0x700, bytes([self.nmt]))
+            self.emit(0x700, bytes([self.nmt]))
             self.held_back = [(count - 1, frames) for count, frames in self.held_back]
             self.answer()
         elif self.nmt != 0x05:
@@ -132,16 +132,18 @@ class ScriptedDrive:
         status += self.inputs.to_bytes(4, "little")
         place = self.position.to_bytes(4, "little", signed=True)
         place += (self.demand - self.position).to_bytes(4, "little", signed=True)
-        # As long as they are mapped.
+        # Lengths as mapped.
         status = status if self.objects[0x1A00, 0] == b"\x03" else status[:3]
         place = place if self.objects[0x1A01, 0] == b"\x02" else place[:4]
         now = [(0x180, status), (0x280, place)]
         if self.loses:
             self.loses -= 1
         else:
-            self.held_back.append((self.answers_late, self.told if self.tells_late else now))
+            self.held_back.append(
+                (self.answers_late, self.previous if self.answers_previous_sample else now)
+            )
         self.answer()
-        self.told = now
+        self.previous = now
         self.target = self.next_target
         if self.homing_for >= 0:
             self.homing_for += 1
@@ -158,18 +160,18 @@ class ScriptedDrive:
             self.demand = self.position
 
     def searches(self, *ways: int, forever: int = 0) -> None:
-        """Go so many counts a cycle while it homes, and never find a home."""
+        """Move by these counts per cycle while it homes, and find no home."""
         self.home_after = 10**9
         self.search = itertools.chain(ways, itertools.repeat(forever))
 
     def answer(self) -> None:
-        """Say what is not held back any more."""
+        """Send the answers that are due."""
         while self.held_back and self.held_back[0][0] <= 0:
             for function, data in self.held_back.pop(0)[1]:
-                self.say(function, data)
+                self.emit(function, data)
 
     def follow(self) -> None:
-        """With power, also in a quick stop, the motor goes to the demand."""
+        """Move to the demand, with power, also in a quick stop."""
         if self.state == "enabled" and self.mode == 8:
             self.demand = self.target - self.left_over
         elif self.state != "quick stop":
@@ -179,10 +181,10 @@ class ScriptedDrive:
 
     def command(self, word: int) -> None:
         order = "quick stop" if word & 0x06 == 0x02 else "" if word & 0x02 else "off"
-        if {order, "all"} & self.deaf_to:
+        if {order, "all"} & self.ignored_orders:
             return
         if self.state == "fault":
-            if word & 0x80 and not self.last_word & 0x80 and not self.deaf_to_reset:
+            if word & 0x80 and not self.last_word & 0x80 and not self.ignores_reset:
                 self.state = "disabled"
         elif not word & 0x02:
             self.state = "disabled"
@@ -217,7 +219,7 @@ class ScriptedDrive:
         if index in self.missing_objects:
             code = 0x0602_0000
         if code:
-            self.say(0x580, b"\x80" + head + code.to_bytes(4, "little"))
+            self.emit(0x580, b"\x80" + head + code.to_bytes(4, "little"))
         elif not written:
             live = {
                 (0x6041, 0): self.statusword.to_bytes(2, "little"),
@@ -228,21 +230,21 @@ class ScriptedDrive:
             }
             value = live.get((index, sub)) or self.objects.get((index, sub))
             if value is None:
-                self.say(0x580, b"\x80" + head + bytes.fromhex("00000206"))
+                self.emit(0x580, b"\x80" + head + bytes.fromhex("00000206"))
                 return
             first = 0x43 | (4 - len(value)) << 2
-            self.say(0x580, bytes([first]) + head + value.ljust(4, b"\x00"))
+            self.emit(0x580, bytes([first]) + head + value.ljust(4, b"\x00"))
         else:
             self.objects[index, sub] = self.stores(index, data[4 : 4 + size])
             if index == 0x6040 and not (self.ignores_sdo_orders and self.nmt == 0x05):
                 self.command(int.from_bytes(data[4:6], "little"))
             if index == 0x6060 and data[4] in self.modes:
                 self.mode = data[4]
-            self.say(0x580, b"\x60" + head + bytes(4))
+            self.emit(0x580, b"\x60" + head + bytes(4))
 
 
 class ScriptedBus:
-    """A bus with two scripted drives on it, who answer at once; remembers what was sent."""
+    """A bus with scripted drives that answer at once; records the frames."""
 
     def __init__(
         self,
@@ -254,7 +256,7 @@ class ScriptedBus:
         self.sending = sending
         self.drives = drives
         self.sent: list[tuple[int, bytes]] = []
-        # What the drives say waits for the next `flush`.
+        # Whether answers wait for the next `flush`.
         self.late = False
         self.cut = False
 

@@ -1,4 +1,4 @@
-"""A supervisor in a time of its own, whatever its axes are."""
+"""A supervisor with virtual time."""
 
 from __future__ import annotations
 
@@ -6,25 +6,24 @@ import abc
 import itertools
 import math
 
-from needle_core.messages import HoldState
+from needle_core.messages import CommandResult, HoldState, Trajectory, TrajectoryPoint
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.procedure import Procedure, T
-from needle_device_driver.supervisor.command import Command, CommandPoint
-from needle_device_driver.supervisor.reports import Event, Notice, Reply, StepResult
+from needle_device_driver.supervisor.reports import Event, Notice, ServiceResult
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
 PERIOD = 0.02
 NAMES = ("insertion_joint", "rotation_joint")
 
 
-def command(stamp_ns: int, *points: tuple[float, float, float]) -> Command:
+def command(stamp_ns: int, *points: tuple[float, float, float]) -> Trajectory:
     """Return a command through points: insertion [m], rotation [rad], time from start [s]."""
-    way = tuple(CommandPoint((insertion, turn), (), time) for insertion, turn, time in points)
-    return Command(stamp_ns, NAMES, way)
+    way = tuple(TrajectoryPoint((insertion, turn), time) for insertion, turn, time in points)
+    return Trajectory(stamp_ns, NAMES, way)
 
 
 class SupervisorBench(abc.ABC):
-    """Drives a supervisor cycle by cycle and remembers what it tells."""
+    """Runs the cycles of a supervisor and records its events."""
 
     supervisor: MotionSupervisor
 
@@ -72,7 +71,7 @@ class SupervisorBench(abc.ABC):
     @property
     def results(self) -> list[tuple[int, str]]:
         self.events += self.supervisor.take_events()
-        return [(e.stamp_ns, e.outcome) for e in self.events if isinstance(e, StepResult)]
+        return [(e.stamp_ns, e.outcome) for e in self.events if isinstance(e, CommandResult)]
 
     @property
     def outcomes(self) -> list[str]:
@@ -90,30 +89,30 @@ class SupervisorBench(abc.ABC):
         count: int | None = None,
         lifetime: float = math.inf,
     ) -> str:
-        """Send a hold message; return whose press counts then."""
+        """Send a hold message; return the owner."""
         number = next(self.stamps) if count is None else count
         message = HoldState(sender, session, number, pressed, scale, lifetime)
         self.supervisor.receive_hold(message, self.now)
         return self.status.hold_owner
 
     def press(self) -> None:
-        """Release and press anew."""
+        """Release and press again."""
         self.hold(False)
         self.hold()
 
-    def enable(self, on: bool = True) -> Reply:
+    def enable(self, on: bool = True) -> ServiceResult:
         return self.supervisor.enable(on, self.now)
 
-    def retract(self) -> Reply:
+    def retract(self) -> ServiceResult:
         return self.supervisor.retract(self.now)
 
-    def reset(self) -> Reply:
+    def reset(self) -> ServiceResult:
         return self.run(self.supervisor.reset(self.now))
 
-    def configure(self) -> Reply:
+    def configure(self) -> ServiceResult:
         return self.run(self.supervisor.configure(self.now))
 
-    def home(self) -> Reply:
+    def home(self) -> ServiceResult:
         self.supervisor.confirm_needle_out(True)
         return self.run(self.supervisor.home(self.now))
 
@@ -138,7 +137,7 @@ class SupervisorBench(abc.ABC):
             self.exchange()
 
     def wait(self, cycles: int = 1) -> None:
-        """Run cycles without a word from who holds."""
+        """Run cycles without hold messages."""
         for _ in range(cycles):
             self._tick()
             self.exchange()

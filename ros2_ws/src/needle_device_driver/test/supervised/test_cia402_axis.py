@@ -1,4 +1,4 @@
-"""A pair of drives on a scripted bus: what the axes make of it, homing, and a hand that pushes."""
+"""Axes on scripted drives: set-points, homing, an axis without motor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .drive_bench import RAD, DriveBench
 
 
 @pytest.mark.parametrize("reverse", [False, True])
-def test_steps_end_where_their_sum_is_to_the_count(reverse: bool) -> None:
+def test_steps_add_up_without_rounding_errors(reverse: bool) -> None:
     bench = DriveBench(insertion_reverse=reverse).ready()
     insertion = rotation = 0.0
     for k in range(15):
@@ -28,7 +28,7 @@ def test_steps_end_where_their_sum_is_to_the_count(reverse: bool) -> None:
     assert bench.state == "HOLDING"
 
 
-def test_measured_velocity_is_that_of_the_last_cycle() -> None:
+def test_velocity_is_measured_over_the_last_cycle() -> None:
     bench = DriveBench().moving()
     joints = bench.supervisor.joints(bench.now)
     assert joints is not None
@@ -36,7 +36,7 @@ def test_measured_velocity_is_that_of_the_last_cycle() -> None:
     assert joints.rotation.velocity == pytest.approx(0.2, rel=2e-2)
 
 
-def test_a_drive_without_transition_16_is_switched_off_and_on_again() -> None:
+def test_drive_without_transition_16_is_switched_off_and_on() -> None:
     bench = DriveBench().moving()
     bench.insertion.keeps_quick_stop = True
     bench.hold(False)
@@ -56,7 +56,7 @@ def test_enable_and_home_wait_until_the_axes_are_off() -> None:
     assert bench.enable().success
 
 
-def test_the_outer_end_is_the_negative_limit_switch_or_the_home_switch() -> None:
+def test_outer_end_is_negative_limit_or_home_switch() -> None:
     for reverse, outer, inner in ((False, (1, 4, 5), (2,)), (True, (2, 4, 6), (1,))):
         bench = DriveBench(insertion_reverse=reverse).configured()
         for inputs in range(8):
@@ -67,7 +67,7 @@ def test_the_outer_end_is_the_negative_limit_switch_or_the_home_switch() -> None
             assert at.at_inner_switch is any(inputs & bits for bits in inner)
 
 
-def test_a_drive_that_said_nothing_yet_is_nowhere_and_on_its_way_nowhere() -> None:
+def test_drive_without_feedback_has_no_joints_and_needs_no_cycles() -> None:
     bench = DriveBench()
     assert bench.axes[0].monitor.feedback == Feedback(0, 0, 0, 0, 0, 0)
     assert bench.axes[0].monitor.fresh_time == -math.inf
@@ -77,7 +77,7 @@ def test_a_drive_that_said_nothing_yet_is_nowhere_and_on_its_way_nowhere() -> No
 
 
 def again(bench: DriveBench, position: int, home_after: int) -> DriveBench:
-    """Begin to home a drive that says all along that it attained the homing before."""
+    """Begin to home a drive that reports the previous homing as attained."""
     bench.homed()
     drive = bench.insertion
     drive.position, drive.home_after, drive.stale_homing = position, home_after, True
@@ -86,7 +86,7 @@ def again(bench: DriveBench, position: int, home_after: int) -> DriveBench:
     return bench
 
 
-def test_a_homing_ends_by_its_second_bit_where_the_first_stays_for_good() -> None:
+def test_homing_ends_by_target_reached_if_attained_is_always_set() -> None:
     bench = again(DriveBench(), 3000, 20)
     bench.wait(4)
     for _ in range(15):
@@ -99,10 +99,8 @@ def test_a_homing_ends_by_its_second_bit_where_the_first_stays_for_good() -> Non
 
 
 @pytest.mark.parametrize(("parameters", "cycles"), [({}, 25), ({"insertion_homing_method": 37}, 5)])
-def test_a_homing_that_nobody_saw_under_way_ends_where_it_stands(
-    parameters: dict[str, int], cycles: int
-) -> None:
-    """On the edge of its switch a drive is through between two answers."""
+def test_homing_within_one_cycle_ends(parameters: dict[str, int], cycles: int) -> None:
+    """At the edge of its switch a drive homes within one cycle."""
     bench = again(DriveBench(**parameters), 0, 0)
     stood = 0
     while not bench.is_homed():
@@ -111,7 +109,7 @@ def test_a_homing_that_nobody_saw_under_way_ends_where_it_stands(
     assert stood == cycles
 
 
-def test_a_homing_can_be_stopped_and_leaves_the_axis_un_homed() -> None:
+def test_stopped_homing_leaves_the_axis_without_home() -> None:
     bench = DriveBench()
     bench.insertion.home_after = 1000
     bench.homing()
@@ -133,7 +131,7 @@ def pushed(home: int = 777) -> DriveBench:
 
 
 @pytest.mark.parametrize("home", [777, -777])
-def test_a_pushed_axis_is_told_nothing_that_moves_and_depends_on_no_computer(home: int) -> None:
+def test_axis_without_motor_gets_no_motion_commands_and_no_watchdog(home: int) -> None:
     bench = pushed(home)
     assert bench.status.insertion_m == pytest.approx(0.0)
     bench.step(0.001, 0.2)
@@ -147,7 +145,7 @@ def test_a_pushed_axis_is_told_nothing_that_moves_and_depends_on_no_computer(hom
     assert bench.outcomes == ["aborted: hold released"]
     assert not [cob for cob, _ in bench.bus.sent if cob in (0x201, 0x301)]
     assert (0x605A, 0) not in bench.insertion.objects
-    assert bench.insertion.holds(0x1016, 1) == 0
+    assert bench.insertion.value(0x1016, 1) == 0
     # A fault of its drive is acknowledged by SDO.
     bench.after(lambda: bench.insertion.fail(0x7305))
     assert bench.state == "FAULT"

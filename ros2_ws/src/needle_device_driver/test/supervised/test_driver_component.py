@@ -1,4 +1,4 @@
-"""device_driver as a component, on scripted drives: what it hears, says, and when it ends."""
+"""device_driver as a component, on scripted drives."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PERIOD = 0.02
 
 
 class DriverBench:
-    """The component, called by hand, in a time of its own."""
+    """The component with virtual time."""
 
     def __init__(self, **parameters: Any) -> None:
         settings = DeviceDriverParameters(link="virtual", channel="test", **parameters)
@@ -41,7 +41,7 @@ class DriverBench:
         self.now = 10.0
         self.numbers = itertools.count(1)
         self.status = self.driver.supervisor.status(self.now)
-        self.said: list[Any] = []
+        self.actions: list[Any] = []
         self.rows = {row.topic: row.handler for row in self.driver.inputs}
         self.services = {row.name: row.handler for row in self.driver.services}
 
@@ -49,8 +49,8 @@ class DriverBench:
     def at(self) -> Moment:
         return Moment(self.now, 1_000_000_000 + round(self.now * 1e9))
 
-    def do(self, actions: Actions) -> None:
-        """Take what a handler brings about; what drives answer comes half a millisecond later."""
+    def perform(self, actions: Actions) -> None:
+        """Perform the actions of a handler; the drives answer after 0.5 ms."""
         for action in actions:
             match action:
                 case Send(_, batch):
@@ -59,14 +59,14 @@ class DriverBench:
                 case Publish("device/status", message):
                     self.status = message
                 case _:
-                    self.said.append(action)
+                    self.actions.append(action)
         if self.frames and self.exits == []:
             answers, self.frames[:] = tuple(self.frames), []
             self.now += 0.0005
-            self.do(self.driver.ports[0].handler(answers, self.at))
+            self.perform(self.driver.ports[0].handler(answers, self.at))
 
     def of(self, kind: type[Any]) -> list[Any]:
-        return [action for action in self.said if isinstance(action, kind)]
+        return [action for action in self.actions if isinstance(action, kind)]
 
     @property
     def exits(self) -> list[tuple[int, str]]:
@@ -84,26 +84,28 @@ class DriverBench:
             self.now = round(self.now / PERIOD + 1) * PERIOD
             if holding:
                 self.hold()
-            self.do(self.driver.timers[0].handler(self.at))
+            self.perform(self.driver.timers[0].handler(self.at))
 
-    def hear(self, topic: str, message: Any) -> None:
-        self.do(self.rows[topic](message, self.at))
+    def receive(self, topic: str, message: Any) -> None:
+        self.perform(self.rows[topic](message, self.at))
 
     def hold(self, pressed: bool = True) -> None:
-        self.hear("device/hold", m.HoldState("person", "", next(self.numbers), pressed, 1.0, 0.1))
+        self.receive(
+            "device/hold", m.HoldState("person", "", next(self.numbers), pressed, 1.0, 0.1)
+        )
 
     def call(self, name: str, argument: bool | None = None) -> Reply:
         number = next(self.numbers)
-        self.do(self.services[f"device/{name}"](argument, number, self.at))
+        self.perform(self.services[f"device/{name}"](argument, number, self.at))
         return self.answer(number)
 
     def answer(self, number: int) -> Reply:
-        (reply,) = [a for a in self.said if isinstance(a, Reply) and a.request == number]
+        (reply,) = [a for a in self.actions if isinstance(a, Reply) and a.request == number]
         return reply
 
     def set_up(self) -> DriverBench:
         self.run(10)
-        assert self.status.state == "DISABLED", self.said
+        assert self.status.state == "DISABLED", self.actions
         return self
 
     def ready(self) -> DriverBench:
@@ -120,7 +122,7 @@ class DriverBench:
     def step(self, length: float = 0.002) -> None:
         point = m.TrajectoryPoint((self.drives[0].position / 2e7 + length, 0.1), 1.0)
         names = m.INSERTION_JOINT, m.ROTATION_JOINT
-        self.hear("device/joint_trajectory", m.Trajectory(self.at.stamp_ns, names, (point,)))
+        self.receive("device/joint_trajectory", m.Trajectory(self.at.stamp_ns, names, (point,)))
 
     def moving(self) -> DriverBench:
         self.ready()
@@ -129,20 +131,21 @@ class DriverBench:
         assert self.status.state == "MOVING"
         return self
 
-    def hears_of(self, *, commands: int = 1, others: tuple[str, ...] = ()) -> None:
+    def set_peers(self, *, commands: int = 1, others: tuple[str, ...] = ()) -> None:
         names = ("/device_driver", *others)
         topics = {"device/joint_trajectory": ("/c",) * commands, "device/status": names}
-        self.do(self.driver.on_peers(Peers(topics), self.at))
+        self.perform(self.driver.on_peers(Peers(topics), self.at))
 
 
-def test_it_sets_the_drives_up_homes_and_moves_them() -> None:
+def test_driver_sets_up_homes_and_moves_the_drives() -> None:
     bench = DriverBench()
     bench.run(2)
     assert bench.bus.sent == [], "another device shows itself before"
     assert bench.call("home").text == "waiting for the drives"
+    assert {row.max_bytes for row in bench.driver.inputs} == {4096}
     bench.ready()
     assert bench.status.simulated is False
-    bench.said.clear()
+    bench.actions.clear()
     bench.step()
     bench.run(60, holding=True)
     assert bench.outcomes == ["succeeded"]
@@ -150,62 +153,62 @@ def test_it_sets_the_drives_up_homes_and_moves_them() -> None:
     joints = [a.message for a in bench.of(Publish) if isinstance(a.message, m.JointState)]
     assert len(joints) == 60
     assert joints[-1].positions == pytest.approx((0.002, 0.1), abs=1e-4)
-    # The drives sampled them at the SYNC, with which the cycle began.
+    # The drives sampled the joints at the SYNC, at the begin of the cycle.
     assert joints[-1].stamp_ns == 1_000_000_000 + round(round(bench.now / PERIOD) * PERIOD * 1e9)
-    bench.do(bench.driver.timers[1].handler(bench.at))
+    bench.perform(bench.driver.timers[1].handler(bench.at))
     health = bench.of(Diagnose)[-1].diagnostic
     assert (health.message, health.values["unanswered_syncs"]) == ("connected", "0")
 
 
-def test_an_emergency_stop_and_a_release_are_heard_between_cycles() -> None:
+def test_estop_and_release_act_between_cycles() -> None:
     bench = DriverBench().moving()
     bench.hold(False)
     assert bench.outcomes == ["aborted: hold released"]
     bench.hold()
     bench.step()
     bench.run(5, holding=True)
-    bench.hear("device/estop", m.EmergencyStop(True))
+    bench.receive("device/estop", m.EmergencyStop(True))
     assert [drive.state for drive in bench.drives] == ["quick stop"] * 2
     assert (bench.status.state, bench.status.text) == ("ESTOPPED", "emergency stop")
     assert bench.of(Log)[-1] == Log("error", "emergency stop [estop_latches]")
-    bench.hear("device/estop", m.EmergencyStop(False))
+    bench.receive("device/estop", m.EmergencyStop(False))
     bench.hold(False)
     bench.run(12)
     assert bench.call("reset").success
     assert bench.status.state == "DISABLED"
 
 
-def test_its_end_in_the_middle_of_a_step_leaves_the_drives_off_without_watchdog() -> None:
+def test_exit_during_a_step_switches_the_drives_off() -> None:
     bench = DriverBench().moving()
-    bench.do(bench.driver.on_stop(bench.at))
+    bench.perform(bench.driver.on_stop(bench.at))
     bench.run(10)
     assert bench.exits == [(0, "")]
     assert [drive.state for drive in bench.drives] == ["disabled"] * 2
-    assert [drive.holds(0x1016, 1) for drive in bench.drives] == [0, 0]
+    assert [drive.value(0x1016, 1) for drive in bench.drives] == [0, 0]
     assert bench.call("enable", True).text == "waiting for the drives"
 
 
-def test_one_device_and_command_one_publisher_count_who_is_there() -> None:
+def test_one_device_and_command_one_publisher_count_peers() -> None:
     bench = DriverBench().ready()
-    bench.hears_of(commands=2)
+    bench.set_peers(commands=2)
     bench.step()
     assert bench.outcomes == ["aborted: 2 nodes publish commands, wanted 1"]
-    bench.hears_of()
+    bench.set_peers()
     bench.run(1, holding=True)
     bench.step()
-    bench.hears_of(others=("/sim_rig",))
+    bench.set_peers(others=("/sim_rig",))
     assert bench.status.state == "FAULT"
     assert "another device is there: /sim_rig publishes device/status" in bench.status.fault
     bench.hold(False)
     assert not bench.call("reset").success
     assert bench.exits == []
     bench = DriverBench()
-    bench.hears_of(others=("/sim_rig",))
+    bench.set_peers(others=("/sim_rig",))
     ((code, text),) = bench.exits
     assert (code, "/sim_rig" in text) == (2, True)
 
 
-def test_drives_that_are_not_there_are_waited_for_and_those_that_refuse_are_not() -> None:
+def test_driver_waits_for_missing_drives_and_exits_on_refusal() -> None:
     bench = DriverBench(connect_timeout=3.0)
     bench.drives[1].silent = True
     bench.run(150)
@@ -222,10 +225,10 @@ def test_drives_that_are_not_there_are_waited_for_and_those_that_refuse_are_not(
     assert (code, "refuses to write 0 to 0x1016:1" in text) == (2, True)
 
 
-def test_link_loss_is_a_fault_at_once_and_a_reset_opens_it_anew() -> None:
+def test_link_loss_is_an_immediate_fault_until_reset() -> None:
     bench = DriverBench().moving()
     port = bench.driver.ports[0]
-    bench.do(port.on_change(PortChange("unplugged"), bench.at))
+    bench.perform(port.on_change(PortChange("unplugged"), bench.at))
     assert bench.status.fault == "insertion axis: link virtual test is lost: unplugged; " + (
         "rotation axis: link virtual test is lost: unplugged"
     )
@@ -234,33 +237,33 @@ def test_link_loss_is_a_fault_at_once_and_a_reset_opens_it_anew() -> None:
     bench.run(10)
     assert bench.bus.sent == []
     assert "cannot open virtual test: unplugged" in bench.call("reset").text
-    bench.do(bench.driver.timers[1].handler(bench.at))
+    bench.perform(bench.driver.timers[1].handler(bench.at))
     assert bench.of(Diagnose)[-1].diagnostic.message == "link virtual test is lost: unplugged"
-    bench.do(port.on_change(PortChange(), bench.at))
+    bench.perform(port.on_change(PortChange(), bench.at))
     assert bench.call("reset").success
     assert bench.status.state == "DISABLED"
 
 
-def test_a_master_heard_before_the_link_broke_is_no_fault_once_it_is_opened_anew() -> None:
+def test_second_master_is_forgotten_when_the_link_is_reopened() -> None:
     bench = DriverBench()
     port = bench.driver.ports[0]
     bench.drives[1].silent = True
     bench.run(10)
-    bench.do(port.handler((CanFrame(0x000, b"\x01\x00"),), bench.at))
-    bench.do(port.on_change(PortChange("unplugged"), bench.at))
-    bench.do(port.on_change(PortChange(), bench.at))
+    bench.perform(port.handler((CanFrame(0x000, b"\x01\x00"),), bench.at))
+    bench.perform(port.on_change(PortChange("unplugged"), bench.at))
+    bench.perform(port.on_change(PortChange(), bench.at))
     bench.drives[1].silent = False
     bench.run(40)
     assert (bench.status.state, bench.status.fault) == ("DISABLED", "")
 
 
 @pytest.mark.parametrize("how", ["stop", "disable", "emergency stop", "silence"])
-def test_an_order_that_takes_its_time_is_called_off(how: str) -> None:
+def test_slow_procedure_is_cancelled(how: str) -> None:
     bench = DriverBench().set_up()
     bench.call("confirm_needle_out", True)
     bench.drives[1].silent = True
     number = next(bench.numbers)
-    bench.do(bench.services["device/home"](None, number, bench.at))
+    bench.perform(bench.services["device/home"](None, number, bench.at))
     bench.run(2)
     assert bench.call("reset").text == "another order is under way"
     if how == "stop":
@@ -268,7 +271,7 @@ def test_an_order_that_takes_its_time_is_called_off(how: str) -> None:
     elif how == "disable":
         assert bench.call("enable", False).success
     elif how == "emergency stop":
-        bench.hear("device/estop", m.EmergencyStop(True))
+        bench.receive("device/estop", m.EmergencyStop(True))
     else:
         bench.run(60)
     reply = bench.answer(number)
@@ -284,7 +287,7 @@ def _breaks(*_: Any) -> Any:
     raise ZeroDivisionError("planted")
 
 
-def test_what_raises_stops_both_axes_and_a_cycle_ends_the_driver(
+def test_internal_error_stops_both_axes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bench = DriverBench().moving()
@@ -306,7 +309,7 @@ def test_what_raises_stops_both_axes_and_a_cycle_ends_the_driver(
     assert bench.of(Reply)[-1].text == "called off: internal error"
 
 
-def test_positions_alone_change_the_status_seldom() -> None:
+def test_status_rate_is_limited_for_positions() -> None:
     bench = DriverBench().moving()
     told = []
     for _ in range(40):

@@ -1,4 +1,4 @@
-"""Whatever comes in whatever order, the needle never moves when or where it must not."""
+"""Random sequences of events never cause a forbidden motion."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _named(name: str, event: Event) -> Event:
 
 def _homeless(bench: Bench) -> None:
     bench.insertion.homed = False
-    # The supervisor cannot know before the axis' next reply.
+    # The supervisor knows only after the next feedback of the axis.
     bench.supervisor.observe(bench.now)
 
 
@@ -64,7 +64,7 @@ _others = st.sampled_from([_named(name, event) for name, event in _EVENTS.items(
 
 
 class Witness(Bench):
-    """Watches every cycle with a model of the hold of its own, from what was sent alone."""
+    """Checks every cycle with an independent model of the hold."""
 
     def __init__(self) -> None:
         self.heard: dict[str, tuple[float, bool]] = {}
@@ -104,7 +104,7 @@ class Witness(Bench):
     is_ready=st.booleans(),
     events=st.lists(st.one_of(_cycles, _cycles, _commands, _others), max_size=40),
 )
-def test_never_without_hold_never_beyond_limits(is_ready: bool, events: list[Event]) -> None:
+def test_no_motion_without_hold_or_beyond_limits(is_ready: bool, events: list[Event]) -> None:
     bench = Witness()
     if is_ready:
         bench.ready()

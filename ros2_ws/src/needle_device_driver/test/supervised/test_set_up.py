@@ -1,4 +1,4 @@
-"""What the set-up makes of drives of any maker: what it writes, does without, or refuses."""
+"""Set-up of drives of many makers: written objects, missing objects, refusals."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RANGE = 0x0609_0030
 COUNTS, COUNTS_2, RPM, RPM_S = 0x00B5_0300, 0x00B5_5700, 0x00B4_4700, 0x00C0_0300
 TURN = {(0x608F, 1): 20_000, (0x608F, 2): 1}
 IN_RPM = {(0x60A9, 0): RPM, (0x60AA, 0): RPM_S, **TURN}
-# 5 mm/s, 2 mm/s to the switch, a quarter off it; 50 mm/s^2, stops at 500 mm/s^2.
+# 5 mm/s, 2 mm/s to the switch, a quarter of that off it; 50 mm/s^2, stops at 500 mm/s^2.
 SPEEDS = {(0x607F, 0): 100_000, (0x6081, 0): 100_000, (0x6099, 1): 40_000, (0x6099, 2): 10_000}
 RAMPS = {(0x6083, 0): 10**6, (0x6084, 0): 10**6, (0x609A, 0): 10**6, (0x6085, 0): 10**7}
 
@@ -37,8 +37,8 @@ def has(**attributes: object) -> Change:
 
 
 def tells(values: Values) -> Change:
-    """Let a drive have values."""
-    return lambda drive: drive.tells(values)
+    """Set values of a drive."""
+    return lambda drive: drive.set_objects(values)
 
 
 def lacks(*indices: int) -> Change:
@@ -46,12 +46,12 @@ def lacks(*indices: int) -> Change:
 
 
 def refuses(code: int, *indices: int, but: bytes = b"none") -> Change:
-    """Let a drive refuse to have objects written, but for one value."""
+    """Refuse writes to objects, except one value."""
     return has(refuses=lambda i, sub, value: code if i in indices and value != but else 0)
 
 
 def makes(index: int, wanted: int, made: int) -> Change:
-    """Let a drive make something else of a value."""
+    """Store another value than the written one."""
 
     def stores(at: int, value: bytes) -> bytes:
         size = len(value)
@@ -76,7 +76,7 @@ def needs(index: int) -> tuple[Change, str]:
 
 
 def fed(*ratio: int) -> Change:
-    """Let a drive in rpm have a gear of 5 : 2, and say how many counts its feed is."""
+    """Give a drive in rpm a gear of 5 : 2 and a feed in counts."""
     gear = {(0x6091, 1): 5, (0x6091, 2): 2, (0x6092, 1): ratio[0], (0x6092, 2): ratio[1]}
     return tells(IN_RPM | gear)
 
@@ -92,6 +92,10 @@ REFUSED: list[tuple[Change, str]] = [
         all_of(tells({(0x6502, 0): 0x225}), refuses(RANGE, 0x6060)),
         "node 1 refuses to write 8 to 0x6060:0 mode of operation",
     ),
+    (
+        all_of(lacks(0x6502), has(modes={8})),
+        "node 1 has no homing mode (0x6060 = 6, 0x6061 = 0)",
+    ),
     (all_of(lacks(0x6502), refuses(RANGE, 0x6060, but=b"\x06")), "write 8 to 0x6060:0 mode"),
     (all_of(lacks(0x6502), refuses(RANGE, 0x6060, but=b"\x08")), "write 6 to 0x6060:0 mode"),
     (lacks(0x1016), "refuses to write 0 to 0x1016:1 consumer heartbeat time"),
@@ -100,7 +104,9 @@ REFUSED: list[tuple[Change, str]] = [
     (all_of(tells({(0x1017, 0): 0}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
     (all_of(tells({(0x1017, 0): 201}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
     *(needs(index) for index in (0x605A, 0x605E, 0x6007, 0x6065, 0x6085, 0x60C2, 0x607C, 0x6098)),
-    # By chance it has what an un-homed drive shall have.
+    # A method to a switch is never replaced by one where the axis stands.
+    (refuses(RANGE, 0x6098, but=b"\x25"), "refuses to write 17 to 0x6098:0"),
+    # It happens to have the values for a drive without home.
     (
         all_of(tells({(0x607D, 1): 2**31, (0x607D, 2): 2**31 - 1}), refuses(READ_ONLY, 0x607D)),
         "refuses to write -2147483648 to 0x607D:1",
@@ -135,7 +141,7 @@ REFUSED: list[tuple[Change, str]] = [
     in_unit(0x60A8, 0x00B4_0000, "turns"),
     in_unit(0x60A8, 0xFFB5_0000, "10^-1 counts"),
     (tells({(0x60A9, 0): 0x0001_0300}), "wanted counts/s or rpm"),
-    # Turns whose counts are not known, or known twice; a factor that is none.
+    # Counts per turn unknown or ambiguous; an invalid factor.
     *(
         (
             tells({(0x60A9, 0): RPM} | turn),
@@ -153,32 +159,30 @@ REFUSED: list[tuple[Change, str]] = [
         has(refuses=lambda i, sub, v: RANGE * ((i, sub) == (0x1800, 2))),
         "node 1 refuses to write 1 to 0x1800:2 transmission type",
     ),
-    (has(state="enabled", deaf_to={"all"}), "node 1 does not switch off"),
+    (has(state="enabled", ignored_orders={"all"}), "node 1 does not switch off"),
     (has(beats=False), "node 1 sends no heartbeat (0x1017)"),
 ]
 
 
 @pytest.mark.parametrize(("change", "text"), REFUSED)
-def test_a_drive_that_lacks_what_is_needed_is_refused_by_value_and_wish(
-    change: Change, text: str
-) -> None:
+def test_drive_without_a_required_object_or_value_is_refused(change: Change, text: str) -> None:
     bench = DriveBench()
     change(bench.insertion)
     bench.sdo_time = 0.02
     refusal = bench.refusal()
     assert refusal.startswith("insertion axis: ")
     assert text in refusal
-    # The other axis waits for nobody's heartbeat.
-    assert bench.rotation.holds(0x1016, 1) == 0
+    # The watchdog of the other axis is not armed.
+    assert bench.rotation.value(0x1016, 1) == 0
     assert bench.state == "FAULT"
 
 
-def test_the_other_drive_is_judged_alike_and_may_be_set_up_once_the_first_is_mended() -> None:
+def test_refused_rotation_drive_can_be_set_up_after_repair() -> None:
     bench = DriveBench()
     change, text = in_unit(0x60A9, 0x0001_0300, "m/s")
     change(bench.rotation)
     assert f"rotation axis: {text}" in bench.refusal()
-    bench.rotation.tells({(0x60A9, 0): COUNTS})
+    bench.rotation.set_objects({(0x60A9, 0): COUNTS})
     assert bench.reset().success
     bench.steps()
     bench = DriveBench()
@@ -187,7 +191,7 @@ def test_the_other_drive_is_judged_alike_and_may_be_set_up_once_the_first_is_men
 
 
 def no_types(types: bytes) -> Change:
-    """Let a drive lack one or two transmission types of what it receives."""
+    """Refuse transmission types of received PDOs."""
     lacking = types[:1], types[1:]
     return has(
         refuses=lambda i, sub, v: RANGE * (i & 0xFF00 == 0x1400 and sub == 2 and v in lacking)
@@ -198,7 +202,7 @@ Row = tuple[Change, Values, str]
 
 
 def units(speed: int, ramp: int, more: Values, per_speed: float, per_ramp: float) -> Row:
-    """Return a drive with units, and what its speeds and ramps are to be."""
+    """Return a drive with units, and its expected speeds and ramps."""
     wanted = {at: max(1, round(counts / per_speed)) for at, counts in SPEEDS.items()}
     wanted |= {at: round(counts / per_ramp) for at, counts in RAMPS.items()}
     return tells({(0x60A9, 0): speed, (0x60AA, 0): ramp, **more}), wanted, ""
@@ -210,11 +214,11 @@ WIDTHS = {(0x605A, 0): 1, (0x6066, 0): 4, (0x60C2, 1): 2}
 TAKEN: list[Row] = [
     (has(), {(0x6065, 0): 10_000, (0x607D, 1): -20_000, (0x607D, 2): 4_020_000}, ""),
     units(COUNTS, COUNTS_2, {}, 1.0, 1.0),
-    # Without dimension, bits that mean nothing; 0.1 counts/s and 10 counts/s^2 (Copley).
+    # Dimensionless units, unused bits; 0.1 counts/s and 10 counts/s^2 (Copley).
     units(0x0000_035A, 0x0000_5700, {}, 1.0, 1.0),
     units(0xFFB5_0300, 0x01B5_5700, {}, 0.1, 10.0),
     units(RPM, RPM_S, TURN, 20_000 / 60, 20_000 / 60),
-    # 0.1 rpm with ramps in rpm/s; a gear, and one that is none; rpm with ramps in counts.
+    # 0.1 rpm with ramps in rpm/s; a gear, and an invalid one; rpm with ramps in counts.
     units(0xFFB4_4700, RPM_S, TURN, 2000 / 60, 20_000 / 60),
     units(RPM, RPM_S, {**TURN, (0x6091, 1): 5, (0x6091, 2): 2}, 50_000 / 60, 50_000 / 60),
     units(RPM, RPM_S, {**TURN, (0x6091, 1): 0, (0x6091, 2): 0}, 20_000 / 60, 20_000 / 60),
@@ -228,7 +232,7 @@ TAKEN: list[Row] = [
     (lacks(0x60AA), SPEEDS | RAMPS, f"{ASSUMED}the unit of its speeds per second (0x60AA);"),
     (all_of(tells(IN_RPM), lacks(0x60AA)), {(0x6085, 0): 30_000}, ASSUMED),
     (all_of(lacks(0x60A9), tells({(0x6096, 1): 7, (0x6096, 2): 7})), SPEEDS, ASSUMED),
-    # What no rule hangs on; a heartbeat that is fixed; what it has already.
+    # Objects without a rule; a fixed heartbeat; objects with the value already.
     (refuses(RANGE, 0x605B, 0x1029, 0x1006), {}, "keeps its own 0x605B"),
     (lacks(0x1006, 0x1029, 0x6007), {}, "has no 0x6007"),
     (makes(0x6083, 10**6, 65_535), {(0x6083, 0): 65_535}, ""),
@@ -238,10 +242,10 @@ TAKEN: list[Row] = [
     (all_of(tells({(0x1017, 0): 200}), refuses(READ_ONLY, 0x1017)), {(0x1017, 0): 200}, ""),
     (all_of(tells({(0x1017, 0): 1}), refuses(READ_ONLY, 0x1017)), {}, ""),
     (all_of(tells({(0x605A, 0): 6}), refuses(READ_ONLY, 0x605A)), {(0x605A, 0): 6}, ""),
-    # Modes that are not listed are tried, once it is off (an EPOS4 lists 0x225).
+    # Unlisted modes are tried after switching off (an EPOS4 lists 0x225).
     (tells({(0x6502, 0): 0x225}), {}, ""),
     (all_of(lacks(0x6502), has(state="enabled")), {(0x6040, 0): 0}, ""),
-    # Objects wider and narrower than in the standard; counters of less than 32 bits.
+    # Other sizes than in the standard; counters of less than 32 bits.
     (
         all_of(
             has(objects=ScriptedDrive(1).objects | {at: bytes(n) for at, n in WIDTHS.items()}),
@@ -250,11 +254,11 @@ TAKEN: list[Row] = [
         {(0x605A, 0): 6, (0x6066, 0): 50, (0x60C2, 1): 20},
         "",
     ),
-    # What it receives acts at once where it does not take type 1 or 255.
+    # Received PDOs act at once if the drive refuses type 1 or 255.
     (no_types(b"\xff"), {(0x1400, 2): 0xFE, (0x1401, 2): 1}, ""),
     (no_types(b"\x01"), {(0x1400, 2): 0xFF, (0x1401, 2): 0xFF}, ""),
     (no_types(b"\x01\xff"), {(0x1400, 2): 0xFE, (0x1401, 2): 0xFE}, ""),
-    # Process data that nobody asked for.
+    # Unused process data.
     (tells({(0x1802, 1): 0x4000_0381}), {(0x1802, 1): 0xC000_0381, (0x1800, 3): 0}, ""),
     (lacks(0x60FD), {(0x1A00, 0): 2}, "has no digital inputs to map"),
     (
@@ -263,77 +267,77 @@ TAKEN: list[Row] = [
         "has no digital inputs to map",
     ),
     (lacks(0x60F4), {(0x1A01, 0): 1}, "has no following error to map"),
-    # A node that another program stopped.
+    # Another program stopped the node.
     (has(nmt=0x04), {}, ""),
 ]
 
 
 @pytest.mark.parametrize(("change", "wanted", "missing"), TAKEN)
-def test_a_drive_of_any_maker_is_set_up_as_it_is_and_steps(
+def test_drives_of_many_makers_are_set_up_and_move(
     change: Change, wanted: Values, missing: str
 ) -> None:
     bench = DriveBench()
     change(bench.insertion)
     bench.run(bench.drives.probe())
     bench.steps()
-    assert {at: bench.insertion.holds(*at) for at in wanted} == wanted
+    assert {at: bench.insertion.value(*at) for at in wanted} == wanted
     told = bench.drives.missing_optional_objects
     assert told[0].startswith(f"insertion drive {missing}") if missing else told == ()
 
 
-def test_parameters_go_before_what_a_drive_tells() -> None:
+def test_parameters_override_reported_units() -> None:
     bench = DriveBench(insertion_counts_per_turn=50_000.0, rotation_max_torque=0.8)
     fed(360, 1)(bench.insertion)
     bench.configured()
-    assert bench.insertion.holds(0x6085) == 12_000
+    assert bench.insertion.value(0x6085) == 12_000
     assert (0x6072, 0) not in bench.insertion.objects
-    assert bench.rotation.holds(0x6072) == 800
+    assert bench.rotation.value(0x6072) == 800
     # 100 rad/s^2 are 955 rpm/s.
     bench = DriveBench(rotation_counts_per_turn=65536.0)
-    bench.rotation.tells({(0x60A9, 0): RPM, (0x60AA, 0): RPM_S})
+    bench.rotation.set_objects({(0x60A9, 0): RPM, (0x60AA, 0): RPM_S})
     bench.configured()
-    assert bench.rotation.holds(0x6085) == 955
+    assert bench.rotation.value(0x6085) == 955
 
 
-def test_who_is_set_up_again_is_homed_again() -> None:
+def test_new_set_up_needs_a_new_homing() -> None:
     bench = DriveBench().homed()
     assert bench.run(bench.supervisor.deconfigure()).success
     bench.configured()
     assert not bench.is_homed()
 
 
-def test_a_drive_that_started_anew_is_asked_anew() -> None:
+def test_rebooted_drive_reports_its_units_again() -> None:
     bench = DriveBench()
-    bench.insertion.tells(IN_RPM)
+    bench.insertion.set_objects(IN_RPM)
     bench.configured()
-    assert bench.insertion.holds(0x6085) == 30_000
-    bench.insertion.tells({(0x608F, 1): 10_000})
+    assert bench.insertion.value(0x6085) == 30_000
+    bench.insertion.set_objects({(0x608F, 1): 10_000})
     bench.after(bench.insertion.reboot)
     bench.hold(False)
     assert bench.reset().success
-    assert bench.insertion.holds(0x6085) == 60_000
+    assert bench.insertion.value(0x6085) == 60_000
 
 
-def test_where_it_stands_has_two_numbers() -> None:
+def test_homing_method_35_replaces_37() -> None:
     bench = DriveBench()
     refuses(RANGE, 0x6098, but=b"\x23")(bench.rotation)
     bench.steps()
-    assert bench.rotation.holds(0x6098) == 35
+    assert bench.rotation.value(0x6098) == 35
 
 
-def test_an_encoder_of_a_hand_moved_axis_needs_positions_in_counts_alone() -> None:
+def test_axis_without_motor_needs_only_position_units() -> None:
     bench = DriveBench(insertion_drive="hand")
-    bench.insertion.tells({(0x60A9, 0): 0x0001_0300, (0x60AA, 0): 0})
+    bench.insertion.set_objects({(0x60A9, 0): 0x0001_0300, (0x60AA, 0): 0})
     bench.configured()
     assert bench.drives.missing_optional_objects == ()
     bench = DriveBench(insertion_drive="hand")
-    bench.insertion.tells({(0x60A8, 0): 0x0001_0000})
+    bench.insertion.set_objects({(0x60A8, 0): 0x0001_0000})
     assert "insertion axis: the drive counts positions in m (0x60A8" in bench.refusal()
 
 
-def test_a_homing_that_is_slower_than_the_unit_of_the_drive_is_refused() -> None:
+def test_homing_slower_than_one_speed_unit_is_refused() -> None:
     bench = DriveBench(homing_speed=1e-5)
-    bench.insertion.tells(IN_RPM)
+    bench.insertion.set_objects(IN_RPM)
     bench.configured()
     assert "homing at 1e-05/s is less than one of the drive's units" in bench.home().message
     bench.wait(20)
@@ -343,16 +347,16 @@ def test_a_homing_that_is_slower_than_the_unit_of_the_drive_is_refused() -> None
 # ---- software limits ----------------------------------------------------------------------------
 
 
-def test_no_limits_are_as_wide_as_the_drive_counts() -> None:
+def test_disabled_limits_fit_the_range_of_the_drive() -> None:
     bench = DriveBench()
     bench.insertion.refuses = lambda index, sub, value: (
         RANGE * (index == 0x607D and abs(int.from_bytes(value, "little", signed=True)) > 2**30)
     )
     bench.configured()
-    assert [bench.insertion.holds(0x607D, sub) for sub in (1, 2)] == [-(2**30), 2**30 - 1]
+    assert [bench.insertion.value(0x607D, sub) for sub in (1, 2)] == [-(2**30), 2**30 - 1]
 
 
-def test_limits_that_a_homed_drive_does_not_take_keep_it_from_being_switched_on() -> None:
+def test_drive_that_refuses_its_limits_is_not_switched_on() -> None:
     bench = DriveBench().homing()
     refuses(RANGE, 0x607D)(bench.insertion)
     bench.wait(30)
@@ -366,21 +370,21 @@ def test_limits_that_a_homed_drive_does_not_take_keep_it_from_being_switched_on(
     assert "refuses to write -20000 to 0x607D:1" in bench.status.fault
 
 
-def test_between_homing_and_its_limits_nothing_is_switched_on() -> None:
+def test_nothing_is_switched_on_before_the_limits_are_written() -> None:
     bench = DriveBench().homing()
     while not (bench.is_homed() and bench.enable().success):
-        # Whoever is in a hurry is asked to call again, and breaks nothing.
+        # An early call is refused without other effect.
         assert bench.state != "FAULT"
         bench.wait()
     assert bench.state == "HOLDING"
-    assert bench.insertion.holds(0x607D, 1) == -20_000
+    assert bench.insertion.value(0x607D, 1) == -20_000
 
 
-def test_limits_are_taken_from_slow_drives_with_few_heartbeats() -> None:
+def test_slow_drives_with_few_heartbeats_accept_limits() -> None:
     bench = DriveBench().configured()
     bench.sdo_time, bench.insertion.beats, bench.rotation.beats = 0.09, False, False
     assert bench.home().success
     bench.wait(30)
     assert (bench.state, bench.is_homed()) == ("DISABLED", True), bench.status.fault
-    assert bench.insertion.holds(0x607D, 1) == -20_000
+    assert bench.insertion.value(0x607D, 1) == -20_000
     assert bench.enable().success

@@ -1,4 +1,4 @@
-"""How long a set-up waits for a drive, and how far that may round what it is told."""
+"""Set-up of a drive: time limits and rounding."""
 
 from __future__ import annotations
 
@@ -11,14 +11,12 @@ from .drive_bench import DriveBench
 
 
 def stored(index: int, made: int, at: int, value: bytes) -> bytes:
-    """Return what a drive makes of a value."""
+    """Return the stored value."""
     return made.to_bytes(len(value), "little") if at == index else value
 
 
 @pytest.mark.parametrize(("seconds", "is_off"), [(0.9, True), (1.1, False)])
-def test_a_drive_that_was_left_on_may_take_a_second_to_switch_off(
-    seconds: float, is_off: bool
-) -> None:
+def test_powered_drive_has_a_second_to_switch_off(seconds: float, is_off: bool) -> None:
     bench = DriveBench()
     bench.insertion.state = "enabled"
     bench.sdo_time = 0.02
@@ -28,9 +26,7 @@ def test_a_drive_that_was_left_on_may_take_a_second_to_switch_off(
 
 
 @pytest.mark.parametrize(("seconds", "has_it"), [(0.4, True), (0.6, False)])
-def test_a_drive_may_take_half_a_second_to_show_a_mode_that_it_does_not_list(
-    seconds: float, has_it: bool
-) -> None:
+def test_drive_has_half_a_second_to_display_an_unlisted_mode(seconds: float, has_it: bool) -> None:
     bench = DriveBench()
     drive, due = bench.insertion, math.inf
 
@@ -42,7 +38,7 @@ def test_a_drive_may_take_half_a_second_to_show_a_mode_that_it_does_not_list(
     def sending() -> None:
         drive.mode = 8 if bench.now >= due else 0
 
-    drive.tells({(0x6502, 0): 0x225})
+    drive.set_objects({(0x6502, 0): 0x225})
     drive.modes, drive.refuses, bench.bus.sending = set(), refuses, sending
     bench.sdo_time = 0.02
     reply = bench.configure()
@@ -59,13 +55,13 @@ def test_a_drive_may_take_half_a_second_to_show_a_mode_that_it_does_not_list(
         ({"insertion_max_torque": 0.802}, 0x6072, 802, 402, 1604),
     ],
 )
-def test_a_bound_may_be_rounded_in_a_drive_but_not_to_half(
+def test_drive_may_round_a_bound_but_not_halve_it(
     parameter: dict[str, float], index: int, wanted: int, least: int, most: int
 ) -> None:
     for made, is_taken in ((least, True), (most, True), (least - 1, False), (most + 1, False)):
         bench = DriveBench(**parameter)
         bench.insertion.stores = partial(stored, index, made)
         if is_taken:
-            assert bench.configured().insertion.holds(index) == made
+            assert bench.configured().insertion.value(index) == made
         else:
             assert f"took {wanted} for 0x{index:04X}" in bench.refusal()

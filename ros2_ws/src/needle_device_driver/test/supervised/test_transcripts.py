@@ -1,7 +1,6 @@
-"""What goes over the wire, byte by byte: `transcripts/*.txt`, each line a frame as candump has it.
+"""Frames on the bus, compared byte by byte with `transcripts/*.txt`, in the format of candump.
 
-The files were checked by hand against CiA 301 and CiA 402; a change of a byte is a change of what
-drives are told. Lines that begin with # explain.
+The files were checked by hand against CiA 301 and CiA 402. Lines that begin with # are comments.
 """
 
 from __future__ import annotations
@@ -56,10 +55,10 @@ def fault_and_reset(bench: DriveBench) -> None:
 
 
 @pytest.mark.parametrize("scene", [set_up, home, move, quick_stop, fault_and_reset])
-def test_the_bytes_are_those_of_the_transcript(scene: Callable[[DriveBench], None]) -> None:
+def test_frames_match_the_transcript(scene: Callable[[DriveBench], None]) -> None:
     bench = DriveBench()
     scene(bench)
-    # Heartbeats are test_bus_rules' concern.
+    # test_bus_rules checks the heartbeats.
     sent = [f"{cob:03X}#{data.hex().upper()}" for cob, data in bench.bus.sent if cob != 0x77F]
     lines = (FOLDER / f"{scene.__name__}.txt").read_text("utf-8").splitlines()
     assert sent == [line.split()[0] for line in lines if line and not line.startswith("#")]

@@ -1,4 +1,4 @@
-"""Bounds are those of docs/safety.md, and the hard ones cannot be configured away."""
+"""Limits of docs/safety.md, and their caps."""
 
 from __future__ import annotations
 
@@ -54,19 +54,19 @@ HARD = {
 }
 
 
-def test_bounds_of_the_driver_are_those_of_the_document_and_parameters_of_their_name() -> None:
-    assert dataclasses.asdict(DeviceDriverParameters().limits) == BOUNDS
+def test_default_limits_and_their_parameters() -> None:
+    assert dataclasses.asdict(SafetyLimits.of(DeviceDriverParameters())) == BOUNDS
     for name, bound in BOUNDS.items():
         changed: dict[str, Any] = {name: 0.9 * bound}
-        given = DeviceDriverParameters(**changed).limits
+        given = SafetyLimits.of(DeviceDriverParameters(**changed))
         assert dataclasses.asdict(given) == BOUNDS | {name: 0.9 * bound}
-    # Ideal axes come nearer to their targets.
+    # Ideal axes have smaller tolerances.
     ideal = BOUNDS | {"insertion_tolerance": 1e-6, "rotation_tolerance": 1e-4}
     assert dataclasses.asdict(SafetyLimits()) == ideal
     assert SafetyLimits().longest_homings == pytest.approx((150.0, 1.5 * 20.0 * math.pi))
 
 
-def test_a_bound_is_finite_positive_and_no_more_than_the_hard_one() -> None:
+def test_limits_are_finite_positive_and_capped() -> None:
     for name, bound in HARD.items():
         assert getattr(SafetyLimits(**{name: bound}), name) == bound
         with pytest.raises(OutOfBoundsError, match=name):
@@ -78,7 +78,7 @@ def test_a_bound_is_finite_positive_and_no_more_than_the_hard_one() -> None:
                 SafetyLimits(**{name: bad})
 
 
-def test_a_flood_of_notices_is_counted_and_not_told_but_for_other_rules_and_faults() -> None:
+def test_notices_of_one_rule_are_limited_and_counted() -> None:
     limit, refused = NoticeLimit(), Notice("refused", Rule.TIP_AGE)
     told = [limit.admit(refused, 100.0 + number * 1e-3) for number in range(999)]
     assert [text for text in told if text] == ["refused [tip_age]"] * 5

@@ -1,4 +1,4 @@
-"""The transition table, transition by transition."""
+"""Transition table of the device."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from needle_device_driver.supervisor.states import (
     next_state,
 )
 
-# By trigger: from where to where.
-WAYS = {
+# State before and after, by trigger.
+PAIRS = {
     "configure": "UNCONFIGURED-DISABLED",
     "deconfigure": "DISABLED-UNCONFIGURED",
     "enable": "DISABLED-HOLDING",
@@ -30,9 +30,9 @@ WAYS = {
 }
 
 
-def test_each_pair_leads_where_it_should_or_nowhere() -> None:
+def test_transition_table() -> None:
     found = {f"{t.value}: {a.value}-{b.value}" for (a, t), b in TRANSITIONS.items()}
-    assert found == {f"{t}: {way}" for t, ways in WAYS.items() for way in ways.split()}
+    assert found == {f"{t}: {pair}" for t, pairs in PAIRS.items() for pair in pairs.split()}
     assert next_state(State.HOLDING, Trigger.MOTION_START) is State.MOVING
     with pytest.raises(ForbiddenTransitionError, match="no transition from FAULT by motion start"):
         next_state(State.FAULT, Trigger.MOTION_START)

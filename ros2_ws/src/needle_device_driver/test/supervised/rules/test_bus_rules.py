@@ -1,4 +1,4 @@
-"""Links, cables and drives that are lost, named as in docs/safety.md."""
+"""Rules for lost links and drives, named as in docs/safety.md."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Callable
 import pytest
 
 from needle_device_driver.cia402 import drive_setup
-from needle_device_driver.cia402.pdo_setup import silence_unused
 from needle_device_driver.link.frame_link import LinkError
 from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.procedure import Procedure
@@ -17,7 +16,7 @@ from ..drive_bench import DriveBench
 WATCHDOG = 127 << 16 | 100
 
 
-def test_loop_heartbeat_comes_first_in_each_cycle_and_before_each_request() -> None:
+def test_loop_heartbeat_is_sent_in_each_cycle_and_before_each_request() -> None:
     bench = DriveBench().configured()
     cobs = [cob for cob, _ in bench.bus.sent]
     requests = [number for number, cob in enumerate(cobs) if cob in (0x601, 0x602)]
@@ -28,14 +27,14 @@ def test_loop_heartbeat_comes_first_in_each_cycle_and_before_each_request() -> N
     assert bench.bus.sent[0][0] == 0x77F
 
 
-def test_link_loss_is_named_and_reset_opens_the_link_anew() -> None:
+def test_link_loss_is_reported_and_reset_reopens_the_link() -> None:
     bench = DriveBench().moving()
     bench.broken = "takes nothing for 0.05 s"
     bench.go()
     bench.failed("link_loss", "link virtual test is lost: takes nothing")
-    # Without a computer the drives' watchdogs trip, and nobody knows what else happened to them.
+    # Without the computer the drives' watchdogs trip, and their state is unknown.
     bench.insertion.state = bench.rotation.state = "fault"
-    bench.insertion.tells({(0x1016, 1): 0})
+    bench.insertion.set_objects({(0x1016, 1): 0})
     bench.hold(False)
     bench.no_adapter = True
     assert "cannot open" in bench.reset().message
@@ -43,12 +42,12 @@ def test_link_loss_is_named_and_reset_opens_the_link_anew() -> None:
     bench.no_adapter = False
     bench.stopped("link_loss", "takes nothing")
     assert bench.link.openings == 2
-    assert bench.insertion.holds(0x1016, 1) == WATCHDOG
+    assert bench.insertion.value(0x1016, 1) == WATCHDOG
 
 
-def test_link_loss_while_nothing_is_sent_and_before_the_start() -> None:
+def test_link_loss_while_idle_and_before_the_set_up() -> None:
     bench = DriveBench().configured()
-    bench.link.change("gone")
+    bench.link.set_port_error("gone")
     bench.supervisor.observe(bench.now)
     assert (bench.state, bench.rule) == ("FAULT", "link_loss")
     bench = DriveBench()
@@ -62,7 +61,7 @@ def test_link_loss_while_nothing_is_sent_and_before_the_start() -> None:
 # ---- answers that do not come, or late ----------------------------------------------------------
 
 
-def test_reply_age_a_cut_bus_reports_nothing_and_is_found() -> None:
+def test_reply_age_detects_a_cut_bus() -> None:
     bench = DriveBench().moving()
     bench.bus.cut = True
     bench.go()
@@ -77,7 +76,7 @@ def test_reply_age_a_cut_bus_reports_nothing_and_is_found() -> None:
     bench.stopped("reply_age", "no reply")
 
 
-def test_reply_age_a_heartbeat_keeps_positions_fresh_only_while_no_sync_is_unanswered() -> None:
+def test_reply_age_heartbeats_renew_only_answered_positions() -> None:
     bench = DriveBench().configured()
     for _ in range(5):
         bench.now += 0.05
@@ -87,7 +86,7 @@ def test_reply_age_a_heartbeat_keeps_positions_fresh_only_while_no_sync_is_unans
     bench.insertion.syncs = False
     bench.wait(8)
     assert (bench.state, bench.rule) == ("FAULT", "reply_age")
-    # Nor do the heartbeats of a drive that left the operational state.
+    # Heartbeats in another state than operational do not count.
     bench = DriveBench().configured()
     bench.insertion.nmt = 0x7F
     bench.now += 0.2
@@ -106,7 +105,7 @@ def test_reply_age_a_heartbeat_keeps_positions_fresh_only_while_no_sync_is_unans
     ],
     ids=["80 ms", "100 ms", "growing"],
 )
-def test_reply_age_joints_are_no_older_than_answers_are_late(
+def test_reply_age_includes_late_answers(
     late: Callable[[int], int], cycles: int, rule: str
 ) -> None:
     bench = DriveBench().ready()
@@ -114,8 +113,8 @@ def test_reply_age_joints_are_no_older_than_answers_are_late(
     take, sync = drive.take, drive.sync
 
     def without_heartbeats(cob_id: int, data: bytes) -> None:
-        # No heartbeat brings an answer.
-        drive.say(0x700, bytes([drive.nmt])) if cob_id == 0x77F else take(cob_id, data)
+        # A heartbeat does not replace an answer.
+        drive.emit(0x700, bytes([drive.nmt])) if cob_id == 0x77F else take(cob_id, data)
 
     def noted() -> None:
         nonlocal at
@@ -143,7 +142,7 @@ def test_reply_age_joints_are_no_older_than_answers_are_late(
     assert rule or bench.drives.unanswered == cycles
 
 
-def test_reply_age_lost_answers_are_counted_and_given_up_after_a_pause() -> None:
+def test_reply_age_lost_answers_are_discarded_after_a_pause() -> None:
     bench = DriveBench().moving()
     for _ in range(3):
         bench.insertion.loses = 1
@@ -154,7 +153,7 @@ def test_reply_age_lost_answers_are_counted_and_given_up_after_a_pause() -> None
     bench.go(5)
     bench.insertion.loses = 2
     bench.go(3)
-    # The third answer may be to the first SYNC: nothing is sent on, for two cycles.
+    # The third answer may belong to the first SYNC: no set-point for two cycles.
     waiting, syncs = bench.insertion.next_target, len(bench.bus.sent)
     bench.go(2)
     assert bench.insertion.next_target == waiting
@@ -163,11 +162,14 @@ def test_reply_age_lost_answers_are_counted_and_given_up_after_a_pause() -> None
     assert bench.insertion.next_target > waiting
     bench.go(60)
     assert bench.outcomes == ["succeeded"] * 2
+    syncs = [cob for cob, _ in bench.bus.sent].count(0x80)
+    assert bench.axes[0].monitor.feedback.syncs == syncs
     count = bench.drives.unanswered
-    health = bench.drives.health("", {"more": "1"})
+    health = bench.drives.health("")
     assert health.message == f"{count} SYNCs were not answered in their cycle"
-    assert (health.values["unanswered_syncs"], health.values["more"]) == (str(count), "1")
-    assert bench.drives.health("", {}).message == "connected"
+    assert health.values["unanswered_syncs"] == str(count)
+    assert health.values["late_cycles"] == "0"
+    assert bench.drives.health("").message == "connected"
 
 
 # ---- a drive that starts anew -------------------------------------------------------------------
@@ -181,46 +183,46 @@ def set_up_again(bench: DriveBench) -> None:
     bench.enabled()
 
 
-def test_drive_reboot_is_a_fault_and_leaves_the_way_out_by_the_depth_known_before() -> None:
+def test_drive_reboot_allows_retraction_by_the_last_depth() -> None:
     bench = DriveBench().moving()
     bench.go(20)
-    # Deeper than the software limits reach outward: un-homed, they do not count.
+    # Farther than the outer software limit: without home, it is off.
     deep, drawn_out = bench.insertion.position, 0
     assert deep > 20_000
-    # A second one on the way out leaves what is left of the way.
+    # After a second reboot, the remaining distance is allowed.
     for cycles in (10, 100):
         bench.after(bench.insertion.reboot)
         bench.failed("drive_reboot", "home position is lost")
         assert not bench.is_homed()
         set_up_again(bench)
         assert bench.insertion.nmt == 0x05
-        assert bench.insertion.holds(0x1016, 1) == WATCHDOG
-        assert bench.insertion.holds(0x607D, 1) == -(2**31)
+        assert bench.insertion.value(0x1016, 1) == WATCHDOG
+        assert bench.insertion.value(0x607D, 1) == -(2**31)
         bench.step()
         assert bench.rule == "homed_first"
         assert bench.retract().success
         bench.go(cycles)
         drawn_out -= bench.insertion.position
-    # What was last heard is a cycle old.
+    # The last feedback is a cycle old.
     assert drawn_out == pytest.approx(deep, abs=4000)
     assert bench.retract().message == "the needle is out"
 
 
-def test_drive_reboot_one_that_starts_by_itself_is_set_up_anew_all_the_same() -> None:
+def test_drive_reboot_of_a_self_starting_drive_needs_a_new_set_up() -> None:
     bench = DriveBench().homed()
     for drive in (bench.insertion, bench.rotation):
         drive.reboot()
         drive.nmt = 0x05
-        drive.tells({(0x1016, 1): 0})
+        drive.set_objects({(0x1016, 1): 0})
     bench.bus.flush()
     bench.wait(5)
     assert bench.state == "FAULT"
     assert bench.reset().success
-    assert bench.insertion.holds(0x1016, 1) == bench.rotation.holds(0x1016, 1) == WATCHDOG
+    assert bench.insertion.value(0x1016, 1) == bench.rotation.value(0x1016, 1) == WATCHDOG
     assert not bench.is_homed()
 
 
-def test_drive_reboot_a_node_that_left_operational_is_found_by_its_heartbeat() -> None:
+def test_drive_reboot_is_detected_by_the_nmt_state() -> None:
     bench = DriveBench().moving()
     bench.rotation.nmt = 0x7F
     bench.drives.beat()
@@ -228,21 +230,22 @@ def test_drive_reboot_a_node_that_left_operational_is_found_by_its_heartbeat() -
     bench.failed("drive_reboot", "left the operational state")
 
 
-def test_drive_reboot_within_its_set_up_voids_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_reboot_voids_its_set_up(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = DriveBench().homed()
     reboots = [True]
+    switch_off = drive_setup._switch_off_unused_pdos
 
     def reboots_once(access: ObjectAccess) -> Procedure[None]:
         if reboots:
             reboots.clear()
             bench.insertion.reboot()
             bench.bus.flush()
-        yield from silence_unused(access)
+        yield from switch_off(access)
 
-    monkeypatch.setattr(drive_setup, "silence_unused", reboots_once)
+    monkeypatch.setattr(drive_setup, "_switch_off_unused_pdos", reboots_once)
     bench.after(bench.insertion.reboot)
     bench.hold(False)
-    # What it was told before it started anew is gone: only a whole set-up counts.
+    # The reboot undoes the first part of the set-up: only a complete one counts.
     assert "started anew while it was set up" in bench.reset().message
     assert bench.reset().success
     bench.wait(5)
@@ -257,9 +260,7 @@ def test_drive_reboot_within_its_set_up_voids_it(monkeypatch: pytest.MonkeyPatch
         (0x77F, b"\x05", "the heartbeat of node 127"),
     ],
 )
-def test_one_master_another_on_the_bus_is_named_and_stops_both(
-    cob_id: int, data: bytes, what: str
-) -> None:
+def test_one_master_second_master_stops_both(cob_id: int, data: bytes, what: str) -> None:
     bench = DriveBench().moving()
     bench.bus.put(cob_id, data)
     bench.go()

@@ -1,4 +1,4 @@
-"""Which commands are refused, named as in docs/safety.md."""
+"""Rules for commands, named as in docs/safety.md."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import math
 import pytest
 
 from needle_core.errors import OutOfBoundsError
-from needle_device_driver.supervisor.command import Command, CommandPoint, check_form
+from needle_core.messages import Trajectory, TrajectoryPoint
+from needle_device_driver.supervisor.command import check_form
 from needle_device_driver.supervisor.limits import SafetyLimits
 
 from ..ideal_axes import Bench
@@ -20,7 +21,7 @@ Point = tuple[float, float, float]
 # ---- state --------------------------------------------------------------------------------------
 
 
-def test_command_state_only_in_holding_and_with_power() -> None:
+def test_command_state_requires_holding_and_power() -> None:
     bench = Bench().homed()
     bench.step()
     assert bench.rule == "command_state"
@@ -33,12 +34,12 @@ def test_command_state_only_in_holding_and_with_power() -> None:
     assert bench.status.commands_refused == 1
 
 
-def test_command_state_a_second_command_leaves_the_running_step_alone() -> None:
+def test_command_state_second_command_does_not_affect_the_step() -> None:
     bench = Bench().ready()
     stamp = bench.step()
     bench.go(5)
     other = bench.step(0.002, 1.0)
-    # Its own stamp would tell its sender that the running one has ended.
+    # With its own stamp, the result would mean the end of the running step.
     bench.step(0.002, 1.0, stamp_ns=stamp)
     assert bench.reset().message == "a step is under way"
     bench.go(20)
@@ -48,7 +49,7 @@ def test_command_state_a_second_command_leaves_the_running_step_alone() -> None:
 
 
 @pytest.mark.parametrize("which", ["insertion", "rotation"])
-def test_reply_age_no_step_begins_where_an_axis_is_silent(which: str) -> None:
+def test_reply_age_no_step_begins_with_a_silent_axis(which: str) -> None:
     bench = Bench().ready()
     bench.axis(which).silent_since = bench.now - 0.101
     bench.step()
@@ -88,14 +89,14 @@ def test_homed_first() -> None:
 # ---- form ---------------------------------------------------------------------------------------
 
 
-def form(names: tuple[str, ...], *points: CommandPoint) -> str:
-    refusal = check_form(Command(1, names, points))
+def form(names: tuple[str, ...], *points: TrajectoryPoint) -> str:
+    refusal = check_form(Trajectory(1, names, points))
     return "" if refusal is None else refusal.rule.value
 
 
 def test_command_form() -> None:
-    def point(*positions: float, time: float = 0.5) -> CommandPoint:
-        return CommandPoint(positions, (), time)
+    def point(*positions: float, time: float = 0.5) -> TrajectoryPoint:
+        return TrajectoryPoint(positions, time)
 
     good = point(0.001, 0.1)
     assert form(NAMES, good) == form(NAMES[::-1], good) == ""
@@ -121,16 +122,16 @@ def test_command_form() -> None:
         assert form(names, *points) == "command_form", (names, points)
 
 
-def test_command_form_is_checked_and_told_in_short_and_joints_come_in_any_order() -> None:
+def test_command_form_reason_is_short_and_joints_have_any_order() -> None:
     bench = Bench().ready()
-    point = CommandPoint((0.1, 0.001), (), 0.5)
+    point = TrajectoryPoint((0.1, 0.001), 0.5)
     names = tuple("joint\n" * 1000 for _ in range(300))
-    bench.supervisor.submit(Command(bench.ros_ns, names, (point,)), bench.now)
+    bench.supervisor.submit(Trajectory(bench.ros_ns, names, (point,)), bench.now)
     reason = bench.refused("command_form")
     assert len(reason) < 500
     assert reason.isprintable()
     assert "and 296 more" in reason
-    bench.supervisor.submit(Command(bench.ros_ns, NAMES[::-1], (point,)), bench.now)
+    bench.supervisor.submit(Trajectory(bench.ros_ns, NAMES[::-1], (point,)), bench.now)
     bench.go(25)
     assert bench.positions == (0.001, 0.1)
 
@@ -138,10 +139,10 @@ def test_command_form_is_checked_and_told_in_short_and_joints_come_in_any_order(
 def test_command_finite() -> None:
     for bad in (math.nan, math.inf, -math.inf):
         for point in (
-            CommandPoint((bad, 0.1), (), 0.5),
-            CommandPoint((0.001, bad), (), 0.5),
-            CommandPoint((0.001, 0.1), (0.0, bad), 0.5),
-            CommandPoint((0.001, 0.1), (), bad),
+            TrajectoryPoint((bad, 0.1), 0.5),
+            TrajectoryPoint((0.001, bad), 0.5),
+            TrajectoryPoint((0.001, 0.1), 0.5, (0.0, bad)),
+            TrajectoryPoint((0.001, 0.1), bad),
         ):
             assert form(NAMES, point) == "command_finite"
 
@@ -160,7 +161,7 @@ def test_command_newer_than_the_last() -> None:
     assert bench.state == "MOVING"
 
 
-def test_command_newer_a_reset_keeps_no_stamp_out_that_would_have_counted() -> None:
+def test_command_newer_reset_rejects_no_valid_stamp() -> None:
     bench = Bench().ready()
     bench.step()
     bench.go(25)
@@ -170,16 +171,16 @@ def test_command_newer_a_reset_keeps_no_stamp_out_that_would_have_counted() -> N
     assert bench.state == "MOVING"
 
 
-def test_tip_age_counts_steady_seconds_whatever_ros_time_does() -> None:
+def test_tip_age_is_independent_of_ros_time() -> None:
     bench = Bench().ready()
-    # It stands still.
+    # ROS time stands still.
     stamp = bench.ros_ns
     bench.now += 2.1
     bench.press()
     bench.supervisor.note_time(stamp, bench.now)
     bench.step(stamp_ns=stamp)
     assert "2.100 s old, limit 2 s" in bench.outcomes[-1]
-    # It runs fast.
+    # ROS time runs fast.
     bench = Bench().ready()
     for second in range(100):
         bench.supervisor.note_time(stamp + second * 1000 * MS, bench.now + second * 0.002)
@@ -188,9 +189,9 @@ def test_tip_age_counts_steady_seconds_whatever_ros_time_does() -> None:
     assert bench.state == "MOVING"
 
 
-def test_tip_age_is_told_however_long_ros_time_stands_still() -> None:
+def test_tip_age_while_ros_time_stands_still() -> None:
     bench = Bench().ready()
-    # Longer than notes are kept, and more cycles than are kept of it.
+    # Longer than the horizon, and more cycles than are kept.
     for _ in range(1500):
         bench.now += PERIOD
         bench.supervisor.note_time(bench.ros_ns, bench.now)
@@ -229,7 +230,7 @@ def test_tip_age_bound_is_two_seconds() -> None:
 
 
 def bounded(rule: str, within: Point, beyond: Point, **limits: float) -> None:
-    """Check that a step just beyond a bound is refused by its rule, and one just within goes."""
+    """Check that a step just beyond a bound is refused, and one within is accepted."""
     bench = Bench(**limits).ready()
     bench.submit(beyond)
     assert "is beyond" in bench.refused(rule)
@@ -259,14 +260,14 @@ def test_max_step_length_also_in_the_wrong_unit() -> None:
     bench.refused("max_depth")
 
 
-def test_max_speed_of_5_mm_a_second_is_a_hard_cap() -> None:
-    # 1 um of the way is the tolerance; a message's time is whole nanoseconds.
+def test_max_speed_is_capped_at_5_mm_per_s() -> None:
+    # With the tolerance of 1 um; a message's time has whole nanoseconds.
     bounded("max_speed", (0.001001, 0.0, 0.2), (0.001001, 0.0, 0.199_999))
     with pytest.raises(OutOfBoundsError, match="max_speed"):
         SafetyLimits(max_speed=0.00501)
 
 
-def test_max_rotation_step_counts_from_where_the_rotation_is() -> None:
+def test_max_rotation_step_counts_from_the_set_point() -> None:
     bounded("max_rotation_step", (0.001, 1.2001, 0.5), (0.001, 1.20011, 0.5))
     bounded("max_rotation_step", (0.001, -1.2001, 0.5), (0.001, -1.20011, 0.5))
     bench = Bench().ready()

@@ -1,4 +1,4 @@
-"""How drives stop, what stops both, and those that ignore it, named as in docs/safety.md."""
+"""Rules for stops, watchdogs and emergencies of drives, named as in docs/safety.md."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from ..supervisor_bench import PERIOD
 QUICK_STOP = b"\x02\x00\x08"
 
 
-def test_quick_stop_goes_out_at_once_stays_and_forgets_the_set_point() -> None:
+def test_quick_stop_is_sent_at_once_and_discards_the_set_point() -> None:
     bench = DriveBench().moving()
     bench.bus.sent.clear()
     bench.hold(False)
     assert bench.bus.sent == [(0x201, QUICK_STOP), (0x202, QUICK_STOP)]
     at = bench.positions
-    # However long.
     bench.go(105)
     assert bench.insertion.state == bench.rotation.state == "quick stop"
     assert bench.positions == at
@@ -29,9 +28,9 @@ def test_quick_stop_goes_out_at_once_stays_and_forgets_the_set_point() -> None:
     assert bench.outcomes == ["aborted: hold released", "succeeded"]
 
 
-def test_quick_stop_that_a_drive_only_says_switches_both_off() -> None:
+def test_quick_stop_without_deceleration_switches_both_off() -> None:
     bench = DriveBench().moving()
-    # A ramp that is none: 1 mm/s, as long as it has power.
+    # The drive does not decelerate: 1 mm/s as long as it has power.
     bench.insertion.drift = {"quick stop": 400}
     at = bench.insertion.position
     bench.hold(False)
@@ -49,32 +48,32 @@ def test_quick_stop_that_a_drive_only_says_switches_both_off() -> None:
     assert bench.insertion.state == "disabled"
 
 
-# What the drive does after an emergency stop; what is said of it after so many cycles; its end.
+# Behaviour of the drive after an emergency stop; report after a number of cycles; final state.
 Row = tuple[str, dict[str, Any], list[tuple[int, str]], str]
 UNSTOPPED: dict[str, Row] = {
     "stops": ("insertion", {}, [(cycle, "") for cycle in (1, 8, 9, 45, 52)], "disabled"),
     "only says": ("insertion", {"drift": {"quick stop": 400}}, [(20, ""), (10, "")], "disabled"),
     "ignores the stop": (
         "insertion",
-        {"drift": {"enabled": 400}, "deaf_to": {"quick stop"}},
+        {"drift": {"enabled": 400}, "ignored_orders": {"quick stop"}},
         [(12, "still moving"), (30, ""), (10, "")],
         "disabled",
     ),
     "keeps its power": (
         "rotation",
-        {"deaf_to": {"off"}},
+        {"ignored_orders": {"off"}},
         [(49, ""), (5, "still powered"), (0, "still powered")],
         "quick stop",
     ),
     "stands and takes no stop": (
         "insertion",
-        {"deaf_to": {"quick stop"}},
+        {"ignored_orders": {"quick stop"}},
         [(50, ""), (2, "still powered"), (53, "")],
         "disabled",
     ),
     "runs on powered": (
         "insertion",
-        {"drift": {"enabled": 400}, "deaf_to": {"quick stop", "off"}},
+        {"drift": {"enabled": 400}, "ignored_orders": {"quick stop", "off"}},
         [(60, "still powered and moving")],
         "enabled",
     ),
@@ -90,7 +89,7 @@ UNSTOPPED: dict[str, Row] = {
 
 
 @pytest.mark.parametrize("name", UNSTOPPED)
-def test_quick_stop_a_drive_that_ignores_an_emergency_stop_is_told_while_it_lasts(
+def test_quick_stop_ignored_after_estop_is_reported_while_it_lasts(
     name: str,
 ) -> None:
     which, changes, cycles, end = UNSTOPPED[name]
@@ -110,7 +109,7 @@ def test_quick_stop_a_drive_that_ignores_an_emergency_stop_is_told_while_it_last
     assert drive.state == end
     said = [str(notice) for notice in bench.notices if notice.fault][1:]
     assert said == [f"{fault[16:]} [quick_stop]" for fault in told[1:]]
-    # It ends when the drive is mended, and with a reset.
+    # The report ends with the cause, and with a reset.
     bench.supervisor.receive_estop(False)
     bench.hold(False)
     drive.drift, drive.silent, drive.state = {}, False, "disabled"
@@ -121,7 +120,7 @@ def test_quick_stop_a_drive_that_ignores_an_emergency_stop_is_told_while_it_last
     assert bench.status.fault == ""
 
 
-def test_quick_stop_a_drive_that_ignores_the_stop_of_a_fault_is_told_too() -> None:
+def test_quick_stop_ignored_after_a_fault_is_reported() -> None:
     bench = DriveBench().moving()
     bench.insertion.drift = {"quick stop": 400, "disabled": 400}
     bench.after(lambda: bench.rotation.fail(0x2310))
@@ -130,7 +129,7 @@ def test_quick_stop_a_drive_that_ignores_the_stop_of_a_fault_is_told_too() -> No
     assert bench.status.fault == f"{reports}; insertion axis still moving"
 
 
-def test_quick_stop_of_a_drive_that_answers_again_at_a_reset_nothing_is_told_any_more() -> None:
+def test_quick_stop_report_ends_when_the_drive_answers_a_reset() -> None:
     bench = DriveBench().moving()
     bench.rotation.silent = True
     bench.supervisor.receive_estop(True)
@@ -138,14 +137,14 @@ def test_quick_stop_of_a_drive_that_answers_again_at_a_reset_nothing_is_told_any
     assert bench.status.fault == "emergency stop; rotation axis silent"
     bench.supervisor.receive_estop(False)
     bench.hold(False)
-    # No cycle sees it before the reset does.
+    # No cycle runs before the reset.
     bench.rotation.silent, bench.rotation.state = False, "disabled"
     assert bench.reset().success
     bench.wait(2)
     assert (bench.state, bench.status.fault) == ("DISABLED", "")
 
 
-def test_quick_stop_at_the_end_a_drive_has_time_to_answer_between_two_cycles() -> None:
+def test_quick_stop_at_exit_leaves_time_for_answers() -> None:
     bench = DriveBench().moving()
     sync, times = bench.insertion.sync, []
 
@@ -157,31 +156,31 @@ def test_quick_stop_at_the_end_a_drive_has_time_to_answer_between_two_cycles() -
     bench.run(bench.axes[0].close())
     assert bench.insertion.state == "disabled"
     assert len(times) > 3
-    # Half a cycle: each SYNC is answered at once.
+    # Half a cycle, as each SYNC is answered at once.
     assert np.diff(times) == pytest.approx([PERIOD / 2] * (len(times) - 1))
 
 
 # ---- watchdog and emergencies -------------------------------------------------------------------
 
 
-def test_drive_watchdog_is_armed_last_and_released_at_the_end() -> None:
+def test_drive_watchdog_is_armed_last_and_disarmed_at_exit() -> None:
     bench = DriveBench().configured()
     for drive in (bench.insertion, bench.rotation):
-        assert (drive.holds(0x6007), drive.holds(0x605E)) == (1, 2)
+        assert (drive.value(0x6007), drive.value(0x605E)) == (1, 2)
         sent = [d for c, d in bench.bus.sent if c == 0x600 + drive.node and d[0] & 0xE0 == 0x20]
         assert sent[-1] == bytes.fromhex("2316100164007f00")
     bench = DriveBench().moving()
-    # One that does not say that it is off keeps it.
+    # A drive that does not report off keeps its watchdog.
     bench.insertion.syncs = False
     assert not bench.run(bench.supervisor.deconfigure()).success
     assert "insertion axis: does not say that it is off" in bench.notices[-1].text
-    assert bench.insertion.holds(0x1016, 1) == 127 << 16 | 100
-    assert (bench.rotation.holds(0x1016, 1), bench.rotation.state) == (0, "disabled")
+    assert bench.insertion.value(0x1016, 1) == 127 << 16 | 100
+    assert (bench.rotation.value(0x1016, 1), bench.rotation.state) == (0, "disabled")
     with pytest.raises(AxisError, match="insertion axis is not configured"):
         bench.axes[0].start_move(0.0, 0.001)
 
 
-def test_drive_watchdog_that_tripped_has_its_name_also_before_the_start() -> None:
+def test_drive_watchdog_trip_is_named_also_before_the_set_up() -> None:
     bench = DriveBench().moving()
     bench.after(lambda: bench.rotation.fail(0x8130))
     bench.stopped("drive_watchdog", "heartbeat was missed")
@@ -195,19 +194,19 @@ def test_drive_watchdog_that_tripped_has_its_name_also_before_the_start() -> Non
     assert bench.reset().success
     bench.wait(3)
     assert bench.state == "DISABLED"
-    # What a drive told before its set-up, and is over, is none.
+    # An error from before the set-up that is over does not count.
     bench = DriveBench()
-    bench.insertion.say(0x80, bytes.fromhex("0573000000000000"))
+    bench.insertion.emit(0x80, bytes.fromhex("0573000000000000"))
     bench.configured()
     assert bench.state == "DISABLED"
 
 
-def test_drive_emergency_stops_both_says_why_and_is_acknowledged_in_the_process_data() -> None:
+def test_drive_emergency_stops_both_and_is_acknowledged_by_pdo() -> None:
     bench = DriveBench().moving()
     for drive in (bench.insertion, bench.rotation):
         drive.ignores_sdo_orders = True
-        # They answer with what they sampled at the SYNC before.
-        drive.tells_late = True
+        # The drives answer with samples of the previous SYNC.
+        drive.answers_previous_sample = True
     bench.after(lambda: bench.insertion.fail(0x7305))
     assert bench.rotation.state == "quick stop"
     with pytest.raises(AxisError, match="encoder error"):
@@ -220,7 +219,7 @@ def test_drive_emergency_stops_both_says_why_and_is_acknowledged_in_the_process_
     assert (reset.success, reset.message) == (False, stopping)
     assert bench.state == "FAULT"
     bench.stopped("drive_emergency", "the drive reports 0x7305 encoder error")
-    # A fault without message counts, too.
+    # A fault without an emergency message counts, too.
     bench.rotation.state = "fault"
     bench.go(2)
     bench.failed("drive_emergency", "rotation axis: the drive is in FAULT")
@@ -229,10 +228,10 @@ def test_drive_emergency_stops_both_says_why_and_is_acknowledged_in_the_process_
 @pytest.mark.parametrize(
     ("lacking", "why"), [(set(), ": 0x7121 motor blocked"), ({0x603F}, "")], ids=["code", "none"]
 )
-def test_drive_emergency_that_stays_keeps_the_device_in_fault(lacking: set[int], why: str) -> None:
+def test_drive_emergency_that_persists_keeps_the_fault(lacking: set[int], why: str) -> None:
     bench = DriveBench().homed()
     drive = bench.insertion
-    drive.deaf_to_reset, drive.missing_objects = True, lacking
+    drive.ignores_reset, drive.missing_objects = True, lacking
     bench.after(lambda: drive.fail(0x7121))
     bench.hold(False)
     bench.wait(5)
@@ -241,15 +240,13 @@ def test_drive_emergency_that_stays_keeps_the_device_in_fault(lacking: set[int],
     wanted = f"insertion axis: the drive does not leave its fault{why}"
     assert (reset.success, reset.message) == (False, wanted)
     assert bench.state == "FAULT"
-    # The edge counts: the order before was one to reset, too.
-    drive.deaf_to_reset, drive.missing_objects = False, set()
+    # Only the edge counts: the last command was a reset already.
+    drive.ignores_reset, drive.missing_objects = False, set()
     assert bench.reset().success
 
 
 @pytest.mark.parametrize(("seconds", "leaves"), [(0.9, True), (1.1, False)])
-def test_drive_emergency_a_drive_may_take_a_second_to_leave_its_fault(
-    seconds: float, leaves: bool
-) -> None:
+def test_drive_emergency_reset_may_take_a_second(seconds: float, leaves: bool) -> None:
     bench = DriveBench().homed()
     bench.after(lambda: bench.insertion.fail(0x7121))
     bench.hold(False)
@@ -259,10 +256,10 @@ def test_drive_emergency_a_drive_may_take_a_second_to_leave_its_fault(
     assert bench.reset().success is leaves
 
 
-def test_drive_emergency_that_only_an_answer_from_before_the_reset_tells_is_over() -> None:
+def test_drive_emergency_in_an_outdated_answer_is_ignored() -> None:
     bench = DriveBench().homed()
-    # It answers with what it sampled at the SYNC before.
-    bench.insertion.tells_late = True
+    # The drive answers with samples of the previous SYNC.
+    bench.insertion.answers_previous_sample = True
     bench.after(lambda: bench.insertion.fail(0x7305))
     bench.hold(False)
     bench.wait(5)
@@ -271,7 +268,7 @@ def test_drive_emergency_that_only_an_answer_from_before_the_reset_tells_is_over
     assert bench.state == "DISABLED", bench.status.fault
 
 
-def test_drive_emergency_between_two_cycles_refuses_a_retraction() -> None:
+def test_drive_emergency_between_cycles_refuses_a_retraction() -> None:
     bench = DriveBench().moving()
     bench.press()
     bench.insertion.fail(0x7305)
@@ -281,7 +278,7 @@ def test_drive_emergency_between_two_cycles_refuses_a_retraction() -> None:
     assert (bench.state, bench.rule) == ("FAULT", "drive_emergency")
 
 
-def test_one_fault_stops_both_a_drive_that_switches_itself_off() -> None:
+def test_one_fault_stops_both_if_a_drive_switches_itself_off() -> None:
     bench = DriveBench().moving()
     bench.after(lambda: setattr(bench.rotation, "state", "disabled"))
     bench.failed("one_fault_stops_both", "went from OPERATION_ENABLED to SWITCH_ON_DISABLED by its")

@@ -1,4 +1,4 @@
-"""Who may let the needle move, and which messages count, named as in docs/safety.md."""
+"""Rules for the hold, named as in docs/safety.md."""
 
 from __future__ import annotations
 
@@ -8,15 +8,12 @@ from collections.abc import Callable
 
 import pytest
 
-from needle_core.messages import HoldState
-from needle_device_driver.supervisor.hold import Hold
-
 from ..ideal_axes import Bench
 
 MS = 1_000_000
 
 
-def says(bench: Bench, words: str) -> str:
+def send_holds(bench: Bench, words: str) -> str:
     """Send holds, `sender/session#count` and + for a press or - for a release; a, no session, next.
 
     Returns
@@ -38,7 +35,7 @@ def enabled() -> Bench:
     return bench
 
 
-def test_hold_to_run_without_it_nothing_begins_and_a_release_discards_the_step() -> None:
+def test_hold_to_run_is_required_and_release_aborts_the_step() -> None:
     bench = enabled()
     bench.step()
     bench.wait(3)
@@ -57,14 +54,12 @@ def test_hold_to_run_without_it_nothing_begins_and_a_release_discards_the_step()
 
 
 @pytest.mark.parametrize(("lifetime", "lives"), [(math.inf, 0.25), (5.0, 0.25), (0.1, 0.1)])
-def test_hold_age_a_message_counts_as_long_as_it_says_and_a_quarter_of_a_second(
-    lifetime: float, lives: float
-) -> None:
+def test_hold_age_limit_and_lifetime_of_a_message(lifetime: float, lives: float) -> None:
     bench = Bench().ready()
     bench.step(0.002, 0.1, 2.0)
     bench.hold(lifetime=lifetime)
     arrival = bench.now
-    for lasts in (bench.supervisor.may_move, bench.supervisor.held):
+    for lasts in (bench.supervisor.may_move, bench.supervisor.is_held):
         assert lasts(arrival + lives)
         assert not lasts(arrival + lives + 1e-6)
     bench.supervisor.drive(0.02, arrival + lives)
@@ -76,18 +71,10 @@ def test_hold_age_a_message_counts_as_long_as_it_says_and_a_quarter_of_a_second(
     assert bench.status.reason == silence
     assert bench.status.watchdog_trips == 1
     bench.now = arrival + lives + 0.001
-    assert says(bench, "+ - +") == "- - a"
+    assert send_holds(bench, "+ - +") == "- - a"
 
 
-@pytest.mark.parametrize("start", [0.0, 0.1, 1e6])
-def test_hold_age_is_told_alike_however_long_the_steady_clock_has_run(start: float) -> None:
-    hold = Hold(0.25)
-    hold.receive(HoldState("a", "", 1, True, 1.0, math.inf), start, counting=True)
-    assert hold.lapse(start + 0.249) == ""
-    assert hold.lapse(start + 0.251) == "no hold message for 0.251 s, limit 0.25 s"
-
-
-def test_hold_age_one_that_lives_for_no_time_is_a_release() -> None:
+def test_hold_age_message_without_lifetime_is_a_release() -> None:
     bench = Bench().ready()
     for lifetime in (0.0, -1.0, math.nan):
         bench.press()
@@ -95,7 +82,7 @@ def test_hold_age_one_that_lives_for_no_time_is_a_release() -> None:
     assert bench.hold(lifetime=1e-9) == "a"
 
 
-def test_hold_age_a_gap_that_no_cycle_saw_counts_all_the_same() -> None:
+def test_hold_age_gap_between_cycles_counts() -> None:
     bench = Bench().ready()
     bench.insertion.position = 0.001
     come_backs: tuple[Callable[[], object], ...] = (
@@ -114,7 +101,7 @@ def test_hold_age_a_gap_that_no_cycle_saw_counts_all_the_same() -> None:
     assert bench.status.watchdog_trips == 0, "nothing moved"
 
 
-def test_hold_age_one_that_fell_silent_pressed_keeps_no_reset_out() -> None:
+def test_hold_age_expired_press_does_not_block_reset() -> None:
     bench = Bench().ready()
     bench.supervisor.fail("test")
     bench.hold()
@@ -129,14 +116,14 @@ def test_hold_age_one_that_fell_silent_pressed_keeps_no_reset_out() -> None:
 
 
 @pytest.mark.parametrize("press_before", ["enable", "reset", "stop", "homing", "disable", "fault"])
-def test_hold_new_press_one_from_before_does_not_count(press_before: str) -> None:
+def test_hold_new_press_earlier_press_does_not_count(press_before: str) -> None:
     bench = Bench()
     bench.insertion.position = 0.0005 * (press_before == "homing")
     bench.homed()
     bench.go(30)
     assert bench.enable().success
     if press_before not in ("enable", "homing"):
-        assert says(bench, "- +") == "- a"
+        assert send_holds(bench, "- +") == "- a"
     if press_before == "reset":
         assert bench.reset().success
     elif press_before == "stop":
@@ -147,20 +134,20 @@ def test_hold_new_press_one_from_before_does_not_count(press_before: str) -> Non
         assert bench.enable().success
     elif press_before == "fault":
         bench.supervisor.fail("test")
-        assert says(bench, "+ -") == "- -"
+        assert send_holds(bench, "+ -") == "- -"
         assert bench.reset().success
         bench.hold()
         assert bench.enable().success
     bench.go(5)
     assert (bench.status.hold_owner, bench.status.speed_scale) == ("", 0.0)
     assert bench.status.press_again == "a"
-    assert says(bench, "-") == "-"
+    assert send_holds(bench, "-") == "-"
     assert bench.status.press_again == ""
-    assert says(bench, "+") == "a"
+    assert send_holds(bench, "+") == "a"
     assert bench.status.press_again == ""
 
 
-def test_hold_new_press_is_asked_of_nobody_who_is_silent_or_presses_beside_the_owner() -> None:
+def test_hold_new_press_is_required_only_of_an_active_press_without_owner() -> None:
     bench = Bench().ready()
     bench.hold(sender="b")
     assert (bench.status.hold_owner, bench.status.press_again) == ("a", "")
@@ -171,33 +158,33 @@ def test_hold_new_press_is_asked_of_nobody_who_is_silent_or_presses_beside_the_o
     assert bench.status.press_again == ""
 
 
-def test_hold_new_press_a_first_press_counts_only_without_a_session() -> None:
+def test_hold_new_press_first_press_counts_only_without_session() -> None:
     bench = enabled()
-    assert says(bench, "b/s+") == "-"
+    assert send_holds(bench, "b/s+") == "-"
     assert bench.rule == "hold_new_press"
     assert bench.status.reason == "hold of 'b/s' does not count (hold_new_press)"
-    assert says(bench, "by_hand+") == "by_hand"
+    assert send_holds(bench, "by_hand+") == "by_hand"
 
 
 def test_hold_one_owner_until_released() -> None:
     bench = enabled()
-    assert says(bench, "a+ b+") == "a a"
+    assert send_holds(bench, "a+ b+") == "a a"
     assert bench.rule == "hold_one_owner"
-    # A press while another has it takes nothing over later; one after a release of its own does.
-    assert says(bench, "b+ a- b+ b- b+") == "a - - - b"
+    # A press beside the owner does not count later; one after an own release does.
+    assert send_holds(bench, "b+ a- b+ b- b+") == "a - - - b"
 
 
-def test_hold_one_owner_sixteen_sources_are_known_unless_they_are_silent() -> None:
+def test_hold_one_owner_remembers_sixteen_sources() -> None:
     bench = enabled()
     others = " ".join(f"s{number}-" for number in range(15))
-    says(bench, f"a- {others}")
+    send_holds(bench, f"a- {others}")
     bench.now += 0.25
-    says(bench, others)
-    assert says(bench, "late+") == "-"
+    send_holds(bench, others)
+    assert send_holds(bench, "late+") == "-"
     assert bench.rule == "hold_one_owner"
     bench.now += 0.001
-    # It takes the place of the one that was silent longest, and of nobody else.
-    assert says(bench, "late+ late- s3+") == "late - s3"
+    # It replaces only the source that was silent longest.
+    assert send_holds(bench, "late+ late- s3+") == "late - s3"
 
 
 # ---- speed --------------------------------------------------------------------------------------
@@ -211,7 +198,7 @@ def test_speed_scale_outside_0_to_1_is_a_release(scale: float) -> None:
     assert bench.rule == "speed_scale"
 
 
-def test_speed_scale_slows_and_0_stands_still() -> None:
+def test_speed_scale_slows_and_0_stops() -> None:
     bench = enabled()
     assert bench.status.speed_scale == 0.0
     bench.hold(scale=0.5)
@@ -222,7 +209,7 @@ def test_speed_scale_slows_and_0_stands_still() -> None:
     bench.go(10, scale=0.0)
     assert bench.insertion.position == pytest.approx(0.0002)
     assert not bench.supervisor.may_move(bench.now)
-    assert not bench.supervisor.held(bench.now)
+    assert not bench.supervisor.is_held(bench.now)
     bench.hold(False)
     assert bench.status.speed_scale == 0.0
 
@@ -233,16 +220,16 @@ def test_speed_scale_slows_and_0_stands_still() -> None:
 def in_session() -> Bench:
     """Return a device that moves by the third message of session `s`."""
     bench = enabled()
-    assert says(bench, "a/s#1- a/s#2- a/s#3+") == "- - a"
+    assert send_holds(bench, "a/s#1- a/s#2- a/s#3+") == "- - a"
     bench.step(0.002, 0.1, 2.0)
     assert bench.state == "MOVING"
     return bench
 
 
-def test_hold_in_order_a_press_that_comes_twice_keeps_nothing_alive_and_is_said_once() -> None:
+def test_hold_in_order_repeated_press_extends_nothing() -> None:
     bench = in_session()
     for _ in range(20):
-        says(bench, "a/s#3+")
+        send_holds(bench, "a/s#3+")
         bench.wait()
     assert bench.state == "HOLDING"
     assert bench.outcomes[-1].startswith("aborted: no hold message")
@@ -251,51 +238,51 @@ def test_hold_in_order_a_press_that_comes_twice_keeps_nothing_alive_and_is_said_
     assert rules == ["hold_in_order", "hold_age"]
 
 
-def test_hold_in_order_what_was_overtaken_changes_nothing() -> None:
+def test_hold_in_order_overtaken_message_changes_nothing() -> None:
     bench = in_session()
-    says(bench, "a/s#5+ a/s#4-")
+    send_holds(bench, "a/s#5+ a/s#4-")
     assert bench.state == "MOVING"
-    assert says(bench, "a/s#7- a/s#6+ a/s#7+") == "- - -"
+    assert send_holds(bench, "a/s#7- a/s#6+ a/s#7+") == "- - -"
     assert bench.outcomes == ["aborted: hold released"]
     assert (bench.status.press_again, bench.status.holds_ignored) == ("", 3)
-    assert says(bench, "a/s#8+") == "a"
-    # A release that comes late lets no press count that was there before the stop.
+    assert send_holds(bench, "a/s#8+") == "a"
+    # After a late release, a press from before the stop does not count.
     bench.supervisor.stop()
-    assert says(bench, "a/s#10+ a/s#9- a/s#11+") == "- - -"
+    assert send_holds(bench, "a/s#10+ a/s#9- a/s#11+") == "- - -"
 
 
 @pytest.mark.parametrize("later", ["t", ""])
-def test_hold_in_order_a_new_session_takes_the_place_of_the_one_before_for_good(later: str) -> None:
+def test_hold_in_order_new_session_ends_the_previous(later: str) -> None:
     bench = in_session()
-    assert says(bench, f"a/{later}#1+") == "-"
+    assert send_holds(bench, f"a/{later}#1+") == "-"
     assert bench.outcomes == ["aborted: hold released"]
     assert bench.rule == "hold_new_press"
-    # It must send a release first.
-    assert says(bench, f"a/{later}#2+ a/{later}#3- a/{later}#4+") == "- - a"
-    assert says(bench, "a/s#4- a/s#5+ a/s#100- a/s#101+") == "a a a a"
+    # The new session must release first.
+    assert send_holds(bench, f"a/{later}#2+ a/{later}#3- a/{later}#4+") == "- - a"
+    assert send_holds(bench, "a/s#4- a/s#5+ a/s#100- a/s#101+") == "a a a a"
     assert bench.status.holds_ignored == 4
-    assert says(bench, f"a/{later}#5- a/s#102- a/s#103+") == "- - -"
+    assert send_holds(bench, f"a/{later}#5- a/s#102- a/s#103+") == "- - -"
 
 
-def test_hold_in_order_sixteen_sessions_are_remembered_of_each_source() -> None:
+def test_hold_in_order_remembers_sixteen_sessions_per_source() -> None:
     bench = in_session()
-    says(bench, " ".join(f"a/t{number}#1-" for number in range(16)))
-    assert says(bench, "a/s#100- a/s#101+") == "- -"
-    # With a seventeenth the first is forgotten; another source's session is another one.
-    assert says(bench, "a/t16#1- a/s#1- a/s#2+ b/s#1- b/t#1- a/s#3+") == "- - a a a a"
+    send_holds(bench, " ".join(f"a/t{number}#1-" for number in range(16)))
+    assert send_holds(bench, "a/s#100- a/s#101+") == "- -"
+    # The seventeenth replaces the first; sessions of another source are separate.
+    assert send_holds(bench, "a/t16#1- a/s#1- a/s#2+ b/s#1- b/t#1- a/s#3+") == "- - a a a a"
 
 
 # ---- what a reset lets in again -----------------------------------------------------------------
 
 
-def test_hold_in_order_a_reset_lets_in_a_source_without_session_that_was_ahead() -> None:
+def test_hold_in_order_reset_accepts_lower_stamps_without_session() -> None:
     bench = enabled()
-    says(bench, f"#{10**18}- b/s#10- - +")
+    send_holds(bench, f"#{10**18}- b/s#10- - +")
     assert bench.rule == "hold_in_order"
     assert bench.status.reason.endswith("(hold_in_order); device/reset ends this")
     assert bench.reset().success
-    # But no earlier message of a session.
-    assert says(bench, "- + - b/s#8- b/s#9+") == "- a - - -"
+    # Earlier messages of a session stay rejected.
+    assert send_holds(bench, "- + - b/s#8- b/s#9+") == "- a - - -"
     assert bench.status.holds_ignored == 4
 
 
@@ -306,7 +293,7 @@ def back_to(bench: Bench, ros_ns: int) -> None:
 
 
 @pytest.mark.parametrize("back_ns", [3_600_000_000_000, 1_000_000_000])
-def test_command_newer_a_reset_lets_commands_in_after_time_went_back(back_ns: int) -> None:
+def test_command_newer_reset_accepts_commands_after_time_went_back(back_ns: int) -> None:
     bench = Bench()
     back_to(bench, 2 * back_ns)
     bench.ready()
@@ -323,11 +310,11 @@ def test_command_newer_a_reset_lets_commands_in_after_time_went_back(back_ns: in
     assert bench.state == "MOVING"
 
 
-def test_command_newer_tells_of_time_that_went_back_only_where_it_did() -> None:
+def test_command_newer_hint_on_time_that_went_back() -> None:
     bench = Bench().ready()
     last = bench.step()
     bench.go(25)
-    # As far as a stamp may be ahead of its arrival it is no time that went back.
+    # Within the tolerated lead, time did not go back.
     for back_ns, told in ((-MS, False), (0, False), (100 * MS, False), (100 * MS + 1, True)):
         bench.supervisor.note_time(last - back_ns, bench.now)
         bench.step(stamp_ns=last)
@@ -335,7 +322,7 @@ def test_command_newer_tells_of_time_that_went_back_only_where_it_did() -> None:
         assert ("ROS time went back" in bench.outcomes[-1]) is told, back_ns
 
 
-def test_command_newer_no_stamp_is_used_twice_though_time_went_back() -> None:
+def test_command_newer_stamps_are_used_once() -> None:
     bench = Bench().ready()
     used = bench.step()
     bench.go(2)

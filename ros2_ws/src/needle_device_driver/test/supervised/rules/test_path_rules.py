@@ -1,4 +1,4 @@
-"""Paths: several points, replaced without a stop, at rest at their end; named as in safety.md."""
+"""Rules for paths, named as in docs/safety.md."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def straight(bench: Bench) -> int:
     return path(bench, (0.0, 0.0), (1.0, 0.0), (2.0, 0.0))
 
 
-def test_coordinated_a_path_is_gone_through_its_knots_at_its_speed() -> None:
+def test_coordinated_path_passes_its_knots_at_its_speed() -> None:
     bench = Bench().ready()
     path(bench, (0.0, 0.0), (1.0, 0.3), (2.0, 0.1))
     places = [bench.positions]
@@ -36,12 +36,12 @@ def test_coordinated_a_path_is_gone_through_its_knots_at_its_speed() -> None:
     assert bench.outcomes == ["succeeded"]
 
 
-def test_coordinated_a_path_takes_the_place_of_another_without_a_stop() -> None:
+def test_coordinated_path_replaces_another_without_a_stop() -> None:
     bench = Bench().ready()
     first = path(bench, (0.0, 0.0), (1.0, 0.3), (2.0, 0.3))
     bench.go(4)
     here = bench.positions[0] * 1e3
-    # It began where the needle has been: what is left of its first leg takes its share of time.
+    # It begins behind the needle: the rest of its first leg takes its share of time.
     second = path(bench, (0.1, 0.0), (1.1, -0.2), (here + 2.0, -0.2))
     before = bench.positions
     bench.go()
@@ -52,14 +52,14 @@ def test_coordinated_a_path_takes_the_place_of_another_without_a_stop() -> None:
     while bench.state == "MOVING":
         bench.go()
     assert bench.results == [(first, "replaced"), (second, "succeeded")]
-    # One of its knots may be where the needle is.
+    # A knot may coincide with the needle position.
     bench = Bench().ready()
     path(bench, (-1.0, 0.0), (0.0, 0.2), (1.0, 0.3))
     bench.go(5)
     assert bench.positions == pytest.approx((0.0005, 0.15))
 
 
-def test_forward_only_a_path_that_ends_where_the_needle_is_moves_nothing() -> None:
+def test_forward_only_path_that_ends_at_the_needle_moves_nothing() -> None:
     bench = Bench().ready()
     path(bench, (0.0, 0.0), (0.5, 0.1), (1.0, 0.1))
     bench.go(12)
@@ -73,7 +73,7 @@ def test_forward_only_a_path_that_ends_where_the_needle_is_moves_nothing() -> No
     assert bench.state == "MOVING"
 
 
-def test_forward_only_each_point_is_ahead_of_the_one_before() -> None:
+def test_forward_only_each_point_is_ahead_of_the_previous() -> None:
     bench = Bench().ready()
     bench.submit((0.0, 0.0, 0.0), (0.001, 0.0, 0.2), (0.0009, 0.0, 0.4), (0.0015, 0.0, 0.6))
     why = "insertion 0.9 mm is not ahead of the point before, 1 mm"
@@ -84,13 +84,13 @@ def test_forward_only_each_point_is_ahead_of_the_one_before() -> None:
     bench.refused("forward_only")
 
 
-def test_max_rotation_rate_where_rotation_cannot_follow_insertion_waits() -> None:
+def test_max_rotation_rate_slows_the_insertion() -> None:
     bench = Bench().ready()
     path(bench, (0.0, 0.0), (0.5, 0.4), (0.6, 1.1))
     bench.refused("max_rotation_rate")
     path(bench, (0.0, 0.0), (1.0, 0.5), (2.0, 0.5))
     bench.go(10)
-    # What is left of the first leg, 0.05 mm, is now to be 0.9 rad away.
+    # The rest of the first leg, 0.05 mm, has a rotation of 0.9 rad.
     path(bench, (0.8, -0.4), (1.05, -0.42), (2.0, -0.42))
     for _ in range(5):
         before = bench.positions
@@ -119,7 +119,7 @@ def test_each_piece_of_a_path_is_bounded(
     bench.refused(rule)
 
 
-def test_command_state_a_step_never_takes_the_place_of_a_path_nor_a_path_of_a_step() -> None:
+def test_command_state_step_and_path_do_not_replace_each_other() -> None:
     bench = Bench().ready()
     bench.step()
     bench.go(2)
@@ -133,44 +133,35 @@ def test_command_state_a_step_never_takes_the_place_of_a_path_nor_a_path_of_a_st
     assert bench.state == "MOVING"
 
 
-def test_max_step_length_bounds_how_far_ahead_a_path_ends() -> None:
+def test_max_step_length_bounds_the_end_of_a_path() -> None:
     bench = Bench().ready()
     path(bench, (0.0, 0.0), (1.0, 0.0), (2.0011, 0.0))
     bench.refused("max_step_length")
-    # Beside where they were told to be, the axes rest by their tolerance.
+    # The axes may rest beside their set-points by the tolerance.
     path(bench, (0.001, 0.0), (1.001, 0.0), (2.001, 0.0))
     assert bench.state == "MOVING"
 
 
-def test_tip_age_a_slow_path_ends_when_its_tip_is_too_old() -> None:
+def test_tip_age_ends_a_slow_path() -> None:
     bench = Bench().ready()
     straight(bench)
+    limit = bench.now + 2.0
     bench.go(99, scale=0.05)
+    bench.now = limit
+    bench.hold(scale=0.05)
+    bench.supervisor.drive(PERIOD, limit)
     assert bench.state == "MOVING"
-    bench.go(3, scale=0.05)
+    bench.supervisor.drive(PERIOD, limit + 1e-9)
     assert (bench.state, bench.rule) == ("HOLDING", "tip_age")
-    assert "the tip behind the path is 2.020 s old, limit 2 s" in bench.outcomes[-1]
+    assert "the tip behind the path is 2.000 s old, limit 2 s" in bench.outcomes[-1]
     assert bench.status.watchdog_trips == 1
     at = bench.positions
     bench.go(5)
     assert bench.positions == at
 
 
-def test_tip_age_a_path_goes_on_while_its_tip_is_just_as_old_as_it_may_be() -> None:
-    bench = Bench().ready()
-    straight(bench)
-    too_old = bench.now + 2.0
-    bench.go(99, scale=0.05)
-    bench.now = too_old
-    bench.hold(scale=0.05)
-    bench.supervisor.drive(PERIOD, too_old)
-    assert bench.state == "MOVING"
-    bench.supervisor.drive(PERIOD, too_old + 1e-9)
-    assert (bench.state, bench.rule) == ("HOLDING", "tip_age")
-
-
 @pytest.mark.parametrize("back", [0.3, 3600.0])
-def test_tip_age_a_path_ends_when_time_is_set_back(back: float) -> None:
+def test_tip_age_ends_a_path_when_time_is_set_back(back: float) -> None:
     bench = Bench().ready()
     bench.wait(20)
     bench.press()
@@ -182,7 +173,7 @@ def test_tip_age_a_path_ends_when_time_is_set_back(back: float) -> None:
     assert "ahead of this computer's clock" in bench.outcomes[-1]
 
 
-def test_tip_age_a_path_goes_on_at_any_speed_while_fresh_ones_come() -> None:
+def test_tip_age_path_continues_with_fresh_paths() -> None:
     bench = Bench().ready()
     for _ in range(60):
         here = bench.positions[0] * 1e3
@@ -192,14 +183,14 @@ def test_tip_age_a_path_goes_on_at_any_speed_while_fresh_ones_come() -> None:
     assert bench.positions[0] == pytest.approx(60 * 2 * PERIOD * 0.05 * SPEED)
 
 
-def test_tip_age_a_step_outlives_its_tip() -> None:
+def test_tip_age_does_not_end_a_step() -> None:
     bench = Bench().ready()
     bench.step(0.002, 0.0, 3.0)
     bench.go(150)
     assert bench.outcomes == ["succeeded"]
 
 
-def test_settling_time_begins_anew_with_the_path_that_takes_the_place() -> None:
+def test_settling_time_restarts_with_a_new_path() -> None:
     bench = Bench().ready()
     for end in (1.0, 2.0):
         path(bench, (0.0, 0.0), (0.5, 0.0), (end, 0.0))
@@ -210,7 +201,7 @@ def test_settling_time_begins_anew_with_the_path_that_takes_the_place() -> None:
     assert (bench.state, bench.rule) == ("FAULT", "settling_time")
 
 
-def test_command_form_a_path_that_begins_ahead_of_the_needle_is_refused() -> None:
+def test_command_form_path_must_not_begin_ahead_of_the_needle() -> None:
     bench = Bench().ready()
     for ahead in (0.0011, 1.0):
         path(bench, (ahead, 0.0), (1.1, 0.1), (1.5, 0.1))
@@ -237,7 +228,7 @@ def push(bench: Bench, distance: float) -> None:
     bench.go()
 
 
-def test_coordinated_pushed_by_hand_rotation_follows_the_path_over_the_distance_made() -> None:
+def test_coordinated_rotation_follows_a_pushed_needle() -> None:
     bench = pushed()
     path(bench, (0.0, 0.0), (1.0, 0.3), (2.0, 0.1))
     bench.go()
@@ -256,7 +247,7 @@ def test_coordinated_pushed_by_hand_rotation_follows_the_path_over_the_distance_
     assert "by hand" in bench.retract().message
 
 
-def test_max_rotation_rate_pushed_too_fast_is_said_at_once_and_no_longer_when_it_is_over() -> None:
+def test_max_rotation_rate_reports_a_fast_push_while_it_lasts() -> None:
     bench = pushed()
     path(bench, (0.0, 0.0), (1.0, 0.5), (2.0, 0.5))
     push(bench, 1.5e-3)
@@ -270,7 +261,7 @@ def test_max_rotation_rate_pushed_too_fast_is_said_at_once_and_no_longer_when_it
     assert [notice.rule for notice in bench.notices].count(bench.notices[-1].rule) == 1
 
 
-def test_hold_to_run_pushed_by_hand_without_hold_nothing_turns() -> None:
+def test_hold_to_run_without_hold_a_push_turns_nothing() -> None:
     bench = pushed()
     path(bench, (0.0, 0.0), (1.0, 0.5), (2.0, 0.5))
     bench.go()

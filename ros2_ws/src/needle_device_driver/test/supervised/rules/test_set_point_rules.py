@@ -1,4 +1,4 @@
-"""What a drive may be told to go to, named as in docs/safety.md."""
+"""Rules for set-points, named as in docs/safety.md."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def refused(bench: DriveBench, target: float, rule: Rule, axis: int = 0) -> str:
     return str(caught.value)
 
 
-def test_look_ahead_refuses_a_set_point_that_is_further() -> None:
+def test_look_ahead_refuses_a_farther_set_point() -> None:
     bench = DriveBench().moving()
-    # A cycle's way at 5 mm/s, 1 % and a count.
+    # One cycle at 5 mm/s, plus 1 % and a count.
     at = bench.joint()
     why = "set-point 0.0001011 ahead in a cycle at 0.005/s, at most 0.00010105"
     assert why in refused(bench, at + 2022 / 20e6, Rule.LOOK_AHEAD)
@@ -33,7 +33,7 @@ def test_look_ahead_refuses_a_set_point_that_is_further() -> None:
 
 
 @pytest.mark.parametrize(("speed", "counts"), [(0.0025, 1010), (0.0025025, 1011)])
-def test_look_ahead_has_room_for_one_count_of_rounding(speed: float, counts: int) -> None:
+def test_look_ahead_tolerates_rounding_by_one_count(speed: float, counts: int) -> None:
     bench = DriveBench(max_speed=speed).moving()
     at = bench.joint()
     refused(bench, at + (counts + 2) / 20e6, Rule.LOOK_AHEAD)
@@ -41,15 +41,15 @@ def test_look_ahead_has_room_for_one_count_of_rounding(speed: float, counts: int
 
 
 @pytest.mark.parametrize("left_over", [-90, 90])
-def test_look_ahead_counts_from_the_last_set_point_where_a_motor_rests_beside_it(
+def test_look_ahead_counts_from_the_last_set_point(
     left_over: int,
 ) -> None:
     bench = DriveBench(retraction_speed=0.005).ready()
-    # As much as its tolerance has room for.
+    # Up to the tolerance.
     bench.insertion.left_over, bench.rotation.left_over = left_over, left_over // 10
     bench.go()
     for number in (1, 2):
-        # As far and as fast as may be, from where the last step was to end.
+        # The longest and fastest step, from the last set-point.
         bench.submit((0.002 * number, 1.1999 * number, 0.4))
         bench.go(30)
     assert bench.outcomes == ["succeeded", "succeeded"]
@@ -59,16 +59,16 @@ def test_look_ahead_counts_from_the_last_set_point_where_a_motor_rests_beside_it
     assert abs(bench.insertion.position) <= 100
 
 
-def test_look_ahead_without_further_set_points_the_drive_ends_its_motion() -> None:
+def test_look_ahead_drive_stops_without_new_set_points() -> None:
     bench = DriveBench().moving()
     last = bench.insertion.next_target
     for _ in range(10):
-        # The computer is dead; something else still sends SYNC.
+        # The computer fails while another device sends SYNC.
         bench.insertion.sync()
     assert bench.insertion.position == last
 
 
-def test_look_ahead_an_axis_that_has_not_answered_is_not_sent_on() -> None:
+def test_look_ahead_no_set_point_without_an_answer() -> None:
     bench = DriveBench().moving()
     bench.rotation.syncs = False
     bench.go()
@@ -76,17 +76,16 @@ def test_look_ahead_an_axis_that_has_not_answered_is_not_sent_on() -> None:
     bench.go(2)
     assert (bench.insertion.next_target, bench.rotation.next_target) == waiting
     assert bench.state == "MOVING"
-    # It was but a moment.
     bench.rotation.syncs = True
     bench.go(50)
     assert bench.outcomes == ["succeeded"]
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_following_error_counts_from_the_set_point_that_was_due_also_in_late_answers(
+def test_following_error_uses_the_set_point_of_the_answer(
     late: bool,
 ) -> None:
-    # Half a cycle's way: a position that is a cycle too old would break it.
+    # Half a cycle: a position that is one cycle too old would exceed the bound.
     bench = DriveBench(insertion_following_error=5e-5).ready()
     bench.step(0.001, 0.1, 0.2)
     bench.bus.late = late
@@ -104,11 +103,11 @@ def test_following_error_of_a_blocked_motor() -> None:
     assert bench.insertion.next_target - bench.insertion.position <= 0.7e-3 * 20e6
     bench.failed("following_error", "mm off its set-point")
     bench.insertion.blocked = False
-    # A motor that comes free has no power to go on.
+    # A released motor has no power.
     bench.stopped("following_error", "mm off its set-point")
 
 
-def test_following_error_of_a_motor_that_comes_free_after_the_stop() -> None:
+def test_following_error_of_a_motor_released_after_the_stop() -> None:
     bench = DriveBench().moving()
     bench.insertion.blocked = True
     bench.go(3)
@@ -126,7 +125,7 @@ def test_following_error_of_a_motor_that_comes_free_after_the_stop() -> None:
     bench.steps()
 
 
-def test_following_error_that_a_drive_reports() -> None:
+def test_following_error_reported_by_the_drive() -> None:
     bench = DriveBench().moving()
     bench.rotation.STATES = {**bench.rotation.STATES, "enabled": 0x2237}
     bench.go()
@@ -136,12 +135,12 @@ def test_following_error_that_a_drive_reports() -> None:
 # ---- software limits ----------------------------------------------------------------------------
 
 
-def test_software_limits_in_the_drives_come_with_homing_and_end_when_they_home_again() -> None:
+def test_software_limits_of_the_drives_follow_homing() -> None:
     bench = DriveBench().configured()
 
     def limits() -> list[int]:
         drives = bench.insertion, bench.rotation
-        return [drive.holds(0x607D, sub) for drive in drives for sub in (1, 2)]
+        return [drive.value(0x607D, sub) for drive in drives for sub in (1, 2)]
 
     none = [-(2**31), 2**31 - 1] * 2
     assert limits() == none
@@ -153,7 +152,7 @@ def test_software_limits_in_the_drives_come_with_homing_and_end_when_they_home_a
     assert limits() == none
 
 
-def test_software_limits_in_the_driver_refuse_a_set_point() -> None:
+def test_software_limits_of_the_driver_refuse_a_set_point() -> None:
     bench = DriveBench().ready()
     limits = "outside the drive's limits [-0.001, 0.201]"
     for target in (0.201 + 1e-7, -0.001 - 1e-7):
@@ -163,9 +162,7 @@ def test_software_limits_in_the_driver_refuse_a_set_point() -> None:
 
 
 @pytest.mark.parametrize(("reverse", "at"), [(False, -(2**31)), (True, 2**31 - 1)])
-def test_software_limits_of_an_axis_without_home_are_where_its_counter_ends(
-    reverse: bool, at: int
-) -> None:
+def test_software_limits_without_home_are_the_counter_range(reverse: bool, at: int) -> None:
     bench = DriveBench(insertion_reverse=reverse)
     drive = bench.insertion
     drive.position = drive.target = drive.next_target = at + (-5000 if reverse else 5000)
@@ -178,14 +175,14 @@ def test_software_limits_of_an_axis_without_home_are_where_its_counter_ends(
     assert abs(drive.position - at) < 1000
 
 
-def test_no_motion_by_itself_set_up_enabling_and_reset_leave_a_drive_where_it_is() -> None:
+def test_no_motion_by_itself_on_set_up_enable_and_reset() -> None:
     bench = DriveBench()
-    # Where the drive was left, with a set-point of someone else's.
+    # The drive has an earlier set-point of another program.
     bench.insertion.position, bench.insertion.next_target = 12_345, 99_999
     bench.configured()
     bench.wait(5)
     assert bench.insertion.position == 12_345
-    # Someone turns the motor while it is off.
+    # A person turns the motor while it is off.
     bench.insertion.position = 55_555
     bench.wait()
     assert bench.enable().success

@@ -1,4 +1,4 @@
-"""How fast and how far an axis goes that its drive moves, named as in docs/safety.md."""
+"""Rules for speed and travel of an axis, named as in docs/safety.md."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from needle_device_driver.cia402.axis_speed import SpeedWatch
 from needle_device_driver.cia402.drive_monitor import Feedback
-from needle_device_driver.cia402.homing_run import HomingRun
+from needle_device_driver.cia402.drive_watch import HomingRun, SpeedMonitor
 from needle_device_driver.parameters import DeviceDriverParameters
 
 from ..drive_bench import RAD, DriveBench
@@ -21,7 +20,7 @@ MM_S = 400
 
 
 def until_fault(bench: DriveBench, rule: str) -> str:
-    """Run cycles until there is a fault, of this rule; return its text."""
+    """Run cycles until a fault of this rule; return its text."""
     for _ in range(1000):
         if bench.state == "FAULT":
             break
@@ -29,7 +28,7 @@ def until_fault(bench: DriveBench, rule: str) -> str:
     assert bench.rule == rule
     at = bench.positions
     bench.wait(10)
-    # One that was under way.
+    # Plus the cycle under way.
     assert abs(bench.positions[0] - at[0]) <= 150 * MM_S
     return bench.status.fault
 
@@ -38,7 +37,7 @@ def until_fault(bench: DriveBench, rule: str) -> str:
 
 
 @pytest.mark.parametrize("mm_s", [-150.0, 150.0, -3.55])
-def test_axis_speed_a_homing_that_is_too_fast_is_stopped_in_two_cycles(mm_s: float) -> None:
+def test_axis_speed_stops_a_fast_homing_in_two_cycles(mm_s: float) -> None:
     bench = DriveBench()
     way = round(mm_s * MM_S)
     bench.insertion.searches(forever=way)
@@ -53,13 +52,13 @@ def test_axis_speed_a_homing_that_is_too_fast_is_stopped_in_two_cycles(mm_s: flo
     assert (bench.state, stops) == ("FAULT", [0x201, 0x202])
     text = f"insertion axis: moves at {abs(mm_s):.4g} mm/s, at most 3.5 mm/s where 2 mm/s are comm"
     assert text in until_fault(bench, "axis_speed")
-    # Two cycles that are seen, one that was under way.
+    # Two observed cycles, plus the cycle under way.
     assert abs(bench.insertion.position) == 3 * abs(way)
     assert bench.insertion.state == bench.rotation.state == "disabled"
     assert bench.reset().success
 
 
-def test_axis_speed_a_homing_at_its_speed_goes_on_also_where_answers_are_lost() -> None:
+def test_axis_speed_allows_homing_with_lost_answers() -> None:
     for mm_s, loses, state in ((-3.45, 0, "MOVING"), (-2.0, 1, "MOVING"), (-20.0, 1, "FAULT")):
         bench = DriveBench()
         bench.insertion.searches(forever=round(mm_s * MM_S))
@@ -71,11 +70,11 @@ def test_axis_speed_a_homing_at_its_speed_goes_on_also_where_answers_are_lost() 
         assert bench.state == state, bench.status.fault
 
 
-def test_axis_speed_a_drive_that_counts_anew_at_its_home_is_not_fast() -> None:
+def test_axis_speed_ignores_the_new_zero_at_home() -> None:
     bench = DriveBench()
     bench.insertion.position = 1_234_567
     bench.homed()
-    # A homing whose end comes later than its new count, as where the edge is latched.
+    # The homing ends after its new zero, as with a latched edge.
     bench.insertion.position = 500_000
     bench.wait(5)
     bench.insertion.searches(*[-2 * MM_S] * 20, -2_000_000, *[MM_S // 2] * 20)
@@ -95,10 +94,10 @@ def test_axis_speed_of_the_rotation_axis() -> None:
     assert "rotation axis: moves at 1.611 rad/s, at most 1.6 rad/s" in bench.status.fault
 
 
-def test_axis_speed_an_axis_that_drifts_while_nothing_is_commanded() -> None:
+def test_axis_speed_of_a_drifting_axis() -> None:
     for mm_s, state in ((0.49, "HOLDING"), (0.51, "FAULT")):
         bench = DriveBench().ready()
-        # What was commanded before fades.
+        # The earlier commanded speed decays.
         bench.go(60)
         for _ in range(4):
             bench.insertion.left_over += round(mm_s * MM_S)
@@ -107,7 +106,7 @@ def test_axis_speed_an_axis_that_drifts_while_nothing_is_commanded() -> None:
 
 
 @pytest.mark.parametrize("drive", ["motor", "hand"])
-def test_axis_speed_an_axis_that_is_off_or_that_a_hand_moves_is_not_judged(drive: str) -> None:
+def test_axis_speed_ignores_axes_without_power_or_motor(drive: str) -> None:
     bench = DriveBench(insertion_drive=drive).configured()
     for _ in range(20):
         bench.insertion.position += 100 * MM_S
@@ -116,17 +115,17 @@ def test_axis_speed_an_axis_that_is_off_or_that_a_hand_moves_is_not_judged(drive
 
 
 class Answers:
-    """Feedback of an axis that goes at a speed, by the time of each answer."""
+    """Feedback of an axis at a speed."""
 
     def __init__(self) -> None:
         settings = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
-        self.watch = SpeedWatch(settings, PERIOD)
+        self.watch = SpeedMonitor(settings, PERIOD)
         self.at = Feedback(0, 0, 0, 0, 0, 0)
 
     def answer(
         self, mm: float, syncs: int = 1, numbers: int = 1, seconds: float = PERIOD, to: float = 2e-3
     ) -> bool:
-        """Return whether the next answer is plausible, where a speed is commanded [m/s]."""
+        """Return whether the next answer is plausible at a commanded speed [m/s]."""
         before = self.at
         self.at = dataclasses.replace(
             before,
@@ -136,45 +135,45 @@ class Answers:
             time=before.time + seconds,
         )
         self.watch.command(to)
-        return self.watch.judge(before, self.at, powered=True)
+        return self.watch.check(before, self.at, powered=True)
 
 
-def test_axis_speed_is_judged_by_elapsed_sync_periods() -> None:
+def test_axis_speed_uses_elapsed_sync_periods() -> None:
     for syncs, numbers, seconds, periods in (
-        # Jitter of an answer counts for nothing, that of a SYNC by half its period.
+        # Jitter of an answer is ignored, that of a SYNC up to half a period.
         (1, 1, 0.001, 1),
         (1, 1, 0.029, 1),
         (1, 1, 0.031, 2),
-        # A SYNC that was not answered; two answers after one SYNC; a driver that stood still.
+        # An unanswered SYNC; two answers after one SYNC; a stalled driver.
         (2, 1, 0.040, 2),
         (1, 2, 0.020, 2),
         (0, 1, 0.005, 1),
         (1, 1, 0.100, 5),
-        # A simulation that is faster than its time.
+        # A simulation faster than real time.
         (3, 1, 0.001, 3),
     ):
         answers = Answers()
         bound = 3.5 * PERIOD * periods
         for share, plausible in ((0.99, True), (1.01, False), (-1.01, False)):
             assert answers.answer(share * bound, syncs, numbers, seconds) is plausible
-        assert answers.watch.trouble
+        assert answers.watch.problem
 
 
-def test_axis_speed_once_too_fast_is_forgiven_and_what_was_commanded_fades() -> None:
+def test_axis_speed_tolerates_one_fast_cycle() -> None:
     answers = Answers()
     for mm in (1.0, 0.04) * 5:
         answers.answer(mm)
-        assert not answers.watch.trouble
-    # Ten cycles are a time constant: 0.5 mm/s, and 3 mm/s that fade.
+        assert not answers.watch.problem
+    # Ten cycles are a time constant: 0.5 mm/s, and 3 mm/s that decay.
     for _ in range(10):
         answers.answer(0.0, to=0.0)
     assert answers.answer((0.5 + 3.0 * math.exp(-1.1)) * PERIOD - 1e-4, to=0.0)
     assert not answers.answer((0.5 + 3.0 * math.exp(-1.2)) * PERIOD + 1e-4, to=0.0)
     for mm in (1.0, 1.0):
         answers.answer(mm, to=0.0)
-    assert "moves at" in answers.watch.trouble
-    answers.watch.forget()
-    assert answers.watch.trouble == ""
+    assert "moves at" in answers.watch.problem
+    answers.watch.reset()
+    assert answers.watch.problem == ""
     assert not answers.answer(0.51 * PERIOD, to=0.0)
 
 
@@ -185,41 +184,41 @@ def test_axis_speed_once_too_fast_is_forgiven_and_what_was_commanded_fades() -> 
     ("parameters", "most_mm"),
     [
         ({}, 12.0),
-        # A screw of 1 mm, that the drive tells or the parameter; a method without index pulse.
+        # A screw of 1 mm, from the drive or the parameter; a method without index pulse.
         ({"insertion_homing_method": 1}, 13.0),
         ({"insertion_homing_method": 33}, 13.0),
         ({"insertion_homing_method": 2, "insertion_counts_per_turn": 40_000.0}, 14.0),
         ({"insertion_homing_method": 20}, 12.0),
     ],
 )
-def test_homing_time_an_axis_goes_no_farther_than_its_own_travel_and_a_fifth(
+def test_homing_time_bounds_the_distance_by_the_travel(
     parameters: dict[str, Any], most_mm: float
 ) -> None:
     bench = DriveBench(max_depth=0.01, **parameters)
-    bench.insertion.tells({(0x608F, 1): 20_000, (0x608F, 2): 1})
+    bench.insertion.set_objects({(0x608F, 1): 20_000, (0x608F, 2): 1})
     bench.insertion.searches(forever=-3 * MM_S)
     bench.homing()
     text = f"without finding its home, at most {most_mm:.4g} mm"
     assert text in until_fault(bench, "homing_time")
-    # One cycle to see it, one that was under way.
+    # One observed cycle, plus the cycle under way.
     assert most_mm < abs(bench.insertion.position) / 2e4 <= most_mm + 2 * 0.06
 
 
 @pytest.mark.parametrize(("method", "switch"), [(17, 1), (18, 2)])
-def test_homing_time_a_drive_that_goes_away_from_its_switch_is_stopped(
+def test_homing_time_stops_a_drive_that_moves_away_from_its_switch(
     method: int, switch: int
 ) -> None:
     away = 1 if method == 17 else -1
     for reverse in (False, True):
         bench = DriveBench(insertion_homing_method=method, insertion_reverse=reverse)
         bench.insertion.searches(forever=away * 2 * MM_S)
-        # Its other switches say nothing about this one.
+        # The other switches do not matter.
         bench.insertion.inputs = 7 - switch
         bench.homing()
         text = f"away from the limit switch of homing method {method}"
         assert text in until_fault(bench, "homing_time")
         assert 10_000 < abs(bench.insertion.position) <= 10_000 + 3 * MM_S, "0.5 mm, two cycles"
-    # Off its switch it goes the other way; one that tells no switches is not judged.
+    # Off its switch the axis moves the other way; a drive without inputs is not checked.
     for tells in (True, False):
         bench = DriveBench(insertion_homing_method=method)
         if not tells:
@@ -235,18 +234,16 @@ def test_homing_time_a_drive_that_goes_away_from_its_switch_is_stopped(
 
 
 @pytest.mark.parametrize(("counts", "is_away"), [(1, True), (-1, False)])
-def test_homing_time_a_count_is_away_from_the_switch_where_it_is_more_than_the_bound(
-    counts: int, is_away: bool
-) -> None:
+def test_homing_time_tolerance_of_the_direction(counts: int, is_away: bool) -> None:
     settings = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
     settings = dataclasses.replace(settings, counts_per_unit=1000.0)
-    homing = HomingRun(settings, 0.002, switches=True)
+    homing = HomingRun(settings, 0.002, has_inputs=True)
     for position in (0, counts):
         homing.update(Feedback(1, 0x0237, 6, 0, position, 0), position)
-    assert ("went 1 mm away from the limit switch" in homing.trouble) is is_away
+    assert ("went 1 mm away from the limit switch" in homing.problem) is is_away
 
 
-def test_homing_time_a_drive_that_reports_a_failure_has_no_other_name() -> None:
+def test_homing_time_is_not_the_rule_of_a_reported_failure() -> None:
     bench = DriveBench()
     bench.insertion.searches()
     bench.homing()

@@ -1,4 +1,4 @@
-"""What ends every motion, named as in docs/safety.md."""
+"""Rules that end every motion, named as in docs/safety.md."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from ..ideal_axes import Bench
 
 
-def test_estop_latches_until_released_hold_off_and_reset() -> None:
+def test_estop_latches_until_hold_release_and_reset() -> None:
     bench = Bench().moving()
     at = bench.positions
     bench.supervisor.receive_estop(True)
@@ -53,12 +53,12 @@ def test_estop_latches_from_every_state(state: str) -> None:
     assert bench.state == ("UNCONFIGURED" if state == "UNCONFIGURED" else "DISABLED")
 
 
-def test_one_device_stops_and_refuses_everything_until_it_is_alone_and_reset() -> None:
+def test_one_device_refuses_everything_until_the_conflict_ends() -> None:
     bench = Bench().moving()
     supervisor, other = bench.supervisor, "another device is there: /sim_rig"
     at = bench.positions
-    supervisor.see_others(other)
-    supervisor.see_others(other)
+    supervisor.report_conflicting_device(other)
+    supervisor.report_conflicting_device(other)
     assert (bench.state, bench.rule) == ("FAULT", "one_device")
     assert bench.outcomes == [f"aborted: {other}"]
     assert supervisor.stops == 1
@@ -74,14 +74,14 @@ def test_one_device_stops_and_refuses_everything_until_it_is_alone_and_reset() -
     ):
         assert not reply.success
     assert bench.reset().message == other
-    supervisor.see_others("")
+    supervisor.report_conflicting_device("")
     assert bench.state == "FAULT"
     assert bench.reset().success
     assert bench.positions == at
-    # Whoever said that a needle is out may have meant the other's.
+    # The confirmation may have been meant for the other device.
     supervisor.confirm_needle_out(True)
-    supervisor.see_others(other)
-    supervisor.see_others("")
+    supervisor.report_conflicting_device(other)
+    supervisor.report_conflicting_device("")
     assert bench.reset().success
     assert "confirm first" in bench.run(supervisor.home(bench.now)).message
 
@@ -110,14 +110,14 @@ def test_one_fault_stops_both(which: str, change: dict[str, Any], text: str) -> 
     assert [str(notice) for notice in faults] == [f"{text.format(which)} [one_fault_stops_both]"]
     assert bench.outcomes == [f"aborted: {text.format(which)}"]
     assert other.orders[-2:] == ["stop", "off"]
-    # What was ordered before the fault showed: one period at most.
+    # At most the motion of one period, ordered before the fault.
     at = other.position
     assert abs(at - before) <= {"insertion": 1e-3, "rotation": 2e-5}[which] + 1e-9
     bench.go(10)
     assert other.position == at
 
 
-def test_one_fault_stops_both_while_nothing_moves_and_needs_no_home() -> None:
+def test_one_fault_stops_both_without_motion_or_home() -> None:
     bench = Bench().ready()
     bench.insertion.homed = False
     bench.go()
@@ -140,7 +140,7 @@ def test_one_fault_stops_both_while_nothing_moves_and_needs_no_home() -> None:
 
 
 @pytest.mark.parametrize("which", ["insertion", "rotation"])
-def test_reply_age_a_silent_axis_is_a_fault_and_hides_the_joints(which: str) -> None:
+def test_reply_age_silent_axis_is_a_fault_without_joints(which: str) -> None:
     bench = Bench().moving()
     axis = bench.axis(which)
     axis.silent_since = bench.now
@@ -201,7 +201,7 @@ def test_disable_and_close_end_a_motion() -> None:
     assert bench.run(bench.supervisor.deconfigure()).message == "the device is FAULT"
 
 
-def test_configuration_that_fails_is_a_fault_with_the_reason() -> None:
+def test_failed_configuration_is_a_fault() -> None:
     bench = Bench()
     bench.insertion.unplugged = True
     assert bench.configure().message == "insertion: no link"

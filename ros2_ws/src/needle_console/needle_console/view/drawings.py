@@ -1,4 +1,7 @@
-"""The chart of r1 over depth, as an SVG: a page's hold must not wait for a chart's library."""
+"""SVG drawings: chart of r1 over depth, dial of the rotation.
+
+They need no library in the browser, whose load could delay the hold.
+"""
 
 from __future__ import annotations
 
@@ -9,26 +12,26 @@ import numpy as np
 
 from needle_console.view.snapshot import Snapshot
 
-# Of Okabe and Ito's palette: told apart by whoever does not tell red from green.
+# Of Okabe and Ito's palette, which suits red-green colour blindness.
 BLUE, ORANGE, GREY = "#0072b2", "#e69f00", "#8a8f98"
 GOAL_MM = 1.0
 _MM = 1e3
 _DEFAULT_DEPTH_MM = 120.0
-# The picture and its frame, in its own units: pixels at 1280x720.
+# Chart and frame in pixels at 1280x720.
 _WIDTH, _HEIGHT = 460.0, 290.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 446.0, 26.0, 252.0
 _TICKS_ACROSS, _TICKS_UP = 6, 6
 
 
 class _Frame:
-    """Places depths and distances [mm] in the picture, and marks them along its edges.
+    """Axes of the chart: pixel coordinates of depths and distances [mm], and the grid.
 
     Parameters
     ----------
     depth : float
-        Of the right edge [mm]; the left one is the entry.
+        Depth at the right edge [mm]; at the left edge it is 0.
     limit : float
-        Distance of the upper edge, and below 0 of the lower one [mm].
+        Distance at the upper edge; at the lower one it is negative [mm].
     """
 
     def __init__(self, depth: float, limit: float) -> None:
@@ -62,14 +65,14 @@ class _Frame:
 
 
 def chart(snapshot: Snapshot) -> str:
-    """Return an SVG: r1 as a line, twice its sigma as a band, the goal as two dashed lines.
+    """Return the chart: r1 as a line, 2 sigma as a band, the goal as two dashed lines.
 
     Parameters
     ----------
     snapshot : Snapshot
-        The rig; mm in the chart.
+        State of the rig.
     """
-    rows = [(p.depth * _MM, p.r1 * _MM, 2.0 * p.sigma * _MM) for p in snapshot.course]
+    rows = [(p.depth * _MM, p.r1 * _MM, 2.0 * p.sigma * _MM) for p in snapshot.track]
     limit = max([1.5 * GOAL_MM, *(1.1 * (abs(r1) + half) for _, r1, half in rows)])
     controller = snapshot.controller
     depth = None if controller is None else controller.depth_m
@@ -109,7 +112,7 @@ def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
 
 
 def _ticks(begin: float, end: float, most: int) -> Iterable[float]:
-    """Return round numbers within two bounds, as many as there is room for."""
+    """Return round numbers within two bounds, at most about `most`."""
     rough = (end - begin) / most
     decade = 10.0 ** math.floor(math.log10(rough))
     step = decade * next(digit for digit in (1.0, 2.0, 5.0, 10.0) if digit * decade >= rough)
@@ -117,5 +120,28 @@ def _ticks(begin: float, end: float, most: int) -> Iterable[float]:
 
 
 def _round_up(limit: float) -> float:
-    """Return an even limit, so that the axis does not move with every point."""
+    """Return the next even limit, so that the axis does not change with every point."""
     return 2.0 * math.ceil(0.5 * limit)
+
+
+def dial(rotation: float) -> str:
+    """Return a dial with a pointer: up at 0, clockwise as seen from behind the needle.
+
+    Parameters
+    ----------
+    rotation : float
+        Of the base [rad]; NaN draws no pointer.
+    """
+    pointer = ""
+    if math.isfinite(rotation):
+        x, y = 24.0 + 18.0 * math.sin(rotation), 24.0 - 18.0 * math.cos(rotation)
+        pointer = (
+            f'<line x1="24" y1="24" x2="{x:.2f}" y2="{y:.2f}" stroke="{BLUE}" stroke-width="4" '
+            'stroke-linecap="round"/>'
+        )
+    return (
+        '<svg viewBox="0 0 48 48" width="48" height="48" aria-hidden="true">'
+        f'<circle cx="24" cy="24" r="21" fill="none" stroke="{GREY}" stroke-width="2"/>'
+        f'<line x1="24" y1="1" x2="24" y2="8" stroke="{GREY}" stroke-width="2"/>'
+        f"{pointer}</svg>"
+    )

@@ -1,6 +1,10 @@
-"""Camera views with tip and shaft drawn in, as JPEG."""
+"""Camera views with tip, shaft and target, as JPEG; drawn only on request."""
 
 from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Mapping
 
 import cv2
 import numpy as np
@@ -8,6 +12,12 @@ from numpy.typing import NDArray
 
 from needle_console.view.snapshot import Array, Snapshot
 from needle_tracker.optics.refraction import RefractedCamera
+
+SIDES = ("left", "right")
+# Shortest period between two drawings of a view [s].
+PERIOD = 0.1
+# A view is not shown if its image is older [s].
+_MAX_AGE = 2.0
 
 Image = NDArray[np.uint8]
 # BGR, of Okabe and Ito's palette.
@@ -17,17 +27,59 @@ _QUALITY = 80
 _SUB_BITS = 4
 
 
+class CameraView:
+    """Views of both cameras; any thread may call the methods.
+
+    All times are steady [s].
+
+    Parameters
+    ----------
+    cameras : mapping of str to RefractedCamera
+        By side; without its camera a side is shown without the needle.
+    snapshot : callable
+        Returns the newest state of the rig.
+    """
+
+    def __init__(
+        self, cameras: Mapping[str, RefractedCamera], snapshot: Callable[[], Snapshot]
+    ) -> None:
+        self._cameras = cameras
+        self._snapshot = snapshot
+        self._lock = threading.Lock()
+        self._images: dict[str, tuple[Image, float]] = {}
+        self._jpegs: dict[str, tuple[bytes, float]] = {}
+
+    def set_image(self, side: str, image: Image, now: float) -> None:
+        """Set the newest image of a side, grey, shape (height, width)."""
+        with self._lock:
+            self._images[side] = image, now
+
+    def jpeg(self, side: str, now: float) -> bytes | None:
+        """Return the newest view of a side as JPEG; None without a recent image."""
+        with self._lock:
+            image, arrival = self._images.get(side, (None, -math.inf))
+            if image is None or now - arrival > _MAX_AGE:
+                return None
+            jpeg, drawn = self._jpegs.get(side, (b"", -math.inf))
+        if now - drawn < PERIOD:
+            return jpeg
+        jpeg = draw_view(image, self._snapshot(), self._cameras.get(side))
+        with self._lock:
+            self._jpegs[side] = jpeg, now
+        return jpeg
+
+
 def draw_view(image: Image, snapshot: Snapshot, camera: RefractedCamera | None) -> bytes:
-    """Return a camera's view with the needle drawn in.
+    """Return a camera image with the needle drawn into it.
 
     Parameters
     ----------
     image : ndarray of uint8, shape (height, width)
-        As the camera sent it.
+        The camera image.
     snapshot : Snapshot
-        Tip, shaft and target point.
+        With tip, shaft and target point.
     camera : RefractedCamera or None
-        Where points are seen; None: nothing is drawn in, as where the image has another size.
+        Projects the points; without it, or for another image size, nothing is drawn.
 
     Returns
     -------
@@ -63,13 +115,13 @@ def _draw_needle(picture: Image, snapshot: Snapshot, camera: RefractedCamera, sc
 
 
 def _pixels(points: Array, scale: float) -> NDArray[np.int32]:
-    """Return pixel coordinates in OpenCV's fixed point, kept where its arithmetic holds them."""
+    """Return pixel coordinates in OpenCV's fixed point, clipped to its range."""
     scaled = (np.nan_to_num(points, nan=-1.0) + 0.5) * scale - 0.5
     bounded = np.clip(scaled, -1e4, 1e4) * (1 << _SUB_BITS)
     return np.asarray(np.rint(bounded), np.int32)
 
 
 def _mark(picture: Image, at: NDArray[np.int32], kind: int) -> None:
-    where = (int(at[0]) >> _SUB_BITS, int(at[1]) >> _SUB_BITS)
+    position = (int(at[0]) >> _SUB_BITS, int(at[1]) >> _SUB_BITS)
     for colour, thickness in ((_WHITE, 4), (_ORANGE, 2)):
-        cv2.drawMarker(picture, where, colour, kind, 18, thickness, cv2.LINE_AA)
+        cv2.drawMarker(picture, position, colour, kind, 18, thickness, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""The rules of the console's hold (docs/safety.md): whose press counts, and until when."""
+"""Rules of the console's hold (docs/safety.md)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,8 @@ from collections.abc import Callable
 import pytest
 
 from hold_scene import Scene
-from needle_console.hold.hold_arbiter import IDLE, OTHER_PAGE, SILENCE
-from needle_console.hold.hold_state import RELEASED, HoldState, Mode
-from needle_console.hold.hold_talk import PERIOD
-from needle_console.hold.page_session import ECHO_AGE_LIMIT
-from needle_console.hold.refusals import Refusal
+from needle_console.hold.hold_protocol import IDLE, OTHER_PAGE, PERIOD, SILENCE
+from needle_console.hold.page_session import ECHO_AGE_LIMIT, RELEASED, HoldRefusal, Mode, PageHold
 
 STALLED = "no echo from this page for 0.25 s (browser, network or console stalled)"
 JUST = 1e-6
@@ -29,22 +26,20 @@ def page(scene: Scene) -> int:
     return scene.page()
 
 
-def test_a_press_after_a_release_counts_with_its_speed_and_mode(scene: Scene, page: int) -> None:
-    assert scene.say(page, True) is Refusal.NEW_PRESS
-    assert scene.arbiter.state(scene.now) == RELEASED
+def test_press_after_a_release_counts(scene: Scene, page: int) -> None:
+    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
+    assert scene.protocol.state(scene.now) == RELEASED
     assert scene.say(page, False) is None
     assert scene.say(page, True, speed=0.25, mode="retract") is None
-    assert scene.arbiter.state(scene.now) == HoldState(True, 0.25, Mode.RETRACT)
+    assert scene.protocol.state(scene.now) == PageHold(True, 0.25, Mode.RETRACT)
     assert scene.say(page, True, speed=0.75, mode="retract") is None
-    assert scene.arbiter.state(scene.now).speed == 0.75
+    assert scene.protocol.state(scene.now).speed == 0.75
     assert scene.say(page, False) is None
-    assert scene.arbiter.state(scene.now) == RELEASED
+    assert scene.protocol.state(scene.now) == RELEASED
 
 
-def test_a_hold_goes_on_while_it_is_confirmed_and_ends_with_silence(
-    scene: Scene, page: int
-) -> None:
-    # The bound of docs/safety.md: 300 ms, transport and the device's cycle included.
+def test_hold_lasts_while_echoed_and_ends_with_silence(scene: Scene, page: int) -> None:
+    # docs/safety.md: 300 ms, including transport and a device cycle.
     assert ECHO_AGE_LIMIT + PERIOD < 0.3
     scene.press(page)
     for _ in range(20):
@@ -53,28 +48,25 @@ def test_a_hold_goes_on_while_it_is_confirmed_and_ends_with_silence(
         assert scene.say(page, True) is None
     scene.wait(ECHO_AGE_LIMIT + JUST)
     assert not scene.pressed
-    assert scene.arbiter.lapses(scene.now)
-    assert not scene.arbiter.lapses(scene.now)
-    # The finger that is still there counts for nothing, and the first reason stays.
+    # A continued press does not count, and the first reason stays.
     for _ in range(10):
-        assert scene.say(page, True) is Refusal.NEW_PRESS
+        assert scene.say(page, True) is HoldRefusal.NEW_PRESS
         assert not scene.pressed
-        assert scene.arbiter.tell(page, scene.now)["why"] == STALLED
+        assert scene.message_to(page)["why"] == STALLED
         scene.wait(PERIOD)
+    assert scene.protocol.counts()["hold lost"] == 1
     scene.press(page)
-    assert scene.arbiter.tell(page, scene.now)["why"] == ""
+    assert scene.message_to(page)["why"] == ""
 
 
-def test_a_hold_counts_from_when_its_count_was_sent_however_late_the_echo(
-    scene: Scene, page: int
-) -> None:
+def test_hold_age_counts_from_the_sent_count(scene: Scene, page: int) -> None:
     scene.press(page)
     begin, held_up = scene.now, []
     while scene.now + PERIOD < begin + ECHO_AGE_LIMIT:
         scene.wait(PERIOD)
         held_up.append((scene.message(page, True), scene.now))
     for data, _ in held_up:
-        assert scene.arbiter.receive(page, data, scene.now) is None
+        assert scene.protocol.receive(page, data, scene.now) is None
     _, last = held_up[-1]
     scene.wait(last + ECHO_AGE_LIMIT - JUST - scene.now)
     assert scene.pressed
@@ -84,7 +76,7 @@ def test_a_hold_counts_from_when_its_count_was_sent_however_late_the_echo(
 
 @pytest.mark.parametrize("holds", [True, False])
 @pytest.mark.parametrize("held_up", [[True] * 12, [False, True]])
-def test_a_burst_after_a_stall_does_not_count_then_or_later(
+def test_burst_after_a_stall_does_not_count(
     scene: Scene, page: int, held_up: list[bool], holds: bool
 ) -> None:
     if holds:
@@ -94,137 +86,136 @@ def test_a_burst_after_a_stall_does_not_count_then_or_later(
     messages = [scene.message(page, pressed) for pressed in held_up]
     scene.wait(ECHO_AGE_LIMIT + JUST)
     for data in messages:
-        assert scene.arbiter.receive(page, data, scene.now) is Refusal.STALE
+        assert scene.protocol.receive(page, data, scene.now) is HoldRefusal.STALE
         assert not scene.pressed
-    assert scene.say(page, True) is Refusal.NEW_PRESS
+    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
     scene.press(page)
 
 
-def test_an_echo_counts_once_and_a_release_may_repeat_the_last(scene: Scene, page: int) -> None:
-    assert scene.say(page, False, count=1) is Refusal.ECHO, "nothing was sent"
+def test_echo_counts_once_except_for_a_release(scene: Scene, page: int) -> None:
+    assert scene.say(page, False, count=1) is HoldRefusal.ECHO, "nothing was sent"
     scene.press(page)
     count = scene.count(page)
-    assert scene.say(page, True, count=count + 1) is Refusal.ECHO
+    assert scene.say(page, True, count=count + 1) is HoldRefusal.ECHO
     assert scene.say(page, True, count=count) is None
-    assert scene.say(page, True, count=count) is Refusal.ECHO
+    assert scene.say(page, True, count=count) is HoldRefusal.ECHO
     assert scene.say(page, False, count=count) is None
     assert not scene.pressed
-    # A press that did not count when it came does not count later.
-    assert scene.say(page, True, count=count) is Refusal.ECHO
-    assert scene.say(page, True) is Refusal.NEW_PRESS
-    assert scene.say(page, False, count=count) is Refusal.ECHO
+    assert scene.say(page, True, count=count) is HoldRefusal.ECHO
+    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
+    assert scene.say(page, False, count=count) is HoldRefusal.ECHO
 
 
-def test_an_echo_of_another_connection_does_not_count(scene: Scene, page: int) -> None:
+def test_echo_of_another_connection_does_not_count(scene: Scene, page: int) -> None:
     other = scene.page()
     scene.say(page, False)
     counts = [scene.count(which) for which in (page, other, page)]
     assert counts == sorted(set(counts))
-    assert scene.say(page, True, count=counts[1]) is Refusal.ECHO
+    assert scene.say(page, True, count=counts[1]) is HoldRefusal.ECHO
     assert scene.say(page, False, count=counts[2]) is None
-    # A page that comes again is another connection, and has to release first.
-    scene.arbiter.close(page)
+    # A reconnected page has to release first.
+    scene.protocol.close(page, scene.now)
     again = scene.page()
     before = scene.count(again)
-    assert scene.say(again, False, count=counts[2]) is Refusal.ECHO
-    assert scene.say(again, True, count=before) is Refusal.NEW_PRESS
+    assert scene.say(again, False, count=counts[2]) is HoldRefusal.ECHO
+    assert scene.say(again, True, count=before) is HoldRefusal.NEW_PRESS
 
 
 @pytest.mark.parametrize(
     ("act", "refusal"),
     [
-        (lambda scene, page: scene.say(page, False, count=10**6), Refusal.ECHO),
-        (lambda scene, page: scene.say(page, True, mode="retract"), Refusal.NEW_PRESS),
-        (lambda scene, page: scene.arbiter.receive(page, "{}", scene.now), Refusal.GARBAGE),
-        (lambda scene, page: scene.say(page, True, speed=float("nan")), Refusal.GARBAGE),
+        (lambda scene, page: scene.say(page, False, count=10**6), HoldRefusal.ECHO),
+        (lambda scene, page: scene.say(page, True, mode="retract"), HoldRefusal.NEW_PRESS),
+        (lambda scene, page: scene.protocol.receive(page, "{}", scene.now), HoldRefusal.INVALID),
+        (lambda scene, page: scene.say(page, True, speed=float("nan")), HoldRefusal.INVALID),
     ],
 )
-def test_what_is_no_confirmation_ends_a_hold_and_takes_a_new_press(
-    scene: Scene, page: int, act: Callable[[Scene, int], Refusal | None], refusal: Refusal
+def test_invalid_message_ends_the_hold(
+    scene: Scene, page: int, act: Callable[[Scene, int], HoldRefusal | None], refusal: HoldRefusal
 ) -> None:
     scene.press(page)
     assert act(scene, page) is refusal
     assert not scene.pressed
-    assert scene.say(page, True) is Refusal.NEW_PRESS
-    # It takes back a release that was heard before it, too.
+    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
+    # It also invalidates an earlier release.
     scene.say(page, False)
     act(scene, page)
-    assert scene.say(page, True) is Refusal.NEW_PRESS
+    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
     scene.press(page)
 
 
 @pytest.mark.parametrize("is_local", [True, False])
-def test_a_barred_page_holds_nothing_and_is_told_why(scene: Scene, is_local: bool) -> None:
+def test_barred_page_gets_the_reason(scene: Scene, is_local: bool) -> None:
     page = scene.page(is_local=is_local)
     scene.bars[not is_local] = "of no concern"
     scene.press(page)
     scene.bars[is_local] = "only watching"
-    assert scene.say(page, True) is Refusal.BARRED
+    assert scene.say(page, True) is HoldRefusal.BARRED
     assert not scene.pressed
-    told = scene.arbiter.tell(page, scene.now)
+    told = scene.message_to(page)
     assert (told["bar"], told["why"]) == ("only watching", "only watching")
     scene.bars[is_local] = ""
-    assert scene.say(page, True) is Refusal.NEW_PRESS
+    assert scene.say(page, True) is HoldRefusal.NEW_PRESS
     scene.press(page)
 
 
-def test_one_page_owns_the_hold_until_it_is_gone_or_idle(scene: Scene) -> None:
+def test_page_owns_the_hold_until_it_disconnects_or_idles(scene: Scene) -> None:
     first, second, third = scene.page(), scene.page(), scene.page()
     scene.press(first)
     scene.say(first, False)
-    assert scene.arbiter.tell(first, scene.now)["bar"] == ""
+    assert scene.message_to(first)["bar"] == ""
     scene.say(second, False)
-    assert scene.say(second, True) is Refusal.BARRED
-    assert scene.arbiter.tell(second, scene.now)["why"] == OTHER_PAGE
-    scene.arbiter.close(first)
-    # The finger that is still there counts for nothing.
-    assert scene.say(second, True) is Refusal.NEW_PRESS
+    assert scene.say(second, True) is HoldRefusal.BARRED
+    assert scene.message_to(second)["why"] == OTHER_PAGE
+    scene.protocol.close(first, scene.now)
+    # A continued press does not count.
+    assert scene.say(second, True) is HoldRefusal.NEW_PRESS
     scene.press(second)
     scene.say(second, False)
     scene.wait(IDLE)
-    assert scene.arbiter.tell(third, scene.now)["bar"] == OTHER_PAGE
+    assert scene.message_to(third)["bar"] == OTHER_PAGE
     scene.wait(JUST)
     scene.press(third)
-    assert scene.arbiter.tell(second, scene.now)["bar"] == OTHER_PAGE
-    # What an earlier owner says or does is nothing to the hold; the owner takes its hold along.
+    assert scene.message_to(second)["bar"] == OTHER_PAGE
+    # An earlier owner does not affect the hold; the owner ends it by disconnecting.
     scene.say(second, False)
-    scene.arbiter.close(second)
+    scene.protocol.close(second, scene.now)
     assert scene.pressed
-    scene.arbiter.close(third)
+    scene.protocol.close(third, scene.now)
     assert not scene.pressed
 
 
-def test_an_owner_that_holds_for_long_is_not_idle(scene: Scene) -> None:
+def test_owner_that_holds_is_not_idle(scene: Scene) -> None:
     first, second = scene.page(), scene.page()
     scene.press(first)
     for _ in range(round(IDLE / 0.2) + 2):
         scene.wait(0.2)
         assert scene.say(first, True) is None
     scene.say(second, False)
-    assert scene.say(second, True) is Refusal.BARRED
+    assert scene.say(second, True) is HoldRefusal.BARRED
     assert scene.pressed
 
 
-def test_a_page_is_gone_when_it_is_silent(scene: Scene, page: int) -> None:
+def test_silent_page_is_lost(scene: Scene, page: int) -> None:
     scene.wait(SILENCE)
-    assert not scene.arbiter.is_silent(page, scene.now)
+    assert not scene.protocol.is_silent(page, scene.now)
     scene.wait(JUST)
-    assert scene.arbiter.is_silent(page, scene.now)
+    assert scene.protocol.is_silent(page, scene.now)
     scene.say(page, False)
-    assert not scene.arbiter.is_silent(page, scene.now)
+    assert not scene.protocol.is_silent(page, scene.now)
 
 
 class Witness(Scene):
-    """Keeps a record of its own, and judges each hold by it."""
+    """Checks each hold with an independent record."""
 
     def __init__(self) -> None:
         super().__init__()
         self.pages = [self.page(), self.page()]
         self.written: list[str] = []
-        # Count -> the page that it went to, and when.
+        # Count to page and time.
         self._sent: dict[int, tuple[int, float]] = {}
-        # By page: highest count echoed; when the newest count of a pressed message was sent; at
-        # which event a fresh release was heard, and at which a hold was over.
+        # By page: highest echoed count; time of the newest count echoed by a press; event
+        # of the last fresh release, and of the last end of a hold.
         self._heard: dict[int, int] = {}
         self._proof: dict[int, float] = {}
         self._released: dict[int, int] = {}
@@ -249,19 +240,19 @@ class Witness(Scene):
             elif not fields["pressed"] and self.now - sent <= ECHO_AGE_LIMIT:
                 self._released[page] = self._event
             self._heard[page] = fields["count"]
-        self.arbiter.receive(page, data, self.now)
+        self.protocol.receive(page, data, self.now)
         self.look()
 
     def look(self) -> None:
-        """Look at the hold now, and judge it."""
-        holders = [page for page in self.pages if self.arbiter.tell(page, self.now)["held"]]
+        """Check the hold now."""
+        holders = [page for page in self.pages if self.message_to(page)["held"]]
         assert len(holders) == self.pressed
         holder = holders[0] if holders else None
         if holder is not None:
-            # Somebody pressed this page's button no longer ago than that, by our own clock.
+            # The button was pressed within the limit.
             assert self.now - self._proof[holder] <= ECHO_AGE_LIMIT
             if self._holder is None:
-                # And it was seen released since its last hold was over.
+                # And it was released since its last hold.
                 assert self._released[holder] >= self._over.get(holder, -1)
             else:
                 assert holder == self._holder
@@ -271,7 +262,7 @@ class Witness(Scene):
         self._event += 1
 
     def act(self, rng: random.Random) -> None:
-        """Do one thing that pages, networks or strangers may do."""
+        """Perform one random action of pages, network or other senders."""
         number, pressed = rng.randrange(2), rng.random() < 0.6
         match rng.choice(("echo", "echo", "echo", "wait", "write", "replay", "end")):
             case "echo":
@@ -283,18 +274,18 @@ class Witness(Scene):
             case "write":
                 self.write(self.pages[number], pressed)
             case "replay" if self.written:
-                # At some later time, more than once, to any page.
+                # Later, repeatedly, to any page.
                 self.deliver(self.pages[number], rng.choice(self.written[-8:]))
             case "end" if pressed:
-                self.arbiter.receive(self.pages[number], "{", self.now)
+                self.protocol.receive(self.pages[number], "{", self.now)
             case "end":
-                self.arbiter.close(self.pages[number])
+                self.protocol.close(self.pages[number], self.now)
                 self.pages[number] = self.page()
         self.look()
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_nothing_resumes_by_itself_whatever_comes(seed: int) -> None:
+def test_nothing_resumes_by_itself(seed: int) -> None:
     rng = random.Random(seed)
     for _ in range(30):
         witness = Witness()

@@ -1,1 +1,0 @@
-"""Access control of connections: Host and Origin."""
