@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 
 from needle_core.errors import UserError
-from needle_tracker.calibrating.board_views import averaged_view, views_in_folders
-from needle_tracker.calibrating.calibration_session import Place, Session
+from needle_tracker.calibrating.calibration_session import (
+    Place,
+    Session,
+    averaged_view,
+    views_in_folders,
+)
 from needle_tracker.calibrating.charuco import CharucoBoard
 from needle_tracker.optics.calibration import SIDES
 

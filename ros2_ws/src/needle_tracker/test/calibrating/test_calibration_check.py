@@ -10,11 +10,9 @@ import pytest
 
 from needle_core.errors import UserError
 from needle_sim.camera.stereo_rig import StereoRig
-from needle_tracker.calibrating.calibration_check import check
-from needle_tracker.calibrating.calibration_session import Place
-from needle_tracker.calibrating.check_options import figures, report
+from needle_tracker.calibrating.calibration_check import check, figures, report
+from needle_tracker.calibrating.calibration_session import BoardView, Place
 from needle_tracker.calibrating.rig_calibration import RigCalibration
-from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
 
 from .synthetic_rig import (

@@ -14,10 +14,10 @@ import yaml
 from needle_core.errors import UserError
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_tracker.calibrating.calibrate_stereo import figures, report
-from needle_tracker.calibrating.calibration_outliers import doubts, square_error
+from needle_tracker.calibrating.calibration_outliers import contradictions, square_error
+from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.calibrating.imported_lenses import read_lenses
 from needle_tracker.calibrating.rig_calibration import calibrate
-from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 
 from .synthetic_rig import GIVEN, PLACES, SIZES, take
@@ -235,6 +235,6 @@ def test_lenses_of_other_cameras_or_in_another_unit_are_the_reason_told(
     given = read(written(tmp_path / "chain.yaml", longer))
     places = {name: place for name, place in PLACES.items() if name != "surface_b"}
     result = calibrate(take(rig, free=0, places=places), SIZES, GIVEN, given)
-    said = doubts(result, square_error(result))
+    said = contradictions(result, square_error(result))
     assert any("another camera, focus or image size" in text for text in said)
     assert not any("more distortion" in text for text in said)

@@ -12,10 +12,11 @@ import pytest
 from needle_core.errors import UserError
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_tracker.calibrating.calibrate_stereo import save_calibration
-from needle_tracker.calibrating.calibration_outliers import doubts, square_error
+from needle_tracker.calibrating.calibration_outliers import contradictions, square_error
+from needle_tracker.calibrating.calibration_session import BoardView, Corners
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_fit import fit
-from needle_tracker.calibrating.rig_model import LENS, BoardView, Corners, RigModel, camera_slice
+from needle_tracker.calibrating.rig_model import LENS, RigModel, camera_slice
 from needle_tracker.calibrating.tip_error import (
     measured_points,
     needle_points,
@@ -62,7 +63,7 @@ def test_tips_are_right_to_60_micrometres_and_it_says_so(
         assert result.reprojection_rms_px(side) == pytest.approx(math.sqrt(2) * NOISE_PX, rel=0.15)
     error, sigma = square_error(result)
     assert abs(error) < 4.0 * sigma
-    assert doubts(result, (error, sigma)) == []
+    assert contradictions(result, (error, sigma)) == []
     assert result.apart == []
 
 
@@ -230,5 +231,5 @@ def test_the_lens_of_a_webcam_is_fitted_with_k3(rig: StereoRig) -> None:
         found = result.parameters[f"{side}.k3"]
         assert not found.kept
         assert abs(found.value - 0.05) < 4.0 * found.sigma < 0.08
-    assert doubts(result, square_error(result)) == []
+    assert contradictions(result, square_error(result)) == []
     assert tip_error(webcams, result.calibration) < 0.07e-3
