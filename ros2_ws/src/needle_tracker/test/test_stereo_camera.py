@@ -28,9 +28,8 @@ from needle_core.diagnostics import Level
 from needle_core.errors import UserError
 from needle_core.runners.virtual import VirtualRunner
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.sources import pair_port
-from needle_tracker.sources.pair_port import PairPort
-from needle_tracker.sources.stereo_source import EndOfRecording, StampedPair
+from needle_tracker.sources import stereo_source
+from needle_tracker.sources.stereo_source import EndOfRecording, PairPort, StampedPair
 from needle_tracker.stereo_camera import PAIRS, StereoCamera, StereoCameraParameters
 
 ASK = Send(PAIRS, ("next",))
@@ -193,7 +192,7 @@ def test_a_thread_reads_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
         def shutdown(self) -> None:
             asked.clear()
 
-    monkeypatch.setattr(pair_port, "ThreadPoolExecutor", Thread)
+    monkeypatch.setattr(stereo_source, "ThreadPoolExecutor", Thread)
     source = mock.Mock()
     port, arrived = PairPort(source), list[Any]()
     port.open(arrived.append)

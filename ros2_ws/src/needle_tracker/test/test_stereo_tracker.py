@@ -46,7 +46,7 @@ class Bench:
         tracker.answers.tracker.process = (  # type: ignore[method-assign]
             lambda *pair: self.measured or process(*pair)
         )
-        tracker.answers.swap.see = lambda *_: None  # type: ignore[method-assign]
+        tracker.answers.swap.update = lambda *_: None  # type: ignore[method-assign]
 
     def do(self, actions: Actions) -> None:
         for action in actions:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from code_lines import ROOT
-from needle_tracker.answers.annotation import annotate, describe_view
-from needle_tracker.answers.seen import HELP, SeenCounts, missing
+from needle_tracker.answers.annotation import HELP, annotate, describe_view, missing
+from needle_tracker.answers.run_summary import SeenCounts
 from needle_tracker.answers.track_images import COLUMNS, to_row
 from needle_tracker.detector.end_fit import ImageEnd
 from needle_tracker.filter.measurement import Measurement, NoTip, TrackState

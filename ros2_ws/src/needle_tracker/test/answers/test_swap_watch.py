@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_tracker.answers import swapped_images
-from needle_tracker.answers.swapped_images import SwapWatch
+from needle_tracker.answers import pair_answers
+from needle_tracker.answers.pair_answers import SwapWatch
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
@@ -38,7 +38,7 @@ class Other:
 @pytest.fixture
 def other(monkeypatch: pytest.MonkeyPatch) -> Other:
     other = Other()
-    monkeypatch.setattr(swapped_images, "NeedleTracker", lambda *_: other)
+    monkeypatch.setattr(pair_answers, "NeedleTracker", lambda *_: other)
     return other
 
 
@@ -49,7 +49,7 @@ def watch(calibration: StereoCalibration, settings: TrackerSettings) -> SwapWatc
 
 def misses(watch: SwapWatch, pairs: int) -> None:
     for _ in range(pairs):
-        watch.see(LEFT, RIGHT, None, MISSED)
+        watch.update(LEFT, RIGHT, None, MISSED)
 
 
 def test_four_in_a_row_after_five_missed_are_a_suspicion_until_a_tip(
@@ -61,7 +61,7 @@ def test_four_in_a_row_after_five_missed_are_a_suspicion_until_a_tip(
     seen = ((MISSED, 8), (MISSED, 1), (MISSED, 5), (entry, 1), (found, 1), (MISSED, 5))
     for measured, pairs in seen:
         for _ in range(pairs):
-            watch.see(LEFT, RIGHT, None, measured)
+            watch.update(LEFT, RIGHT, None, measured)
         looks.append((other.looks, watch.suspected))
     assert looks == [(3, False), (4, True), (4, True), (4, True), (4, False), (4, False)]
 

@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from needle_tracker.sources.insertion_history import InsertionHistory
-from needle_tracker.sources.pairing import PairMatcher
+from needle_tracker.sources.pairing import InsertionHistory, PairMatcher
 
 
 def test_equal_stamps_pair_in_any_order_of_arrival() -> None:
@@ -82,7 +81,7 @@ def test_insertion_is_interpolated_at_the_exposure() -> None:
     # Of two at one moment the later counts; one that is not finite does not.
     history.add(200, 0.030)
     history.add(210, math.nan)
-    assert (history.at(200), history.refused, history.is_bracketed(205)) == (0.030, 1, False)
+    assert (history.at(200), history.rejected, history.is_bracketed(205)) == (0.030, 1, False)
     history.add(50, 0.002)
     assert (history.restarts, history.at(100), history.at(50)) == (1, None, 0.002)
     assert (history.time_before(49), history.time_before(50)) == (1, 0)
