@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from needle_tracker.filter.needle_motion import (
+from needle_tracker.filter.needle_track import (
     HEADING,
     POSITION,
     SCALE,

@@ -40,31 +40,31 @@ def after(
 
 def test_an_end_at_the_insertion_is_the_needle_at_once(settings: TrackerSettings) -> None:
     accepted = ACCEPTED
-    assert after(settings, [0.05], [0.05]).log_odds > accepted
-    assert after(settings, [0.05], [0.056]).log_odds < 0.0
+    assert after(settings, [0.05], [0.05]).log_odds(settings) > accepted
+    assert after(settings, [0.05], [0.056]).log_odds(settings) < 0.0
     # A stage 1 mm off does not hide the needle.
-    assert after(settings, [0.05], [0.051]).log_odds > accepted
+    assert after(settings, [0.05], [0.051]).log_odds(settings) > accepted
 
 
 def test_what_stands_while_the_stage_moves_is_no_needle(settings: TrackerSettings) -> None:
     insertions = [0.049 + 5e-4 * n for n in range(8)]
-    assert after(settings, [0.05] * 8, list(insertions)).log_odds < 0.0
+    assert after(settings, [0.05] * 8, list(insertions)).log_odds(settings) < 0.0
     moving = after(settings, [0.001 + i for i in insertions], list(insertions))
-    assert moving.log_odds > ACCEPTED
+    assert moving.log_odds(settings) > ACCEPTED
 
 
 def test_without_the_insertion_what_has_moved_is_the_needle(settings: TrackerSettings) -> None:
     nothing: list[float | None] = [None] * 10
     resting = after(settings, [0.05] * 10, nothing)
-    assert resting.log_odds < ACCEPTED
+    assert resting.log_odds(settings) < ACCEPTED
     moving = after(settings, [0.05 + 1e-3 * n for n in range(4)], nothing[:4])
-    assert moving.log_odds > ACCEPTED
+    assert moving.log_odds(settings) > ACCEPTED
 
 
 def test_a_miss_costs_rank_and_no_belief(settings: TrackerSettings) -> None:
     before = after(settings, [0.05], [0.05])
     missed = before.predicted(0.051, settings).missed()
-    assert missed.log_odds == before.log_odds
+    assert missed.log_odds(settings) == before.log_odds(settings)
     assert missed.rank(settings) == before.rank(settings) - settings.filter.miss_cost
     assert missed.misses == 1
 

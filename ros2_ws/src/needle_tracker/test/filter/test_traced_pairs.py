@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from needle_tracker.answers.tracker_parameters import default_settings
-from needle_tracker.filter.background import Image
 from needle_tracker.filter.needle_tracker import NeedleTracker
+from needle_tracker.filter.settings import Image
 from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
 from needle_tracker.stereo.triangulation import SpatialTip
 

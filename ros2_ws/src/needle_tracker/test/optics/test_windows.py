@@ -19,12 +19,10 @@ import pytest
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
-from needle_tracker.detector.reach import Reach
-from needle_tracker.detector.search_grid import make_search_grid
+from needle_tracker.detector.search_grid import Reach, make_search_grid
 from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
-from needle_tracker.optics.camera_model import project_optical
 from needle_tracker.optics.compiled_projection import pixel_ray, project_point
-from needle_tracker.optics.refraction import RefractedCamera, stereo_views
+from needle_tracker.optics.refraction import RefractedCamera, project_optical, stereo_views
 from needle_tracker.optics.window import Layer, Window
 
 Array = np.ndarray
@@ -253,7 +251,7 @@ def test_lens_and_slopes_agree_with_opencv_and_finite_differences(
 def test_each_view_of_a_box_searches_where_needles_go(calibration_path: Path) -> None:
     rig = load_calibration(calibration_path.with_name("calibration_top_and_side.yaml"))
     for number, view in enumerate(stereo_views(rig)):
-        grid = make_search_grid(view, REACH, first_distance=2e-3)
+        grid = make_search_grid(view, REACH, 2e-3)
         assert grid.reachable[:, len(grid.angles) // 2].mean() > 0.9
         assert abs(view.sideways[1 - number]) > 0.999
         # A needle that bends towards this camera lies on the grid's middle, one aside does not.

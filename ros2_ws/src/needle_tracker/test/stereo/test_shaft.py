@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from needle_tracker.detector.end_search import ShaftPath
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.refraction import RefractedCamera
-from needle_tracker.stereo.shaft import is_reachable, shaft_length, shaft_points
+from needle_tracker.stereo.sighting import is_reachable, shaft_length, shaft_points
 
 Views = tuple[RefractedCamera, RefractedCamera]
 LENGTH = 70e-3

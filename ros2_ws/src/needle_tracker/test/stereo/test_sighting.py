@@ -47,6 +47,7 @@ def search(views: Views, settings: TrackerSettings) -> Callable[..., StereoSearc
             settings.reach,
             settings.windows,
             settings.tip_lean,
+            settings.entry_zone,
         )
 
     return make
