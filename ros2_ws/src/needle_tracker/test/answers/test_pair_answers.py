@@ -57,7 +57,7 @@ def answering(
     return bench
 
 
-def test_an_answer_is_out_before_what_it_does_not_need(
+def test_an_answer_is_sent_before_the_check_for_swapped_images(
     answering: Answering, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []

@@ -52,7 +52,7 @@ def misses(watch: SwapWatch, pairs: int) -> None:
         watch.update(LEFT, RIGHT, None, MISSED)
 
 
-def test_four_in_a_row_after_five_missed_are_a_suspicion_until_a_tip(
+def test_four_agreeing_pairs_after_five_misses_raise_a_suspicion_until_a_tip(
     watch: SwapWatch, other: Other
 ) -> None:
     entry: Any = Measurement(None, TrackState.ENTRY, "")
@@ -66,7 +66,7 @@ def test_four_in_a_row_after_five_missed_are_a_suspicion_until_a_tip(
     assert looks == [(3, False), (4, True), (4, True), (4, True), (4, False), (4, False)]
 
 
-def test_where_the_other_way_round_shows_none_half_of_the_pairs_are_looked_at(
+def test_half_of_the_pairs_are_checked_while_swapped_pairs_show_no_needle(
     watch: SwapWatch, other: Other
 ) -> None:
     other.finds = False

@@ -92,7 +92,7 @@ def test_another_surface_or_index_is_found(
     assert f"{cause.replace('_', ' ')} is {'+' if off > 0 else '-'}" in report(found)
 
 
-def test_a_target_that_cannot_show_it_is_never_ok(
+def test_a_target_that_cannot_detect_errors_is_never_ok(
     calibration: StereoCalibration, rig: StereoRig
 ) -> None:
     rng = np.random.default_rng(1)
@@ -106,7 +106,7 @@ def test_a_target_that_cannot_show_it_is_never_ok(
     assert any("cannot show errors of tips below 0.0" in problem for problem in found.problems)
 
 
-def test_other_cameras_or_lenses_are_no_turned_camera(
+def test_other_cameras_or_lenses_are_not_reported_as_a_turned_camera(
     calibration: StereoCalibration, rig: StereoRig
 ) -> None:
     exchanged = [dataclasses.replace(v, left=v.right, right=v.left) for v in target(rig)]

@@ -61,7 +61,7 @@ def one_line(out: Out) -> str:
     return captured.err
 
 
-def test_a_calibration_is_written_that_its_check_accepts(
+def test_a_written_calibration_passes_its_check(
     seen: dict[str, list[BoardView]], arguments: list[str], tmp_path: Path, capsys: Out
 ) -> None:
     output, figures = tmp_path / "rig.yaml", tmp_path / "figures.json"
@@ -98,7 +98,7 @@ def test_a_calibration_is_written_that_its_check_accepts(
     assert values["left_camera_turned_deg"] is None
 
 
-def test_what_is_doubted_is_told_in_words_figures_and_exit_code(
+def test_contradictions_are_in_text_json_and_exit_code(
     seen: dict[str, list[BoardView]],
     arguments: list[str],
     tmp_path: Path,
@@ -127,7 +127,7 @@ def test_what_is_doubted_is_told_in_words_figures_and_exit_code(
     assert not output.exists()
 
 
-def test_bad_arguments_are_one_line_and_exit_2(
+def test_bad_arguments_are_reported_in_one_line_with_exit_2(
     seen: dict[str, list[BoardView]],
     arguments: list[str],
     tmp_path: Path,

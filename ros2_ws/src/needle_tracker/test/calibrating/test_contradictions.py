@@ -44,7 +44,7 @@ def test_wrong_squares_are_found_by_their_size(
     assert "smaller than the session says" in contradictions(result, (error, sigma))[0]
 
 
-def test_one_place_does_not_tell_the_size_of_the_squares(
+def test_one_place_does_not_determine_the_size_of_the_squares(
     views: list[BoardView], calibration: StereoCalibration
 ) -> None:
     found = said_larger(views[2:7], 0.01)
@@ -127,7 +127,7 @@ def moved(rig: StereoRig, views: list[BoardView], numbers: set[int]) -> list[Boa
         ({7: 8}, set(), ["under_deep"]),
     ],
 )
-def test_few_pairs_not_taken_at_once_are_left_out(
+def test_few_inconsistent_pairs_are_left_out(
     rig: StereoRig,
     many: list[BoardView],
     calibration: StereoCalibration,
@@ -145,7 +145,7 @@ def test_few_pairs_not_taken_at_once_are_left_out(
 
 
 @pytest.mark.parametrize("count", [FREE, 3])
-def test_many_pairs_not_taken_at_once_are_the_reason_told(
+def test_many_inconsistent_pairs_are_rejected(
     rig: StereoRig, many: list[BoardView], calibration: StereoCalibration, count: int
 ) -> None:
     views = moved(rig, many, set(range(count)))[: FREE + 2]
@@ -153,7 +153,7 @@ def test_many_pairs_not_taken_at_once_are_the_reason_told(
         consistent_views(views, calibration, 3)
 
 
-def test_a_place_that_only_one_image_shows_is_not_ok(result: RigCalibration) -> None:
+def test_a_place_in_only_one_image_is_not_ok(result: RigCalibration) -> None:
     place = next(view for view in result.model.views if view.name == "surface_a")
     apart = dataclasses.replace(result, apart=[place])
     assert "in surface_a, though" in contradictions(apart, (0.0, np.inf))[0]

@@ -57,7 +57,7 @@ def test_a_gap_is_bridged_and_an_end_before_it_is_another_candidate(grid: Search
     assert len(paths) <= SEARCH.candidates
 
 
-def test_ends_only_in_the_rows_that_are_asked_for(grid: SearchGrid) -> None:
+def test_ends_are_only_in_the_given_rows(grid: SearchGrid) -> None:
     maps = drawn(grid, middle(grid), END_ROW)
     for path in find_paths(grid, *maps, 130, 150):
         assert 130 <= len(path.pixels) - 1 <= 150

@@ -44,7 +44,7 @@ def test_a_reference_holds_until_the_needle_is_outside() -> None:
     assert shown(background, [None, 0.04, 0.0, 0.05]) == [100, 100, None, 2]
 
 
-def test_an_image_that_its_owner_changes_later_does_not_change_it() -> None:
+def test_the_background_is_a_copy() -> None:
     images = pair(7)
     background = Background(images, LEAST_NEW)
     images[0][:] = 99

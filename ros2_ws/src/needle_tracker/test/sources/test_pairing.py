@@ -22,7 +22,7 @@ def test_equal_stamps_pair_in_any_order_of_arrival() -> None:
     assert (matcher.pairs, matcher.unpaired.total()) == (2, 0)
 
 
-def test_latest_is_never_paired_with_latest_and_what_is_passed_over_is_counted() -> None:
+def test_latest_is_never_paired_with_latest_and_dropped_images_are_counted() -> None:
     matcher: PairMatcher[str] = PairMatcher(0)
     matcher.add("left", 10, "l10")
     assert matcher.add("right", 20, "r20") is None
@@ -48,7 +48,7 @@ def test_tolerance_is_kept_and_the_nearest_wins() -> None:
     assert matcher.unpaired["left"] == 1
 
 
-def test_free_running_cameras_pair_within_half_a_frame_and_the_skew_is_told() -> None:
+def test_free_running_cameras_pair_within_half_a_frame_and_the_skew_is_reported() -> None:
     matcher: PairMatcher[str] = PairMatcher(None)
     period, late, pairs = 33_000, 12_000, []
     for number in range(40):
