@@ -156,13 +156,13 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
         scale, unit = unit_of(name)
         value, given, sigma = (scale * v for v in (found.value, found.given, found.sigma))
         unit = unit and f" {unit}"
-        said = f"{value:.5g}{unit} +- {sigma:.2g}{unit}"
+        result_text = f"{value:.5g}{unit} +- {sigma:.2g}{unit}"
         if found.kept:
             asked = "not asked of these views"
             if math.isfinite(sigma):
                 asked = f"NOT DETERMINED by these views (+- {sigma:.2g}{unit})"
-            said = f"{asked}, kept at the given {given:g}{unit}"
-        lines.append(f"{name}: {said}")
+            result_text = f"{asked}, kept at the given {given:g}{unit}"
+        lines.append(f"{name}: {result_text}")
     error, sigma = (100.0 * value for value in size)
     if sigma < _SCALE_KNOWN:
         lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % beside the session's")

@@ -128,7 +128,7 @@ def calibrate(
     sizes : dict of str to (int, int)
         Width and height of each side's images [px].
     windows : pair of Window
-        Of the left and the right camera, as given; what the views do not tell of them is kept.
+        Given windows of the left and the right camera.
     lenses : StereoCalibration, optional
         Cameras whose lenses are kept, and their relative pose if they are not in one place.
 

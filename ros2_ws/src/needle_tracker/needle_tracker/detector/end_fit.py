@@ -119,29 +119,27 @@ def fit_end(
     back = min(behind, FIT.line_widths * width)
     if back < FIT.least_line_widths * width:
         return None
-    result = np.zeros(8)
-    found = _fit(
-        shaft,
-        ends,
-        np.ascontiguousarray(point, np.float64),
-        np.ascontiguousarray(direction, np.float64),
-        back,
-        along,
-        across,
-        width,
-        result,
-    )
-    if not found:
-        return None
-    u, v, d_u, d_v, sigma_across, sigma_along, sigma_angle, certainty = result.tolist()
-    end = np.array([u, v])
+    point = np.ascontiguousarray(point, np.float64)
+    direction = np.ascontiguousarray(direction, np.float64)
+    offset, slope = _best_line(shaft, point, direction, back, across, width)
+    end, spread = 0.0, along
+    sigma_across = sigma_angle = certainty = 0.0
+    for _ in range(_PASSES):
+        length, offset, slope, sigma_across, sigma_angle, certainty = _fit_line(
+            shaft, point, direction, offset, slope, end, back, width
+        )
+        if length < FIT.least_line_widths * width:
+            return None
+        end, spread = _end_on_line(ends, point, direction, offset, slope, along, width)
+    norm, across_direction = math.hypot(1.0, slope), np.array([-direction[1], direction[0]])
+    fitted = point + end * direction + (offset + slope * end) * across_direction
     return ImageEnd(
-        end,
-        np.array([d_u, d_v]),
+        fitted,
+        (direction + slope * across_direction) / norm,
         math.hypot(sigma_across, FIT.systematic_widths * width),
-        math.hypot(sigma_along, FIT.systematic_widths * width),
+        math.hypot(spread * norm, FIT.systematic_widths * width),
         math.hypot(sigma_angle, FIT.systematic_widths / FIT.line_widths),
-        _ends_about(ends, end, width),
+        _ends_about(ends, fitted, width),
         certainty,
     )
 
@@ -173,39 +171,6 @@ def _on_line(image: Map, point: Array, direction: Array, along: float, across: f
     x = point[0] + along * direction[0] - across * direction[1]
     y = point[1] + along * direction[1] + across * direction[0]
     return _at(image, x, y)
-
-
-@compiled
-def _fit(
-    shaft: Map,
-    ends: Map,
-    point: Array,
-    direction: Array,
-    back: float,
-    along: float,
-    across: float,
-    width: float,
-    result: Array,
-) -> bool:
-    """Write end, direction, sigmas across, along and of the angle, and the mean probability."""
-    offset, slope = _best_line(shaft, point, direction, back, across, width)
-    end = 0.0
-    line = np.empty(6)
-    spread = along
-    for _ in range(_PASSES):
-        _fit_line(shaft, point, direction, offset, slope, end, back, width, line)
-        if line[0] < FIT.least_line_widths * width:
-            return False
-        offset, slope = line[1], line[2]
-        end, spread = _end_on_line(ends, point, direction, offset, slope, along, width)
-    norm = math.sqrt(1.0 + slope * slope)
-    beside = offset + slope * end
-    result[0] = point[0] + end * direction[0] - beside * direction[1]
-    result[1] = point[1] + end * direction[1] + beside * direction[0]
-    result[2] = (direction[0] - slope * direction[1]) / norm
-    result[3] = (direction[1] + slope * direction[0]) / norm
-    result[4], result[5], result[6], result[7] = line[3], spread * norm, line[4], line[5]
-    return True
 
 
 @compiled
@@ -241,11 +206,10 @@ def _fit_line(
     end: float,
     back: float,
     width: float,
-    line: Array,
-) -> None:
+) -> tuple[float, float, float, float, float, float]:
     """Fit a line to the centre of the shaft, by weighted least squares.
 
-    Writes the length of the shaft [px], offset and slope, their standard deviations at the end, and
+    Return the length of the shaft [px], offset and slope, their standard deviations at the end, and
     the mean probability along the line.
     """
     count = int(back)
@@ -269,9 +233,9 @@ def _fit_line(
             breadth += weights[i] * (second / mass - (moment / mass) ** 2)
         certainty += _on_line(shaft, point, direction, s, centre)
     total = weights.sum()
-    line[0], line[5] = total, certainty / count
+    certainty /= count
     if total < 2.0:
-        return
+        return total, offset, slope, 0.0, 0.0, certainty
     mean = (weights * places).sum() / total
     middle = (weights * middles).sum() / total
     spread = (weights * (places - mean) ** 2).sum() / total
@@ -280,12 +244,12 @@ def _fit_line(
     variance = (weights * residuals * residuals).sum() / total
     # Disturbances of the centre are correlated over about the width of the needle.
     independent = max(total / width - 2.0, 1.0)
-    line[1], line[2] = middle - lean * mean, lean
     # The variance of the probability across one shaft is width^2 / 12, with blurred edges up to
     # twice that. A broader distribution may be two lines, such as a needle beside its shadow.
     doubt = max(breadth / total - 2.0 * width * width / 12.0, 0.0)
-    line[3] = math.sqrt(doubt + variance / independent * (1.0 + (end - mean) ** 2 / spread))
-    line[4] = math.sqrt(variance / independent / spread)
+    sigma = math.sqrt(doubt + variance / independent * (1.0 + (end - mean) ** 2 / spread))
+    sigma_angle = math.sqrt(variance / independent / spread)
+    return total, middle - lean * mean, lean, sigma, sigma_angle, certainty
 
 
 @compiled

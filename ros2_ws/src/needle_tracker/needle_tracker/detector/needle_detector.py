@@ -261,14 +261,11 @@ class NeedleDetector:
         )
         if found is None:
             return None
-        return ImageEnd(
-            _full_px(found.point + corner, shrink),
-            found.direction,
-            found.sigma_across * shrink,
-            found.sigma_along * shrink,
-            found.sigma_angle,
-            found.ends,
-            found.shaft,
+        return dataclasses.replace(
+            found,
+            point=_full_px(found.point + corner, shrink),
+            sigma_across=found.sigma_across * shrink,
+            sigma_along=found.sigma_along * shrink,
         )
 
     def _box(

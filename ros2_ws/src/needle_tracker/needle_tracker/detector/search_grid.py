@@ -139,7 +139,7 @@ def make_search_grid(view: RefractedCamera, reach: Reach, first_distance: float)
     # Close to the entry the hole tolerance would allow any angle.
     widest = min(float(limit[len(limit) // 2 :].max()), math.pi / 2)
     half = math.ceil(widest / settings.angle_pitch)
-    angles = settings.angle_pitch * np.arange(-half, half + 1)
+    angles = np.asarray(settings.angle_pitch * np.arange(-half, half + 1), dtype=np.float64)
     directions = np.sin(angles)[:, None] * view.sideways + np.cos(angles)[:, None] * [0.0, 0.0, 1.0]
     pixels = view.project(distances[:, None, None] * directions)
     last = np.array([camera.width, camera.height]) - 1 - settings.border_px

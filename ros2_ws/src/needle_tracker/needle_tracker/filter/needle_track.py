@@ -244,6 +244,9 @@ class NeedleTrack:
         place, covariance = _merged(self.place, self.place_covariance, tip)
         way = math.dist(tip.position, self.place) if self.way is None else abs(self.way)
         independent = min(way / numbers.evidence_length, 1.0)
+        # The end after a gap may be that of another thing, such as the shadow of the needle.
+        before = self.motion_log_odds
+        before = max(before - numbers.miss_cost * self.misses, min(before, 0.0))
         return dataclasses.replace(
             self,
             motion=motion.seen(tip),
@@ -254,7 +257,7 @@ class NeedleTrack:
             place_log_odds=min(
                 self.place_log_odds, place_log_odds(sighting, self.insertion, settings)
             ),
-            motion_log_odds=self.motion_log_odds + gain,
+            motion_log_odds=before + gain,
             way=0.0,
             misses=0,
         )._bounded(settings)

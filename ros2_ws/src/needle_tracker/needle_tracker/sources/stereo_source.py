@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -41,25 +41,9 @@ class EndOfRecording:
     missing: str = ""
 
 
-class StereoSource(Protocol):
-    """Source of one pair after the other."""
-
-    def next(self) -> StampedPair | EndOfRecording | None:
-        """Return the next pair; None if it could not be read.
-
-        Raises
-        ------
-        UserError
-            A source that was disconnected, or images of another size.
-        """
-
-    def close(self) -> None:
-        """Close devices and files."""
-
-
 def open_source(
     names: tuple[str, str], sizes: Sizes, rate: float, clock: Callable[[], int], *, loop: bool
-) -> StereoSource:
+) -> CameraPair | RecordedPairs:
     """Open cameras or a recording.
 
     Parameters
@@ -141,7 +125,13 @@ class CameraPair:
                 capture.set(key, value)
 
     def next(self) -> StampedPair | None:
-        """Return the next pair; None if a camera failed."""
+        """Return the next pair; None if a camera failed.
+
+        Raises
+        ------
+        UserError
+            Cameras that were disconnected, or images of another size.
+        """
         stamps, grabbed = {}, True
         for side, capture in self._captures.items():
             grabbed = bool(capture.grab()) and grabbed
@@ -192,7 +182,13 @@ class RecordedPairs:
         self._events = self._read()
 
     def next(self) -> StampedPair | EndOfRecording | None:
-        """Return the next pair; None if one of its images cannot be read."""
+        """Return the next pair; None if one of its images cannot be read.
+
+        Raises
+        ------
+        UserError
+            Images of another size.
+        """
         return next(self._events)
 
     def close(self) -> None:
@@ -236,11 +232,11 @@ class PairPort:
 
     Parameters
     ----------
-    source : StereoSource
+    source : CameraPair or RecordedPairs
         An open source, closed with the port.
     """
 
-    def __init__(self, source: StereoSource) -> None:
+    def __init__(self, source: CameraPair | RecordedPairs) -> None:
         self._source = source
         self._reader = ThreadPoolExecutor(1, "pairs")
 

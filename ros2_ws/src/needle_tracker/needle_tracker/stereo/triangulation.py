@@ -176,6 +176,9 @@ def _solve_position(
         normal = rows.T @ rows
         # Scaled by its diagonal, the determinant shows how well the position is determined.
         product = normal[0, 0] * normal[1, 1] * normal[2, 2]
+        # A NaN, of a point behind a camera, must not reach det().
+        if not 0.0 < product < math.inf:
+            return False, normal, residual, jacobians
         if not np.linalg.det(normal) > _LEAST_DETERMINANT * product:
             return False, normal, residual, jacobians
         step = np.linalg.solve(normal, rows.T @ residual)
