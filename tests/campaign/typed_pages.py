@@ -27,8 +27,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (
     "docs/setup.md", "README.md", "bags/README.md", "docs/hardware.md", "docs/calibration.md",
-    "docs/own_controllers.md", "docs/examples/README.md", "docs/own_estimator.md",
-    "docs/first_run.md", "docs/own_rig.md", "docs/report_a_problem.md",
+    "docs/own_controllers.md", "docs/examples/README.md", "docs/first_run.md",
+    "docs/own_rig.md", "docs/report_a_problem.md",
 )  # fmt: skip
 COMMAND, PROGRAM, FILE = "command", "python", "file"
 FILES = ("yaml", "toml", "python")

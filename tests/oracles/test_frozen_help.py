@@ -16,6 +16,7 @@ CHANGED = {
     "scripts_console": "the rig is in one process, cameras and tracker in a second one",
     "scripts_dask": "what it installs is an extra of pyproject.toml",
     "scripts_docs": "Sphinx goes into .venv",
+    "scripts_soak": "the page on clusters is several_computers.md",
     "scripts_setup": "it takes the extras to be installed",
     "scripts_train_needle_map": "what draws its patches is in needle_bringup",
     "calibrate_stereo": "no picture of what the corners miss by: what is wrong is said in words",

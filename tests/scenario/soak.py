@@ -61,7 +61,7 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     )
     cluster = (
         "do the runs on the Dask cluster of this scheduler, such as tcp://10.0.0.5:8786, to the "
-        "same results (docs/cluster.md)"
+        "same results (docs/several_computers.md)"
     )
     for name, kind, default, metavar, told in (
         ("--runs", int, 300, "N", "number of runs (300)"),

@@ -6,7 +6,7 @@ import enum
 
 
 class Rule(enum.Enum):
-    """A safety rule; docs/safety.md has the bound, the reason and the test of each."""
+    """A safety rule; docs/safety.md has the bound and the reason of each."""
 
     HOLD_TO_RUN = "hold_to_run"
     HOLD_AGE = "hold_age"

@@ -300,7 +300,7 @@ def _parser() -> CommandParser:
         action="append",
         default=[],
         metavar="MODULE:NAME",
-        help="a component of your own beside the rig's (docs/own_component.md); may be repeated",
+        help="a component of your own beside the rig's (docs/own_controllers.md); may be repeated",
     )
     add("--bag", metavar="DIR", help="new folder for the run (default: time-stamped, in bags/)")
     add("--params", metavar="FILE", help="ROS parameter file on top of the rig's configuration")

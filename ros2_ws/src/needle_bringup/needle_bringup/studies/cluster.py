@@ -130,7 +130,7 @@ def _run(work: Callable[[Part], Result], wanted: Mapping[str, str], part: Part) 
     if differing:
         raise UserError(
             f"the worker on {socket.gethostname()} has {', '.join(differing)}; all machines need "
-            "the same checkout, set up alike (docs/cluster.md)"
+            "the same checkout, set up alike (docs/several_computers.md)"
         )
     return work(part)
 

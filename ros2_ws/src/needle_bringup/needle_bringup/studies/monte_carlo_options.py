@@ -259,7 +259,7 @@ def _parser() -> CommandParser:
         default="",
         metavar="ADDRESS",
         help="steer the needles on the Dask cluster of this scheduler, such as "
-        "tcp://10.0.0.5:8786, to the same figures (docs/cluster.md)",
+        "tcp://10.0.0.5:8786, to the same figures (docs/several_computers.md)",
     )
     add("--json", metavar="FILE", help="write the figures as one flat JSON object")
     add(

@@ -23,7 +23,7 @@ from needle_bringup.studies.study_laws import (
     rrt_law,
     sliding_law,
 )
-from needle_controller.laws.law import LinearizingLaw, StepLaw
+from needle_controller.laws.law import LinearizingLaw
 from needle_controller.many_needles import ManyObservers
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import TargetMotion
@@ -85,23 +85,6 @@ class SteeredNeedles:
         self._estimators: Estimators | None = None
         self._insertion: FloatArray = np.zeros(())
         self._turned: FloatArray = np.zeros(())
-
-    @classmethod
-    def one_by_one(
-        cls, new: Callable[[], Estimator], law: StepLaw, covariance: Array | None = None
-    ) -> SteeredNeedles:
-        """Return needles of any estimator and law, each of them called in Python.
-
-        Parameters
-        ----------
-        new : callable
-            Returns a needle's estimator.
-        law : StepLaw
-            Of all needles.
-        covariance : ndarray, shape (3, 3), optional
-            See above.
-        """
-        return cls(lambda _: EachEstimator(lambda _: new()), each_rate(lambda _: law), covariance)
 
     def start(self, tips: FloatArray) -> FloatArray:
         """Take the first measured tips; see `study.Controller.start`."""

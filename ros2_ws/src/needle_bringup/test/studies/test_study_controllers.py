@@ -133,7 +133,10 @@ def test_needles_say_what_their_estimate_says() -> None:
 
 def test_needles_that_are_not_where_they_are_to_be_say_so() -> None:
     tips = np.array([[0.0005, 0.0, 0.0], [-0.003, 0.0, 0.0]])
-    needles = SteeredNeedles.one_by_one(lambda: HypothesisFilter(FilterSettings()), still)
+    needles = SteeredNeedles(
+        lambda _: EachEstimator(lambda _: HypothesisFilter(FilterSettings())),
+        each_rate(lambda _: still),
+    )
     needles.start(tips)
     # What counts is the point, not the plane x = 0.
     to_points = point_controller_factory("best", 0.001)()

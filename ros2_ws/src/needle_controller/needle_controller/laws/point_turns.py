@@ -43,7 +43,8 @@ class PointLawSettings(NamedTuple):
     last_turns_from : float
         Insertion left from which they shrink to that [m].
     close_enough : float
-        A miss that is left alone [m].
+        A miss that is left alone [m]; so is half a standard deviation of where the tip would be at
+        the target.
     dead_band : float
         An error of the bevel's direction that is left alone [rad].
     scatter_dead_band : float
@@ -62,7 +63,7 @@ class PointLawSettings(NamedTuple):
     max_winding: Annotated[float, Bounds(2.0 * math.pi, 1e6, "rad")] = 6.0 * math.pi
     reserve: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.4
     doubt: Annotated[float, Bounds(0.0, 10.0, "-")] = 2.0
-    last_turn: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.008
+    last_turn: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.010
     last_turns_from: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.03
     close_enough: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.00005
     dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.3
@@ -173,7 +174,7 @@ def wanted_turn(
     rate = settings.max_rotation_per_length
     turn = turn_to(need)
     missed = rest_after(need, left, curvature, 0.0, left)
-    close = math.hypot(missed[0], missed[1]) < settings.close_enough
+    close = math.hypot(missed[0], missed[1]) < max(settings.close_enough, 0.5 * std)
     if close or abs(turn) < settings.dead_band:
         return 0.0
     turning = abs(turn) / rate + slack

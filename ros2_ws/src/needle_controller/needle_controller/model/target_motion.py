@@ -1,45 +1,51 @@
-"""Prediction of a moving target, some seconds ahead, from where it was seen.
+"""Prediction of a moving target from where it was observed.
 
-Tissue drifts, and breathes: what was seen of a target is explained by a drift, or by a drift and a
-period with its first overtone, whichever is simpler and explains it. What neither explains is not
-foretold: the target is then expected to stay where it was last seen. Nothing is asked of phase,
-rate or direction, and a target that was seen once, or rests, is where it is.
+Tissue drifts and breathes. Three models compete for the observed places: a random walk (the target
+may go anywhere, so it is expected where it was last observed), a drift, and a drift with a period
+and its first overtone. Drift and period are linear in their coefficients, which have Gaussian
+priors, so that evidence and prediction have closed forms (Bishop, Pattern Recognition and Machine
+Learning, 2006, section 3.5). The prediction is the mean of the models, weighted by their evidence.
 """
 
 from __future__ import annotations
+
+import math
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
 
-WINDOWS = (20.0, 10.0)
-"""So far back is asked what was seen: the shorter where the longer is not of one piece, as after a
-jump [s]."""
-SHORTEST = 5.0
-"""So long a target must have been seen: less tells no drift from a breath [s]."""
-SLOWEST, FASTEST = 0.08, 0.7
-"""Rates of breathing that are thought of [Hz]."""
-EXPLAINED = 0.9
-"""Share of the variance that an explanation must explain."""
-_BETTER = 0.25
-"""Share of the variance that a drift leaves, at which a period explains better."""
-_RECENT = 2.0
-"""So long is averaged for where an explained target is: jumps pass soon, and noise is small [s]."""
-_GOES_ON = 2.0
-"""A drift goes on for so many times as long as it was seen, and a target no farther beyond where it
-was seen, in each direction, than so many times as far as it was seen to move."""
-_RATE_STEP = 0.004
+WINDOW = 20.0
+"""Observations are kept for this long [s]."""
+SHORTEST = 3.0
+"""The target is expected where it was last observed until it was observed for this long [s]: half
+a breath, before which a breath looks like a drift."""
+_BEGINS = (WINDOW, 0.5 * WINDOW, 0.25 * WINDOW)
+"""A motion may have begun this long ago, equally likely; before, the target walked [s]."""
+_DRIFT_STD = (0.1, 0.001)
+"""Standard deviations of a drifting target's place [m] and speed [m/s] in each direction."""
+_BREATH_STD = (0.1, 0.0001, 0.005, 0.005, 0.002, 0.002)
+"""The same of a breathing one, and of the cosine and sine of its period and overtone [m]."""
+_SLOWEST, _FASTEST, _RATE_STEP = 0.08, 0.7, 0.004
+"""Rates of breathing [Hz]."""
+_EVERY = 5
+"""Every so many of these rates is a model of its own while the likeliest is not known."""
 _OF_SAMPLING = 0.2
-"""Fastest breathing as a share of the sampling's rate: its overtone is told from a slower one."""
+"""Fastest breathing as a share of the sampling rate: a faster overtone aliases."""
+_SCATTER = (1e-4, 3e-4, 1e-3)
+"""Standard deviations of what drift and breath leave unexplained, equally likely [m]."""
+_RATE_SCATTER = 1e-4
+"""The same where the likeliest rate is looked for [m]."""
+_WALK = (1e-3, 3e-3, 1e-2)
+"""Standard deviations of a random walk over 1 s, equally likely [m]."""
 _MOST_SAMPLES = 80
-_TERMS = 6
-_DRIFT = 2  # the first terms
-_AT_REST = 1e-12  # variance [m^2]
+_TERMS = len(_BREATH_STD)
 
 
 class TargetMotion:
-    """The motion of one target, or of many that are seen at the same times.
+    """The motion of one target, or of many that are observed at the same times.
 
     Times are seconds of any clock that all calls share.
     """
@@ -51,22 +57,22 @@ class TargetMotion:
 
     @property
     def last(self) -> Array:
-        """Place where it was last seen, shape (..., 3) [m].
+        """Place where it was last observed, shape (..., 3) [m].
 
         Raises
         ------
         IndexError
-            Nothing was seen yet.
+            Nothing was observed yet.
         """
         return self._points[-1]
 
     @property
     def seen(self) -> float:
-        """Time at which it was last seen [s]."""
+        """Time at which it was last observed [s]."""
         return self._times[-1]
 
     def see(self, time: float, points: npt.ArrayLike) -> None:
-        """Take where the target is; a time that is not after the last begins anew.
+        """Add an observation; a time that is not after the last one starts anew.
 
         Parameters
         ----------
@@ -78,17 +84,17 @@ class TargetMotion:
         if self._times and time <= self._times[-1]:
             self.forget()
         # Not more often than the window needs: the last one may still be replaced.
-        spacing = WINDOWS[0] / _MOST_SAMPLES
+        spacing = WINDOW / _MOST_SAMPLES
         if len(self._times) > 1 and time - self._times[-2] < spacing:
             del self._times[-1], self._points[-1]
         self._times.append(time)
         self._points.append(np.array(points, dtype=float))
-        while self._times[0] < time - WINDOWS[0]:
+        while self._times[0] < time - WINDOW:
             del self._times[0], self._points[0]
         self._motion = None
 
     def forget(self) -> None:
-        """Forget all that was seen."""
+        """Forget all observations."""
         self._times.clear()
         self._points.clear()
         self._motion = None
@@ -107,95 +113,128 @@ class TargetMotion:
 
 
 class _Motion:
-    """Motion that explains some targets' samples: times (K,) [s], points (K, ..., 3) [m]."""
+    """Models of targets that were observed at times (K,) [s] at points (K, ..., 3) [m].
+
+    Each model has a rate (H, N) [Hz] and coefficients (H, N, T, 3), times its weight. The random
+    walk has none: all is relative to the last place.
+    """
 
     def __init__(self, times: Array, points: Array) -> None:
         self._shape = points.shape[1:-1]
         self._end = times[-1]
-        self._span = times[-1] - times[0]
-        since, samples = times - self._end, points.reshape(len(times), -1, 3)
-        self._rates = np.zeros(samples.shape[1])
-        self._coefficients = np.zeros((samples.shape[1], _TERMS, 3))
-        least, most = samples.min(axis=0), samples.max(axis=0)
-        beyond = _GOES_ON * (most - least)
-        self._bounds = least - beyond, most + beyond
-        self._place = samples[-1].copy()
-        unexplained = np.arange(samples.shape[1])
-        for window in WINDOWS:
-            inside = since >= -window
-            seen = np.moveaxis(samples[inside][:, unexplained], 0, 1)
-            rates, coefficients, explained = _explain(since[inside], seen)
-            self._rates[unexplained] = rates
-            self._coefficients[unexplained] = coefficients
-            unexplained = unexplained[~explained]
-        recent = since[since >= -_RECENT]
-        moved = np.stack([self._moved(np.full_like(self._rates, t)) for t in recent])
-        self._place += np.where(
-            np.any(self._coefficients, axis=(1, 2))[:, None],
-            np.mean(samples[-len(recent) :] - moved, axis=0) - samples[-1],
-            0.0,
-        )
+        self._last = points[-1].reshape(-1, 3)
+        samples = np.moveaxis(points.reshape(len(times), -1, 3) - self._last, 0, 1)
+        moving = np.any(samples != 0.0, axis=(1, 2))
+        needles = len(samples)
+        self._rates, self._coefficients = np.zeros((1, needles)), np.zeros((1, needles, _TERMS, 3))
+        since = times - self._end
+        if -since[0] >= SHORTEST and np.any(moving):
+            rates, coefficients = _weighted_models(since, samples[moving])
+            self._rates = np.zeros((len(rates), needles))
+            self._coefficients = np.zeros((len(rates), needles, _TERMS, 3))
+            self._rates[:, moving], self._coefficients[:, moving] = rates, coefficients
 
     def at(self, time: Array) -> Array:
         """Return where the targets are expected [m]."""
         ahead = np.broadcast_to(time - self._end, self._shape).reshape(-1)
-        place = np.clip(self._place + self._moved(ahead), *self._bounds)
-        return np.asarray(place.reshape(*self._shape, 3))
-
-    def _moved(self, ahead: Array) -> Array:
-        """Return how far the targets move from the last sample until some time after it [m]."""
-        terms = _terms(ahead, self._rates) - _terms(np.zeros_like(ahead), self._rates)
-        terms[:, 1] = np.clip(terms[:, 1], -_GOES_ON * self._span, _GOES_ON * self._span)
-        return np.asarray(np.einsum("nt,ntc->nc", terms, self._coefficients))
+        moved = np.einsum("hnt,hntc->nc", _terms(ahead, self._rates), self._coefficients)
+        return np.asarray((self._last + moved).reshape(*self._shape, 3))
 
 
-def _explain(times: Array, samples: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-    """Return rates (N,), coefficients (N, T, 3) of the terms, and which targets they explain.
-
-    Coefficients of what is not explained are 0.
-    """
-    needles, count, _ = samples.shape
-    rates, coefficients = np.zeros(needles), np.zeros((needles, _TERMS, 3))
-    span = -times[0]
-    if span < SHORTEST or count <= _TERMS:
-        return rates, coefficients, np.zeros(needles, dtype=bool)
-    variance = _variance(samples - samples.mean(axis=1, keepdims=True), 1)
-    if np.all(variance <= _AT_REST):
-        return rates, coefficients, np.ones(needles, dtype=bool)
-    drift = _terms(times, np.zeros(1))[:, :_DRIFT]
-    solved, *_ = np.linalg.lstsq(drift, np.moveaxis(samples, 1, 0).reshape(count, -1), rcond=None)
-    coefficients[:, :_DRIFT] = np.moveaxis(solved.reshape(_DRIFT, needles, 3), 1, 0)
-    left = _variance(samples - drift @ coefficients[:, :_DRIFT], _DRIFT)
-    fastest = min(FASTEST, _OF_SAMPLING * (count - 1) / span)
-    thought_of = np.arange(max(SLOWEST, 1.0 / span), fastest, _RATE_STEP)
-    if len(thought_of):
-        found = _likeliest_rates(times, samples, thought_of)
-        design = _terms(times[None, :], found[:, None])
-        q, r = np.linalg.qr(design)
-        periodic = np.linalg.solve(r, q.swapaxes(1, 2) @ samples)
-        left_then = _variance(samples - design @ periodic, _TERMS)
-        better = left_then < _BETTER * left
-        rates[better], coefficients[better], left[better] = (
-            found[better], periodic[better], left_then[better]
-        )  # fmt: skip
-    explained = (left <= (1.0 - EXPLAINED) * variance) & (variance > _AT_REST)
-    coefficients[~explained] = 0.0
-    return rates, coefficients, explained | (variance <= _AT_REST)
+def _weighted_models(since: Array, samples: Array) -> tuple[Array, Array]:
+    """Return rates (H, N) and coefficients (H, N, T, 3) times weights, of samples (N, K, 3)."""
+    walk = _walk_evidence(since, samples)
+    evidence, rates, coefficients = [_log_mean(np.sum(walk, axis=2))], [], []
+    for begin in _BEGINS:
+        inside = since >= -begin
+        if begin < WINDOW and np.all(inside):
+            continue
+        before = _log_mean(np.sum(walk[:, :, ~inside], axis=2)) - math.log(len(_BEGINS))
+        for rate, log, fitted in _models(since[inside], samples[:, inside]):
+            evidence.append(before + log)
+            rates.append(rate)
+            coefficients.append(fitted)
+    log = np.array(evidence)
+    weights = np.exp(log - np.max(log, axis=0))
+    weights /= np.sum(weights, axis=0)
+    return np.array(rates), weights[1:, :, None, None] * np.array(coefficients)
 
 
-def _likeliest_rates(times: Array, samples: Array, rates: Array) -> Array:
-    """Return for each target the rate that leaves least, (N,) [Hz]; between those given, too."""
-    q, _ = np.linalg.qr(_terms(times[None, :], rates[:, None]))
-    explained = np.sum(np.einsum("fkt,nkc->nftc", q, samples) ** 2, axis=(2, 3))
-    best = np.argmax(explained, axis=1)
-    inner = np.clip(best, 1, max(len(rates) - 2, 1))
+def _models(since: Array, samples: Array) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield rate (N,) [Hz], log evidence (N,), coefficients (N, T, 3): rest, drift and breaths."""
+    still = np.zeros(len(samples))
+    for std in (_DRIFT_STD[:1], _DRIFT_STD):
+        yield still, *_fit(since, still[:1], samples, std)
+    fastest = min(_FASTEST, _OF_SAMPLING * (len(since) - 1) / -since[0])
+    rates = np.arange(_SLOWEST, fastest, _RATE_STEP)
     if len(rates) < 3:
-        return np.asarray(rates[best])
-    row = np.arange(len(samples))
-    before, at, after = (explained[row, inner + k] for k in (-1, 0, 1))
+        return
+    some = rates[::_EVERY]
+    for rate in some:
+        log, fitted = _fit(since, np.array([rate]), samples, _BREATH_STD)
+        yield np.full(len(samples), rate), log - math.log(len(some)), fitted
+    likeliest = _likeliest_rates(since, samples, rates)
+    log, fitted = _fit(since, likeliest, samples, _BREATH_STD)
+    yield likeliest, log - math.log(len(rates)), fitted
+
+
+def _fit(since: Array, rates: Array, samples: Array, std: tuple[float, ...]) -> tuple[Array, Array]:
+    """Return log evidence (N,) and coefficients (N, T, 3) of a model of samples (N, K, 3).
+
+    Terms X, prior N(0, S^2) of the coefficients and scatter s give the samples the covariance
+    X S^2 X' + s^2, and the coefficients the mean S (S X'X S + s^2)^-1 S X'y. The eigenvalues of
+    S X'X S serve every s.
+    """
+    scale = np.array(std)
+    scaled = _terms(since, rates[:, None])[:, :, : len(std)] * scale
+    values, vectors = np.linalg.eigh(scaled.swapaxes(1, 2) @ scaled)
+    projected = vectors.swapaxes(1, 2) @ (scaled.swapaxes(1, 2) @ samples)
+    square, count = np.sum(samples**2, axis=(1, 2)), len(since)
+    logs, fits = [], []
+    for variance in np.square(_SCATTER):
+        sums = np.maximum(values, 0.0) + variance
+        rest = square - np.sum(projected**2 / sums[..., None], axis=(1, 2))
+        determinant = np.sum(np.log(sums / variance), axis=1) + count * math.log(variance)
+        logs.append(-1.5 * (determinant + count * math.log(2.0 * math.pi)) - 0.5 * rest / variance)
+        fits.append(scale[:, None] * (vectors @ (projected / sums[..., None])))
+    log = np.array(logs)
+    weights = np.exp(log - np.max(log, axis=0))
+    weights /= np.sum(weights, axis=0)
+    coefficients = np.zeros((len(samples), _TERMS, 3))
+    coefficients[:, : len(std)] = np.einsum("sn,sntc->ntc", weights, np.array(fits))
+    return _log_mean(log.T), coefficients
+
+
+def _walk_evidence(since: Array, samples: Array) -> Array:
+    """Return log densities of a random walk's steps, (N, S, K); the first is the place's."""
+    variance = np.square(_WALK)[:, None] * np.diff(since)
+    steps = np.sum(np.diff(samples, axis=1) ** 2, axis=2)[:, None]
+    log = -1.5 * np.log(2.0 * math.pi * variance) - 0.5 * steps / variance
+    place = -1.5 * math.log(2.0 * math.pi * _DRIFT_STD[0] ** 2)
+    return np.concatenate([np.full((*log.shape[:2], 1), place), log], axis=2)
+
+
+def _log_mean(logs: Array) -> Array:
+    """Return the logarithm of the mean of the exponentials along the last axis."""
+    most = np.max(logs, axis=-1)
+    return np.asarray(most + np.log(np.mean(np.exp(logs - most[..., None]), axis=-1)))
+
+
+def _likeliest_rates(since: Array, samples: Array, rates: Array) -> Array:
+    """Return each target's likeliest rate, (N,) [Hz]; between those given, too."""
+    # The prior as further rows: an observation of each coefficient, 0 to one standard deviation.
+    scaled = _terms(since, rates[:, None]) * np.array(_BREATH_STD)
+    prior = np.broadcast_to(_RATE_SCATTER * np.eye(_TERMS), (len(rates), _TERMS, _TERMS))
+    q, r = np.linalg.qr(np.concatenate([scaled, prior], axis=1))
+    q = q[:, : len(since)]
+    explained = np.sum(np.einsum("fkt,nkc->nftc", q, samples, optimize=True) ** 2, axis=(2, 3))
+    volume = np.sum(np.log(np.abs(np.diagonal(r, axis1=1, axis2=2))), axis=1)
+    likely = explained - 6.0 * _RATE_SCATTER**2 * volume
+    best, row = np.clip(np.argmax(likely, axis=1), 1, len(rates) - 2), np.arange(len(samples))
+    before, at, after = (likely[row, best + k] for k in (-1, 0, 1))
     bend = before - 2.0 * at + after
     offset = np.where(bend < 0.0, 0.5 * (before - after) / np.where(bend < 0.0, bend, 1.0), 0.0)
-    return np.asarray(rates[inner] + _RATE_STEP * np.clip(offset, -1.0, 1.0))
+    return np.asarray(rates[best] + _RATE_STEP * np.clip(offset, -1.0, 1.0))
 
 
 def _terms(time: Array, rate: Array) -> Array:
@@ -206,8 +245,3 @@ def _terms(time: Array, rate: Array) -> Array:
         [one, time * one, np.cos(phase), np.sin(phase), np.cos(2.0 * phase), np.sin(2.0 * phase)],
         axis=-1,
     )
-
-
-def _variance(rest: Array, terms: int) -> Array:
-    """Return each target's mean square of what some terms leave, (N,) [m^2]."""
-    return np.asarray(np.sum(rest**2, axis=(1, 2)) / (3 * (rest.shape[1] - terms)))

@@ -13,7 +13,7 @@ from needle_controller.laws.law import SteeringCommand
 from needle_controller.laws.point_law import PointLaw
 from needle_controller.laws.point_turns import PointLawSettings
 from needle_controller.model.arrays import Array
-from needle_controller.model.target_motion import WINDOWS, TargetMotion
+from needle_controller.model.target_motion import WINDOW, TargetMotion
 from needle_controller.observers.estimator import Estimate
 from needle_controller.presets.own_law import OwnLaw, tried_law
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -83,7 +83,7 @@ class Foresight:
         now = float(np.max(time))
         speed = self._speed(now, float(np.max(insertion)))
         self._foretold = None
-        if speed is None or not -_CLOCKS_APART <= now - self.motion.seen <= WINDOWS[0]:
+        if speed is None or not -_CLOCKS_APART <= now - self.motion.seen <= WINDOW:
             return self.aim
         if self._arrival is None:
             self._arrival = time + np.maximum(left(self.aim), 0.0) / speed

@@ -32,7 +32,7 @@ HELP = {
     ),
     NoTip.UNCERTAIN.value: "what lies over the end; cameras farther apart",
 }
-"""Remedies for the causes that have one, as in docs/images.md."""
+"""Remedies for the causes that have one, as in docs/own_rig.md."""
 
 
 def shows_end(end: ImageEnd | None) -> bool:

@@ -54,7 +54,7 @@ class SeenCounts:
         lines += [f"  no tip {n:6d} x  {cause}" for cause, n in self.missing.most_common()]
         for cause, _ in self.missing.most_common():
             if cause in HELP:
-                lines.append(f"  most often `{cause}`, helps: {HELP[cause]} (docs/images.md)")
+                lines.append(f"  most often `{cause}`, helps: {HELP[cause]} (docs/own_rig.md)")
                 break
         return "\n".join(lines)
 

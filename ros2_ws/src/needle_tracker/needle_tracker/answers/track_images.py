@@ -49,7 +49,7 @@ The output is a CSV file, one line for each pair:
   pitch_rad yaw_rad   of the shaft at its visible end: asin(d_x) and atan2(-d_y, d_z)
   left_end right_end  how many needle ends the network expects there, about 1 where the end is seen
   left_shaft right_shaft  mean probability of shaft behind it; empty where nothing was found
-  missing         why there is no tip; docs/images.md says what helps
+  missing         why there is no tip; docs/own_rig.md says what helps
 --insertion helps: one look at the needle is then enough. A needle shorter than 8 mm (entry_zone) is
 seen or not: nothing is wrong with images that do not show it.
 The stage's zero and scale may be off (stage_zero_sigma, stage_scale_sigma); both are estimated and
