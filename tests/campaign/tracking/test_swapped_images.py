@@ -48,7 +48,7 @@ class Looks:
         self.watch = SwapWatch(calibration, settings)
         self.ever = False
 
-    def see(self, left: np.ndarray, right: np.ndarray, insertion: float | None) -> Measurement:
+    def update(self, left: np.ndarray, right: np.ndarray, insertion: float | None) -> Measurement:
         measured = self.tracker.process(left, right, insertion)
         self.watch.update(left, right, insertion, measured)
         self.ever = self.ever or self.watch.suspected

@@ -266,7 +266,7 @@ def test_swapped_folders_are_suspected(
         def __init__(self, *_: Any) -> None:
             pass
 
-        def see(self, *_: Any) -> None:
+        def update(self, *_: Any) -> None:
             pass
 
     monkeypatch.setattr(track_images, "SwapWatch", Suspects)
