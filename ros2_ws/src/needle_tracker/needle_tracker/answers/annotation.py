@@ -33,6 +33,11 @@ HELP = {
     NoTip.UNCERTAIN.value: "what lies over the end; cameras farther apart",
 }
 """Remedies for the causes that have one, as in docs/own_rig.md."""
+_SCALE = 0.5
+_GREEN, _YELLOW, _RED = (90, 230, 90), (255, 220, 60), (255, 80, 60)
+_SHAFT_PX = 40.0
+_SHIFT = 4  # fractional bits of coordinates for drawing
+_BAR_PX = 44
 
 
 def shows_end(end: ImageEnd | None) -> bool:
@@ -55,13 +60,6 @@ def missing(measured: Measurement) -> str:
         return str(measured.reason)
     left, right = measured.ends
     return _BY_VIEWS[shows_end(left), shows_end(right)]
-
-
-_SCALE = 0.5
-_GREEN, _YELLOW, _RED = (90, 230, 90), (255, 220, 60), (255, 80, 60)
-_SHAFT_PX = 40.0
-_SHIFT = 4  # fractional bits of coordinates for drawing
-_BAR_PX = 44
 
 
 def annotate(left: Image, right: Image, measured: Measurement) -> Image:

@@ -22,6 +22,7 @@ from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.sources.pairing import InsertionHistory, Pair, PairMatcher
 
 SUSPICION = "left and right images seem to be swapped: the other way round they show a needle"
+_NEW_RECORDING = 1_000_000_000  # a longer step back in time begins a new recording [ns]
 # Consecutive pairs without a tip before the first check, pairs of a check, period of the checks.
 _BEFORE, _CHECKED, _PERIOD = 5, 10, 20
 _AGREEING = 4  # consecutive pairs that must show a needle when swapped
@@ -91,9 +92,6 @@ class SwapWatch:
         swapped = self._swapped.process(right, left, insertion)
         self._agreeing = self._agreeing + 1 if swapped.tip is not None else 0
         self.suspected = self._agreeing >= _AGREEING
-
-
-_NEW_RECORDING = 1_000_000_000  # a longer step back in time begins a new recording [ns]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,6 +24,8 @@ from needle_tracker.stereo.triangulation import SpatialTip
 
 RIG_FRAME = "rig"
 LEFT_FRAME = "left_camera_optical"
+ROLL_VARIANCE = math.pi**2
+"""Variance of an unknown angle [rad^2]: finite, since an infinite one means no tip."""
 _QUOTED = 40  # characters of an unknown encoding
 
 
@@ -126,9 +128,6 @@ def _position(tip: SpatialTip) -> tuple[float, float, float]:
 
 
 Array = NDArray[np.float64]
-
-ROLL_VARIANCE = math.pi**2
-"""Variance of an unknown angle [rad^2]: finite, since an infinite one means no tip."""
 
 
 def orientation(direction: Array) -> Array:

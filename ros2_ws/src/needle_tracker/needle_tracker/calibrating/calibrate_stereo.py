@@ -60,6 +60,13 @@ the images, and how to calibrate cameras that look through walls or from aside.
 is left) or OpenCV (intrinsics.yml extrinsics.yml) wrote them, in metres: then a board at one place
 in air, and those under the surface, suffice.
 """
+_COLOURS = {"left": "#1668b0", "right": "#d1701b"}
+_BOARDS = {
+    "free": ("board held freely", "#9aa0a8"),
+    "surface": ("board of known place in air", "#1b1b1b"),
+    "under": ("board under the surface", "#b03060"),
+}
+_MM = 1e3
 _SCALE_KNOWN = 0.1  # largest standard deviation of a known size of the squares [%]
 _EPILOG = """\
 writes: FILE.yaml, FILE.rig.png (cameras, surface, boards)
@@ -277,14 +284,6 @@ if __name__ == "__main__":
 
 
 Array = NDArray[np.float64]
-
-_COLOURS = {"left": "#1668b0", "right": "#d1701b"}
-_BOARDS = {
-    "free": ("board held freely", "#9aa0a8"),
-    "surface": ("board of known place in air", "#1b1b1b"),
-    "under": ("board under the surface", "#b03060"),
-}
-_MM = 1e3
 
 
 def rig_figure(result: RigCalibration) -> Figure:

@@ -18,6 +18,12 @@ from needle_tracker.optics.calibration import Camera
 
 Array = NDArray[np.float64]
 
+_ITERATIONS = 40
+_UNDISTORT_ITERATIONS = 12
+_UNDISTORTED = 1e-9  # error of a converged inversion of the distortion, at unit focal length
+_JACOBIAN_STEP = 1e-5  # of the central differences [m]: their relative error is about 1e-8
+_LAYERS = 29  # index of the first layer in a packed camera: thickness and refractive index
+
 
 @inlined
 def cross(one: Array, other: Array, result: Array) -> None:
@@ -32,15 +38,6 @@ def dot(one: Array, other: Array) -> float:
     """Return the scalar product of two vectors, shape (3,)."""
     product: float = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
     return product
-
-
-_ITERATIONS = 40
-_UNDISTORT_ITERATIONS = 12
-_UNDISTORTED = 1e-9  # error of a converged inversion of the distortion, at unit focal length
-_JACOBIAN_STEP = 1e-5  # of the central differences [m]: their relative error is about 1e-8
-
-
-_LAYERS = 29  # index of the first layer in a packed camera: thickness and refractive index
 
 
 def pack_camera(camera: Camera) -> Array:

@@ -13,6 +13,7 @@ T = TypeVar("T")
 _WAITING_LIMIT = 3  # images of one side without a partner
 _SKEWS = 100  # latest pairs whose differences of stamps are reported
 _PERIODS = 15  # latest periods of the cameras, of which the median is used
+_KEPT = 2000  # samples: 40 s at 50 Hz
 OTHER_SIDE = {"left": "right", "right": "left"}
 
 
@@ -113,9 +114,6 @@ class PairMatcher(Generic[T]):
         for old in [other for other in waiting if other < stamp]:
             del waiting[old]
             self.unpaired[side] += 1
-
-
-_KEPT = 2000  # samples: 40 s at 50 Hz
 
 
 class InsertionHistory:
