@@ -38,8 +38,6 @@ class PairingSettings:
         Squared distance over its covariance above which two observations differ: 5 sigma.
     sigmas : float
         Half width of a search region, in standard deviations.
-    closer_looks : int
-        Pairs of paths whose ends are fitted at full size.
     path_across_px, path_along_px : float
         Standard deviations of the end of a path [px]: two lines may be one at half size.
     same_px : float
@@ -61,7 +59,6 @@ class PairingSettings:
 
     gate: float = 25.0
     sigmas: float = 3.0
-    closer_looks: int = 5
     path_across_px: float = 4.0
     path_along_px: float = 10.0
     same_px: float = 2.0
@@ -172,7 +169,8 @@ class StereoSearch:
             if tip is not None and tip.misfit < PAIRING.gate:
                 pairs.append((pair[0].score + pair[1].score - 0.5 * tip.misfit, pair))
         pairs.sort(key=lambda scored: -scored[0])
-        best = [pair for _, pair in pairs[: PAIRING.closer_looks]]
+        # The ends of as many pairs as half of the candidates are fitted at full size.
+        best = [pair for _, pair in pairs[: SEARCH.candidates // 2]]
         left, right = (list({id(pair[i]): pair[i] for pair in best}.values()) for i in range(2))
         return left, right
 

@@ -27,8 +27,7 @@ from needle_tracker.optics.refraction import RefractedCamera
 Array = NDArray[np.float64]
 
 _ITERATIONS = 12
-_STEP = 1e-10  # of a converged position [m]
-_LEAST_DETERMINANT = 1e-10  # of the normal matrix, scaled by its diagonal
+_ROUNDING = 1e-10  # step of a converged position [m]; scaled determinant of a singular matrix
 _LEAST_SINE = 1e-3  # of the angle between the two planes through a camera and the shaft
 
 
@@ -179,11 +178,11 @@ def _solve_position(
         # A NaN, of a point behind a camera, must not reach det().
         if not 0.0 < product < math.inf:
             return False, normal, residual, jacobians
-        if not np.linalg.det(normal) > _LEAST_DETERMINANT * product:
+        if not np.linalg.det(normal) > _ROUNDING * product:
             return False, normal, residual, jacobians
         step = np.linalg.solve(normal, rows.T @ residual)
         position += step
-        if np.abs(step).max() < _STEP:
+        if np.abs(step).max() < _ROUNDING:
             return True, normal, residual, jacobians
     return False, normal, residual, jacobians
 
