@@ -46,8 +46,7 @@ class DetectorSettings:
     end_window_px : int
         Side of the square over which the ends about a cell are summed [px].
     near_widths : float
-        Half the size of the region about a path that is examined at full size, and context beyond
-        an expected end [needle widths].
+        Half the size of the region about a path that is examined at full size [needle widths].
     """
 
     coarse_width_px: float = 4.4
@@ -230,8 +229,9 @@ class NeedleDetector:
             None if the maps show no shaft.
         """
         shrink, width = self._shrink, self.width_px
-        # The network needs context beyond the end.
-        back, ahead = FIT.line_widths * width + along, along + DETECTOR.near_widths * width
+        # The network needs context beyond the end: half as much as behind it.
+        line = FIT.line_widths * width
+        back, ahead = line + along, 0.5 * line + along
         box = self._box(point, direction, (-back, ahead), across)
         if box is None:
             return None

@@ -296,12 +296,17 @@ class NeedleTrack:
     def log_odds(self, settings: TrackerSettings) -> float:
         """Return the log-odds that this is the needle.
 
-        The alternatives are the end of another thing or none, which do not move as the needle does,
-        and the shadow or the mirror image of the needle, which does so elsewhere.
+        The alternatives are the end of another thing, which does not move as the needle does; no
+        end at all; and the shadow or the mirror image of the needle, which moves so elsewhere. With
+        the insertion, a line without an end is fitted where the stage predicts the end, so that its
+        motion is no evidence.
 
-        P(else) / P(needle) = ((1 + e^-end) e^-motion + e^-shadow) e^-place
+        P(else) / P(needle) = (e^-motion + e^-end [e^-motion] + e^-shadow) e^-place
         """
-        others = _log_sum(0.0, -self.end_log_odds) - self.motion_log_odds
+        no_end = -self.end_log_odds
+        if self.insertion is None:
+            no_end -= self.motion_log_odds
+        others = _log_sum(-self.motion_log_odds, no_end)
         return self.place_log_odds - _log_sum(others, -settings.filter.shadow_log_odds)
 
     def rank(self, settings: TrackerSettings) -> float:
