@@ -20,7 +20,7 @@ import yaml
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
-from needle_bringup.descendants import processes_with
+from needle_bringup.workplace import processes_with
 from needle_core.errors import UserError
 
 T = TypeVar("T")

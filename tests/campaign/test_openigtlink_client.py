@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_analysis.link.link_port import LinkPort
-from needle_analysis.link.openigtlink import OpenIGTLink, OpenIGTLinkParameters
+from needle_bags.link.link_port import LinkPort
+from needle_bags.link.openigtlink import OpenIGTLink, OpenIGTLinkParameters
 from needle_core import messages as m
 from needle_core.component import Moment, Send
 from needle_core.status_messages import ControllerStatus
@@ -56,7 +56,7 @@ class Scene:
 
 
 def test_pyigtls_client_hears_the_needle_in_mm() -> None:
-    pyigtl = pytest.importorskip("pyigtl", reason="the lock is not installed: docs/slicer.md")
+    pyigtl = pytest.importorskip("pyigtl", reason="the lock is not installed: docs/viewers.md")
     with contextlib.closing(Scene(pyigtl.OpenIGTLinkClient)) as scene:
         assert scene.hears("NeedleStatus").string == "nothing heard of the needle"
         status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))

@@ -26,9 +26,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (
-    "docs/setup.md", "README.md", "bags/README.md", "docs/hardware.md", "docs/calibration.md",
-    "docs/own_controllers.md", "docs/examples/README.md", "docs/first_run.md",
-    "docs/own_rig.md", "docs/report_a_problem.md",
+    "docs/get_started.md", "README.md", "bags/README.md", "docs/hardware.md", "docs/calibration.md",
+    "docs/own_controllers.md", "docs/examples/README.md", "docs/own_rig.md",
+    "docs/troubleshooting.md",
 )  # fmt: skip
 COMMAND, PROGRAM, FILE = "command", "python", "file"
 FILES = ("yaml", "toml", "python")

@@ -19,8 +19,7 @@ from campaign.checks import (
     check_traced,
     check_tracker,
 )
-from needle_bringup.descendants import ending_descendants
-from needle_bringup.workplace import checkout, make_folder, temporary_folder
+from needle_bringup.workplace import checkout, ending_descendants, make_folder, temporary_folder
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError

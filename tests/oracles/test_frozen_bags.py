@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from needle_analysis.ros import rerun
-from needle_bags.reading.bag_files import read_contents
+from needle_bags.reading.bag_messages import read_contents
+from needle_bags.ros import rerun
 
 BAGS = Path(__file__).resolve().parent / "bags"
 NAMES = (

@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from needle_analysis.ros.rerun import Node
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
-from needle_bags.reading.bag_order import messages_as_sent
+from needle_bags.reading.bag_messages import messages_as_sent
 from needle_bags.reading.bag_reader import Run, read_run
+from needle_bags.ros.rerun import Node
 from needle_core.component import Actions, Moment, Publish
 from needle_core.convert import from_ros
 from needle_core.messages import Image, JointState, Pose

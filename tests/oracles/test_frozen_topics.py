@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from needle_bags.reading.bag_files import read_contents
+from needle_bags.reading.bag_messages import read_contents
 from needle_bringup.simulation.rig_configuration import command_line_parameters, run_info
 from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.virtual_run import make_components, run_virtually

@@ -7,7 +7,7 @@ import os
 import signal
 import time
 
-from needle_bringup.descendants import processes_with
+from needle_bringup.workplace import processes_with
 
 NAME = "NEEDLE_TEST_RUN"
 RUN = os.environ.get(NAME, "")

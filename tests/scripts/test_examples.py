@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from needle_bringup.simulation.needle_options import contradictions
 from needle_bringup.simulation.rig_configuration import (
     NODES,
     command_line_parameters,
+    contradictions,
     merge,
     nodes_of,
     refuse_reserved,
@@ -122,7 +122,7 @@ def test_every_parameter_file_is_tried() -> None:
 @pytest.mark.parametrize("notebook", sorted(EXAMPLES.glob("*.ipynb")), ids=lambda path: path.name)
 def test_a_notebook_runs(notebook: Path) -> None:
     for name in ("pandas", "nbclient", "ipykernel"):
-        pytest.importorskip(name, reason="the notebooks' lock is not installed: docs/notebooks.md")
+        pytest.importorskip(name, reason="the notebooks' lock is not installed: docs/viewers.md")
     # In a process: what runs it leaves an event loop behind.
     run = "import sys; from nbclient.cli import main; sys.exit(main())"
     done = subprocess.run(

@@ -182,8 +182,10 @@ def _forgetful(await_start: Any, link: Any, monitor: Any, *others: Any) -> Any:
     monitor.forget_start()
 
 
-def _unstamped(take: Any, source: JoySource, axes: Any, buttons: Any, now: float, **_: Any) -> None:
-    take(source, axes, buttons, now)
+def _unstamped(
+    receive: Any, source: JoySource, axes: Any, buttons: Any, now: float, **_: Any
+) -> None:
+    receive(source, axes, buttons, now)
 
 
 def _unless_stopped(set_up: Any, driver: DeviceDriver, now: float) -> Any:
@@ -242,7 +244,7 @@ _MENDED: dict[str, tuple[str, Plant]] = {
         _judge_forgets(_homing_until=-1.0),
     ),
     "a_rebooted_drive_is_homed_where_it_stands": ("turns_as_commanded", _judge_forgets(_zero=0.0)),
-    "an_overtaken_release": ("no_motion_by_itself", wrapped(JoySource, "take", _unstamped)),
+    "an_overtaken_release": ("no_motion_by_itself", wrapped(JoySource, "receive", _unstamped)),
     "a_driver_killed_under_a_press": (
         "no_motion_by_another",
         set_to(HoldWitness, lose_device=lambda *_: None),

@@ -17,7 +17,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from code_lines import ROOT
-from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
+from needle_bringup.simulation.node_graph import NodeProcess, stop, wait_for
 from needle_core.commands.cli import EXIT_DONE, EXIT_INTERRUPTED
 from needle_core.files.installed import find_executable
 from needle_tracker.optics.calibration import SIDES

@@ -89,7 +89,7 @@ def test_nothing_is_loaded_from_elsewhere(site: Path, pages: dict[Path, Page]) -
 
 def test_names_of_the_code_lead_to_their_descriptions(site: Path, pages: dict[Path, Page]) -> None:
     links = pages[site / "docs/equations.html"].links
-    name = "needle_controller.model.kinematics.coordinate_rates"
+    name = "needle_controller.model.kinematics.angles_from_rotation"
     assert f"reference/api/needle_controller.model.html#{name}" in links
 
 

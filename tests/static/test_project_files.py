@@ -20,14 +20,14 @@ SCRIPT = re.compile(r"(?<![\w./])(?:needle/)?((?:scripts|\.ci)/[\w/.]+)")
 
 
 def example() -> str:
-    """Return the workflow that docs/ci.md has for another repository."""
-    page = (ROOT / "docs/ci.md").read_text("utf-8")
+    """Return the workflow that docs/tests.md has for another repository."""
+    page = (ROOT / "docs/tests.md").read_text("utf-8")
     return page.partition("```yaml\n")[2].partition("```")[0]
 
 
 def workflows() -> dict[str, Any]:
     texts = {path.name: path.read_text("utf-8") for path in WORKFLOWS}
-    return {name: yaml.safe_load(text) for name, text in {**texts, "ci.md": example()}.items()}
+    return {name: yaml.safe_load(text) for name, text in {**texts, "tests.md": example()}.items()}
 
 
 def commands(workflow: dict[str, Any]) -> str:
@@ -35,7 +35,7 @@ def commands(workflow: dict[str, Any]) -> str:
     return "\n".join(step["run"] for job in jobs for step in job["steps"] if "run" in step)
 
 
-@pytest.mark.parametrize("name", [*(path.name for path in WORKFLOWS), "ci.md"])
+@pytest.mark.parametrize("name", [*(path.name for path in WORKFLOWS), "tests.md"])
 def test_a_workflow_runs_what_there_is(name: str) -> None:
     text = commands(workflows()[name])
     scripts = set(SCRIPT.findall(text))

@@ -17,8 +17,8 @@ import latency_benchmark
 import recording_benchmark
 import reference_loop
 import tracker_benchmark
-from needle_bringup.descendants import ending_descendants
 from needle_bringup.studies.study_controllers import controller_factory, needles_at_a_time
+from needle_bringup.workplace import ending_descendants
 from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.model.reachability import reachability
 from needle_controller.model.target_plane import offset_plane

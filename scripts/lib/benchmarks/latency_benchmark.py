@@ -23,8 +23,8 @@ import latency_rig
 import needle_tracker
 from campaign.trials.steered_needle import FRAME_RATE, OFFSET, steer
 from campaign.trials.trial_processes import TrialProcesses
-from needle_analysis.run.stage_timing import stage_timings
 from needle_bags.reading.bag_reader import read_run
+from needle_bags.run.stage_timing import stage_timings
 from needle_bringup.simulation.rig_configuration import GRAPH_WATCHDOG, can_adapter
 from needle_core.component import Actions
 from needle_core.errors import UserError

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from campaign.trials.recording_trials import record_full_rate
 from needle_bags.format.bag_writer import BagWriter
-from needle_bags.recording.allocator import keep_freed_memory
+from needle_bags.recording.recording import reuse_freed_memory
 from needle_core.files.bag_topic import BagTopic
 
 EXPOSURES = 150
@@ -43,7 +43,7 @@ class Speeds:
 
 def measure() -> Speeds:
     """Write stereo pairs and what goes with them; the disk's own cache is emptied each time."""
-    keep_freed_memory()  # as the recorder does
+    reuse_freed_memory()  # as the recorder does
     images = np.random.default_rng(1).integers(0, 256, (2, 1024 * 768 + 64), dtype=np.uint8)
     left, right = (image.tobytes() for image in images)
     small = images[0, :200].tobytes()

@@ -17,7 +17,7 @@ ROOMS = (
     "needle_controller.curvature",
     "needle_tracker.optics",
     "needle_bags.reading",
-    "needle_analysis.run",
+    "needle_bags.run",
     "needle_sim.needle",
     "needle_sim.studies",
 )

@@ -14,7 +14,7 @@ from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
 
 HELP = """\
-Write the documents as a site: this checkout's README, docs, packages' READMEs and decision records,
+Write the documents as a site: this checkout's README, docs and packages' READMEs,
 and a reference made from the code as it is: nodes, topics, services, parameters, diagnostics,
 command lines, libraries. It is read from the disk or any web server, without a network.
 """

@@ -21,7 +21,7 @@ from std_msgs.msg import String
 
 from code_lines import ROOT
 from needle_bags.player.player_options import parse_options
-from needle_bags.reading.bag_files import read_contents
+from needle_bags.reading.bag_messages import read_contents
 from needle_console.console import OF_BUTTON, PAGE, Console
 from needle_console.console_parameters import ConsoleParameters
 from needle_console.hold.hold_state import HoldState, Mode
@@ -233,7 +233,7 @@ def _player(module: ModuleType, *more: str) -> Node:
 
 def _make_and_look(node: Any, _: Noted) -> None:
     node._make_publishers()
-    node.look_around()
+    node.check_graph()
 
 
 def _report_and_close(node: Any, _: Noted) -> None:

@@ -21,12 +21,12 @@ from campaign.checks.control_studies import (
     judge,
     run,
 )
-from needle_bringup.descendants import ran
 from needle_bringup.studies.pure_insertions import (
     RADIUS,
     curvature_errors,
     pure_insertions,
 )
+from needle_bringup.workplace import ran
 from needle_core.files.installed import find_executable
 
 INSERTIONS = 3000

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from campaign.checking import Finding
-from needle_bringup.descendants import ran
+from needle_bringup.workplace import ran
 from needle_core.files.installed import find_executable
 
 AT_END = "converged_at_end"

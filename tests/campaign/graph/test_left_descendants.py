@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from needle_bringup.descendants import ending_descendants, processes_with
+from needle_bringup.workplace import ending_descendants, processes_with
 
 # A child that starts another in a session of its own.
 CODE = """

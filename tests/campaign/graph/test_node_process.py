@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
+from needle_bringup.simulation.node_graph import NodeProcess, stop, wait_for
 
 
 def test_what_a_node_started_ends_with_it(tmp_path: Path) -> None:
@@ -30,7 +30,7 @@ def test_a_node_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
     code = """
 import os, sys, time
 from pathlib import Path
-from needle_bringup.simulation.node_process import NodeProcess
+from needle_bringup.simulation.node_graph import NodeProcess
 node = NodeProcess("n", ["sleep", "1000"], environment=os.environ, log=Path(sys.argv[1]))
 print(node.pid, flush=True)
 time.sleep(1000)

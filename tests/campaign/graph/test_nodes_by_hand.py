@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag2 import Reader
 
-from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
+from needle_bringup.simulation.node_graph import NodeProcess, stop, wait_for
 from needle_core.files.installed import find_executable
 from needle_core.process.ros_domain import own_domain
 

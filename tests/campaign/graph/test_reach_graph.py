@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from campaign.trials.holds.computers import ADDRESSES, two_computers
-from needle_bringup.simulation.node_process import NodeProcess, stop
+from needle_bringup.simulation.node_graph import NodeProcess, stop
 from needle_core.files.installed import find_executable
 from needle_core.process.reach import DISCOVERY_RANGE, PROFILES
 from needle_core.process.ros_domain import own_domain, ports_of

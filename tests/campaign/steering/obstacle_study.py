@@ -23,8 +23,8 @@ from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.actions import next_step
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.next_step import next_step
 from needle_controller.protocol.plane_control import PlaneControl
 from needle_core.commands.cli import EXIT_DONE, run_command, write_json
 from needle_core.commands.options import CommandParser, number, output_file, whole_number
@@ -156,7 +156,7 @@ def _best(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
     obstacles = tuple(float(value) for value in scene.obstacles.ravel())
     control = PlaneControl(dataclasses.replace(settings, obstacles=obstacles), offset_plane(0.0))
     control.target_point = scene.target
-    if control.path_obstacle(0.0):
+    if control.reason_without_path(0.0):
         return None
 
     def drive(tip: FloatArray, joints: JointSample) -> SteeringCommand | None:

@@ -15,9 +15,9 @@ from campaign.steering.obstacle_scenes import ObstacleScene, make_scene
 from campaign.steering.obstacle_study import CURVATURE, study_parser, tell
 from needle_controller.planning.entry import entry_state
 from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner
 from needle_controller.planning.path_search import THOROUGH_STARTS
-from needle_controller.planning.path_settings import PathSettings
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.commands.cli import EXIT_DONE, run_command
 from needle_core.commands.options import number, output_file, whole_number
@@ -68,7 +68,7 @@ def study(scenes: int, seed: int, radius: float, tolerance: float) -> dict[str, 
         PathSettings(
             SteeringSettings.max_rotation_per_length,
             curvature_share=1.0,
-            comfortable_share=1.0,
+            gentle_share=1.0,
             goal_tolerance=tolerance,
         )
     )
@@ -86,19 +86,19 @@ def study(scenes: int, seed: int, radius: float, tolerance: float) -> dict[str, 
     planner.warm_up()
     for n in range(scenes):
         scene = make_scene(seed, n, curvature=CURVATURE, pitch_bound=0.0, roll_bound=0.0)
-        question = entry, scene.target, scene_obstacles(scene)
-        path = timed("quick", lambda: planner.path(*question))  # noqa: B023 - called at once
+        problem = entry, scene.target, scene_obstacles(scene)
+        path = timed("quick", lambda: planner.path(*problem))  # noqa: B023 - called at once
         if path is not None:
             found_quickly += 1
             times["first"].append(times["quick"][-1])
-        if path is None and not timed("fill", lambda: planner.may_have_path(*question)):  # noqa: B023
+        if path is None and not timed("fill", lambda: planner.may_have_path(*problem)):  # noqa: B023
             none_exists += 1
             continue
         if path is None:
-            path = timed("thorough", lambda: planner.path(*question, starts=THOROUGH_STARTS))  # noqa: B023
+            path = timed("thorough", lambda: planner.path(*problem, starts=THOROUGH_STARTS))  # noqa: B023
         if isinstance(path, NeedlePath):
             paths.append(path)
-    clear = [1e3 * (path.margin + planner.settings.least_clear) for path in paths]
+    clear = [1e3 * (path.margin + planner.settings.least_clearance) for path in paths]
 
     def quantile(values: Sequence[float], percent: float) -> float | None:
         return float(np.percentile(values, percent)) if values else None
@@ -111,7 +111,7 @@ def study(scenes: int, seed: int, radius: float, tolerance: float) -> dict[str, 
         "none_found": scenes - len(paths) - none_exists,
         "least_clearance_mm": quantile(clear, 0.0),
         "median_clearance_mm": quantile(clear, 50.0),
-        "within_tolerance_only": sum(path.scarce > 0.0 for path in paths),
+        "within_tolerance_only": sum(path.gentle_miss > 0.0 for path in paths),
     }
     for what, values in times.items():
         for percent in (50, 95):

@@ -17,7 +17,7 @@ import numpy as np
 from rosbags.rosbag2 import Reader
 
 from campaign.checking import busy, unreadable
-from needle_bags.reading.bag_files import read_contents
+from needle_bags.reading.bag_messages import read_contents
 from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_core.errors import UserError

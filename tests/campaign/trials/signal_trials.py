@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from campaign.checking import busy, unreadable
 from campaign.trials.trial_processes import TrialProcesses
-from needle_bringup.simulation.node_process import NodeProcess
+from needle_bringup.simulation.node_graph import NodeProcess
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_core.errors import UserError

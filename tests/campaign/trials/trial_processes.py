@@ -8,8 +8,14 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from needle_bringup.simulation.node_graph import LOGS, PARAMETERS, NodeGraph
-from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
+from needle_bringup.simulation.node_graph import (
+    LOGS,
+    PARAMETERS,
+    NodeGraph,
+    NodeProcess,
+    stop,
+    wait_for,
+)
 from needle_bringup.simulation.rig_configuration import (
     PACKAGES,
     command_line_parameters,

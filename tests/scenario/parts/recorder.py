@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from needle_bags.format.bag_writer import BagWriter
-from needle_bags.recording.free_space import FreeSpace
-from needle_bags.recording.recording import Received, Recording
-from needle_bags.recording.worker import Do, Job, nothing
+from needle_bags.recording.recording import FreeSpace, Received, Recording
+from needle_bags.recording.worker import Job, RunJob, no_op
 from needle_core.component import Actions, Component, Input, Moment, Output, Timer
 from needle_core.files.bag_topic import BagTopic
 from scenario.faults import Fault, Kind
@@ -113,7 +112,7 @@ class _Space(FreeSpace):
 class _Jobs:
     """A `Worker` whose jobs are done when time is given to it."""
 
-    def __init__(self, do: Do, end: Job) -> None:
+    def __init__(self, do: RunJob, end: Job) -> None:
         self._do, self._end = do, end
         self._jobs: deque[Job] = deque()
         self._due = 0.0
@@ -128,7 +127,7 @@ class _Jobs:
     def work(self, now: float, seconds: float, cost: Callable[[], float]) -> None:
         """Do as many jobs as `seconds` have time for."""
         if not self._jobs and now >= self._due:
-            self._due = self._do(nothing)
+            self._due = self._do(no_op)
         while self._jobs and seconds > 0.0:
             seconds -= cost()
             self._due = self._do(self._jobs.popleft())
@@ -164,11 +163,12 @@ class RecorderStandIn(Component):
         self._now = 0.0
         self._count = 0
         self._killed_at: float | None = None
+        self._refused_at: float | None = None
         self._bag = _Bag(disk, disk.next_bag())
         self._witness = BagWitness(self._bag.directory)
         workers: list[_Jobs] = []
 
-        def make_worker(do: Do, end: Job) -> _Jobs:
+        def make_worker(do: RunJob, end: Job) -> _Jobs:
             workers.append(_Jobs(do, end))
             return workers[0]
 
@@ -202,7 +202,12 @@ class RecorderStandIn(Component):
             return self._witness.losses_of_killed(self._killed_at) if judges_killed else []
         self.recording.close()
         if not self.recording.is_whole:
-            return [f"{self._bag.directory} is not whole: {self.recording.error}"]
+            if self._refused_at is None:
+                self._note_refusal()
+            if self._refused_at is None:
+                return [f"{self._bag.directory} is not whole: {self.recording.error}"]
+            # A disk that refused data leaves what a kill leaves.
+            return self._witness.losses_of_killed(self._refused_at) if judges_killed else []
         return self._witness.losses_of_ended()
 
     def _hear(self, topic: str, message: Any, at: Moment) -> Actions:
@@ -218,4 +223,10 @@ class RecorderStandIn(Component):
         if not self._disk.stands_still:
             draw, slowness = self._chance.uniform, self._disk.slowness
             self._jobs.work(at.steady, _WORK, lambda: draw(*_JOB) + slowness)
+            self._note_refusal()
         return ()
+
+    def _note_refusal(self) -> None:
+        refused = (self.recording.error or "").startswith("cannot write")
+        if refused and self._refused_at is None:
+            self._refused_at = self._now

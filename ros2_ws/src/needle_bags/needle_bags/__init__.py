@@ -1,1 +1,1 @@
-"""Bags of the rig: recorder, player, recovery, and reading."""
+"""Bags of the rig: recorder, player, recovery, rerun, report, and the live view."""

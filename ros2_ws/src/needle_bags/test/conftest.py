@@ -1,5 +1,95 @@
-"""The made-up run that tests of bags share."""
+"""Bags that tests share: made-up runs, the committed bag's first steps, and its report."""
 
-from made_up_run import make_run
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from made_up_run import make_run, write_run
+from needle_bags.format.bag_writer import BagCopy
+from needle_bags.reading.bag_messages import raw_as_sent, read_contents
+from needle_bags.reading.bag_reader import Run, read_run
+from needle_bags.report import report
 
 __all__ = ["make_run"]
+
+BAG = Path(__file__).resolve().parents[4] / "bags" / "regression"
+COMMAND = "scripts/simulate --level=tip --params='a <file>.yaml'"
+STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+@pytest.fixture(autouse=True)
+def _no_git(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("needle_bags.rerun.rerun_bag.commit", lambda: "0123abc")
+
+
+@pytest.fixture(scope="session")
+def regression() -> Path:
+    return BAG
+
+
+@pytest.fixture(scope="session")
+def made_up(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A made-up run as it is read."""
+    return read_run(write_run(tmp_path_factory.mktemp("made_up") / "run"))
+
+
+@pytest.fixture(scope="session")
+def cut_bag(tmp_path_factory: pytest.TempPathFactory) -> Callable[[float], Path]:
+    """Copies the committed bag up to an insertion [m]: eight steps, or the first pictures."""
+    run, contents = read_run(BAG), read_contents(BAG)
+
+    def cut(insertion: float) -> Path:
+        row = int(np.searchsorted(run.joints.values[:, 0], insertion))
+        bag = tmp_path_factory.mktemp("cut") / "bag"
+        copy = BagCopy(bag, contents.distribution, contents.custom_data)
+        for message in raw_as_sent(BAG, lambda _: True, lambda _: False):
+            if message.log_time < run.joints.received[row]:
+                copy.put(
+                    contents.topics[message.topic], message.data, message.log_time, message.time
+                )
+        copy.close()
+        return bag
+
+    return cut
+
+
+@pytest.fixture(scope="session")
+def eight_steps(cut_bag: Callable[[float], Path]) -> Path:
+    return cut_bag(8e-3)
+
+
+@pytest.fixture(scope="session")
+def first_pictures(cut_bag: Callable[[float], Path]) -> Path:
+    return cut_bag(30.5e-3)
+
+
+@pytest.fixture(scope="session")
+def reported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, str]:
+    """The committed bag with a tip that is no number and markup in its texts; and its report."""
+    bag = tmp_path_factory.mktemp("reported") / "bag"
+    contents = read_contents(BAG)
+    custom = contents.custom_data | {
+        "run_info": f'{{"level": "camera", "command": "{COMMAND}"}}',
+        "versions": '{"system": "<script>alert(1)</script>"}',
+    }
+    copy = BagCopy(bag, contents.distribution, custom)
+    tips = 0
+    for message in raw_as_sent(BAG, lambda _: True, lambda _: False):
+        topic, data = contents.topics[message.topic], message.data
+        if topic.name == "/needle/tip":
+            tips += 1
+            if tips == 60:
+                tip: Any = STORE.deserialize_cdr(data, topic.type_name)
+                tip.point.x = math.nan
+                data = bytes(STORE.serialize_cdr(tip, topic.type_name))
+        copy.put(topic, data, message.log_time, message.time)
+    copy.close()
+    assert report.main([str(bag)]) == 0
+    return read_run(bag), (bag / "report.html").read_text()

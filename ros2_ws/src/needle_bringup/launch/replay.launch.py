@@ -2,7 +2,7 @@
 
     ros2 launch needle_bringup replay.launch.py bag:=DIR rate:=0.5 loop:=true
 
-Plays the bag and runs the live view beside it (docs/live_view.md). Commands, holds and targets are
+Plays the bag and runs the live view beside it (docs/viewers.md). Commands, holds and targets are
 played under /replay only: no rig moves by it. The launch ends with the bag.
 """
 

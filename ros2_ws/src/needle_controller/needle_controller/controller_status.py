@@ -1,25 +1,35 @@
-"""Content of needle/controller_status."""
+"""Content of needle/controller_status, including the log of received messages.
+
+A node on a busy machine receives a message some time after it was sent, possibly after later ones;
+messages that exceed its queue are lost. The log lets a bag be replayed in the order of reception.
+"""
 
 from __future__ import annotations
 
 import math
+import re
+from typing import NamedTuple
 
+from needle_controller.protocol.actions import SteeringState
 from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.steering_types import SteeringState
 from needle_core.diagnostics import Level
 from needle_core.status_messages import ControllerStatus
 
 _LEVELS = {SteeringState.FAULT: Level.ERROR, SteeringState.WAITING_FOR_TIP: Level.WARN}
+_LOG_LENGTH = 100
+"""Most messages in one log: one or two seconds of a rig at rest."""
+_LOGGED = re.compile(r"(\S+) (\d{1,19})")
 
 
 def controller_status(steering: Steering, preset: str, source: str = "") -> ControllerStatus:
-    """Return what the node `source` says of the protocol."""
-    reach, control, intake = steering.reach, steering.control, steering.intake
+    """Return the status of the protocol; `source` is the node's name."""
+    reach, control, tips = steering.reach, steering.control, steering.tips
+    confidence = steering.confidence
     point = control.target_point
     target = None if point is None else (float(point[0]), float(point[1]), float(point[2]))
-    reason = steering.patience.silence or steering.reason
+    reason = steering.watchdog.silence or steering.reason
     level = _LEVELS.get(steering.state, Level.OK)
-    if steering.rejection or steering.patience.silence or steering.trust.is_doubtful:
+    if steering.rejection or steering.watchdog.silence or confidence.is_doubtful:
         level = max(level, Level.WARN)
     return ControllerStatus(
         source=source,
@@ -34,18 +44,16 @@ def controller_status(steering: Steering, preset: str, source: str = "") -> Cont
         obstacles=len(control.obstacles),
         reachable=None if reach is None else bool(reach.reachable),
         reachable_depth_m=None if reach is None else float(reach.depth),
-        trusted=steering.trust.verdict,
-        r1_low_m=_finite(steering.trust.low),
-        r1_high_m=_finite(steering.trust.high),
+        trusted=confidence.verdict,
+        r1_low_m=_finite(confidence.low),
+        r1_high_m=_finite(confidence.high),
         reason=reason,
         awaiting=steering.awaiting.value,
         insertion=steering.settings.insertion,
         command_ns=steering.command_ns,
-        tip_after_ns=intake.after_ns,
-        tips_rejected=intake.refused.total(),
-        tips_rejected_for=", ".join(
-            f"{fault.value} {count}" for fault, count in intake.refused.items()
-        ),
+        tip_after_ns=tips.after_ns,
+        tips_rejected=tips.rejected.total(),
+        tips_rejected_for=", ".join(f"{fault.value} {n}" for fault, n in tips.rejected.items()),
         watchdog_trips=steering.watchdog_trips,
         preset=preset,
         depth_m=steering.settings.depth,
@@ -54,3 +62,38 @@ def controller_status(steering: Steering, preset: str, source: str = "") -> Cont
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+class ReceivedMessage(NamedTuple):
+    """Topic of a received message, and the time at which its sender sent it [ns]."""
+
+    topic: str
+    sent_ns: int
+
+
+class ReceptionLog:
+    """Messages received since the last published status, in order."""
+
+    def __init__(self) -> None:
+        self._messages: list[ReceivedMessage] = []
+
+    def add(self, topic: str, sent_ns: int) -> None:
+        """Add a received message."""
+        self._messages.append(ReceivedMessage(topic, sent_ns))
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the log must be published."""
+        return len(self._messages) >= _LOG_LENGTH
+
+    def pop_text(self) -> str:
+        """Return the log as text, and clear it."""
+        text = ", ".join(f"{topic} {sent_ns}" for topic, sent_ns in self._messages)
+        self._messages.clear()
+        return text
+
+
+def received_messages(text: str) -> list[ReceivedMessage]:
+    """Return the messages of `ReceptionLog.pop_text`."""
+    found = map(_LOGGED.fullmatch, text.split(", "))
+    return [ReceivedMessage(match[1], int(match[2])) for match in found if match is not None]

@@ -1,6 +1,6 @@
-"""Many needles at once, for studies: compiled loops over what the node does for one of them."""
+"""Filters, observers and laws of many needles, for studies: compiled loops over the node's code."""
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -13,14 +13,8 @@ from numba import prange
 from needle_controller.filter.bank import advance_needle, correct_needle, start_needle
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.late_tips import LAST
-from needle_controller.filter.mixture import estimate_from, estimate_needle
-from needle_controller.filter.records import (
-    ESTIMATE,
-    EVENT,
-    HYPOTHESIS,
-    NEEDLE,
-    TORSION,
-)
+from needle_controller.filter.mixture import estimate_from_record, estimate_needle
+from needle_controller.filter.records import ESTIMATE, EVENT, HYPOTHESIS, NEEDLE, TORSION
 from needle_controller.laws.law import LinearizingGains, linearizing_rate
 from needle_controller.laws.point_law import point_turn
 from needle_controller.laws.point_turns import PointLawSettings
@@ -40,49 +34,49 @@ Records = npt.NDArray[np.void]
 
 
 class ManyFilters:
-    """The hypothesis filters of N needles, each as `HypothesisFilter` has it.
+    """Hypothesis filters of N needles, equal to N times `HypothesisFilter`.
 
-    They enter at the origin along z, with their bases at 0.
+    The needles enter at the origin along z, with their bases at 0.
 
     Parameters
     ----------
     settings : FilterSettings
-        What is assumed.
+        Assumptions.
     count : int
-        N.
+        Number of needles N.
     shortest_step : float
-        Insertion from one tip to the next, at least [m].
+        Least insertion between two tips [m].
 
     Attributes
     ----------
     estimates, torsions : ndarray of ESTIMATE, TORSION, shape (N,), (N, K)
-        What is known.
+        Present estimates.
     """
 
     def __init__(self, settings: FilterSettings, count: int, shortest_step: float) -> None:
         self._prior = settings.prior()
-        # A record alone is nothing that a parallel loop can be given.
-        self._known = np.array([settings.assumptions()])
+        # An array: parallel loops cannot take a single record.
+        self._assumed = np.array([settings.assumptions()])
         self._needles = np.zeros(count, NEEDLE)
         self._needles["initial_rotation"] = np.eye(3)
         self._needles["has_entry"] = True
         self._hypotheses = np.empty((count, self._prior.size + 1), HYPOTHESIS)
-        # Two advances a step, where the base begins to turn on the way.
+        # A step has two advances if the base begins to turn within it.
         self._events = np.zeros((count, 2 * math.ceil(LAST / shortest_step) + 4), EVENT)
         self.estimates = np.zeros(count, ESTIMATE)
         self.torsions = np.zeros((count, len(settings.torsion_hypotheses)), TORSION)
 
     def start(self, tips: Array) -> None:
         """Start at first tips, (N, 3) [m]."""
-        _start_all(self._needles, self._hypotheses, self._prior, tips, self._known)
+        _start_all(self._needles, self._hypotheses, self._prior, tips, self._assumed)
         self._estimate()
 
     def advance(self, lengths: Array, turns: Array) -> None:
-        """Move on by inserted lengths [m] and rotations of the bases [rad], (N,)."""
-        _advance_all(self._needles, self._hypotheses, self._events, lengths, turns, self._known)
+        """Advance by inserted lengths [m] and rotations of the bases [rad], (N,)."""
+        _advance_all(self._needles, self._hypotheses, self._events, lengths, turns, self._assumed)
 
     def correct(self, tips: Array, covariance: Array | None, ages: Array) -> None:
-        """Take tips, (N, 3), their covariance, (3, 3), and ages, (N,)."""
+        """Correct by tips, (N, 3), with their covariance, (3, 3), and ages, (N,)."""
         _correct_all(
             self._needles,
             self._hypotheses,
@@ -92,18 +86,18 @@ class ManyFilters:
             np.zeros((3, 3)) if covariance is None else covariance,
             covariance is not None,
             ages,
-            self._known,
+            self._assumed,
         )
         self._estimate()
 
     def _estimate(self) -> None:
-        _estimate_all(self._needles, self._hypotheses, self.estimates, self.torsions, self._known)
+        _estimate_all(self._needles, self._hypotheses, self.estimates, self.torsions, self._assumed)
 
     def each(self) -> list[Estimate]:
-        """Return the estimates as laws in Python take them."""
+        """Return the estimates as `Estimate`."""
         return [
-            estimate_from(said, torsions)
-            for said, torsions in zip(self.estimates, self.torsions, strict=True)
+            estimate_from_record(record, torsions)
+            for record, torsions in zip(self.estimates, self.torsions, strict=True)
         ]
 
     def roll_rates(self, settings: RollLawSettings, bend_sign: float) -> Array:
@@ -122,7 +116,7 @@ class ManyFilters:
 
 
 class ManyObservers:
-    """The observers of N needles and the law of [KC09], each as the node has it."""
+    """Observers of N needles, and the law of [KC09]."""
 
     def __init__(self, model: ObserverModel, law: LinearizingGains | None, count: int) -> None:
         self._model, self._law = model, law
@@ -136,12 +130,12 @@ class ManyObservers:
     def step(
         self, lengths: Array, unturned: Array, turns: Array, tips: Array, ages: Array
     ) -> Array:
-        """Take a step and its tips; return the rotation rates, (N,) [rad/m].
+        """Advance by a step, correct by its tips; return the rotation rates, (N,) [rad/m].
 
         Parameters
         ----------
         lengths, unturned, turns : ndarray, shape (N,)
-            Inserted, before the base begins to turn [m], and rotation of the base [rad].
+            Inserted length, its part before the base begins to turn [m], and rotation [rad].
         tips, ages : ndarray, shape (N, 3), (N,)
             See `ManyFilters.correct`.
         """
@@ -157,10 +151,10 @@ class ManyObservers:
 
 @parallel
 def _start_all(
-    needles: Records, hypotheses: Records, prior: Records, tips: Array, known: Records
+    needles: Records, hypotheses: Records, prior: Records, tips: Array, assumed: Records
 ) -> None:
     for n in prange(needles.size):
-        start_needle(needles[n], hypotheses[n], prior, tips[n], 0.0, 0.0, known[0])
+        start_needle(needles[n], hypotheses[n], prior, tips[n], 0.0, 0.0, assumed[0])
 
 
 @parallel
@@ -170,10 +164,10 @@ def _advance_all(
     events: Records,
     lengths: Array,
     turns: Array,
-    known: Records,
+    assumed: Records,
 ) -> None:
     for n in prange(needles.size):
-        advance_needle(needles[n], hypotheses[n], events[n], lengths[n], turns[n], known[0])
+        advance_needle(needles[n], hypotheses[n], events[n], lengths[n], turns[n], assumed[0])
 
 
 @parallel
@@ -186,7 +180,7 @@ def _correct_all(
     covariance: Array,
     has_covariance: bool,
     ages: Array,
-    known: Records,
+    assumed: Records,
 ) -> None:
     for n in prange(needles.size):
         correct_needle(
@@ -198,20 +192,16 @@ def _correct_all(
             covariance,
             has_covariance,
             ages[n],
-            known[0],
+            assumed[0],
         )
 
 
 @parallel
 def _estimate_all(
-    needles: Records,
-    hypotheses: Records,
-    estimates: Records,
-    torsions: Records,
-    known: Records,
+    needles: Records, hypotheses: Records, estimates: Records, torsions: Records, assumed: Records
 ) -> None:
     for n in prange(needles.size):
-        estimate_needle(needles[n], hypotheses[n], estimates[n], torsions[n], known[0])
+        estimate_needle(needles[n], hypotheses[n], estimates[n], torsions[n], assumed[0])
 
 
 @compiled
@@ -219,9 +209,9 @@ def _roll_all(
     estimates: Records, torsions: Records, bend_sign: float, settings: RollLawSettings, turns: Array
 ) -> None:
     for n in range(estimates.size):
-        known = estimates[n]
-        s, uncertainty = known.linearized, known.uncertainty
-        base, wound = known.base, known.wound
+        estimate = estimates[n]
+        s, uncertainty = estimate.linearized, estimate.uncertainty
+        base, wound = estimate.base, estimate.wound
         turns[n] = roll_turn(
             s[0], s[1], uncertainty, torsions[n], base, wound, bend_sign, settings
         )[0]
@@ -238,14 +228,14 @@ def _point_all(
     left: Array,
 ) -> None:
     for n in range(estimates.size):
-        known = estimates[n]
+        estimate = estimates[n]
         turns[n], left[n] = point_turn(
-            known.coordinates,
-            known.curvature,
-            known.uncertainty,
+            estimate.coordinates,
+            estimate.curvature,
+            estimate.uncertainty,
             torsions[n],
-            known.base,
-            known.wound,
+            estimate.base,
+            estimate.wound,
             targets[n],
             rotation_left[n],
             settings,
@@ -262,7 +252,7 @@ def _step_observers(
     ages: Array,
     model: ObserverModel,
 ) -> None:
-    # Steps are alike as a rule, and so are their gains.
+    # Most steps have the same length, and so the same gain.
     since, gain = 0.0, (0.0, 0.0, 0.0)
     for n in range(needles.size):
         needle = needles[n]

@@ -1,4 +1,4 @@
-"""plane_controller as a component: measured tips in, one insertion step at a time out."""
+"""plane_controller as a component: receives measured tips, sends insertion steps."""
 
 from __future__ import annotations
 
@@ -10,26 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from needle_controller.controller_status import controller_status
+from needle_controller.controller_status import ReceptionLog, controller_status
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes
 from needle_controller.model.point_reach import point_from_message
 from needle_controller.model.target_plane import plane_from_pose
 from needle_controller.observers.estimator import Estimate
-from needle_controller.planning.marked_obstacles import obstacles_from_markers
+from needle_controller.planning.obstacles import obstacles_from_markers
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.actions import Action, PublishUpdate, SendPath, SendStep, StartReply
 from needle_controller.protocol.continuous import make_steering
-from needle_controller.protocol.heard_messages import HeardMessages
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.steering_types import (
-    Action,
-    PublishUpdate,
-    SendPath,
-    SendStep,
-    StartReply,
-)
-from needle_controller.protocol.tip_gate import TipCovariance, TipMeasurement
+from needle_controller.protocol.tip_checks import TipCovariance, TipMeasurement
 from needle_core import messages as m
 from needle_core.component import (
     JOINT_STATES,
@@ -57,22 +50,22 @@ from needle_core.status_messages import ControllerStatus, DeviceStatus
 COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"
 TARGET_PLANE, TARGET_POINT, OBSTACLES = "target_plane", "target_point", "obstacles"
 TARGETS = (TARGET_PLANE, TARGET_POINT, OBSTACLES)
-_LAST_STAYS = {
+_KEPT_MESSAGE = {
     TARGET_PLANE: "the last plane stays",
     TARGET_POINT: "the last target stays",
     OBSTACLES: "the last obstacles stay",
 }
-# Time between two lines of log of one kind [s]: never every cycle.
 _LOG_PERIOD = 2.0
+"""Shortest time between two log messages of one kind [s]."""
 
 
 class PlaneController(Component):
-    """Steers the needle into the target plane, or to the target point: the step protocol on topics.
+    """Steers the needle into the target plane, or to the target point.
 
     Parameters
     ----------
     settings : SteeringSettings
-        The node's parameters.
+        Parameters of the node.
     name : str
         Full name of the node.
 
@@ -80,8 +73,8 @@ class PlaneController(Component):
     ----------
     steering : Steering
         The step protocol.
-    complaints : dict of str to str
-        By topic what is wrong with its latest message; only topics with something wrong.
+    problems : dict of str to str
+        Problem with the latest message of each topic that has one.
     """
 
     name = "plane_controller"
@@ -89,12 +82,12 @@ class PlaneController(Component):
     def __init__(self, settings: SteeringSettings, name: str = name) -> None:
         self.name, self.settings = name, settings
         self.steering: Steering = make_steering(settings)
-        self.complaints: dict[str, str] = {}
+        self.problems: dict[str, str] = {}
         self._bad_joints = 0
         self._missing: list[str] = [f"subscriber of {COMMANDS}"]
-        self._heard = HeardMessages()
+        self._received = ReceptionLog()
         self._logged: dict[str, float] = {}
-        self._told: tuple[dict[str, str], dict[str, str]] | None = None
+        self._reported_health: tuple[dict[str, str], dict[str, str]] | None = None
         self._published: ControllerStatus | None = None
         rows: tuple[tuple[str, type[Any], Callable[[Any, Moment], Iterable[Action]], Delivery], ...]
         rows = (
@@ -126,13 +119,13 @@ class PlaneController(Component):
         self.timers = (Timer(0.1, self._on_timer),)
 
     def on_settings(self, settings: SteeringSettings, at: Moment) -> Actions:
-        """Take changed parameters."""
+        """Apply changed parameters."""
         self.settings = settings
         self.steering.configure(settings)
         return self.carry_out([Log("info", "parameters changed")], at)
 
     def carry_out(self, actions: Iterable[Action], at: Moment) -> Actions:
-        """Return what the protocol's actions are on the graph, and the status if it has changed."""
+        """Convert actions of the protocol into messages; publish the status if it has changed."""
         for action in actions:
             match action:
                 case Log():
@@ -141,16 +134,14 @@ class PlaneController(Component):
                     yield from _update(action)
                 case SendStep() | SendPath():
                     yield Publish(COMMANDS, trajectory(action))
-        yield from self._report()
+        yield from self._report_changes()
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note whether anybody receives commands: a first step to nobody would be lost."""
+        """Check that a driver subscribes to commands: without one, the first step would be lost."""
         names = peers.subscribers.get(COMMANDS, ())
         receivers = [name for name in names if name.rpartition("/")[2] != "recorder"]
         self._missing = [] if receivers else [f"subscriber of {COMMANDS}"]
         return ()
-
-    # ---- inputs -------------------------------------------------------------------------------
 
     def _receive(
         self,
@@ -159,20 +150,20 @@ class PlaneController(Component):
         message: Any,
         at: Moment,
     ) -> Actions:
-        self._heard.add(topic, at.sent_ns)
+        self._received.add(topic, at.sent_ns)
         try:
             actions = handler(message, at)
         except UserError as error:
-            actions = self._complain(topic, error)
+            actions = self._on_bad_message(topic, error)
         else:
-            self.complaints.pop(topic, None)
+            self.problems.pop(topic, None)
         return self.carry_out(actions, at)
 
-    def _complain(self, topic: str, error: UserError) -> list[Action]:
+    def _on_bad_message(self, topic: str, error: UserError) -> list[Action]:
         self._bad_joints += topic == "joint_states"
-        kept = _LAST_STAYS.get(topic)
-        self.complaints[topic] = f"{error}; {kept}" if kept else str(error)
-        return [Log("warning", self.complaints[topic], topic)]
+        kept = _KEPT_MESSAGE.get(topic)
+        self.problems[topic] = f"{error}; {kept}" if kept else str(error)
+        return [Log("warning", self.problems[topic], topic)]
 
     def _on_joints(self, message: m.JointState, at: Moment) -> Iterable[Action]:
         return self.steering.on_joints(joint_sample(message, at.sent_ns))
@@ -201,28 +192,24 @@ class PlaneController(Component):
         point = point_from_message(message.frame_id, message.position)
         self.steering.settings.check_point(point)
         if message.stamp_ns:
-            self.steering.control.see_target_point(point, message.stamp_ns * 1e-9)
+            self.steering.control.observe_target_point(point, message.stamp_ns * 1e-9)
         else:
-            # Placed by hand: nobody says when it was there.
+            # Placed by hand: the time of the position is unknown.
             self.steering.control.target_point = point
         x, y, z = point
-        text = f"{TARGET_POINT} at ({x:g}, {y:g}, {z:g}) m"
-        return [Log("info", text, TARGET_POINT)]
+        return [Log("info", f"{TARGET_POINT} at ({x:g}, {y:g}, {z:g}) m", TARGET_POINT)]
 
     def _on_obstacles(self, message: m.Markers, at: Moment) -> Iterable[Action]:
-        obstacles = obstacles_from_markers(message)
-        self.steering.control.obstacles = obstacles
+        obstacles = self.steering.control.obstacles = obstacles_from_markers(message)
         return [Log("info", f"{len(obstacles)} obstacles", OBSTACLES)]
 
-    # ---- services and time --------------------------------------------------------------------
-
     def start(self, at: Moment) -> tuple[StartReply, Actions]:
-        """Begin to steer, if all is there."""
+        """Start steering, if all conditions hold."""
         reply, actions = self.steering.on_start()
         return reply, self.carry_out(actions, at)
 
     def stop(self, at: Moment) -> tuple[StartReply, Actions]:
-        """Send no more steps."""
+        """Stop sending steps."""
         reply, actions = self.steering.on_stop()
         return reply, self.carry_out(actions, at)
 
@@ -242,8 +229,6 @@ class PlaneController(Component):
     def _on_timer(self, at: Moment) -> Actions:
         return self.carry_out(self.steering.on_time(at.steady), at)
 
-    # ---- what is said -------------------------------------------------------------------------
-
     def _log(self, log: Log, at: Moment) -> Actions:
         if log.kind:
             if at.steady - self._logged.get(log.kind, -_LOG_PERIOD) < _LOG_PERIOD:
@@ -251,27 +236,27 @@ class PlaneController(Component):
             self._logged[log.kind] = at.steady
         yield log
 
-    def _report(self) -> Actions:
-        history = self.steering.intake.joints
-        complaints = {"joint_states": history.complaint} | self.complaints
+    def _report_changes(self) -> Actions:
+        history = self.steering.tips.joints
+        problems = {"joint_states": history.problem} | self.problems
         counts = {
             "joint_states_refused": str(self._bad_joints),
-            "joint_states_doubted": str(history.doubted),
+            "joint_states_doubted": str(history.rejected),
         }
-        if (complaints, counts) != self._told:
-            self._told = complaints, counts
-            yield Diagnose("joint_states", _health(complaints["joint_states"], counts))
+        if (problems, counts) != self._reported_health:
+            self._reported_health = problems, counts
+            yield Diagnose("joint_states", _health(problems["joint_states"], counts))
             for topic in TARGETS:
-                yield Diagnose(topic, _health(complaints.get(topic, ""), {}))
+                yield Diagnose(topic, _health(problems.get(topic, ""), {}))
         status = controller_status(self.steering, self.settings.preset, self.name)
-        if status != self._published or self._heard.is_full:
+        if status != self._published or self._received.is_full:
             self._published = status
             yield Diagnose("steering", status.diagnostic)
-            yield Publish(STATUS, dataclasses.replace(status, heard=self._heard.take_text()))
+            yield Publish(STATUS, dataclasses.replace(status, heard=self._received.pop_text()))
 
 
 def trajectory(command: SendStep | SendPath) -> m.Trajectory:
-    """Return a step as a trajectory of one point, a path as one of several."""
+    """Return the trajectory of a step (one point) or a path (several)."""
     match command:
         case SendStep(stamp_ns, insertion, rotation, duration):
             points: tuple[m.TrajectoryPoint, ...] = (
@@ -283,12 +268,12 @@ def trajectory(command: SendStep | SendPath) -> m.Trajectory:
 
 
 def joint_sample(message: m.JointState, sent_ns: int) -> JointSample:
-    """Return the two joints of a message, found by name, with the time of its sending [ns].
+    """Return the two joints of a message that was sent at a time [ns].
 
     Raises
     ------
     UserError
-        If one of them is missing or not finite.
+        A joint is missing or not finite.
     """
     position = dict(zip(message.names, message.positions, strict=False))
     missing = [name for name in (m.INSERTION_JOINT, m.ROTATION_JOINT) if name not in position]
@@ -301,13 +286,13 @@ def joint_sample(message: m.JointState, sent_ns: int) -> JointSample:
 
 
 def tip_covariance(message: m.PoseWithCovariance) -> TipCovariance:
-    """Return the covariance of a measured tip as it came, nothing checked."""
+    """Return the unchecked covariance of a measured tip."""
     matrix = np.array(message.covariance).reshape(6, 6)[:3, :3]
     return TipCovariance(message.stamp_ns, message.frame_id, matrix)
 
 
-def _health(complaint: str, values: dict[str, str]) -> Diagnostic:
-    return Diagnostic(Level.WARN if complaint else Level.OK, complaint or "ok", values)
+def _health(problem: str, values: dict[str, str]) -> Diagnostic:
+    return Diagnostic(Level.WARN if problem else Level.OK, problem or "ok", values)
 
 
 def _update(action: PublishUpdate) -> Actions:
@@ -320,7 +305,7 @@ def _update(action: PublishUpdate) -> Actions:
 
 
 def _pose(estimate: Estimate, stamp_ns: int) -> m.PoseWithCovariance:
-    """Return the estimated pose, its covariance in the message's fixed-axis convention."""
+    """Return the estimated pose with its covariance about the fixed axes of the frame."""
     turn = np.eye(6)
     turn[3:, 3:] = angle_axes(estimate.coordinates[3:])
     covariance = turn @ estimate.covariance @ turn.T

@@ -1,4 +1,4 @@
-"""plane_controller as a component: what its inputs, services and timer lead to."""
+"""plane_controller as a component: inputs, services and timer."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from needle_controller.controller_status import received_messages
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.observers.estimator import pose_estimate
 from needle_controller.plane_controller import COMMANDS, STATUS, PlaneController, tip_covariance
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.protocol.heard_messages import heard_messages
 from needle_core import messages as m
 from needle_core.component import Actions, Diagnose, Log, Moment, Peers, Publish, Reply
 from needle_core.diagnostics import Diagnostic, Level
@@ -57,7 +57,7 @@ class Bench:
                 case Reply():
                     self.replies.append(action)
 
-    def hear(self, topic: str, message: Any) -> None:
+    def receive(self, topic: str, message: Any) -> None:
         (row,) = (row for row in self.component.inputs if row.topic == topic)
         assert isinstance(message, row.message)
         self.do(row.handler(message, self.at))
@@ -71,32 +71,34 @@ class Bench:
     def joints(self, **positions: float) -> None:
         self.now += TICK
         names = tuple(f"{name}_joint" for name in positions)
-        self.hear("joint_states", m.JointState(self.now, names, tuple(positions.values())))
+        self.receive("joint_states", m.JointState(self.now, names, tuple(positions.values())))
 
     def tip(self, x: float = 0.0, frame: str = "rig") -> None:
         self.joints(**self.place)
         z = self.place["insertion"]
-        self.hear("needle/tip", m.Point(self.now, frame, (x, 0.0, z)))
+        self.receive("needle/tip", m.Point(self.now, frame, (x, 0.0, z)))
 
     def started(self) -> Bench:
-        self.hear("device/status", DeviceStatus(state="HOLDING", homed=True, hold_owner="operator"))
+        self.receive(
+            "device/status", DeviceStatus(state="HOLDING", homed=True, hold_owner="operator")
+        )
         self.joints(**self.place)
         assert self.call("start") == (True, "steering")
         return self
 
     def step(self) -> m.Trajectory:
-        """Show a tip; carry out the command that it leads to, and answer."""
+        """Send a tip, execute the resulting command, and answer."""
         self.tip()
         command: m.Trajectory = self.published[COMMANDS][-1]
         assert command.stamp_ns == self.now
         insertion, rotation = command.points[0].positions
         self.place = {"rotation": rotation, "insertion": insertion}
         self.joints(**self.place)
-        self.hear("device/result", m.CommandResult(command.stamp_ns, "succeeded"))
+        self.receive("device/result", m.CommandResult(command.stamp_ns, "succeeded"))
         return command
 
 
-def test_it_steers_step_by_step_and_says_what_it_believes() -> None:
+def test_it_steers_in_steps_and_publishes_its_estimate() -> None:
     bench = Bench().started()
     assert bench.status.state == "STEERING"
     for number in (1, 2, 3):
@@ -117,20 +119,20 @@ def test_it_steers_step_by_step_and_says_what_it_believes() -> None:
     rate = bench.published["needle/control_input"][-1].values[1]
     before = bench.published[COMMANDS][-2].points[0].positions[1]
     assert point.positions[1] - before == pytest.approx(rate * 0.001)
-    heard = [one for s in bench.published[STATUS] for one in heard_messages(s.heard)]
+    heard = [one for s in bench.published[STATUS] for one in received_messages(s.heard)]
     assert [one.topic for one in heard[-2:]] == ["joint_states", "device/result"]
     assert bench.call("stop") == (True, "stopped")
     assert bench.status.state == "IDLE"
 
 
-def test_a_start_waits_for_a_device_that_listens_and_says_why_not() -> None:
+def test_a_start_requires_a_driver_that_subscribes() -> None:
     assert Bench().call("start") == (False, "no device/status has come")
     bench = Bench(receiver="/recorder")
     assert bench.call("start") == (False, f"waiting for subscriber of {COMMANDS}")
     assert bench.component.steering.state.value == "IDLE"
 
 
-def test_joints_that_cannot_be_used_are_named_and_counted() -> None:
+def test_invalid_joints_are_reported_and_counted() -> None:
     bench = Bench()
     bench.joints(insertion=0.0)
     assert "without rotation_joint" in bench.health["joint_states"].message
@@ -138,12 +140,12 @@ def test_joints_that_cannot_be_used_are_named_and_counted() -> None:
     assert "not finite" in bench.health["joint_states"].message
     health = bench.health["joint_states"]
     assert (health.level, health.values["joint_states_refused"]) == (Level.WARN, "2")
-    assert bench.component.steering.intake.joints.latest is None
+    assert bench.component.steering.tips.joints.latest is None
     bench.joints(insertion=0.0, rotation=0.0)
     assert bench.health["joint_states"].level is Level.OK
 
 
-def test_every_reason_to_refuse_a_tip_is_logged_once_in_two_seconds() -> None:
+def test_each_reason_to_reject_a_tip_is_logged_once_in_two_seconds() -> None:
     bench = Bench().started()
     for again in (1, 2, 3):
         for x, frame in ((float("nan"), "rig"), (0.0, "map"), (1.0, "rig")):
@@ -154,14 +156,14 @@ def test_every_reason_to_refuse_a_tip_is_logged_once_in_two_seconds() -> None:
     assert (bench.status.tips_rejected, bench.status.level) == (9, Level.WARN)
     for reason in ("not finite", "frame 'map'", "from the entry point"):
         assert sum(reason in line for line in bench.logs) == 2
-    # Time is looked at by the timer.
+    # The timer checks the timeouts.
     for _ in range(2):
         bench.do(bench.component.timers[0].handler(bench.at))
         bench.later += 3.0
     assert bench.status.state == "WAITING_FOR_TIP"
 
 
-def test_a_reason_that_goes_on_is_logged_again_every_two_seconds() -> None:
+def test_a_lasting_reason_is_logged_every_two_seconds() -> None:
     bench = Bench().started()
     for _ in range(5):
         bench.tip(float("nan"))
@@ -169,7 +171,7 @@ def test_a_reason_that_goes_on_is_logged_again_every_two_seconds() -> None:
     assert sum("not finite" in line for line in bench.logs) == 3
 
 
-def test_a_tip_pose_says_the_positions_covariance() -> None:
+def test_the_covariance_of_a_tip_pose_is_used() -> None:
     pose = m.PoseWithCovariance(5, "rig", (0.0, 0.0, 0.0), STRAIGHT, tuple(map(float, range(36))))
     known = tip_covariance(pose)
     np.testing.assert_array_equal(known.matrix, [[0, 1, 2], [6, 7, 8], [12, 13, 14]])
@@ -178,12 +180,14 @@ def test_a_tip_pose_says_the_positions_covariance() -> None:
     bench.tip()
     assert not bench.published[COMMANDS]
     noise = tuple(1e-8 * np.eye(6).ravel())
-    bench.hear("needle/tip_pose", dataclasses.replace(pose, stamp_ns=bench.now, covariance=noise))
+    bench.receive(
+        "needle/tip_pose", dataclasses.replace(pose, stamp_ns=bench.now, covariance=noise)
+    )
     assert len(bench.published[COMMANDS]) == 1
 
 
 def test_the_covariance_follows_the_messages_convention(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fixed axes of target_plane: a sample of small turns has the published covariance."""
+    """A sample of small rotations about the axes of target_plane has the published covariance."""
     bench, rng, angles = Bench().started(), np.random.default_rng(1), np.array([0.5, -0.7, 1.2])
     mean, root = rotation_from_angles(angles), rng.normal(size=(6, 6))
     estimate = pose_estimate(np.zeros(3), mean, 8.0, root @ root.T)
@@ -198,46 +202,46 @@ def test_the_covariance_follows_the_messages_convention(monkeypatch: pytest.Monk
     np.testing.assert_allclose(sampled, published, atol=0.05 * np.max(published))
 
 
-def test_targets_are_taken_or_refused_and_the_last_stays() -> None:
+def test_invalid_targets_are_rejected_and_the_last_stays() -> None:
     bench = Bench()
     plane = m.Pose(0, "rig", (0.005, 0.0, 0.0), STRAIGHT)
-    bench.hear("target_plane", plane)
+    bench.receive("target_plane", plane)
     assert bench.status.target_offset_m == 0.005
     for bad, said in (((np.nan, 0.0, 0.0), "not finite"), ((0.5, 0.0, 0.0), "cannot be reached")):
-        bench.hear("target_plane", dataclasses.replace(plane, position=bad))
+        bench.receive("target_plane", dataclasses.replace(plane, position=bad))
         assert said in bench.health["target_plane"].message
-    assert "the last plane stays" in bench.component.complaints["target_plane"]
+    assert "the last plane stays" in bench.component.problems["target_plane"]
     assert bench.status.target_offset_m == 0.005
     for x, z in ((0.01, 0.1), (0.09, 0.1)):
-        bench.hear("target_point", m.Point(0, "rig", (x, 0.0, z)))
+        bench.receive("target_point", m.Point(0, "rig", (x, 0.0, z)))
         assert bench.status.target_point_m == (0.01, 0.0, 0.1)
     assert "entering at" in bench.health["target_point"].message
-    # A plane takes the point's place.
-    bench.hear("target_plane", plane)
+    # A plane replaces the point.
+    bench.receive("target_plane", plane)
     assert bench.status.target_point_m is None
     assert bench.health["target_plane"].level is Level.OK
     ball = m.Marker("rig", "bone", 1, 2, 0, (0.0, 0.0, 0.06), STRAIGHT, (0.004, 0.004, 0.004))
-    bench.hear("obstacles", m.Markers((ball,)))
-    bench.hear("obstacles", m.Markers((dataclasses.replace(ball, kind=1),)))
+    bench.receive("obstacles", m.Markers((ball,)))
+    bench.receive("obstacles", m.Markers((dataclasses.replace(ball, kind=1),)))
     assert "the last obstacles stay" in bench.health["obstacles"].message
     assert bench.status.obstacles == 1
-    bench.hear("obstacles", m.Markers(()))
+    bench.receive("obstacles", m.Markers(()))
     assert bench.status.obstacles == 0
 
 
-def test_a_stamped_point_is_foretold_and_another_rests() -> None:
+def test_the_motion_of_a_stamped_point_is_predicted() -> None:
     for stamped, wanted in ((True, 0.0055), (False, 0.005)):
         bench = Bench()
         for k in range(41):
-            # It drifts along x.
+            # The point drifts along x.
             stamp = k * 250_000_000 + 5_000_000_000 if stamped else 0
-            bench.hear("target_point", m.Point(stamp, "rig", (0.004 + 0.25e-4 * k, 0.0, 0.09)))
+            bench.receive("target_point", m.Point(stamp, "rig", (0.004 + 0.25e-4 * k, 0.0, 0.09)))
         points = bench.component.steering.control._points
         assert points is not None
         np.testing.assert_allclose(points.motion.at(20.0), [wanted, 0.0, 0.09], atol=1e-7)
 
 
-def test_parameters_change_on_the_way_and_a_path_has_several_points() -> None:
+def test_parameters_change_while_steering_and_a_path_has_several_points() -> None:
     bench = Bench().started()
     bench.do(
         bench.component.on_settings(dataclasses.replace(SETTINGS, preset="open_loop"), bench.at)

@@ -175,7 +175,7 @@ class ControllerStatus(KeyValues):
     depth_m : float or None
         Where steering ends.
     heard : str
-        What was heard since the status before, in order (`heard_messages`).
+        What was heard since the status before, in order (`received_messages`).
     """
 
     part = "steering"

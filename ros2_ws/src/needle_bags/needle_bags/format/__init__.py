@@ -1,1 +1,1 @@
-"""rosbag2 directories with MCAP data: how they are written."""
+"""Writing of rosbag2 directories with MCAP data."""

@@ -1,4 +1,4 @@
-"""Metadata of a bag, as rosbag2's metadata.yaml (version 9) has them, and the file itself."""
+"""Metadata of a bag in rosbag2's metadata.yaml (version 9)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from needle_core.files.file_access import replace_file
 
 METADATA_VERSION: Final = 9
 _NO_LIMIT: Final = QosTime(*divmod(2**63 - 1, 10**9))
-# What a publisher offers of which nothing else is known.
+# Default for publishers with an unknown offer.
 USUAL_QOS: Final = Qos(
     QosHistory.UNKNOWN,
     0,
@@ -40,7 +40,7 @@ USUAL_QOS: Final = Qos(
 
 @dataclasses.dataclass
 class DataFile:
-    """Contents of one of the bag's data files.
+    """Contents of a data file.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ def bag_information(
 ) -> dict[str, Any]:
     """Return the content of metadata.yaml below `rosbag2_bagfile_information`.
 
-    Messages that were compressed one by one (`is_packed`) are read so by every tool.
+    Set `is_packed` if messages are compressed one by one.
     """
     starts = [file.first for file in files if file.first is not None]
     start = min(starts, default=0)
@@ -116,7 +116,7 @@ def bag_information(
 
 
 def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
-    """Write metadata.yaml; one that exists is complete, and on the disk.
+    """Write metadata.yaml atomically, and flush it to the disk.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
 
 
 def channel_metadata(topic: BagTopic) -> dict[str, str]:
-    """Return what an MCAP channel says about a topic."""
+    """Return the metadata of a topic's MCAP channel."""
     profiles = dump_qos_v9(list(topic.offered_qos))
     return {
         "offered_qos_profiles": to_yaml(profiles).strip() if profiles else "",
@@ -137,7 +137,7 @@ def channel_metadata(topic: BagTopic) -> dict[str, str]:
 
 
 def to_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:
-    """Return YAML that simple readers understand, too."""
+    """Return YAML without anchors, for simple readers."""
     text: str = yaml.dump(value, Dumper=_PlainDumper, sort_keys=False, allow_unicode=True)
     return text
 
@@ -153,7 +153,7 @@ def _topic_metadata(topic: BagTopic) -> dict[str, Any]:
 
 
 class _PlainDumper(yaml.SafeDumper):
-    """Writes no anchors: rosbag2's reader and other simple ones do not follow them."""
+    """Writes no anchors, which rosbag2's reader does not support."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import os
+import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Final
 
 from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from needle_bags.format.bag_metadata import (
+    USUAL_QOS,
     DataFile,
     bag_information,
     channel_metadata,
     to_yaml,
     write_metadata,
 )
-from needle_bags.format.mcap_ending import NO_ROOM, McapEnding
 from needle_core.errors import UserError
 from needle_core.files.bag_path import METADATA_FILE
 from needle_core.files.bag_records import DISTRO_KEY, METADATA_KEY, METADATA_RECORD
@@ -28,34 +32,35 @@ LIBRARY: Final = "needle_bags"
 COMPRESSIONS: Final = ("none", "zstd")
 CHUNK_SIZE: Final = 2 * 2**20
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
+_STAMP_END: Final = 12
 
 
 class BagWriteError(UserError):
-    """The disk refused the bag's data; the message says why and where."""
+    """The disk refused data of a bag."""
 
 
 class BagWriter:
-    """One bag being written; not thread-safe: one thread owns it.
+    """A bag that is being written; not thread-safe.
 
     Parameters
     ----------
     directory : Path
-        The bag; made if it does not exist.
+        The bag; created if it does not exist.
     distribution : str
         ROS distribution whose message types the bag holds.
     chunk_size : int
-        Bytes after which a chunk is written out.
+        Bytes after which a chunk is written.
     max_file_size : int
-        Bytes of messages after which another data file is begun; 0: never.
+        Bytes of messages after which a new data file is started; 0: never.
     compression : str
         `none` or `zstd`, chunk by chunk.
     describe_itself : bool
-        Whether the data file repeats metadata.yaml, which has the bag's name.
+        Whether the data file repeats metadata.yaml, which contains the bag's name.
 
     Raises
     ------
     UserError
-        If the directory holds a bag already or cannot be made, or the disk takes nothing.
+        If the directory holds a bag already or cannot be made, or the disk refuses data.
     """
 
     def __init__(
@@ -82,16 +87,16 @@ class BagWriter:
             directory.mkdir(parents=True, exist_ok=True)
             self._begin_file()
         except OSError as error:
-            self._leave_nothing()
+            self._remove_file()
             raise UserError(f"cannot record into {directory}: {error.strerror}") from error
 
     @property
     def data_file(self) -> Path:
-        """The file that is written now."""
+        """The file that is being written."""
         return self.directory / self._files[-1].name
 
     def add_topic(self, topic: BagTopic) -> int:
-        """Announce a topic and return the number that its messages are written with."""
+        """Announce a topic; return its number for `write`."""
         self._topics.append(topic)
         self._register(topic)
         return len(self._topics) - 1
@@ -110,7 +115,7 @@ class BagWriter:
         log_time, publish_time : int
             When it was received and sent, system clock [ns].
         sequence : int
-            The publisher's own number of the message, 0 where it has none.
+            Sequence number of the publisher, 0 if it has none.
 
         Raises
         ------
@@ -132,21 +137,21 @@ class BagWriter:
             self._mcap.add_metadata(name, dict(values))
 
     def add_attachment(self, name: str, media_type: str, data: bytes, time: int) -> None:
-        """Append a file as an MCAP attachment; `time` is the system clock's [ns]."""
+        """Append a file as an MCAP attachment; `time` is system time [ns]."""
         with self._writing():
             self._mcap.add_attachment(time, time, name, media_type, data)
 
     def set_custom_data(self, key: str, value: str) -> None:
-        """Set one text of the `custom_data` in metadata.yaml, which every bag reader shows."""
+        """Set a text of `custom_data` in metadata.yaml."""
         self._custom_data[key] = value
 
     def flush(self) -> None:
-        """Close the chunk in progress, so that a crash loses nothing written before."""
+        """Write the current chunk, so that a crash cannot lose it."""
         with self._writing():
             self._mcap.flush()  # type: ignore[no-untyped-call]
 
     def close(self) -> None:
-        """Write the index and metadata.yaml; the bag is whole after this.
+        """Write the index and metadata.yaml.
 
         Raises
         ------
@@ -160,63 +165,30 @@ class BagWriter:
             self._end_file()
             write_metadata(self.directory, information)
 
-    def end_early(self) -> dict[str, int]:
-        """Complete the bag after a `BagWriteError`, as far as what is written is whole.
-
-        What a full disk cut off is dropped; if there is no room for the index and metadata.yaml
-        either, the last chunks make room for them.
-
-        Returns
-        -------
-        dict of str to int
-            Messages of each topic that were taken and are not in the bag.
-
-        Raises
-        ------
-        BagWriteError
-            If the disk refuses that, too.
-        """
-        # The buffer's rest meets the same disk; the file is closed all the same.
+    def abandon(self) -> None:
+        """Close the data file as it is after a `BagWriteError`; `recover` completes the bag."""
         with contextlib.suppress(OSError):
             self._stream.close()
-        path = self.data_file
-        taken = self._files[-1].counts
-        with self._writing():
-            ending = McapEnding(self._mcap, path)
-            while True:
-                ending.write()
-                self._files[-1] = DataFile(path.name, ending.counts, *ending.times)
-                try:
-                    write_metadata(self.directory, self._information())
-                except OSError as error:
-                    if error.errno not in NO_ROOM:
-                        raise
-                    ending.give_back()
-                else:
-                    break
-        kept = self._files[-1].counts
-        missing = {topic: count - kept.get(topic, 0) for topic, count in taken.items()}
-        return {topic: count for topic, count in missing.items() if count}
 
     def update_metadata(self) -> None:
-        """Write metadata.yaml again, with custom data that came after the end.
+        """Rewrite metadata.yaml with custom data that was set after `close`.
 
         Raises
         ------
         BagWriteError
-            If the disk refuses it; the file that is there stays as it is.
+            If the disk refuses it; the existing file is kept.
         """
         with self._writing():
             write_metadata(self.directory, self._information())
 
     def open_file(self, path: Path) -> IO[bytes]:
-        """Return a new file of the bag."""
+        """Open a new data file."""
         return path.open("xb")
 
     def _begin_file(self) -> None:
         name = f"{self.directory.absolute().name}_{len(self._files)}.mcap"
         self._stream = self.open_file(self.directory / name)
-        # Held until the file is closed: `recover` keeps off a bag that is being recorded.
+        # Locked until it is closed: `recover` refuses a bag that is being recorded.
         fcntl.flock(self._stream, fcntl.LOCK_EX)
         self._files.append(DataFile(name))
         self._file_bytes = 0
@@ -229,11 +201,11 @@ class BagWriter:
         self._mcap.add_metadata(METADATA_RECORD, {DISTRO_KEY: self._distribution})
         for topic in self._topics:
             self._register(topic)
-        # A disk that takes nothing is found out before there is anything to lose.
+        # Detect a full or broken disk before there are messages to lose.
         self._mcap.flush()  # type: ignore[no-untyped-call]
 
-    def _leave_nothing(self) -> None:
-        """Remove the file that could not be begun, so that the next try finds no bag."""
+    def _remove_file(self) -> None:
+        """Remove the file that could not be started, so that the next attempt finds no bag."""
         if self._files:
             with contextlib.suppress(OSError):
                 self._stream.close()
@@ -278,3 +250,79 @@ def refuse_existing_bag(directory: Path) -> None:
         raise UserError(f"cannot record into {directory}: it is a file")
     if (directory / METADATA_FILE).exists() or any(directory.glob("*.mcap")):
         raise UserError(f"{directory} holds a bag already: name a new directory")
+
+
+class BagCopy:
+    """A compressed bag that adds each topic with its first message.
+
+    Parameters
+    ----------
+    directory : Path
+        The new bag.
+    distribution : str
+        ROS distribution of its message types.
+    custom_data : mapping
+        Texts for metadata.yaml.
+
+    Raises
+    ------
+    UserError
+        If the directory holds a bag already or cannot be made.
+    """
+
+    def __init__(self, directory: Path, distribution: str, custom_data: Mapping[str, str]) -> None:
+        self._writer = BagWriter(directory, distribution=distribution, compression="zstd")
+        self._topics: dict[str, int] = {}
+        for key, text in custom_data.items():
+            self._writer.set_custom_data(key, text)
+
+    def put(self, topic: BagTopic, data: bytes, log_time: int, sent: int) -> None:
+        """Append a message that was received at `log_time` and sent at `sent` [ns].
+
+        Raises
+        ------
+        UserError
+            If the disk refuses the data.
+        """
+        if topic.name not in self._topics:
+            self._topics[topic.name] = self._writer.add_topic(topic)
+        self._writer.write(self._topics[topic.name], data, log_time, sent)
+
+    def close(self) -> None:
+        """Complete the bag; raises UserError if the disk refuses the data."""
+        self._writer.close()
+
+
+def standard_topic(name: str, type_name: str) -> BagTopic:
+    """Return a topic of a standard message type."""
+    store = _jazzy()
+    definition, _ = store.generate_msgdef(type_name, ros_version=2)
+    return BagTopic(name, type_name, definition, store.hash_rihs01(type_name), (USUAL_QOS,))
+
+
+def standard_text(text: str) -> bytes:
+    """Return a std_msgs/String as CDR."""
+    name = "std_msgs/msg/String"
+    store = _jazzy()
+    return bytes(store.serialize_cdr(store.types[name](data=text), name))
+
+
+@functools.cache
+def _jazzy() -> Typestore:
+    """Return Jazzy's types; loading them takes 0.1 s, which readers do not need."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def stamp_of(data: bytes) -> int:
+    """Return the stamp [ns] of a message (CDR) that begins with a header.
+
+    Raises
+    ------
+    UserError
+        If the message is too short.
+    """
+    if len(data) < _STAMP_END:
+        raise UserError(f"a message of {len(data)} bytes has no header with a stamp")
+    order = "<" if data[1] & 1 else ">"
+    sec, nanosec = struct.unpack_from(f"{order}iI", data, 4)
+    return int(sec) * 10**9 + int(nanosec)

@@ -1,4 +1,4 @@
-"""The full text of a message type's definition, from the files every ROS installation has."""
+"""Full definition texts of message types, from the installed .msg files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FIELD = re.compile(r"^\s*([A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w")
 
 
 def full_definition(type_name: str) -> str:
-    """Return a type's definition with those of all types it contains, as MCAP's `ros2msg` has it.
+    """Return the definition of a type and all types it contains, in MCAP's format `ros2msg`.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def full_definition(type_name: str) -> str:
     Raises
     ------
     UserError
-        If the .msg file of the type, or of one it contains, is not installed.
+        If the .msg file of the type, or of a contained type, is not installed.
     """
     texts: dict[str, str] = {}
     waiting = [type_name]
@@ -71,7 +71,7 @@ def message_class(type_name: str) -> Any:
     Raises
     ------
     ImportError, AttributeError, ValueError
-        If it is not installed, or the name is none.
+        If it is not installed, or the name is invalid.
     """
     package, kind, short = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), short)
@@ -89,7 +89,7 @@ def _read(type_name: str) -> str:
 
 
 def _contained(type_name: str, text: str) -> list[str]:
-    """Return the full names of the message types that a definition's fields have."""
+    """Return the full names of the message types in a definition."""
     found = []
     for line in text.splitlines():
         match = _FIELD.match(line.split("#", 1)[0])

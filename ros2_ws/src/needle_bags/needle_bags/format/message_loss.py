@@ -1,32 +1,32 @@
-"""Counts the messages that did not arrive, by the numbers that their publishers give them."""
+"""Number of lost messages, from gaps in the sequence numbers."""
 
 from __future__ import annotations
 
-# A gap counts once so many messages have followed it and nothing has come from within it.
+# A gap is final after this many messages without a message from within it.
 CERTAIN_AFTER = 5
 
 
 class SequenceGaps:
-    """The gaps in the numbers of one topic's messages, where it has one publisher.
+    """Gaps in the sequence numbers of a topic with one publisher.
 
-    Every publisher counts its messages from 1, and a message does not say which publisher it is
-    from: a jump may be a second publisher's first message that came before the graph told of it.
-    Where the numbers before the jump go on, it was.
+    Every publisher counts from 1, and a message does not name its publisher: a jump may be the
+    first message of a second publisher, received before its discovery. This is the case if the
+    numbers before the jump continue.
     """
 
     def __init__(self) -> None:
         self._missing = 0
         self._last: int | None = None
-        # Last number before a jump, how many it passed over, messages since.
+        # Last number before a jump, size of the gap, number of messages since.
         self._jump: tuple[int, int, int] | None = None
 
     @property
     def missing(self) -> int:
-        """Messages that did not arrive."""
+        """Number of lost messages."""
         return self._missing + (self._jump[1] if self._jump is not None else 0)
 
-    def take(self, number: int) -> None:
-        """Take the number of a message that has arrived."""
+    def add(self, number: int) -> None:
+        """Add the number of a received message."""
         if self._jump is not None:
             before, count, since = self._jump
             if number == before + 1:
@@ -40,8 +40,8 @@ class SequenceGaps:
             self._jump = (self._last, number - self._last - 1, 0)
         self._last = number
 
-    def forget(self) -> None:
-        """Begin anew: other publishers are there, and may have been for a moment."""
+    def reset(self) -> None:
+        """Start over after a change of the publishers."""
         self._jump = None
         self._last = None
 

@@ -1,4 +1,4 @@
-"""Which of the topics that there are: by name, by regular expression, and without which."""
+"""Selection of topics by name and by regular expressions."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from needle_core.errors import UserError
 
 @dataclasses.dataclass(frozen=True)
 class TopicChoice:
-    """A choice of topics; all where neither names nor an expression are given.
+    """A selection of topics; all without names and expressions.
 
     Attributes
     ----------
     names : tuple of str
-        Absolute names. They are chosen whatever is excluded.
+        Absolute names, selected regardless of `exclude_regex`.
     regex : str
-        Names in which it is found are chosen too; empty: none.
+        Also selects matching names; empty: none.
     exclude_regex : str
-        Names in which it is found are not chosen; empty: none is excluded.
+        Excludes matching names; empty: none.
 
     Raises
     ------
     UserError
-        If an expression is not one.
+        If an expression is invalid.
     """
 
     names: tuple[str, ...] = ()
@@ -40,7 +40,7 @@ class TopicChoice:
                 raise UserError(f"{text!r} is not a regular expression: {error}") from error
 
     def __contains__(self, name: str) -> bool:
-        """Return whether a topic of this absolute name is chosen."""
+        """Return whether a topic of this absolute name is selected."""
         if name in self.names:
             return True
         if self.exclude_regex and re.search(self.exclude_regex, name):

@@ -1,1 +1,1 @@
-"""Choice, times and names of what is played of a bag."""
+"""Playback of a bag: options, names and clock."""

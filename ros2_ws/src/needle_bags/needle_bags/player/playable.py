@@ -1,4 +1,4 @@
-"""Which recorded topics can be played with the message types that are installed."""
+"""Check whether a recorded topic can be played with the installed message types."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from needle_core.files.bag_topic import BagTopic
 
 
 def unplayable(topic: BagTopic) -> str:
-    """Return why a topic cannot be played here; an empty text if it can."""
+    """Return why a topic cannot be played; an empty text if it can."""
     try:
         installed = full_definition(topic.type_name)
         message_class(topic.type_name)
-        here = type_hash(topic.type_name, installed)
-        there = topic.type_hash or (
-            type_hash(topic.type_name, topic.definition) if topic.definition else here
+        installed_hash = type_hash(topic.type_name, installed)
+        recorded_hash = topic.type_hash or (
+            type_hash(topic.type_name, topic.definition) if topic.definition else installed_hash
         )
     except UserError as error:
         return str(error)
     except (ImportError, AttributeError, ValueError):
         return f"{topic.type_name} is not installed"
-    if here != there:
+    if installed_hash != recorded_hash:
         return (
             f"{topic.type_name} is defined otherwise in this bag than here (another ROS "
             "distribution): play it where it was recorded"

@@ -1,4 +1,4 @@
-"""Times at which a bag's messages are due, and reading ahead of them."""
+"""Clock of the player, and a thread that reads messages ahead."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 _NANOSECONDS = 1e9
-# What is read ahead: a second of stereo images, less than 60 MB.
+# Number of messages read ahead: one second of stereo images, less than 60 MB.
 READ_AHEAD = 64
 
 
 class PlaybackClock:
-    """Maps a steady time to the time of recording, with a rate and pauses.
+    """Maps steady time to recording time, with a rate and pauses.
 
     Parameters
     ----------
     rate : float
-        How many times faster than recorded.
+        Ratio of playback speed to recording speed.
     start : int
-        Time of recording at which playing begins [ns].
+        Recording time at the start [ns].
     now : float
         Steady time [s].
     paused : bool
-        Whether to begin paused.
+        Whether to start paused.
 
     Attributes
     ----------
     rate : float
-        The present rate.
+        The current rate.
     """
 
     def __init__(self, rate: float, start: int, now: float, *, paused: bool = False) -> None:
@@ -40,25 +40,25 @@ class PlaybackClock:
         self._time = float(start)
 
     def restart(self, start: int, now: float) -> None:
-        """Go to another time of recording [ns]; paused stays paused."""
+        """Jump to a recording time [ns]; a paused clock stays paused."""
         self._time, self._since = float(start), now
 
     def pause(self, paused: bool, now: float) -> None:
-        """Stop or go on."""
+        """Pause or continue."""
         self._time, self._since = self._at(now), now
         self.is_paused = paused
 
     def set_rate(self, rate: float, now: float) -> None:
-        """Go on at another rate."""
+        """Change the rate."""
         self._time, self._since = self._at(now), now
         self.rate = rate
 
     def time(self, now: float) -> int:
-        """Return the time of recording [ns] at a steady time [s]."""
+        """Return the recording time [ns] at a steady time [s]."""
         return int(self._at(now))
 
     def wait(self, time: int, now: float) -> float:
-        """Return how long [s] until a time of recording [ns]; infinite while paused."""
+        """Return the time [s] until a recording time [ns]; infinite while paused."""
         if self.is_paused:
             return float("inf")
         return max(0.0, (time - self._at(now)) / (_NANOSECONDS * self.rate))
@@ -70,12 +70,12 @@ class PlaybackClock:
 
 
 class ReadAhead(Generic[T]):
-    """Runs an iterator in a thread of its own, a little ahead of whoever takes its items.
+    """Runs an iterator ahead in its own thread.
 
     Parameters
     ----------
     make : callable
-        Makes the iterator, in the thread.
+        Makes the iterator, inside the thread.
     """
 
     def __init__(self, make: Callable[[], Iterator[T]]) -> None:
@@ -86,7 +86,7 @@ class ReadAhead(Generic[T]):
         self._thread.start()
 
     def next(self) -> T | None:
-        """Return the next item, None at the end; raises what the iterator raised."""
+        """Return the next item, None at the end; re-raises exceptions of the iterator."""
         item, error = self._items.get()
         if error is not None:
             raise error
@@ -103,7 +103,7 @@ class ReadAhead(Generic[T]):
                 if not self._put(item, None):
                     return
             self._put(None, None)
-        # Whatever reading raises belongs to whoever takes the items.
+        # next() re-raises it.
         except Exception as error:  # noqa: BLE001
             self._put(None, error)
 

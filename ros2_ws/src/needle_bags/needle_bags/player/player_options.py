@@ -54,17 +54,17 @@ class PlayerOptions:
     bag : Path
         The bag's directory, or a file.
     rate : float
-        How many times faster than recorded.
+        Ratio of playback speed to recording speed.
     start, end : float
-        From and to when, after the bag's first message [s].
+        Start and end, after the first message of the bag [s].
     topics : TopicChoice
-        Which topics.
+        Topics to play.
     remaps : dict of str to str
         Absolute recorded name to absolute name.
     loop, paused : bool
-        Begin again at the end; begin paused.
+        Repeat at the end; start paused.
     clock : float or None
-        Rate of a /clock with the time of recording [Hz].
+        Rate of a /clock with the recording time [Hz].
     """
 
     bag: Path
@@ -93,7 +93,7 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
     Raises
     ------
     UserError
-        If they are not what `--help` says.
+        If an option is invalid.
     """
     parser = CommandParser("player", _DESCRIPTION, _EPILOG)
 
@@ -137,7 +137,7 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
 
 
 def require_fits(options: PlayerOptions, contents: BagDirectory) -> None:
-    """Raise a `UserError` if the options ask for what the bag does not have."""
+    """Raise a `UserError` if a topic or the start of the options is not in the bag."""
     known = contents.topics
     for name in (*options.topics.names, *options.remaps):
         if name not in known:

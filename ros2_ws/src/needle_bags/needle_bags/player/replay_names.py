@@ -1,4 +1,4 @@
-"""Under which names a bag is played: nothing of it may ever move a needle."""
+"""Topic names of a played bag: none of its messages may ever move a needle."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Final
 
 REPLAY: Final = "/replay"
-# What a rig obeys, whatever its namespace: commands, holds, emergency stops and targets. Recorded
-# parameter events would change the clock of nodes that carry the recorded names.
+# Topics that control a rig in any namespace: commands, holds, emergency stops and targets. Recorded
+# parameter events would change the clock of nodes with the recorded names.
 _GUARDED_NAMES: Final = (
     "/device/joint_trajectory",
     "/device/hold",
@@ -17,19 +17,19 @@ _GUARDED_NAMES: Final = (
     "/obstacles",
     "/parameter_events",
 )
-# The same, under whatever name it was recorded.
+# Types of such messages, guarded under any name.
 _GUARDED_TYPES: Final = (
     "trajectory_msgs/msg/JointTrajectory",
     "sensor_msgs/msg/Joy",
     "geometry_msgs/msg/Twist",
     "geometry_msgs/msg/TwistStamped",
 )
-# A driver publishes this; where one is, a rig is.
+# Published by the driver of a rig.
 _RIG_MARK: Final = "/device/status"
 
 
 def is_guarded(name: str, type_name: str) -> bool:
-    """Return whether a topic is one that a rig obeys.
+    """Return whether a topic controls a rig.
 
     Parameters
     ----------
@@ -46,25 +46,25 @@ def is_guarded(name: str, type_name: str) -> bool:
 def played_name(
     name: str, type_name: str, remaps: Mapping[str, str], *, beside_rig: bool = False
 ) -> str:
-    """Return the name under which a recorded topic is played.
+    """Return the name of a recorded topic during playback.
 
     Parameters
     ----------
     name, type_name : str
-        As recorded.
+        Recorded name and type.
     remaps : mapping
-        Absolute recorded name to absolute wanted name.
+        Absolute recorded name to absolute requested name.
     beside_rig : bool
-        Whether a rig is alive on the graph: then everything is played under `replay/`.
+        Whether a rig is on the graph: then everything is played under `replay/`.
     """
-    wanted = remaps.get(name, name)
-    if wanted.startswith(f"{REPLAY}/"):
-        return wanted
-    if beside_rig or is_guarded(name, type_name) or is_guarded(wanted, type_name):
-        return REPLAY + wanted
-    return wanted
+    requested = remaps.get(name, name)
+    if requested.startswith(f"{REPLAY}/"):
+        return requested
+    if beside_rig or is_guarded(name, type_name) or is_guarded(requested, type_name):
+        return REPLAY + requested
+    return requested
 
 
 def marks_a_rig(name: str) -> bool:
-    """Return whether a topic's publisher is a rig's driver."""
+    """Return whether a topic is published by the driver of a rig."""
     return name.endswith(_RIG_MARK) and not name.startswith(f"{REPLAY}/")

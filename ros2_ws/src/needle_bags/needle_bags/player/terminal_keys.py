@@ -1,4 +1,4 @@
-"""Keys pressed in the terminal, without waiting for them."""
+"""Non-blocking keyboard input from the terminal."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from typing import Any, Final
 PAUSE: Final = " "
 FASTER: Final = "\x1b[A"
 SLOWER: Final = "\x1b[B"
-ON: Final = "\x1b[C"
+FORWARD: Final = "\x1b[C"
 BACK: Final = "\x1b[D"
-# A terminal sends an arrow as three characters, or with O where a program asked for that.
+# A terminal sends an arrow key as three characters, in application mode with O.
 _KEY: Final = re.compile(r"\x1b[\[O][A-D]|.", re.DOTALL)
 
 
 def keys_in(text: str) -> list[str]:
-    """Return the keys that a terminal's characters stand for."""
+    """Return the keys in the characters of a terminal."""
     return [key.replace("\x1bO", "\x1b[") for key in _KEY.findall(text)]
 
 
 class Keys:
-    """The keys pressed in a terminal; none where there is no terminal."""
+    """Keys pressed in the terminal; none without a terminal."""
 
     def __init__(self) -> None:
         self._file = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else None

@@ -1,1 +1,1 @@
-"""Recorded runs, straight from their bags."""
+"""Access to recorded runs."""

@@ -1,4 +1,4 @@
-"""Images in a bag: raw, or compressed as image_transport's `.../compressed` topics have them."""
+"""Images in a bag, raw or compressed on `.../compressed` topics of image_transport."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from needle_bags.format.bag_copy import stamp_of
-from needle_bags.reading.bag_files import read_messages
-from needle_bags.reading.bag_order import raw_as_sent
+from needle_bags.format.bag_writer import stamp_of
+from needle_bags.reading.bag_messages import raw_as_sent, read_messages
 from needle_bags.reading.bag_reader import Run, nanoseconds
 from needle_core.errors import UserError
 
@@ -21,14 +20,14 @@ SIDES = ("left", "right")
 TOPICS = {
     f"stereo/{side}/image_raw{ending}": side for side in SIDES for ending in ("", "/compressed")
 }
-"""Relative topic to the side whose images it carries."""
+"""Relative topic to the side of its camera."""
 
 Stamps = npt.NDArray[np.int64]
 
 
 @dataclasses.dataclass(frozen=True)
 class PlainImage:
-    """Fields of a sensor_msgs/Image, of an image that was compressed."""
+    """Fields of a sensor_msgs/Image, for a decompressed image."""
 
     header: Any
     height: int
@@ -39,9 +38,9 @@ class PlainImage:
 
 
 def plain_image(message: Any) -> Any:
-    """Return an image message with pixels: itself, or a compressed one uncompressed.
+    """Return an image message, decompressed if necessary.
 
-    What cannot be uncompressed has no pixels, and its `encoding` says what it was.
+    An image that cannot be decompressed has no pixels; its `encoding` is the compressed format.
     """
     if not hasattr(message, "format"):
         return message
@@ -62,7 +61,7 @@ def pixels_of(image: Any, path: Path) -> npt.NDArray[np.uint8]:
     Raises
     ------
     UserError
-        If the message has more or fewer than it says; `path` names its bag.
+        If the size of the data does not fit; `path` names its bag.
     """
     size = (image.height, image.width)
     if image.step < image.width or len(image.data) != image.height * image.step:
@@ -88,7 +87,7 @@ def exposures(run: Run) -> Stamps:
 
 
 def images_at(run: Run, stamps: Stamps) -> Iterator[tuple[int, str, npt.NDArray[np.uint8]]]:
-    """Yield (index into `stamps`, side, mono image (H, W)) of images of exactly these stamps.
+    """Yield (index into `stamps`, side, mono image (H, W)) of the images with these stamps.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Typed access to a recorded run: arrays of what the graph said, straight from a bag."""
+"""Typed access to a recorded run: arrays of the rig's messages from a bag."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from needle_bags.reading.bag_files import read_contents, read_messages
+from needle_bags.reading.bag_messages import read_contents, read_messages
 from needle_bags.reading.bag_rigs import CALIBRATION, namespace_of, namespaces, require_types
 from needle_core.errors import UserError
 from needle_core.files.plain_yaml import load_plain
@@ -20,7 +20,7 @@ Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 
 _NANOSECONDS = 1_000_000_000
-# Numbers in a row of each series.
+# Row length of each series.
 _WIDTHS = {
     **{"tips": 3, "tip_covariances": 9, "truth": 7, "estimate": 7, "estimate_covariances": 36},
     **{"reduced_state": 3, "joints": 2, "control_input": 3, "commands": 2, "holds": 2},
@@ -71,7 +71,7 @@ class Status:
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """One step's end: the stamp of its command, and `succeeded` or `aborted: why`."""
+    """Result of a step: the stamp of its command, and `succeeded` or `aborted: reason`."""
 
     log_time: int
     stamp: int
@@ -80,7 +80,7 @@ class Result:
 
 @dataclasses.dataclass(frozen=True)
 class HealthEvent:
-    """A part of a node that is not well, or is again (level 0): /diagnostics, on change."""
+    """A change in /diagnostics: a part with a problem, or recovered (level 0)."""
 
     log_time: int
     part: str
@@ -90,7 +90,7 @@ class HealthEvent:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """Contents of a bag about one run, images apart (`bag_images`).
+    """Contents of the bag of a run, without images (`bag_images`).
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Run:
     tips : Series
         Measured tips in `rig`, (N, 3) [m].
     tip_covariances : Series
-        Position covariance of every exposure's answer, (N, 9) [m^2]; infinite: no tip found.
+        Position covariance of every exposure, (N, 9) [m^2]; infinite: no tip found.
     truth : Series
         Ground truth in `rig`: position and quaternion x y z w, (N, 7).
     estimate : Series
@@ -113,28 +113,28 @@ class Run:
     control_input : Series
         v, u [rad/m] and accumulated rotation [rad], (N, 3).
     commands : Series
-        Commanded insertion [m] and rotation [rad], (N, 2), stamped with the tip that caused them.
+        Commanded insertion [m] and rotation [rad], (N, 2), with the stamp of the causing tip.
     holds : Series
-        The hold pressed (0 or 1) and its speed scale, (N, 2), stamped with their arrival.
+        Hold pressed (0 or 1) and speed scale, (N, 2), with their time of arrival.
     controller_status, device_status : list of Status
         In order of arrival.
     results : list of Result
         In order of arrival.
     health : list of HealthEvent
-        What was not well, and when it was again, in order of arrival.
+        Problems and recoveries, in order of arrival.
     topics : dict of str to int
         Messages for each topic.
     parameters : dict
         Node name to its parameters at the start.
     run_info, versions : dict
-        What the recorder was told about the run, and what made it.
+        Description of the run, and versions of its software.
     calibration, commit : str
-        Text of the calibration (the tracker's own, or what the recorder was told) and the commit
-        of the sources; empty where unknown.
+        Text of the calibration (from the tracker, or given to the recorder) and commit of the
+        sources; empty if unknown.
     recording : dict of str to str
-        What the recorder, or `recover`, had to say about the recording: keys of `RECORDING`.
+        Notes of the recorder or of `recover`: keys of `RECORDING`.
     namespace : str
-        Of the rig's topics, `/` or with one at its end.
+        Namespace of the rig's topics, ends with `/`.
     """
 
     path: Path
@@ -166,20 +166,20 @@ class Run:
         """Time of the first command of a step, system clock [ns]."""
         return int(self.commands.received.min()) if len(self.commands) else None
 
-    def insertion_at(self, stamps: Stamps) -> Floats:
-        """Return the insertion [m], (N,), at ROS times [ns]; NaN where no joints were recorded."""
+    def joints_at(self, stamps: Stamps) -> Floats:
+        """Return interpolated joints, (N, 2) [m, rad], at ROS times [ns]; NaN without any."""
         if not len(self.joints):
-            return np.full(len(stamps), np.nan)
+            return np.full((len(stamps), 2), np.nan)
         start = self.joints.stamps[0]
-        insertion: Floats = np.interp(
-            (stamps - start).astype(np.float64),
-            (self.joints.stamps - start).astype(np.float64),
-            self.joints.values[:, 0],
-        )
-        return insertion
+        at, known = ((x - start).astype(np.float64) for x in (stamps, self.joints.stamps))
+        return np.column_stack([np.interp(at, known, row) for row in self.joints.values.T])
+
+    def insertion_at(self, stamps: Stamps) -> Floats:
+        """Return the insertion depth [m], (N,), at ROS times [ns]; NaN without any joints."""
+        return self.joints_at(stamps)[:, 0]
 
     def last_status(self, key: str) -> str:
-        """Return the last value of a key of the controller's status; empty where it has none."""
+        """Return the last value of a key of the controller status; empty without any."""
         for status in reversed(self.controller_status):
             if key in status.values:
                 return status.values[key]
@@ -188,7 +188,7 @@ class Run:
     def parameter(self, node: str, name: str) -> Any:
         """Return a node's parameter, None if it is not recorded.
 
-        The rig's own node, or else the only other one of that name.
+        The node of this rig, or otherwise the only node of that name.
         """
         own = self.parameters.get(f"{self.namespace}{node}")
         if own is not None:
@@ -207,26 +207,26 @@ def read_run(path: Path, namespace: str | None = None) -> Run:
     Parameters
     ----------
     path : Path
-        A rosbag2 directory written by the recorder (or by rosbag2's own).
+        A rosbag2 directory.
     namespace : str, optional
-        Which rig's run, where the bag holds several.
+        Namespace of the rig; required if the bag holds several.
 
     Raises
     ------
     UserError
-        If there is no bag, it is broken or incomplete, it holds no needle run, or several and none
-        is named.
+        If there is no bag, it is broken or incomplete, or it holds no needle run, or several and
+        no namespace is given.
     """
     contents = read_contents(path)
     custom = contents.custom_data
     namespace = namespace_of(contents, namespace)
     collected = _Collector(namespace, namespaces(contents))
-    takers = {namespace + name: taker for name, taker in collected.takers().items()}
-    takers["/diagnostics"] = collected.take_diagnostics
+    handlers = {namespace + name: handler for name, handler in collected.handlers().items()}
+    handlers["/diagnostics"] = collected.add_diagnostics
     require_types(contents, namespace)
-    for topic, log_time, message in read_messages(path, lambda name: name in takers):
+    for topic, log_time, message in read_messages(path, lambda name: name in handlers):
         try:
-            takers[topic](log_time, message)
+            handlers[topic](log_time, message)
         except (AttributeError, TypeError, ValueError) as error:
             where = contents.distribution or "another distribution"
             raise UserError(
@@ -252,7 +252,7 @@ def read_run(path: Path, namespace: str | None = None) -> Run:
 
 
 class _Collector:
-    """Turns messages into rows, topic by topic; `/diagnostics` are those of one rig of several."""
+    """Collects the messages of one rig as rows, topic by topic."""
 
     def __init__(self, namespace: str, rigs: Sequence[str]) -> None:
         self._own = namespace.lstrip("/")
@@ -265,8 +265,8 @@ class _Collector:
         self.calibration = ""
         self._last_health: dict[str, tuple[int, str]] = {}
 
-    def takers(self) -> dict[str, Callable[[int, Any], None]]:
-        """Return relative topic name to what takes its messages."""
+    def handlers(self) -> dict[str, Callable[[int, Any], None]]:
+        """Return the handlers by relative topic name."""
         return {
             "needle/tip": lambda t, m: self._add("tips", t, m, _xyz(m.point)),
             "needle/tip_pose": lambda t, m: self._add(
@@ -276,24 +276,24 @@ class _Collector:
                 tuple(np.reshape(m.pose.covariance, (6, 6))[:3, :3].ravel()),
             ),
             "sim/tip_pose": lambda t, m: self._add("truth", t, m, _pose(m.pose)),
-            "needle/estimate": self._take_estimate,
+            "needle/estimate": self._add_estimate,
             "needle/reduced_state": lambda t, m: self._add("reduced_state", t, m, _xyz(m.vector)),
             "needle/control_input": lambda t, m: self._add("control_input", t, m, _xyz(m.vector)),
-            "device/hold": self._take_hold,
-            "joint_states": self._take_joints,
-            "device/joint_trajectory": self._take_command,
-            "device/result": self._take_result,
+            "device/hold": self._add_hold,
+            "joint_states": self._add_joints,
+            "device/joint_trajectory": self._add_command,
+            "device/result": self._add_result,
             "needle/controller_status": lambda t, m: self.controller_status.append(
                 Status(t, {pair.key: pair.value for pair in m.values})
             ),
             "device/status": lambda t, m: self.device_status.append(
                 Status(t, {pair.key: pair.value for pair in m.values})
             ),
-            CALIBRATION: self._take_calibration,
+            CALIBRATION: self._add_calibration,
         }
 
     def series(self, name: str, width: int) -> Series:
-        """Return one topic's rows in order of their stamps, the first of equal ones."""
+        """Return the rows of a series sorted by stamp; of equal stamps the first."""
         rows = self._rows.get(name, [])
         stamps = np.array([stamp for stamp, _, _ in rows], dtype=np.int64)
         received = np.array([log_time for _, log_time, _ in rows], dtype=np.int64)
@@ -305,24 +305,24 @@ class _Collector:
         rows = self._rows.setdefault(name, [])
         rows.append((nanoseconds(message.header.stamp), log_time, row))
 
-    def _take_estimate(self, log_time: int, message: Any) -> None:
+    def _add_estimate(self, log_time: int, message: Any) -> None:
         self._add("estimate", log_time, message, _pose(message.pose.pose))
         covariance = tuple(float(value) for value in message.pose.covariance)
         self._add("estimate_covariances", log_time, message, covariance)
 
-    def _take_hold(self, log_time: int, message: Any) -> None:
+    def _add_hold(self, log_time: int, message: Any) -> None:
         pressed = float(message.buttons[0]) if len(message.buttons) else 0.0
         scale = float(message.axes[0]) if len(message.axes) else 0.0
-        # Its stamp is a count, of each source its own.
+        # The stamp of a hold is a counter of its source.
         self._rows.setdefault("holds", []).append((log_time, log_time, (pressed, scale)))
 
-    def _take_joints(self, log_time: int, message: Any) -> None:
+    def _add_joints(self, log_time: int, message: Any) -> None:
         position = dict(zip(message.name, message.position, strict=False))
         if "insertion_joint" in position and "rotation_joint" in position:
             row = (float(position["insertion_joint"]), float(position["rotation_joint"]))
             self._add("joints", log_time, message, row)
 
-    def _take_command(self, log_time: int, message: Any) -> None:
+    def _add_command(self, log_time: int, message: Any) -> None:
         insertion = rotation = np.nan
         if len(message.points) == 1:
             positions = dict(zip(message.joint_names, message.points[0].positions, strict=False))
@@ -330,14 +330,14 @@ class _Collector:
             rotation = float(positions.get("rotation_joint", np.nan))
         self._add("commands", log_time, message, (insertion, rotation))
 
-    def _take_calibration(self, _: int, message: Any) -> None:
+    def _add_calibration(self, _: int, message: Any) -> None:
         self.calibration = str(message.data)
 
-    def _take_result(self, log_time: int, message: Any) -> None:
+    def _add_result(self, log_time: int, message: Any) -> None:
         self.results.append(Result(log_time, nanoseconds(message.stamp), message.frame_id))
 
-    def take_diagnostics(self, log_time: int, message: Any) -> None:
-        """Take what is not well, and what is again, where it changed."""
+    def add_diagnostics(self, log_time: int, message: Any) -> None:
+        """Add the changes between problem and recovery of each part."""
         for status in message.status:
             name = str(status.name).removeprefix(self._own)
             if name == status.name and name.startswith(self._others):

@@ -1,4 +1,4 @@
-"""Which rigs a bag holds the topics of."""
+"""Finds the rigs in a bag by their topics."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ _TYPES = {
 
 
 def namespaces(contents: BagDirectory) -> list[str]:
-    """Return the namespaces of a bag's rigs, each `/` or with one at its end."""
+    """Return the namespaces of the rigs in a bag; each ends with `/`."""
     return sorted(
         name.removesuffix(_LANDMARK) for name in contents.topics if name.endswith(f"/{_LANDMARK}")
     )
 
 
 def namespace_of(contents: BagDirectory, wanted: str | None = None) -> str:
-    """Return the namespace of the rig whose run is read, `/` or with one at its end.
+    """Return the namespace of the rig to read; it ends with `/`.
 
     Parameters
     ----------
     contents : BagDirectory
         The bag.
     wanted : str, optional
-        The rig's namespace as a user writes it; needed where the bag holds several.
+        Namespace given by the user; required if the bag holds several rigs.
 
     Raises
     ------
     UserError
-        If the bag holds no rig, not the wanted one, or several and none is wanted.
+        If the bag holds no rig, not the wanted one, or several and none is given.
     """
     found = namespaces(contents)
     if not found:
@@ -66,7 +66,7 @@ def namespace_of(contents: BagDirectory, wanted: str | None = None) -> str:
 
 
 def require_types(contents: BagDirectory, namespace: str) -> None:
-    """Raise a `UserError` if a topic of the rig has another type than the rig's."""
+    """Raise a `UserError` if a topic of the rig has a wrong type."""
     types = {namespace + name: type_name for name, type_name in _TYPES.items()}
     types["/diagnostics"] = "diagnostic_msgs/msg/DiagnosticArray"
     for name, wanted in types.items():

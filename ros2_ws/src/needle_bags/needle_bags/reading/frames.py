@@ -1,4 +1,4 @@
-"""A bag as pandas frames: a table for each topic, a row for each message."""
+"""Reads a bag into pandas frames: a table for each topic, a row for each message."""
 
 from __future__ import annotations
 
@@ -7,41 +7,41 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from needle_bags.reading.bag_files import read_contents, read_messages
+from needle_bags.reading.bag_messages import read_contents, read_messages
 from needle_core.errors import UserError
 
 if TYPE_CHECKING:
     import pandas as pd
 
 INDEX, RECEIVED = "stamp", "received"
-# Of a pixel or a byte there is no column.
-_PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+# Images have no columns.
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _HEALTH = "diagnostic_msgs/msg/DiagnosticArray"
-_MOST_ELEMENTS = 64
+_MAX_ELEMENTS = 64
 _NAMES = ("name", "joint_names")
 
 
 def read_frames(path: str | Path, topics: Collection[str] = ()) -> dict[str, pd.DataFrame]:
     """Return the topics of a bag as frames.
 
-    A column is named as the way to its field, such as `pose.position.x`; elements of an array have
+    A column is named by the path of its field, such as `pose.position.x`; elements of an array have
     their number, those of joints the joint's name (`position.insertion_joint`), and key-values
-    their key (`values.state`), as numbers where all of a column are. The index `stamp` is the
-    header's [s]: of exposure or sampling, on the rig's clock, the same in all that came of one
-    exposure. A topic without headers has when it was received, which all have as a column
-    (`received` [s], system clock).
+    their key (`values.state`), converted to numbers if the whole column is numeric. The index
+    `stamp` is that of the header [s]: time of exposure or sampling on the rig's clock, common to
+    all messages of an exposure. Without a header it is the time of reception, which every table
+    has as the column `received` ([s], system clock).
 
     Parameters
     ----------
     path : str or Path
         A rosbag2 directory.
     topics : collection of str
-        Which; all by default, but for images.
+        Topics to read; by default all except images.
 
     Returns
     -------
     dict of str to DataFrame
-        By the topic's name. `/diagnostics` have a row for each status.
+        By topic name. `/diagnostics` has a row for each status.
 
     Raises
     ------
@@ -49,18 +49,18 @@ def read_frames(path: str | Path, topics: Collection[str] = ()) -> dict[str, pd.
         If pandas is not installed, there is no bag, it is not whole, or it has no such topic.
     """
     try:
-        # An extra, and a second of imports.
+        # Optional dependency, and a second of imports.
         import pandas as pd  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise UserError(
-            "pandas is not installed; docs/notebooks.md says how to install it"
+            "pandas is not installed; docs/viewers.md says how to install it"
         ) from error
     path = Path(path)
     types = {name: topic.type_name for name, topic in read_contents(path).topics.items()}
     for name in topics:
         if name not in types:
             raise UserError(f"{path}: no topic {name} (it has {', '.join(sorted(types))})")
-    wanted = topics or {name for name, kind in types.items() if kind not in _PICTURES}
+    wanted = topics or {name for name, kind in types.items() if kind not in _IMAGES}
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in sorted(wanted)}
     for topic, log_time, message in read_messages(path, rows.__contains__):
         for row in _rows(message):
@@ -69,7 +69,7 @@ def read_frames(path: str | Path, topics: Collection[str] = ()) -> dict[str, pd.
 
 
 def _rows(message: Any) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a message; the stamp comes before anything else of that name."""
+    """Yield the rows of a message; the stamp of its header takes precedence."""
     if message.__msgtype__ == _HEALTH:
         for status in message.status:
             yield {**dict(_flat(message.header, ("header",))), **dict(_flat(status, ()))}
@@ -77,17 +77,19 @@ def _rows(message: Any) -> Iterator[dict[str, Any]]:
         yield dict(_flat(message, ()))
 
 
-def _flat(value: Any, way: Sequence[str], joints: Sequence[str] = ()) -> Iterator[tuple[str, Any]]:
+def _flat(
+    value: Any, parts: Sequence[str], joints: Sequence[str] = ()
+) -> Iterator[tuple[str, Any]]:
     """Yield the columns of a field."""
     kind = getattr(value, "__msgtype__", "")
     if kind == "builtin_interfaces/msg/Time":
         stamp = value.sec + value.nanosec * 1e-9
-        # The header's, or that of a message that is a header.
-        yield (INDEX if way[:-1] in ((), ("header",)) else ".".join(way)), stamp
+        # Stamp of the header, or of a message that is a header itself.
+        yield (INDEX if parts[:-1] in ((), ("header",)) else ".".join(parts)), stamp
     elif kind == "builtin_interfaces/msg/Duration":
-        yield ".".join(way), value.sec + value.nanosec * 1e-9
+        yield ".".join(parts), value.sec + value.nanosec * 1e-9
     elif kind:
-        # What has a default is a constant of the type.
+        # Fields with a default are constants of the type.
         fields = {
             field.name: getattr(value, field.name)
             for field in dataclasses.fields(value)
@@ -95,27 +97,27 @@ def _flat(value: Any, way: Sequence[str], joints: Sequence[str] = ()) -> Iterato
         }
         named = [fields.pop(name) for name in _NAMES if isinstance(fields.get(name), list)]
         for name, each in fields.items():
-            yield from _flat(each, (*way, name), named[0] if named else joints)
+            yield from _flat(each, (*parts, name), named[0] if named else joints)
     elif isinstance(value, str | bytes) or not hasattr(value, "__len__"):
-        yield ".".join(way), value
+        yield ".".join(parts), value
     elif not len(value):
         return
     elif getattr(value[0], "__msgtype__", "") == "diagnostic_msgs/msg/KeyValue":
-        yield from ((".".join((*way, pair.key)), pair.value) for pair in value)
-    elif len(value) <= _MOST_ELEMENTS:
+        yield from ((".".join((*parts, pair.key)), pair.value) for pair in value)
+    elif len(value) <= _MAX_ELEMENTS:
         are_joints = len(joints) == len(value) and not hasattr(value[0], "__msgtype__")
         for k, each in enumerate(value):
             name = joints[k] if are_joints else str(k)
-            yield from _flat(each, (*way, name), joints)
+            yield from _flat(each, (*parts, name), joints)
 
 
 def _frame(pd: Any, rows: list[dict[str, Any]]) -> Any:
     frame = pd.DataFrame(rows, columns=None if rows else [INDEX, RECEIVED]).set_index(INDEX)
     for name in frame.columns:
         if name.startswith("values."):
-            # What is a number wherever it is something is one.
+            # Convert the column if all its values are numbers.
             numbers = pd.to_numeric(frame[name], errors="coerce")
-            nothing = frame[name].isna() | (frame[name] == "")
-            if not nothing.all() and (numbers.isna() == nothing).all():
+            empty = frame[name].isna() | (frame[name] == "")
+            if not empty.all() and (numbers.isna() == empty).all():
                 frame[name] = numbers
     return frame

@@ -1,4 +1,4 @@
-"""Makes of a run's bag one that is small enough for git: few images, and those compressed."""
+"""Copies a bag to one that is small enough for git: a few images, compressed."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ import numpy as np
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_copy import BagCopy, stamp_of, standard_topic
-from needle_bags.reading.bag_files import read_contents
+from needle_bags.format.bag_writer import BagCopy, stamp_of, standard_topic
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
 from needle_bags.reading.bag_images import pixels_of, plain_image
-from needle_bags.reading.bag_order import SentMessage, raw_as_sent
+from needle_bags.reading.bag_messages import SentMessage, raw_as_sent, read_contents
 from needle_bags.reading.bag_reader import Run, read_run
 from needle_core.commands.cli import EXIT_DONE, run_command
 from needle_core.commands.options import CommandParser
@@ -28,7 +27,7 @@ Copies a bag without what a rerun does not need, and with the images of a few ex
 compressed. What the tracker says of compressed images is not quite what was recorded: let `rerun
 SMALL_BAG --output DIR` put today's answers in. scripts/renew_regression_bag does all of it.
 """
-# Some in a row, which the tracker follows, and some far apart, where it has to search [m].
+# Consecutive exposures, which the tracker follows, and distant ones, where it has to search [m].
 DEPTHS = (30e-3, 31e-3, 32e-3, 75e-3, 76e-3, 110e-3)
 QUALITY = 90
 NODES = ("sim_rig", "stereo_tracker", "plane_controller")
@@ -88,7 +87,7 @@ def write_small_bag(source: Path, target: Path) -> None:
 
 
 def _exposures(run: Run) -> set[int]:
-    """Return the stamps of the exposures that are kept with their images."""
+    """Return the stamps of the exposures whose images are kept."""
     stamps = run.tip_covariances.stamps
     depth = run.insertion_at(stamps)
     if not np.isfinite(depth).any():
@@ -111,7 +110,7 @@ def _put_image(copy: BagCopy, message: SentMessage, source: Path) -> None:
 
 
 def _custom_data(run: Run) -> dict[str, str]:
-    """Return what the bag says of itself, without the places of the machine it was made on."""
+    """Return the custom data without paths of the recording machine."""
     parameters = {
         name: {"ros__parameters": values}
         for name, values in run.parameters.items()

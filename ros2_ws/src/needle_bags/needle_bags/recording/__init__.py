@@ -1,1 +1,1 @@
-"""The recorder's writing half."""
+"""Writing half of the recorder."""

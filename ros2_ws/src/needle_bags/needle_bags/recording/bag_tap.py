@@ -1,7 +1,7 @@
-"""A recorder that taps a virtual run: every publication into a bag, without ROS.
+"""Records a virtual run into a bag, without ROS.
 
-Log times are virtual, and paths, dates and host go into metadata.yaml only: so the same seed gives
-the same bytes of MCAP.
+Log times are virtual, and paths, dates and host are stored in metadata.yaml only, so that the same
+seed gives the same bytes of MCAP.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from needle_core.message_types import rosbags_types
 
 
 class BagTap:
-    """A bag that grows by a run's publications.
+    """Writes all publications of a run into a bag.
 
     Parameters
     ----------
     directory : Path
-        The bag's.
+        The bag.
     components : iterable of Component
-        The run's, whose topics and settings the bag names.
+        Components of the run; their topics and settings are stored.
     others : iterable of Output
-        Topics of the runner itself.
+        Topics of the runner.
     run_info : mapping
-        What the bag says about how it was made.
+        Description of the run.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Versions of the code that made a run, and of what it stands on."""
+"""Versions of the code of a run and of its dependencies."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _DISTRIBUTION = "jazzy"
 
 
 def distribution() -> str:
-    """Return the ROS distribution; the workspace is built for Jazzy where nothing else is said."""
+    """Return the ROS distribution, Jazzy by default."""
     return os.environ.get("ROS_DISTRO") or _DISTRIBUTION
 
 
 def versions() -> dict[str, str]:
-    """Return name to version of Python, the operating system, ROS and the packages in use."""
+    """Return the versions of Python, the operating system, ROS and the packages, by name."""
     found = {
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -37,8 +37,8 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str:
-    """Return the git commit of the sources, `-dirty` where they differ, or `unknown`."""
-    # Links are followed, so that an installed link names its checkout.
+    """Return the git commit of the sources, with `-dirty` if modified, or `unknown`."""
+    # Follow symlinks of the installation to the checkout.
     folder = str(Path(__file__).resolve().parent)
     try:
         answer = subprocess.run(

@@ -1,4 +1,4 @@
-"""Health of a recording, as its node tells it in /diagnostics."""
+"""Health of a recording, as the recorder publishes it in /diagnostics."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from needle_bags.recording.free_space import megabytes
-from needle_bags.recording.recording import Recording
-from needle_core.diagnostics import Level
+from needle_bags.recording.recording import Recording, megabytes
+from needle_core.diagnostics import Diagnostic, Level
 
-# Bytes that wait for the disk: a second of stereo images.
+# Warn when this many bytes are queued: one second of stereo images.
 WARN_WAITING: Final = 50_000_000
-# The disk is nearly full when it lasts less than this at the present rate [s], or when what is
-# left is less than so many times the reserve.
+# Warn when the disk will be full within this time at the present rate [s], or when the free space
+# is below this multiple of the reserve.
 WARN_BEFORE: Final = 120.0
 WARN_RESERVES: Final = 3
+_MAX_REASON_LENGTH: Final = 200
 
 
 class RecorderHealth:
-    """Looks at a recording now and then.
+    """Periodic check of a recording.
 
     Parameters
     ----------
     recording : Recording
-        What is recorded.
+        The recording.
     bag : Path
         Its directory, as the user named it.
     """
@@ -35,7 +35,7 @@ class RecorderHealth:
         self._bytes_before = 0
         self._rate = 0.0
 
-    def look(
+    def check(
         self, period: float, lost: Mapping[str, int], refused: Sequence[str]
     ) -> tuple[Level, str]:
         """Return the level and one line.
@@ -43,31 +43,31 @@ class RecorderHealth:
         Parameters
         ----------
         period : float
-            Time since the last look [s].
+            Time since the last check [s].
         lost : mapping
-            Topic to messages that are not in the bag.
+            Topic to number of messages missing from the bag.
         refused : sequence of str
-            Why topics are not recorded.
+            Reasons why topics are not recorded.
         """
         recording = self._recording
         received = recording.bytes_received
-        # A second's mean or so: images come in bursts.
+        # Average over about a second, because images arrive in bursts.
         self._rate += 0.5 * ((received - self._bytes_before) / period - self._rate)
         self._bytes_before = received
         if recording.error is not None:
             return Level.ERROR, f"recording ended: {recording.error}"
         if lost:
             return Level.WARN, f"messages lost on {', '.join(lost)}"
-        warning = self._waiting() or self._space() or "; ".join(refused)
+        warning = self._backlog_warning() or self._space_warning() or "; ".join(refused)
         return (Level.WARN, warning) if warning else (Level.OK, "recording")
 
-    def _waiting(self) -> str:
+    def _backlog_warning(self) -> str:
         waiting = self._recording.bytes_waiting
         if waiting <= WARN_WAITING:
             return ""
         return f"the disk, or this machine, is slower than the graph: {megabytes(waiting)} wait"
 
-    def _space(self) -> str:
+    def _space_warning(self) -> str:
         space = self._recording.space
         try:
             usable = space.usable()
@@ -77,3 +77,26 @@ class RecorderHealth:
             return ""
         reserve = megabytes(space.reserve)
         return f"the disk of {self._bag} is nearly full: recording ends at {reserve} free"
+
+
+class DecodeErrors:
+    """Number of inputs that could not be decoded, by source, with the last reason of each."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, int] = {}
+        self._reasons: dict[str, str] = {}
+
+    def add(self, source: str, error: Exception) -> bool:
+        """Count an error; return whether it is the first of its source."""
+        self._counts[source] = self._counts.get(source, 0) + 1
+        text = next(iter(str(error).splitlines()), "")
+        self._reasons[source] = f"{type(error).__name__}: {text}"[:_MAX_REASON_LENGTH]
+        return self._counts[source] == 1
+
+    def diagnostic(self) -> Diagnostic:
+        """Return a warning that names all sources with errors, or OK without any."""
+        if not self._counts:
+            return Diagnostic(Level.OK, "all understood", {})
+        parts = [f"{source} ({self._reasons[source]})" for source in self._counts]
+        values = {source: str(count) for source, count in self._counts.items()}
+        return Diagnostic(Level.WARN, f"not understood: {'; '.join(parts)}", values)

@@ -1,10 +1,12 @@
-"""The recorder's writing half: a queue that callbacks append to, and a worker that empties it."""
+"""Writing half of the recorder: callbacks fill a queue, and a worker writes it into the bag."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import dataclasses
 import json
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -17,31 +19,35 @@ from needle_bags.format.bag_writer import (
     BagWriter,
     refuse_existing_bag,
 )
-from needle_bags.recording.free_space import FreeSpace, megabytes
-from needle_bags.recording.worker import Do, Job, Worker, WorkerThread
+from needle_bags.recording.worker import Job, RunJob, Worker, WorkerThread
 from needle_core.errors import UserError
 from needle_core.files.bag_topic import BagTopic
 
 FLUSH_PERIOD: Final = 0.1
-# What waits for a slow disk at most, in bytes; more is dropped, and counted. Nearly three seconds
-# of stereo images. Where images fill it, there is still an eighth more for what is small.
+# Backlog limit for a slow disk [B], nearly three seconds of stereo images; messages beyond it are
+# dropped and counted. Small messages get another eighth, so that images cannot crowd them out.
 WAITING_LIMIT: Final = 128_000_000
 _SHARE_FOR_SMALL: Final = 8
 SMALL: Final = 65_536
-# What a message takes in memory beside its data.
+# Memory that a message takes in addition to its data [B].
 OVERHEAD: Final = 800
 RESERVE: Final = 64_000_000
-# Key of the custom data that says why a recording ended before it was told to.
+# The reserve takes at most this share of a small disk.
+LARGEST_RESERVE_SHARE: Final = 0.1
+# custom_data key: why a recording ended early.
 ENDED_EARLY: Final = "recording_ended"
-# Key of that which says how many messages of each topic are not in the bag, as JSON.
+# custom_data key: number of missing messages by topic, as JSON.
 MESSAGES_LOST: Final = "messages_lost"
-# The disk is looked at after so many bytes, and with every flush.
-_LOOK_EVERY: Final = 2**20
+# The free space is checked after this many bytes, and at every flush.
+_CHECK_EVERY: Final = 2**20
+# <malloc.h>
+_M_TRIM_THRESHOLD: Final = -1
+_M_MMAP_THRESHOLD: Final = -3
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Received:
-    """One message as it came.
+    """A received message.
 
     Attributes
     ----------
@@ -52,7 +58,7 @@ class Received:
     log_time, publish_time : int
         When it was received and sent, system clock [ns].
     sequence : int
-        The publisher's own number of the message, 0 where it has none.
+        Sequence number of the publisher, 0 if it has none.
     """
 
     topic: str
@@ -63,42 +69,69 @@ class Received:
 
     @property
     def memory(self) -> int:
-        """Size [B]."""
+        """Size in memory [B]."""
         return len(self.data) + OVERHEAD
 
 
+class FreeSpace:
+    """Free space of the disk that holds a directory.
+
+    Parameters
+    ----------
+    directory : Path
+        An existing directory.
+    reserve : int
+        Bytes to leave free; limited to `LARGEST_RESERVE_SHARE` of the disk.
+
+    Attributes
+    ----------
+    reserve : int
+        Bytes that are kept free.
+    """
+
+    def __init__(self, directory: Path, reserve: int) -> None:
+        self._directory = directory
+        status = os.statvfs(directory)
+        self.reserve = min(reserve, int(LARGEST_RESERVE_SHARE * status.f_blocks * status.f_frsize))
+
+    def usable(self) -> int:
+        """Return how many bytes may still be written; negative below the reserve."""
+        status = os.statvfs(self._directory)
+        return int(status.f_bavail * status.f_frsize) - self.reserve
+
+
 class Recording:
-    """A bag that a worker fills, so that no disk delay reaches the subscriptions.
+    """A bag that a worker fills, so that a slow disk never delays the subscriptions.
 
     Parameters
     ----------
     bag : BagWriter
-        The bag; the worker's from now on.
+        The bag; only the worker uses it from now on.
     space : FreeSpace
-        Of its disk: where none is left the recording ends in order.
+        Free space of its disk; the recording ends in order when none is usable.
     make_worker : callable
-        Makes the worker from what does a job and what comes at the end.
+        Makes the worker from a job runner and a closing call.
     waiting_limit : int
-        What waits for a slow disk at most [B], but for an eighth more of what is small; what is
-        beyond is dropped, and counted.
+        Backlog limit [B], plus an eighth for small messages; messages beyond it are dropped.
     clock : callable
         Steady time [s].
 
     Attributes
     ----------
     error : str or None
-        Why writing ended before its time; None while all is well.
+        Why the recording ended early; None while it runs.
     is_whole : bool
-        Whether the bag is complete: after `close`, or after an early end in order.
+        Whether the bag is complete. It is not after the disk has refused data: then `recover`
+        restores what was written.
     dropped : dict of str to int
-        Messages for each topic that came and could not be written.
+        Number of received messages that were not written, by topic.
     """
 
     def __init__(
         self,
         bag: BagWriter,
         space: FreeSpace,
-        make_worker: Callable[[Do, Job], Worker] = WorkerThread,
+        make_worker: Callable[[RunJob, Job], Worker] = WorkerThread,
         waiting_limit: int = WAITING_LIMIT,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -113,27 +146,27 @@ class Recording:
         self._lost_before: dict[str, int] = {}
         self.bytes_received = 0
         self.messages_received = 0
-        self._bytes_done = 0
-        self._looked_at = self._flushed = 0
+        self._bytes_written = 0
+        self._bytes_checked = self._bytes_flushed = 0
         self._next_flush = self._clock() + FLUSH_PERIOD
-        self._worker = make_worker(self._do, self._end)
+        self._worker = make_worker(self._run_job, self._end)
 
     @property
     def messages_waiting(self) -> int:
-        """Messages received that the worker has not taken yet."""
+        """Number of received messages that are still queued."""
         return self._worker.waiting
 
     @property
     def bytes_waiting(self) -> int:
-        """Size in memory [B]."""
-        return self.bytes_received - self._bytes_done + OVERHEAD * self.messages_waiting
+        """Memory of the queued messages [B]."""
+        return self.bytes_received - self._bytes_written + OVERHEAD * self.messages_waiting
 
     def add_topic(self, topic: BagTopic) -> None:
-        """Announce a topic; before the first `append` with its name."""
+        """Announce a topic; required before the first `append` with its name."""
         self._put(lambda: self._add_topic(topic))
 
     def append(self, message: Received) -> None:
-        """Queue one message; it is dropped, and counted, where too much waits already."""
+        """Queue a message; drop and count it if the backlog limit is reached."""
         is_small = len(message.data) <= SMALL
         room = self._waiting_limit // _SHARE_FOR_SMALL if is_small else 0
         if self.bytes_waiting > self._waiting_limit + room:
@@ -142,7 +175,7 @@ class Recording:
             self.append_all((message,))
 
     def append_all(self, messages: Sequence[Received]) -> None:
-        """Queue messages that are in memory anyhow, however many."""
+        """Queue messages regardless of the backlog limit."""
         for message in messages:
             if self.error is not None:
                 self._drop(message.topic)
@@ -152,11 +185,11 @@ class Recording:
             self._worker.put(lambda message=message: self._write(message))  # type: ignore[misc]
 
     def add_record(self, name: str, values: dict[str, str]) -> None:
-        """Queue a metadata record, kept in the MCAP file as soon as it is known."""
+        """Queue a metadata record; unlike metadata.yaml it survives a kill."""
         self._put(lambda: self._bag.add_metadata(name, values))
 
     def add_file(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
-        """Queue a file that the bag carries."""
+        """Queue a file to attach to the bag."""
         self._put(lambda: self._bag.add_attachment(name, media_type, data, time_ns))
 
     def set_custom_data(self, key: str, value: str) -> None:
@@ -164,18 +197,19 @@ class Recording:
         self._worker.put(lambda: self._bag.set_custom_data(key, value))
 
     def close(self, lost_before: Mapping[str, int] | None = None) -> None:
-        """Write all that waits, then index and metadata; `error` tells how it went.
+        """Write all queued messages, the index and the metadata; see `error` and `is_whole`.
 
         Parameters
         ----------
         lost_before : mapping of str to int
-            Messages of each topic that never got here; the bag names them beside `dropped`.
+            Number of messages by topic that were lost before they were appended; the bag names
+            them together with `dropped`.
         """
         self._lost_before = dict(lost_before or {})
         self._worker.finish()
 
     def _put(self, job: Job) -> None:
-        """Queue what can be done only while data is written."""
+        """Queue a job that is skipped once the recording has ended."""
         self._worker.put(lambda: job() if self.error is None else None)
 
     def _add_topic(self, topic: BagTopic) -> None:
@@ -197,59 +231,57 @@ class Recording:
         except Exception:
             self._drop(topic)
             raise
-        self._bytes_done += len(message.data)
+        self._bytes_written += len(message.data)
 
     def _drop(self, topic: str) -> None:
         self.dropped[topic] = self.dropped.get(topic, 0) + 1
 
-    def _do(self, job: Job) -> float:
-        """Do a job, and what the disk needs; after an early end messages are counted as dropped."""
-        if self.error is None:
-            self._write_on(job)
-        else:
+    def _run_job(self, job: Job) -> float:
+        """Run a job, then flush and check the disk; return when the next flush is due."""
+        if self.error is not None:
             job()
-        return self._next_flush if self.error is None else self._clock() + FLUSH_PERIOD
-
-    def _write_on(self, job: Job) -> None:
+            return self._clock() + FLUSH_PERIOD
         try:
             job()
-            self._tend_disk()
+            self._check_disk()
         except (BagWriteError, OSError) as error:
-            self._end_early(str(error))
-            return
-        # A worker that ended in silence would leave all that comes after it waiting.
+            self._abandon(error)
+        # An exception that ended the worker would leave all later messages waiting.
         except Exception as error:  # noqa: BLE001
-            self.error = f"{type(error).__name__}: {error}"
-        if self.error is not None:
-            self._bag.set_custom_data(ENDED_EARLY, self.error)
-            self._complete()
+            self._end_early(f"{type(error).__name__}: {error}")
+        return self._next_flush
 
-    def _tend_disk(self) -> None:
-        """Write out where it is time; end the recording where there is no room for more."""
+    def _check_disk(self) -> None:
+        """Flush if it is due; end the recording if the disk has no usable space."""
         is_due = self._clock() >= self._next_flush
-        if is_due or self._bytes_done - self._looked_at >= _LOOK_EVERY:
-            self._looked_at = self._bytes_done
-            unwritten = min(CHUNK_SIZE, self._bytes_done - self._flushed)
+        if is_due or self._bytes_written - self._bytes_checked >= _CHECK_EVERY:
+            self._bytes_checked = self._bytes_written
+            unwritten = min(CHUNK_SIZE, self._bytes_written - self._bytes_flushed)
             if self.space.usable() < unwritten:
                 left = megabytes(self.space.usable() + self.space.reserve)
-                self.error = f"the disk of {self._bag.directory} has only {left} left"
+                self._end_early(f"the disk of {self._bag.directory} has only {left} left")
                 return
         if is_due:
             self._bag.flush()
-            self._flushed = self._bytes_done
+            self._bytes_flushed = self._bytes_written
             self._next_flush = self._clock() + FLUSH_PERIOD
 
+    def _end_early(self, reason: str) -> None:
+        """Complete the bag and stop writing."""
+        self.error = reason
+        self._bag.set_custom_data(ENDED_EARLY, reason)
+        self._complete()
+
     def _end(self) -> None:
-        self._name_lost()
+        self._store_lost_counts()
         if self.error is None:
             self._complete()
-        if self.error is not None and self.is_whole:
-            # What was dropped at the very end is known only now.
-            self._name_lost()
+        elif self.is_whole:
+            # Messages were dropped after the early end.
             with contextlib.suppress(BagWriteError):
                 self._bag.update_metadata()
 
-    def _name_lost(self) -> None:
+    def _store_lost_counts(self) -> None:
         lost = Counter(self._lost_before) + Counter(self.dropped)
         if lost:
             self._bag.set_custom_data(MESSAGES_LOST, json.dumps(lost))
@@ -259,15 +291,11 @@ class Recording:
             self._bag.close()
             self.is_whole = True
         except (BagWriteError, OSError) as error:
-            self._end_early(str(error))
+            self._abandon(error)
 
-    def _end_early(self, why: str) -> None:
-        self.error = self.error or why
-        self._bag.set_custom_data(ENDED_EARLY, self.error)
-        with contextlib.suppress(BagWriteError):
-            for topic, count in self._bag.end_early().items():
-                self.dropped[topic] = self.dropped.get(topic, 0) + count
-            self.is_whole = True
+    def _abandon(self, error: Exception) -> None:
+        self.error = self.error or str(error)
+        self._bag.abandon()
 
 
 def open_recording(
@@ -278,7 +306,7 @@ def open_recording(
     compression: str = "none",
     reserve: int = RESERVE,
 ) -> Recording:
-    """Begin a bag that a thread of its own fills.
+    """Create a bag and the thread that fills it.
 
     Parameters
     ----------
@@ -287,7 +315,7 @@ def open_recording(
     distribution : str
         ROS distribution of its message types.
     max_file_size : int
-        Bytes of messages after which another data file is begun; 0: never.
+        Bytes of messages after which a new data file is started; 0: never.
     compression : str
         `none` or `zstd`.
     reserve : int
@@ -299,18 +327,6 @@ def open_recording(
         If the directory holds a bag already or cannot be made, or the disk is full.
     """
     refuse_existing_bag(directory)
-    space = _space(directory, reserve)
-    bag = BagWriter(
-        directory,
-        distribution=distribution,
-        max_file_size=max_file_size,
-        compression=compression,
-    )
-    return Recording(bag, space)
-
-
-def _space(directory: Path, reserve: int) -> FreeSpace:
-    """Return the watch over the directory's disk; there must be room to begin."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
         space = FreeSpace(directory, reserve)
@@ -320,4 +336,27 @@ def _space(directory: Path, reserve: int) -> FreeSpace:
     if usable < 0:
         left, kept = megabytes(usable + space.reserve), megabytes(space.reserve)
         raise UserError(f"cannot record into {directory}: {left} free, {kept} are kept free")
-    return space
+    bag = BagWriter(
+        directory,
+        distribution=distribution,
+        max_file_size=max_file_size,
+        compression=compression,
+    )
+    return Recording(bag, space)
+
+
+def megabytes(count: float) -> str:
+    """Return a number of bytes as MB or GB."""
+    return f"{count / 1e6:.0f} MB" if count < 10e9 else f"{count / 1e9:.0f} GB"
+
+
+def reuse_freed_memory() -> None:
+    """Let the C library reuse freed blocks of the size of a chunk.
+
+    By default it returns each to the kernel and clears a new one for the next chunk, which takes
+    two thirds of the processor time of recording images.
+    """
+    with contextlib.suppress(AttributeError, OSError):  # other C libraries lack it
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_M_MMAP_THRESHOLD, 32 * 2**20)
+        mallopt(_M_TRIM_THRESHOLD, 64 * 2**20)

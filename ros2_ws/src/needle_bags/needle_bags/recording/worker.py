@@ -1,4 +1,4 @@
-"""A worker beside its owner: does one job after the other, in the order in which they came."""
+"""A worker that runs queued jobs in order, beside its owner's thread."""
 
 from __future__ import annotations
 
@@ -9,42 +9,41 @@ from collections.abc import Callable
 from typing import Protocol
 
 Job = Callable[[], None]
-Do = Callable[[Job], float]
-"""Does a job; returns when it wants to be called at the latest, be it for `nothing`, steady clock
-[s]."""
+RunJob = Callable[[Job], float]
+"""Runs a job; returns the steady time [s] by which it wants the next call."""
 
 
-def nothing() -> None:
-    """Do nothing: the job of who is called for the time alone."""
+def no_op() -> None:
+    """No-op job, used for periodic wake-ups."""
 
 
 class Worker(Protocol):
-    """Hands jobs on, each as soon as the one before is done."""
+    """Runs jobs one after the other."""
 
     @property
     def waiting(self) -> int:
-        """Jobs that have not been taken yet."""
+        """Number of queued jobs."""
 
     def put(self, job: Job) -> None:
         """Queue a job."""
 
     def finish(self) -> None:
-        """Return when all jobs, and what comes at the end, are done."""
+        """Run all queued jobs and the closing call, then return."""
 
 
 class WorkerThread:
-    """A worker in a thread of its own.
+    """A worker with its own thread.
 
     Parameters
     ----------
-    do : Do
-        Does its jobs.
+    run_job : RunJob
+        Runs the jobs.
     end : callable
-        Called once, after the last.
+        Called once, after the last job.
     """
 
-    def __init__(self, do: Do, end: Callable[[], None]) -> None:
-        self._do = do
+    def __init__(self, run_job: RunJob, end: Callable[[], None]) -> None:
+        self._run_job = run_job
         self._end = end
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="worker")
@@ -52,7 +51,7 @@ class WorkerThread:
 
     @property
     def waiting(self) -> int:
-        """Jobs that have not been taken yet."""
+        """Number of queued jobs."""
         return self._jobs.qsize()
 
     def put(self, job: Job) -> None:
@@ -60,18 +59,18 @@ class WorkerThread:
         self._jobs.put(job)
 
     def finish(self) -> None:
-        """Return when all jobs, and what comes at the end, are done."""
+        """Run all queued jobs and the closing call, then return."""
         self._jobs.put(None)
         self._thread.join()
 
     def _run(self) -> None:
-        due = self._do(nothing)
+        due = self._run_job(no_op)
         while True:
             try:
                 job = self._jobs.get(timeout=max(0.0, due - time.monotonic()))
             except queue.Empty:
-                job = nothing
+                job = no_op
             if job is None:
                 self._end()
                 return
-            due = self._do(job)
+            due = self._run_job(job)

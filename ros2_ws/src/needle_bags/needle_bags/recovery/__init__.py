@@ -1,1 +1,1 @@
-"""Bags made whole: everything before the first damage."""
+"""Recovery of damaged bags."""

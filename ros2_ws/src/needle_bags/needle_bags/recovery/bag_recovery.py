@@ -1,7 +1,7 @@
-"""Makes a bag whole: it keeps everything before the first damage, and no other recording's files.
+"""Completes a damaged bag: keeps everything before the first damage.
 
-A bag of several files ends at the first that is damaged or missing. A damaged file is written anew
-up to the damage, read back, and put in its place; the old one stays as `<name>.damaged`.
+A bag of several files ends at the first damaged or missing file. A damaged file is rewritten up to
+the damage, read back, and replaced; the old file is kept as `<name>.damaged`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from needle_core.files.bag_path import (
 from needle_core.files.bag_records import RUN_RECORD, custom_data_of
 from needle_core.files.file_access import sync_directory
 
-# Key of the custom data that says what was lost.
+# custom_data key: description of the loss.
 _RECOVERED: Final = "recovered"
 _DAMAGED: Final = ".damaged"
 _NOTHING_LOST: Final = "its metadata or index was made anew; all that was written is here"
@@ -44,15 +44,15 @@ class BagRecovery:
     Attributes
     ----------
     was_whole : bool
-        Whether nothing had to be done.
+        Whether the bag was complete before.
     bag : BagDirectory
-        The bag as it is now, closed.
+        The bag after the recovery, closed.
     lost : str
         The damage and the time that follows it; empty if no message is lost.
     seconds_lost : float or None
-        Time of the recording behind the damage [s]; None if unknown.
+        Time of the recording after the damage [s]; None if unknown.
     left_out : list of str
-        Names of MCAP files of its folder that are not in the bag.
+        Names of MCAP files in its folder that do not belong to the bag.
     kept : list of str
         Names of the previous files.
     """
@@ -71,7 +71,7 @@ class BagRecovery:
 
 
 class _Loss(NamedTuple):
-    """The place of the first damage, the loss in words, and in seconds (None if unknown)."""
+    """Place of the first damage, and the loss as text and in seconds (None if unknown)."""
 
     where: str = ""
     text: str = ""
@@ -93,13 +93,13 @@ def recover_bag(path: Path) -> BagRecovery:
         the disk refuses the changes. Nothing is changed then.
     """
     folder = path if path.is_dir() else path.parent
-    told = _information(folder)
-    names = told.get("relative_file_paths", ())
+    metadata = _information(folder)
+    names = metadata.get("relative_file_paths", ())
     listed = [folder / PurePath(str(name)).name.removesuffix(".zstd") for name in names]
     if path in listed:
         path = folder
     elif path != folder:
-        told = {}  # metadata.yaml describes other files
+        metadata = {}  # metadata.yaml describes other files
     try:
         bag = _read_through(path)
     except BrokenBagError as error:
@@ -116,7 +116,7 @@ def recover_bag(path: Path) -> BagRecovery:
         return BagRecovery(True, bag, "", 0.0, _left_out(bag, listed), [])
     try:
         with tempfile.TemporaryDirectory(prefix=".recover.", dir=folder) as scratch:
-            return _Mending(path, files, told, Path(scratch)).run()
+            return _Recovery(path, files, metadata, Path(scratch)).run()
     except OSError as error:
         reason = f"{path} cannot be recovered: {error.filename or path}: {error.strerror}"
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
@@ -124,8 +124,8 @@ def recover_bag(path: Path) -> BagRecovery:
         raise UserError(reason) from error
 
 
-class _Mending:
-    """Recovery of one bag; it changes nothing in the folder before it has read all files.
+class _Recovery:
+    """Recovery of a bag; all files are read before anything in the folder changes.
 
     Parameters
     ----------
@@ -133,41 +133,41 @@ class _Mending:
         The bag, or a single file.
     files : list of Path
         Its files, in order.
-    told : mapping
-        Content of metadata.yaml; empty if these files were found without it.
+    metadata : mapping
+        Content of metadata.yaml; empty if it is missing or lists other files.
     scratch : Path
-        Folder for files that are written anew.
+        Folder for rewritten files.
     """
 
     def __init__(
-        self, path: Path, files: list[Path], told: Mapping[str, Any], scratch: Path
+        self, path: Path, files: list[Path], metadata: Mapping[str, Any], scratch: Path
     ) -> None:
-        self._path, self._files, self._told, self._scratch = path, files, told, scratch
+        self._path, self._files, self._metadata, self._scratch = path, files, metadata, scratch
         self._parts: list[BagDirectory] = []
 
     def run(self) -> BagRecovery:
-        """Replace the bag by everything before its first damage."""
+        """Replace the bag by its content before the first damage."""
         loss = self._read()
         parts = self._parts
         if not parts:
             raise UserError(f"{self._path} cannot be recovered: nothing comes before {loss.where}")
         kept: list[str] = []
         if self._path.is_dir():
-            information = _new_information(parts, self._told, loss.text or _NOTHING_LOST)
-            kept += _set_aside(self._path / METADATA_FILE)
-            # Before the data: a recovery that is interrupted here starts again with these files.
+            information = _new_information(parts, self._metadata, loss.text or _NOTHING_LOST)
+            kept += _keep_original(self._path / METADATA_FILE)
+            # Before the data: after an interruption the recovery restarts with these files.
             write_metadata(self._path, information)
         for file, part in zip(self._files, parts, strict=False):
             if part.path.parent == self._scratch:
-                kept += _set_aside(file)
+                kept += _keep_original(file)
                 part.path.replace(file)
                 sync_directory(file.parent)
-        with BagDirectory(self._path) as bag:  # every tool must be able to open the result
+        with BagDirectory(self._path) as bag:  # check the result
             left_out = _left_out(bag, self._files[: len(parts)])
             return BagRecovery(False, bag, loss.text, loss.seconds, left_out, kept)
 
     def _read(self) -> _Loss:
-        """Read the files up to the first damage; return what is lost."""
+        """Read the files up to the first damage; return the loss."""
         for file in self._files:
             if not os.path.lexists(file):
                 return self._loss(f"{file.name} (it is missing)", self._last)
@@ -180,7 +180,7 @@ class _Mending:
         return _Loss()
 
     def _read_damaged(self, file: Path) -> _Loss:
-        """Write the records before a file's damage to a new file; return what is lost."""
+        """Copy the records before the damage of a file to a new file; return the loss."""
         if shutil.disk_usage(self._scratch).free < file.stat().st_size:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))
         new = self._scratch / file.name
@@ -202,14 +202,14 @@ class _Mending:
 
     @property
     def _last(self) -> int:
-        """Latest log time [ns] so far."""
+        """Latest log time of the files read so far [ns]."""
         return max((part.end for part in self._parts), default=0)
 
     def _loss(self, where: str, last: int) -> _Loss:
-        """Return the loss from a damage on; `last` is the latest log time before it [ns]."""
+        """Return the loss after a damage; `last` is the latest log time before it [ns]."""
         with contextlib.suppress(LookupError, TypeError):
-            begin = self._told["starting_time"]["nanoseconds_since_epoch"]
-            end = begin + self._told["duration"]["nanoseconds"]
+            begin = self._metadata["starting_time"]["nanoseconds_since_epoch"]
+            end = begin + self._metadata["duration"]["nanoseconds"]
             seconds = max(0, end - last) / 1e9
             return _Loss(where, f"all from {where} on: {seconds:.1f} s follow", seconds)
         text = f"all from {where} on: half a second at most if a kill ended the recording there"
@@ -217,16 +217,18 @@ class _Mending:
 
 
 def _information(folder: Path) -> dict[str, Any]:
-    """Return the content of metadata.yaml; empty if it cannot be read or names no files."""
+    """Return the content of metadata.yaml; empty if it is unreadable or lists no files."""
     with contextlib.suppress(OSError, ValueError):
-        told = read_information(folder)
-        if told.get("relative_file_paths") and isinstance(told["relative_file_paths"], list):
-            return told
+        metadata = read_information(folder)
+        if metadata.get("relative_file_paths") and isinstance(
+            metadata["relative_file_paths"], list
+        ):
+            return metadata
     return {}
 
 
 def _new_information(
-    parts: Sequence[BagDirectory], told: Mapping[str, Any], note: str
+    parts: Sequence[BagDirectory], metadata: Mapping[str, Any], note: str
 ) -> dict[str, Any]:
     """Return the content of a metadata.yaml for these files."""
     files = [
@@ -234,20 +236,20 @@ def _new_information(
         for part in parts
     ]
     topics = {name: topic for part in reversed(parts) for name, topic in part.topics.items()}
-    custom = told.get("custom_data")
+    custom = metadata.get("custom_data")
     if not isinstance(custom, dict):
         custom = custom_data_of(record for part in parts for record in part.records)
     before = str(custom.get(_RECOVERED, ""))
     if note not in before:
         custom = {**custom, _RECOVERED: "; ".join(filter(None, (before, note)))}
-    distribution = parts[0].distribution or str(told.get("ros_distro") or "")
+    distribution = parts[0].distribution or str(metadata.get("ros_distro") or "")
     is_packed = any(part.is_packed for part in parts)
     return bag_information(files, list(topics.values()), custom, distribution, is_packed=is_packed)
 
 
 def _read_through(path: Path) -> BagDirectory:
-    """Return a bag, closed, all of whose messages could be read."""
-    tqdm.monitor_interval = 0  # its thread would outlive the bar
+    """Read all messages of a bag; return it, closed."""
+    tqdm.monitor_interval = 0  # no monitor thread
     with BagDirectory(path) as bag:
         messages, total = bag.messages(lambda _: True), bag.counts.total()
         for _ in tqdm(messages, path.name, total, leave=False, delay=1.0, disable=None):
@@ -256,12 +258,12 @@ def _read_through(path: Path) -> BagDirectory:
 
 
 def _left_out(bag: BagDirectory, taken: Sequence[Path]) -> list[str]:
-    """Return the names of the MCAP files of a bag's folder that are not in it."""
+    """Return the names of the MCAP files in the bag's folder that do not belong to it."""
     return [file.name for file in sorted(set(bag.path.glob("[!.]*.mcap")).difference(taken))]
 
 
-def _set_aside(path: Path) -> list[str]:
-    """Give a file a second name, under which it stays; return that name."""
+def _keep_original(path: Path) -> list[str]:
+    """Keep a file under a second name; return that name."""
     if not os.path.lexists(path):
         return []
     kept = path.with_name(path.name + _DAMAGED)

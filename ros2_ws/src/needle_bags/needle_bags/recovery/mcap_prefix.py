@@ -1,4 +1,4 @@
-"""Everything before the first damage of an MCAP file."""
+"""Copies the intact prefix of an MCAP file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from needle_bags.format.bag_writer import CHUNK_SIZE, LIBRARY
 from needle_core.files.file_access import open_regular
 
-# Errors of mcap's reader on bytes that are not what they should be.
+# Errors of mcap's reader on damaged data.
 _DAMAGE: Final = (
     *(McapError, ValueError, LookupError, struct.error, OverflowError, RuntimeError),
     zstandard.ZstdError,
@@ -23,14 +23,14 @@ _DAMAGE: Final = (
 
 
 class PrefixCopy:
-    """A copy of all records before the first that is damaged, not finished yet.
+    """Copy of all records before the first damaged one; its writer is not finished yet.
 
     Parameters
     ----------
     source : Path
         The damaged file.
     target : file
-        Takes the copy.
+        Destination.
 
     Raises
     ------
@@ -40,11 +40,11 @@ class PrefixCopy:
     Attributes
     ----------
     writer : Writer
-        Of the copy.
+        Writer of the copy.
     end : int
-        Where the damage begins [B]; 0 if the file has nothing before it.
+        Position of the damage [B]; 0 if there is no intact record.
     reason : str
-        The kind of damage; empty if the data end as they should.
+        The kind of damage; empty if the data end properly.
     messages, last : int
         Messages in the copy, and their latest log time [ns].
     """
@@ -57,16 +57,16 @@ class PrefixCopy:
         self._channels: dict[int, int] = {}
         with open_regular(source) as stream:
             try:
-                # A chunk's records come at once, after its checksum was compared.
+                # The reader returns the records of a chunk after checking its checksum.
                 for record in StreamReader(stream, validate_crcs=True).records:
-                    self._put(record)
+                    self._copy(record)
                     self.end = stream.tell()
             except EndOfFile:
                 self.reason = "the file ends within a record"
             except _DAMAGE as error:
                 self.reason = f"a record is damaged: {type(error).__name__}"
 
-    def _put(self, record: Any) -> None:
+    def _copy(self, record: Any) -> None:
         match record:
             case Header():
                 self.writer.start(record.profile, LIBRARY)

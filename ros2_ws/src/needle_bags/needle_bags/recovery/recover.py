@@ -1,4 +1,4 @@
-"""`recover`: makes a bag whole that a crash, a kill or a full disk left behind."""
+"""`recover`: completes the bag of a recording that a crash, a kill or a full disk ended."""
 
 from __future__ import annotations
 

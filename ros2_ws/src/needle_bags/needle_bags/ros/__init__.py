@@ -1,1 +1,1 @@
-"""The recorder's and the player's ROS side."""
+"""ROS nodes of this package."""

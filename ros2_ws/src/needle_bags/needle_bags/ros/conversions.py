@@ -1,4 +1,4 @@
-"""Quality of service between rclpy and what bags say."""
+"""Conversion of quality of service between rclpy and bags."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from rosbags.interfaces import (
 )
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-# DDS does not tell a publisher's depth. What late joiners get of a latched topic; and what a
-# subscriber that is busy for a moment may have waiting.
+# Assumed depths, because DDS does not announce that of a publisher: of latched topics, of images,
+# and of other topics.
 UNKNOWN_LATCHED_DEPTH = 10
 UNKNOWN_IMAGE_DEPTH = 30
 UNKNOWN_DEPTH = 500
 
 
 def offered_qos(offer: TopicEndpointInfo) -> Qos:
-    """Return what a publisher of the graph offers."""
+    """Return the offered QoS of a publisher."""
     qos = offer.qos_profile
 
     def time(duration: Duration) -> QosTime:
@@ -50,7 +50,7 @@ def offered_qos(offer: TopicEndpointInfo) -> Qos:
 
 
 def strictest_request(offers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfile:
-    """Return the strictest subscription that every publisher can serve."""
+    """Return the strictest QoS that every publisher can serve."""
     profiles = [offer.qos_profile for offer in offers]
     reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
     latched = bool(profiles) and all(
@@ -65,10 +65,9 @@ def strictest_request(offers: Sequence[TopicEndpointInfo], depth: int) -> QoSPro
 
 
 def recorded_offer(type_name: str, offers: Sequence[Qos]) -> QoSProfile:
-    """Return the offer that serves whoever was served by the recorded ones.
+    """Return an offer that matches every request that the recorded offers matched.
 
-    One recorded offer is given as it was. Of several, the stronger of each policy: it matches
-    every request that one of them matched.
+    A single recorded offer is kept; of several, the strongest of each policy is used.
     """
     unknown_depth = UNKNOWN_IMAGE_DEPTH if type_name in IMAGE_TYPES else UNKNOWN_DEPTH
     if not offers:

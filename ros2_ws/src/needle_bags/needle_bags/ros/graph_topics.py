@@ -1,4 +1,4 @@
-"""Every chosen topic of the graph, message by message, as it was sent."""
+"""Subscriptions to the chosen topics of the graph, as serialised messages."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from needle_bags.recording.recording import Received
 from needle_bags.ros.conversions import IMAGE_TYPES, offered_qos, strictest_request
 from needle_core.files.bag_topic import BagTopic
 
-# A look at the graph takes this long at most; what is left is looked at next time [s].
+# Time limit of one poll of the graph; the next poll continues [s].
 GRAPH_TIME = 0.05
-# What waits on one topic is taken for this long at most: then it is the others' turn [s].
+# Time limit for the queued messages of one topic, so that other topics get their turn [s].
 TURN = 0.02
-# All that Fast DDS keeps for a reader by default: a burst while the graph is looked at must fit.
+# Fast DDS keeps at most this many by default; a burst during a poll must fit.
 DEPTH = 5000
-# A second of a camera's. Fast DDS keeps the memory of as many for good, at their largest.
+# One second of a camera. Fast DDS never releases the memory of this many images.
 IMAGE_DEPTH = 30
-# A subscription that another one has replaced is listened to for so long still [s]: until that one
-# is found by all publishers, and until what waits for it and what it has lost are told.
+# A replaced subscription is kept for this time [s]: until all publishers have discovered the new
+# one, and until its queued messages and its losses have been reported.
 OVERLAP = 1.0
-# Stamps that fit a bag: nanoseconds since the epoch, as a signed number.
+# Largest stamp that fits into a bag [ns].
 _LATEST = 2**63 - 1
 
 
 class _Topic:
-    """One topic being listened to."""
+    """State of one subscribed topic."""
 
     def __init__(self, name: str, type_name: str, message_class: type) -> None:
         self.name = name
@@ -45,40 +45,40 @@ class _Topic:
         self.subscription: Subscription | None = None
         self.publishers = -1
         self.described = False
-        # What each of its subscriptions, one after the other, has lost.
+        # Number of messages lost by each of its subscriptions so far.
         self.lost_events: list[int] = []
         self.gaps = SequenceGaps()
         self.replaced: Subscription | None = None
         self.replaced_until = 0.0
-        # Source stamps and numbers, which tell messages apart, of the last ones, and of all while
-        # two subscriptions get them.
+        # (source stamp, number) of the last messages, and of all messages while two subscriptions
+        # receive the topic: used to drop duplicates.
         self.recent: collections.deque[tuple[int, int]] = collections.deque(maxlen=64)
         self.repeated: set[tuple[int, int]] | None = None
 
     @property
     def lost(self) -> int:
-        """Messages that did not arrive: as DDS tells, or as the numbers of the others show."""
+        """Number of lost messages, by DDS events or by gaps in the sequence numbers."""
         return max(sum(self.lost_events), self.gaps.missing)
 
 
 class GraphTopics:
-    """Subscriptions to the chosen topics of the graph; those that appear later included.
+    """Subscriptions to the chosen topics of the graph, including topics that appear later.
 
     Parameters
     ----------
     node : Node
         The node that subscribes.
     choice : TopicChoice
-        Which topics.
+        The chosen topics.
     describe : callable
-        Takes a topic, before its first message.
-    take : callable
-        Takes a message.
+        Called with a topic before its first message.
+    receive : callable
+        Called with every message.
 
     Attributes
     ----------
     refused : dict of str to str
-        Topic to why it is not listened to.
+        Topic to the reason why it is not recorded.
     """
 
     def __init__(
@@ -86,37 +86,37 @@ class GraphTopics:
         node: Node,
         choice: TopicChoice,
         describe: Callable[[BagTopic], None],
-        take: Callable[[Received], None],
+        receive: Callable[[Received], None],
     ) -> None:
         self._node = node
         self._choice = choice
         self._on_topic = describe
-        self._take = take
+        self._receive = receive
         self._topics: dict[str, _Topic] = {}
         self.refused: dict[str, str] = {}
 
     def __len__(self) -> int:
-        """Return how many topics are listened to."""
+        """Return the number of subscribed topics."""
         return len(self._topics)
 
     @property
     def lost(self) -> dict[str, int]:
-        """Messages that did not arrive, by topic."""
+        """Number of lost messages by topic."""
         return {name: topic.lost for name, topic in self._topics.items() if topic.lost}
 
     def poll(self) -> None:
-        """Look at the graph, as far as there is time."""
+        """Subscribe to new topics of the graph, within the time limit."""
         for topic in self._topics.values():
             if topic.replaced is not None and time.monotonic() > topic.replaced_until:
-                self._leave_replaced(topic)
+                self._drop_replaced(topic)
         until = time.monotonic() + GRAPH_TIME
         for name, types in self._node.get_topic_names_and_types():
-            # What waits on the topics that are there comes first; the rest at the next poll.
+            # Queued messages take precedence; the next poll does the rest.
             if time.monotonic() > until:
                 return
             if name not in self._choice or name in self.refused:
                 continue
-            # Names and types are whatever another participant of the graph says.
+            # Names and types come from other participants and may be invalid.
             try:
                 topic = self._topics.get(name) or self._new_topic(name, types)
                 self._subscribe(topic)
@@ -124,15 +124,15 @@ class GraphTopics:
                 self._refuse(name, f"{name} is not recorded: {error}")
 
     def describe_all(self) -> None:
-        """Describe the topics that have had no message."""
+        """Describe the topics without any message."""
         for topic in self._topics.values():
             if not topic.described:
                 self._describe(topic)
 
-    def leave(self) -> None:
-        """Stop listening."""
+    def unsubscribe(self) -> None:
+        """Destroy all subscriptions."""
         for topic in self._topics.values():
-            self._leave_replaced(topic)
+            self._drop_replaced(topic)
             if topic.subscription is not None:
                 self._node.destroy_subscription(topic.subscription)
                 topic.subscription = None
@@ -155,14 +155,14 @@ class GraphTopics:
             return
         offers = self._node.get_publishers_info_by_topic(topic.name)
         if len(offers) != publishers:
-            return  # the graph is changing under us: look again at the next poll
+            return  # the graph is changing: try again at the next poll
         topic.publishers = publishers
-        topic.gaps.forget()
+        topic.gaps.reset()
         if topic.subscription is not None and not offers:
             return
         qos = strictest_request(offers, IMAGE_DEPTH if topic.type_name in IMAGE_TYPES else DEPTH)
-        if not offers and self._is_taken_best_effort(topic.name):
-            # More would be more than the publisher that is still to come is likely to offer.
+        if not offers and self._has_best_effort_subscriber(topic.name):
+            # The publisher is likely to offer best effort as well.
             qos.reliability = ReliabilityPolicy.BEST_EFFORT
         before = topic.subscription
         if before is not None:
@@ -175,62 +175,62 @@ class GraphTopics:
         def count_lost(event: Any) -> None:
             topic.lost_events[number] = event.total_count
 
-        def take(data: bytes, info: dict[str, int]) -> None:
+        def receive(data: bytes, info: dict[str, int]) -> None:
             if following is topic.replaced:
-                self._take_one(topic, data, info)
+                self._receive_one(topic, data, info)
                 return
-            # What the one before got before this one was there comes first.
-            self._take_replaced(topic)
-            self._take_all(topic, data, info)
+            # Messages of the previous subscription come first.
+            self._receive_replaced(topic)
+            self._receive_all(topic, data, info)
 
         following = self._node.create_subscription(
             topic.message_class,
             topic.name,
-            take,
+            receive,
             qos,
             event_callbacks=SubscriptionEventCallbacks(message_lost=count_lost),
             raw=True,
         )
         if before is not None:
-            self._leave_replaced(topic)
+            self._drop_replaced(topic)
             topic.replaced, topic.replaced_until = before, time.monotonic() + OVERLAP
             topic.repeated = {*topic.recent, *(topic.repeated or ())}
         topic.subscription = following
 
-    def _is_taken_best_effort(self, name: str) -> bool:
+    def _has_best_effort_subscriber(self, name: str) -> bool:
         return any(
             info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
             for info in self._node.get_subscriptions_info_by_topic(name)
         )
 
-    def _leave_replaced(self, topic: _Topic) -> None:
-        """Take what waits for the subscription that another has replaced, and end it."""
-        self._take_replaced(topic)
+    def _drop_replaced(self, topic: _Topic) -> None:
+        """Receive the queued messages of a replaced subscription, and destroy it."""
+        self._receive_replaced(topic)
         if topic.replaced is not None:
             self._node.destroy_subscription(topic.replaced)
             topic.replaced = None
 
-    def _take_replaced(self, topic: _Topic) -> None:
+    def _receive_replaced(self, topic: _Topic) -> None:
         if topic.replaced is None:
             return
-        # What comes meanwhile comes to the other one, too.
-        for taken in islice(_waiting(topic, topic.replaced), topic.replaced.qos_profile.depth):
-            self._take_one(topic, *taken)
+        # The new subscription receives what arrives meanwhile.
+        for taken in islice(_queued(topic, topic.replaced), topic.replaced.qos_profile.depth):
+            self._receive_one(topic, *taken)
 
-    def _take_all(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
-        """Take a message and those that wait behind it: a turn costs more than they."""
-        self._take_one(topic, data, info)
+    def _receive_all(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
+        """Receive a message and those queued behind it: an executor turn is more expensive."""
+        self._receive_one(topic, data, info)
         if topic.subscription is None:
             return
         until = time.monotonic() + TURN
-        for taken in _waiting(topic, topic.subscription):
-            self._take_one(topic, *taken)
+        for taken in _queued(topic, topic.subscription):
+            self._receive_one(topic, *taken)
             if time.monotonic() >= until:
                 return
         if topic.replaced is None:
             topic.repeated = None
 
-    def _take_one(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
+    def _receive_one(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
         sent = info["source_timestamp"]
         number = info["publication_sequence_number"] or 0
         if topic.repeated is not None:
@@ -241,11 +241,11 @@ class GraphTopics:
         if not topic.described:
             self._describe(topic)
         if number and topic.publishers == 1:
-            topic.gaps.take(number)
+            topic.gaps.add(number)
         received = info["received_timestamp"] or time.time_ns()
-        # When it was sent is what its publisher says.
+        # The publisher may send an invalid stamp.
         sent = sent if 0 < sent <= _LATEST else received
-        self._take(Received(topic.name, data, received, sent, number))
+        self._receive(Received(topic.name, data, received, sent, number))
 
     def _describe(self, topic: _Topic) -> None:
         topic.described = True
@@ -262,8 +262,8 @@ class GraphTopics:
         )
 
 
-def _waiting(topic: _Topic, subscription: Subscription) -> Iterator[tuple[bytes, dict[str, int]]]:
-    """Take one after the other what waits for a subscription."""
+def _queued(topic: _Topic, subscription: Subscription) -> Iterator[tuple[bytes, dict[str, int]]]:
+    """Yield the queued messages of a subscription."""
     handle = subscription.handle
     with handle:
         while (taken := handle.take_message(topic.message_class, True)) is not None:

@@ -1,4 +1,4 @@
-"""The parameters of every node of the graph: as they are when it can first answer, and changes."""
+"""Parameters of all nodes of the graph, and their changes."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
-from needle_bags.ros.question import Question
+from needle_bags.ros.repeated_request import RepeatedRequest
 from needle_core.ros import node_names
 
 
 def plain_value(value: ParameterValue) -> Any:
-    """Return a parameter's value as YAML can hold it; None where it is not set.
+    """Return a parameter value as plain Python; None if it is not set.
 
     Parameters
     ----------
     value : ParameterValue
-        rclpy's, or a bag's as rosbags has it.
+        The message of rclpy or of rosbags.
     """
     try:
         plain = parameter_value_to_python(value)
-    except RuntimeError:  # of no type that there is
+    except RuntimeError:  # unknown type
         return None
     return [_plain_element(element) for element in plain] if isinstance(plain, list) else plain
 
@@ -38,123 +38,125 @@ def _plain_element(element: Any) -> Any:
 
 
 class ParameterSnapshots:
-    """The parameters of all nodes as they were when each node was first seen, and their changes.
+    """Parameters of all nodes when each was first discovered, and their changes.
 
     Parameters
     ----------
     node : Node
-        The node that asks; its own parameters are taken too.
+        The node that sends the requests; its own parameters are included.
     on_snapshot : callable
-        Called with a node's full name and its parameters, when they have come.
+        Called with the full name and the parameters of a node.
 
     Attributes
     ----------
     changes : list of dict
-        All changes since (`take_event`), in order.
+        All changes since (`apply_event`), in order.
     """
 
     def __init__(self, node: Node, on_snapshot: Callable[[str, dict[str, Any]], None]) -> None:
         self._node = node
         self._on_snapshot = on_snapshot
-        self._questions: dict[str, _Questions] = {}
+        self._requests: dict[str, _ParameterRequests] = {}
         self._values: dict[str, dict[str, Any]] = {}
-        self._now: dict[str, dict[str, Any]] = {}
+        self._current: dict[str, dict[str, Any]] = {}
         self.changes: list[dict[str, Any]] = []
 
     def document(self) -> dict[str, Any]:
-        """Return all parameters known so far, in the form of a ROS parameter file."""
+        """Return all parameters as a ROS parameter file."""
         return {name: {"ros__parameters": values} for name, values in self._values.items()}
 
-    def take_event(self, event: ParameterEvent) -> list[dict[str, Any]]:
-        """Take a message of /parameter_events; return the changes that it tells of.
+    def apply_event(self, event: ParameterEvent) -> list[dict[str, Any]]:
+        """Apply a message of /parameter_events; return its changes.
 
-        Each is `stamp_ns` (ROS time), `node`, `name`, `value` (None: deleted). What a node declares
-        before its first snapshot is in the snapshot.
+        Each is `stamp_ns` (ROS time), `node`, `name`, `value` (None: deleted). Parameters declared
+        before the first snapshot of a node are part of the snapshot.
         """
-        known = self._now.get(event.node)
+        known = self._current.get(event.node)
         if known is None:
             return []
-        told = {
+        changed = {
             p.name: plain_value(p.value) for p in (*event.new_parameters, *event.changed_parameters)
         }
-        told.update({p.name: None for p in event.deleted_parameters})
+        changed.update({p.name: None for p in event.deleted_parameters})
         stamp = event.stamp.sec * 1_000_000_000 + event.stamp.nanosec
         changes = [
             {"stamp_ns": stamp, "node": event.node, "name": name, "value": value}
-            for name, value in told.items()
+            for name, value in changed.items()
             if known.get(name) != value
         ]
-        known.update(told)
+        known.update(changed)
         self.changes += changes
         return changes
 
     def poll(self) -> None:
-        """Ask the nodes of the graph whose parameters have not come yet."""
-        there = set()
+        """Request the parameters of nodes that have not answered yet."""
+        present = set()
         for name, namespace in self._node.get_node_names_and_namespaces():
             if name.startswith("_"):
                 continue
             full_name = node_names.full_name(namespace, name)
-            there.add(full_name)
+            present.add(full_name)
             if full_name == self._node.get_fully_qualified_name():
-                self._take_own(full_name)
+                self._store_own(full_name)
             elif full_name not in self._values:
-                self._ask(full_name)
-        # Not from an answer's callback: its client is in use there.
-        for full_name in [n for n in self._questions if n in self._values or n not in there]:
-            self._questions.pop(full_name).close()
+                self._request(full_name)
+        # Not in the callback of an answer, which uses the client.
+        for full_name in [n for n in self._requests if n in self._values or n not in present]:
+            self._requests.pop(full_name).close()
 
-    def _take_own(self, full_name: str) -> None:
+    def _store_own(self, full_name: str) -> None:
         if full_name not in self._values:
             own = self._node.get_parameters_by_prefix("")
-            self._take(full_name, {name: p.value for name, p in own.items()})
+            self._store(full_name, {name: p.value for name, p in own.items()})
 
-    def _ask(self, full_name: str) -> None:
-        questions = self._questions.get(full_name)
-        if questions is None:
-            questions = _Questions(
-                self._node, full_name, lambda values: self._take(full_name, values)
+    def _request(self, full_name: str) -> None:
+        requests = self._requests.get(full_name)
+        if requests is None:
+            requests = _ParameterRequests(
+                self._node, full_name, lambda values: self._store(full_name, values)
             )
-            self._questions[full_name] = questions
-        questions.ask()
+            self._requests[full_name] = requests
+        requests.send()
 
-    def _take(self, full_name: str, values: dict[str, Any]) -> None:
+    def _store(self, full_name: str, values: dict[str, Any]) -> None:
         self._values[full_name] = {
             name: value for name, value in values.items() if value is not None
         }
-        self._now[full_name] = dict(self._values[full_name])
+        self._current[full_name] = dict(self._values[full_name])
         self._on_snapshot(full_name, self._values[full_name])
 
 
-class _Questions:
-    """Asks one node for the names of its parameters, then for their values, as often as needed."""
+class _ParameterRequests:
+    """Requests to one node: the names of its parameters, then their values."""
 
-    def __init__(self, node: Node, full_name: str, take: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(
+        self, node: Node, full_name: str, on_values: Callable[[dict[str, Any]], None]
+    ) -> None:
         self._node = node
-        self._take = take
+        self._on_values = on_values
         self._names: list[str] | None = None
         names_of = node.create_client(ListParameters, f"{full_name}/list_parameters")
         values_of = node.create_client(GetParameters, f"{full_name}/get_parameters")
         self._clients: tuple[Client, ...] = (names_of, values_of)
-        self._names_of = Question(names_of, self._take_names)
-        self._values_of = Question(values_of, self._take_values)
+        self._names_of = RepeatedRequest(names_of, self._receive_names)
+        self._values_of = RepeatedRequest(values_of, self._receive_values)
 
-    def ask(self) -> None:
-        """Ask what is not answered yet, when it is time to."""
+    def send(self) -> None:
+        """Send the next request if it is due."""
         if self._names is None:
-            self._names_of.ask(ListParameters.Request())
+            self._names_of.send(ListParameters.Request())
         else:
-            self._values_of.ask(GetParameters.Request(names=self._names))
+            self._values_of.send(GetParameters.Request(names=self._names))
 
     def close(self) -> None:
-        """Drop the clients."""
+        """Destroy the clients."""
         for client in self._clients:
             self._node.destroy_client(client)
 
-    def _take_names(self, response: ListParameters.Response) -> None:
+    def _receive_names(self, response: ListParameters.Response) -> None:
         self._names = list(response.result.names)
-        self.ask()
+        self.send()
 
-    def _take_values(self, response: GetParameters.Response) -> None:
+    def _receive_values(self, response: GetParameters.Response) -> None:
         values = [plain_value(value) for value in response.values]
-        self._take(dict(zip(self._names or [], values, strict=False)))
+        self._on_values(dict(zip(self._names or [], values, strict=False)))

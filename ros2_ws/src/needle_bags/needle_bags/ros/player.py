@@ -30,8 +30,8 @@ from needle_bags.player.player_options import (
     require_fits,
 )
 from needle_bags.player.replay_names import REPLAY, is_guarded, marks_a_rig, played_name
-from needle_bags.player.terminal_keys import BACK, FASTER, ON, PAUSE, SLOWER, Keys
-from needle_bags.reading.bag_files import raw_messages, read_contents
+from needle_bags.player.terminal_keys import BACK, FASTER, FORWARD, PAUSE, SLOWER, Keys
+from needle_bags.reading.bag_messages import raw_messages, read_contents
 from needle_bags.ros.conversions import recorded_offer
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_core.diagnostics import Diagnostic, Level
@@ -46,13 +46,13 @@ from needle_core.ros.whole_node import WholeNode
 from needle_core.settings.parameter_fields import check_fields, parameter
 
 CLOCK: Final = "/clock"
-# How long a rig that is there has to show itself before the first message; how much longer those
-# who listen have to learn of our publishers; and how often the graph is looked at then [s].
+# Time to discover a rig before the first message, further time for subscribers to discover the
+# publishers, and period of checking the graph during playback [s].
 DISCOVERY: Final = 2.0
 MATCHING: Final = 3.0
-LOOK_PERIOD: Final = 0.1
+CHECK_PERIOD: Final = 0.1
 ACKNOWLEDGED: Final = 5.0
-PATIENCE: Final = 0.02  # the longest that a signal, a key or a service call waits [s]
+MAX_TURN: Final = 0.02  # maximum delay of a signal, a key or a service call [s]
 _NANOSECONDS: Final = 1_000_000_000
 RATE_STEP: Final = 1.1
 SEEK_STEP: Final = 5 * _NANOSECONDS
@@ -62,13 +62,17 @@ Message = tuple[str, int, bytes]
 
 @dataclasses.dataclass(frozen=True)
 class PlayerParameters:
-    """Parameters that can be set while it plays; the rest are options."""
+    """Parameters that can be set during playback; the rest are options."""
 
     rate: float = parameter(
-        1.0, unit="-", description="How many times faster.", lower=MIN_RATE, upper=MAX_RATE
+        1.0,
+        unit="-",
+        description="Ratio of playback speed to recording speed.",
+        lower=MIN_RATE,
+        upper=MAX_RATE,
     )
     seek: float = parameter(
-        0.0, unit="s", description="Set it to go there, after the first message.", lower=0.0
+        0.0, unit="s", description="Jump to this time after the first message.", lower=0.0
     )
 
     def __post_init__(self) -> None:
@@ -77,11 +81,11 @@ class PlayerParameters:
 
 
 class RigAppearedError(Exception):
-    """A rig came up while topics are played under their own names."""
+    """A rig appeared while topics are played under their own names."""
 
 
 class Player(WholeNode):
-    """Publishes a bag's messages when they are due."""
+    """Publishes the messages of a bag when they are due."""
 
     def __init__(self, options: PlayerOptions, contents: BagDirectory) -> None:
         super().__init__("player")
@@ -97,10 +101,10 @@ class Player(WholeNode):
         self.clock = PlaybackClock(options.rate, self.start, now, paused=options.paused)
         self._clock_publisher: Publisher | None = None
         self._next_clock = 0.0
-        self._looked_at = 0.0
+        self._checked_at = 0.0
         self.beside_rig = False
         self.messages = 0
-        self.sought: int | None = None  # where playing goes on [ns]
+        self.seek_target: int | None = None  # recording time [ns]
         self._begin = self.start
         self.create_service(SetBool, "~/pause", self._on_pause)
         NodeParameters(self, PlayerParameters)
@@ -108,7 +112,7 @@ class Player(WholeNode):
         self.add_post_set_parameters_callback(self._on_parameters)
 
     def _playable(self) -> dict[str, BagTopic]:
-        """Return the topics to play; say why others are left out."""
+        """Return the topics to play; log why others are left out."""
         options, known = self._options, self._contents.topics
         chosen = {name: topic for name, topic in known.items() if name in options.topics}
         if not chosen:
@@ -127,17 +131,17 @@ class Player(WholeNode):
         return playable
 
     def prepare(self, spin: partial[None], end: EndRequest) -> bool:
-        """Look for a rig, make the publishers, and wait for who listens already.
+        """Discover a rig, make the publishers, and wait for existing subscribers.
 
         Returns
         -------
         bool
-            False where `end` was wanted meanwhile: then nothing is to be played.
+            False if `end` was requested meanwhile.
 
         Raises
         ------
         UserError
-            If a ROS remapping would bring a guarded topic to a rig.
+            If a ROS remapping would pass a guarded topic to a rig.
         """
         self._make_publishers()
         begin = time.monotonic()
@@ -177,7 +181,7 @@ class Player(WholeNode):
             name,
             recorded_offer(topic.type_name, topic.offered_qos),
         )
-        # Remappings of the ROS command line come after ours.
+        # ROS remappings apply after those of --remap.
         final = publisher.topic_name
         if not final.startswith(f"{REPLAY}/") and (
             self.beside_rig
@@ -194,7 +198,7 @@ class Player(WholeNode):
         )
 
     def _publish_latched(self, before: int) -> None:
-        """Publish what late joiners would have got at a time of recording [ns]."""
+        """Publish the latched messages at a recording time [ns]."""
         latched = {name for name, topic in self._topics.items() if topic.is_latched}
         if before == self._contents.start or not latched:
             return
@@ -205,52 +209,52 @@ class Player(WholeNode):
             self.publish(message)
 
     def read(self) -> Iterator[Message]:
-        """Yield the messages to play, in order, from where playing begins."""
+        """Yield the messages to play, in order, from the current start."""
         return raw_messages(self._options.bag, set(self._topics), self._begin, self.end + 1)
 
     def seek(self, time: int) -> None:
-        """Go on at another time of recording [ns], or at the nearest that the bag has."""
-        self.sought = min(max(time, self._contents.start), self.end)
+        """Jump to a recording time [ns], limited to the bag."""
+        self.seek_target = min(max(time, self._contents.start), self.end)
 
     def begin(self) -> None:
-        """Go to where playing goes on: where somebody wanted, or the start."""
-        self._begin = self.start if self.sought is None else self.sought
-        if self.sought is not None:
+        """Start at the seek target, or at the beginning."""
+        self._begin = self.start if self.seek_target is None else self.seek_target
+        if self.seek_target is not None:
             self._publish_latched(self._begin)
-        self.sought = None
+        self.seek_target = None
         self.clock.restart(self._begin, time.monotonic())
 
     def press(self, key: str) -> None:
-        """Do what a key in the terminal stands for."""
+        """Handle a key pressed in the terminal."""
         now = time.monotonic()
         if key == PAUSE:
             self.pause(not self.clock.is_paused)
         elif key in (FASTER, SLOWER):
             rate = self.clock.rate * (RATE_STEP if key == FASTER else 1.0 / RATE_STEP)
             self.set_parameters([Parameter("rate", value=min(max(rate, MIN_RATE), MAX_RATE))])
-        elif key in (BACK, ON):
-            self.seek(self.clock.time(now) + (SEEK_STEP if key == ON else -SEEK_STEP))
+        elif key in (BACK, FORWARD):
+            self.seek(self.clock.time(now) + (SEEK_STEP if key == FORWARD else -SEEK_STEP))
 
     def publish(self, message: Message) -> None:
-        """Send one message."""
+        """Publish a message."""
         self._senders[message[0]].publish(message[2])
         self.messages += 1
 
-    def look_around(self) -> None:
-        """Publish the clock and the state; see whether a rig has come up.
+    def check_graph(self) -> None:
+        """Publish clock and state; check for a rig.
 
         Raises
         ------
         RigAppearedError
-            If one has, while topics are played under their own names.
+            If a rig appeared while topics are played under their own names.
         """
         now = time.monotonic()
         if self._clock_publisher is not None and now >= self._next_clock:
             self._next_clock = now + 1.0 / cast(float, self._options.clock)
             self._clock_publisher.publish(Clock(clock=to_stamp(self.clock.time(now))))
-        if now - self._looked_at < LOOK_PERIOD:
+        if now - self._checked_at < CHECK_PERIOD:
             return
-        self._looked_at = now
+        self._checked_at = now
         rig = None if self.beside_rig else self._rig()
         if rig is not None:
             raise RigAppearedError(rig)
@@ -259,17 +263,17 @@ class Player(WholeNode):
         self._diagnostics.set("playback", Diagnostic(Level.OK, state, values))
 
     def pause(self, paused: bool) -> None:
-        """Stop or go on."""
+        """Pause or continue."""
         self.clock.pause(paused, time.monotonic())
 
     def finish(self) -> None:
-        """Wait until all that listen have everything."""
+        """Wait until all subscribers have received all messages."""
         timeout = Duration(seconds=ACKNOWLEDGED)
         for publisher in self._senders.values():
             publisher.wait_for_all_acked(timeout)
 
     def _rig(self) -> str | None:
-        """Return what makes a rig of this graph."""
+        """Return the publisher that belongs to a rig, as text, or None."""
         for name, _ in self.get_topic_names_and_types():
             if marks_a_rig(name):
                 for info in self.get_publishers_info_by_topic(name):
@@ -307,17 +311,17 @@ def _play(player: Player, loop: bool, end: EndRequest) -> int:
         while True:
             with contextlib.closing(ReadAhead(player.read)) as source:
                 message = source.next()
-                while message is not None and player.sought is None:
-                    # A turn of the executor costs more than a message: take it now and then.
+                while message is not None and player.seek_target is None:
+                    # An executor turn is more expensive than a message: publish several per turn.
                     wait = player.clock.wait(message[1], time.monotonic())
-                    turn = time.monotonic() + PATIENCE
+                    turn = time.monotonic() + MAX_TURN
                     while wait == 0.0 and message is not None and time.monotonic() < turn:
                         player.publish(message)
                         message = source.next()
                         if message is not None:
                             wait = player.clock.wait(message[1], time.monotonic())
-                    executor.spin_once(min(wait, PATIENCE))
-                    player.look_around()
+                    executor.spin_once(min(wait, MAX_TURN))
+                    player.check_graph()
                     if end.wanted:
                         return EXIT_DONE
                     for key in keys.pressed():
@@ -325,7 +329,7 @@ def _play(player: Player, loop: bool, end: EndRequest) -> int:
                     elapsed = player.clock.time(time.monotonic()) - player.start
                     bar.n = min(bar.total, elapsed / _NANOSECONDS)
                     bar.set_description("paused" if player.clock.is_paused else "playing")
-            if not loop and player.sought is None:
+            if not loop and player.seek_target is None:
                 player.finish()
                 return EXIT_DONE
             player.begin()
@@ -369,7 +373,7 @@ def main(args: list[str] | None = None) -> int:
 def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Return (own arguments, those from `--ros-args` to `--`).
 
-    rclpy's own way takes every `A:=B` for a remapping of its own.
+    rclpy would treat the `A:=B` of `--remap` as ROS remappings.
     """
     own: list[str] = []
     ros: list[str] = []

@@ -1,4 +1,4 @@
-"""Records every topic of the graph, with what is needed to repeat the run, into one bag."""
+"""The `recorder` node: records every topic of the graph, parameters and versions into a bag."""
 
 from __future__ import annotations
 
@@ -17,11 +17,9 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
-from needle_bags.recording.allocator import keep_freed_memory
-from needle_bags.recording.not_understood import NotUnderstood
 from needle_bags.recording.provenance import commit, distribution, versions
-from needle_bags.recording.recorder_health import RecorderHealth
-from needle_bags.recording.recording import Received, open_recording
+from needle_bags.recording.recorder_health import DecodeErrors, RecorderHealth
+from needle_bags.recording.recording import Received, open_recording, reuse_freed_memory
 from needle_bags.ros.graph_topics import GraphTopics
 from needle_bags.ros.parameter_snapshots import ParameterSnapshots
 from needle_bags.ros.recorder_parameters import RecorderParameters
@@ -39,44 +37,44 @@ from needle_core.ros.whole_node import WholeNode
 HELP = """
 recorder: records every topic of the graph into a bag (a rosbag2 directory with MCAP data).
 
-Topics that appear later are recorded too, images included, but for pictures that were drawn for a
-person to look at (`exclude_regex`). The bag also carries the message definitions, all nodes'
-parameters and their changes, versions and commit. Ctrl-C ends the recording and completes the
-bag. Written out ten times a second: what a crash or kill -9 leaves is made whole by
-`ros2 run needle_bags recover BAG`.
+Topics that appear later are recorded too, images included; annotated images are left out
+(`exclude_regex`). The bag also contains the message definitions, all nodes' parameters and their
+changes, versions and commit. Ctrl-C ends the recording and completes the bag. Data are written ten
+times a second: after a crash, kill -9 or a full disk, `ros2 run needle_bags recover BAG` completes
+the bag.
 
   ros2 run needle_bags recorder --ros-args -p bag:=bags/my_run
   ros2 run needle_bags recorder --ros-args -p topics:='[/needle/tip, /joint_states]'
   ros2 run needle_bags recorder --ros-args -p snapshot_seconds:=20.0
 
-With `snapshot_seconds` the last seconds are kept in memory, and written only when somebody asks
-(service ~/snapshot, std_srvs/Trigger) or a second after a device/status says FAULT or ESTOPPED.
-Each snapshot goes into the same bag; what was written is not kept for the next.
+With `snapshot_seconds` the last seconds are kept in memory, and written only on a call of the
+service ~/snapshot (std_srvs/Trigger) or a second after a device/status reports FAULT or ESTOPPED.
+All snapshots go into the same bag; a message is written once.
 
 Subscribes to every topic of the graph; publishes /diagnostics: a warning when messages are lost,
-what came cannot be understood (it is recorded all the same) or the disk is nearly full. Down to
-`reserve` the recording ends, the bag is completed, and the node stays and reports it; the rest of
-the graph goes on.
-Exit codes: 0 the bag is whole; 1 the disk refused data or was full; 2 bad parameters, or a bag that
-cannot be begun.
+a message cannot be decoded (it is recorded anyway) or the disk is nearly full. When only `reserve`
+is free, the recording ends and the bag is completed; the node goes on reporting this, and the rest
+of the graph continues.
+Exit codes: 0 the bag is whole; 1 the disk refused data or was full; 2 bad parameters, or the bag
+cannot be created.
 """
 
 GRAPH_PERIOD = 0.1
-# What the graph still sends when all nodes end together is waited for this long.
-LAST_WORDS = 0.3
-LAST_WORDS_LIMIT = 1.0
+# After the signal, record until no message has arrived for DRAIN_QUIET, at most DRAIN_LIMIT [s].
+DRAIN_QUIET = 0.3
+DRAIN_LIMIT = 1.0
 REPORT_PERIOD = 0.5
-# What is said of a fault comes a little after it [s].
-AFTERMATH = 1.0
+# A snapshot includes this much time after the fault [s].
+FAULT_DELAY = 1.0
 PARAMETER_EVENTS = "/parameter_events"
-# The part of its diagnostics that names the nodes whose parameters are in the bag.
+# Diagnostics part that names the nodes whose parameters are in the bag.
 PARAMETERS_OF = "parameters_of"
 DEVICE_STATUS = "/device/status"
 FAULTS = ("FAULT", "ESTOPPED")
 
 
 class Recorder(WholeNode):
-    """Subscribes to whatever the graph has and hands it to a `Recording`."""
+    """Subscribes to all topics of the graph and passes their messages to a `Recording`."""
 
     def __init__(self) -> None:
         super().__init__("recorder")
@@ -85,13 +83,13 @@ class Recorder(WholeNode):
         file = self._settings.calibration_file
         calibration = read_calibration(Path(file)) if file else ""
         self._diagnostics = DiagnosticsPublisher(self)
-        self._topics = GraphTopics(self, self._settings.choice, self._take_topic, self._take)
-        self._not_understood = NotUnderstood()
+        self._topics = GraphTopics(self, self._settings.choice, self._add_topic, self._receive)
+        self._decode_errors = DecodeErrors()
         self._recent = self._settings.recent
         self._states: dict[str, str] = {}
         self._snapshot_due: tuple[float, str] | None = None
         self._nodes: list[str] = []
-        self._told: str = ""
+        self._last_warning = ""
         self.bag = Path(bag)
         self.recording = open_recording(
             self.bag,
@@ -103,7 +101,7 @@ class Recorder(WholeNode):
         self._health = RecorderHealth(self.recording, self.bag)
         try:
             self._write_provenance(calibration)
-            self._snapshots = ParameterSnapshots(self, self._take_parameters)
+            self._snapshots = ParameterSnapshots(self, self._store_parameters)
             if self._recent is not None:
                 self.create_service(Trigger, "~/snapshot", self._on_snapshot)
             self._poll_graph()
@@ -129,59 +127,59 @@ class Recorder(WholeNode):
                 "calibration.yaml", "application/yaml", calibration.encode(), time.time_ns()
             )
 
-    def _take_parameters(self, node: str, values: dict[str, Any]) -> None:
+    def _store_parameters(self, node: str, values: dict[str, Any]) -> None:
         document = {node: {"ros__parameters": values}}
         self.recording.add_record("parameters", {"node": node, "yaml": yaml.safe_dump(document)})
         self._nodes.append(node)
         self._diagnostics.set(PARAMETERS_OF, Diagnostic(Level.OK, ", ".join(self._nodes)))
 
-    def _take_parameter_event(self, message: Received) -> None:
-        changes = self._snapshots.take_event(deserialize_message(message.data, ParameterEvent))
+    def _store_parameter_event(self, message: Received) -> None:
+        changes = self._snapshots.apply_event(deserialize_message(message.data, ParameterEvent))
         for change in changes:
             record = {key: yaml.safe_dump(value).split("\n")[0] for key, value in change.items()}
             self.recording.add_record("parameter_change", record)
 
     def _poll_graph(self) -> None:
         if self.recording.error is not None:
-            self._topics.leave()
+            self._topics.unsubscribe()
         else:
             self._topics.poll()
             self._snapshots.poll()
 
-    def _take_topic(self, topic: BagTopic) -> None:
+    def _add_topic(self, topic: BagTopic) -> None:
         self.recording.add_topic(topic)
         if self._recent is not None and topic.is_latched:
             self._recent.latch(topic.name)
 
-    def _take(self, message: Received) -> None:
+    def _receive(self, message: Received) -> None:
         if self._recent is None:
             self.recording.append(message)
         else:
             self._recent.put(message)
             if message.topic.endswith(DEVICE_STATUS):
-                self._understand(message, self._take_device_status)
+                self._inspect(message, self._check_device_status)
         if message.topic == PARAMETER_EVENTS:
-            self._understand(message, self._take_parameter_event)
+            self._inspect(message, self._store_parameter_event)
 
-    def _understand(self, message: Received, take: Callable[[Received], None]) -> None:
-        """Look into a message that is recorded, whatever is in it."""
+    def _inspect(self, message: Received, inspect: Callable[[Received], None]) -> None:
+        """Decode a recorded message; a malformed one is counted."""
         try:
-            take(message)
+            inspect(message)
         except Exception as error:  # noqa: BLE001
-            self.note_not_understood(message.topic, error)
+            self.report_decode_error(message.topic, error)
 
-    def note_not_understood(self, where: str, error: Exception) -> None:
-        """Count and tell what came from outside and could not be handled."""
-        if self._not_understood.add(where, error):
-            self.get_logger().warning(f"not understood: {where}: {error}")
-        self._diagnostics.set("input", self._not_understood.diagnostic())
+    def report_decode_error(self, source: str, error: Exception) -> None:
+        """Count an input that could not be decoded; log the first of its source."""
+        if self._decode_errors.add(source, error):
+            self.get_logger().warning(f"not understood: {source}: {error}")
+        self._diagnostics.set("input", self._decode_errors.diagnostic())
 
-    def _take_device_status(self, message: Received) -> None:
+    def _check_device_status(self, message: Received) -> None:
         status = deserialize_message(message.data, DiagnosticStatus)
         state = next((pair.value for pair in status.values if pair.key == "state"), "")
         if state in FAULTS and self._states.get(message.topic) != state:
-            why = f"{message.topic} says {state}"
-            self._snapshot_due = (time.monotonic() + AFTERMATH, why)
+            reason = f"{message.topic} says {state}"
+            self._snapshot_due = (time.monotonic() + FAULT_DELAY, reason)
         self._states[message.topic] = state
 
     def _on_snapshot(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -189,22 +187,22 @@ class Recorder(WholeNode):
         response.success = self.recording.error is None
         return response
 
-    def _write_snapshot(self, why: str) -> str:
-        """Hand over what is in memory; return what is said of it."""
+    def _write_snapshot(self, reason: str) -> str:
+        """Queue the buffered messages; return a summary."""
         if self._recent is None:
             return ""
         self._snapshot_due = None
         seconds = self._recent.seconds
         messages = self._recent.take()
         self.recording.append_all(messages)
-        said = f"{len(messages)} messages of the last {seconds:.1f} s into {self.bag}: {why}"
-        record = {"why": why, "messages": str(len(messages)), "time_ns": str(time.time_ns())}
+        summary = f"{len(messages)} messages of the last {seconds:.1f} s into {self.bag}: {reason}"
+        record = {"why": reason, "messages": str(len(messages)), "time_ns": str(time.time_ns())}
         self.recording.add_record("snapshot", record)
-        self.get_logger().info(f"snapshot: {said}")
-        return said
+        self.get_logger().info(f"snapshot: {summary}")
+        return summary
 
     def report(self) -> None:
-        """Publish the recording's health; write a snapshot that is due."""
+        """Publish the health of the recording; write a snapshot if it is due."""
         if self._snapshot_due is not None and time.monotonic() >= self._snapshot_due[0]:
             self._write_snapshot(self._snapshot_due[1])
         recording = self.recording
@@ -221,27 +219,27 @@ class Recorder(WholeNode):
             values["in_memory_s"] = f"{self._recent.seconds:.1f}"
             values["in_memory_bytes"] = str(self._recent.memory)
         refused = list(self._topics.refused.values())
-        level, message = self._health.look(REPORT_PERIOD, lost, refused)
+        level, message = self._health.check(REPORT_PERIOD, lost, refused)
         self._diagnostics.set("bag", Diagnostic(level, message, values))
-        # Once for each kind of trouble: the figures at the end of a message change.
+        # Log each kind of problem once; the figures behind the colon change.
         kind = message.partition(":")[0]
-        if level is Level.OK or kind == self._told:
+        if level is Level.OK or kind == self._last_warning:
             return
-        self._told = kind
+        self._last_warning = kind
         if level is Level.ERROR:
             self.get_logger().error(message)
         else:
             self.get_logger().warning(message)
 
     def _lost(self) -> dict[str, int]:
-        """Return how many messages of which topic are not in the bag."""
+        """Return the number of messages missing from the bag, by topic."""
         lost = self._topics.lost
         for name, count in list(self.recording.dropped.items()):
             lost[name] = lost.get(name, 0) + count
         return lost
 
     def finish(self) -> int:
-        """Complete the bag; return the exit code and say one line about it."""
+        """Complete the bag and print the result; return the exit code."""
         self._topics.describe_all()
         if self._snapshot_due is not None:
             self._write_snapshot(self._snapshot_due[1])
@@ -257,11 +255,8 @@ class Recorder(WholeNode):
         count = self.recording.messages_received
         lost = self._lost()
         if self.recording.error is not None:
-            state = (
-                "the bag is whole up to there"
-                if self.recording.is_whole
-                else recover_hint(self.bag)
-            )
+            whole = self.recording.is_whole
+            state = "the bag is whole up to there" if whole else recover_hint(self.bag)
             print(f"error: recording ended: {self.recording.error}; {state}", file=sys.stderr)
         else:
             print(f"recorded {count} messages of {len(self._topics)} topics into {self.bag}")
@@ -271,16 +266,16 @@ class Recorder(WholeNode):
 
 
 def _spin_once(executor: SingleThreadedExecutor, recorder: Recorder, timeout: float) -> None:
-    """Let the executor do one thing; what others sent that it cannot do does not end the node."""
+    """Execute one callback; a malformed request of another node does not end this node."""
     try:
         executor.spin_once(timeout_sec=timeout)
     except Exception as error:  # noqa: BLE001
-        recorder.note_not_understood("a service or the graph", error)
+        recorder.report_decode_error("a service or the graph", error)
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the recorder; returns the exit code."""
-    keep_freed_memory()
+    reuse_freed_memory()
 
     def spin(node: Node, end: EndRequest) -> int:
         recorder = cast(Recorder, node)
@@ -289,13 +284,13 @@ def main(args: list[str] | None = None) -> int:
         try:
             while not end.wanted:
                 _spin_once(executor, recorder, 0.1)
-            limit = time.monotonic() + LAST_WORDS_LIMIT
-            quiet = time.monotonic() + LAST_WORDS
+            limit = time.monotonic() + DRAIN_LIMIT
+            quiet = time.monotonic() + DRAIN_QUIET
             while time.monotonic() < min(quiet, limit):
                 before = recorder.recording.messages_received
                 _spin_once(executor, recorder, 0.05)
                 if recorder.recording.messages_received > before:
-                    quiet = time.monotonic() + LAST_WORDS
+                    quiet = time.monotonic() + DRAIN_QUIET
             return recorder.finish()
         finally:
             recorder.recording.close()

@@ -20,28 +20,30 @@ class RecorderParameters:
     topics: tuple[str, ...] = fixed_parameter(
         (), "-", "Names of topics to record; with neither these nor a regex: all.", texts=True
     )
-    regex: str = fixed_parameter("", "-", "Topics in whose name this is found are recorded, too.")
+    regex: str = fixed_parameter("", "-", "Also record topics whose name this expression matches.")
     exclude_regex: str = fixed_parameter(
         "/annotated_image$|/live_view/",
         "-",
-        "Topics in whose name this is found are not recorded, unless `topics` names them.",
+        "Do not record topics whose name this expression matches, unless `topics` names them.",
     )
     snapshot_seconds: float = fixed_parameter(
         0.0,
         "s",
-        "Keep so much in memory and write it only when asked or on a fault; 0: write all.",
+        "Keep this time in memory and write it only on request or on a fault; 0: write all.",
         0.0,
         3600.0,
     )
     snapshot_size: int = fixed_parameter(
         500_000_000,
         "B",
-        "Memory for it: images may fill it before the seconds are over.",
+        "Memory for it; images may fill it earlier.",
         1_000_000,
         2**40,
     )
     calibration_file: str = fixed_parameter(
-        "", "-", "A file to keep in the bag as calibration.yaml; a tracker that runs says its own."
+        "",
+        "-",
+        "File to store in the bag as calibration.yaml; a tracker publishes its own.",
     )
     run_info: str = fixed_parameter(
         "", "-", "Text about the run to keep in the bag: YAML `key: value` lines or JSON."
@@ -49,13 +51,13 @@ class RecorderParameters:
     max_file_size: int = fixed_parameter(
         4_000_000_000,
         "B",
-        "Messages in one data file, after which another is begun; 0: no bound.",
+        "Bytes of messages in one data file; 0: no limit.",
         lower=0,
     )
     compression: str = fixed_parameter(
         "none",
         "-",
-        "Of the data: zstd takes a third of a core for noisy images.",
+        "Compression of the data; zstd takes a third of a core for noisy images.",
         choices=COMPRESSIONS,
     )
     reserve: int = fixed_parameter(
@@ -80,7 +82,7 @@ class RecorderParameters:
 
     @property
     def recent(self) -> RecentMessages | None:
-        """Empty store of the last seconds; None where everything is written."""
+        """Empty snapshot buffer; None if everything is written."""
         if not self.snapshot_seconds:
             return None
         return RecentMessages(self.snapshot_seconds, self.snapshot_size)

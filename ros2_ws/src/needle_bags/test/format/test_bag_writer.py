@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import errno
 import io
-import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,21 +12,19 @@ from typing import Any
 import pytest
 import yaml
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from rosbags.interfaces import QosDurability, QosReliability, QosTime
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from needle_bags.format.bag_copy import standard_text, standard_topic
 from needle_bags.format.bag_metadata import USUAL_QOS
-from needle_bags.format.bag_writer import BagWriter
+from needle_bags.format.bag_writer import BagWriter, standard_text, standard_topic
 from needle_bags.format.message_definitions import full_definition
-from needle_bags.reading.bag_files import read_contents
+from needle_bags.reading.bag_messages import read_contents
 from needle_bags.recording import recording as recording_module
-from needle_bags.recording.free_space import FreeSpace
 from needle_bags.recording.recorder_health import WARN_WAITING, RecorderHealth
-from needle_bags.recording.recording import Received, Recording, open_recording
-from needle_bags.recording.worker import Do, Job
+from needle_bags.recording.recording import FreeSpace, Received, Recording, open_recording
+from needle_bags.recording.worker import Job, RunJob
+from needle_bags.recovery.bag_recovery import recover_bag
 from needle_core.diagnostics import Level
 from needle_core.errors import UserError
 
@@ -75,7 +72,7 @@ def test_definitions_hash_as_rosbags_computes() -> None:
         full_definition("no_such_msgs/msg/Thing")
 
 
-def test_rosbags_reads_the_messages_and_what_is_said_of_their_topic(texts: Path) -> None:
+def test_rosbags_reads_messages_and_qos(texts: Path) -> None:
     with Reader(texts) as reader:
         messages = list(reader.messages())
         (connection,) = reader.connections
@@ -110,7 +107,7 @@ def test_mcap_reads_the_file_alone(texts: Path) -> None:
     assert attachment.data == b"left: {}\n"
 
 
-def test_a_bag_is_begun_where_none_is_and_replaces_none(texts: Path, tmp_path: Path) -> None:
+def test_an_existing_bag_is_not_replaced(texts: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds a bag already"):
         BagWriter(texts)
     (tmp_path / "parameters.yaml").write_text("{}")
@@ -126,7 +123,17 @@ class _BrokenFile(io.FileIO):
         raise OSError(errno.EIO, "Input/output error")
 
 
-def test_a_disk_that_takes_nothing_is_said_at_the_start(
+class _FullFile(io.FileIO):
+    """A file on a disk with 8 MB of room; the last write is cut short."""
+
+    def write(self, data: Any) -> int:
+        room = 8_000_000 - self.tell()
+        if room <= 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return super().write(data[:room])
+
+
+def test_a_disk_that_refuses_data_is_an_error_at_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not after a run of which nothing was kept; and nothing stands in the way of the next try."""
@@ -141,29 +148,23 @@ def test_a_disk_that_takes_nothing_is_said_at_the_start(
     open_recording(tmp_path / "bag").close()
 
 
-def test_what_a_disk_that_fills_at_the_very_end_drops_is_named_in_the_bag(
+def test_recover_completes_the_bag_of_a_disk_that_refused_data(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    finish = Writer.finish
-
-    def full_once(writer: Writer) -> None:
-        monkeypatch.setattr(Writer, "finish", finish)
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(BagWriter, "flush", lambda _: None)
-    monkeypatch.setattr(Writer, "finish", full_once)
+    monkeypatch.setattr(BagWriter, "open_file", lambda _, path: _FullFile(path, "xb"))
     recording = open_recording(tmp_path / "bag")
     recording.add_topic(TOPIC)
-    for number in range(10):
-        recording.append(received(number))
-    recording.close({"/t": 2, "/other": 1})
-    assert recording.is_whole
+    for number in range(2000):
+        recording.append(Received("/t", standard_text(f"{number:010000}"), TIME, TIME))
+    recording.close()
+    assert not recording.is_whole
     assert str(recording.error).endswith("bag_0.mcap: No space left on device")
-    lost = read_contents(tmp_path / "bag").custom_data["messages_lost"]
-    assert json.loads(lost) == {"/t": 12, "/other": 1}
+    recovery = recover_bag(tmp_path / "bag")
+    kept = read_contents(tmp_path / "bag").counts["/t"]
+    assert 0 < kept == recovery.messages < 2000
 
 
-def test_a_recording_ends_in_order_before_its_disk_is_full_or_at_what_it_cannot_write(
+def test_a_recording_ends_in_order_before_its_disk_is_full_or_at_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The thread that writes may not end in silence: all that comes after would wait for ever."""
@@ -176,7 +177,7 @@ def test_a_recording_ends_in_order_before_its_disk_is_full_or_at_what_it_cannot_
     full = open_recording(tmp_path / "full")
     full.add_topic(TOPIC)
     monkeypatch.setattr(FreeSpace, "usable", lambda _: -1)
-    monkeypatch.setattr(recording_module, "_LOOK_EVERY", 1)
+    monkeypatch.setattr(recording_module, "_CHECK_EVERY", 1)
     full.append(received())
     full.close()
     assert str(full.error).startswith(f"the disk of {tmp_path / 'full'} has only")
@@ -188,7 +189,7 @@ def test_a_recording_ends_in_order_before_its_disk_is_full_or_at_what_it_cannot_
 class HeldWorker(list[Job]):
     """A worker that does nothing before the end: its disk stands still."""
 
-    def __init__(self, do: Do, end: Job) -> None:
+    def __init__(self, do: RunJob, end: Job) -> None:
         self._do, self._end = do, end
         self.put = self.append
 
@@ -202,7 +203,7 @@ class HeldWorker(list[Job]):
         self._end()
 
 
-def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(tmp_path: Path) -> None:
+def test_a_recording_keeps_room_for_small_messages_and_counts_dropped_ones(tmp_path: Path) -> None:
     """Images fill the memory that there is, commands still get in."""
     limit = 1_000_000
     bag, space = BagWriter(tmp_path / "bag"), FreeSpace(tmp_path, 0)
@@ -227,20 +228,20 @@ def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(tmp_p
     assert counts == {"/image": 12 - dropped["/image"], "/command": 1050 - dropped["/command"]}
 
 
-def test_health_tells_the_worst_first() -> None:
+def test_health_reports_the_worst_problem() -> None:
     space = SimpleNamespace(reserve=1_000_000, usable=lambda: 10**9)
     told: Any = SimpleNamespace(error=None, bytes_received=0, bytes_waiting=0, space=space)
     health = RecorderHealth(told, Path("bag"))
-    assert health.look(0.5, {}, []) == (Level.OK, "recording")
-    assert health.look(0.5, {}, ["/odd is not recorded"]) == (Level.WARN, "/odd is not recorded")
+    assert health.check(0.5, {}, []) == (Level.OK, "recording")
+    assert health.check(0.5, {}, ["/odd is not recorded"]) == (Level.WARN, "/odd is not recorded")
     # 10 MB/s: 120 s of it do not fit.
     for _ in range(4):
         told.bytes_received += 5_000_000
-        level, text = health.look(0.5, {}, [])
+        level, text = health.check(0.5, {}, [])
     assert level is Level.WARN
     assert text == "the disk of bag is nearly full: recording ends at 1 MB free"
     told.bytes_waiting = WARN_WAITING + 1
-    assert "slower than the graph: 50 MB wait" in health.look(0.5, {}, [])[1]
-    assert health.look(0.5, {"/t": 3}, []) == (Level.WARN, "messages lost on /t")
+    assert "slower than the graph: 50 MB wait" in health.check(0.5, {}, [])[1]
+    assert health.check(0.5, {"/t": 3}, []) == (Level.WARN, "messages lost on /t")
     told.error = "broken"
-    assert health.look(0.5, {"/t": 3}, []) == (Level.ERROR, "recording ended: broken")
+    assert health.check(0.5, {"/t": 3}, []) == (Level.ERROR, "recording ended: broken")

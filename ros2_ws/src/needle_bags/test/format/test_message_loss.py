@@ -19,22 +19,22 @@ from needle_bags.format.message_loss import CERTAIN_AFTER, SequenceGaps
 def test_gaps(numbers: tuple[int, ...], missing: int) -> None:
     gaps = SequenceGaps()
     for number in numbers:
-        gaps.take(number)
+        gaps.add(number)
     assert gaps.missing == missing
 
 
-def test_a_jump_just_before_another_publisher_is_known_is_no_gap() -> None:
+def test_a_jump_before_the_discovery_of_a_publisher_is_no_gap() -> None:
     gaps = SequenceGaps()
     for number in (1, 2, 3, 50):
-        gaps.take(number)
-    gaps.forget()
-    gaps.take(51)
+        gaps.add(number)
+    gaps.reset()
+    gaps.add(51)
     assert gaps.missing == 0
 
 
-def test_a_gap_stays_when_publishers_change_later() -> None:
+def test_a_gap_remains_after_a_change_of_publishers() -> None:
     gaps = SequenceGaps()
     for number in (1, *range(4, 5 + CERTAIN_AFTER)):
-        gaps.take(number)
-    gaps.forget()
+        gaps.add(number)
+    gaps.reset()
     assert gaps.missing == 2

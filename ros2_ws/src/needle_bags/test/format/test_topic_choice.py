@@ -8,7 +8,7 @@ from needle_core.errors import UserError
 TOPICS = ("/needle/tip", "/needle/tip_pose", "/stereo/left/image_raw", "/joint_states")
 
 
-def test_topics_are_chosen_by_name_and_expression() -> None:
+def test_topics_are_selected_by_name_and_expression() -> None:
     for choice, chosen in (
         (TopicChoice(), TOPICS),
         (TopicChoice(("/needle/tip",)), TOPICS[:1]),

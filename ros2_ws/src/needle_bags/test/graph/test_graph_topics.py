@@ -60,7 +60,7 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Graph:
     return Graph(monkeypatch)
 
 
-def test_what_waits_for_the_one_before_comes_first_and_once(graph: Graph) -> None:
+def test_queued_messages_of_the_previous_subscription_come_first_and_once(graph: Graph) -> None:
     before, following = graph.replace()
     graph.hear(before, 1)
     before.waiting.extend(map(sent, (2, 3, 4)))
@@ -69,7 +69,7 @@ def test_what_waits_for_the_one_before_comes_first_and_once(graph: Graph) -> Non
     assert graph.numbers == [1, 2, 3, 4, 5]
 
 
-def test_what_both_get_or_is_sent_again_is_given_once_whoever_is_first(graph: Graph) -> None:
+def test_duplicates_of_two_subscriptions_are_dropped(graph: Graph) -> None:
     before, following = graph.replace(1, 2)
     graph.hear(following, 1, 2, 3)
     for number in range(4, 8):
@@ -78,7 +78,7 @@ def test_what_both_get_or_is_sent_again_is_given_once_whoever_is_first(graph: Gr
         assert graph.numbers == list(range(1, number + 1))
 
 
-def test_the_one_before_gives_what_waits_at_its_end(graph: Graph) -> None:
+def test_a_replaced_subscription_delivers_its_queue_before_its_end(graph: Graph) -> None:
     before, following = graph.replace()
     graph.now += OVERLAP
     graph.topics.poll()
@@ -92,7 +92,7 @@ def test_the_one_before_gives_what_waits_at_its_end(graph: Graph) -> None:
     assert graph.numbers == [1, 2, 3]
 
 
-def test_a_third_subscription_gives_what_the_first_two_got_first(graph: Graph) -> None:
+def test_a_third_subscription_keeps_the_messages_of_the_first_two(graph: Graph) -> None:
     before, following = graph.replace()
     graph.hear(before, 1)
     graph.hear(following, 2)
@@ -107,7 +107,7 @@ def test_a_third_subscription_gives_what_the_first_two_got_first(graph: Graph) -
     assert (graph.numbers, graph.subscriptions) == ([1, 2, 3, 4], [third])
 
 
-def test_the_strictest_that_all_can_serve_is_asked_for_also_before_anybody_serves(
+def test_the_strictest_qos_of_all_publishers_is_requested(
     graph: Graph,
 ) -> None:
     graph.offer("/latched", Int32, LATCHED)
@@ -129,7 +129,7 @@ def test_the_strictest_that_all_can_serve_is_asked_for_also_before_anybody_serve
     assert graph.asked()[1] is KEPT
 
 
-def test_losses_and_topics_that_cannot_be_recorded_are_told(graph: Graph) -> None:
+def test_losses_and_unrecordable_topics_are_reported(graph: Graph) -> None:
     graph.types["/odd"] = "no_msgs/msg/Such"
     graph.offer(JOINTS, Int32)
     for _ in range(2):
@@ -145,5 +145,5 @@ def test_losses_and_topics_that_cannot_be_recorded_are_told(graph: Graph) -> Non
     assert graph.topics.lost == {JOINTS: 2}
     subscription.lost(SimpleNamespace(total_count=7))
     assert graph.topics.lost == {JOINTS: 7}
-    graph.topics.leave()
+    graph.topics.unsubscribe()
     assert graph.subscriptions == []

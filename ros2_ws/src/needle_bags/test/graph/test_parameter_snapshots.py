@@ -9,7 +9,7 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from needle_bags.ros import question
+from needle_bags.ros import repeated_request
 from needle_bags.ros.parameter_snapshots import ParameterSnapshots
 
 from .played_graph import PlayedGraph
@@ -21,7 +21,7 @@ class Bench(PlayedGraph):
     """A recorder, and another node that answers when the test wants."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        super().__init__(monkeypatch, question)
+        super().__init__(monkeypatch, repeated_request)
         self.parameters[OTHER] = VALUES
         self.taken: dict[str, dict[str, Any]] = {}
         self.snapshots = ParameterSnapshots(
@@ -31,7 +31,7 @@ class Bench(PlayedGraph):
 
     def waits(self) -> None:
         """Let the time pass after which it is asked again."""
-        self.now += question.ASK_AGAIN
+        self.now += repeated_request.RETRY_PERIOD
         self.snapshots.poll()
 
 
@@ -40,7 +40,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     return Bench(monkeypatch)
 
 
-def test_a_request_that_is_lost_is_sent_again_and_a_late_answer_counts(bench: Bench) -> None:
+def test_a_lost_request_is_repeated_and_a_late_answer_accepted(bench: Bench) -> None:
     assert bench.taken == {"/recorder": {"own": 1}}
     names, values = bench.clients
     bench.waits()
@@ -55,11 +55,11 @@ def test_a_request_that_is_lost_is_sent_again_and_a_late_answer_counts(bench: Be
     assert bench.snapshots.document()[OTHER] == {"ros__parameters": VALUES}
 
 
-def test_a_node_that_is_long_in_answering_is_given_up_only_when_it_has_gone(bench: Bench) -> None:
-    for _ in range(3 * question.MOST_PENDING):
+def test_a_slow_node_is_asked_until_it_disappears(bench: Bench) -> None:
+    for _ in range(3 * repeated_request.MAX_PENDING):
         bench.waits()
     # What the last minutes asked is not all kept.
-    assert len(bench.clients[0].pending) == question.MOST_PENDING
+    assert len(bench.clients[0].pending) == repeated_request.MAX_PENDING
     del bench.parameters[OTHER]
     bench.snapshots.poll()
     assert bench.clients == []
@@ -73,13 +73,13 @@ def test_changes_are_those_after_the_snapshot(bench: Bench) -> None:
         told.changed_parameters = [change.to_parameter_msg() for change in changes]
         return told
 
-    assert bench.snapshots.take_event(event(gain=1.0)) == []
+    assert bench.snapshots.apply_event(event(gain=1.0)) == []
     bench.answer_all()
     gone = event(gain=3.5, names=["a", "b"])
     gone.deleted_parameters = [Parameter("names", value="").to_parameter_msg()]
     change = {"stamp_ns": 2_000_000_000, "node": OTHER}
-    assert bench.snapshots.take_event(gone) == [
+    assert bench.snapshots.apply_event(gone) == [
         {**change, "name": "gain", "value": 3.5},
         {**change, "name": "names", "value": None},
     ]
-    assert bench.snapshots.take_event(event(gain=3.5)) == []
+    assert bench.snapshots.apply_event(event(gain=3.5)) == []

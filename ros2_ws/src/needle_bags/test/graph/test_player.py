@@ -23,7 +23,7 @@ from trajectory_msgs.msg import JointTrajectory
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition
-from needle_bags.player.terminal_keys import FASTER, ON, PAUSE, Keys
+from needle_bags.player.terminal_keys import FASTER, FORWARD, PAUSE, Keys
 from needle_bags.ros import player as node
 from needle_core.files.bag_topic import BagTopic
 
@@ -139,7 +139,7 @@ def scene(monkeypatch: pytest.MonkeyPatch, bag: Path) -> Scene:
     return Scene(monkeypatch, bag)
 
 
-def test_all_is_played_but_nothing_that_a_rig_obeys(
+def test_topics_that_control_a_rig_are_not_played(
     scene: Scene, capsys: pytest.CaptureFixture[str]
 ) -> None:
     begin = scene.now
@@ -172,7 +172,7 @@ def test_part_of_a_bag_under_another_name_at_another_rate(scene: Scene) -> None:
     assert stamps[-1] - START // 10**9 == pytest.approx(7, abs=1)
 
 
-def test_paused_a_latched_message_is_there_and_loops_go_on_until_the_end(scene: Scene) -> None:
+def test_latched_messages_are_available_while_paused_and_loops_repeat(scene: Scene) -> None:
     def begin() -> None:
         # The latched message lies before --start: who joins late gets it all the same.
         assert len(scene.heard["/plane"]) == 1
@@ -195,7 +195,7 @@ def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
     scene.when(15, lambda: scene.change(seek=4.0))
     scene.when(4, lambda: scene.change(seek=4.0))
     # From 4 five seconds on; then a pause that takes no time of the bag's.
-    scene.when(5, lambda: scene.pressed.append(ON))
+    scene.when(5, lambda: scene.pressed.append(FORWARD))
     scene.when(11, lambda: scene.pressed.append(PAUSE))
     scene.when(11, lambda: scene.at(10.0, lambda: scene.pressed.extend([PAUSE, FASTER])))
     assert scene.play("--regex ^/n|plane --exclude-regex noisy") == 0
@@ -205,7 +205,7 @@ def test_seeking_pausing_and_another_rate_while_it_plays(scene: Scene) -> None:
     assert len(scene.heard["/plane"]) == 1 + 4
 
 
-def test_beside_a_rig_all_is_under_replay(scene: Scene) -> None:
+def test_beside_a_rig_everything_is_played_under_replay(scene: Scene) -> None:
     scene.at(1.5, lambda: scene.offer("/device/status", DiagnosticStatus, node="device_driver"))
     assert scene.play("--clock") == 0
     assert any("all is played under /replay" in line for line in scene.logged)
@@ -214,7 +214,7 @@ def test_beside_a_rig_all_is_under_replay(scene: Scene) -> None:
     assert not scene.heard.keys() - {"/diagnostics"} - scene.offered()
 
 
-def test_a_rig_that_comes_up_ends_the_playing(
+def test_a_rig_that_appears_ends_the_playback(
     scene: Scene, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # One of its own, replayed, is none.
@@ -226,7 +226,7 @@ def test_a_rig_that_comes_up_ends_the_playing(
     assert scene.numbers("/numbered") == [0, 1, 2, 3]
 
 
-def test_a_ros_remapping_does_not_reach_a_rig_either(
+def test_a_ros_remapping_cannot_reach_a_rig(
     scene: Scene, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for played, remapped in (
@@ -240,7 +240,7 @@ def test_a_ros_remapping_does_not_reach_a_rig_either(
         assert scene.heard.keys() <= {"/diagnostics"}
 
 
-def test_who_listens_already_is_waited_for(scene: Scene) -> None:
+def test_the_player_waits_for_existing_subscribers(scene: Scene) -> None:
     begun: list[float] = []
     scene.request("/numbered", Int32)
     scene.unmatched.add("/numbered")
@@ -251,7 +251,7 @@ def test_who_listens_already_is_waited_for(scene: Scene) -> None:
     assert begun == [pytest.approx(end, abs=0.2)]
 
 
-def test_what_cannot_be_played_is_one_line(
+def test_unplayable_bags_give_a_one_line_error(
     scene: Scene, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for options, words in {

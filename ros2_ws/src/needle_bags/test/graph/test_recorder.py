@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -21,11 +20,11 @@ from std_msgs.msg import Int32, String
 from std_srvs.srv import Trigger
 
 from needle_bags.format.bag_writer import BagWriter
-from needle_bags.reading.bag_files import read_contents, read_messages
-from needle_bags.recording.free_space import FreeSpace
-from needle_bags.recording.recording import Recording
-from needle_bags.recording.worker import Do, Job
-from needle_bags.ros import graph_topics, question
+from needle_bags.reading.bag_messages import read_contents, read_messages
+from needle_bags.recording.recording import FreeSpace, Recording
+from needle_bags.recording.worker import Job, RunJob
+from needle_bags.recovery.bag_recovery import recover_bag
+from needle_bags.ros import graph_topics, repeated_request
 from needle_bags.ros import recorder as node
 from needle_bags.ros.recorder_parameters import RecorderParameters
 from needle_core.errors import UserError
@@ -40,7 +39,7 @@ class AtOnce:
 
     waiting = 0
 
-    def __init__(self, do: Do, end: Job) -> None:
+    def __init__(self, do: RunJob, end: Job) -> None:
         self._do, self._ends = do, [end]
 
     def put(self, job: Job) -> None:
@@ -55,7 +54,7 @@ class Scene(PlayedGraph):
     """A recorder that begins and ends when the test says so."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-        super().__init__(monkeypatch, node, graph_topics, question)
+        super().__init__(monkeypatch, node, graph_topics, repeated_request)
         self.bag = folder / "bag"
 
         def begin(bag: Path, *, reserve: int, **how: Any) -> Recording:
@@ -99,7 +98,7 @@ def scene(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Scene:
     return Scene(monkeypatch, tmp_path)
 
 
-def test_all_that_is_sent_is_in_the_bag_with_what_repeats_the_run(
+def test_the_bag_has_all_messages_and_what_a_rerun_needs(
     scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration = tmp_path / "calibration.yaml"
@@ -142,7 +141,7 @@ def test_all_that_is_sent_is_in_the_bag_with_what_repeats_the_run(
     assert scene.health("parameters_of").message == "/recorder, /source"
 
 
-def test_what_cannot_be_understood_is_told_recorded_and_ends_nothing(scene: Scene) -> None:
+def test_malformed_messages_are_reported_and_recorded(scene: Scene) -> None:
     scene.offer(EVENTS, ParameterEvent)
     malformed = (b"\0\1\0\0" + bytes(8) + b"\xff\xff\xff\x7fmore", b"\xff" * 8)
 
@@ -167,7 +166,7 @@ def test_what_cannot_be_understood_is_told_recorded_and_ends_nothing(scene: Scen
     assert len(scene.logged) == 3
 
 
-def test_a_disk_that_fills_ends_the_recording_and_nothing_else(
+def test_a_full_disk_ends_the_recording_and_not_the_node(
     scene: Scene, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene.offer("/numbered", Int32)
@@ -196,15 +195,14 @@ def test_a_disk_that_fills_ends_the_recording_and_nothing_else(
     assert f"cannot write {scene.bag}/bag_0.mcap: No space left on device" in said.message
     assert sum("recording ended" in line for line in scene.logged) == 1
     errors = capsys.readouterr().err
-    assert "the bag is whole up to there" in errors
+    assert f"`ros2 run needle_bags recover {scene.bag}`" in errors
     assert 'messages lost: {"/numbered": 3}' in errors
+    monkeypatch.undo()
+    recover_bag(scene.bag)
     assert scene.numbers("/numbered") == [0, 1, 2, 3, 4, 5]
-    custom = read_contents(scene.bag).custom_data
-    assert "No space left" in custom["recording_ended"]
-    assert json.loads(custom["messages_lost"]) == {"/numbered": 3}
 
 
-def test_snapshots_when_asked_and_a_second_after_a_fault(scene: Scene) -> None:
+def test_snapshots_on_request_and_a_second_after_a_fault(scene: Scene) -> None:
     scene.offer("/plane", Int32, LATCHED)
     scene.offer("/numbered", Int32)
     scene.offer(STATUS, DiagnosticStatus, LATCHED)
@@ -243,7 +241,7 @@ def test_snapshots_when_asked_and_a_second_after_a_fault(scene: Scene) -> None:
     assert read_contents(scene.bag).counts[STATUS] == 3
 
 
-def test_which_topics_are_recorded_or_why_the_parameters_are_refused() -> None:
+def test_topic_selection_and_invalid_parameters() -> None:
     topics = ("/a/annotated_image", "/rig/live_view/path", "/rig/one", "/rig/two", "/other")
     named: Any = {"topics": ("a/annotated_image",), "regex": "^/rig/", "exclude_regex": "two|view"}
     for settings, chosen in (({}, topics[2:]), (named, (topics[0], topics[2]))):

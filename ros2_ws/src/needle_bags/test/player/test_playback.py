@@ -11,7 +11,7 @@ import pytest
 from needle_bags.player.playback import READ_AHEAD, PlaybackClock, ReadAhead
 from needle_bags.player.player_options import parse_options
 from needle_bags.player.replay_names import is_guarded, marks_a_rig, played_name
-from needle_bags.player.terminal_keys import BACK, FASTER, ON, PAUSE, SLOWER, keys_in
+from needle_bags.player.terminal_keys import BACK, FASTER, FORWARD, PAUSE, SLOWER, keys_in
 from needle_core.errors import UserError
 
 SECOND = 1_000_000_000
@@ -19,7 +19,7 @@ TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 JOY, POSE, POINT = "sensor_msgs/msg/Joy", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/Point"
 
 
-def test_the_clock_runs_at_its_rate_and_counts_another_from_then_on() -> None:
+def test_the_clock_runs_at_its_rate_also_after_a_change() -> None:
     clock = PlaybackClock(2.0, 10 * SECOND, now=100.0)
     assert clock.time(101.5) == 13 * SECOND
     assert clock.wait(14 * SECOND, 101.5) == pytest.approx(0.5)
@@ -41,11 +41,11 @@ def test_a_pause_takes_no_time() -> None:
     assert clock.wait(7 * SECOND, 70.0) == pytest.approx(1.0)
 
 
-def test_arrows_are_keys_of_their_own() -> None:
-    assert keys_in(" \x1b[A\x1bOBx\x1b[C\x1b[D") == [PAUSE, FASTER, SLOWER, "x", ON, BACK]
+def test_arrow_keys_are_decoded() -> None:
+    assert keys_in(" \x1b[A\x1bOBx\x1b[C\x1b[D") == [PAUSE, FASTER, SLOWER, "x", FORWARD, BACK]
 
 
-def test_reading_ahead_keeps_order_and_bounds_and_hands_on_errors() -> None:
+def test_reading_ahead_keeps_order_and_limit_and_passes_on_errors() -> None:
     read: list[int] = []
     full = threading.Event()
 
@@ -78,14 +78,14 @@ def test_reading_ahead_keeps_order_and_bounds_and_hands_on_errors() -> None:
         *(("/keys", f"geometry_msgs/msg/{kind}") for kind in ("Twist", "TwistStamped")),
     ],
 )
-def test_what_a_rig_obeys_is_played_under_replay(name: str, type_name: str) -> None:
+def test_topics_that_control_a_rig_are_played_under_replay(name: str, type_name: str) -> None:
     assert is_guarded(name, type_name)
     assert played_name(name, type_name, {}) == f"/replay{name}"
     assert played_name(name, type_name, {name: "/mine"}) == "/replay/mine"
     assert played_name(f"/replay{name}", type_name, {}) == f"/replay{name}"
 
 
-def test_other_topics_keep_their_names_unless_a_rig_is_there_or_would_obey_the_new_one() -> None:
+def test_other_topics_keep_their_names_unless_the_new_one_controls_a_rig() -> None:
     for name in ("/needle/tip", "/joint_states", "/clock", "/my_target_plane"):
         assert played_name(name, POINT, {}) == name
         assert played_name(name, POINT, {}, beside_rig=True) == f"/replay{name}"

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_bags.format.bag_copy import BagCopy, standard_topic
-from needle_bags.format.bag_writer import BagWriter
-from needle_bags.reading.bag_files import read_contents
-from needle_bags.reading.bag_order import raw_as_sent
+from needle_bags.format.bag_writer import BagCopy, BagWriter, standard_topic
+from needle_bags.reading.bag_messages import raw_as_sent, read_contents
 from needle_bags.reading.bag_reader import _Collector, read_run
 from needle_core.errors import UserError
 from needle_core.files.bag_topic import BagTopic
@@ -38,7 +36,7 @@ def two_rigs(make_run: MakeRun, tmp_path: Path) -> Path:
     return tmp_path / "two"
 
 
-def test_of_two_rigs_one_has_to_be_chosen(two_rigs: Path) -> None:
+def test_two_rigs_require_a_namespace(two_rigs: Path) -> None:
     with pytest.raises(UserError, match=r"two holds 2 rigs, in /, /bench: choose one with --names"):
         read_run(two_rigs)
     with pytest.raises(UserError, match=r"two has no rig in /desk; it has those in /, /bench"):
@@ -49,7 +47,7 @@ def test_of_two_rigs_one_has_to_be_chosen(two_rigs: Path) -> None:
     assert len(read_run(two_rigs, "/").tips) == 31
 
 
-def test_a_rigs_parameters_are_its_own_nodes(make_run: MakeRun) -> None:
+def test_parameters_are_those_of_the_nodes_of_the_rig(make_run: MakeRun) -> None:
     run = read_run(make_run(namespace="/bench/", steps=2))
     nodes = {"/sim_rig": {"seed": 1}, "/bench/sim_rig": {"seed": 2}, "/desk/tracker": {"a": 3}}
     run = dataclasses.replace(run, parameters=nodes)
@@ -59,7 +57,7 @@ def test_a_rigs_parameters_are_its_own_nodes(make_run: MakeRun) -> None:
     assert run.parameter("sim_rig", "seed") is None
 
 
-def test_health_is_the_chosen_rigs() -> None:
+def test_health_is_that_of_the_selected_rig() -> None:
     def status(name: str) -> Any:
         return SimpleNamespace(name=name, level=1, message="not well")
 
@@ -69,17 +67,17 @@ def test_health_is_the_chosen_rigs() -> None:
         ("/bench/", ["sim_rig: a", "sim_rig: b", "camera/left: c"]),
     ):
         collected = _Collector(namespace, ["/", "/bench/"])
-        collected.take_diagnostics(0, SimpleNamespace(status=[status(name) for name in names]))
+        collected.add_diagnostics(0, SimpleNamespace(status=[status(name) for name in names]))
         assert [event.part for event in collected.health] == kept
 
 
-def test_holds_of_two_sessions_are_both_kept_at_the_times_of_their_arrival() -> None:
+def test_holds_of_two_sessions_are_stamped_by_arrival() -> None:
     collected = _Collector("/", ["/"])
     for time, session in ((10, "a"), (20, "b")):
         # The first message of each.
         header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=1), frame_id=f"me/{session}")
         joy = SimpleNamespace(header=header, axes=[0.5], buttons=[1])
-        collected.takers()["device/hold"](time, joy)
+        collected.handlers()["device/hold"](time, joy)
     holds = collected.series("holds", 2)
     assert holds.stamps.tolist() == holds.received.tolist() == [10, 20]
 

@@ -31,7 +31,7 @@ def rows() -> dict[str, list[dict[str, Any]]]:
         return read_frames(BAG)
 
 
-def test_rows_have_what_the_typed_reader_has(rows: dict[str, list[dict[str, Any]]]) -> None:
+def test_rows_agree_with_the_typed_reader(rows: dict[str, list[dict[str, Any]]]) -> None:
     run = read_run(BAG)
     joints = [f"position.{joint}_joint" for joint in ("insertion", "rotation")]
     commands = [f"points.0.positions.{joint}_joint" for joint in ("insertion", "rotation")]
@@ -69,9 +69,9 @@ def test_rows_have_what_the_typed_reader_has(rows: dict[str, list[dict[str, Any]
     assert "OK" not in status
 
 
-def test_what_frames_need_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_dependencies_and_topics_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(UserError, match=r"pandas is not installed; docs/notebooks\.md"):
+    with pytest.raises(UserError, match=r"pandas is not installed; docs/viewers\.md"):
         read_frames(BAG)
     monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace())
     with pytest.raises(UserError, match=r"no topic /needle/top \(it has /device/hold, "):

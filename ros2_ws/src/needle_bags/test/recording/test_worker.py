@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import queue
 
-from needle_bags.recording.worker import Job, WorkerThread, nothing
+from needle_bags.recording.worker import Job, WorkerThread, no_op
 
 
-def test_jobs_are_done_in_order_with_looks_between_and_the_end_after_all() -> None:
+def test_jobs_run_in_order_with_periodic_wake_ups() -> None:
     done: list[str] = []
     looked: queue.SimpleQueue[Job] = queue.SimpleQueue()
 
     def do(job: Job) -> float:
         job()
-        if job is nothing:
+        if job is no_op:
             looked.put(job)
         return 0.0  # it wants to be called at once
 
     worker = WorkerThread(do, lambda: done.append("end"))
     for _ in range(3):
-        assert looked.get(timeout=20.0) is nothing
+        assert looked.get(timeout=20.0) is no_op
     names = [f"job {number}" for number in range(5)]
     for name in names:
         worker.put(lambda name=name: done.append(name))  # type: ignore[misc]
@@ -31,14 +31,14 @@ def test_jobs_are_done_in_order_with_looks_between_and_the_end_after_all() -> No
     assert done[-2:] == [names[-1], "end"]
 
 
-def test_a_job_ends_the_wait_for_what_is_due_much_later() -> None:
+def test_a_job_ends_the_wait_for_the_next_wake_up() -> None:
     done: queue.SimpleQueue[int] = queue.SimpleQueue()
 
     def do(job: Job) -> float:
         job()
         return float("1e9")
 
-    worker = WorkerThread(do, nothing)
+    worker = WorkerThread(do, no_op)
     worker.put(lambda: done.put(1))
     assert done.get(timeout=20.0) == 1
     worker.finish()

@@ -14,11 +14,10 @@ from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_copy import standard_topic
 from needle_bags.format.bag_metadata import (
     USUAL_QOS,
 )
-from needle_bags.format.bag_writer import BagWriter
+from needle_bags.format.bag_writer import BagWriter, standard_topic
 from needle_core.files.bag_topic import BagTopic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

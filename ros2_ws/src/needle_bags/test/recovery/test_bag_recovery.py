@@ -17,9 +17,8 @@ from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as OtherWriter
 
-from needle_bags.format.bag_copy import standard_text, standard_topic
-from needle_bags.format.bag_writer import BagWriter
-from needle_bags.reading.bag_files import read_contents, read_messages
+from needle_bags.format.bag_writer import BagWriter, standard_text, standard_topic
+from needle_bags.reading.bag_messages import read_contents, read_messages
 from needle_bags.reading.bag_reader import read_run
 from needle_bags.recovery import bag_recovery, recover
 from needle_bags.recovery.bag_recovery import recover_bag
@@ -31,7 +30,7 @@ from .numbered_bag import START, STEP, TOPICS, chunks, contents, damage, kill, n
 STRING = standard_topic("/a", "std_msgs/msg/String")
 
 
-def test_a_killed_recording_becomes_a_bag_again(tmp_path: Path) -> None:
+def test_a_killed_recording_is_recovered(tmp_path: Path) -> None:
     path = kill(write(tmp_path / "bag"))
     before = contents(path)
     with pytest.raises(UserError, match=rf"run `ros2 run needle_bags recover {path}`$"):
@@ -57,7 +56,7 @@ def test_a_killed_recording_becomes_a_bag_again(tmp_path: Path) -> None:
     assert recover_bag(path).was_whole
 
 
-def test_without_metadata_alone_everything_comes_back_in_order(tmp_path: Path) -> None:
+def test_without_metadata_everything_is_recovered_in_order(tmp_path: Path) -> None:
     path = write(tmp_path / "bag", max_file_size=3000)
     assert len(list(path.glob("*.mcap"))) > 10
     before = yaml.safe_load((path / "metadata.yaml").read_text())
@@ -80,7 +79,7 @@ def test_without_metadata_alone_everything_comes_back_in_order(tmp_path: Path) -
     assert read_contents(path).counts.total() == 300
 
 
-def test_the_command_says_what_was_lost_and_leaves_a_whole_bag(
+def test_the_command_reports_the_loss_and_leaves_a_whole_bag(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write(tmp_path / "bag")
@@ -128,7 +127,7 @@ def texts(path: Path) -> list[str]:
     return [message.data for _, _, message in read_messages(path, "/a".__eq__)]
 
 
-def test_messages_that_were_compressed_one_by_one_come_back_up_to_the_damage(
+def test_messages_compressed_one_by_one_are_recovered_up_to_the_damage(
     tmp_path: Path,
 ) -> None:
     path = write_compressed(tmp_path / "bag", CompressionMode.MESSAGE)
@@ -140,7 +139,7 @@ def test_messages_that_were_compressed_one_by_one_come_back_up_to_the_damage(
         assert sum(1 for _ in reader.messages()) == 30
 
 
-def test_files_that_were_compressed_as_a_whole_are_whole_or_to_be_unpacked(tmp_path: Path) -> None:
+def test_files_compressed_as_a_whole_are_whole_or_must_be_unpacked(tmp_path: Path) -> None:
     path = write_compressed(tmp_path / "bag", CompressionMode.FILE)
     assert recover_bag(path).was_whole
     (packed,) = path.glob("*.zstd")
@@ -158,7 +157,7 @@ def test_files_that_were_compressed_as_a_whole_are_whole_or_to_be_unpacked(tmp_p
     assert len(texts(path)) == 30
 
 
-def test_what_cannot_be_recovered_is_one_line_and_stays(
+def test_an_unrecoverable_bag_gives_a_one_line_error_and_is_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("other", "empty"):
@@ -199,9 +198,9 @@ class Interruption(Exception):
 
 
 @pytest.mark.parametrize(
-    "step", ["_read_through", "write_metadata", "_set_aside", "sync_directory"]
+    "step", ["_read_through", "write_metadata", "_keep_original", "sync_directory"]
 )
-def test_an_interrupted_recovery_is_done_again_alike(
+def test_an_interrupted_recovery_can_be_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     path = write(tmp_path / "bag", 90, max_file_size=4500, chunk_size=2048)
@@ -237,7 +236,7 @@ def test_an_interrupted_recovery_is_done_again_alike(
 
 
 @pytest.mark.parametrize("compression", ["none", "zstd"])
-def test_a_damaged_bag_is_all_before_the_damage(tmp_path: Path, compression: str) -> None:
+def test_everything_before_the_damage_is_recovered(tmp_path: Path, compression: str) -> None:
     whole = write(tmp_path / "whole", 80, compression=compression)
     (file,) = whole.glob("*.mcap")
     data = file.read_bytes()
@@ -260,9 +259,7 @@ def test_a_damaged_bag_is_all_before_the_damage(tmp_path: Path, compression: str
 
 
 @pytest.mark.parametrize("harm", ["damaged", "missing", "missing, and no metadata"])
-def test_a_bag_of_several_files_ends_at_the_first_that_is_not_whole(
-    tmp_path: Path, harm: str
-) -> None:
+def test_a_bag_of_several_files_ends_at_the_first_damaged_one(tmp_path: Path, harm: str) -> None:
     bag = write(tmp_path / "bag", 240, max_file_size=11_000)
     if harm == "damaged":
         damage(bag / "bag_1.mcap")

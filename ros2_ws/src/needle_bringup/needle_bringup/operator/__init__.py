@@ -1,1 +1,1 @@
-"""A person's pedal, key or joystick: from a device's bytes to the hold."""
+"""Operator: hold-to-run switch of a pedal, key or joystick."""

@@ -1,7 +1,8 @@
-"""A device file of the kernel's input devices: what it sends, and what it is asked for."""
+"""Access to an input device of the kernel (evdev): its events, keys and axes."""
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import fcntl
 import os
@@ -9,28 +10,31 @@ import struct
 
 _KEY_BYTES = 96  # one bit for each code up to KEY_MAX, 0x2ff
 _ABSINFO = struct.Struct("@6i")  # value, minimum, maximum, fuzz, flat, resolution
-_LONGEST_READ = 65536
+_MAX_READ = 65536
+# struct input_event of a 64-bit kernel: time (two longs), type, code, value.
+EVENT = struct.Struct("@llHHi")
+_EV_SYN, _EV_KEY = 0, 1
+_SYN_DROPPED = 3
+_RELEASED, _PRESSED = 0, 1
 
 
 def _request(number: int, size: int) -> int:
-    """Return the ioctl that reads so many bytes from an input device."""
+    """Return the ioctl number that reads `size` bytes from an input device."""
     return 2 << 30 | size << 16 | ord("E") << 8 | number
 
 
-# Names of linux/input.h.
+# Names as in linux/input.h.
 EVIOCGKEY = _request(0x18, _KEY_BYTES)
 EVIOCGBIT_KEY = _request(0x20 + 1, _KEY_BYTES)
 
 
 def eviocgabs(axis: int) -> int:
-    """Return the ioctl that asks for an axis."""
+    """Return the ioctl number that reads an axis."""
     return _request(0x40 + axis, _ABSINFO.size)
 
 
 class InputDevice:
-    """An open device file, never waited for.
-
-    Every call raises OSError where the device is gone.
+    """An open device file; no call blocks, and every call raises OSError if the device is gone.
 
     Parameters
     ----------
@@ -54,7 +58,7 @@ class InputDevice:
             raise
 
     def read(self) -> bytes:
-        """Return the events that wait, as the kernel packs them; empty: none.
+        """Return the queued events as the kernel packs them.
 
         Raises
         ------
@@ -62,7 +66,7 @@ class InputDevice:
             If the device is gone.
         """
         try:
-            data = os.read(self._file, _LONGEST_READ)
+            data = os.read(self._file, _MAX_READ)
         except BlockingIOError:
             return b""
         if not data:
@@ -70,11 +74,11 @@ class InputDevice:
         return data
 
     def keys_down(self) -> frozenset[int]:
-        """Return the codes of the keys that are down now."""
+        """Return the codes of the keys that are down."""
         return self._bits(EVIOCGKEY)
 
     def axis(self, code: int) -> float:
-        """Return where an axis is now, -1 at its least and 1 at its most; 0 where it has no range.
+        """Return the position of an axis, from -1 to 1; 0 for an axis without a range.
 
         Raises
         ------
@@ -82,11 +86,11 @@ class InputDevice:
             If there is no such axis.
         """
         info = fcntl.ioctl(self._file, eviocgabs(code), bytes(_ABSINFO.size))
-        value, least, most, *_ = _ABSINFO.unpack(info)
-        return 2.0 * (value - least) / (most - least) - 1.0 if most > least else 0.0
+        value, low, high, *_ = _ABSINFO.unpack(info)
+        return 2.0 * (value - low) / (high - low) - 1.0 if high > low else 0.0
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         os.close(self._file)
 
     def _bits(self, request: int) -> frozenset[int]:
@@ -94,7 +98,44 @@ class InputDevice:
 
 
 def set_bits(data: bytes) -> frozenset[int]:
-    """Return the numbers of the bits that are set, the lowest of the first byte being 0."""
+    """Return the numbers of the set bits; the lowest bit of the first byte is 0."""
     return frozenset(
         8 * index + bit for index, byte in enumerate(data) for bit in range(8) if byte >> bit & 1
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class KeyChanges:
+    """Keys that went down or up since the last reading.
+
+    Attributes
+    ----------
+    pressed, released : frozenset of int
+        Their codes; a key can be in both. Key repeat is in neither.
+    dropped : bool
+        Whether the kernel dropped events, so that the changes are incomplete.
+    """
+
+    pressed: frozenset[int] = frozenset()
+    released: frozenset[int] = frozenset()
+    dropped: bool = False
+
+
+class EventReader:
+    """Decodes key changes from the bytes of a device, which may be split anywhere."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def decode(self, data: bytes) -> KeyChanges:
+        """Return the key changes in the next bytes."""
+        data = self._rest + data
+        whole = len(data) - len(data) % EVENT.size
+        self._rest = data[whole:]
+        changed: dict[int, set[int]] = {_PRESSED: set(), _RELEASED: set()}
+        dropped = False
+        for _, _, kind, code, value in EVENT.iter_unpack(data[:whole]):
+            dropped |= kind == _EV_SYN and code == _SYN_DROPPED
+            if kind == _EV_KEY and value in changed:
+                changed[value].add(code)
+        return KeyChanges(frozenset(changed[_PRESSED]), frozenset(changed[_RELEASED]), dropped)

@@ -20,11 +20,11 @@ class OperatorParameters:
     source: str = fixed_parameter(
         PEDAL,
         "-",
-        "What is held: a pedal or key or a joystick, by their event device; or the topic joy.",
+        "Input: a pedal or key or a joystick, by their event device; or the topic joy.",
         choices=(PEDAL, JOYSTICK, JOY),
     )
     device: str = fixed_parameter(
-        "", "-", "Event device of the pedal or joystick, best by its name in /dev/input/by-id."
+        "", "-", "Event device of the pedal or joystick, preferably a name in /dev/input/by-id."
     )
     key: int = fixed_parameter(
         _NONE,
@@ -34,7 +34,7 @@ class OperatorParameters:
         _LAST_KEY,
     )
     retract_key: int = fixed_parameter(
-        _NONE, "-", "Held to draw the needle out; -1: none.", _NONE, _LAST_KEY
+        _NONE, "-", "Held to withdraw the needle; -1: none.", _NONE, _LAST_KEY
     )
     stop_key: int = fixed_parameter(_NONE, "-", "Pressed to stop; -1: none.", _NONE, _LAST_KEY)
     speed_axis: int = fixed_parameter(
@@ -59,12 +59,12 @@ class OperatorParameters:
     )
 
     def __post_init__(self) -> None:
-        """Refuse what nobody could hold.
+        """Check the fields.
 
         Raises
         ------
         UserError
-            A field that is out of bounds, is missing, or contradicts another.
+            If a field is out of bounds, is missing, or contradicts another.
         """
         check_fields(self)
         if self.key == _NONE:
@@ -84,7 +84,7 @@ class OperatorParameters:
 
     @property
     def controls(self) -> Controls:
-        """Meaning of the source's buttons and axes."""
+        """Meaning of the buttons and axes."""
         return Controls(
             insert=self.key,
             retract=_known(self.retract_key),

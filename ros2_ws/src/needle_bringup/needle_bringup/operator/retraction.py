@@ -1,4 +1,4 @@
-"""Drawing the needle out by a held button: the calls that it takes, in their order."""
+"""Withdrawal of the needle with a held button: the required service calls in their order."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import enum
 
 STOP_STEERING = "plane_controller/stop"
 RETRACT = "device/retract"
-# So long an answer, or what must follow it, is waited for [s].
-PATIENCE = 1.0
+# Time limit for an answer, and for its effect [s].
+STEP_TIMEOUT = 1.0
 _RETRACTION = "retraction"
 
 
@@ -21,8 +21,8 @@ class _Phase(enum.Enum):
     OVER = enum.auto()
 
 
-# What to say where the next thing does not come.
-_IN_VAIN = {
+# Error text if a phase times out.
+_TIMEOUT_TEXT = {
     _Phase.STEERING_ENDS: f"no answer from {STOP_STEERING}",
     _Phase.HOLD_COUNTS: "the device does not take the hold (device/status says why)",
     _Phase.DEVICE_ANSWERS: f"no answer from {RETRACT}",
@@ -31,16 +31,16 @@ _IN_VAIN = {
 
 
 class RetractionSequence:
-    """From the press of the button to its release.
+    """State machine from the press of the button to its release.
 
-    A controller that steers would answer the hold with a step forward: it is told to stop first.
-    The hold is given while the needle is drawn out, and ends with that: who goes on holding the
-    button when the needle is out holds nothing that could insert it.
+    A steering controller would answer the hold with a step forward, so it is stopped first. The
+    hold is pressed only during the withdrawal: a button that is still held when the needle is out
+    cannot insert it.
 
     Parameters
     ----------
     name : str
-        Whose hold it is, as the device knows it.
+        Owner of the hold, as in device/status.
     """
 
     def __init__(self, name: str) -> None:
@@ -54,7 +54,7 @@ class RetractionSequence:
 
     @property
     def holds(self) -> bool:
-        """Whether the hold is to be pressed."""
+        """Whether to press the hold."""
         return self._phase in (
             _Phase.HOLD_COUNTS,
             _Phase.DEVICE_ANSWERS,
@@ -62,62 +62,62 @@ class RetractionSequence:
             _Phase.RETRACTING,
         )
 
-    def see_device(self, owner: str, activity: str, now: float) -> None:
-        """Take who holds, and what is under way, as device/status says them."""
+    def handle_device(self, owner: str, activity: str, now: float) -> None:
+        """Handle the owner of the hold and the activity in device/status."""
         self._owner, self._activity = owner, activity
         if self._phase is _Phase.HOLD_COUNTS and owner == self._name:
-            self._go(_Phase.DEVICE_ANSWERS, now, call=RETRACT)
+            self._enter(_Phase.DEVICE_ANSWERS, now, call=RETRACT)
         elif self._phase is _Phase.NEEDLE_LEAVES and activity == _RETRACTION:
-            self._go(_Phase.RETRACTING, now)
+            self._enter(_Phase.RETRACTING, now)
         elif self._phase is _Phase.RETRACTING and activity != _RETRACTION:
-            self._go(_Phase.OVER, now)
+            self._enter(_Phase.OVER, now)
 
-    def take_answer(self, service: str, success: bool, message: str, now: float) -> None:
-        """Take the answer to a call; one that comes too late changes nothing."""
+    def handle_answer(self, service: str, success: bool, message: str, now: float) -> None:
+        """Handle the answer to a call; ignore a late one."""
         if self._phase is _Phase.STEERING_ENDS and service == STOP_STEERING:
             if success:
-                self._go(_Phase.HOLD_COUNTS, now)
+                self._enter(_Phase.HOLD_COUNTS, now)
             else:
                 self._give_up(f"{service} was refused: {message}", now)
         elif self._phase is _Phase.DEVICE_ANSWERS and service == RETRACT:
             if success:
-                self._go(_Phase.NEEDLE_LEAVES, now)
-                self.see_device(self._owner, self._activity, now)
+                self._enter(_Phase.NEEDLE_LEAVES, now)
+                self.handle_device(self._owner, self._activity, now)
             else:
                 self._give_up(f"{service} was refused: {message}", now)
 
-    def look(self, held: bool, now: float, *, controller: bool) -> str | None:
-        """Go on with what the button wants.
+    def update(self, held: bool, now: float, *, controller: bool) -> str | None:
+        """Update the sequence with the state of the button.
 
         Parameters
         ----------
         held : bool
-            Whether the button is held, and counts.
+            Whether the button is held.
         now : float
             Steady time [s].
         controller : bool
-            Whether there is a controller that might steer.
+            Whether a controller is present.
 
         Returns
         -------
         str or None
-            The service to call now; its answer goes to `take_answer`.
+            The service to call now; pass its answer to `handle_answer`.
         """
         if not held:
             self._phase, self._call, self.trouble = _Phase.IDLE, None, ""
             return None
         if self._phase is _Phase.IDLE and controller:
-            self._go(_Phase.STEERING_ENDS, now, call=STOP_STEERING)
+            self._enter(_Phase.STEERING_ENDS, now, call=STOP_STEERING)
         elif self._phase is _Phase.IDLE:
-            self._go(_Phase.HOLD_COUNTS, now)
-        elif self._phase in _IN_VAIN and now - self._since > PATIENCE:
-            self._give_up(_IN_VAIN[self._phase], now)
+            self._enter(_Phase.HOLD_COUNTS, now)
+        elif self._phase in _TIMEOUT_TEXT and now - self._since > STEP_TIMEOUT:
+            self._give_up(_TIMEOUT_TEXT[self._phase], now)
         call, self._call = self._call, None
         return call
 
     def _give_up(self, trouble: str, now: float) -> None:
-        self._go(_Phase.OVER, now)
+        self._enter(_Phase.OVER, now)
         self.trouble = trouble
 
-    def _go(self, phase: _Phase, now: float, call: str | None = None) -> None:
+    def _enter(self, phase: _Phase, now: float, call: str | None = None) -> None:
         self._phase, self._since, self._call = phase, now, call

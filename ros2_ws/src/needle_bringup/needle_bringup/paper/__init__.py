@@ -1,1 +1,1 @@
-"""Every figure and number of [KC09] section IV, the paper's value beside ours."""
+"""Reproduction of [KC09] section IV."""

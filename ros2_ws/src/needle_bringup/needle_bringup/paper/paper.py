@@ -1,4 +1,4 @@
-"""`scripts/paper`: every figure and number of [KC09] section IV, the paper's value beside ours."""
+"""`scripts/paper`: every figure and number of [KC09] section IV."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
-from needle_bringup.descendants import ending_descendants
-from needle_bringup.workplace import checkout, make_folder, temporary_folder
+from needle_bringup.workplace import checkout, ending_descendants, make_folder, temporary_folder
 from needle_core.commands.cli import EXIT_DONE, run_command, write_json
 from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
@@ -49,8 +48,8 @@ def _paper(arguments: Sequence[str]) -> int:
     root = checkout()
     out = make_folder("--out", given.out or str(root / OUT))
     make_folder("--out", str(out / IMAGES))
-    # They take a second to import: not for a command line that is refused.
-    from needle_analysis.figures.figure_style import save  # noqa: PLC0415
+    # These imports take a second; an invalid command line does not need them.
+    from needle_bags.figures.figure_style import save  # noqa: PLC0415
     from needle_bringup.paper.paper_figures import figures_of  # noqa: PLC0415
     from needle_bringup.paper.paper_page import as_text, key_figures, page, table  # noqa: PLC0415
     from needle_bringup.paper.paper_results import PaperRuns  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""The figures of `docs/paper.md`: [KC09]'s figures 3 and 4, and what its text says of the study."""
+"""Figures of `docs/paper.md`: figures 3 and 4 of [KC09], and its study."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from needle_analysis.figures.figure_style import ESTIMATE, GOAL_BAND, INK, STYLE
+from needle_bags.figures.figure_style import ESTIMATE, GOAL_BAND, INK, STYLE
 from needle_bringup.paper.paper_results import (
     DEPTH_MM,
     DOMAIN_PITCH_DEG,
@@ -35,7 +35,7 @@ _DOTS: dict[str, Any] = {
 
 
 def figures_of(results: PaperRuns) -> Mapping[str, Figure]:
-    """Return all figures by their file's name."""
+    """Return all figures by file name."""
     with mpl.rc_context(STYLE):
         return {
             "paper_figure_3": figure_3(results),
@@ -92,7 +92,7 @@ def figure_4(trials: list[SteeringTrial]) -> Figure:
 
 
 def study_figure(results: PaperRuns) -> Figure:
-    """Return how far the study's runs end from the plane, at its depth and farther in."""
+    """Return the final distances of the runs of the study, at its depth and farther in."""
     figure = Figure(figsize=(8.4, 3.4), layout="constrained")
     share, later = figure.subplots(1, 2)
     for grid, color in (("endpoint", MEAN), ("cell", ESTIMATE)):
@@ -126,7 +126,7 @@ def study_figure(results: PaperRuns) -> Figure:
 
 
 def domain_figure(results: PaperRuns) -> Figure:
-    """Return from which starts the needle converges."""
+    """Return the share of converging runs over the start."""
     figure = Figure(figsize=(8.4, 3.8), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     image: Any = None

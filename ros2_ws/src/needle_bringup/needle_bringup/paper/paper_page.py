@@ -1,9 +1,9 @@
-"""`docs/paper.md`: the paper's values beside ours with a remark, and the figures."""
+"""The page `docs/paper.md`: values of the paper and of this project, and the figures."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -20,51 +20,22 @@ from needle_bringup.paper.paper_results import (
     missed_later,
     settled_mm,
 )
-from needle_bringup.studies.limit_study import Reached
 from needle_bringup.studies.pure_insertions import RADIUS
 from needle_core.commands.cli import JsonValue
 
+_TEMPLATE = Path(__file__).with_name("static") / "paper_page.txt"
 Row = tuple[str, str, str, str]
-
-INTRODUCTION = """\
-# The paper's results, reproduced
-
-`scripts/paper --out docs` writes this page: section IV of [[KC09]](equations.md) in simulation,
-with preset `paper`. Its bench trials run here through rendered images, the tracker and all nodes.
-
-"""
-FIGURES = """
-Rows of `best`: RMS over the last 20 mm to a plane; RMS and share within 1 mm at points. "limit" is
-a particle filter that knows the true model and steers with the laws of `best`.
-
-**Figure 3.** Start r = (-3 mm, 2 deg, 15 deg). Closed loop with ±0.5 mm noise. Camera trial with
-torsion; its first millimetres follow from the insertion, because the needle cannot be seen yet.
-
-![open loop, closed loop, camera trial](images/paper_figure_3.png)
-
-**Figure 4.** Camera trials towards a plane 3 mm above the entry; unknown pitch, roll and torsion.
-
-![mean and standard deviation of r1](images/paper_figure_4.png)
-
-**Study.** "Endpoint" grids include their bounds; "cell" grids use 0.9 of them.
-
-![distance from the plane at the end](images/paper_study.png)
-
-**Domain of attraction.** 120 mm, ±1 mm noise; the white box is the study of the paper.
-
-![share of starts that converge](images/paper_domain.png)
-"""
 
 
 def page(results: PaperRuns) -> str:
     """Return the whole page."""
     lines = ["| what | paper | here | remark |", "| --- | --- | --- | --- |"]
     lines += ["| " + " | ".join(row) + " |" for row in table(results)]
-    return INTRODUCTION + "\n".join(lines) + "\n" + FIGURES
+    return _TEMPLATE.read_text("utf-8").replace("@ROWS@", "\n".join(lines))
 
 
 def table(results: PaperRuns) -> Iterator[Row]:
-    """Yield what, the paper's value, ours, and a remark."""
+    """Yield (quantity, value of the paper, value here, remark)."""
     yield (
         "figure 3, open loop: r1 at 120 mm",
         '"rapidly diverged"',
@@ -101,8 +72,6 @@ def table(results: PaperRuns) -> Iterator[Row]:
     yield from _study_rows(results)
     yield from _robustness_rows(results)
     yield from _curvature_rows(results)
-    for label, row in results.limits.items():
-        yield f"`best`, {label}", "", f"{_reached(row.best)}; limit {_reached(row.limit)}", ""
 
 
 def key_figures(results: PaperRuns) -> dict[str, JsonValue]:
@@ -129,12 +98,6 @@ def key_figures(results: PaperRuns) -> dict[str, JsonValue]:
             f"{grid}_missed": missed,
             f"{grid}_missed_also_later": still,
             f"{grid}_missed_worst_later_mm": worst,
-        }
-    for label, row in results.limits.items():
-        key = re.sub("[^a-z0-9]+", "_", label)
-        values |= {
-            f"limit_{key}_rms_mm": row.limit.rms_mm,
-            f"limit_{key}_point_rms_mm": row.limit.point_rms_mm,
         }
     for scale in SCALES:
         key = f"kappa_scale_{scale:g}_converged_at_end".replace(".", "_")
@@ -212,11 +175,6 @@ def _curvature_rows(results: PaperRuns) -> Iterator[Row]:
         f"arc: 1/kappa {100.0 * errors.bias:+.1f} ± {100.0 * errors.spread:.1f} %",
         "",
     )
-
-
-def _reached(reached: Reached) -> str:
-    share = 100.0 * reached.point_share
-    return f"{reached.rms_mm:.2f} mm, {reached.point_rms_mm:.2f} mm, {share:.1f} %"
 
 
 def _percent(figures: dict[str, JsonValue], key: str) -> str:

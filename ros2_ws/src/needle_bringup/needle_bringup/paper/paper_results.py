@@ -1,4 +1,4 @@
-"""Results of [KC09] section IV, run again: the trials, the studies, and the figures from them."""
+"""Reproduction of [KC09] section IV: trials, studies and their results."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import dataclasses
 import numpy as np
 import numpy.typing as npt
 
-from needle_analysis.run.run_summary import reduced_states, target_offset
 from needle_bags.reading.bag_reader import Run, Series
+from needle_bags.run.run_summary import reduced_states, target_offset
 from needle_bringup.paper.paper_runs import Columns, Laboratory
-from needle_bringup.studies.limit_study import NEEDLES, PARTICLES, limits
 from needle_bringup.studies.pure_insertions import ARC, curvature_errors
 
 Floats = npt.NDArray[np.float64]
@@ -32,7 +31,7 @@ GOAL_MM = 1.0
 
 @dataclasses.dataclass(frozen=True)
 class SteeringTrial:
-    """One trial over the insertion: what the controller saw and estimated, and the truth.
+    """One trial: measurement, estimate and truth over the insertion.
 
     Attributes
     ----------
@@ -52,23 +51,23 @@ class SteeringTrial:
 
 
 class PaperRuns:
-    """Runs of the paper's section IV, all of which are made here.
+    """All runs of the paper's section IV.
 
     Parameters
     ----------
     laboratory : Laboratory
-        Makes them.
+        Executes the runs.
     seed : int
-        Of all noise.
+        Seed of all noise.
     quick : bool
-        Fewer trials, and one draw in place of ten.
+        Fewer trials, and one draw instead of ten.
 
     Attributes
     ----------
     open_loop, closed_loop : SteeringTrial
         The first two columns of figure 3.
     trials : list of SteeringTrial
-        Figure 4; the first is figure 3's third column.
+        Figure 4; the first is the third column of figure 3.
     start : dict
         Figures of many runs from figure 3's start.
     grids : dict
@@ -86,8 +85,6 @@ class PaperRuns:
         What `identify_curvature` finds in a pure insertion by cameras.
     curvature_errors : CurvatureErrors
         What many pure insertions with the paper's noise give.
-    limits : dict
-        What `best` reaches, and a filter that knows the true model, by the rows of `limit_study`.
     """
 
     def __init__(self, laboratory: Laboratory, seed: int, *, quick: bool) -> None:
@@ -132,15 +129,14 @@ class PaperRuns:
             self.scales_longer[scale], _ = study(f"scale_{scale:g}_longer", *wrong, *far)
         self.start, _ = study("start", *at, f"--initial={INITIAL}", "--noise-mm", "0.5")
         self.best, _ = study("best", "--controller", "best", "--seed", str(seed), *draws)
-        # What the tracker says before it sees the needle is no measurement.
+        # Before the needle is visible the tracker reports predictions.
         self.curvature = laboratory.identify("curvature", "pure_insertion", "--from-mm", "5")
         many = 300 if quick else 3000
         self.curvature_errors = curvature_errors(many, np.random.default_rng(seed))
-        self.limits = limits(50 if quick else NEEDLES, PARTICLES, seed)
 
 
 def read_trial(run: Run) -> SteeringTrial:
-    """Return what a bag says of a trial, at the exposures that all of it has."""
+    """Return the trial in a bag, at the exposures common to all its series."""
     offset = target_offset(run)
     stamps = run.reduced_state.stamps
     for series in (run.tips, run.truth, run.control_input):
@@ -170,7 +166,7 @@ def settled_mm(insertion_mm: Floats, r1_mm: Floats) -> float:
 
 
 def missed_later(runs: Columns, longer: Columns) -> tuple[int, int, float]:
-    """Return how many runs missed, how many of these still miss farther in, and the worst there.
+    """Return how many runs missed at 120 mm and at the greater depth, and the worst distance there.
 
     Returns
     -------

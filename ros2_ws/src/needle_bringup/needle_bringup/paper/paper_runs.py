@@ -1,4 +1,4 @@
-"""Runs what the paper's results are made of: trials through the whole graph, and studies."""
+"""Runs the trials and studies for the paper's results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_bags.reading.bag_reader import Run, read_run
-from needle_bringup.descendants import ran
+from needle_bringup.workplace import ran
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue
 from needle_core.files.installed import find_executable
 
@@ -23,14 +23,14 @@ SUMMARY = "summary.json"
 
 
 class Laboratory:
-    """Place in which trials and studies are run, each once.
+    """Runs trials and studies, each once.
 
     Parameters
     ----------
     simulate : sequence of str
-        The command that runs one trial through the whole graph.
+        Command of a trial.
     folder : Path
-        Keeps the bags and the studies' files; what is there already is not run again.
+        Folder for the results; existing ones are reused.
     """
 
     def __init__(self, simulate: Sequence[str], folder: Path) -> None:
@@ -38,27 +38,27 @@ class Laboratory:
         self._folder = folder
 
     def trial(self, name: str, *arguments: str) -> Run:
-        """Run one trial and read its bag; that it misses the plane is a result as well.
+        """Run a trial and read its bag; a missed plane is no error.
 
         Raises
         ------
         UserError
-            If it does not run.
+            If it fails.
         """
         bag = self._folder / name
         if not (bag / SUMMARY).is_file():
-            shutil.rmtree(bag, ignore_errors=True)  # what an earlier, broken run left
+            shutil.rmtree(bag, ignore_errors=True)  # of an earlier, failed run
             command = [*self._simulate, *arguments, "--bag", str(bag)]
             _run(name, command, (EXIT_DONE, EXIT_MISSED))
         return read_run(bag)
 
     def study(self, name: str, *arguments: str) -> tuple[dict[str, JsonValue], Columns]:
-        """Run a Monte Carlo study; return its figures, and its runs' columns of numbers.
+        """Run a Monte Carlo study; return its figures, and the numeric columns of its runs.
 
         Raises
         ------
         UserError
-            If it does not run.
+            If it fails.
         """
         figures, runs = self._folder / f"{name}.json", self._folder / f"{name}.csv"
         if not figures.is_file():
@@ -71,12 +71,12 @@ class Laboratory:
         return dict(json.loads(figures.read_text("utf-8"))), _numbers(columns)
 
     def identify(self, name: str, bag: str, *arguments: str) -> dict[str, JsonValue]:
-        """Find the curvature in a trial's bag with `identify_curvature`; return what it found.
+        """Identify the curvature in the bag of a trial; return the figures.
 
         Raises
         ------
         UserError
-            If it does not run.
+            If it fails.
         """
         figures = self._folder / f"{name}.json"
         if not figures.is_file():
@@ -87,7 +87,7 @@ class Laboratory:
 
 
 def _numbers(columns: Mapping[str, Sequence[str]]) -> Columns:
-    """Return the columns of numbers, NaN where a cell is empty; what has words is left out."""
+    """Return the numeric columns, with NaN for empty cells."""
     numbers = {}
     for name, cells in columns.items():
         with contextlib.suppress(ValueError):

@@ -1,1 +1,1 @@
-"""The operators, a person's and the simulation's, and what the launch files share."""
+"""ROS nodes of this package, and the common part of the launch files."""

@@ -1,4 +1,4 @@
-"""Common part of the launch files, the one module that needs `launch`: PyPI does not have it."""
+"""Common part of the launch files; the only module that imports `launch`, which PyPI lacks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from launch_ros.actions import Node
 
 from launch import LaunchDescription
 from needle_bringup.simulation.launch_nodes import LAUNCHED_PACKAGES, refuse_misspelt
-from needle_bringup.simulation.node_process import RECORDER_GRACE
+from needle_bringup.simulation.node_graph import RECORDER_GRACE
 from needle_core.settings.parameter_files import Parameters
 
 
@@ -22,20 +22,20 @@ def describe(
     choices: Mapping[str, Sequence[str]] = {},
     words: Callable[[Mapping[str, str]], Mapping[str, Sequence[str]]] = lambda _: {},
 ) -> LaunchDescription:
-    """Return a graph that ends as soon as one of its nodes does.
+    """Return a launch description that ends as soon as one of its nodes does.
 
     Parameters
     ----------
     arguments : mapping
-        What the user can say, beside `namespace`, to its default and what it is; misspelt, it ends
-        the launch likewise.
+        Launch argument, besides `namespace`, to its default and description. A misspelt argument
+        ends the launch.
     nodes : callable
-        Takes launch argument -> text, returns node -> parameter -> value; what it raises ends the
+        Takes launch argument -> text, returns node -> parameter -> value; an exception ends the
         launch before a node is started.
     choices : mapping
-        Argument to all that it may be, where not anything.
+        Argument to its allowed values.
     words : callable
-        Takes launch argument -> text, returns node -> what else is on its command line.
+        Takes launch argument -> text, returns node -> further command line arguments.
     """
     every = {**arguments, "namespace": ("", "namespace of all nodes")}
 
@@ -61,8 +61,8 @@ def _node(name: str, values: Mapping[str, Any], namespace: str, words: Sequence[
     ros_arguments = []
     for parameter, value in values.items():
         ros_arguments += ["-p", f"{parameter}:={json.dumps(value)}"]
-    # The recorder writes out what it still holds.
-    patience = {"sigterm_timeout": str(RECORDER_GRACE)} if name == "recorder" else {}
+    # A slow disk delays the end of the recorder.
+    grace = {"sigterm_timeout": str(RECORDER_GRACE)} if name == "recorder" else {}
     return Node(
         package=LAUNCHED_PACKAGES[name],
         executable=name,
@@ -71,5 +71,5 @@ def _node(name: str, values: Mapping[str, Any], namespace: str, words: Sequence[
         ros_arguments=ros_arguments,
         output="screen",
         on_exit=Shutdown(reason=f"{name} has ended"),
-        **patience,
+        **grace,
     )

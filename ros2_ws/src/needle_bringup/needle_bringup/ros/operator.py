@@ -14,13 +14,14 @@ from needle_core.component import Batch, PortChange, RealPort
 from needle_core.ros.main import run_component
 
 HELP = """\
-operator: holds the needle's switch for a person: a foot pedal, a key, a joystick.
+operator: hold-to-run switch of the needle: a foot pedal, a key, a joystick.
 
 A pedal, key or joystick by its event device (source pedal or joystick, device, key), or a
-joystick behind a topic of sensor_msgs/Joy (source joy), which must talk at 20 Hz or more. Held, the
-needle is inserted, or drawn out with retract_key; released, unplugged, silent or frozen it stops.
-What is held at the start or after a loss counts only when all was let go of and it is pressed
-again. To draw the needle out, a plane_controller that steers is stopped first.
+joystick on a topic of sensor_msgs/Joy (source joy), published at 20 Hz or more. The needle is
+inserted, or withdrawn with retract_key, while the button is held; it stops when the button is
+released, or the device is unplugged, silent or frozen. A button that is down at the start or after
+a loss is ignored until all are released and it is pressed again. Before a withdrawal, a steering
+plane_controller is stopped.
 
 Publishes   device/hold
 Subscribes  joy (source joy), device/status
@@ -29,12 +30,12 @@ Calls       device/stop, device/retract, plane_controller/stop
 
 
 class InputPort:
-    """The input device: looked at every `PERIOD`, at the moment when the look is handled.
+    """The input device: read every `PERIOD`, when the component handles the event.
 
     Parameters
     ----------
     settings : OperatorParameters
-        Which device, and what its keys mean.
+        The device, and the meaning of its keys.
     open_device : callable
         Opens it.
     """
@@ -49,18 +50,18 @@ class InputPort:
         self._closed = threading.Event()
 
     def open(self, arrive: Callable[[Batch | PortChange], None]) -> None:
-        """Begin to ask for a look."""
-        threading.Thread(target=self._ask, args=(arrive,), daemon=True).start()
+        """Start the periodic readings."""
+        threading.Thread(target=self._request_readings, args=(arrive,), daemon=True).start()
 
     def send(self, batch: tuple[float, ...]) -> None:
-        """Take the speed at the axis' full end, or without an axis, 0..1."""
+        """Set the speed at full axis, or without an axis, 0..1."""
         self._speed = batch[-1]
 
     def close(self) -> None:
-        """Ask no more."""
+        """Stop the readings."""
         self._closed.set()
 
-    def _ask(self, arrive: Callable[[Batch | PortChange], None]) -> None:
+    def _request_readings(self, arrive: Callable[[Batch | PortChange], None]) -> None:
         while not self._closed.wait(PERIOD):
             arrive(lambda: (self._source.read(time.monotonic()),))
 

@@ -1,4 +1,4 @@
-"""The `simulated_operator` executable: keeps the hold in simulation, in a person's stead."""
+"""The `simulated_operator` executable: presses the hold of a simulated rig."""
 
 from __future__ import annotations
 
@@ -8,20 +8,23 @@ import time
 from collections.abc import Callable
 from typing import Any, TextIO
 
-from needle_bringup.simulated_operator.component import PROGRESS, SimulatedOperator
-from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
+from needle_bringup.simulated_operator.component import (
+    PROGRESS,
+    SimulatedOperator,
+    SimulatedOperatorParameters,
+)
 from needle_bringup.simulated_operator.progress import PROGRESS_FD, Progress, Shown
 from needle_core.commands.cli import EXIT_INTERRUPTED
 from needle_core.ros.main import run_component
 
 HELP = """\
-simulated_operator: stands in for the person who holds the needle's switch, in simulation.
+simulated_operator: presses the hold-to-run switch of a simulated rig in place of a person.
 
-Confirms that the needle is out, homes, enables, starts the controller, then keeps the hold until
-the controller is DONE or in FAULT; releases and disables at the end, also on Ctrl-C. Draws the
-progress. It acts only on a device that is alone and says in device/status that it is simulated: on
-a rig that moves a real needle a person holds. A call that is not answered is made again after 1 s,
-home and start only where the statuses do not show that they were taken.
+Confirms that the needle is out, homes, enables, starts the controller, then presses the hold until
+the controller is DONE or in FAULT; releases and disables at the end, also on Ctrl-C. Shows the
+progress. It acts only if there is a single device that reports in device/status that it is
+simulated: on a real rig a person holds the switch. Unanswered calls are repeated after 1 s, home
+and start only if the statuses do not show that they were accepted.
 
 Publishes   device/hold
 Subscribes  needle/controller_status, device/status
@@ -38,19 +41,19 @@ class _ProgressPort:
         self._progress = Progress(_progress_stream())
 
     def open(self, arrive: Callable[[Any], None]) -> None:
-        """Do nothing: nothing comes from there."""
+        """Do nothing: this port has no events."""
 
     def send(self, batch: tuple[Shown, ...]) -> None:
         for shown in batch:
             self._progress.show(shown.insertion, shown.depth)
-            self._progress.tell_wait(shown.waits_because)
+            self._progress.show_wait(shown.waits_because)
 
     def close(self) -> None:
         self._progress.close("")
 
 
 def _progress_stream() -> TextIO:
-    """Return where the progress goes: stderr, or what the supervisor keeps open for it."""
+    """Return stderr, or the stream that the parent process keeps open."""
     descriptor = os.environ.get(PROGRESS_FD)
     if descriptor is None:
         return sys.stderr
@@ -58,7 +61,7 @@ def _progress_stream() -> TextIO:
 
 
 def main() -> int:
-    """Run the stand-in; returns its exit code."""
+    """Run the node; returns its exit code."""
     return run_component(
         "simulated_operator",
         SimulatedOperatorParameters,

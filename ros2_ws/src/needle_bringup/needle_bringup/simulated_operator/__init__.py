@@ -1,1 +1,1 @@
-"""Order of what a person's stand-in does in simulation."""
+"""Simulated operator: presses the hold of a simulated rig."""

@@ -1,7 +1,8 @@
-"""simulated_operator as a component: keeps the hold in simulation, in a person's stead."""
+"""simulated_operator as a component: presses the hold of a simulated rig in place of a person."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 from needle_bringup.simulated_operator.operator_sequence import (
@@ -10,7 +11,6 @@ from needle_bringup.simulated_operator.operator_sequence import (
     OperatorSequence,
     ServiceCall,
 )
-from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
 from needle_bringup.simulated_operator.progress import Shown
 from needle_core import messages as m
 from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
@@ -33,24 +33,61 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.hold_session import HoldSession
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter, parameter
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 HOLD, PROGRESS = "device/hold", "progress"
 RECORDER, PARAMETERS_OF = "recorder", "parameters_of"
 _CONTROLLER, _DEVICE = "needle/controller_status", "device/status"
-# The hold is best effort: a release worth sending is worth sending again.
+# The hold is best effort, so a final release is repeated.
 _RELEASES = 3
 
 
+@dataclasses.dataclass(frozen=True)
+class SimulatedOperatorParameters:
+    """Parameters of simulated_operator; SI units."""
+
+    speed_scale: float = parameter(
+        1.0,
+        unit="-",
+        lower=0.0,
+        upper=1.0,
+        description="Share of the commanded speed during the hold.",
+    )
+    hold_rate: float = fixed_parameter(
+        20.0, "Hz", "Rate of device/hold; the device wants 10 Hz or more.", 10.0, 100.0
+    )
+    wait_timeout: float = fixed_parameter(
+        90.0,
+        "s",
+        "Time limit for the rig to get ready, and for each service to answer.",
+        0.1,
+        3600.0,
+    )
+    stall_timeout: float = fixed_parameter(
+        30.0,
+        "s",
+        "The hold is released when the needle has not advanced for this time.",
+        0.1,
+        3600.0,
+    )
+    wait_for_recorder: bool = fixed_parameter(
+        False, "-", "Start only when the recorder has the parameters of all nodes."
+    )
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+
 class SimulatedOperator(Component):
-    """Does what `OperatorSequence` asks for and tells it what was received.
+    """Executes an `OperatorSequence`.
 
     Parameters
     ----------
     settings : SimulatedOperatorParameters
         The node's parameters.
     name : str
-        Full name of the node, by which the device knows whose hold it is.
+        Full name of the node, which identifies the owner of the hold.
     now : float
         Steady time [s].
     """
@@ -83,8 +120,8 @@ class SimulatedOperator(Component):
         self.timers = (Timer(1.0 / settings.hold_rate, self._on_timer),)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note which partners are there."""
-        self._sequence.see_devices(peers.publishers.get(_DEVICE, ()))
+        """Note the missing partners."""
+        self._sequence.handle_devices(peers.publishers.get(_DEVICE, ()))
         missing = [
             f"service {call.service}" for call in PREPARATION if call.service not in peers.services
         ]
@@ -94,17 +131,17 @@ class SimulatedOperator(Component):
         if HOLD not in peers.subscribers:
             missing.append(f"subscriber of {HOLD}")
         self._missing, self._nodes = missing, peers.nodes
-        self._sequence.see_missing([*self._missing, *self._unrecorded])
+        self._sequence.handle_missing([*self._missing, *self._unrecorded])
         return ()
 
     def on_answer(self, answer: Answer, at: Moment) -> Actions:
-        """Take the answer to the last call, or exit after the last of all."""
+        """Handle the answer to the last call; exit after the final call."""
         if self._is_finished:
             return self._exit() if answer.service == DISABLE.service else ()
         call = self._pending
         if call is None or call.service != answer.service or not answer.answered:
             return ()
-        self._sequence.take_answer(call, answer.success, answer.text, at.steady)
+        self._sequence.handle_answer(call, answer.success, answer.text, at.steady)
         return self._advance(at)
 
     def on_stop(self, at: Moment) -> Actions:
@@ -112,34 +149,34 @@ class SimulatedOperator(Component):
         self._sequence.interrupt()
         outcome = self._sequence.outcome
         if self._is_finished and outcome is not None:
-            # Nobody answers any more; others end on the same signal.
+            # The other nodes end on the same signal and do not answer.
             return (Exit(EXIT_INTERRUPTED, outcome.reason),)
         return self._advance(at)
 
     def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
         sequence = self._sequence
-        sequence.see_controller(message, at.steady)
+        sequence.handle_controller(message, at.steady)
         if sequence.steering and sequence.depth:
             shown = Shown(sequence.insertion, sequence.depth, sequence.waits_because)
             yield Send(PROGRESS, (shown,))
         yield from self._advance(at)
 
     def _on_device(self, message: DeviceStatus, at: Moment) -> Actions:
-        self._sequence.see_device(message, at.steady)
+        self._sequence.handle_device(message, at.steady)
         return self._advance(at)
 
     def _on_health(self, message: m.Diagnostics, at: Moment) -> Actions:
-        """Note whose parameters are not in the bag yet: without them no run can be repeated."""
+        """Note the nodes whose parameters are not in the bag yet; a rerun needs them."""
         for status in message.statuses:
             if status.part == PARAMETERS_OF and status.source.rpartition("/")[2] == RECORDER:
                 recorded = {name.lstrip("/") for name in status.text.split(", ")}
                 missing = sorted(self._nodes - recorded)
                 self._unrecorded = [f"recorder of {name}'s parameters" for name in missing]
-                self._sequence.see_missing([*self._missing, *self._unrecorded])
+                self._sequence.handle_missing([*self._missing, *self._unrecorded])
         return ()
 
     def _on_timer(self, at: Moment) -> Actions:
-        # Also before it presses: a press counts only after a release.
+        # Also while released: the device accepts a press only after a release.
         if self._sequence.may_act and not self._is_finished:
             yield self._hold(at, pressed=self._sequence.hold())
         self._sequence.check_time(at.steady)

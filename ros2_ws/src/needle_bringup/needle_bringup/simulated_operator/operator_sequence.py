@@ -1,4 +1,4 @@
-"""Order of what the stand-in of a person does, and when it gives up: no ROS."""
+"""State machine of the simulated operator: preparation, hold and time limits."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ ENABLE = ServiceCall("device/enable", True)
 START = ServiceCall("plane_controller/start")
 PREPARATION = (ServiceCall("device/confirm_needle_out", True), HOME, ENABLE, START)
 DISABLE = ServiceCall("device/enable", False)
-# A rig that has not found all its partners yet refuses with this beginning: ask again.
+# Start of the refusal of a node that has not discovered all partners; the call is repeated.
 NOT_YET = "waiting for"
 RETRY_AFTER = 0.1
-# An answer can be lost for good: a server whose process does not know the client yet drops it, and
-# neither side is told. So long it is waited for before the call is made again [s].
-ASK_AGAIN = 1.0
-# What device/home answers when it has begun; anything else: there is nothing to wait for.
+# An answer can be lost for good: a server that has not discovered the client yet drops it without
+# notice. An unanswered call is repeated after this time [s].
+CALL_TIMEOUT = 1.0
+# Answer of device/home when homing has started; with any other there is nothing to wait for.
 HOMING = "homing"
-# Any other refusal may rest on news that are still under way (joints, the answer before this one).
-REFUSAL_PATIENCE = 2.0
+# Other refusals may be due to delayed messages, so they are repeated for this time [s].
+REFUSAL_TIMEOUT = 2.0
 _NO_REASON = "no reason given"
 
 
@@ -52,9 +52,9 @@ class Outcome:
     done : bool
         Whether the controller reached its depth.
     reason : str
-        One line for the person at the terminal.
+        One line for the terminal.
     prepared : bool
-        Whether the rig got ready at all.
+        Whether the rig got ready.
     interrupted : bool
         Whether a signal ended it.
     """
@@ -66,23 +66,23 @@ class Outcome:
 
 
 class OperatorSequence:
-    """Prepares the rig, keeps the hold while it steers, and ends with an outcome.
+    """Prepares the rig, presses the hold while it steers, and ends with an outcome.
 
-    A call whose answer does not come is made again. Confirming and enabling twice is the same as
-    once; whether homing and start were taken is told by the statuses, before they are asked again.
+    Unanswered calls are repeated. Confirming and enabling are idempotent; homing and start are only
+    repeated if the statuses do not show that they were accepted.
 
-    All times are readings of one steady clock [s].
+    All times are steady times [s].
 
     Parameters
     ----------
     now : float
         Time of the start.
     name : str
-        Whose hold it is, as the device knows it.
+        Owner of the hold, as in device/status.
     wait_timeout : float
-        How long the rig may take to get ready (partners, each service call's answer) [s].
+        Time limit for each step of the preparation [s].
     stall_timeout : float
-        How long steering may show no progress [s].
+        Time limit for steering without progress [s].
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class OperatorSequence:
         self._homed = False
         self._moving = False
         self._simulated = False
-        self._speaker = ""
+        self._device_source = ""
         self._devices: Sequence[str] = ()
         self._homed_since_call = False
         self._homing_seen = False
@@ -124,24 +124,24 @@ class OperatorSequence:
 
     @property
     def steering(self) -> bool:
-        """Tell whether the preparation is over and the run is not."""
+        """Whether the rig is prepared and the run has not ended."""
         return self._prepared == len(PREPARATION) and self.outcome is None
 
     def hold(self) -> bool:
-        """Return whether the hold is pressed."""
+        """Return whether to press the hold."""
         return self.steering and not self._must_release and self.may_act
 
     @property
     def touched(self) -> bool:
-        """Tell whether the drives may have been enabled, so that they must be disabled."""
+        """Whether the drives may be enabled, so that they must be disabled at the end."""
         return self._prepared >= 2
 
-    def see_missing(self, missing: Sequence[str]) -> None:
-        """Take the list of partners that are not there (empty: all are)."""
+    def handle_missing(self, missing: Sequence[str]) -> None:
+        """Handle the list of missing partners; empty if all are present."""
         self._missing = missing
 
     def next_call(self, now: float) -> ServiceCall | None:
-        """Return the service to call now; its answer goes to `take_answer`."""
+        """Return the service to call now; pass its answer to `handle_answer`."""
         waits = bool(self._missing) or now < self._retry_at or not self.may_act
         if waits or self.outcome is not None or self._prepared == len(PREPARATION):
             return None
@@ -157,20 +157,20 @@ class OperatorSequence:
             self._homing_seen = not self._homed
             self._starts_before = self._starts or 0
         self._asked = self._pending = True
-        self._retry_at = now + ASK_AGAIN
+        self._retry_at = now + CALL_TIMEOUT
         return call
 
-    def take_answer(self, call: ServiceCall, success: bool, message: str, now: float) -> None:
-        """Take an answer to `call`, however late; one to a call that is over changes nothing."""
+    def handle_answer(self, call: ServiceCall, success: bool, message: str, now: float) -> None:
+        """Handle the answer to `call`; ignore it if the call is completed."""
         wanted = self._prepared < len(PREPARATION) and call == PREPARATION[self._prepared]
         if self.outcome is not None or not wanted:
             return
         self._pending = False
         if success:
             if message == HOMING:
-                # What was heard before the call is no news of this homing.
+                # An earlier status does not refer to this homing.
                 self._homed = self._homed_since_call
-            self._go_on(now)
+            self._advance(now)
             return
         self._refusal = message
         self._retry_at = now + RETRY_AFTER
@@ -178,10 +178,10 @@ class OperatorSequence:
             self._refused_since = None
         elif self._refused_since is None:
             self._refused_since = now
-        elif now >= self._refused_since + REFUSAL_PATIENCE:
+        elif now >= self._refused_since + REFUSAL_TIMEOUT:
             self._end(f"{call.service} was refused: {message}")
 
-    def _go_on(self, now: float) -> None:
+    def _advance(self, now: float) -> None:
         self._prepared += 1
         self._asked = self._pending = False
         self._retry_at = now
@@ -190,16 +190,16 @@ class OperatorSequence:
         self._deadline = now + self._wait_timeout
         self._progress_at = now
 
-    def see_devices(self, names: Sequence[str]) -> None:
-        """Take who publishes device/status: with more than one, nobody knows what would move."""
+    def handle_devices(self, names: Sequence[str]) -> None:
+        """Handle the publishers of device/status; end the run if there are several."""
         self._devices = names
         if len(names) > 1 and (self._prepared or self._asked):
             self._end(f"there is more than one device: {', '.join(names)}; {WAY_OUT}")
 
-    def see_device(self, status: DeviceStatus, now: float) -> None:
-        """Take device/status."""
+    def handle_device(self, status: DeviceStatus, now: float) -> None:
+        """Handle device/status."""
         self._simulated = status.simulated is True
-        self._speaker = status.source
+        self._device_source = status.source
         if status.simulated is False:
             self._end(
                 f"{status.source} is a real device, or not in simulated time (it says simulated = "
@@ -211,16 +211,16 @@ class OperatorSequence:
         self._homed_since_call = self._homed
         self._homing_seen = self._homing_seen or self._moving
         if self._called(HOME) and self._homed and self._homing_seen:
-            self._go_on(now)
-        # A press that the device does not take, or no longer, counts again only after a release.
+            self._advance(now)
+        # The device requires a release before it accepts the press again.
         must_release = self.steering and status.press_again == self._name
         self.presses_again += self._must_release and not must_release
         self._must_release = must_release
         if status.state in ("FAULT", "ESTOPPED") and self._prepared:
             self._end(f"device {status.state}: {status.why or _NO_REASON}")
 
-    def see_controller(self, status: ControllerStatus, now: float) -> None:
-        """Take needle/controller_status."""
+    def handle_controller(self, status: ControllerStatus, now: float) -> None:
+        """Handle needle/controller_status."""
         self.insertion = status.insertion_m
         self.depth = status.depth_m
         waits = status.state == "WAITING_FOR_TIP"
@@ -228,15 +228,15 @@ class OperatorSequence:
         self._starts = status.starts or 0
         started = self._starts > self._starts_before
         if self._called(START) and started:
-            # The status can overtake the answer, which may be lost.
-            self._go_on(now)
+            # The answer may be late or lost.
+            self._advance(now)
         progress = (status.state, status.step, status.insertion_m)
         if progress != self._progress:
             self._progress, self._progress_at = progress, now
         if self.steering and started:
-            self._judge(status)
+            self._check_end(status)
 
-    def _judge(self, status: ControllerStatus) -> None:
+    def _check_end(self, status: ControllerStatus) -> None:
         why = status.reason or _NO_REASON
         if status.state == "DONE":
             self.outcome = Outcome(
@@ -248,21 +248,23 @@ class OperatorSequence:
             self._end(f"plane_controller stopped: {why}")
 
     def _called(self, call: ServiceCall) -> bool:
-        """Tell whether `call` has been made and its success is not known yet."""
+        """Return whether `call` was made and its success is not known yet."""
         return self.outcome is None and self._asked and PREPARATION[self._prepared] == call
 
     def interrupt(self) -> None:
-        """Take a signal to end."""
+        """Handle a signal to end."""
         if self.outcome is None:
             self.outcome = Outcome(False, "interrupted", interrupted=True)
 
     def check_time(self, now: float) -> None:
-        """End the run where the rig took too long."""
+        """End the run if a time limit is exceeded."""
         if self.outcome is not None:
             return
         if self._prepared < len(PREPARATION):
             if now >= self._deadline:
-                self._end(f"the rig is not ready after {self._wait_timeout:g} s: {self.hangs()}")
+                self._end(
+                    f"the rig is not ready after {self._wait_timeout:g} s: {self.pending_reason()}"
+                )
         elif now >= self._progress_at + self._stall_timeout:
             state = self._progress[0] or "silent"
             why = f": {self.waits_because}" if self.waits_because else ""
@@ -273,10 +275,10 @@ class OperatorSequence:
 
     @property
     def may_act(self) -> bool:
-        """Tell whether the only device that is there has said that it is simulated."""
-        return self._simulated and list(self._devices) == [self._speaker]
+        """Whether the only device reports that it is simulated."""
+        return self._simulated and list(self._devices) == [self._device_source]
 
-    def hangs(self) -> str:
+    def pending_reason(self) -> str:
         """Return what the preparation waits for."""
         call = PREPARATION[self._prepared].service
         if self._missing:

@@ -1,4 +1,4 @@
-"""Progress of the insertion, shown to the person at the terminal."""
+"""Progress of the insertion on the terminal."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import TextIO
 
 from tqdm import tqdm
 
-# Environment variable: number of an open file that takes the progress instead of stderr.
+# Environment variable: file descriptor for the progress instead of stderr.
 PROGRESS_FD = "NEEDLE_PROGRESS_FD"
 
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """Insertion and depth of the needle [m], and why it does not go on; empty: it does."""
+    """Insertion and final depth [m], and why the needle waits; empty if it advances."""
 
     insertion: float
     depth: float
@@ -21,12 +21,12 @@ class Shown:
 
 
 class Progress:
-    """A bar on a terminal, a line for every quarter elsewhere.
+    """A progress bar on a terminal, otherwise a line for every quarter.
 
     Parameters
     ----------
     stream : TextIO
-        Where to show it, usually stderr; kept as the attribute `stream`.
+        Output stream, usually stderr; kept as the attribute `stream`.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -34,10 +34,10 @@ class Progress:
         self._terminal = stream.isatty()
         self._bar: tqdm[None] | None = None
         self._shown_quarter = 0
-        self._told_wait = ""
+        self._last_reason = ""
 
     def show(self, insertion: float, depth: float) -> None:
-        """Show that the needle is `insertion` of `depth` in [m]."""
+        """Show the insertion and the final depth [m]."""
         if depth <= 0.0:
             return
         if self._terminal:
@@ -48,27 +48,27 @@ class Progress:
             self._shown_quarter = quarter
             print(f"{insertion * 1e3:5.1f} of {depth * 1e3:.1f} mm", file=self.stream, flush=True)
 
-    def tell_wait(self, reason: str) -> None:
-        """Say once why the needle does not go on; an empty reason: it does."""
-        if reason and reason != self._told_wait:
-            self._take_bar_away()
+    def show_wait(self, reason: str) -> None:
+        """Print each new reason for waiting once; an empty reason: no waiting."""
+        if reason and reason != self._last_reason:
+            self._remove_bar()
             print(f"waiting: {reason}", file=self.stream, flush=True)
-        self._told_wait = reason
+        self._last_reason = reason
 
     def close(self, line: str) -> None:
-        """Take the bar away and leave one line, unless it is empty."""
-        self._take_bar_away()
+        """Remove the bar and print a line, unless it is empty."""
+        self._remove_bar()
         if line:
             print(line, file=self.stream, flush=True)
 
-    def _take_bar_away(self) -> None:
+    def _remove_bar(self) -> None:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
 
     def _show_bar(self, insertion: float, depth: float) -> None:
         if self._bar is None:
-            tqdm.monitor_interval = 0  # its thread would outlive the bar
+            tqdm.monitor_interval = 0  # no monitor thread
             self._bar = tqdm(
                 total=round(depth * 1e3, 1),
                 unit="mm",

@@ -1,1 +1,1 @@
-"""One simulated run: its nodes, their parameters, their end."""
+"""Simulated rig: `simulate`, `console`, and the nodes of the launch files."""

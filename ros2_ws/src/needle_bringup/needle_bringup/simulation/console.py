@@ -1,27 +1,89 @@
-"""A simulated rig in real time and the console's page on it: scripts/console."""
+"""A simulated rig in real time with the web console: `scripts/console`."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
+import shutil
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from needle_bringup.simulation.console_graph import run_console_graph
-from needle_bringup.simulation.console_options import LOOPBACK, ConsoleOptions, parse_console
 from needle_bringup.simulation.rig_configuration import command_line_parameters
+from needle_bringup.simulation.simulate_options import SimulateOptions, parse
 from needle_core.commands.cli import EXIT_INTERRUPTED, EXIT_MISSED, run_command
+from needle_core.commands.options import CommandParser, join_start, whole_number
 from needle_core.process.end_request import EndRequest
 from needle_core.settings.parameter_files import Parameters
 
 if TYPE_CHECKING:
     from needle_core.component import Component, RealPort
 
-# As often as a page shows them [Hz].
+DESCRIPTION = """\
+Steer a simulated needle by hand, in a browser, in real time.
+
+Runs sim_rig, plane_controller (at level drive also drive_emulator and device_driver) and the
+console in one process, cameras and stereo_tracker in a second one, and prints the address to open.
+With --graph each is a ROS node of this shell's domain, with live_view for RViz and Foxglove.
+Nothing moves before you have pressed the buttons in their order; Ctrl-C ends all.
+"""
+
+EPILOG = """\
+examples:
+  scripts/console
+      camera images, the page on http://127.0.0.1:8080/
+  scripts/console --level tip
+      no images: for a slow machine
+  scripts/console --level drive --port 9000
+      the device driver moves two emulated CANopen drives; page and hold on ports 9000 and 9001
+  scripts/console --graph
+      ROS nodes, to look at with `ros2 topic echo`, RViz or Foxglove as well
+
+exit codes: 130 ended by Ctrl-C, 1 a part of the rig ended before, 2 bad input or something missing.
+"""
+
+# Options with the same meaning as those of `simulate`.
+_SHARED = {
+    "--level": ("tip|camera|drive", "what is simulated (default: camera)"),
+    "--controller": ("paper|best|open_loop", "how the needle is turned (default: best)"),
+    "--insertion": (
+        "continuous|stepwise",
+        "without a stop, or 1 mm at a time (default: continuous)",
+    ),
+    "--initial": ("X_MM,PITCH_DEG,ROLL_DEG", "where the needle starts (default: -3,2,15)"),
+    "--noise-mm": ("A", "level tip: how far off a measured tip may be (default: 1.0)"),
+    "--depth-mm": ("D", "how far to insert (default: 120)"),
+    "--seed": ("N", "seed of all noise (default: 1)"),
+}
+# The hold uses the port after that of the page.
+_DEFAULT_PORT, _LAST_PORT = "8080", 65534
+LOOPBACK = "127.0.0.1"
+"""Address of page and hold."""
+# Display rate of the page [Hz].
 _CAMERA_RATE = 10.0
 _SLICE = 0.2
+# The person at the page replaces the simulated operator, and nothing is recorded.
+_LEFT_OUT = ("simulated_operator", "recorder")
+_POLL = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class ConsoleOptions:
+    """Options of `console`.
+
+    Attributes
+    ----------
+    port : int
+        Port of the page; the hold uses the next one.
+    rig : SimulateOptions
+        The rig, simulated in real time.
+    """
+
+    port: int
+    rig: SimulateOptions
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,28 +92,67 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(lambda: console(parse_console(words)))
 
 
-def console(options: ConsoleOptions) -> int:
-    """Run rig and page until a signal comes.
-
-    Parameters
-    ----------
-    options : ConsoleOptions
-        What to run.
-
-    Returns
-    -------
-    int
-        130 after a signal, 1 where a component ended before.
+def parse_console(arguments: Sequence[str]) -> ConsoleOptions:
+    """Return the options of a command line (without the program's name).
 
     Raises
     ------
     UserError
-        Where something is missing or a port is taken.
+        If an option is invalid.
     """
-    if options.rig.graph:
-        with EndRequest() as end:
-            return run_console_graph(options, rig_parameters(options), end)
-    # Small matrices: threads only get in each other's way. It counts for what is loaded from here.
+    parser = CommandParser("console", DESCRIPTION, EPILOG)
+    parser.add_argument(
+        "--port",
+        default=_DEFAULT_PORT,
+        metavar="N",
+        help=f"port of the page; the hold takes the next (default: {_DEFAULT_PORT})",
+    )
+    parser.add_argument("--graph", action="store_true", help="run ROS nodes, for RViz and Foxglove")
+    for option, (metavar, text) in _SHARED.items():
+        parser.add_argument(option, metavar=metavar, help=text)
+    given = parser.parse_args(join_start(arguments))
+    words = ["--graph"] if given.graph else ["--real-time-factor", "1"]
+    words += ["--insertion", "continuous"]
+    for option in _SHARED:
+        value = getattr(given, option[2:].replace("-", "_"))
+        if value is not None:
+            words.append(f"{option}={value}")
+    port = whole_number("--port", given.port, 1, _LAST_PORT)
+    return ConsoleOptions(port, parse(words))
+
+
+def console(options: ConsoleOptions) -> int:
+    """Run rig and page until a signal arrives.
+
+    Parameters
+    ----------
+    options : ConsoleOptions
+        Options of the command line.
+
+    Returns
+    -------
+    int
+        130 after a signal, 1 if a component ended before.
+
+    Raises
+    ------
+    UserError
+        If something is missing, a port is in use, or a node ended.
+    """
+    with EndRequest() as end:
+        run = run_nodes if options.rig.graph else _run_components
+        return run(options, rig_parameters(options), end)
+
+
+def rig_parameters(options: ConsoleOptions) -> Parameters:
+    """Return the parameters of the rig's nodes, by name."""
+    parameters = command_line_parameters(options.rig, Path())
+    parameters["sim_rig"]["camera_rate"] = _CAMERA_RATE
+    return parameters
+
+
+def _run_components(options: ConsoleOptions, parameters: Parameters, end: EndRequest) -> int:
+    # One thread per process: the matrices are small. numpy reads this when it is loaded.
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
     from needle_console.console import PAGE, Console  # noqa: PLC0415
     from needle_console.console_parameters import ConsoleParameters  # noqa: PLC0415
@@ -59,27 +160,19 @@ def console(options: ConsoleOptions) -> int:
     from needle_core.runners.paced import PacedRunner  # noqa: PLC0415
 
     settings = ConsoleParameters(address=LOOPBACK, port=options.port, hold_port=options.port + 1)
-    with EndRequest() as end:
-        desk = ServedDesk(settings)
-        rig, ports = _make_rig(rig_parameters(options))
-        components = [*rig, Console(settings)]
-        runner = PacedRunner(components, options.rig.seed, ports={PAGE: desk, **ports})
-        with contextlib.closing(runner):
-            print(f"http://{LOOPBACK}:{options.port}/   (Ctrl-C ends all)", flush=True)
-            while not end.wanted:
-                if runner.run(_SLICE):
-                    (name, ended), *_ = runner.exits.items()
-                    print(f"error: {name} ended: {ended.text}", file=sys.stderr)
-                    return EXIT_MISSED
-                desk.note_lag(runner.lag)
-        return EXIT_INTERRUPTED
-
-
-def rig_parameters(options: ConsoleOptions) -> Parameters:
-    """Return the parameters of the rig, by its nodes' names."""
-    parameters = command_line_parameters(options.rig, Path())
-    parameters["sim_rig"]["camera_rate"] = _CAMERA_RATE
-    return parameters
+    desk = ServedDesk(settings)
+    rig, ports = _make_rig(parameters)
+    components = [*rig, Console(settings)]
+    runner = PacedRunner(components, options.rig.seed, ports={PAGE: desk, **ports})
+    with contextlib.closing(runner):
+        _print_address(options)
+        while not end.wanted:
+            if runner.run(_SLICE):
+                (name, ended), *_ = runner.exits.items()
+                print(f"error: {name} ended: {ended.text}", file=sys.stderr)
+                return EXIT_MISSED
+            desk.note_lag(runner.lag)
+    return EXIT_INTERRUPTED
 
 
 def _make_rig(parameters: Parameters) -> tuple[list[Component], dict[str, RealPort]]:
@@ -89,14 +182,63 @@ def _make_rig(parameters: Parameters) -> tuple[list[Component], dict[str, RealPo
     if parameters["sim_rig"]["level"] == "tip":
         return make_rig(parameters), {}
     from needle_bringup.simulation.vision import (  # noqa: PLC0415
-        EYES,
-        DistantTracker,
-        EyesProcess,
+        VISION,
+        RemoteTracker,
+        VisionProcess,
     )
     from needle_sim.camera_sensor import DistantCameras  # noqa: PLC0415
 
-    rig = make_rig(parameters, DistantCameras, lambda _: DistantTracker())
-    return rig, {EYES: EyesProcess(parameters)}
+    rig = make_rig(parameters, DistantCameras, lambda _: RemoteTracker())
+    return rig, {VISION: VisionProcess(parameters)}
+
+
+def run_nodes(options: ConsoleOptions, rig: Parameters, end: EndRequest) -> int:
+    """Run the rig, its page and its live view as nodes in this shell's ROS domain.
+
+    Parameters
+    ----------
+    options : ConsoleOptions
+        Options of the command line.
+    rig : Parameters
+        Node to its parameters.
+    end : EndRequest
+        Ends the run.
+
+    Returns
+    -------
+    int
+        130 after a signal.
+
+    Raises
+    ------
+    NodeFailedError
+        If a node ended before.
+    """
+    from needle_bringup.simulation.launch_nodes import LAUNCHED_PACKAGES  # noqa: PLC0415
+    from needle_bringup.simulation.node_graph import NodeGraph, wait_for  # noqa: PLC0415
+    from needle_core.process.reach import settle_environment  # noqa: PLC0415
+
+    settle_environment()
+    nodes = {name: values for name, values in rig.items() if name not in _LEFT_OUT}
+    nodes["console"] = {"port": options.port, "hold_port": options.port + 1}
+    packages = {**LAUNCHED_PACKAGES, "console": "needle_console"}
+    folder = Path(tempfile.mkdtemp(prefix="needle_console_"))
+    graph = NodeGraph(folder, nodes)
+    try:
+        for name in (*nodes, "live_view"):
+            graph.start(packages[name], name)
+        _print_address(options)
+        while not end.wanted:
+            graph.check()
+            wait_for([graph.nodes["console"]], _POLL)
+    finally:
+        graph.stop()
+    shutil.rmtree(folder)
+    return EXIT_INTERRUPTED
+
+
+def _print_address(options: ConsoleOptions) -> None:
+    print(f"http://{LOOPBACK}:{options.port}/   (Ctrl-C ends all)", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Which nodes the launch files start, with which parameters: from launch arguments. No ROS here."""
+"""Nodes of the launch files and their parameters, from launch arguments."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from needle_bringup.simulation.simulate_options import existing_file, parse
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import Parameters, read_parameters
 
-LAUNCHED_PACKAGES = {**PACKAGES, "player": "needle_bags", "live_view": "needle_analysis"}
-"""Package of each node that a launch file starts."""
-# What the live view wants and the player sends under /replay only: a rig would obey it.
+LAUNCHED_PACKAGES = {**PACKAGES, "player": "needle_bags", "live_view": "needle_bags"}
+"""Package of each node in a launch file."""
+# Topics of the live view that the player publishes under /replay only.
 _NOT_FOR_RIGS = ("target_plane", "target_point")
 
-# Parameter that no file may set -> the launch argument that does.
+# Parameter that a file must not set -> its launch argument.
 _OF_SIMULATION = {
     "level": "level",
     "seed": "seed",
@@ -32,26 +32,26 @@ _OF_SIMULATION = {
     "pty": "can",
     "channel": "can",
 }
-_CLOSE = 0.84  # names that have so much in common are one, misspelt; ros_namespace is none
+_CLOSE = 0.84  # similarity of a misspelt name; that of ros_namespace is lower
 _OF_RIG = {"calibration_file": "calibration", "bag": "bag"}
 
 
 def refuse_misspelt(given: Iterable[str], declared: Sequence[str]) -> None:
-    """Refuse launch arguments that are close to a declared one: launch takes any, in silence.
+    """Reject launch arguments that resemble a declared one; launch accepts any name.
 
-    Others may be those of a launch file that includes this one.
+    Other names may be arguments of an including launch file.
 
     Parameters
     ----------
     given : iterable of str
-        The names that launch knows.
+        Names of all launch arguments.
     declared : sequence of str
-        Those of the launch file.
+        Names declared by the launch file.
 
     Raises
     ------
     UserError
-        Names the argument, and the one that is meant.
+        Names the argument, and the similar one.
     """
     for name in given:
         meant = difflib.get_close_matches(name.lower(), declared, n=1, cutoff=_CLOSE)
@@ -76,7 +76,7 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
     Raises
     ------
     UserError
-        If an argument cannot be meant so, a file is missing, or the bag is there already.
+        If an argument is invalid, a file is missing, or the bag exists.
     """
     words = ["--graph"]
     for name in ("level", "seed", "controller"):
@@ -112,12 +112,12 @@ def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
     Raises
     ------
     UserError
-        If a file is missing or is not what it should be, or the bag is there already.
+        If a file is missing or invalid, or the bag exists.
     """
     calibration = existing_file("calibration:=", arguments["calibration"]).absolute()
     bag = _new_bag(arguments["bag"])
     parameters: Parameters = {
-        # Hears cameras that publish best effort and such that do not.
+        # Best effort receives cameras of either reliability.
         "stereo_tracker": {"calibration_file": str(calibration), "reliable_images": False},
         "plane_controller": {},
     }
@@ -144,7 +144,7 @@ def replayed_nodes(arguments: Mapping[str, str]) -> Parameters:
     Raises
     ------
     UserError
-        If no bag is named, or it is not there.
+        If no bag is given, or it does not exist.
     """
     if not arguments["bag"]:
         raise UserError("bag:= is missing: the folder of the bag to play")
@@ -154,7 +154,7 @@ def replayed_nodes(arguments: Mapping[str, str]) -> Parameters:
 
 
 def replay_words(arguments: Mapping[str, str]) -> dict[str, list[str]]:
-    """Return what is on the command lines of the nodes of replay.launch.py.
+    """Return the command line arguments of the nodes of replay.launch.py.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def replay_words(arguments: Mapping[str, str]) -> dict[str, list[str]]:
 def _with_file(
     parameters: Parameters, arguments: Mapping[str, str], reserved: Mapping[str, str]
 ) -> Parameters:
-    """Return the parameters with a parameter file on top."""
+    """Return the parameters, replaced by those of a parameter file."""
     if not arguments["params"]:
         return parameters
     given = _read("params", arguments, list(parameters))

@@ -1,13 +1,16 @@
-"""A rig as ROS nodes, one process each: started, watched, and ended in their order."""
+"""The rig as ROS nodes, one process each: started, monitored, and ended in order."""
 
 from __future__ import annotations
 
+import ctypes
 import os
+import signal
+import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from needle_bringup.simulation.node_process import RECORDER_GRACE, NodeProcess, stop
 from needle_bringup.simulation.rig_configuration import write_parameters
 from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_MISSED
 from needle_core.errors import UserError
@@ -16,17 +19,153 @@ from needle_core.settings.parameter_files import Parameters
 
 LOGS, PARAMETERS = "logs", "parameters.yaml"
 OPERATOR = "simulated_operator"
-# rclpy's own log files would double those in LOGS.
+# rclpy's log files would duplicate those in LOGS.
 _ROS_ARGUMENTS = ("--ros-args", "--disable-external-lib-logs")
+INTERRUPT_GRACE = 5.0
+TERMINATE_GRACE = 3.0
+# A slow disk delays the end of the recorder.
+RECORDER_GRACE = 30.0
+POLL = 0.01
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None, use_errno=True)
+
+
+class NodeProcess:
+    """A process in its own session; it ends with its parent, even if that is killed.
+
+    Parameters
+    ----------
+    name : str
+        The node's name.
+    command : sequence of str
+        The command line.
+    environment : mapping
+        Its whole environment.
+    log : Path
+        File for its output.
+    pass_fds : sequence of int
+        Open files that it inherits.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        *,
+        environment: Mapping[str, str],
+        log: Path,
+        pass_fds: Sequence[int] = (),
+    ) -> None:
+        self.name = name
+        self.log = log
+        parent = os.getpid()
+
+        def end_with_parent() -> None:
+            _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+            if os.getppid() != parent:
+                os._exit(1)
+
+        with log.open("ab") as output:
+            self._process = subprocess.Popen(
+                list(command),
+                env=dict(environment),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                pass_fds=pass_fds,
+                start_new_session=True,
+                preexec_fn=end_with_parent,  # noqa: PLW1509
+            )
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    @property
+    def exit_code(self) -> int | None:
+        """Exit code, negative for a signal; None while it runs."""
+        return self._process.poll()
+
+    @property
+    def last_line(self) -> str:
+        """Last line of its output that is not empty."""
+        lines = [line.strip() for line in self.tail(20) if line.strip()]
+        return lines[-1] if lines else ""
+
+    def tail(self, count: int) -> list[str]:
+        """Return the last `count` lines of its output."""
+        try:
+            lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        except OSError:
+            return []
+        return lines[-count:]
+
+    def describe_end(self) -> str:
+        """Return how it ended, as text."""
+        code = self.exit_code
+        if code is None:
+            return f"{self.name} runs"
+        how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        text = self.last_line.removeprefix("error: ")
+        return f"{self.name} ended with {how}" + (f": {text}" if text else "")
+
+    def signal_group(self, number: signal.Signals) -> None:
+        """Send a signal to the process and its descendants."""
+        try:
+            os.killpg(self._process.pid, number)
+        except ProcessLookupError:
+            return
+
+
+def wait_for(processes: Iterable[NodeProcess], timeout: float) -> list[NodeProcess]:
+    """Wait up to `timeout` [s] until all have ended; return those that have not."""
+    deadline = time.monotonic() + timeout
+    running = list(processes)
+    while True:
+        running = [process for process in running if process.exit_code is None]
+        if not running or time.monotonic() >= deadline:
+            return running
+        time.sleep(POLL)
+
+
+def stop(processes: Iterable[NodeProcess], grace: float = INTERRUPT_GRACE) -> list[str]:
+    """End processes by SIGINT, then SIGTERM, then SIGKILL.
+
+    Parameters
+    ----------
+    processes : iterable of NodeProcess
+        The processes; they may have ended already.
+    grace : float
+        Time for an orderly end [s].
+
+    Returns
+    -------
+    list of str
+        A warning for each process that had to be killed.
+    """
+    started = list(processes)
+    running = [process for process in started if process.exit_code is None]
+    for process in running:
+        process.signal_group(signal.SIGINT)
+    running = wait_for(running, grace)
+    for process in running:
+        process.signal_group(signal.SIGTERM)
+    stubborn = wait_for(running, TERMINATE_GRACE)
+    for process in started:
+        # A process that has ended may have left others in its group.
+        process.signal_group(signal.SIGKILL)
+    wait_for(stubborn, TERMINATE_GRACE)
+    return [f"{process.name} did not end on SIGINT and SIGTERM, killed" for process in stubborn]
 
 
 class NodeFailedError(UserError):
-    """A node that ended before its time.
+    """A node ended too early.
 
     Parameters
     ----------
     node : NodeProcess
-        Which one.
+        The node.
     """
 
     def __init__(self, node: NodeProcess) -> None:
@@ -41,16 +180,16 @@ class NodeGraph:
     Parameters
     ----------
     folder : Path
-        Takes their parameters and logs.
+        Folder for their parameters and logs.
     parameters : Parameters
-        Node to its parameters: of all that will be started.
+        Node to its parameters, of all nodes to be started.
     variables : str
-        Of the nodes' environment, beside this process's own.
+        Environment variables of the nodes, in addition to those of this process.
 
     Attributes
     ----------
     nodes : dict of str to NodeProcess
-        Those that were started.
+        Started nodes.
     """
 
     def __init__(self, folder: Path, parameters: Parameters, **variables: str) -> None:
@@ -59,7 +198,7 @@ class NodeGraph:
         self._environment = {
             **os.environ,
             "PYTHONUNBUFFERED": "1",
-            # Small matrices: threads only get in each other's way, and in that of other nodes.
+            # One thread per node: the matrices are small.
             "OPENBLAS_NUM_THREADS": "1",
             "OMP_NUM_THREADS": "1",
             **variables,
@@ -80,7 +219,7 @@ class NodeGraph:
         return node
 
     def check(self) -> None:
-        """Look whether all run that should: all but the operator.
+        """Check that all nodes except the operator are running.
 
         Raises
         ------
@@ -92,9 +231,9 @@ class NodeGraph:
                 raise NodeFailedError(node)
 
     def stop(self) -> None:
-        """End the operator, then the others, then the recorder that still records their ends.
+        """End the operator, the driver, the other nodes, and the recorder last.
 
-        The driver switches the drives off before they, too, are gone.
+        The driver switches the drives off before the emulated drives end.
         """
         rest = dict(self.nodes)
         recorder = rest.pop("recorder", None)
@@ -105,8 +244,8 @@ class NodeGraph:
         if recorder is not None:
             warnings += stop([recorder], RECORDER_GRACE)
             if recorder.exit_code == EXIT_MISSED:
-                said = [line for line in recorder.tail(3) if line.startswith("error: ")]
-                warnings += [line.removeprefix("error: ") for line in said] or [
+                errors = [line for line in recorder.tail(3) if line.startswith("error: ")]
+                warnings += [line.removeprefix("error: ") for line in errors] or [
                     recorder.describe_end()
                 ]
         for warning in warnings:

@@ -1,4 +1,4 @@
-"""The rig's parameters, and what one run changes in them."""
+"""Parameters of the rig's nodes for one run, and checks of their consistency."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import json
 import math
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
-from needle_bringup.simulation.needle_options import needle_parameters
 from needle_bringup.simulation.simulate_options import SimulateOptions, command_of
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import Parameters
 
-# Node -> its package, in the order in which they start.
+# Node -> its package, in the order of starting.
 PACKAGES = {
     "recorder": "needle_bags",
     "sim_rig": "needle_sim",
@@ -28,7 +28,7 @@ PACKAGES = {
     "simulated_operator": "needle_bringup",
 }
 NODES = tuple(PACKAGES)
-# Nodes that not every level runs -> the levels that do.
+# Nodes of some levels only -> these levels.
 _LEVELS = {
     "drive_emulator": ("drive",),
     "device_driver": ("drive",),
@@ -36,11 +36,11 @@ _LEVELS = {
 }
 
 CONTINUOUS_CAMERA_RATE = 30.0
-"""Frames of a needle that goes on [1/s]."""
-# A sensor without noise still has this bound for the controllers' design [m].
+"""Camera rate of a continuous insertion [Hz]."""
+# Minimum noise bound for the design of the controllers [m].
 SMALLEST_NOISE = 1e-5
 
-# Parameter that simulate sets -> the option that it comes from.
+# Parameter that simulate sets -> its option.
 _ALIKE = ("level", "seed", "bag", "estimator", "law", "planner", "insertion", "obstacles")
 OPTIONS = {
     **{name: f"--{name}" for name in _ALIKE},
@@ -57,15 +57,61 @@ OPTIONS = {
     "target_point": "--target",
 }
 
-# Seven processes share the cores: drives and driver wait for each other longer than by default [s].
+# Watchdog of driver and drives if seven processes share the cores [s].
 GRAPH_WATCHDOG = 0.5
 
-# Parameters of the recorder that leave something out of the bag.
+# Parameters of the recorder that make the bag incomplete.
 _CHOICES = ("topics", "regex", "exclude_regex", "snapshot_seconds")
 
 
+CURVATURE, DIAMETER, PRE_BEND, LEAN = 1.0 / 0.122, 0.7e-3, math.radians(10.0), math.radians(5.6)
+"""The needle of [KC09], every node's default: curvature [1/m], diameter [m], bend, lean [rad]."""
+_SEARCHED = 1.1
+"""Maximum curvature of the tracker's search, as a multiple of the needle's."""
+_LEAN_MARGIN = math.radians(6.4)
+"""Tolerance of the tracker for the lean of the visible end."""
+_RELATIVE = 1e-3
+_GATES = {("sim_rig", "curvature"): ("stereo_tracker", "max_curvature", 9.0)}
+
+
+class Shared(NamedTuple):
+    """A value that several nodes must share.
+
+    Attributes
+    ----------
+    what, option : str
+        Its name, and the option of simulate that sets it in all nodes.
+    default : float or str
+        Default of every node.
+    unit : str
+        Unit.
+    places : dict of str to str
+        Node to its parameter.
+    """
+
+    what: str
+    option: str
+    default: float | str
+    unit: str
+    places: dict[str, str]
+
+
+_CURVATURES = {"sim_rig": "curvature", "plane_controller": "curvature"}
+_WIDTHS = {
+    "sim_rig": "needle_diameter",
+    "stereo_tracker": "needle_width",
+    "plane_controller": "needle_diameter",
+}
+_FILES = {"sim_rig": "calibration_file", "stereo_tracker": "calibration_file"}
+SHARED = (
+    Shared("curvature", "--curvature", CURVATURE, "1/m", _CURVATURES),
+    Shared("diameter", "--diameter-mm", DIAMETER, "m", _WIDTHS),
+    Shared("calibration", "--params", "", "", _FILES),
+)
+
+
 def merge(*layers: Parameters) -> Parameters:
-    """Return the layers as one; later ones win, parameter by parameter."""
+    """Return the merged layers; a parameter of a later layer replaces that of an earlier one."""
     merged: Parameters = {}
     for layer in layers:
         for node, values in layer.items():
@@ -81,7 +127,7 @@ def nodes_of(options: SimulateOptions) -> tuple[str, ...]:
 def command_line_parameters(
     options: SimulateOptions, bag: Path, command: str | None = None
 ) -> Parameters:
-    """Return what the command line sets in the nodes that the run needs.
+    """Return the parameters that the command line sets, of the nodes of the run.
 
     Parameters
     ----------
@@ -90,7 +136,7 @@ def command_line_parameters(
     bag : Path
         The bag's folder.
     command : str, optional
-        What repeats the run; `simulate` with these options by default.
+        Command that repeats the run; `simulate` with these options by default.
     """
     sim_rig: dict[str, Any] = {
         "level": options.level,
@@ -135,7 +181,7 @@ def command_line_parameters(
     if options.obstacles is not None:
         parameters["plane_controller"]["obstacles"] = _obstacles(options.obstacles)
     if options.noise_mm is not None:
-        # The sensor's own data sheet: the controllers know how far off a tip can be.
+        # The controllers know the noise bound of the sensor.
         bound = max(options.noise_mm * 1e-3, SMALLEST_NOISE)
         parameters["plane_controller"]["tip_covariance"] = "configured"
         parameters["plane_controller"]["tip_noise"] = "bounded"
@@ -151,25 +197,25 @@ def command_line_parameters(
 
 
 def _obstacles(path: Path) -> list[float]:
-    """Return a file's obstacles as plane_controller's parameter has them."""
-    # It brings compiled code along: half a second that only runs with obstacles pay for.
-    from needle_controller.planning.obstacle_files import read_obstacles  # noqa: PLC0415
+    """Return the obstacles of a file as plane_controller's parameter."""
+    # Importing compiled code takes half a second.
+    from needle_controller.planning.obstacles import read_obstacles  # noqa: PLC0415
 
     return [float(value) for value in read_obstacles(path).table.ravel()]
 
 
 def can_adapter() -> Path:
-    """Return where this process' emulated CAN adapter is plugged in; gone when it has ended."""
+    """Return the path of this process' emulated CAN adapter."""
     return Path(tempfile.gettempdir()) / f"needle_can_{os.getpid()}"
 
 
 def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> None:
-    """Refuse a parameter file that contradicts the command line.
+    """Reject a parameter file that conflicts with the command line.
 
     Raises
     ------
     UserError
-        If the file sets what an option sets, or what the recorder leaves out.
+        If the file sets the parameter of an option, or makes the recording incomplete.
     """
     reserved = command_line_parameters(options, Path())
     for node, values in given.items():
@@ -185,14 +231,87 @@ def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> 
 
 
 def run_info(options: SimulateOptions) -> dict[str, Any]:
-    """Return what the bag says about how it was made."""
-    told = dataclasses.asdict(options)
+    """Return the description of the run in the bag."""
+    info = dataclasses.asdict(options)
     for name in ("bag", "params", "json"):
-        del told[name]
-    return {**told, "obstacles": None if options.obstacles is None else options.obstacles.name}
+        del info[name]
+    return {**info, "obstacles": None if options.obstacles is None else options.obstacles.name}
 
 
 def write_parameters(path: Path, parameters: Parameters) -> None:
     """Write a ROS parameter file."""
     document = {node: {"ros__parameters": values} for node, values in parameters.items()}
     path.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+
+
+def needle_parameters(
+    curvature: float | None, diameter: float | None, pre_bend: float | None
+) -> Parameters:
+    """Return the parameters of all nodes for a needle; None keeps the defaults.
+
+    Parameters
+    ----------
+    curvature : float or None
+        Curvature of its path [1/m].
+    diameter : float or None
+        Diameter [m].
+    pre_bend : float or None
+        Angle between shaft and pre-bent end [rad]; the lean is the same share of it as in [KC09].
+    """
+    sim_rig: dict[str, Any] = {}
+    tracker: dict[str, Any] = {}
+    controller: dict[str, Any] = {}
+    if curvature is not None:
+        sim_rig["curvature"] = controller["curvature"] = curvature
+        tracker["max_curvature"] = _SEARCHED * curvature
+    if diameter is not None:
+        sim_rig["needle_diameter"] = controller["needle_diameter"] = diameter
+        tracker["needle_width"] = diameter
+    if pre_bend is not None:
+        lean = pre_bend * LEAN / PRE_BEND
+        sim_rig["pre_bend"], sim_rig["pre_bend_lean"] = pre_bend, lean
+        tracker["tip_lean"] = lean + _LEAN_MARGIN
+    return {"sim_rig": sim_rig, "stereo_tracker": tracker, "plane_controller": controller}
+
+
+def contradictions(parameters: Parameters, nodes: Sequence[str]) -> list[str]:
+    """Return a line for each difference between the needle parameters of the nodes.
+
+    Parameters
+    ----------
+    parameters : dict
+        Parameters of all nodes; missing ones have the default.
+    nodes : sequence of str
+        Names of the running nodes.
+    """
+    found = []
+    for shared in SHARED:
+        values = {
+            (node, name): parameters.get(node, {}).get(name, shared.default)
+            for node, name in shared.places.items()
+            if node in nodes
+        }
+        first = next(iter(values.values()), None)
+        if all(_alike(value, first) for value in values.values()):
+            continue
+        listed = ", ".join(
+            f"{node} has {name} {_shown(value, shared.unit)}"
+            for (node, name), value in values.items()
+        )
+        found.append(f"{shared.what} differs: {listed} ({shared.option} sets it in all nodes)")
+    for (node, name), (other, gate, default) in _GATES.items():
+        limit = parameters.get(other, {}).get(gate, default)
+        value = parameters.get(node, {}).get(name, CURVATURE)
+        if other in nodes and isinstance(value, float) and value > limit:
+            found.append(f"{node} has {name} {value:g}, but {other} looks for {gate} {limit:g}")
+    return found
+
+
+def _alike(one: Any, other: Any) -> bool:
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=_RELATIVE)
+    return bool(one == other)
+
+
+def _shown(value: Any, unit: str) -> str:
+    return f"{value:.4g} {unit}" if isinstance(value, float) else repr(value)

@@ -1,4 +1,4 @@
-"""Supervises one simulated run: starts the nodes, waits, ends them, reports. No ROS in here."""
+"""`simulate`: runs the simulated rig, records it and writes the report."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ from pathlib import Path
 from types import ModuleType
 
 from needle_bringup.simulated_operator.progress import PROGRESS_FD
-from needle_bringup.simulation.needle_options import contradictions
 from needle_bringup.simulation.node_graph import (
     OPERATOR,
     PARAMETERS,
     NodeFailedError,
     NodeGraph,
+    wait_for,
 )
-from needle_bringup.simulation.node_process import wait_for
-from needle_bringup.simulation.own_component import own_component
 from needle_bringup.simulation.rig_configuration import (
     PACKAGES,
     command_line_parameters,
+    contradictions,
     merge,
     nodes_of,
     refuse_reserved,
@@ -52,9 +51,9 @@ METADATA = "metadata.yaml"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 POLL = 0.05
-# When the nodes have started, one core has time for this process [s].
-QUIET_AFTER = 4.0
-# Set by scripts/simulate: when the command was given, in seconds since the epoch.
+# Start-up time of the nodes; afterwards this process may use a core [s].
+START_UP = 4.0
+# Environment variable of scripts/simulate: start of the command, seconds since the epoch.
 STARTED_AT = "NEEDLE_STARTED_AT"
 
 
@@ -72,7 +71,7 @@ def simulate(options: SimulateOptions) -> int:
     Parameters
     ----------
     options : SimulateOptions
-        What to run.
+        Options of the command line.
 
     Returns
     -------
@@ -82,9 +81,9 @@ def simulate(options: SimulateOptions) -> int:
     Raises
     ------
     UserError
-        Where something is broken or missing.
+        If something is broken or missing.
     KeyboardInterrupt
-        After an interrupt, when everything has ended.
+        After an interrupt and the end of all parts.
     """
     if options.graph:
         settle_environment(own_graph=True)
@@ -93,7 +92,7 @@ def simulate(options: SimulateOptions) -> int:
     if options.params is not None:
         given = read_parameters(options.params, nodes_of(options))
         refuse_reserved(options.params, given, options)
-    # A signal is looked at between steps from here on; in the report it raises wherever it comes.
+    # From here on a signal is checked between steps; during the report it raises immediately.
     end = EndRequest()
     bag = _make_folder(options)
     try:
@@ -110,7 +109,7 @@ def simulate(options: SimulateOptions) -> int:
         _check(end)
         return _report(options, bag, started_at)
     except NodeFailedError as error:
-        # Bad input leaves nothing behind; what broke leaves its logs.
+        # Keep the logs of a node that broke.
         if error.is_bad_input:
             shutil.rmtree(bag, ignore_errors=True)
         raise
@@ -129,11 +128,11 @@ def _run_components(
     options: SimulateOptions, parameters: Parameters, bag: Path, end: EndRequest
 ) -> None:
     """Run the rig in this process until the operator ends."""
-    # The controller's compiled code takes a while to load: not where other processes do that.
+    # Loading compiled code takes a while; with --graph the nodes do it.
     from needle_bringup.simulation import virtual_run  # noqa: PLC0415
 
     components = virtual_run.make_components(parameters)
-    components += [own_component(name) for name in options.component]
+    components += [virtual_run.own_component(name) for name in options.component]
     print(f"recording into {shown(bag)}", file=sys.stderr)
     virtual_run.run_virtually(
         components,
@@ -151,7 +150,7 @@ def _run_graph(
     """Run the rig as ROS nodes until the operator ends."""
     with own_domain() as domain:
         print(f"recording into {shown(bag)} (ROS_DOMAIN_ID {domain})", file=sys.stderr)
-        # Nodes write into their log files; only the operator's progress goes to the terminal.
+        # The nodes write log files; only the progress of the operator goes to the terminal.
         progress = os.dup(sys.stderr.fileno())
         variables = {"ROS_DOMAIN_ID": str(domain), PROGRESS_FD: str(progress)}
         graph = NodeGraph(bag, parameters, **variables)
@@ -170,7 +169,7 @@ def _await_operator(graph: NodeGraph, end: EndRequest) -> None:
     while operator.exit_code is None:
         _check(end)
         graph.check()
-        if time.monotonic() - begin > QUIET_AFTER:
+        if time.monotonic() - begin > START_UP:
             _import_report()
         wait_for([operator], POLL)
     graph.check()
@@ -179,7 +178,7 @@ def _await_operator(graph: NodeGraph, end: EndRequest) -> None:
 
 
 def _report(options: SimulateOptions, bag: Path, started_at: float) -> int:
-    """Make summary and report from the bag; the exit code."""
+    """Write summary and report of the bag; return the exit code."""
     report, bag_reader, run_summary = _import_report()
     run = bag_reader.read_run(bag)
     summary = run_summary.summarize(run)
@@ -193,22 +192,22 @@ def _report(options: SimulateOptions, bag: Path, started_at: float) -> int:
 
 
 def shown(path: Path) -> Path:
-    """Return a path as short as it can be typed: relative where it is below the current folder."""
+    """Return a path, relative if it is below the current folder."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def _import_report() -> tuple[ModuleType, ...]:
-    """Import what makes the report: a second of work, best done while there is time to spare."""
+    """Import the report's modules, which takes a second."""
     names = (
-        "needle_analysis.report.report",
+        "needle_bags.report.report",
         "needle_bags.reading.bag_reader",
-        "needle_analysis.run.run_summary",
+        "needle_bags.run.run_summary",
     )
     return tuple(loaded(name) for name in names)
 
 
 def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
-    """Return the result as a person reads it.
+    """Return the result as text.
 
     Parameters
     ----------
@@ -269,14 +268,14 @@ def _make_folder(options: SimulateOptions) -> Path:
 
 
 def _checkout() -> Path:
-    """Return the checkout's folder; the current one where the package runs without it."""
+    """Return the checkout, or the current folder of an installed package."""
     with contextlib.suppress(UserError):
         return checkout()
     return Path.cwd()
 
 
 def _end_with_parent() -> None:
-    """Take SIGTERM when scripts/simulate is killed outright."""
+    """Receive SIGTERM when scripts/simulate is killed."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)
     if os.getppid() == 1:

@@ -1,4 +1,4 @@
-"""The command line of `simulate`: what it understands, and what it refuses in one line."""
+"""Command line of `simulate`."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ something missing, 130 interrupted.
 
 LEVELS = ("tip", "camera", "drive")
 CONTROLLERS = ("best", "paper", "open_loop")
-"""plane_controller's presets; named here again, for to import them takes half a second."""
+"""Presets of plane_controller, repeated here because their import takes half a second."""
 INSERTIONS = ("stepwise", "continuous")
-"""How plane_controller lets the needle go in, likewise."""
+"""Insertion modes of plane_controller, likewise."""
 
 
 DEPTH_MM, LARGEST_DEPTH_MM = "120", 150.0
-# Options that a repeated run has anew, and such as are written otherwise than they are named.
-_SAID_APART = (
+# Options that command_of() omits, or writes in a special form.
+_SPECIAL = (
     *("bag", "json", "level", "controller", "seed", "target_mm", "graph", "component"),
     *("initial_x_mm", "initial_pitch_deg", "initial_roll_deg"),
 )
@@ -79,7 +79,7 @@ _SAID_APART = (
 
 @dataclasses.dataclass(frozen=True)
 class SimulateOptions:
-    """Options of one run of `simulate`; mm and degrees, as the user writes them."""
+    """Options of `simulate`, in mm and degrees as on the command line."""
 
     level: str = "camera"
     controller: str = "best"
@@ -114,7 +114,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
     Raises
     ------
     UserError
-        Anything that cannot be run as asked.
+        If an option is invalid.
     """
     given = _parser().parse_args(join_start(arguments))
     _one_of("--level", given.level, LEVELS)
@@ -167,14 +167,14 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
 
 
 def command_of(options: SimulateOptions) -> str:
-    """Return the command that runs the same again, into a bag of its own.
+    """Return the command that repeats a run with a new bag.
 
-    Level, controller and seed always stand in it; of the rest, what is not the default.
+    It contains level, controller, seed and all options that differ from the default.
 
     Parameters
     ----------
     options : SimulateOptions
-        What was run.
+        Options of the run.
     """
     plain = SimulateOptions(
         noise_mm=1.0 if options.level == "tip" else None,
@@ -189,7 +189,7 @@ def command_of(options: SimulateOptions) -> str:
         words.append(f"--target={_joined(options.target_mm)}")
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
-        if field.name not in _SAID_APART and value != getattr(plain, field.name):
+        if field.name not in _SPECIAL and value != getattr(plain, field.name):
             words.append(f"--{field.name.replace('_', '-')}={value}")
     if options.graph:
         words.append("--graph")
@@ -347,7 +347,7 @@ def _new_bag(text: str | None) -> Path | None:
     if text is None:
         return None
     path = Path(text).expanduser()
-    # lexists: a dangling link is in the way as well
+    # A dangling link is in the way as well.
     if path.exists() or path.is_symlink():
         raise UserError(f"--bag {text}: exists already; give a new folder")
     return path.absolute()
@@ -358,19 +358,19 @@ def _readable(name: str, text: str | None) -> Path | None:
 
 
 def existing_file(given_by: str, text: str) -> Path:
-    """Return a file that is there.
+    """Return an existing file.
 
     Parameters
     ----------
     given_by : str
-        What stands before it where it is given: `--params `, `params:=`.
+        Prefix for the error message: `--params `, `params:=`.
     text : str
-        As given.
+        Path of the file.
 
     Raises
     ------
     UserError
-        If it is a folder, or is not there.
+        If it is a folder or does not exist.
     """
     path = Path(text).expanduser()
     if not path.is_file():
@@ -380,7 +380,7 @@ def existing_file(given_by: str, text: str) -> Path:
 
 
 def add_own_part_options(add: Callable[..., Any], points: str) -> None:
-    """Add `--estimator`, `--law` and `--planner`; `points` is the option that planners go with."""
+    """Add `--estimator`, `--law` and `--planner`; `points` is the option that planners require."""
     for option, what in (
         ("--estimator", "an estimator"),
         ("--law", "a control law"),

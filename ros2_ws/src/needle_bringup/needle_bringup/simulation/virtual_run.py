@@ -1,7 +1,8 @@
-"""The whole rig as components in this process, on a virtual clock: the run of `simulate`."""
+"""The rig as components in this process, on a virtual clock: the run of `simulate`."""
 
 from __future__ import annotations
 
+import importlib
 import math
 import random
 import sys
@@ -11,8 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from needle_bags.recording.bag_tap import BagTap
-from needle_bringup.simulated_operator.component import SimulatedOperator
-from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
+from needle_bringup.simulated_operator.component import (
+    SimulatedOperator,
+    SimulatedOperatorParameters,
+)
 from needle_bringup.simulated_operator.progress import Progress
 from needle_controller.plane_controller import STATUS, PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -35,23 +38,23 @@ if TYPE_CHECKING:
     from needle_tracker.stereo_tracker import StereoTipTracker
 
 _FOLLOWING, _SEARCH = (0.03, 0.05), (0.3, 0.9)
-"""Time that the tracker takes for a pair, with and without a tip, on two shared cores [s]."""
+"""Compute time of the tracker for a pair with and without a tip, on two shared cores [s]."""
 _SLICE = 1.0
-_WIND_UP = 5.0
-"""What the rest of the rig may take to end after the operator [s]."""
-# The virtual bus stands in for them.
+_END_TIMEOUT = 5.0
+"""Time for the rig to end after the operator [s]."""
+# Parameters of the CAN adapter, which the virtual bus replaces.
 _OF_ADAPTER = ("pty",)
 
 
 def make_components(parameters: Parameters) -> list[Component]:
-    """Return the rig of a level and who operates it; errors as of `make_rig`."""
+    """Return the rig of a level with its simulated operator; errors as of `make_rig`."""
     operator = settings_of(SimulatedOperatorParameters, parameters, "simulated_operator")
     return [*make_rig(parameters), SimulatedOperator(operator)]
 
 
 def make_tracker(parameters: Parameters) -> StereoTipTracker:
     """Return the tracker."""
-    # It brings OpenCV along: not where there are no images.
+    # Imports OpenCV, which a run without images does not need.
     from needle_tracker import stereo_tracker  # noqa: PLC0415
     from needle_tracker.answers.tracker_parameters import StereoTrackerParameters  # noqa: PLC0415
 
@@ -71,12 +74,12 @@ def make_rig(
     parameters : Parameters
         Node to its parameters.
     see, track : callable
-        Make what sees the needle, and the tracker where there are images.
+        Make the sensor, and the tracker if there are images.
 
     Raises
     ------
     UserError
-        A parameter that a component does not have, or that is out of its bounds.
+        If a parameter is unknown or out of bounds.
     """
     rig = SimRig(settings_of(SimRigParameters, parameters, "sim_rig"), see=see)
     level = rig.settings.level
@@ -89,7 +92,7 @@ def make_rig(
 
 
 def _make_drives(parameters: Parameters) -> list[Component]:
-    # Not where nothing is driven: both bring code along.
+    # Imported only for level drive.
     from needle_device_driver.device_driver import DeviceDriver  # noqa: PLC0415
     from needle_device_driver.parameters import DeviceDriverParameters  # noqa: PLC0415
     from needle_sim.drive_emulator import DriveEmulator  # noqa: PLC0415
@@ -107,8 +110,32 @@ def _make_drives(parameters: Parameters) -> list[Component]:
     ]
 
 
+def own_component(given: str) -> Component:
+    """Return a component of the class `MODULE:NAME`, which takes no arguments.
+
+    Modules in the current folder are found as well.
+
+    Raises
+    ------
+    UserError
+        If there is no such class, or it is no component.
+    """
+    module_name, _, name = given.partition(":")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        make = getattr(importlib.import_module(module_name), name)
+        component = make()
+    except (ImportError, AttributeError, TypeError) as error:
+        raise UserError(f"--component {given}: {error}") from error
+    finally:
+        sys.path.pop(0)
+    if not isinstance(component, Component):
+        raise UserError(f"--component {given}: makes a {type(component).__name__}, no Component")
+    return component
+
+
 def _tracker_time(actions: Sequence[Action], rng: random.Random) -> float:
-    """Return the compute time of a handler of the tracker [s]: measuring a pair takes longest."""
+    """Return the compute time of a handler of the tracker [s]; an image pair takes longest."""
     seconds = rng.uniform(1e-4, 3e-4)
     for action in actions:
         if isinstance(action, Publish) and action.topic == "needle/tip_pose":
@@ -142,13 +169,13 @@ def run_virtually(
     bag : Path
         Folder of the bag.
     seed : int
-        Keys latencies and compute times.
+        Seed of latencies and compute times.
     run_info : mapping
-        What the bag says about how it was made.
+        Description of the run in the bag.
     real_time_factor : float
         Virtual over real time; 0: as fast as possible.
     check : callable
-        Raises KeyboardInterrupt where the run shall end.
+        Raises KeyboardInterrupt to end the run.
 
     Raises
     ------
@@ -163,10 +190,10 @@ def run_virtually(
     try:
         while not runner.run(_SLICE):
             check()
-        _judge(runner.exits, operator)
+        _check_exits(runner.exits, operator)
     except KeyboardInterrupt:
         runner.stop(operator)
-        runner.run(_WIND_UP)
+        runner.run(_END_TIMEOUT)
         raise
     finally:
         ended = runner.exits.get(operator)
@@ -177,7 +204,7 @@ def run_virtually(
                 component.close()
 
 
-def _judge(exits: Mapping[str, Exit], operator: str) -> None:
+def _check_exits(exits: Mapping[str, Exit], operator: str) -> None:
     for name, ended in exits.items():
         if name != operator or ended.code not in (EXIT_DONE, EXIT_MISSED):
             raise UserError(f"{name} ended with exit code {ended.code}: {ended.text}")
@@ -189,7 +216,7 @@ def settings_of(kind: type[Any], parameters: Parameters, node: str) -> Any:
 
 
 class _ProgressTap:
-    """Shows how far the needle is in, from what the controller says."""
+    """Shows the progress of the insertion, from the controller's status."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
@@ -199,7 +226,7 @@ class _ProgressTap:
             if message.state in ("STEERING", "WAITING_FOR_TIP", "DONE") and message.depth_m:
                 self._progress.show(message.insertion_m, message.depth_m)
             waits = message.state == "WAITING_FOR_TIP"
-            self._progress.tell_wait(message.reason if waits else "")
+            self._progress.show_wait(message.reason if waits else "")
 
     def close(self, line: str) -> None:
         self._progress.close(line)

@@ -1,4 +1,4 @@
-"""Cameras and tracker of a simulated rig in a process of their own, behind a port."""
+"""Cameras and tracker of a simulated rig in a second process, behind a port."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from needle_sim.camera_sensor import CAMERAS, Exposure, StereoCameras
 from needle_sim.sim_rig_parameters import SimRigParameters
 from needle_tracker.stereo_tracker import CALIBRATION, TIP, TIP_POSE
 
-EYES = "eyes"
-"""Name of the port between the tracker's stand-in and the process that works."""
-_MOST_EXPOSURES = 2
+VISION = "vision"
+"""Name of the port between `RemoteTracker` and its process."""
+_MAX_EXPOSURES = 2
 _CHECK_PERIOD = 0.05
 
 Item = Exposure | m.JointState | None
-"""What is handed on; None: time alone."""
+"""Input of the process; None: a timer tick."""
 Done = Future[list[Action]]
 
 
-class Eyes:
-    """Cameras and tracker, in the process that works: what comes in, and what comes of it.
+class VisionWorker:
+    """Cameras and tracker inside the second process.
 
     Parameters
     ----------
@@ -52,8 +52,8 @@ class Eyes:
         Node to its parameters.
     """
 
-    here: ClassVar[Eyes]
-    """Those of this process."""
+    instance: ClassVar[VisionWorker]
+    """Instance of the process."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._cameras = StereoCameras(settings_of(SimRigParameters, parameters, "sim_rig"))
@@ -62,16 +62,16 @@ class Eyes:
 
     @staticmethod
     def open(parameters: Parameters) -> None:
-        """Make those of this process."""
-        Eyes.here = Eyes(parameters)
+        """Create the instance of this process."""
+        VisionWorker.instance = VisionWorker(parameters)
 
     @staticmethod
     def work(item: Item, at: Moment) -> list[Action]:
-        """Return what comes of an exposure, of joints, or of time alone."""
-        return list(Eyes.here.handle(item, at))
+        """Return the actions of cameras and tracker for an input."""
+        return list(VisionWorker.instance.handle(item, at))
 
     def handle(self, item: Item, at: Moment) -> Iterable[Action]:
-        """Return what comes of an exposure, of joints, or of time alone."""
+        """Return the actions of cameras and tracker for an input."""
         match item:
             case Exposure():
                 for image in self._cameras.render(item):
@@ -83,8 +83,8 @@ class Eyes:
                 yield from self._tracker.check(at)
 
 
-class EyesProcess:
-    """The process of `Eyes`: the real port `eyes`.
+class VisionProcess:
+    """Process of a `VisionWorker`: the real port `vision`.
 
     Parameters
     ----------
@@ -93,60 +93,63 @@ class EyesProcess:
     """
 
     def __init__(self, parameters: Parameters) -> None:
-        self._pool = start_worker(Eyes.open, parameters)
+        self._pool = start_worker(VisionWorker.open, parameters)
 
     def open(self, arrive: Callable[[tuple[Done] | PortChange], None]) -> None:
-        """Begin to hand over what is done."""
+        """Start to pass on results."""
         self._arrive = arrive
 
     def send(self, batch: Sequence[tuple[Item, Moment]]) -> None:
-        """Take work to do."""
+        """Submit inputs."""
         try:
             for item, at in batch:
-                done = self._pool.submit(Eyes.work, item, at)
+                done = self._pool.submit(VisionWorker.work, item, at)
                 done.add_done_callback(lambda done: self._arrive((done,)))
         except BrokenProcessPool:
             self._arrive(PortChange("the process that renders and tracks has ended"))
 
     def close(self) -> None:
-        """End it, when what it does is done."""
+        """End the process after its current input."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
-class DistantTracker(Component):
-    """Stands for the tracker where that works in a process of its own, and for its images.
+class RemoteTracker(Component):
+    """Proxy of cameras and tracker in the second process.
 
-    It hands on exposures, joint states and time, and sends what comes back. Exposures that come
-    faster than they are worked off are lost, as a camera loses frames.
+    It passes on exposures, joint states and timer ticks, and publishes the results. Exposures that
+    arrive faster than they are processed are dropped, as by a camera.
     """
 
     name = "stereo_tracker"
 
     def __init__(self) -> None:
-        # Of what is under way, in order: whether it is an exposure.
-        self._under_way: deque[bool] = deque()
-        self.inputs = (Input("joint_states", m.JointState, self._hand_on, JOINT_STATES),)
+        # For each pending input, in order: whether it is an exposure.
+        self._pending: deque[bool] = deque()
+        self.inputs = (Input("joint_states", m.JointState, self._submit, JOINT_STATES),)
         self.outputs = (
             *StereoCameras.outputs,
             Output(TIP, m.Point),
             Output(TIP_POSE, m.PoseWithCovariance),
             Output(CALIBRATION, m.Text, LATCHED),
         )
-        self.ports = (Port(CAMERAS, self._on_exposures), Port(EYES, self._on_done, self._on_change))
-        self.timers = (Timer(_CHECK_PERIOD, partial(self._hand_on, None)),)
+        self.ports = (
+            Port(CAMERAS, self._on_exposures),
+            Port(VISION, self._on_results, self._on_change),
+        )
+        self.timers = (Timer(_CHECK_PERIOD, partial(self._submit, None)),)
 
-    def _hand_on(self, item: Item, at: Moment) -> Actions:
-        self._under_way.append(isinstance(item, Exposure))
-        yield Send(EYES, ((item, at),))
+    def _submit(self, item: Item, at: Moment) -> Actions:
+        self._pending.append(isinstance(item, Exposure))
+        yield Send(VISION, ((item, at),))
 
     def _on_exposures(self, batch: Sequence[Exposure], at: Moment) -> Actions:
         for exposure in batch:
-            if sum(self._under_way) < _MOST_EXPOSURES:
-                yield from self._hand_on(exposure, at)
+            if sum(self._pending) < _MAX_EXPOSURES:
+                yield from self._submit(exposure, at)
 
-    def _on_done(self, batch: Sequence[Done], at: Moment) -> Actions:
+    def _on_results(self, batch: Sequence[Done], at: Moment) -> Actions:
         for done in batch:
-            self._under_way.popleft()
+            self._pending.popleft()
             yield from done.result()
 
     def _on_change(self, change: PortChange, at: Moment) -> Actions:

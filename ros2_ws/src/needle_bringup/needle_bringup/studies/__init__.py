@@ -1,1 +1,1 @@
-"""Studies of the controller over simulated needles."""
+"""Studies of controllers on simulated needles."""

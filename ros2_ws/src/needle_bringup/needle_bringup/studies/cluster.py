@@ -1,7 +1,7 @@
-"""Work in parts on a Dask cluster: which worker does which part, and when, makes no difference.
+"""Runs the parts of a job on a Dask cluster.
 
-A worker that dies has its parts done by another. One that runs other code, or other versions of
-numerical libraries, ends the work: its results would not be those of this machine.
+The parts of a worker that dies are repeated by another. A worker with different code, or other
+versions of numerical libraries, ends the job, because its results would differ.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Part = TypeVar("Part")
 Result = TypeVar("Result")
 
 CONNECTS_WITHIN = 30.0
-"""How long a scheduler has to answer [s]."""
+"""Time limit for the connection to the scheduler [s]."""
 _NUMERICAL = ("numpy", "scipy", "numba")
 _PACKAGES = (
-    "needle_analysis", "needle_bags", "needle_bringup", "needle_core", "needle_console",
+    "needle_bags", "needle_bringup", "needle_core", "needle_console",
     "needle_controller", "needle_device_driver", "needle_sim", "needle_tracker", "scenario",
 )  # fmt: skip
 
@@ -42,17 +42,17 @@ def on_cluster(
     Parameters
     ----------
     address : str
-        The scheduler's, such as tcp://10.0.0.5:8786. Without workers it waits for some.
+        Address of the scheduler, such as tcp://10.0.0.5:8786. The call waits for workers.
     work : callable
-        A function of a module, which workers can import.
+        A module function, which workers can import.
     parts : sequence
-        What can be pickled.
+        Arguments that can be pickled.
 
     Raises
     ------
     UserError
-        It is no address, Dask is not installed, the scheduler does not answer or is lost, a worker
-        runs something else, or a part ended several workers.
+        If the address is invalid, Dask is not installed, the scheduler does not answer or is lost,
+        a worker has different code, or a part killed several workers.
     """
     if re.fullmatch(r"(tcp|tls)://[^\s/]+:\d+", address) is None:
         raise UserError(
@@ -60,20 +60,20 @@ def on_cluster(
             "as the scheduler prints it"
         )
     try:
-        # An extra, and a second of imports that only studies on a cluster pay for.
+        # Optional dependency, and a second of imports.
         import distributed  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise UserError(
             "--scheduler: Dask is not installed; scripts/dask --version installs it"
         ) from error
-    # All that it logs comes as an exception, too.
+    # It also raises what it logs.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     run = functools.partial(_run, work, identity())
-    # Results that have come before those of parts ahead of them.
+    # Results that arrived before those of earlier parts.
     early: dict[int, Result] = {}
-    told = 0
-    while told < len(parts):
-        missing = [number for number in range(told, len(parts)) if number not in early]
+    yielded = 0
+    while yielded < len(parts):
+        missing = [number for number in range(yielded, len(parts)) if number not in early]
         try:
             client = distributed.Client(address, timeout=CONNECTS_WITHIN)
         except OSError as error:
@@ -89,24 +89,24 @@ def on_cluster(
                     early[numbers[future.key]] = future.result()
                     # The cluster may forget it.
                     future.release()
-                    while told in early:
-                        yield early.pop(told)
-                        told += 1
+                    while yielded in early:
+                        yield early.pop(yielded)
+                        yielded += 1
             except distributed.KilledWorker as error:
                 raise UserError(
                     f"--scheduler {address}: {_line(error)} (out of memory? their logs say more)"
                 ) from error
             except (OSError, distributed.CancelledError) as error:
-                # With the connection the scheduler forgets what it was asked for.
-                if told + len(early) == len(parts) - len(missing):
+                # The scheduler drops the tasks of a lost connection.
+                if yielded + len(early) == len(parts) - len(missing):
                     raise UserError(
-                        f"--scheduler {address}: lost, with {told} of {len(parts)} parts done"
+                        f"--scheduler {address}: lost, with {yielded} of {len(parts)} parts done"
                     ) from error
 
 
 @functools.lru_cache(maxsize=1)
 def identity() -> Mapping[str, str]:
-    """Return name to version, or digest, of the code that this process would run."""
+    """Return the versions of libraries, and a digest of the code, of this process."""
     code = hashlib.sha256()
     for package in _PACKAGES:
         spec = importlib.util.find_spec(package)
@@ -120,7 +120,7 @@ def identity() -> Mapping[str, str]:
 
 
 def _run(work: Callable[[Part], Result], wanted: Mapping[str, str], part: Part) -> Result:
-    """Do a part on a worker."""
+    """Run a part on a worker."""
     here = identity()
     differing = [
         f"{name} {here[name]} in place of {wanted[name]}"
@@ -136,5 +136,5 @@ def _run(work: Callable[[Part], Result], wanted: Mapping[str, str], part: Part) 
 
 
 def _line(error: BaseException) -> str:
-    """Return an exception's text as a line."""
+    """Return the text of an exception as one line."""
     return " ".join(str(error).split())

@@ -1,4 +1,4 @@
-"""A study's parts on a Dask cluster, and whether its machines reckon as this one does."""
+"""Runs the parts of a study on a Dask cluster, and checks that its machines round alike."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from needle_sim.studies.point_study import PointOutcomes
 
 @dataclasses.dataclass(frozen=True)
 class ClusterPart:
-    """A part to be done on whichever machine.
+    """A part to run on any machine.
 
     Attributes
     ----------
     part : StudyPart
-        What is asked for.
+        The part of the study.
     witness : StudyPart
-        A few needles that every machine steers, so that their last bits can be compared.
+        A few needles that every machine steers, to compare their last bits.
     """
 
     part: StudyPart
@@ -41,13 +41,13 @@ class PartDone:
     Attributes
     ----------
     outcomes : Outcomes or PointOutcomes
-        Of its needles.
+        Outcomes of its needles.
     cpu_s : float
-        What it cost [s].
+        Processor time [s].
     machine : str
-        Who did it.
+        Name of the machine.
     witness : str
-        Digest of the witness's outcomes on that machine.
+        Digest of the outcomes of the witness on that machine.
     """
 
     outcomes: Outcomes | PointOutcomes
@@ -67,22 +67,22 @@ def run_parts(
     Parameters
     ----------
     address : str
-        The scheduler's.
+        Address of the scheduler.
     parts : sequence of StudyPart
-        The study.
+        The parts of the study.
     witness : StudyPart
         A few needles, steered here as well.
     on_progress : callable
-        Told after each part how many needles it had.
+        Called after each part with its number of needles.
 
     Returns
     -------
     outcomes : list of Outcomes or PointOutcomes
         In the order of the parts.
     cpu_s : float
-        What they cost together [s].
+        Their total processor time [s].
     differing : list of str
-        Machines that round otherwise than this one does.
+        Machines that round differently from this one.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def run_parts(
 
 
 def run_part(asked: ClusterPart) -> PartDone:
-    """Do a part, on a worker."""
+    """Run a part on a worker."""
     witness = _witness_digest(pickle.dumps(asked.witness))
     begin = time.thread_time()
     outcomes = asked.part.run()
@@ -109,13 +109,13 @@ def run_part(asked: ClusterPart) -> PartDone:
 
 @functools.lru_cache(maxsize=4)
 def _witness_digest(pickled: bytes) -> str:
-    """Return the digest of a witness's outcomes; once for each process."""
+    """Return the digest of the outcomes of a witness, computed once in each process."""
     witness: StudyPart = pickle.loads(pickled)
     return digest(witness.run())
 
 
 def digest(outcomes: Outcomes | PointOutcomes) -> str:
-    """Return a digest of all bits of some outcomes."""
+    """Return a digest of all bits of the outcomes."""
     total = hashlib.sha256()
     for field in dataclasses.fields(outcomes):
         total.update(np.ascontiguousarray(getattr(outcomes, field.name)).tobytes())

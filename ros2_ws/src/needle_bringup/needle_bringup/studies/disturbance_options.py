@@ -1,4 +1,4 @@
-"""The options of `monte_carlo` that say what goes wrong: with the tips, the tissue, the needle."""
+"""Options of `monte_carlo` for disturbances of tips, tissue and needle."""
 
 from __future__ import annotations
 
@@ -83,12 +83,12 @@ def add_disturbance_options(parser: CommandParser) -> None:
 
 
 def disturbances_of(given: argparse.Namespace) -> Disturbances:
-    """Return what is asked for.
+    """Return the disturbances of the options.
 
     Raises
     ------
     UserError
-        A value out of its bounds, or noise of two kinds.
+        If a value is out of bounds, or two kinds of noise are given.
     """
     return Disturbances(
         **_noise(given),
@@ -113,7 +113,7 @@ def disturbances_of(given: argparse.Namespace) -> Disturbances:
 
 
 def _noise(given: argparse.Namespace) -> dict[str, Any]:
-    """Return what of the disturbances is the noise of the tips, of one kind."""
+    """Return the fields of the tip noise, of one kind."""
     kinds = [name for name in ("correlated", "student", "bias_walk") if getattr(given, name)]
     if len(kinds) > 1 or (kinds and given.noise_shape != "uniform"):
         names = [f"--{name.replace('_', '-')}" for name in kinds]

@@ -1,4 +1,4 @@
-"""`ros2 run needle_sim monte_carlo`: steers thousands of simulated needles and counts."""
+"""`ros2 run needle_sim monte_carlo`: steers thousands of simulated needles."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def monte_carlo(options: MonteCarloOptions) -> int:
-    """Run a study as asked, print its figures and write its files."""
+    """Run a study, print its figures and write its files."""
     parts = parts_of(options)
     witness = parts[0].of_first(2)
-    # What is compiled is compiled now, not in the time that is reported.
+    # Compile before the time measurement.
     witness.run()
     begin, worked_before = time.perf_counter(), time.process_time()
     steps = settings_of(options).steps
@@ -87,13 +87,13 @@ def monte_carlo(options: MonteCarloOptions) -> int:
     if options.json is not None:
         names = ("controller", "estimator", "law", "planner", "grid", "seed")
         asked: dict[str, JsonValue] = {name: getattr(options, name) for name in names}
-        # Of a plane there are no figures of points, and the other way round.
+        # A study has figures either of the plane or of points.
         write_json(options.json, {**dict.fromkeys(LABELS), **seen, **asked})
     return EXIT_DONE
 
 
 def describe(result: Mapping[str, JsonValue]) -> str:
-    """Return a study's figures as a person reads them."""
+    """Return the figures of a study as text."""
     lines = []
     for key, label in LABELS.items():
         if key not in result:
@@ -105,16 +105,16 @@ def describe(result: Mapping[str, JsonValue]) -> str:
 
 
 def write_csv(path: Path, columns: Mapping[str, FloatArray], of_all: Mapping[str, str]) -> None:
-    """Write one line for each run; `settle_mm` is empty where a run ends outside.
+    """Write one line for each run; `settle_mm` is empty for runs that end outside.
 
     Parameters
     ----------
     path : Path
         The file.
     columns : mapping of str to ndarray, shape (N,)
-        What differs from run to run.
+        Values of each run.
     of_all : mapping
-        What they have in common: the files of several studies make one table.
+        Values common to all runs, so that the files of several studies can be joined.
 
     Raises
     ------

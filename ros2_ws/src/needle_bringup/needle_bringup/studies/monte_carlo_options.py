@@ -1,4 +1,4 @@
-"""The command line of `monte_carlo`: what it understands, and what it refuses in one line."""
+"""Command line of `monte_carlo`."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
 """
 
 _DEPTH_MM, _DEPTH_OF_POINTS_MM = "120", "150"
-# Of the study, not of a run: each run has a start of its own.
+# Options of the study that are not options of each run.
 _OF_THE_STUDY = (
     "grid", "draws", "x_mm", "pitch_deg", "roll_deg", "initial", "targets",
     "scheduler", "json", "csv",
@@ -81,9 +81,9 @@ _OF_THE_STUDY = (
 
 @dataclasses.dataclass(frozen=True)
 class MonteCarloOptions:
-    """Options of one study; SI.
+    """Options of a study; SI.
 
-    `of_a_run` has what each run is run with beside its start and its point, as it was typed.
+    `of_a_run` has the options of each run besides its start and its point, as typed.
     """
 
     controller: str
@@ -118,7 +118,7 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
     Raises
     ------
     UserError
-        Anything that cannot be run as asked.
+        If an option is invalid.
     """
     given = _parser().parse_args(join_start(arguments))
     if given.grid not in GRIDS:
@@ -164,7 +164,7 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
 
 
 def _of_a_run(given: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the options that every run has, by name; how much a base turns is a result."""
+    """Return the options of every run; `rotation_deg` is renamed, because it is a result."""
     renamed = {"rotation_deg": "most_rotation_deg"}
     return {
         renamed.get(name, name): value or ""

@@ -1,4 +1,4 @@
-"""Many insertions without rotation, and what their tips say of the curvature ([KC09] IV-B)."""
+"""Simulated insertions without rotation, and the curvature estimated from them ([KC09] IV-B)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from needle_controller.curvature.circle_fit import circle_curvature
-from needle_controller.curvature.curvature_fit import fit_curvature
+from needle_controller.curvature.curvature_fit import circle_curvature, fit_curvature
 
 Floats = npt.NDArray[np.float64]
 
@@ -43,7 +42,7 @@ class CurvatureErrors:
 
 
 def curvature_errors(count: int, rng: np.random.Generator) -> CurvatureErrors:
-    """Return how far off the curvature is that each of some insertions gives."""
+    """Return the errors of the curvature over a number of insertions."""
     tips, insertion = pure_insertions(count, rng)
     radius = fit_curvature(tips, insertion).radius / RADIUS - 1.0
     circle = circle_curvature(tips) * RADIUS - 1.0
@@ -53,15 +52,15 @@ def curvature_errors(count: int, rng: np.random.Generator) -> CurvatureErrors:
 
 
 def pure_insertions(count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return measured tips of insertions without rotation, and how far in each was.
+    """Return measured tips of insertions without rotation, and the insertion depths.
 
     Returns
     -------
     tips : ndarray, shape (count, 61, 3)
-        On circles of radius `RADIUS` at any roll, entering with a heading off by 5 deg and a place
-        off by 0.5 mm (standard deviations), with +-1 mm of uniform noise [m].
+        On circles of radius `RADIUS` with random roll, a heading error of 5 deg and an entry error
+        of 0.5 mm (standard deviations), with +-1 mm of uniform noise [m].
     insertion : ndarray, shape (61,)
-        [m].
+        Insertion depths [m].
     """
     insertion = np.linspace(0.0, ARC, 61)
     angle = insertion / RADIUS

@@ -1,6 +1,6 @@
-"""The controllers a study can ask for: needle_controller's own estimators and laws, unchanged.
+"""Controllers for studies: the estimators and laws of needle_controller.
 
-needle_sim, whose studies these are for, does not know the controller under test.
+The studies are in needle_sim, which does not import the controller under test.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from needle_controller.presets.steering_settings import (
     PRESETS,
     SteeringSettings,
 )
-from needle_controller.protocol.trust import point_missed
+from needle_controller.protocol.confidence import point_miss_probability
 from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
@@ -50,25 +50,25 @@ SLIDING_MODE, RRT = "sliding_mode", "rrt"
 """Names of the reference laws for points."""
 CURVATURE = SteeringSettings.curvature
 STEP_LENGTH = SteeringSettings.step_length
-# What the linear observer knows of a needle is a twentieth of what the bank does.
+# The linear observer needs a twentieth of the memory of the filter.
 _LINEAR_CHUNK = 20 * CHUNK
-# Studies have depths of their own; what limits flips here is what the settings take [m].
+# Upper limit of the settings; a study has its own depth [m].
 _DEEPEST = 1.0
 
 
 class SteeredNeedles:
-    """Estimators and laws, called as the node calls them: what `study.Controller` describes.
+    """Estimators and laws, called as in the node; implements `study.Controller`.
 
     Parameters
     ----------
     new_estimators : callable
-        Returns the estimators of so many needles.
+        Returns the estimators of a number of needles.
     rates : callable
         Returns the rotation rates, (N,) [rad/m], for estimators at an inserted length [m].
     covariance : ndarray, shape (3, 3), optional
-        What each tip's is said to be [m^2]; the estimator's own assumption if none is given.
+        Claimed covariance of each tip [m^2]; by default the estimator's own assumption.
     turn_delay : float
-        See `study.StudySettings`: the joints tell.
+        See `study.StudySettings`.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class SteeredNeedles:
         self._turned: FloatArray = np.zeros(())
 
     def start(self, tips: FloatArray) -> FloatArray:
-        """Take the first measured tips; see `study.Controller.start`."""
+        """Handle the first measured tips; see `study.Controller.start`."""
         self._estimators = self._new_estimators(len(tips))
         self._estimators.start(np.ascontiguousarray(tips))
         self._insertion = self._turned = np.zeros(len(tips))
@@ -100,7 +100,7 @@ class SteeredNeedles:
         tips: FloatArray,
         age: float | FloatArray,
     ) -> FloatArray:
-        """Take a step and what was measured after it; see `study.Controller.step`."""
+        """Handle a step and the tips measured after it; see `study.Controller.step`."""
         assert self._estimators is not None
         lengths = np.array(np.broadcast_to(d_insertion, len(tips)))
         self._insertion = self._insertion + lengths
@@ -115,23 +115,23 @@ class SteeredNeedles:
         return self._rates(self._estimators, float(np.max(self._insertion)))
 
     def belief(self) -> Belief | None:
-        """Return what is known after the last step; see `study.Controller.belief`."""
+        """Return the estimates after the last step; see `study.Controller.belief`."""
         if self._estimators is None:
             return None
         return self._estimators.belief()
 
 
 class NeedlesToPoints(SteeredNeedles):
-    """Estimators, and laws for points: what `point_study.PointController` describes.
+    """Estimators, and laws for points; implements `point_study.PointController`.
 
     Parameters
     ----------
     new_estimators, covariance :
         See `SteeredNeedles`.
     new_laws : callable
-        Returns the laws for targets whose motion is told to a `TargetMotion`.
+        Returns the laws from the motion of the targets.
     rotation_budget : float
-        Most that each base may turn [rad].
+        Maximum total rotation of each base [rad].
     """
 
     def __init__(
@@ -148,21 +148,21 @@ class NeedlesToPoints(SteeredNeedles):
         super().__init__(new_estimators, self._command, covariance)
 
     def see_targets(self, time: float, targets: FloatArray) -> None:
-        """Take where the targets are; see `point_study.PointController`."""
+        """Handle the positions of the targets; see `point_study.PointController`."""
         self._motion.see(time, targets)
 
     def insertion_left(self) -> FloatArray:
-        """Return how far each needle has to go; see `point_study.PointController`."""
+        """Return the remaining insertion of each needle; see `point_study.PointController`."""
         return self._left
 
     def belief(self) -> Belief | None:
-        """Return what is known after the last step; a miss is one of the point."""
+        """Return the estimates after the last step; a miss refers to the point."""
         belief = super().belief()
         if belief is None or belief.missed is None:
             return belief
         assert self._estimators is not None
         tips, covariances = self._estimators.tips()
-        missed = point_missed(tips - self._motion.last, covariances)
+        missed = point_miss_probability(tips - self._motion.last, covariances)
         return dataclasses.replace(belief, missed=missed)
 
     def _command(self, estimators: Any, _: float) -> FloatArray:
@@ -173,12 +173,12 @@ class NeedlesToPoints(SteeredNeedles):
 
 
 class PaperNeedles:
-    """The observer and the law of [KC09], in compiled loops: what `study.Controller` describes.
+    """Observer and law of [KC09] in compiled loops; implements `study.Controller`.
 
     Parameters
     ----------
     settings : SteeringSettings
-        Of preset `paper` or `open_loop`.
+        Settings of preset `paper` or `open_loop`.
     turn_delay : float
         See `SteeredNeedles`.
     """
@@ -188,7 +188,7 @@ class PaperNeedles:
         self._needles: ManyObservers | None = None
 
     def start(self, tips: FloatArray) -> FloatArray:
-        """Take the first measured tips; see `study.Controller.start`."""
+        """Handle the first measured tips; see `study.Controller.start`."""
         gains = self._settings.gains()
         law = make_law(self._settings, gains)
         self._needles = ManyObservers(
@@ -205,7 +205,7 @@ class PaperNeedles:
         tips: FloatArray,
         age: float | FloatArray,
     ) -> FloatArray:
-        """Take a step and what was measured after it; see `study.Controller.step`."""
+        """Handle a step and the tips measured after it; see `study.Controller.step`."""
         assert self._needles is not None
         lengths = np.array(np.broadcast_to(d_insertion, len(tips)))
         unturned = np.minimum(self._turn_delay, 0.9 * lengths)
@@ -213,12 +213,12 @@ class PaperNeedles:
         return self._needles.step(lengths, unturned, d_rotation, tips, ages)
 
     def belief(self) -> Belief | None:
-        """Return None: the steady gain makes no use of a covariance."""
+        """Return None: the steady-state gain uses no covariance."""
         return None
 
 
 def needles_at_a_time(name: str) -> int:
-    """Return how many needles of a preset to steer at a time: so many fit into a cache."""
+    """Return the number of needles of a preset that fit into the cache."""
     return _LINEAR_CHUNK if name in ONE_SIDED_PRESETS else CHUNK
 
 
@@ -232,33 +232,32 @@ def controller_factory(
     own: Mapping[str, Any] = {},
     first: int = 0,
 ) -> Callable[[], SteeredNeedles | PaperNeedles]:
-    """Return what makes the controller of some needles.
+    """Return a factory of the controller of some needles.
 
     Parameters
     ----------
     name : str
         One of `PRESETS`.
     claimed : float
-        Largest error of a measured coordinate that it is told the sensor makes [m].
+        Claimed maximum error of a measured coordinate [m].
     flip_depths : sequence of float
         Insertions at which the bevel is flipped, mirrored, in rising order [m].
     sigma_scale : float
-        Other than 1: it is not told of a bound; instead each tip comes with a covariance, whose
-        standard deviations are those of uniform noise within `claimed`, divided by this.
+        Other than 1: each tip has a covariance instead of the bound; its standard deviations are
+        those of uniform noise within `claimed`, divided by this.
     turn_delay : float
-        As of `study.StudySettings` [m].
+        See `study.StudySettings` [m].
     own : mapping
-        What other packages have in place of the preset's: settings `estimator`, `law`, `planner`
-        and `seed`.
+        Settings `estimator`, `law`, `planner` of other packages, and `seed`.
     first : int
-        Number of the first needle, which keys what chance an own estimator uses.
+        Number of the first needle, which seeds the random numbers of an own estimator.
 
     Raises
     ------
     UserError
         If there is no such controller, or it cannot flip.
     """
-    settings, covariance = _what_is_told(name, claimed, sigma_scale, flip_depths, own)
+    settings, covariance = _claimed_settings(name, claimed, sigma_scale, flip_depths, own)
     if name in ONE_SIDED_PRESETS and not settings.estimator and not settings.law:
         return lambda: PaperNeedles(settings, turn_delay)
     rates: Callable[[Any, float], FloatArray] = best_rates(settings)
@@ -268,7 +267,7 @@ def controller_factory(
 
 
 def new_estimators(settings: SteeringSettings, first: int) -> Callable[[int], Estimators]:
-    """Return what makes the estimators of so many needles, the first of which has a number."""
+    """Return a factory of the estimators of needles, numbered from `first`."""
     if settings.preset == "best" and not settings.estimator:
         known = filter_settings(settings)
         return lambda count: BestEstimators(known, count, settings.step_length)
@@ -290,12 +289,12 @@ def point_controller_factory(
 ) -> Callable[[], NeedlesToPoints]:
     """Return what makes the controller of some needles that are steered to points.
 
-    Parameters, and what is raised, as of `controller_factory`; a preset that does not estimate the
-    whole pose is refused, and the reference laws have the estimator of `best`. `rotation_budget` is
-    the most that each base may turn [rad]; those laws do not heed it.
+    Parameters and errors as of `controller_factory`. A preset that does not estimate the whole pose
+    is rejected; the reference laws use the estimator of `best`. `rotation_budget` is the maximum
+    total rotation of each base [rad]; the reference laws ignore it.
     """
     preset = "best" if name in {SLIDING_MODE, RRT} else name
-    settings, covariance = _what_is_told(preset, claimed, sigma_scale, (), own)
+    settings, covariance = _claimed_settings(preset, claimed, sigma_scale, (), own)
     settings.check_steers_to_points()
 
     def new_laws(motion: TargetMotion) -> PointLaws:
@@ -318,7 +317,7 @@ def point_controller_factory(
     )
 
 
-def _what_is_told(
+def _claimed_settings(
     name: str,
     claimed: float,
     sigma_scale: float,

@@ -1,4 +1,4 @@
-"""Estimators of a study's needles: any kind one by one, those of `best` in compiled loops."""
+"""Estimators of the needles of a study: of any kind one by one, or `best` in compiled loops."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ class Estimators(Protocol):
     """The estimators of N needles."""
 
     def start(self, tips: FloatArray) -> None:
-        """Start at first tips, (N, 3) [m], with all bases at 0."""
+        """Start at the first tips, (N, 3) [m], with all rotations 0."""
 
     def advance(self, lengths: FloatArray, turns: FloatArray) -> None:
-        """Move on by inserted lengths [m] and rotations of the bases [rad], (N,)."""
+        """Advance by inserted lengths [m] and base rotations [rad], (N,)."""
 
     def correct(self, tips: FloatArray, covariance: Array | None, ages: FloatArray) -> None:
-        """Take tips, (N, 3), of a covariance, (3, 3), and their ages, (N,) [m]."""
+        """Correct by tips, (N, 3) [m], with a covariance, (3, 3), and their ages, (N,) [m]."""
 
     def each(self) -> Sequence[Estimate]:
-        """Return what is known of each."""
+        """Return the estimate of each needle."""
 
     def belief(self) -> Belief:
-        """Return what is known of all."""
+        """Return the estimates of all needles."""
 
     def tips(self) -> tuple[FloatArray, FloatArray]:
-        """Return where the tips are, (N, 3) [m], and their covariances, (N, 3, 3) [m^2]."""
+        """Return the estimated tips, (N, 3) [m], and their covariances, (N, 3, 3) [m^2]."""
 
 
 class EachEstimator:
-    """Estimators of any kind, one called after the other; see `Estimators`.
+    """Estimators of any kind, called one by one; see `Estimators`.
 
     Parameters
     ----------
     new : callable
-        Returns the estimator of the needle with a number, counted from 0.
+        Returns the estimator of the needle with a number from 0.
     """
 
     def __init__(self, new: Callable[[int], Estimator]) -> None:
@@ -52,20 +52,20 @@ class EachEstimator:
         self._known: list[Estimate] = []
 
     def start(self, tips: FloatArray) -> None:
-        """Start at first tips."""
+        """Start at the first tips."""
         self._estimators = [self._new(n) for n in range(len(tips))]
         for estimator, tip in zip(self._estimators, tips, strict=True):
             estimator.reset(tip, np.zeros(2))
         self._estimate()
 
     def advance(self, lengths: FloatArray, turns: FloatArray) -> None:
-        """Move on."""
+        """Advance by the motion of the joints."""
         moved = zip(self._estimators, lengths.tolist(), turns.tolist(), strict=True)
         for estimator, length, turn in moved:
             estimator.advance(length, turn)
 
     def correct(self, tips: FloatArray, covariance: Array | None, ages: FloatArray) -> None:
-        """Take tips."""
+        """Correct by tips."""
         for estimator, tip, age in zip(self._estimators, tips, ages.tolist(), strict=True):
             estimator.correct(tip, covariance, age)
         self._estimate()
@@ -74,11 +74,11 @@ class EachEstimator:
         self._known = [estimator.estimate() for estimator in self._estimators]
 
     def each(self) -> Sequence[Estimate]:
-        """Return what is known of each."""
+        """Return the estimate of each needle."""
         return self._known
 
     def belief(self) -> Belief:
-        """Return what is known of all."""
+        """Return the estimates of all needles."""
         uncertainty = np.array([hypotheses_of(known).uncertainty for known in self._known])
         s = np.array([known.linearized for known in self._known])
         missed = None
@@ -87,7 +87,7 @@ class EachEstimator:
         return _belief(s, uncertainty, missed)
 
     def tips(self) -> tuple[FloatArray, FloatArray]:
-        """Return where the tips are, and their covariances."""
+        """Return the estimated tips and their covariances."""
         covariances = np.array([known.covariance[:3, :3] for known in self._known])
         return np.array([known.position for known in self._known]), covariances
 
@@ -96,12 +96,12 @@ class BestEstimators(ManyFilters):
     """The estimators of preset `best`, in compiled loops; see `Estimators`."""
 
     def belief(self) -> Belief:
-        """Return what is known of all."""
+        """Return the estimates of all needles."""
         known = self.estimates
         return _belief(known["linearized"], known["uncertainty"], known["miss"].copy())
 
     def tips(self) -> tuple[FloatArray, FloatArray]:
-        """Return where the tips are, and their covariances."""
+        """Return the estimated tips and their covariances."""
         known = self.estimates
         return known["coordinates"][:, :3].copy(), known["covariance"][:, :3, :3].copy()
 

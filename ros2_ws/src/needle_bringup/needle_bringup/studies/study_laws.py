@@ -1,4 +1,4 @@
-"""Laws of a study's needles: any kind one by one, those of `best` in compiled loops."""
+"""Laws of the needles of a study: of any kind one by one, or `best` in compiled loops."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from needle_sim.studies.rrt_replanning import SAMPLES, DutyCycle, plan
 from needle_sim.studies.sliding_mode import sliding_mode_rate
 
 TimedLaw = Callable[[Estimate, float, float, float], SteeringCommand]
-"""Takes an estimate, the time [s], the insertion [m], and what the base may still turn [rad]."""
+"""Maps an estimate, time [s], insertion [m] and remaining rotation [rad] to a command."""
 
 CLEAR = 0.00085
-"""What the published planner keeps from obstacles: the needle's radius and half a mm [m]."""
+"""Clearance of the published planner: the needle's radius and half a mm [m]."""
 
 PointLaws = Callable[[Any, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""Takes estimators, inserted lengths [m] and what the bases may still turn [rad], (N,); returns
-rotation rates [rad/m] and insertions left [m], (N,)."""
+"""Maps estimators, inserted lengths [m] and remaining rotations [rad], (N,), to rotation rates
+[rad/m] and remaining insertions [m], (N,)."""
 
 
 def each_rate(new_law: Callable[[int], StepLaw]) -> Callable[[Estimators, float], FloatArray]:
-    """Return rotation rates by laws that are called in Python, one after the other."""
+    """Return rotation rates by laws that are called one by one."""
     laws: list[StepLaw] = []
 
     def rates(estimators: Estimators, insertion: float) -> FloatArray:
@@ -53,14 +53,14 @@ def each_rate(new_law: Callable[[int], StepLaw]) -> Callable[[Estimators, float]
 
 
 def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], TimedLaw]) -> PointLaws:
-    """Return laws for points that are called in Python, one after the other.
+    """Return laws for points that are called one by one.
 
     Parameters
     ----------
     motion : TargetMotion
-        Of all targets.
+        Motion of all targets.
     new_law : callable
-        Returns the law of one needle, whose target's motion is told to a `TargetMotion`.
+        Returns the law of a needle from the motion of its target.
     """
     laws: list[tuple[TargetMotion, TimedLaw]] = []
 
@@ -76,9 +76,9 @@ def each_point_law(motion: TargetMotion, new_law: Callable[[TargetMotion], Timed
         for n, (own, law) in enumerate(laws):
             own.see(motion.seen, targets[n])
             inserted = float(insertion[n])
-            said = law(known[n], inserted / INSERTION_SPEED, inserted, float(rotation_left[n]))
-            assert said.insertion_left is not None
-            rates[n], left[n] = said.rotation_rate, said.insertion_left
+            command = law(known[n], inserted / INSERTION_SPEED, inserted, float(rotation_left[n]))
+            assert command.insertion_left is not None
+            rates[n], left[n] = command.rotation_rate, command.insertion_left
         return rates, left
 
     return commands
@@ -111,14 +111,14 @@ def best_point_laws(settings: SteeringSettings, motion: TargetMotion) -> PointLa
 
 
 def sliding_law(motion: TargetMotion, largest_rate: float) -> TimedLaw:
-    """Return the published reference law, which goes to where the target is; see `sliding_mode`.
+    """Return the published reference law towards the current target; see `sliding_mode`.
 
     Parameters
     ----------
     motion : TargetMotion
-        Of the target.
+        Motion of the target.
     largest_rate : float
-        Rotation per inserted length [rad/m].
+        Maximum rotation per inserted length [rad/m].
     """
 
     def command(estimate: Estimate, *_: float) -> SteeringCommand:
@@ -135,16 +135,16 @@ def rrt_law(
     rng: np.random.Generator,
     obstacles: Array | None = None,
 ) -> TimedLaw:
-    """Return the published planner as a law that plans anew at every step; see `rrt_replanning`.
+    """Return the published planner as a law that plans at every step; see `rrt_replanning`.
 
     Parameters
     ----------
     motion : TargetMotion
-        Of the target.
+        Motion of the target.
     settings : SteeringSettings
-        Of the needle.
+        Settings of the needle.
     rng : numpy.random.Generator
-        All chance of the planner.
+        Random numbers of the planner.
     obstacles : ndarray, shape (M, 7), optional
         Ends of the axis and radius of each capsule [m]; none by default.
     """
@@ -153,7 +153,7 @@ def rrt_law(
 
     def command(estimate: Estimate, *_: float) -> SteeringCommand:
         ahead = estimate.rotation.T @ (motion.last - estimate.position)
-        # Where no path is found, the tightest arc towards the target.
+        # Default without a path: the tightest arc towards the target.
         arc = np.array([ahead[0], ahead[1], 1.0])
         plan(
             np.array(estimate.position),
@@ -171,14 +171,14 @@ def rrt_law(
 
 
 def planned_law(motion: TargetMotion, settings: SteeringSettings) -> TimedLaw:
-    """Return the law that leads a needle along a planner's way; no obstacle is in it.
+    """Return the law that follows the path of a planner, without obstacles.
 
     Parameters
     ----------
     motion : TargetMotion
-        Of the target.
+        Motion of the target.
     settings : SteeringSettings
-        Of the needle, and which planner.
+        Settings of the needle, including the planner.
     """
     law, free, plane = prompt_point_law(settings), Obstacles(), offset_plane(0.0)
     needle = PathSteering(settings)
@@ -186,10 +186,10 @@ def planned_law(motion: TargetMotion, settings: SteeringSettings) -> TimedLaw:
     def command(estimate: Estimate, _: float, insertion: float, __: float) -> SteeringCommand:
         route = needle.route(tip_state(estimate, plane), motion.last, free, insertion)
         if route is None:
-            # Who sees no way stays where it is.
+            # Without a path the needle stops.
             return SteeringCommand(0.0, 0.0, -math.inf)
-        said = law(estimate, route.aim)
-        left = said.insertion_left if route.length is None else route.length
-        return SteeringCommand(said.virtual_input, said.rotation_rate, left)
+        aimed = law(estimate, route.aim)
+        left = aimed.insertion_left if route.length is None else route.length
+        return SteeringCommand(aimed.virtual_input, aimed.rotation_rate, left)
 
     return command

@@ -1,7 +1,7 @@
-"""A study in parts that know nothing of each other: some needles each, and what became of them.
+"""A study in independent parts of some needles each, and their results.
 
-Chance is keyed by the needle, and an own estimator's by the part, so that a part's outcomes do not
-depend on where or when it runs.
+Random numbers are seeded by the needle, and those of an own estimator by the part, so that the
+outcomes of a part do not depend on where or when it runs.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from needle_sim.studies.point_targets import MovingTargets, random_targets
 from needle_sim.studies.start_grids import GRIDS, POINTS
 from needle_sim.studies.study import StudySettings, run_study
 
-# Of the controller's settings, those that a study passes on as they are asked for.
+# Options that are passed on as settings of the controller.
 _OWN = ("estimator", "law", "planner", "seed", "step_length")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StudyPart:
-    """Some needles of a study that are steered at a time.
+    """Needles of a study that are steered together.
 
     Attributes
     ----------
     options : MonteCarloOptions
-        What is asked for.
+        Options of the study.
     first : int
         Number of the first needle.
     starts : ndarray, shape (N, 3)
         x [m], pitch, roll [rad] of each.
     places : ndarray, shape (N, 3)
-        The point that each is to go to [m]; (0, 3) where it is the plane.
+        Target point of each [m]; (0, 3) if the target is the plane.
     """
 
     options: MonteCarloOptions
@@ -53,13 +53,13 @@ class StudyPart:
     places: FloatArray
 
     def of_first(self, count: int) -> StudyPart:
-        """Return its first needles alone."""
+        """Return a part with its first needles only."""
         return dataclasses.replace(
             self, starts=self.starts[:count].copy(), places=self.places[:count].copy()
         )
 
     def run(self, on_progress: Callable[[int], None] = lambda _: None) -> Outcomes | PointOutcomes:
-        """Steer its needles; `on_progress` is told after each step how many have made one."""
+        """Steer the needles; `on_progress` is called after each step with their number."""
         return (_to_points if self.options.targets else _to_plane)(self, on_progress)
 
 
@@ -70,9 +70,9 @@ class Results:
     Attributes
     ----------
     figures : mapping
-        As `monte_carlo --json` has them.
+        Content of `monte_carlo --json`.
     columns : mapping of str to ndarray, shape (N,)
-        By the names of `monte_carlo --csv`.
+        Columns of `monte_carlo --csv`.
     """
 
     figures: Mapping[str, JsonValue]
@@ -80,7 +80,7 @@ class Results:
 
 
 def settings_of(options: MonteCarloOptions) -> StudySettings:
-    """Return what the needles of a study have in common."""
+    """Return the settings common to all needles of a study."""
     return StudySettings(
         CURVATURE,
         options.depth,
@@ -92,7 +92,7 @@ def settings_of(options: MonteCarloOptions) -> StudySettings:
 
 
 def parts_of(options: MonteCarloOptions) -> list[StudyPart]:
-    """Return a study's parts, in the order of its needles."""
+    """Return the parts of a study, in the order of its needles."""
     starts = _starts(options)
     places: FloatArray = np.empty((0, 3))
     if options.targets:
@@ -110,7 +110,7 @@ def parts_of(options: MonteCarloOptions) -> list[StudyPart]:
 
 
 def results_of(parts: Sequence[StudyPart], outcomes: Sequence[Outcomes | PointOutcomes]) -> Results:
-    """Return the results of a study from what became of its parts, in their order."""
+    """Return the results of a study from the outcomes of its parts, in order."""
     x, pitch, roll = np.concatenate([part.starts for part in parts]).T
     begun = {"x_mm": x * 1e3, "pitch_deg": np.rad2deg(pitch), "roll_deg": np.rad2deg(roll)}
     whole = joined(outcomes)

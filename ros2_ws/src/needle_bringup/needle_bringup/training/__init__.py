@@ -1,1 +1,1 @@
-"""Scenes to train the needle map on: floors, needles, clutter and light, drawn at random."""
+"""Random scenes to train the needle map: floors, needles, clutter and light."""

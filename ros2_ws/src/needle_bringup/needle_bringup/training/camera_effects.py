@@ -1,4 +1,4 @@
-"""Effects of cameras and codecs, drawn at random: the same on all images of one camera."""
+"""Random effects of cameras and codecs, equal for all images of one camera."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ Bytes = NDArray[np.uint8]
 
 @dataclasses.dataclass(frozen=True)
 class CameraEffects:
-    """One camera's optics, sensor and codec, in the order in which they act.
+    """Optics, sensor and codec of a camera, in the order of their effect.
 
     Attributes
     ----------
     haze, haze_level : float
         Share of stray light, and its brightness.
     gamma, gain : float
-        Of the brightness.
+        Gamma and gain of the brightness.
     blur_px : float
-        Sigma of the optics [px].
+        Sigma of the blur of the optics [px].
     shrink : float
-        The image is stored so much smaller, and enlarged again afterwards; 1: as it is.
+        Factor by which the image is reduced, and enlarged again; 1: none.
     noise, noise_share : float
-        Sigma of the sensor's noise, in grey levels and as a share of the brightness.
+        Sigma of the sensor noise, in grey levels and as a share of the brightness.
     noise_blur_px : float
-        How far noise of neighbours goes together [px]; 0: not at all.
+        Correlation length of the noise [px]; 0: white.
     denoise : str
         "median", "bilateral" or "".
     sharpen, sharpen_px : float
-        How much of what differs from a blurred image is added, and that blur's sigma [px].
+        Gain and blur sigma [px] of the unsharp mask.
     quality : int
-        Of JPEG; 0: stored as it is.
+        JPEG quality; 0: no compression.
     """
 
     haze: float
@@ -54,7 +54,7 @@ class CameraEffects:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> CameraEffects:
-        """Return a camera drawn at random; half of all noise is below two grey levels."""
+        """Return a random camera; half of all noise is below two grey levels."""
 
         def sometimes(chance: float, low: float, high: float, otherwise: float) -> float:
             return float(rng.uniform(low, high)) if rng.random() < chance else otherwise
@@ -77,12 +77,12 @@ class CameraEffects:
         )
 
     def apply(self, rng: np.random.Generator, image: Image) -> Bytes:
-        """Return one image of this camera.
+        """Return an image of this camera.
 
         Parameters
         ----------
         rng : Generator
-            What draws the noise.
+            Generator of the noise.
         image : ndarray of float32, shape (height, width)
             Brightness, 0 to 255 and beyond.
         """

@@ -1,7 +1,7 @@
-"""Floors behind a needle, and what lies beside or over it, drawn at random.
+"""Random floors behind a needle, and clutter beside or over it.
 
-Ranges are wide on purpose: what a net has never seen it does not know. Nothing here is the renderer
-of needle_sim, in which the tracker is tried.
+The ranges are wide, so that the net generalises. This code is independent of the renderer of
+needle_sim, with which the tracker is tested.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ Image = NDArray[np.float32]
 
 
 def floor(rng: np.random.Generator, size: int) -> Image:
-    """Return a floor: plain, cloudy, printed, woven or brushed, evenly lit or not.
+    """Return a random floor: plain, cloudy, printed, woven or brushed.
 
     Parameters
     ----------
     rng : Generator
-        What draws it.
+        Random generator.
     size : int
-        Its width and height [px].
+        Width and height [px].
 
     Returns
     -------
@@ -46,7 +46,7 @@ def clutter(rng: np.random.Generator, image: Image) -> Image:
     Parameters
     ----------
     rng : Generator
-        What draws them.
+        Random generator.
     image : ndarray of float32, shape (size, size)
         Brightness, 0 to 255.
     """
@@ -69,7 +69,7 @@ def _cloud(rng: np.random.Generator, size: int, sigma: float) -> Image:
 
 
 def _lines(rng: np.random.Generator, image: Image) -> Image:
-    """Draw graph paper: one or two families of lines, some thicker."""
+    """Draw graph paper: one or two sets of parallel lines, some thicker."""
     size = len(image)
     y, x = _grid(size)
     ink = rng.uniform(0.1, 0.9)
@@ -164,7 +164,7 @@ def _bubble(rng: np.random.Generator, image: Image) -> Image:
 
 
 def _line(rng: np.random.Generator, image: Image) -> Image:
-    """Draw a scratch, lint or an earlier needle's track: thinner than a needle, or fainter."""
+    """Draw a scratch, lint or an old track: thinner or fainter than a needle."""
     size = len(image)
     start, heading = rng.uniform(-size / 8, 1.125 * size, 2), rng.uniform(0.0, 2 * np.pi)
     bend = rng.normal(0.0, 0.02)

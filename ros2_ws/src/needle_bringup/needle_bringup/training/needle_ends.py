@@ -1,4 +1,4 @@
-"""Needles' ends in one view, drawn at random: a tube or rod with a ground bevel, and its shadow."""
+"""Random needle ends in one view: a tube or rod with a ground bevel, and its shadow."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.float32]
 _FINE = 3
-"""Points across a pixel."""
-_TWIN = 0.4  # so many shadows look like the needle
-_FADING = 0.25  # so many ends lose contrast on their last widths, as in real photographs
-_BLUNT = 0.15  # ends cut straight, burr included, as a share of the needle's width
+"""Sub-pixels across a pixel."""
+_TWIN = 0.4  # share of shadows that look like the needle
+_FADING = 0.25  # share of ends that lose contrast near the tip, as in real photographs
+_BLUNT = 0.15  # length of a straight end with its burr, as a share of the needle's width
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,13 +23,13 @@ class Pose:
     Attributes
     ----------
     x, y : float
-        The end of the shaft's axis [px].
+        End of the shaft's axis [px].
     heading : float
-        Which way it points there [rad].
+        Direction at the end [rad].
     bend, twist : float
-        Curvature there, and how that changes [1/px, 1/px^2].
+        Curvature at the end, and its change [1/px, 1/px^2].
     radius : float
-        Of the shaft [px].
+        Radius of the shaft [px].
     """
 
     x: float
@@ -40,7 +40,7 @@ class Pose:
     radius: float
 
     def coordinates(self, size: int) -> tuple[Image, Image]:
-        """Return along (0 at the end, negative on the shaft) and across, on the fine grid [px]."""
+        """Return coordinates along (0 at the end) and across the shaft, on the fine grid [px]."""
         places = (np.arange(size * _FINE, dtype=np.float32) + np.float32(0.5)) / _FINE
         x, y = np.meshgrid(places - np.float32(self.x + 0.5), places - np.float32(self.y + 0.5))
         # Plain floats keep the grid in single precision.
@@ -67,7 +67,7 @@ class Pose:
 
 
 def random_pose(rng: np.random.Generator, size: int, radius: float) -> Pose:
-    """Return a needle's pose; most often its end is well inside."""
+    """Return a random pose; usually the end is well inside the patch."""
     heading = rng.uniform(0.0, 2 * np.pi)
     x, y = rng.uniform(0.2 * size, 0.8 * size, 2)
     if rng.random() < 0.25:
@@ -77,19 +77,19 @@ def random_pose(rng: np.random.Generator, size: int, radius: float) -> Pose:
 
 
 def coarse(fine: Image) -> Image:
-    """Return what pixels see of a fine image."""
+    """Return the pixels of a fine image."""
     size = len(fine) // _FINE
     return np.asarray(cv2.resize(fine, (size, size), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def true_map(pose: Pose, size: int) -> Image:
-    """Return the share of each pixel that is shaft, cut straight at the end of its axis."""
+    """Return the share of each pixel that belongs to the shaft, cut straight at its end."""
     along, across = pose.coordinates(size)
     return coarse(((along <= 0.0) & (np.abs(across) <= pose.radius)).astype(np.float32))
 
 
 def draw_needle(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
-    """Return an image with a needle in it: any material, light and bevel."""
+    """Return an image with a needle of random material, light and bevel."""
     size = len(image)
     along, across = pose.coordinates(size)
     rho = np.clip(across / pose.radius, -1.0, 1.0)
@@ -122,7 +122,7 @@ def draw_needle(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
 
 
 def draw_shadow(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
-    """Return an image with a needle's shadow on the floor: beside it, softer, maybe shorter.
+    """Return an image with the shadow of a needle on the floor: softer, and possibly shorter.
 
     Often it is as dark and sharp as the needle and touches it: only what is known of the needle's
     way then tells the two apart, and the net must show both ends.
@@ -141,14 +141,14 @@ def draw_shadow(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
     if twin:
         sharp = cv2.GaussianBlur(true_map(other, len(image)), (0, 0), rng.uniform(0.3, 0.8))
         return np.asarray(image * (1.0 - rng.uniform(0.4, 0.9) * sharp), np.float32)
-    # Of a small lamp it is as sharp as the needle, and has an end as sharp.
+    # The shadow of a small lamp is as sharp as the needle.
     softness = float(np.exp(rng.uniform(np.log(0.3), np.log(7.0))))
     soft = cv2.GaussianBlur(true_map(other, len(image)), (0, 0), softness)
     return np.asarray(image * (1.0 - rng.uniform(0.1, 0.8) * soft), np.float32)
 
 
 def _metal(rng: np.random.Generator, near: float, along: Image, rho: Image) -> Image:
-    """Return a shaft's brightness: a ground tone, and lamps that it mirrors along a part of it."""
+    """Return the brightness of a shaft: a base tone, and reflections of lamps."""
     kind = rng.choice(["dark", "plain", "mirror"], p=[0.3, 0.2, 0.5])
     tone = {
         "dark": rng.uniform(0.0, 0.5) * near,
@@ -162,11 +162,11 @@ def _metal(rng: np.random.Generator, near: float, along: Image, rho: Image) -> I
         place = rng.uniform(-0.85, 0.85) + rng.normal(0.0, 0.004) * along
         width = rng.uniform(0.08, 0.5)
         glint = strength * np.exp(-(((rho - place) / width) ** 2))
-        if rng.random() < 0.5:  # what mirrors a lamp ends where the angle no longer fits
+        if rng.random() < 0.5:  # a reflection ends where the angle no longer fits
             begin, slope = rng.uniform(-70.0, 5.0), rng.uniform(0.3, 12.0) * rng.choice([-1, 1])
             glint = glint / (1.0 + np.exp(np.clip((along - begin) / slope, -30, 30)))
         metal = metal + glint
-    if rng.random() < 0.4:  # a rough skin glitters
+    if rng.random() < 0.4:  # a rough surface glitters
         speck = rng.standard_normal((len(rho) // 2, len(rho) // 2)).astype(np.float32)
         speck = cv2.resize(speck, rho.shape[::-1], interpolation=cv2.INTER_NEAREST)
         metal = metal * (1.0 + rng.uniform(0.05, 0.4) * speck)
@@ -176,7 +176,7 @@ def _metal(rng: np.random.Generator, near: float, along: Image, rho: Image) -> I
 def _face(
     rng: np.random.Generator, near: float, along: Image, ground: Image, length: float
 ) -> Image:
-    """Return a ground face's brightness: it mirrors a lamp, the dark, or what is like the floor."""
+    """Return the brightness of a ground face: it reflects a lamp, darkness, or the floor."""
     kind = rng.choice(["dark", "bright", "grey", "floor"], p=[0.4, 0.3, 0.2, 0.1])
     if kind == "floor":
         return np.asarray(ground * rng.uniform(0.85, 1.15), np.float32)
@@ -187,7 +187,7 @@ def _face(
     }[kind]
     slope = rng.normal(0.0, 0.3) if rng.random() < 0.5 else 0.0
     face = tone * (1.0 + slope * (along / max(length, 1.0)))
-    if rng.random() < 0.35:  # a facet mirrors a lamp, wherever on the face
+    if rng.random() < 0.35:  # a facet reflects a lamp
         begin, end = -np.sort(rng.uniform(0.0, 1.0, 2)) * length
         face = np.where((along < begin) & (along > end), near + rng.uniform(30.0, 350.0), face)
     return np.asarray(np.clip(face, 0.0, 500.0))

@@ -1,4 +1,4 @@
-"""Tracks that earlier needles left in the gel, drawn at random: what they do to its brightness."""
+"""Random tracks of earlier needles in the gel, as factors of its brightness."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from needle_bringup.training.samples import moved
 
 Image = NDArray[np.float32]
 
-_FAINT = 0.15  # so much may a track change brightness that no background explains
-_GEL_PX = 3.0  # so far may gel move
+_FAINT = 0.15  # maximum change of brightness by a track without a background
+_GEL_PX = 3.0  # maximum motion of the gel
 _MOST = 3
-_BROKEN, _PIECE_PX, _PIECES = 0.4, (5.0, 80.0), 60  # so many are in pieces; so long, with gaps
+_BROKEN, _PIECE_PX, _PIECES = 0.4, (5.0, 80.0), 60  # share in pieces; their length; their number
 
 
 def drawn_tracks(rng: np.random.Generator, pose: Pose, size: int, *, faint: bool) -> Image:
-    """Return by what factor old tracks change the brightness of each pixel.
+    """Return the factor of each pixel's brightness by old tracks.
 
     Parameters
     ----------
@@ -53,21 +53,21 @@ def drawn_tracks(rng: np.random.Generator, pose: Pose, size: int, *, faint: bool
 
 
 def shifted_tracks(rng: np.random.Generator, factor: Image) -> Image:
-    """Return the tracks as they were before: where they are, or the gel has moved since."""
+    """Return the tracks in the background image: unchanged, or shifted by motion of the gel."""
     if rng.random() < 0.5:
         return factor
     return moved(factor, rng.uniform(0.0, _GEL_PX), rng.uniform(0.0, 2.0 * np.pi))
 
 
 def faded(factor: Image, strength: float, blur_px: float) -> Image:
-    """Return a factor nearer to 1, and blurred."""
+    """Return a factor closer to 1, and blurred."""
     if blur_px > 0.0:
         factor = np.asarray(cv2.GaussianBlur(factor, (0, 0), blur_px), np.float32)
     return np.asarray(1.0 + np.float32(strength) * (factor - 1.0), np.float32)
 
 
 def made_faint(factor: Image) -> Image:
-    """Return a factor that changes brightness by little, wherever."""
+    """Return a factor limited to small changes of brightness."""
     most = float(np.abs(factor - 1.0).max())
     return faded(factor, min(1.0, _FAINT / max(most, 1e-6)), 0.0)
 
@@ -90,7 +90,7 @@ def _cloudy(rng: np.random.Generator, pose: Pose, size: int, faint: bool) -> Ima
 
 
 def _pieces(rng: np.random.Generator, pose: Pose, size: int) -> Image:
-    """Return 1 on pieces along a track and 0 in the gaps between them."""
+    """Return a mask of the pieces of a broken track."""
     along, _ = pose.coordinates(size)
     shortest, longest = np.log(_PIECE_PX)
     edges = np.cumsum(np.exp(rng.uniform(shortest, longest, _PIECES))) - 2.0 * size

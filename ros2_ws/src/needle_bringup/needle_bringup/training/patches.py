@@ -1,4 +1,4 @@
-"""Samples whose scene is drawn: a floor, clutter, old tracks, a needle with its shadow."""
+"""Samples of drawn scenes: a floor, clutter, old tracks, a needle with its shadow."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from needle_bringup.training.samples import (
 )
 
 Image = NDArray[np.float32]
-_THERE, _SHADOW, _TRACKS, _TORN = 0.75, 0.6, 0.4, 0.15  # so often
-_LONGER = 0.1  # so often the needle was further in before
+_THERE, _SHADOW, _TRACKS, _TORN = 0.75, 0.6, 0.4, 0.15  # probabilities
+_LONGER = 0.1  # probability of a deeper needle in the background
 _SEED = 2**32
 
 
@@ -49,7 +49,7 @@ def patch(rng: np.random.Generator) -> Sample:
     there = rng.random() < _THERE
     needle, shadow = (int(seed) for seed in rng.integers(_SEED, size=2))
     casts = rng.random() < _SHADOW
-    if rng.random() < 0.2:  # dust that has come
+    if rng.random() < 0.2:  # new dust
         image = clutter(rng, image)
     image = _with(image, pose, needle if there else None, shadow if casts else None)
     if there and rng.random() < _TORN:
@@ -70,14 +70,14 @@ def patch(rng: np.random.Generator) -> Sample:
 
 
 def _alike(rng: np.random.Generator, image: Image, before: Image) -> tuple[Image, Image]:
-    """Return both with the same clutter in front."""
+    """Return both images with the same clutter in front."""
     seed = int(rng.integers(_SEED))
     one, other = (clutter(np.random.default_rng(seed), each) for each in (image, before))
     return one, other
 
 
 def _with(image: Image, pose: Pose, needle: int | None, shadow: int | None) -> Image:
-    """Return an image with a needle and its shadow, of looks that the seeds draw, or without."""
+    """Return an image with a needle and its shadow, drawn by the seeds; without a pose, none."""
     if shadow is not None:
         image = draw_shadow(np.random.default_rng(shadow), image, pose)
     if needle is not None:
@@ -86,7 +86,7 @@ def _with(image: Image, pose: Pose, needle: int | None, shadow: int | None) -> I
 
 
 def _earlier(rng: np.random.Generator, pose: Pose, there: bool) -> Pose | None:
-    """Return where the needle was when the background was taken; None: nowhere."""
+    """Return the pose of the needle in the background; None without a needle."""
     chance = rng.random()
     back = float(np.exp(rng.uniform(np.log(1.0), np.log(90.0))))
     if chance < _LONGER:
@@ -95,7 +95,7 @@ def _earlier(rng: np.random.Generator, pose: Pose, there: bool) -> Pose | None:
 
 
 def _torn(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
-    """Return an image with gel clouded around the needle, up to its end or a little beyond."""
+    """Return an image with clouded gel around the needle, up to its end or slightly beyond."""
     ahead = pose.slid(rng.uniform(-5.0, 5.0))
     soft = cv2.GaussianBlur(
         true_map(ahead, len(image)), (0, 0), pose.radius * rng.uniform(0.8, 2.5)

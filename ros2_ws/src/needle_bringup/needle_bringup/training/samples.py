@@ -1,4 +1,4 @@
-"""Samples for the needle net: an image, the same view before, and where shaft and end are."""
+"""Samples for the needle net: image, background, and position of shaft and end."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ Image = NDArray[np.float32]
 SIZE = 112
 """Width and height of a patch [px]."""
 BORDER = 32
-"""Margin around a patch: brightness is judged against the surroundings [px]."""
+"""Margin around a patch, for the brightness of its surroundings [px]."""
 CANVAS = SIZE + 2 * BORDER
 """Width and height of the images [px]."""
 WIDTHS = (2.2, 10.0)
-"""Of the needles [px]."""
+"""Range of needle widths [px]."""
 WITH_BACKGROUND = 0.6
-"""So often a background is given."""
-_BUMPED, _BUMP_PX = 0.3, 1.5  # so often and so far the camera was moved since the background
-_OTHER_LIGHT, _LIGHT = 0.5, (0.75, 1.3)  # so often and so much brighter it was
+"""Probability of a background."""
+_BUMPED, _BUMP_PX = 0.3, 1.5  # probability and range of a camera shift since the background
+_OTHER_LIGHT, _LIGHT = 0.5, (0.75, 1.3)  # probability and range of a brightness change
 
-_OTHER_FOCUS, _FOCUS_PX = 0.1, (0.5, 1.2)  # so often and so much more it was blurred
+_OTHER_FOCUS, _FOCUS_PX = 0.1, (0.5, 1.2)  # probability and range of an additional blur
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sample:
-    """One patch with its border.
+    """A patch with its border.
 
     Attributes
     ----------
     image : ndarray of uint8, shape (CANVAS, CANVAS)
-        As a camera has it.
+        Camera image.
     background : ndarray of uint8, shape (CANVAS, CANVAS), or None
-        The same view with less of the needle, none, or sometimes more; None: not known.
+        The same view with less of the needle, none, or sometimes more; None: unknown.
     share : ndarray of uint8, shape (CANVAS, CANVAS)
-        255 times the share of each pixel that is shaft, cut straight at the end of its axis.
+        255 times the share of each pixel that belongs to the shaft, cut straight at its end.
     end : ndarray, shape (2,)
-        Where that is, column and row [px]; NaN where there is none.
+        Column and row of the end [px]; NaN without one.
     width_px : float
-        Of the needle [px]; what it would be where there is none.
+        Width of the needle [px], also without a needle.
     """
 
     image: NDArray[np.uint8]
@@ -54,21 +54,21 @@ class Sample:
 
 
 def random_width(rng: np.random.Generator) -> float:
-    """Return a needle's width, every octave as often [px]."""
+    """Return a random needle width, log-uniform [px]."""
     return float(np.exp(rng.uniform(*np.log(WIDTHS))))
 
 
 def exposed(
     rng: np.random.Generator, image: Image, before: Image | None
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """Return what one camera makes of a scene now and before, each with noise of its own.
+    """Return the camera images of a scene and its background, each with its own noise.
 
     Parameters
     ----------
     rng : Generator
-        What draws the camera and its noise.
+        Generator of the camera and its noise.
     image, before : ndarray of float32, shape (size, size)
-        Brightness, 0 to 255 and beyond; no background where `before` is None.
+        Brightness, 0 to 255 and beyond; no background if `before` is None.
     """
     effects = CameraEffects.draw(rng)
     seen = effects.apply(rng, image)
@@ -84,7 +84,7 @@ def exposed(
 
 
 def moved(image: Image, distance: float, angle: float) -> Image:
-    """Return an image moved by a distance in a direction [px, rad]."""
+    """Return an image shifted by a distance in a direction [px, rad]."""
     to = np.array(
         [[1.0, 0.0, distance * np.cos(angle)], [0.0, 1.0, distance * np.sin(angle)]], np.float64
     )

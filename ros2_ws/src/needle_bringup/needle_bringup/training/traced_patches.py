@@ -1,4 +1,4 @@
-"""Samples cut from path-traced images, turned, scaled and exposed anew at random."""
+"""Samples from path-traced images, with random rotation, scale and camera."""
 
 from __future__ import annotations
 
@@ -24,26 +24,29 @@ from needle_bringup.training.traced_scenes import TracedScene
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-_AT_END, _ON_SHAFT = 0.55, 0.25  # so often there; else anywhere
-_BESIDE_PX = 0.4 * SIZE  # so far from the middle may be what a patch is about
-_LARGEST = 1.8  # as a ratio: enlarged more, an image is only blurred
-_SMALLER, _BLUR = 0.8, 0.45  # images made smaller than that are blurred, by so many new pixels
-_TRACKS, _OF_NEEDLE = 0.4, 0.6  # so often there are tracks, and so often they are traced needles
-_DARK = 8.0  # grey levels, that ratios of dark pixels stay sound
+_AT_END, _ON_SHAFT = 0.55, 0.25  # probabilities of the centre; otherwise anywhere
+_BESIDE_PX = 0.4 * SIZE  # maximum distance of the subject from the middle
+_LARGEST = 1.8  # maximum scale; a larger one only blurs the image
+_SMALLER, _BLUR = (
+    0.8,
+    0.45,
+)  # scale below which images are blurred first, and the blur in new pixels
+_TRACKS, _OF_NEEDLE = 0.4, 0.6  # probability of tracks, and of traced needles as tracks
+_DARK = 8.0  # grey levels added before taking ratios of dark pixels
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Cut:
-    """A patch of an image: what of it is in the middle, how large, and turned by what.
+    """Position, scale and rotation of a patch in an image.
 
     Attributes
     ----------
     place : ndarray, shape (2,)
-        Column and row in the middle [px].
+        Column and row of the middle [px].
     scale : float
         New pixels per pixel.
     angle : float
-        The patch is turned by that [rad].
+        Rotation of the patch [rad].
     """
 
     place: Array
@@ -51,11 +54,11 @@ class Cut:
     angle: float
 
     def point(self, point: Array) -> Array:
-        """Return where a point of the image is in the patch [px]."""
+        """Return the position of an image point in the patch [px]."""
         return np.asarray(self._turn() @ (point - self.place) + 0.5 * (CANVAS - 1))
 
     def image(self, image: NDArray[np.uint8]) -> Image:
-        """Return the patch of an image, shape (CANVAS, CANVAS); beyond its edges it is mirrored."""
+        """Return the patch of an image, (CANVAS, CANVAS), mirrored beyond the edges."""
         reach = int(0.75 * CANVAS / self.scale) + 8
         corner = np.rint(self.place).astype(int) - reach
         low = np.clip(corner, 0, None)
@@ -76,14 +79,14 @@ class Cut:
 
 
 def traced_patch(rng: np.random.Generator, scenes: Sequence[TracedScene]) -> Sample:
-    """Return a sample cut from one of these scenes.
+    """Return a sample of one of the scenes.
 
     Parameters
     ----------
     rng : Generator
-        What chooses.
+        Random generator.
     scenes : sequence of TracedScene
-        Where from.
+        The scenes.
     """
     width = random_width(rng)
     for _ in range(8):
@@ -101,7 +104,7 @@ def traced_patch(rng: np.random.Generator, scenes: Sequence[TracedScene]) -> Sam
     before = cut.image(scene.images[_earlier(rng, i, len(scene.images))]) if known else None
     if rng.random() < _TRACKS:
         tracks = _tracks(rng, scene, i, cut, faint=not known)
-        # Most tracks are behind the needle, or the needle is in them.
+        # Most tracks are behind the needle, or contain it.
         uncovered = np.float32(1.0) - (share / np.float32(255.0)) * (rng.random() < 0.7)
         image = image * (1.0 + (tracks - 1.0) * uncovered)
         before = None if before is None else before * shifted_tracks(rng, tracks)
@@ -111,7 +114,7 @@ def traced_patch(rng: np.random.Generator, scenes: Sequence[TracedScene]) -> Sam
 
 
 def _earlier(rng: np.random.Generator, i: int, count: int) -> int:
-    """Return which image of the same camera is the background: empty, shorter or longer."""
+    """Return the index of the background of the same camera: empty, shorter or longer."""
     others = np.arange(i % 2, count, 2)
     longer, shorter = others[others > i], others[(others < i) & (others > 1)]
     chance = rng.random()
@@ -119,14 +122,14 @@ def _earlier(rng: np.random.Generator, i: int, count: int) -> int:
         return int(rng.choice(longer))
     if chance < 0.5 and len(shorter):
         return int(rng.choice(shorter))
-    # Rarely the image is its own background: what was never seen without needle.
+    # Rarely the image is its own background, for views never seen without the needle.
     return i if 0.5 <= chance < 0.53 else i % 2
 
 
 def _tracks(
     rng: np.random.Generator, scene: TracedScene, i: int, cut: Cut, *, faint: bool
 ) -> Image:
-    """Return by what factor old tracks change the brightness of each pixel of a patch."""
+    """Return the factor of each pixel's brightness by old tracks in a patch."""
     if rng.random() > _OF_NEEDLE:
         end = cut.point(scene.ends[i])
         if not np.isfinite(end).all():
@@ -136,7 +139,7 @@ def _tracks(
         return drawn_tracks(
             rng, Pose(float(end[0]), float(end[1]), heading, 0.0, 0.0, radius), CANVAS, faint=faint
         )
-    # A needle of the same scene, traced with all its glints and shadows, at another place.
+    # Use a traced needle of the same scene at another place as a track.
     k = int(rng.integers(2, len(scene.images)))
     if rng.random() < 0.35 and k % 2 == i % 2:
         nudge = rng.normal(0.0, 3.0, 2) / cut.scale
@@ -152,7 +155,7 @@ def _tracks(
 
 
 def _place(rng: np.random.Generator, scene: TracedScene, i: int) -> Array:
-    """Return what a patch of an image is about [px]."""
+    """Return the subject of a patch in an image [px]."""
     chance, end = rng.random(), scene.ends[i]
     if chance < _AT_END and np.isfinite(end).all():
         return np.asarray(end)

@@ -1,4 +1,4 @@
-"""Path-traced images to learn from, and the share of each pixel that is shaft."""
+"""Path-traced training images, and the share of each pixel that belongs to the shaft."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from needle_sim.path_traced.insertion import trace_insertion
 from needle_sim.path_traced.tracer import Mitsuba
 
 _EXPOSURES = 6
-# Insertions are drawn from these [m]; a short step shows what a needle's first new part looks like.
+# Ranges of the first insertion and of the step [m].
 _BEGIN, _STEP = (0.005, 0.03), (0.002, 0.008)
-_FINE, _SUBPIXEL_BITS = 4, 4  # points across a pixel, and bits of a corner's place
+_FINE, _SUBPIXEL_BITS = 4, 4  # sub-pixels across a pixel, and fractional bits of a corner
 _SIDEWAYS = 1e-4  # for the shaft's width in pixels [m]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TracedScene:
-    """The phantom without a needle, then with one at several insertions, as both cameras see it.
+    """Images of both cameras without a needle, then at several insertions.
 
     Attributes
     ----------
     images : ndarray of uint8, shape (n, height, width)
-        As the cameras have them, left and right in turn.
+        Camera images, alternating left and right.
     shares : ndarray of uint8, shape (n, height, width)
-        255 times the share of each pixel that is shaft, cut straight at the end of its axis.
+        255 times the share of each pixel that belongs to the shaft, cut straight at its end.
     ends : ndarray, shape (n, 2)
-        Where that is [px]; NaN where there is no needle in the image.
+        Ends of the shaft [px]; NaN if outside the image.
     widths_px : ndarray, shape (n,)
-        Of the needle in each, or where it will be in the phantom without one [px].
+        Needle width in each image, also in those without a needle [px].
     """
 
     images: NDArray[np.uint8]
@@ -44,16 +44,16 @@ class TracedScene:
 
 
 def trace_scene(mitsuba: Mitsuba, rig: StereoRig, seed: int) -> TracedScene:
-    """Trace one scene at random.
+    """Trace a random scene.
 
     Parameters
     ----------
     mitsuba : Mitsuba
-        As `load_mitsuba` gives it.
+        From `load_mitsuba`.
     rig : StereoRig
         Cameras and phantom.
     seed : int
-        Keys all that is random.
+        Seed of all random numbers.
     """
     look = draw_appearance("random", seed)
     rng = np.random.default_rng(seed)
@@ -90,25 +90,25 @@ def trace_scene(mitsuba: Mitsuba, rig: StereoRig, seed: int) -> TracedScene:
 def shaft_share(
     line: NDArray[np.float64], diameter: float, camera: SimulatedCamera
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:
-    """Return where a camera sees a needle's shaft.
+    """Return the image of the shaft of a needle.
 
     Parameters
     ----------
     line : ndarray, shape (n, 3)
-        Its axis, outwards, in `rig` [m].
+        Axis of the shaft, towards the tip, in `rig` [m].
     diameter : float
-        Of it [m].
+        Diameter of the shaft [m].
     camera : SimulatedCamera
-        Which sees it.
+        The camera.
 
     Returns
     -------
     share : ndarray of uint8, shape (height, width)
-        255 times the share of each pixel, cut straight at the end of the axis.
+        255 times the share of each pixel that belongs to the shaft, cut straight at its end.
     end : ndarray, shape (2,)
-        Where that is [px]; NaN outside the image.
+        End of the shaft [px]; NaN outside the image.
     width_px : float
-        Of the shaft, in the median [px].
+        Median width of the shaft [px].
     """
 
     def seen(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -119,7 +119,7 @@ def shaft_share(
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     ahead = np.gradient(line, axis=0)
-    # Of a round shaft each camera sees the two sides that are across its own line of sight.
+    # The outline of a round shaft is perpendicular to the line of sight.
     one = np.cross(ahead, [1.0, 0.0, 0.0])
     moved = [
         np.sum((seen(line + _SIDEWAYS * side / _norm(side)) - middle) * across, axis=1)

@@ -10,12 +10,10 @@ import struct
 import pytest
 
 from needle_bringup.operator import input_device
-from needle_bringup.operator.controls import Controls
+from needle_bringup.operator.controls import Controls, InputLost, InputState
 from needle_bringup.operator.event_source import OPEN_PERIOD, EventSource
-from needle_bringup.operator.hand import Hand, Lost
-from needle_bringup.operator.hold_gate import Held, HoldGate
-from needle_bringup.operator.input_device import InputDevice, set_bits
-from needle_bringup.operator.input_events import EventReader, KeyChanges
+from needle_bringup.operator.hold_debouncer import HoldDebouncer, HoldKind
+from needle_bringup.operator.input_device import EventReader, InputDevice, KeyChanges, set_bits
 
 KEY, RETRACT, STOP, AXIS = 48, 46, 30, 2
 CONTROLS = Controls(insert=KEY, retract=RETRACT, stop=STOP)
@@ -65,13 +63,13 @@ class PlayedDevice:
 
 
 class Desk:
-    """A source, the device before it, and a gate behind it."""
+    """A source, the device before it, and a debouncer behind it."""
 
     def __init__(self, controls: Controls = CONTROLS, *down: int) -> None:
         self.device = PlayedDevice(*down)
         self.is_there = True
         self.source = EventSource("/dev/input/pedal", controls, lambda: 0.8, self.open)
-        self.gate = HoldGate()
+        self.debouncer = HoldDebouncer()
         self.now = 10.0
 
     def open(self, path: str) -> PlayedDevice:
@@ -85,17 +83,21 @@ class Desk:
             self.device.sent += key(code, value)
             (self.device.down.discard if value == UP else self.device.down.add)(code)
 
-    def read(self) -> Hand | Lost:
+    def read(self) -> InputState | InputLost:
         self.now += CYCLE
         return self.source.read(self.now)
 
-    def held(self) -> Held:
-        return self.gate.take(self.read(), self.now).held
+    def held(self) -> HoldKind:
+        return self.debouncer.update(self.read(), self.now).kind
 
 
-HELD, STOPPED, NOTHING = Hand(insert=True, speed=0.8), Hand(stop=True, speed=0.8), Hand(speed=0.8)
+HELD, STOPPED, NOTHING = (
+    InputState(insert=True, speed=0.8),
+    InputState(stop=True, speed=0.8),
+    InputState(speed=0.8),
+)
 # What was sent before each look, and what the look tells.
-LOOKS: tuple[tuple[tuple[tuple[int, ...], Hand], ...], ...] = (
+LOOKS: tuple[tuple[tuple[tuple[int, ...], InputState], ...], ...] = (
     # A pedal that is held sends nothing.
     (((KEY, DOWN), HELD), ((), HELD), ((KEY, UP), NOTHING)),
     # Key repeat is no press.
@@ -107,7 +109,7 @@ LOOKS: tuple[tuple[tuple[tuple[int, ...], Hand], ...], ...] = (
 )
 
 
-def test_a_look_tells_what_is_held_and_not_what_repeats() -> None:
+def test_a_reading_ignores_key_repeat() -> None:
     for looks in LOOKS:
         desk = Desk()
         assert desk.read() == NOTHING
@@ -117,15 +119,15 @@ def test_a_look_tells_what_is_held_and_not_what_repeats() -> None:
             assert desk.read() == wanted
 
 
-def test_what_is_down_at_the_start_counts_only_when_pressed_again() -> None:
+def test_a_key_down_at_the_start_must_be_pressed_again() -> None:
     desk = Desk(CONTROLS, KEY)
     for _ in range(5):
-        assert desk.held() is Held.NOTHING
+        assert desk.held() is HoldKind.NOTHING
         desk.do(KEY, REPEAT)
     desk.do(KEY, UP)
-    assert desk.held() is Held.NOTHING
+    assert desk.held() is HoldKind.NOTHING
     desk.do(KEY, DOWN)
-    assert desk.held() is Held.INSERT
+    assert desk.held() is HoldKind.INSERT
 
 
 def test_events_that_the_kernel_dropped_may_have_been_a_release() -> None:
@@ -138,38 +140,38 @@ def test_events_that_the_kernel_dropped_may_have_been_a_release() -> None:
     assert desk.read() == HELD
 
 
-def test_an_unplugged_pedal_is_lost_at_once_and_pressed_anew_when_it_is_back() -> None:
+def test_an_unplugged_pedal_is_lost_and_must_be_pressed_again() -> None:
     desk = Desk()
     desk.held()
     old = desk.device
     desk.do(KEY, DOWN)
-    assert desk.held() is Held.INSERT
+    assert desk.held() is HoldKind.INSERT
     # What was cut off with its plug begins no event of the next.
     old.sent = key(KEY, DOWN)[:10]
     desk.read()
     old.gone, desk.is_there = errno.ENODEV, False
-    assert desk.read() == Lost(f"/dev/input/pedal: {os.strerror(errno.ENODEV)}")
+    assert desk.read() == InputLost(f"/dev/input/pedal: {os.strerror(errno.ENODEV)}")
     assert old.closed
     desk.device, desk.is_there = PlayedDevice(KEY), True
     # It is looked for now and then.
     lost_until = desk.now + OPEN_PERIOD
     while desk.now + CYCLE < lost_until:
-        assert isinstance(desk.read(), Lost)
+        assert isinstance(desk.read(), InputLost)
     for _ in range(5):
-        assert desk.held() is Held.NOTHING
+        assert desk.held() is HoldKind.NOTHING
     assert desk.read() == HELD
     desk.do(KEY, UP)
-    assert desk.held() is Held.NOTHING
+    assert desk.held() is HoldKind.NOTHING
     desk.do(KEY, DOWN)
-    assert desk.held() is Held.INSERT
+    assert desk.held() is HoldKind.INSERT
 
 
-def test_a_device_that_is_not_there_or_without_the_key_is_named() -> None:
+def test_a_missing_device_or_key_is_named() -> None:
     desk = Desk()
     desk.is_there = False
-    assert desk.read() == Lost("/dev/input/pedal: No such file or directory")
+    assert desk.read() == InputLost("/dev/input/pedal: No such file or directory")
     desk = Desk(Controls(insert=57))
-    assert desk.read() == Lost("/dev/input/pedal: it has no key 57 (its keys: 30, 46, 48)")
+    assert desk.read() == InputLost("/dev/input/pedal: it has no key 57 (its keys: 30, 46, 48)")
     assert desk.device.closed
 
 
@@ -178,27 +180,27 @@ def test_an_axis_sets_the_speed_up_to_the_scale() -> None:
     for at, share in ((1.0, 0.0), (0.5, 0.0), (-0.25, 0.5), (-1.0, 1.0)):
         desk.device.axis_at = at
         read = desk.read()
-        assert isinstance(read, Hand)
+        assert isinstance(read, InputState)
         assert read.speed == pytest.approx(0.8 * share)
 
 
-def test_bytes_may_be_cut_anywhere() -> None:
+def test_bytes_may_be_split_anywhere() -> None:
     whole = key(KEY, DOWN) + key(RETRACT, REPEAT) + key(KEY, UP) + key(STOP, DOWN)
-    assert EventReader().take(whole) == KeyChanges(frozenset({KEY, STOP}), frozenset({KEY}))
+    assert EventReader().decode(whole) == KeyChanges(frozenset({KEY, STOP}), frozenset({KEY}))
     for cut in range(len(whole)):
         reader = EventReader()
-        one, two = reader.take(whole[:cut]), reader.take(whole[cut:])
+        one, two = reader.decode(whole[:cut]), reader.decode(whole[cut:])
         assert one.pressed | two.pressed == {KEY, STOP}
         assert one.released | two.released == {KEY}
 
 
-def test_a_file_that_is_no_input_device_is_refused() -> None:
+def test_a_file_that_is_no_input_device_is_rejected() -> None:
     for path in ("/dev/null", "/dev/input/that_is_not_there"):
         with pytest.raises(OSError, match=r"no input device|No such file"):
             InputDevice(path)
 
 
-def test_an_open_device_is_asked_as_the_kernel_wants_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ioctls_of_an_input_device(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
     def answer(file: int, request: int, data: bytes) -> bytes:

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from needle_bringup.operator.component import INPUT_DEVICE, PERIOD, Operator
-from needle_bringup.operator.controls import Controls
-from needle_bringup.operator.hand import Hand, Lost, Reading
+from needle_bringup.operator.controls import Controls, InputLost, InputReading, InputState
 from needle_bringup.operator.parameters import OperatorParameters
 from needle_core import messages as m
 from needle_core.component import (
@@ -31,7 +30,7 @@ from needle_core.status_messages import DeviceStatus
 PEDAL = OperatorParameters(device="/dev/input/pedal", key=48, retract_key=49, stop_key=50)
 JOYSTICK = OperatorParameters(source="joy", key=0, retract_key=1, stop_key=2, speed_axis=0)
 STOP_STEERING, RETRACT, STOP = "plane_controller/stop", "device/retract", "device/stop"
-NEUTRAL, OUT = Hand(), Hand(retract=True)
+NEUTRAL, OUT = InputState(), InputState(retract=True)
 
 
 class Scene:
@@ -62,13 +61,13 @@ class Scene:
             else:
                 assert isinstance(action, Diagnose)
 
-    def look(self, reading: Reading = NEUTRAL, **status: Any) -> m.HoldState:
+    def update(self, reading: InputReading = NEUTRAL, **status: Any) -> m.HoldState:
         """Let the device say something, then the hand at the port do."""
         self.now += PERIOD
         (row,), (port,) = self.operator.inputs, self.operator.ports
         if status:
             self.take(row.handler(DeviceStatus(**status), self.at))
-        self.take(port.handler((Lost("an older reading"), reading), self.at))
+        self.take(port.handler((InputLost("an older reading"), reading), self.at))
         return self.holds[-1]
 
     def joy(self, *down: int, silent: bool = False) -> m.HoldState:
@@ -82,25 +81,25 @@ class Scene:
         return self.holds[-1]
 
 
-def test_a_pedal_at_the_port_is_held_until_it_is_lost() -> None:
+def test_a_pedal_is_held_until_it_is_lost() -> None:
     scene = Scene(PEDAL)
-    assert not scene.look().pressed
-    held = scene.look(Hand(insert=True, speed=0.5))
+    assert not scene.update().pressed
+    held = scene.update(InputState(insert=True, speed=0.5))
     assert (held.source, held.pressed, held.speed_scale) == ("operator", True, 0.5)
     assert held.lifetime == m.HOLD_LIFETIME
-    scene.look(Hand(insert=True), press_again="operator")
+    scene.update(InputState(insert=True), press_again="operator")
     assert "the device does not take this press" in scene.logs[-1]
-    assert not scene.look(Lost("unplugged")).pressed
+    assert not scene.update(InputLost("unplugged")).pressed
     assert scene.logs[-1] == "nothing is held: unplugged"
     for _ in range(2):
-        assert not scene.look(Hand(insert=True)).pressed
+        assert not scene.update(InputState(insert=True)).pressed
     # What does not change is said once.
     assert [text for text in scene.logs if "what is held does not count" in text] == scene.logs[-1:]
     assert [hold.count for hold in scene.holds] == list(range(1, len(scene.holds) + 1))
     assert len({hold.session for hold in scene.holds}) == 1
 
 
-def test_a_joystick_holds_at_its_axis_speed_stops_and_must_go_on_talking() -> None:
+def test_a_joystick_holds_sets_the_speed_stops_and_times_out() -> None:
     scene = Scene(JOYSTICK)
     # Pressed from the start on: it does not count.
     assert not scene.joy(0).pressed
@@ -116,27 +115,27 @@ def test_a_joystick_holds_at_its_axis_speed_stops_and_must_go_on_talking() -> No
     assert scene.called == [STOP]
 
 
-def test_the_controller_is_stopped_before_the_needle_is_drawn_out() -> None:
+def test_the_controller_is_stopped_before_a_withdrawal() -> None:
     scene = Scene(PEDAL)
-    scene.look()
+    scene.update()
     # The hold of this look was made before the answer came.
-    assert not scene.look(OUT).pressed
+    assert not scene.update(OUT).pressed
     assert scene.called == [STOP_STEERING]
-    assert scene.look(OUT).pressed
+    assert scene.update(OUT).pressed
     assert scene.logs[-1] == "held to draw the needle out"
-    scene.look(OUT, hold_owner="operator")
+    scene.update(OUT, hold_owner="operator")
     assert scene.called == [STOP_STEERING, RETRACT]
-    assert scene.look(OUT, hold_owner="operator", activity="retraction").pressed
-    assert not scene.look(OUT, activity="none").pressed
-    scene.look()
+    assert scene.update(OUT, hold_owner="operator", activity="retraction").pressed
+    assert not scene.update(OUT, activity="none").pressed
+    scene.update()
     for _ in range(60):
-        scene.look(OUT)
+        scene.update(OUT)
     # Nobody takes the hold.
     assert not scene.holds[-1].pressed
     assert "not drawn out: the device does not take the hold" in scene.logs[-1]
 
 
-def test_a_new_speed_reaches_the_hand_and_whoever_ends_releases() -> None:
+def test_a_new_speed_is_applied_and_the_end_releases() -> None:
     operator, at = Operator(PEDAL), Moment(1.0, 1)
     faster = dataclasses.replace(PEDAL, speed_scale=0.25)
     assert list(operator.on_settings(faster, at)) == [Send(INPUT_DEVICE, (0.25,))]
@@ -145,7 +144,7 @@ def test_a_new_speed_reaches_the_hand_and_whoever_ends_releases() -> None:
     assert end == Exit(0)
 
 
-def test_what_nobody_could_hold_is_refused() -> None:
+def test_invalid_parameters_are_rejected() -> None:
     assert OperatorParameters(key=48, device="/x").controls == Controls(insert=48)
     refused: list[tuple[dict[str, Any], str]] = [
         ({"key": -1}, "key = -1"),

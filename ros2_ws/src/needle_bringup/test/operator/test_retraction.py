@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from needle_bringup.operator.retraction import PATIENCE, RETRACT, STOP_STEERING, RetractionSequence
+from needle_bringup.operator.retraction import (
+    RETRACT,
+    STEP_TIMEOUT,
+    STOP_STEERING,
+    RetractionSequence,
+)
 
 IN_VAIN = (
     f"no answer from {STOP_STEERING}",
@@ -23,64 +28,64 @@ def at_step(steps: int) -> RetractionSequence:
     The controller was told to stop, has, the device was told to retract, and has agreed.
     """
     retraction = RetractionSequence("operator")
-    retraction.see_device("", "none", 0.0)
-    assert retraction.look(True, 1.0, controller=True) == STOP_STEERING
-    assert retraction.look(True, 1.0, controller=True) is None
+    retraction.handle_device("", "none", 0.0)
+    assert retraction.update(True, 1.0, controller=True) == STOP_STEERING
+    assert retraction.update(True, 1.0, controller=True) is None
     assert not holds(retraction)
     if steps > 0:
-        retraction.take_answer(STOP_STEERING, True, "stopped", 1.0)
+        retraction.handle_answer(STOP_STEERING, True, "stopped", 1.0)
     if steps > 1:
-        retraction.see_device("operator", "none", 1.0)
-        assert retraction.look(True, 1.0, controller=True) == RETRACT
-        assert retraction.look(True, 1.0, controller=True) is None
+        retraction.handle_device("operator", "none", 1.0)
+        assert retraction.update(True, 1.0, controller=True) == RETRACT
+        assert retraction.update(True, 1.0, controller=True) is None
     if steps > 2:
-        retraction.take_answer(RETRACT, True, "retracting", 1.0)
+        retraction.handle_answer(RETRACT, True, "retracting", 1.0)
     assert holds(retraction) is (steps > 0)
     return retraction
 
 
-def test_the_hold_ends_with_the_retraction_though_the_button_is_held() -> None:
+def test_the_hold_ends_with_the_retraction() -> None:
     for answer_last in (False, True):
         retraction = at_step(2 if answer_last else 3)
-        retraction.see_device("operator", "retraction", 1.15)
+        retraction.handle_device("operator", "retraction", 1.15)
         if answer_last:
-            retraction.take_answer(RETRACT, True, "retracting", 1.2)
-        assert retraction.look(True, 60.0, controller=False) is None
+            retraction.handle_answer(RETRACT, True, "retracting", 1.2)
+        assert retraction.update(True, 60.0, controller=False) is None
         assert holds(retraction)
-        retraction.see_device("operator", "none", 61.0)
-        assert retraction.look(True, 61.1, controller=False) is None
+        retraction.handle_device("operator", "none", 61.0)
+        assert retraction.update(True, 61.1, controller=False) is None
         assert not holds(retraction)
         assert retraction.trouble == ""
 
 
-def test_without_a_controller_the_hold_is_given_at_once() -> None:
+def test_without_a_controller_the_hold_starts_immediately() -> None:
     retraction = RetractionSequence("operator")
-    assert retraction.look(True, 1.0, controller=False) is None
+    assert retraction.update(True, 1.0, controller=False) is None
     assert holds(retraction)
 
 
-def test_a_release_ends_it_and_a_new_press_begins_it_anew() -> None:
+def test_a_release_ends_the_sequence_and_a_new_press_restarts_it() -> None:
     retraction = at_step(3)
-    assert retraction.look(False, 2.0, controller=True) is None
+    assert retraction.update(False, 2.0, controller=True) is None
     # What was asked for before comes too late.
-    retraction.take_answer(STOP_STEERING, True, "stopped", 2.1)
+    retraction.handle_answer(STOP_STEERING, True, "stopped", 2.1)
     assert not holds(retraction)
-    assert retraction.look(True, 3.0, controller=True) == STOP_STEERING
+    assert retraction.update(True, 3.0, controller=True) == STOP_STEERING
 
 
-def test_a_refusal_ends_the_hold_and_is_said() -> None:
+def test_a_refusal_ends_the_hold_and_is_reported() -> None:
     for steps, service in ((0, STOP_STEERING), (2, RETRACT)):
         retraction = at_step(steps)
-        retraction.take_answer(service, False, "not now", 1.2)
+        retraction.handle_answer(service, False, "not now", 1.2)
         assert not holds(retraction)
         assert retraction.trouble == f"{service} was refused: not now"
 
 
-def test_what_does_not_come_ends_the_hold() -> None:
+def test_a_timeout_ends_the_hold() -> None:
     for steps, said in enumerate(IN_VAIN):
         retraction = at_step(steps)
-        assert retraction.look(True, 1.0 + 0.99 * PATIENCE, controller=True) is None
+        assert retraction.update(True, 1.0 + 0.99 * STEP_TIMEOUT, controller=True) is None
         assert not retraction.trouble
-        retraction.look(True, 1.0 + 1.01 * PATIENCE, controller=True)
+        retraction.update(True, 1.0 + 1.01 * STEP_TIMEOUT, controller=True)
         assert not holds(retraction)
         assert said in retraction.trouble

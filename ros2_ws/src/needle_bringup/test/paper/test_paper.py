@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 
 from needle_bags.reading.bag_reader import Run, read_run
-from needle_bringup.paper import paper_results, paper_runs
+from needle_bringup.paper import paper_runs
 from needle_bringup.paper.paper import main
 from needle_bringup.paper.paper_figures import common_r1, converged_share
 from needle_bringup.paper.paper_results import Floats, SteeringTrial, missed_later, settled_mm
 from needle_bringup.paper.paper_runs import Columns, Laboratory
-from needle_bringup.studies.limit_study import LimitRow, Reached
 from needle_bringup.workplace import checkout
 from needle_core.commands.cli import JsonValue
 from needle_core.errors import UserError
@@ -43,7 +42,7 @@ def test_settled_is_the_last_entry_into_the_band() -> None:
     assert settled_mm(insertion, np.full(6, 2.0)) == np.inf
 
 
-def test_runs_that_missed_are_looked_at_again_farther_in() -> None:
+def test_missed_runs_are_evaluated_again_farther_in() -> None:
     runs = {"r1_final_mm": np.array([0.5, -1.5, 3.0, 1.2])}
     longer = {"r1_final_mm": np.array([5.0, 0.2, -2.0, 0.9])}
     # the first had not missed: what it does later does not count
@@ -51,7 +50,7 @@ def test_runs_that_missed_are_looked_at_again_farther_in() -> None:
     assert missed_later({"r1_final_mm": np.zeros(2)}, {"r1_final_mm": np.zeros(2)}) == (0, 0, 0.0)
 
 
-def test_trials_are_averaged_where_all_are_and_cells_hold_their_own_share() -> None:
+def test_trials_are_averaged_over_their_common_range() -> None:
     one = trial(np.arange(11.0), np.arange(11.0))
     other = trial(np.arange(0.0, 9.0, 2.0), np.zeros(5))
     insertion, r1 = common_r1([one, other])
@@ -66,7 +65,7 @@ def test_trials_are_averaged_where_all_are_and_cells_hold_their_own_share() -> N
     np.testing.assert_allclose(shares, [[0.5, np.nan], [np.nan, 1.0]])
 
 
-def test_what_is_there_is_not_run_again_and_words_and_empty_cells_are_no_numbers(
+def test_existing_results_are_reused(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "one.json").write_text(json.dumps({"runs": 2}), "utf-8")
@@ -79,7 +78,7 @@ def test_what_is_there_is_not_run_again_and_words_and_empty_cells_are_no_numbers
     assert set(runs) == {"x_mm", "settle_mm"}
 
 
-def test_what_runs_is_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_are_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[list[str]] = []
     monkeypatch.setattr(paper_runs, "_run", lambda name, command, good: asked.append(command))
     laboratory = Laboratory(["simulate", "-q"], tmp_path)
@@ -97,7 +96,7 @@ def test_what_runs_is_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert (asked[1][1:3], asked[2][1:4]) == (["--draws", "1"], [bag, "--from-mm", "5"])
 
 
-def test_bad_arguments_are_one_line_and_exit_2(
+def test_bad_arguments_give_a_one_line_error_and_exit_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("", "utf-8")
@@ -145,23 +144,20 @@ class MadeUpLaboratory(Laboratory):
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder with all that `paper` writes of made-up runs."""
     folder = tmp_path_factory.mktemp("paper")
-    row = LimitRow(Reached(0.14, 0.2, 0.999), Reached(0.11, 0.15, 1.0))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_runs, "Laboratory", MadeUpLaboratory)
-        patch.setattr(paper_results, "limits", lambda *_: {"noise ±1 mm": row})
         words = ["--quick", "--out", str(folder / "out"), "--json", str(folder / "figures.json")]
         assert main(words) == 0
     return folder
 
 
-def test_the_page_has_the_paper_s_values_beside_those_of_the_runs(written: Path) -> None:
+def test_the_page_has_both_values(written: Path) -> None:
     page = (written / "out" / "paper.md").read_text("utf-8")
     for cells in (
         "endpoint grid: within ±1 mm at 120 mm",
         "| 98.56 % | 99.00 % / 98.50 % |",
         "| 144 of 10,000; none diverged | 4 of 400; 3 of them within ±1 mm at 240 mm, the worst 2",
         "| 12.2 cm | 12.10 cm (95 %: 118.5 to 124.5 mm) |",
-        "0.14 mm, 0.20 mm, 99.9 %; limit 0.11 mm, 0.15 mm, 100.0 %",
     ):
         assert cells in page
     images = sorted((written / "out" / "images").glob("*.png"))
@@ -172,5 +168,4 @@ def test_the_page_has_the_paper_s_values_beside_those_of_the_runs(written: Path)
         assert np.ptp(image) > 200
     values = json.loads((written / "figures.json").read_text())
     assert (values["endpoint_missed"], values["endpoint_missed_also_later"]) == (4, 1)
-    assert values["limit_noise_1_mm_point_rms_mm"] == 0.15
     assert all(math.isfinite(value) for value in values.values())

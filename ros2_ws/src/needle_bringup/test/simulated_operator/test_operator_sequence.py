@@ -7,7 +7,7 @@ import itertools
 from typing import Any
 
 from needle_bringup.simulated_operator.operator_sequence import (
-    ASK_AGAIN,
+    CALL_TIMEOUT,
     ENABLE,
     HOME,
     PREPARATION,
@@ -29,24 +29,24 @@ STEERING = ControllerStatus(
 
 
 def see(sequence: OperatorSequence, status: DeviceStatus, now: float = 1.0) -> None:
-    sequence.see_device(dataclasses.replace(status, source="/sim_rig"), now)
+    sequence.handle_device(dataclasses.replace(status, source="/sim_rig"), now)
 
 
 def hear(sequence: OperatorSequence, now: float = 2.0, **said: Any) -> None:
-    sequence.see_controller(dataclasses.replace(STEERING, **said), now)
+    sequence.handle_controller(dataclasses.replace(STEERING, **said), now)
 
 
 def unheard() -> OperatorSequence:
     """Return a sequence that has heard nothing, and misses nobody."""
     sequence = OperatorSequence(0.0, "simulated_operator", wait_timeout=30.0, stall_timeout=60.0)
-    sequence.see_missing([])
+    sequence.handle_missing([])
     return sequence
 
 
 def fresh() -> OperatorSequence:
     """Return a sequence before a simulated device that is alone."""
     sequence = unheard()
-    sequence.see_devices(["/sim_rig"])
+    sequence.handle_devices(["/sim_rig"])
     see(sequence, FRESH, 0.0)
     hear(sequence, 0.0, state="IDLE", starts=0)
     return sequence
@@ -78,12 +78,12 @@ def reach(
         assert sequence.next_call(1.0) is None, "one call at a time"
         if call == wanted:
             return sequence
-        sequence.take_answer(call, True, "", 1.0)
+        sequence.handle_answer(call, True, "", 1.0)
     assert sequence.hold()
     return sequence
 
 
-def test_it_prepares_holds_until_done_and_releases() -> None:
+def test_it_prepares_holds_and_releases() -> None:
     sequence = reach()
     hear(sequence, 2.0)
     assert sequence.hold()
@@ -96,7 +96,7 @@ def test_it_prepares_holds_until_done_and_releases() -> None:
 
 def test_it_calls_nothing_while_a_partner_is_missing() -> None:
     sequence = fresh()
-    sequence.see_missing(["service device/home"])
+    sequence.handle_missing(["service device/home"])
     assert sequence.next_call(1.0) is None
     sequence.check_time(29.9)
     assert outcome(sequence) is None
@@ -105,16 +105,16 @@ def test_it_calls_nothing_while_a_partner_is_missing() -> None:
     assert not sequence.touched
 
 
-def test_it_asks_again_where_the_rig_is_not_ready_yet_and_gives_up_where_it_refuses() -> None:
+def test_it_repeats_calls_until_the_rig_is_ready_or_refuses() -> None:
     sequence = reach(CONFIRM)
     not_yet = "waiting for a subscriber of joint_states"
-    sequence.take_answer(CONFIRM, False, not_yet, 1.0)
+    sequence.handle_answer(CONFIRM, False, not_yet, 1.0)
     assert sequence.next_call(1.05) is None
     for now, refusal in ((20.0, not_yet), (20.2, "the needle is in"), (22.2, "the needle is in")):
         # What a refusal rests on may have changed meanwhile.
         assert outcome(sequence) is None
         assert sequence.next_call(now) == CONFIRM
-        sequence.take_answer(CONFIRM, False, refusal, now)
+        sequence.handle_answer(CONFIRM, False, refusal, now)
     assert "the needle is in" in why(sequence)
 
 
@@ -124,26 +124,26 @@ def test_a_service_that_never_answers_is_named() -> None:
     assert "no answer from device/confirm_needle_out" in why(sequence)
 
 
-def test_a_call_whose_answer_was_lost_is_made_again_and_a_late_one_is_to_it_alone() -> None:
+def test_a_call_is_repeated_if_its_answer_is_lost() -> None:
     for call in PREPARATION:
         sequence = reach(call)
-        assert sequence.next_call(0.9 + ASK_AGAIN) is None
-        assert sequence.next_call(1.0 + ASK_AGAIN) == call
-        sequence.take_answer(call, True, "", 2.1)
+        assert sequence.next_call(0.9 + CALL_TIMEOUT) is None
+        assert sequence.next_call(1.0 + CALL_TIMEOUT) == call
+        sequence.handle_answer(call, True, "", 2.1)
         following = sequence.next_call(2.1)
         if call == START:
             assert (following, sequence.hold()) == (None, True)
             continue
         assert following == PREPARATION[PREPARATION.index(call) + 1]
         for success in (True, False):
-            sequence.take_answer(call, success, "the device is MOVING", 2.2)
+            sequence.handle_answer(call, success, "the device is MOVING", 2.2)
             assert not sequence.steering
             assert sequence.next_call(2.5) is None
 
 
-def test_a_homing_is_waited_for_whatever_was_heard_before_it() -> None:
+def test_an_earlier_status_does_not_end_the_homing() -> None:
     sequence = reach(HOME)
-    sequence.take_answer(HOME, True, "homing", 1.0)
+    sequence.handle_answer(HOME, True, "homing", 1.0)
     assert sequence.next_call(1.0) is None
     # A device may say that it is homed, from last time, while it looks for its switches.
     for homed in (False, True):
@@ -153,10 +153,10 @@ def test_a_homing_is_waited_for_whatever_was_heard_before_it() -> None:
     assert sequence.next_call(3.0) == ENABLE
 
 
-def test_the_end_of_a_homing_may_overtake_its_answer_or_stand_for_it() -> None:
+def test_a_status_may_replace_the_answer_of_homing() -> None:
     overtaken, lost, stale = reach(HOME), reach(HOME), reach(HOME)
     see(overtaken, DISABLED)
-    overtaken.take_answer(HOME, True, "homing", 1.0)
+    overtaken.handle_answer(HOME, True, "homing", 1.0)
     assert overtaken.next_call(1.0) == ENABLE
     see(lost, MOVING, 1.2)
     assert lost.next_call(5.0) is None, "it moves: not asked again"
@@ -165,7 +165,7 @@ def test_the_end_of_a_homing_may_overtake_its_answer_or_stand_for_it() -> None:
     # Homed from before the call is no answer to it.
     see(stale, dataclasses.replace(DISABLED, needle_out_confirmed=True), 1.1)
     assert stale.next_call(1.2) is None
-    assert stale.next_call(1.0 + ASK_AGAIN) == HOME
+    assert stale.next_call(1.0 + CALL_TIMEOUT) == HOME
 
 
 def test_a_start_whose_answer_was_lost_is_known_from_the_status() -> None:
@@ -174,28 +174,28 @@ def test_a_start_whose_answer_was_lost_is_known_from_the_status() -> None:
     assert not sequence.hold()
     hear(sequence, 1.2)
     assert sequence.hold()
-    sequence.take_answer(START, False, "already steering", 1.3)
+    sequence.handle_answer(START, False, "already steering", 1.3)
     assert outcome(sequence) is None
     assert sequence.next_call(9.0) is None
 
 
-def test_nothing_is_started_before_the_controller_has_said_how_often_it_was() -> None:
+def test_start_requires_a_controller_status() -> None:
     sequence = unheard()
-    sequence.see_devices(["/sim_rig"])
+    sequence.handle_devices(["/sim_rig"])
     see(sequence, DISABLED)
     for _ in PREPARATION[:-1]:
         call = sequence.next_call(1.0)
         assert call is not None
-        sequence.take_answer(call, True, "", 1.0)
+        sequence.handle_answer(call, True, "", 1.0)
     assert sequence.next_call(1.0) is None
-    assert "needle/controller_status" in sequence.hangs()
+    assert "needle/controller_status" in sequence.pending_reason()
     hear(sequence, 1.1, state="DONE", starts=4)
     assert sequence.next_call(1.1) == START
-    sequence.take_answer(START, True, "", 1.1)
+    sequence.handle_answer(START, True, "", 1.1)
     assert outcome(sequence) is None
 
 
-def test_what_ends_the_run_is_its_reason() -> None:
+def test_the_outcome_names_the_reason() -> None:
     for state, reason in (("FAULT", "curvature lost"), ("IDLE", "stopped by hand")):
         sequence = reach()
         hear(sequence)
@@ -210,7 +210,7 @@ def test_what_ends_the_run_is_its_reason() -> None:
     assert why(sequence) == "interrupted"
 
 
-def test_what_was_said_before_this_start_is_of_another_run() -> None:
+def test_statuses_before_the_start_are_ignored() -> None:
     for state in ("DONE", "FAULT", "IDLE"):
         sequence = fresh()
         hear(sequence, 0.5, state=state)
@@ -223,7 +223,7 @@ def test_what_was_said_before_this_start_is_of_another_run() -> None:
         assert sequence.outcome.done
 
 
-def test_a_start_that_ends_at_once_is_not_waited_for() -> None:
+def test_a_start_that_ends_immediately() -> None:
     """STEERING, then IDLE: a latched status of depth 1 may show the second alone."""
     for state, overtakes in itertools.product(("FAULT", "IDLE"), (False, True)):
         sequence = fresh()
@@ -231,7 +231,7 @@ def test_a_start_that_ends_at_once_is_not_waited_for() -> None:
         reach(START, sequence)
         if overtakes:
             hear(sequence, 1.0, state=state, starts=2, reason="the needle was drawn back")
-        sequence.take_answer(START, True, "", 1.0)
+        sequence.handle_answer(START, True, "", 1.0)
         if not overtakes:
             hear(sequence, 1.0, state=state, starts=2, reason="the needle was drawn back")
         assert "the needle was drawn back" in why(sequence)
@@ -249,7 +249,7 @@ def test_no_progress_releases_the_hold() -> None:
     assert "no progress for 60 s at 3.0 mm" in why(sequence)
 
 
-def test_a_press_that_does_not_count_is_released_and_pressed_again() -> None:
+def test_an_ignored_press_is_released_and_repeated() -> None:
     for counted_before in (False, True):
         sequence = reach()
         if counted_before:
@@ -266,38 +266,40 @@ def test_a_press_that_does_not_count_is_released_and_pressed_again() -> None:
         assert sequence.presses_again == 1
 
 
-def test_a_device_that_is_real_ends_it_whenever_it_is_heard() -> None:
+def test_a_real_device_ends_the_run() -> None:
     for wanted in (*PREPARATION, None):
         sequence = reach(wanted)
-        sequence.see_device(DeviceStatus(source="/device_driver", homed=True, simulated=False), 1.0)
+        sequence.handle_device(
+            DeviceStatus(source="/device_driver", homed=True, simulated=False), 1.0
+        )
         assert "/device_driver is a real device" in why(sequence)
 
 
-def test_it_acts_only_on_a_device_that_is_alone_and_has_said_that_it_is_simulated() -> None:
+def test_it_acts_only_on_a_single_simulated_device() -> None:
     sequence = unheard()
-    sequence.see_devices(["/device_driver"])
+    sequence.handle_devices(["/device_driver"])
     assert sequence.next_call(1.0) is None, "nothing is known of it yet"
     see(sequence, FRESH)
     assert sequence.next_call(1.0) is None, "another said that"
-    sequence.see_devices(["/sim_rig", "/device_driver"])
+    sequence.handle_devices(["/sim_rig", "/device_driver"])
     assert sequence.next_call(1.0) is None
     assert outcome(sequence) is None, "one that was killed counts for a while"
     sequence.check_time(30.0)
     assert "/sim_rig, /device_driver" in why(sequence)
 
 
-def test_a_second_device_ends_it_and_one_that_took_the_place_is_not_held() -> None:
+def test_a_second_device_ends_the_run() -> None:
     sequence = reach()
-    sequence.see_devices(["/device_driver"])
+    sequence.handle_devices(["/device_driver"])
     assert not sequence.hold(), "it has not said what it is"
-    sequence.see_devices(["/device_driver", "/sim_rig"])
+    sequence.handle_devices(["/device_driver", "/sim_rig"])
     assert "more than one device: /device_driver, /sim_rig" in why(sequence)
 
 
-def test_figures_that_are_none_end_nothing() -> None:
+def test_missing_values_are_tolerated() -> None:
     for text in ("nan", "two"):
         sequence = reach(START)
         said = {"state": "STEERING", "starts": text, "insertion_m": text, "depth_m": text}
-        sequence.see_controller(ControllerStatus.parse(said), 1.1)
+        sequence.handle_controller(ControllerStatus.parse(said), 1.1)
         assert outcome(sequence) is None
         assert not sequence.steering

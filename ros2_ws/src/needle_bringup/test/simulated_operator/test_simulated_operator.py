@@ -6,8 +6,10 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
-from needle_bringup.simulated_operator.component import SimulatedOperator
-from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
+from needle_bringup.simulated_operator.component import (
+    SimulatedOperator,
+    SimulatedOperatorParameters,
+)
 from needle_bringup.simulated_operator.progress import Shown
 from needle_core import messages as m
 from needle_core.component import Action, Answer, Call, Exit, Moment, Peers, Publish, Send
@@ -80,7 +82,7 @@ def steered() -> Scene:
     return scene
 
 
-def test_it_asks_again_holds_until_done_releases_and_disables() -> None:
+def test_the_component_prepares_holds_releases_and_disables() -> None:
     scene = Scene(mute=True)
     scene.run(0.2)
     # A press from before it was ready would not count.
@@ -112,7 +114,7 @@ def test_a_signal_releases_and_disables_before_the_end_and_a_second_one_ends_at_
         assert scene.end == Exit(130, "interrupted")
 
 
-def test_a_refusal_and_a_real_device_are_bad_input_and_nothing_was_held() -> None:
+def test_a_refusal_and_a_real_device_are_bad_input() -> None:
     refused = Scene(refusal="the door is open")
     refused.run(5.0)
     assert refused.end == Exit(2, "device/confirm_needle_out was refused: the door is open")
@@ -125,7 +127,7 @@ def test_a_refusal_and_a_real_device_are_bad_input_and_nothing_was_held() -> Non
     assert (real.asked, real.holds) == ([], [])
 
 
-def test_it_waits_until_the_recorder_has_the_parameters_of_all() -> None:
+def test_it_waits_until_the_recorder_has_all_parameters() -> None:
     scene = Scene(wait_for_recorder=True)
     (row,) = (row for row in scene.operator.inputs if row.topic == "/diagnostics")
     for recorded, asked in (("/stand_in", []), (f"/stand_in, /{RIG}", STARTED)):

@@ -9,15 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from needle_bringup.simulation.console import rig_parameters
-from needle_bringup.simulation.console_options import parse_console
-from needle_bringup.simulation.own_component import own_component
+from needle_bringup.simulation.console import parse_console, rig_parameters
 from needle_bringup.simulation.simulate_options import (
     CONTROLLERS,
     SimulateOptions,
     command_of,
     parse,
 )
+from needle_bringup.simulation.virtual_run import own_component
 from needle_controller.presets.steering_settings import PRESETS
 from needle_core.errors import UserError
 
@@ -75,7 +74,7 @@ class Other:
 """
 
 
-def test_what_cannot_be_run_is_named_in_one_line() -> None:
+def test_invalid_options_are_named_in_one_line() -> None:
     for understand, table in ((parse, REFUSED), (parse_console, REFUSED_BY_CONSOLE)):
         for words, named in table:
             with pytest.raises(UserError) as caught:
@@ -84,7 +83,7 @@ def test_what_cannot_be_run_is_named_in_one_line() -> None:
             assert len(str(caught.value).splitlines()) == 1
 
 
-def test_every_preset_of_the_controller_can_be_asked_for() -> None:
+def test_every_preset_of_the_controller_is_an_option() -> None:
     assert sorted(CONTROLLERS) == sorted(PRESETS)
 
 
@@ -96,7 +95,7 @@ def test_the_defaults_are_the_designed_ones() -> None:
     assert parse(["--level", "tip"]).noise_mm == 1.0
 
 
-def test_places_may_begin_with_a_minus_and_a_target_has_all_the_depth_there_is() -> None:
+def test_positions_may_start_with_a_minus_and_a_target_allows_the_full_depth() -> None:
     assert parse(["--initial", "-5,4,15"]).initial_x_mm == -5.0
     for words in (["--target", "-8,5,90"], ["--target=-8,5,90"]):
         options = parse(words)
@@ -104,7 +103,7 @@ def test_places_may_begin_with_a_minus_and_a_target_has_all_the_depth_there_is()
         assert parse([*words, "--depth-mm", "100"]).depth_mm == 100.0
 
 
-def test_the_command_that_is_recorded_runs_the_same_again(
+def test_the_recorded_command_repeats_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -124,9 +123,7 @@ def test_the_command_that_is_recorded_runs_the_same_again(
         assert parse(words) == dataclasses.replace(options, bag=None, json=None), line
 
 
-def test_the_console_has_the_rig_of_simulate_without_stops_and_seen_as_often_as_a_page_shows() -> (
-    None
-):
+def test_the_console_has_the_rig_of_simulate_with_continuous_insertion() -> None:
     words = "--level tip --initial -5,1,0 --noise-mm 0.5"
     rig = parse_console(words.split()).rig
     assert rig == parse([*words.split(), "--insertion=continuous", "--real-time-factor=1"])
@@ -137,7 +134,7 @@ def test_the_console_has_the_rig_of_simulate_without_stops_and_seen_as_often_as_
         assert graph[name] == plain[name]
 
 
-def test_components_of_users_are_found_in_the_current_folder_and_what_is_none_is_named(
+def test_user_components_are_found_in_the_current_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module = "probe_of_a_user"

@@ -84,7 +84,7 @@ def test_rig_and_page_run_until_a_signal(
     assert capsys.readouterr().out.startswith("http://127.0.0.1:9000/ ")
 
 
-def test_a_component_that_ends_and_a_port_that_is_taken_are_one_line(
+def test_an_ended_component_and_a_port_in_use_give_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def ends(runner: PlayedRunner) -> bool:

@@ -39,7 +39,7 @@ def file_of(folder: Path, node: str, **values: Any) -> str:
     return str(path)
 
 
-def test_what_cannot_be_meant_starts_nothing(tmp_path: Path) -> None:
+def test_invalid_launch_arguments_start_nothing(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").touch()
     bag, typo = str(tmp_path), str(tmp_path / "typo.yaml")
     emulator = file_of(tmp_path, "drive_emulator", channel="x")
@@ -65,7 +65,7 @@ def test_what_cannot_be_meant_starts_nothing(tmp_path: Path) -> None:
             start(**arguments)
 
 
-def test_a_rig_has_its_cameras_controller_and_what_its_files_say(tmp_path: Path) -> None:
+def test_a_rig_has_the_nodes_of_its_files(tmp_path: Path) -> None:
     plain = beside_rig()
     assert set(plain) == {"stereo_tracker", "plane_controller"}
     # Images that are sent best effort are heard.
@@ -79,7 +79,7 @@ def test_a_rig_has_its_cameras_controller_and_what_its_files_say(tmp_path: Path)
         beside_rig(drives=drives, namespace="rig1")
 
 
-def test_a_bag_says_how_it_was_made(tmp_path: Path) -> None:
+def test_a_bag_contains_its_launch_arguments(tmp_path: Path) -> None:
     for start in (beside_rig, simulated):
         recorder = start(bag=str(tmp_path / "bag"))["recorder"]
         assert recorder["bag"] == str(tmp_path / "bag")
@@ -111,7 +111,7 @@ def test_a_file_of_two_rigs_has_both_namespaces(tmp_path: Path) -> None:
             start(params=str(file))
 
 
-def test_a_bag_that_is_there_is_played_for_viewers(tmp_path: Path) -> None:
+def test_an_existing_bag_is_played_for_viewers(tmp_path: Path) -> None:
     for bag, said in (("", "bag:= is missing"), (str(tmp_path), "no bag there")):
         with pytest.raises(UserError, match=said):
             replayed_nodes({"bag": bag})
@@ -124,7 +124,7 @@ def test_a_bag_that_is_there_is_played_for_viewers(tmp_path: Path) -> None:
     assert "target_plane:=/replay/first/target_plane" in words["live_view"]
 
 
-def test_a_misspelt_argument_is_named_and_those_of_an_including_file_pass() -> None:
+def test_a_misspelt_argument_is_named() -> None:
     declared = ["calibration", "drives", "bag", "params", "namespace"]
     for name, meant in (("calibraton", "calibration"), ("Bag", "bag"), ("bags", "bag")):
         with pytest.raises(UserError, match=f"unknown argument {name}:=, did you mean {meant}:="):

@@ -12,11 +12,9 @@ from unittest import mock
 
 import pytest
 
-from needle_bringup.simulation import console_graph, node_graph, node_process, simulate
-from needle_bringup.simulation.console import rig_parameters
-from needle_bringup.simulation.console_options import parse_console
-from needle_bringup.simulation.node_graph import NodeFailedError, NodeGraph
-from needle_bringup.simulation.node_process import NodeProcess, stop
+from needle_bringup.simulation import console, node_graph, simulate
+from needle_bringup.simulation.console import parse_console, rig_parameters
+from needle_bringup.simulation.node_graph import NodeFailedError, NodeGraph, NodeProcess, stop
 from needle_bringup.simulation.rig_configuration import PACKAGES
 from needle_bringup.simulation.simulate_options import parse
 from needle_core.errors import UserError
@@ -70,14 +68,14 @@ def played(monkeypatch: pytest.MonkeyPatch) -> None:
     for kept in (Played.all, Played.sent, Played.ended):
         kept.clear()
     monkeypatch.setattr(node_graph, "NodeProcess", Played)
-    monkeypatch.setattr(node_process, "TERMINATE_GRACE", 0.0)
+    monkeypatch.setattr(node_graph, "TERMINATE_GRACE", 0.0)
 
 
 def test_every_executable_is_a_node_that_parameter_files_know() -> None:
     assert {name for _, name, _ in executables("node")} == set(NODES)
 
 
-def test_who_does_not_heed_a_signal_gets_a_stronger_one_and_is_named(tmp_path: Path) -> None:
+def test_a_process_that_ignores_signals_is_killed_and_named(tmp_path: Path) -> None:
     orderly, slow, stubborn = (Played(name, log=tmp_path / name) for name in ("a", "b", "c"))
     slow.heeds, stubborn.heeds = {TERM, KILL}, {KILL}
     assert stop([orderly, slow, stubborn], grace=0.0) == [
@@ -88,7 +86,7 @@ def test_who_does_not_heed_a_signal_gets_a_stronger_one_and_is_named(tmp_path: P
     assert stubborn.exit_code == -KILL
 
 
-def test_it_is_said_how_a_node_ended_and_what_it_said_last(tmp_path: Path) -> None:
+def test_the_end_of_a_node_is_described_with_its_last_line(tmp_path: Path) -> None:
     node = Played("node", log=tmp_path / "node.log")
     assert node.describe_end() == "node runs"
     assert node.last_line == ""
@@ -99,7 +97,7 @@ def test_it_is_said_how_a_node_ended_and_what_it_said_last(tmp_path: Path) -> No
     assert "signal SIGTERM" in node.describe_end()
 
 
-def test_a_graph_ends_in_its_order_and_warns_of_what_its_recorder_lost(
+def test_a_graph_ends_in_order_and_warns_of_recording_errors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     graph = NodeGraph(tmp_path, {"sim_rig": {"level": "tip"}}, EXTRA="x")
@@ -152,7 +150,7 @@ def test_a_graph_runs_until_its_operator_ends(graph: Graph) -> None:
     assert all(node.exit_code is not None for node in Played.all.values())
 
 
-def test_bad_input_of_a_node_leaves_nothing_and_what_broke_leaves_its_logs(graph: Graph) -> None:
+def test_bad_input_leaves_nothing_and_a_failure_leaves_its_logs(graph: Graph) -> None:
     for ended, left in (
         ({"device_driver": 2}, False),
         ({"device_driver": 3}, True),
@@ -188,18 +186,19 @@ def test_an_interrupt_while_nodes_start_ends_them(
     assert not graph.bag.exists()
 
 
-def test_the_console_s_graph_has_the_page_and_a_live_view_and_no_stand_in(
+def test_the_console_graph_has_page_and_live_view(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     end = EndRequest()
 
-    def wait(nodes: Sequence[NodeProcess], _: float) -> None:
+    def wait(nodes: Sequence[NodeProcess], _: float) -> list[NodeProcess]:
         end.wanted = True
+        return []
 
-    monkeypatch.setattr(console_graph, "wait_for", wait)
+    monkeypatch.setattr(node_graph, "wait_for", wait)
     options = parse_console(["--graph", "--port", "9000"])
     with end, mock.patch.dict(os.environ):
-        assert console_graph.run_console_graph(options, rig_parameters(options), end) == 130
+        assert console.run_nodes(options, rig_parameters(options), end) == 130
     rig = ["sim_rig", "stereo_tracker", "plane_controller"]
     assert list(Played.all) == [*rig, "console", "live_view"]
     assert "http://127.0.0.1:9000/" in capsys.readouterr().out

@@ -10,18 +10,16 @@ from typing import Any
 import pytest
 import yaml
 
-from needle_bringup.simulation.needle_options import (
-    CURVATURE,
-    PRE_BEND,
-    SHARED,
-    contradictions,
-    needle_parameters,
-)
 from needle_bringup.simulation.rig_configuration import (
+    CURVATURE,
     NODES,
     PACKAGES,
+    PRE_BEND,
+    SHARED,
     command_line_parameters,
+    contradictions,
     merge,
+    needle_parameters,
     nodes_of,
     refuse_reserved,
     write_parameters,
@@ -69,7 +67,7 @@ def test_obstacles_are_read_into_numbers(tmp_path: Path) -> None:
     assert found == [0.0, 0.001, 0.05, 0.0, 0.001, 0.05, 0.004]
 
 
-def test_only_the_nodes_of_the_level_run_and_driver_and_drives_meet() -> None:
+def test_only_the_nodes_of_the_level_run() -> None:
     everywhere = {"recorder", "sim_rig", "plane_controller", "simulated_operator"}
     camera = everywhere | {"stereo_tracker"}
     drive = camera | {"drive_emulator", "device_driver"}
@@ -92,7 +90,7 @@ def test_the_controller_knows_the_sensor_of_its_level() -> None:
     assert "tip_noise" not in told()["plane_controller"]
 
 
-def test_by_hand_is_the_rig_that_simulate_runs() -> None:
+def test_the_launched_rig_is_that_of_simulate() -> None:
     # What simulate tells the nodes beyond their defaults is said on the command line, or concerns
     # recording and the emulated adapter: nothing of it describes the rig.
     of_run = {"level", "seed", "preset"}
@@ -105,7 +103,7 @@ def test_by_hand_is_the_rig_that_simulate_runs() -> None:
     assert parse([]).depth_mm == pytest.approx(SteeringSettings().depth * 1e3)
 
 
-def test_later_layers_win_one_parameter_at_a_time_and_a_written_file_reads_back(
+def test_later_layers_replace_single_parameters_and_files_round_trip(
     tmp_path: Path,
 ) -> None:
     layers: list[Parameters] = [{"sim_rig": {"level": "tip", "seed": 2}}, {"sim_rig": {"seed": 3}}]
@@ -116,7 +114,7 @@ def test_later_layers_win_one_parameter_at_a_time_and_a_written_file_reads_back(
     assert read_parameters(tmp_path / "p.yaml", NODES) == parameters
 
 
-def test_a_file_may_not_contradict_the_command_line() -> None:
+def test_a_file_must_not_conflict_with_the_command_line() -> None:
     path, options = Path("p.yaml"), parse(["--level", "tip"])
     for given, said in (
         ({"plane_controller": {"depth": 0.1}}, "plane_controller: depth .* use --depth-mm"),
@@ -145,7 +143,7 @@ def test_the_defaults_of_a_needle_are_those_of_the_nodes() -> None:
     assert contradictions({}, NODES) == []
 
 
-def test_the_options_of_a_needle_set_every_node_alike_also_beside_continuous_insertion() -> None:
+def test_the_options_of_a_needle_set_all_nodes() -> None:
     given = told("--curvature 5 --diameter-mm 1.2 --pre-bend-deg 6 --insertion continuous")
     nodes = {
         node: kind(**{k: v for k, v in given[node].items() if k in kind.__dataclass_fields__})
@@ -167,7 +165,7 @@ def test_the_options_of_a_needle_set_every_node_alike_also_beside_continuous_ins
     assert dataclasses.replace(SimRigParameters(), **straight).needle == STRAIGHT
 
 
-def test_what_contradicts_other_nodes_is_told() -> None:
+def test_contradictions_are_reported() -> None:
     for node, name, value, said in (
         ("sim_rig", "curvature", 6.0, "sim_rig has curvature 6 1/m, plane_controller has"),
         ("plane_controller", "curvature", 6.0, "--curvature sets it in all nodes"),

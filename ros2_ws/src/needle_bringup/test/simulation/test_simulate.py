@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from needle_analysis.ros import rerun
-from needle_analysis.run.run_summary import stop_cause, summarize
 from needle_bags.reading.bag_reader import HealthEvent, Run, Status, read_run
+from needle_bags.ros import rerun
+from needle_bags.run.run_summary import stop_cause, summarize
 from needle_bringup.simulated_operator.progress import Progress
 from needle_bringup.simulation import simulate
 from needle_bringup.simulation.rig_configuration import command_line_parameters, run_info
@@ -79,15 +79,13 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]
 
 
 @pytest.mark.parametrize("kind", ["tip", "drive", "continuous"])
-def test_one_seed_is_one_run_and_another_another(
-    recorded: Mapping[str, list[bytes]], kind: str
-) -> None:
+def test_equal_seeds_give_equal_runs(recorded: Mapping[str, list[bytes]], kind: str) -> None:
     one, again, other = recorded[kind]
     assert again == one
     assert other != one
 
 
-def test_a_run_that_cannot_be_leaves_nothing(tmp_path: Path) -> None:
+def test_an_invalid_run_leaves_nothing(tmp_path: Path) -> None:
     bag, file = tmp_path / "bag", tmp_path / "p.yaml"
     file.write_text("plane_controller: {ros__parameters: {curvature: -1.0}}")
     with pytest.raises(UserError, match="curvature = -1"):
@@ -97,7 +95,7 @@ def test_a_run_that_cannot_be_leaves_nothing(tmp_path: Path) -> None:
         simulate.simulate(parse([*WORDS, "--bag", "/proc/no/bag"]))
 
 
-def test_folders_of_one_second_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folders_of_the_same_second_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulate, "_checkout", lambda: tmp_path)
     monkeypatch.setattr("time.strftime", lambda form: f"now{form[17:]}")
     names = [simulate._make_folder(parse([])).name for _ in range(2)]
@@ -142,7 +140,7 @@ def stopped(make_run: Callable[..., Path]) -> Run:
     return dataclasses.replace(run, controller_status=[*run.controller_status, off])
 
 
-def test_a_run_that_did_not_reach_its_depth_says_what_came_first(stopped: Run) -> None:
+def test_an_unfinished_run_names_its_first_cause(stopped: Run) -> None:
     summary = summarize(stopped)
     assert (summary["converged"], summary["reached_depth"]) == (False, False)
     said = simulate.describe(summary, Path("bags/run")).splitlines()
@@ -164,14 +162,14 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_progress_is_a_line_a_quarter_or_a_bar_and_a_wait_is_said_once_each_time() -> None:
+def test_progress_is_a_line_per_quarter_or_a_bar() -> None:
     stream, terminal = io.StringIO(), Terminal()
     for shown in (Progress(stream), Progress(terminal)):
         for insertion in (0.0, 0.001, 0.003, 0.004):
             shown.show(insertion, 0.004)
         shown.show(1.0, 0.0)
         for reason in ("", "no tip", "no tip", "", "no tip"):
-            shown.tell_wait(reason)
+            shown.show_wait(reason)
         shown.close("done")
     waits = ["waiting: no tip"] * 2
     lines = ["  1.0 of 4.0 mm", "  3.0 of 4.0 mm", "  4.0 of 4.0 mm", *waits, "done"]

@@ -13,8 +13,8 @@ from typing import Any
 import cv2
 import pytest
 
-from needle_analysis.ros import rerun
 from needle_bags.recording.bag_tap import BagTap
+from needle_bags.ros import rerun
 from needle_bringup.simulation.rig_configuration import command_line_parameters, run_info
 from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.virtual_run import COMPUTE, make_components
@@ -77,7 +77,7 @@ class Rig:
         return {result.outcome for result in self.sent[RESULTS]}
 
 
-def test_a_continuous_run_goes_on() -> None:
+def test_a_continuous_run_advances() -> None:
     rig = Rig(*SHORT, "--insertion", "continuous")
     assert rig.until_end() == 0
     assert rig.outcomes == {"replaced", "succeeded"}
@@ -90,7 +90,7 @@ def test_a_continuous_run_goes_on() -> None:
 
 
 @pytest.mark.parametrize("insertion", ["stepwise", "continuous"])
-def test_components_that_stand_still_end_nothing(insertion: str) -> None:
+def test_delayed_components_do_not_end_the_run(insertion: str) -> None:
     rig = Rig(*SHORT, "--insertion", insertion)
     for depth, frozen in ((0.001, OPERATOR), (0.003, "plane_controller"), (0.005, "sim_rig")):
         rig.until_depth(depth)
@@ -99,7 +99,7 @@ def test_components_that_stand_still_end_nothing(insertion: str) -> None:
     assert rig.depth == pytest.approx(0.006, abs=1e-5)
 
 
-def test_no_motion_outlasts_a_hold_that_falls_silent() -> None:
+def test_motion_stops_when_the_hold_falls_silent() -> None:
     rig = Rig(*SHORT)
     rig.until_depth(0.0025)
     rig.runner.freeze(OPERATOR, 2.0)
@@ -113,7 +113,7 @@ def test_no_motion_outlasts_a_hold_that_falls_silent() -> None:
     assert any("no hold message" in outcome for outcome in rig.outcomes)
 
 
-def test_it_gets_there_in_spite_of_messages_lost_late_and_twice() -> None:
+def test_it_converges_despite_lost_late_and_duplicate_messages() -> None:
     late = (delay(TIP, 0.2), duplicate(COMMANDS, 0.05), duplicate(TIP, 0.3))
     faults = (drop(TIP, 0.4), drop(HOLD, 0.3), *late)
     rig = Rig("--level", "tip", "--depth-mm", "4", faults=faults)
@@ -147,7 +147,7 @@ def lossy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, str]:
     return rig, said.getvalue()
 
 
-def test_pairs_are_exposed_only_when_a_tip_is_awaited(lossy: tuple[Rig, str]) -> None:
+def test_pairs_are_exposed_only_when_a_tip_is_expected(lossy: tuple[Rig, str]) -> None:
     rig, _ = lossy
     assert rig.depth == pytest.approx(0.003, abs=1e-5)
     pairs, tips = len(rig.sent["stereo/left/image_raw"]), len(rig.sent["needle/tip_pose"])
@@ -155,7 +155,7 @@ def test_pairs_are_exposed_only_when_a_tip_is_awaited(lossy: tuple[Rig, str]) ->
     assert 4 == tips < pairs < 12
 
 
-def test_what_is_rendered_is_written_with_insertion_and_truth(lossy: tuple[Rig, str]) -> None:
+def test_rendered_images_have_insertion_and_truth(lossy: tuple[Rig, str]) -> None:
     rig, _ = lossy
     folder = Path(rig.sim_rig.settings.images)
     for side in ("left", "right"):
@@ -175,7 +175,7 @@ def test_what_is_rendered_is_written_with_insertion_and_truth(lossy: tuple[Rig, 
     assert (folder / "calibration.yaml").is_file()
 
 
-def test_pairs_that_the_tracker_did_not_hear_are_left_out_when_it_runs_again(
+def test_pairs_that_the_tracker_did_not_receive_are_left_out_of_a_rerun(
     lossy: tuple[Rig, str],
 ) -> None:
     assert "pairs are left out: stereo_tracker did not hear them" in lossy[1]
@@ -205,7 +205,7 @@ def late_bag(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRe
     return bag
 
 
-def test_a_bag_whose_controller_heard_late_and_stood_still_runs_again_unchanged(
+def test_a_rerun_with_late_messages_is_unchanged(
     late_bag: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert rerun.main([str(late_bag)]) == 0, capsys.readouterr().out
@@ -219,7 +219,7 @@ def driven() -> Rig:
     return rig
 
 
-def test_at_level_drive_the_needle_goes_where_the_motors_go(driven: Rig) -> None:
+def test_at_level_drive_the_needle_follows_the_motors(driven: Rig) -> None:
     motors = [at.positions[0] for at in driven.sent["sim/drive_positions"]]
     assert driven.sim_rig._bench.insertion == motors[-1] == pytest.approx(0.001, abs=1e-5)
     assert driven.sent["device/status"][-1].values["simulated"] == "true"

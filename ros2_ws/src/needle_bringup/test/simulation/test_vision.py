@@ -13,7 +13,7 @@ import pytest
 from needle_bringup.simulation import vision
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_bringup.simulation.simulate_options import parse
-from needle_bringup.simulation.vision import EYES, DistantTracker, Eyes, EyesProcess
+from needle_bringup.simulation.vision import VISION, RemoteTracker, VisionProcess, VisionWorker
 from needle_core import messages as m
 from needle_core.component import Action, Exit, Moment, PortChange, Publish, Send
 from needle_sim.camera_sensor import CAMERAS, Exposure
@@ -49,19 +49,19 @@ class PlayedPool:
 
 
 @pytest.fixture(scope="module")
-def process() -> Iterator[tuple[EyesProcess, list[Any]]]:
+def process() -> Iterator[tuple[VisionProcess, list[Any]]]:
     """Return cameras and tracker as in their process, and what has arrived from there."""
     arrived: list[Any] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(vision, "start_worker", PlayedPool)
-        made = EyesProcess(PARAMETERS)
+        made = VisionProcess(PARAMETERS)
         made.open(arrived.append)
-        Eyes.work(exposure(0.0, 1), Moment(0.0, 1))
+        VisionWorker.work(exposure(0.0, 1), Moment(0.0, 1))
         yield made, arrived
 
 
 def test_an_exposure_becomes_images_and_a_tip_near_the_truth(
-    process: tuple[EyesProcess, list[Any]],
+    process: tuple[VisionProcess, list[Any]],
 ) -> None:
     (eyes, arrived), seen = process, exposure(0.05)
     around = [m.JointState(AT.stamp_ns + n, (m.INSERTION_JOINT,), (0.05,)) for n in (0, 1)]
@@ -74,18 +74,18 @@ def test_an_exposure_becomes_images_and_a_tip_near_the_truth(
     eyes.close()
     eyes.send([(None, AT)])
     (lost,) = [batch for batch in arrived if isinstance(batch, PortChange)]
-    (port,) = (port for port in DistantTracker().ports if port.name == EYES)
+    (port,) = (port for port in RemoteTracker().ports if port.name == VISION)
     assert list(port.on_change(lost, AT)) == [Exit(1, lost.lost)]
     assert "has ended" in lost.lost
 
 
-def test_exposures_that_come_too_fast_are_lost_and_what_fails_is_not_waited_for() -> None:
-    tracker, seen = DistantTracker(), exposure(0.0)
+def test_fast_exposures_are_dropped_and_failures_raised() -> None:
+    tracker, seen = RemoteTracker(), exposure(0.0)
     hand_on = {port.name: port.handler for port in tracker.ports}
     (row,), (timer,) = tracker.inputs, tracker.timers
     joints = m.JointState(AT.stamp_ns, (m.INSERTION_JOINT,), (0.0,))
     sent = list(hand_on[CAMERAS]((seen, seen, seen), AT))
-    assert sent == [Send(EYES, ((seen, AT),))] * 2
+    assert sent == [Send(VISION, ((seen, AT),))] * 2
     # Joints and time are never lost.
     sent = [*row.handler(joints, AT), *timer.handler(AT)]
     assert [action.batch[0][0] for action in sent if isinstance(action, Send)] == [joints, None]
@@ -93,9 +93,9 @@ def test_exposures_that_come_too_fast_are_lost_and_what_fails_is_not_waited_for(
     tip = Publish("needle/tip", m.Point(AT.stamp_ns, "rig", (0.0, 0.0, 0.0)))
     done: vision.Done = Future()
     done.set_result([tip])
-    assert list(hand_on[EYES]((done,), AT)) == [tip]
+    assert list(hand_on[VISION]((done,), AT)) == [tip]
     failed: vision.Done = Future()
     failed.set_exception(ValueError("cannot see"))
     with pytest.raises(ValueError, match="cannot see"):
-        list(hand_on[EYES]((failed,), AT))
+        list(hand_on[VISION]((failed,), AT))
     assert len(list(hand_on[CAMERAS]((seen, seen, seen), AT))) == 2

@@ -94,14 +94,14 @@ def square(number: int) -> int:
     return number**2
 
 
-def test_results_come_in_the_order_of_the_parts_also_over_a_lost_connection(dask: Dask) -> None:
+def test_results_keep_the_order_of_the_parts_after_a_lost_connection(dask: Dask) -> None:
     assert list(on_cluster(ADDRESS, square, range(5))) == [0, 1, 4, 9, 16]
     dask.lost_after = [2, 1]
     assert list(on_cluster(ADDRESS, square, range(5))) == [0, 1, 4, 9, 16]
     assert dask.asked == [5, 5, 3, 2]
 
 
-def test_what_cannot_go_on_is_one_line(dask: Dask, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cluster_errors_are_one_line(dask: Dask, monkeypatch: pytest.MonkeyPatch) -> None:
     def refusal(*parts: int, address: str = ADDRESS) -> str:
         with pytest.raises(UserError) as error:
             list(on_cluster(address, square, parts))
@@ -118,7 +118,9 @@ def test_what_cannot_go_on_is_one_line(dask: Dask, monkeypatch: pytest.MonkeyPat
     assert "scripts/dask --version installs it" in refusal(1)
 
 
-def test_a_worker_with_other_code_is_refused(dask: Dask, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_with_different_code_is_rejected(
+    dask: Dask, monkeypatch: pytest.MonkeyPatch
+) -> None:
     here = cluster.identity()
     known = iter([{**here, "numpy": "1.0.0"}, here])
     monkeypatch.setattr(cluster, "identity", lambda: next(known))
@@ -135,7 +137,7 @@ def figures_of(folder: Path, *words: str) -> tuple[Mapping[str, object], str]:
     return figures, (folder / "f.csv").read_text("utf-8")
 
 
-def test_a_cluster_gives_the_figures_of_one_machine_and_one_that_rounds_otherwise_is_named(
+def test_a_cluster_gives_the_figures_of_one_machine(
     dask: Dask,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],

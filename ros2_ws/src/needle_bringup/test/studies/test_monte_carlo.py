@@ -120,7 +120,7 @@ def test_targets_have_figures_of_points_and_none_of_the_plane(tmp_path: Path, la
     np.testing.assert_allclose(error, np.array(ahead) - 8.0, atol=30.0)
 
 
-def test_bad_arguments_are_one_line_and_exit_2(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_arguments_give_a_one_line_error_and_exit_2(capsys: pytest.CaptureFixture[str]) -> None:
     for words, said in REFUSED:
         assert main(words.split()) == 2, words
         captured = capsys.readouterr()
@@ -129,7 +129,7 @@ def test_bad_arguments_are_one_line_and_exit_2(capsys: pytest.CaptureFixture[str
         assert said in captured.err
 
 
-def test_troubles_come_in_si_and_the_claim_is_no_matter_of_the_noise() -> None:
+def test_disturbances_are_in_si_and_independent_of_the_claim() -> None:
     noise = "--noise-mm 0.58 --noise-shape normal --outlier-mm 2,3.5"
     others = "--slip -0.05 --bump-mm 2 --untold-delay 3 --sigma-scale 2"
     options = parse([*noise.split(), *others.split()])
@@ -160,7 +160,7 @@ def test_troubles_come_in_si_and_the_claim_is_no_matter_of_the_noise() -> None:
 
 
 @pytest.mark.parametrize("asked", ["--targets 11", "--controller paper --draws 1"])
-def test_a_part_of_a_study_comes_out_as_in_the_whole(asked: str) -> None:
+def test_a_part_of_a_study_gives_the_same_outcomes_as_the_whole(asked: str) -> None:
     """Wherever it is cut: so that parts can be steered on many machines."""
     disturbed = (
         "--depth-mm 8 --target-drift-mm-per-s 0.1 --play-deg 10 --push 1 --roll-walk 2 "

@@ -54,7 +54,7 @@ def still(estimate: Any, insertion: float) -> SteeringCommand:
     return SteeringCommand(0.0, 0.0)
 
 
-def test_the_controller_is_told_what_is_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_controller_gets_the_claimed_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[SteeringSettings] = []
     recorders: list[Recorder] = []
 
@@ -82,7 +82,7 @@ def test_the_controller_is_told_what_is_claimed(monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_allclose(corrected[0].advanced, [(0.0004, 0.0), (0.0006, 1.0)])
 
 
-def test_loops_in_python_and_compiled_ones_give_the_same_bits() -> None:
+def test_python_and_compiled_loops_give_the_same_bits() -> None:
     settings = SteeringSettings(**PAPER_NOISE)
     one_by_one = SteeredNeedles(
         lambda _: EachEstimator(lambda n: make_controller(settings, np.eye(3), np.zeros(3))[0]),
@@ -104,7 +104,7 @@ def test_loops_in_python_and_compiled_ones_give_the_same_bits() -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def test_needles_say_what_their_estimate_says() -> None:
+def test_the_belief_is_that_of_the_estimates() -> None:
     needles = SteeredNeedles(
         lambda count: BestEstimators(FilterSettings(), count, 0.001), each_rate(lambda _: still)
     )
@@ -131,7 +131,7 @@ def test_needles_say_what_their_estimate_says() -> None:
     assert needles_at_a_time("paper") > needles_at_a_time("best")
 
 
-def test_needles_that_are_not_where_they_are_to_be_say_so() -> None:
+def test_needles_off_their_target_report_a_miss() -> None:
     tips = np.array([[0.0005, 0.0, 0.0], [-0.003, 0.0, 0.0]])
     needles = SteeredNeedles(
         lambda _: EachEstimator(lambda _: HypothesisFilter(FilterSettings())),
@@ -148,7 +148,7 @@ def test_needles_that_are_not_where_they_are_to_be_say_so() -> None:
         assert belief.missed[0] < 0.8 < 0.95 < belief.missed[1]
 
 
-def test_a_planner_s_way_leads_where_there_is_one_and_nowhere_else() -> None:
+def test_a_planned_path_is_followed_and_without_one_the_needle_stops() -> None:
     motion = TargetMotion()
     needle, settings = (
         HypothesisFilter(FilterSettings()),

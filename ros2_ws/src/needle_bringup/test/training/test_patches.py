@@ -13,7 +13,7 @@ from needle_bringup.training.samples import CANVAS, moved
 SIZE = 96
 
 
-def test_the_map_is_cut_straight_where_the_axis_ends() -> None:
+def test_the_map_is_cut_straight_at_the_end_of_the_axis() -> None:
     share = true_map(Pose(60.0, 40.0, 0.0, 0.0, 0.0, 2.5), SIZE)
     assert share.sum() == pytest.approx(5.0 * 60.5, rel=0.02)
     assert share[40, :60].min() == 1.0
@@ -70,7 +70,7 @@ def test_gel_moves_tracks_by_three_pixels_at_most() -> None:
         assert np.hypot(*offset) < 3.2
 
 
-def test_an_image_is_moved_as_far_as_told() -> None:
+def test_an_image_is_shifted_by_the_distance() -> None:
     image = np.zeros((40, 40), np.float32)
     image[20, 20] = 100.0
     there = moved(image, 3.0, 0.0)

@@ -49,7 +49,7 @@ def test_a_patch_at_the_border_is_whole(place: tuple[float, float]) -> None:
     assert (Cut(np.array(place), 0.4, 0.7).image(image) == 77).all()
 
 
-def test_a_sample_is_turned_and_scaled_with_what_is_wanted_of_it() -> None:
+def test_a_sample_and_its_labels_are_rotated_and_scaled_alike() -> None:
     with_needle = ends = 0
     for width_px in (4.0, 10.0):
         scene = bars(width_px)
@@ -86,7 +86,7 @@ def test_half_of_the_samples_know_a_background_of_the_same_camera() -> None:
     assert np.median(differences) > 20.0
 
 
-def test_both_cameras_see_a_shaft_as_wide_as_it_is_whichever_way_they_look() -> None:
+def test_the_width_of_a_shaft_is_that_of_its_outline() -> None:
     line = np.linspace([0.0, 0.0, 0.001], [0.003, -0.004, 0.06], 200)
     ahead = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
     # Points of its surface all around the end: the farthest ones across the line are its edges.

@@ -1,4 +1,4 @@
-"""The curvature of one needle, without such priors as its tips contradict."""
+"""Checks of a curvature fit: priors that the tips contradict, and residuals along the arc."""
 
 from __future__ import annotations
 
@@ -14,24 +14,31 @@ from needle_controller.curvature.curvature_fit import (
     checked_tips,
     fit_curvature,
 )
+from needle_controller.model.arrays import Array
 from needle_core.errors import UserError
 
+_CLIPPED = 3.0  # limit of outliers [standard deviations]
+_NEIGHBOURS = 8  # 1 / share of the tips within which two are neighbours
+_BY_CHANCE = 3.0  # limit of the significance [standard deviations]
+_ALLOWED = 5e-5  # correlated error of a tracker [m]
+_REPEATING = 2.5  # the same, in repeating errors
+_MEDIAN = math.sqrt(2.0 * math.log(2.0))  # median length of a vector of two normal components
 _CONTRADICTION = 4.0
-"""Standard deviations beyond which the tips contradict a prior."""
+"""Difference from which on the tips contradict a prior [standard deviations]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CheckedFit:
-    """A fit, and what of the settings the tips contradicted and was left out of it.
+    """A fit without the priors that the tips contradict.
 
     Attributes
     ----------
     fit : CurvatureFit
         The fit.
     settings : CurvatureFitSettings
-        Those it was made with.
+        Settings used for it.
     warnings : tuple of str
-        A line on each that was not used.
+        A line for each unused prior.
     """
 
     fit: CurvatureFit
@@ -42,10 +49,10 @@ class CheckedFit:
 def fit_checked(
     tips: npt.ArrayLike, insertion: npt.ArrayLike | None, settings: CurvatureFitSettings
 ) -> CheckedFit:
-    """Return the fit of one needle, without such priors as its tips contradict.
+    """Return the fit of one needle without the priors that its tips contradict.
 
-    An arc is first fitted without entry and heading; where it is more than four standard deviations
-    from what was said to be known, that is not used.
+    An arc is first fitted without entry and heading; a prior that differs from it by more than four
+    standard deviations is not used.
 
     Parameters
     ----------
@@ -54,12 +61,12 @@ def fit_checked(
     insertion : array_like, shape (K,), or None
         See `fit_curvature`.
     settings : CurvatureFitSettings
-        What is known beside them.
+        Priors.
 
     Returns
     -------
     CheckedFit
-        The fit, and a line on everything that was not used.
+        The fit, with a warning for each unused prior.
 
     Raises
     ------
@@ -86,7 +93,7 @@ def fit_checked(
     if math.isfinite(settings.entry_std):
         off = np.asarray(free.entry) - settings.entry
         if insertion is None:
-            # Along the arc the start of the free fit is arbitrary.
+            # The start of the free fit is arbitrary along the arc.
             off = off - free.heading * (off @ free.heading)
         distance = float(np.linalg.norm(off))
         allowed = _CONTRADICTION * math.hypot(settings.entry_std, float(free.entry_std))
@@ -106,3 +113,57 @@ def fit_checked(
             )
             settings = dataclasses.replace(settings, heading=(x, y, z), heading_std=math.inf)
     return CheckedFit(fit_curvature(tips, insertion, settings), settings, tuple(warnings))
+
+
+def neighbour_correlation(residuals: Array) -> tuple[float, float]:
+    """Return the part of the residuals that neighbouring tips have in common.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (K, 3)
+        Residual of each tip across its arc [m], in order.
+
+    Returns
+    -------
+    shared : float
+        Root mean square of the common part [m].
+    significance : float
+        Relative to the standard deviation for independent errors [-].
+    """
+    lengths = np.linalg.norm(residuals, axis=-1)
+    sigma = float(np.median(lengths)) / _MEDIAN
+    clipped = residuals * np.minimum(1.0, _CLIPPED * sigma / np.maximum(lengths, 1e-12))[:, None]
+    squared = np.sum(clipped**2, axis=-1)
+    total, variance, pairs = 0.0, 0.0, 0
+    for apart in range(1, len(residuals) // _NEIGHBOURS + 1):
+        total += float(np.sum(clipped[apart:] * clipped[:-apart]))
+        # The mean squared cosine of two independent directions across is 1/2.
+        variance += 0.5 * float(squared[apart:] @ squared[:-apart])
+        pairs += len(residuals) - apart
+    significance = total / math.sqrt(variance) if variance > 0.0 else 0.0
+    return math.sqrt(max(total, 0.0) / max(pairs, 1)), significance
+
+
+def check_independent_residuals(residuals: Array, repeating_error: float) -> None:
+    """Check that the residuals of an arc are not correlated along it.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (K, 3)
+        Residual of each tip across its arc [m], in order.
+    repeating_error : float
+        Error that all tips may have in common [m].
+
+    Raises
+    ------
+    UserError
+        They are correlated, so the tips do not follow a single arc.
+    """
+    shared, significance = neighbour_correlation(residuals)
+    allowed = max(_ALLOWED, _REPEATING * repeating_error)
+    if shared > allowed and significance > _BY_CHANCE:
+        raise UserError(
+            f"the tips follow no single arc: one after the other they are {1e3 * shared:.2f} mm "
+            f"beside it, wants <= {1e3 * allowed:.2f} mm; the base was turned on the way, or the "
+            "tissue changes (--until-mm takes what is before; a column rotation_rad tells which)"
+        )

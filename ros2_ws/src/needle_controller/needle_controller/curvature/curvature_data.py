@@ -1,4 +1,4 @@
-"""Tips of one insertion, read from a CSV or straight from a bag, for `identify_curvature`."""
+"""Tips of one insertion, read from a CSV or a bag, for `identify_curvature`."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ import numpy as np
 
 from needle_controller.model.arrays import Array
 from needle_core.errors import OutOfBoundsError, UserError
+from needle_core.message_types import to_nanoseconds
 
 _COORDINATES = ("x_m", "y_m", "z_m")
 _LARGEST_COORDINATE = 1.0
-_NANOSECONDS = 1_000_000_000
 
 
 @dataclasses.dataclass(frozen=True)
 class InsertionRecord:
-    """Tips of one insertion in the order they were seen.
+    """Tips of one insertion in the order of their measurement.
 
     Attributes
     ----------
     tips : ndarray, shape (K, 3)
         Measured tips in `rig` [m].
     insertion : ndarray, shape (K,), or None
-        Inserted length at each [m]; None where it was not recorded.
+        Inserted length at each tip [m]; None if it was not recorded.
     rotation : ndarray, shape (K,), or None
-        Rotation of the base at each [rad]; None where it was not recorded.
+        Rotation of the base at each tip [rad]; None if it was not recorded.
     """
 
     tips: Array
@@ -38,7 +38,7 @@ class InsertionRecord:
     rotation: Array | None
 
     def between(self, least: float, most: float) -> InsertionRecord:
-        """Return the part from one inserted length to another, without what comes after a return.
+        """Return the part between two inserted lengths, without retraction.
 
         Parameters
         ----------
@@ -48,14 +48,14 @@ class InsertionRecord:
         Raises
         ------
         UserError
-            The insertion was not recorded, but a part of it is wanted.
+            A part is requested, but the insertion was not recorded.
         """
         if self.insertion is None:
             if least > 0.0 or math.isfinite(most):
                 raise UserError("--from-mm and --until-mm want an insertion, which is not recorded")
             return self
         kept = (self.insertion >= least) & (self.insertion <= most)
-        # A needle drawn back follows its path in reverse: nothing new is cut.
+        # A retracted needle follows its own path back.
         deepest = np.flatnonzero(self.insertion >= np.max(self.insertion, initial=0.0) - 1e-6)
         kept[int(deepest[-1]) + 1 if len(deepest) else 0 :] = False
         rotation = None if self.rotation is None else self.rotation[kept]
@@ -67,12 +67,12 @@ class InsertionRecord:
         Parameters
         ----------
         tolerance : float
-            What it may have [rad].
+            Largest allowed rotation [rad].
 
         Raises
         ------
         UserError
-            It turned: says by how much and from where on.
+            It turned; the message gives angle and insertion.
         """
         if self.rotation is None or len(self.rotation) == 0:
             return
@@ -103,7 +103,7 @@ def read_record(path: Path, insertion_file: Path | None = None) -> InsertionReco
     Raises
     ------
     UserError
-        What cannot be read, with the line and the value.
+        A file that cannot be read, or a bad value; the message gives line and value.
     """
     if path.is_dir():
         if insertion_file is not None:
@@ -139,11 +139,11 @@ def read_csv(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
                 bound = _LARGEST_COORDINATE
                 raise OutOfBoundsError(f"{path}:{line}: {name}", value, -bound, bound, "m")
         if of_name is not None:
-            # By the image's name with its ending or without, as `track_images` takes the same file.
-            told = of_name.get(row["name"], of_name.get(Path(row["name"]).stem))
-            if told is None:
+            # By the image's name with or without its ending, as in `track_images`.
+            length = of_name.get(row["name"], of_name.get(Path(row["name"]).stem))
+            if length is None:
                 raise UserError(f"{insertion_file}: no insertion for {row['name']}")
-            insertion.append(told)
+            insertion.append(length)
         elif "insertion_m" in columns:
             insertion.append(_number(path, line, row, "insertion_m"))
         if "rotation_rad" in columns:
@@ -158,10 +158,10 @@ def read_csv(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
 def read_bag(path: Path) -> InsertionRecord:
     """Read tips and joints of a bag; see `read_record`.
 
-    Tips get insertion and rotation of their stamp, interpolated; those outside the recorded joints
-    are left out.
+    Insertion and rotation are interpolated at the tips' stamps; tips outside the recorded joints
+    are omitted.
     """
-    # Here, for reading a CSV does without.
+    # Imported here, because reading a CSV does not need it.
     from needle_core.files.bag_directory import BagDirectory  # noqa: PLC0415
 
     tips: dict[int, list[float]] = {}
@@ -176,9 +176,9 @@ def read_bag(path: Path) -> InsertionRecord:
             message = bag.deserialize(store, sent)
             try:
                 if sent.topic.endswith("needle/tip"):
-                    _take_tip(path, message, tips)
+                    _read_tip(path, message, tips)
                 else:
-                    _take_joints(message, joints)
+                    _read_joints(message, joints)
             except AttributeError as error:
                 raise UserError(f"{path}: {sent.topic} is of another type: {error}") from error
     for topic, found in (("needle/tip", tips), ("joint_states", joints)):
@@ -195,26 +195,22 @@ def read_bag(path: Path) -> InsertionRecord:
     )
 
 
-def _take_tip(path: Path, message: Any, tips: dict[int, list[float]]) -> None:
+def _read_tip(path: Path, message: Any, tips: dict[int, list[float]]) -> None:
     position = [float(message.point.x), float(message.point.y), float(message.point.z)]
     if not np.all(np.isfinite(position)):
         raise UserError(f"{path}: a tip is not finite: {position}")
     if message.header.frame_id != "rig":
         raise UserError(f"{path}: a tip is in frame '{message.header.frame_id}', wants 'rig'")
-    tips.setdefault(_nanoseconds(message), position)
+    tips.setdefault(to_nanoseconds(message.header.stamp), position)
 
 
-def _take_joints(message: Any, joints: dict[int, list[float]]) -> None:
+def _read_joints(message: Any, joints: dict[int, list[float]]) -> None:
     position: Mapping[str, float] = dict(zip(message.name, message.position, strict=False))
     if "insertion_joint" in position and "rotation_joint" in position:
         joints.setdefault(
-            _nanoseconds(message),
+            to_nanoseconds(message.header.stamp),
             [float(position["insertion_joint"]), float(position["rotation_joint"])],
         )
-
-
-def _nanoseconds(message: Any) -> int:
-    return int(message.header.stamp.sec) * _NANOSECONDS + int(message.header.stamp.nanosec)
 
 
 def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:

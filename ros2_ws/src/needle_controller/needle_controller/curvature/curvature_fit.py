@@ -1,16 +1,15 @@
 """Curvature of the needle's path from tips of pure insertion, with its uncertainty.
 
-Under insertion without rotation the needle follows a circle of radius 1 / kappa ([KC09] IV-B). A
-tip after the inserted length l is
+Without rotation, the needle follows a circle of radius 1 / kappa ([KC09] IV-B). The tip after the
+inserted length l is
 
     p(l) = p0 + d sin(kappa l) / kappa + n (1 - cos(kappa l)) / kappa
 
 with the entry p0, the heading d there and the direction n the needle bends to. The most likely arc
 is found by Gauss-Newton on p0, two angles of d and the two components of kappa n across d: in these
-the problem is almost linear, has no singular point at kappa = 0, and the unknown roll needs no
-guess. What is known of heading and entry are priors. Tips that the arc explains badly lose weight,
-so that a few outliers do no harm. A stage may move farther than the needle goes in: how far the
-needle goes in for each unit of the recorded insertion is one more unknown.
+the problem is almost linear, has no singularity at kappa = 0, and needs no initial guess of the
+roll. Heading and entry have priors. Tips far from the arc lose weight, so a few outliers do no
+harm. The needle's insertion per recorded insertion of the stage is one more unknown.
 
 Leading axes broadcast.
 """
@@ -39,46 +38,45 @@ from needle_core.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
 
 FEWEST_TIPS = 8
 SHORTEST_ARC = 0.01
-"""Fewer tips, or a shorter insertion [m], say nothing of the curvature."""
+"""Fewest tips and shortest insertion [m] for a fit."""
 _ITERATIONS = 30
 _ROBUST_ITERATIONS = 5
 _SMALLEST_NOISE = 1e-9
 _ARBITRARY_START = 1e-3
-# Median of a tip's squared distance, in variances of a coordinate, of normal and uniform noise:
-# about halfway between the two.
+# Median of a tip's squared distance in variances of a coordinate: about halfway between those for
+# normal and for uniform noise.
 _MEDIAN_SQUARED = {3: 2.6, 2: 1.5}
-# Units in which the unknowns are of one size.
+# Scales of the unknowns.
 _SIZES: Array = np.array([1.0, 1.0, 1.0, 20.0, 20.0, 1e3, 1e3, 20.0])
 _GAIN = UNKNOWNS
-"""Number of the last unknown: the needle's insertion per stage's, less 1."""
+"""Index of the last unknown, the needle's insertion per insertion of the stage, less 1."""
 _HEADING_STD = math.radians(5.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class CurvatureFitSettings:
-    """Knowledge beside the tips.
+    """Priors and noise of a fit.
 
     Attributes
     ----------
     heading : tuple of float
         Direction in which the needle enters.
     heading_std : float
-        How well it is known, about each axis across it [rad]; infinite where it is not.
+        Its standard deviation about each axis across it [rad]; infinite if it is unknown.
     entry : tuple of float
         The entry point [m].
     entry_std : float
-        How well it is known, along each axis [m]; infinite where it is not.
+        Its standard deviation along each axis [m]; infinite if it is unknown.
     measurement_std : float, optional
-        Standard deviation of one measured coordinate [m]; estimated from the residuals if not
-        given.
+        Standard deviation of one measured coordinate [m]; estimated from the residuals by default.
     outlier_limit : float
-        A tip farther from the arc than this many standard deviations of a coordinate loses weight,
-        with the 4th power of its distance; infinite for plain least squares.
+        Distance from the arc, in standard deviations of a coordinate, beyond which a tip loses
+        weight with the 4th power of its distance; infinite for plain least squares.
     slip_std : float
-        How well it is known that the needle goes in as far as the stage moves, as a share.
+        Standard deviation of the relative difference between the insertions of needle and stage.
     repeating_error : float
-        What all tips may be off together, bowed along the arc (a calibration's error), which the
-        residuals cannot show [m]. Bowed by e over a length l, an arc has 8 e / l^2 more curvature.
+        Error common to all tips, bowed along the arc, as of a calibration; residuals cannot show it
+        [m]. Bowed by e over a length l, an arc has 8 e / l^2 more curvature.
     """
 
     heading: tuple[float, float, float] = (0.0, 0.0, 1.0)
@@ -99,7 +97,7 @@ class CurvatureFitSettings:
             raise UserError(f"entry = {self.entry} is not finite")
 
     def precision(self) -> Array:
-        """Return what is known of `CurvatureFit.unknowns`, as inverse variances, (8,)."""
+        """Return the priors of `CurvatureFit.unknowns` as inverse variances, (8,)."""
         precision = np.zeros(UNKNOWNS + 1)
         precision[ENTRY] = self.entry_std**-2.0
         precision[HEADING] = self.heading_std**-2.0
@@ -109,7 +107,7 @@ class CurvatureFitSettings:
 
 @dataclasses.dataclass(frozen=True)
 class CurvatureFit:
-    """Curvature found from tips of pure insertion.
+    """Fitted curvature.
 
     Attributes
     ----------
@@ -121,31 +119,31 @@ class CurvatureFit:
         Standard deviation of one measured coordinate, assumed or from the residuals [m].
     weights : ndarray, shape (..., K)
         Weight of each tip, near 1 as a rule and near 0 for an outlier.
-    misses : ndarray, shape (..., K, 3)
-        What each tip is off the arc, across it [m].
+    residuals : ndarray, shape (..., K, 3)
+        Residual of each tip across the arc [m].
     entry : ndarray, shape (..., 3)
-        The arc's start [m].
+        Start of the arc [m].
     entry_std : ndarray, shape (...)
         Its standard deviation along the worst axis [m].
     heading : ndarray, shape (..., 3)
-        The direction there.
+        Direction there.
     heading_std : ndarray, shape (...)
         Its standard deviation about the worst axis [rad].
     slip, slip_std : ndarray, shape (...)
-        Share by which the stage moves farther than the needle goes in, and its standard deviation;
-        0 and `CurvatureFitSettings.slip_std` where the insertion is not known.
+        Relative excess of the stage's insertion over the needle's, and its standard deviation; 0
+        and `CurvatureFitSettings.slip_std` if the insertion is not known.
     unknowns : ndarray, shape (..., 8)
-        Those of `insertion_arc`, about the known entry in the `frame` of the known heading, and the
-        needle's insertion per stage's, less 1.
+        Those of `insertion_arc`, relative to the known entry in the `frame` of the known heading,
+        and the needle's insertion per insertion of the stage, less 1.
     length : ndarray, shape (..., K)
-        Insertion of the stage at each tip [m]; where it is not known, of the needle.
+        Insertion of the stage at each tip [m]; of the needle if that of the stage is not known.
     """
 
     curvature: Array
     std: Array
     measurement_std: Array
     weights: Array
-    misses: Array
+    residuals: Array
     entry: Array
     entry_std: Array
     heading: Array
@@ -162,13 +160,7 @@ class CurvatureFit:
             return np.asarray(1.0 / self.curvature)
 
     def radius_interval(self, deviations: float = 1.96) -> tuple[Array, Array]:
-        """Return the least and the largest believable 1 / kappa [m], by default with 95 %.
-
-        Parameters
-        ----------
-        deviations : float
-            Half the width of the interval of kappa in standard deviations.
-        """
+        """Return the interval of 1 / kappa [m], by default that of 95 %."""
         least = np.maximum(self.curvature - deviations * self.std, 0.0)
         with np.errstate(divide="ignore"):
             return 1.0 / (self.curvature + deviations * self.std), 1.0 / least
@@ -186,30 +178,30 @@ def fit_curvature(
     tips : array_like, shape (..., K, 3)
         Measured tips [m].
     insertion : array_like, shape (K,) or (..., K), or None
-        How far the stage has moved since the entry at each of them [m]. None where it is not known:
-        then each tip belongs to the nearest point of the arc, and only its distance across counts.
+        Insertion of the stage at each tip [m]. If it is None, each tip belongs to the nearest point
+        of the arc, and only its distance across the arc counts.
     settings : CurvatureFitSettings, optional
-        What is known beside them.
+        Priors and noise.
 
     Returns
     -------
     CurvatureFit
-        With its uncertainty.
+        Curvature and its uncertainty.
 
     Raises
     ------
     UserError
-        Too few tips, too short an arc, or something that is not finite.
+        Too few tips, too short an arc, or a number that is not finite.
     """
     settings = CurvatureFitSettings() if settings is None else settings
     tips = checked_tips(tips)
     axes = frame(np.asarray(settings.heading, dtype=float))
     precision = settings.precision()
-    # In the frame of the known heading, about the known entry.
+    # In the frame of the known heading, relative to the known entry.
     measured = (tips - np.asarray(settings.entry, dtype=float)) @ axes
     known = insertion is not None
     if insertion is None:
-        # Where the arc begins along itself is then arbitrary: near the entry's place.
+        # The position along the arc is arbitrary then: keep it near the entry.
         precision[2] = max(precision[2], _ARBITRARY_START**-2.0)
         length = measured[..., 2] - np.zeros(())
     else:
@@ -237,10 +229,10 @@ def fit_curvature(
         scaled = weights[..., None, None] * slopes
         normal = np.einsum("...kij,...kil->...jl", scaled, slopes)
         gradient = np.einsum("...kij,...ki->...j", scaled, residual)
-        weighed = precision * sigma[..., None] ** 2
-        normal = normal + np.eye(UNKNOWNS + 1) * weighed[..., None, :]
+        weighted = precision * sigma[..., None] ** 2
+        normal = normal + np.eye(UNKNOWNS + 1) * weighted[..., None, :]
         inverse = np.linalg.inv(normal * _SIZES[:, None] * _SIZES) * _SIZES[:, None] * _SIZES
-        change = np.einsum("...ij,...j->...i", inverse, gradient - weighed * unknowns)
+        change = np.einsum("...ij,...j->...i", inverse, gradient - weighted * unknowns)
         unknowns = unknowns + change
         if iteration > _ROBUST_ITERATIONS and np.all(np.abs(change[..., BEND]) < 1e-9):
             break
@@ -254,7 +246,7 @@ def fit_curvature(
         std=std,
         measurement_std=sigma,
         weights=weights,
-        misses=(residual - along * tangent) @ axes.T,
+        residuals=(residual - along * tangent) @ axes.T,
         entry=unknowns[..., ENTRY] @ axes.T + np.asarray(settings.entry, dtype=float),
         entry_std=np.sqrt(np.max(variances[..., ENTRY], axis=-1)),
         heading=headings(unknowns[..., HEADING])[..., :, 2] @ axes.T,
@@ -303,7 +295,36 @@ def _length(bend: Array, covariance: Array) -> tuple[Array, Array]:
     """Return the length of a noisy vector of two components, and its standard deviation."""
     length = np.sqrt(np.sum(bend**2, axis=-1))
     unit = bend / np.maximum(length, 1e-12)[..., None]
-    # Of a straight line no direction is known: the mean over all.
+    # The direction of a straight line is undefined: take the mean over all.
     mean = 0.5 * np.trace(covariance, axis1=-2, axis2=-1)
     along = np.einsum("...i,...ij,...j->...", unit, covariance, unit)
     return length, np.sqrt(np.where(length > 1e-9, along, mean))
+
+
+def circle_curvature(tips: npt.ArrayLike) -> Array:
+    """Return the curvature of the plain least-squares circle ([KC09] IV-B), for comparison.
+
+    The plane is that of the two largest principal axes; the circle minimises the sum of (|p - c|^2
+    - r^2)^2. The result is biased, because noise along a short arc looks like curvature: at 60 mm,
+    +-1 mm, it is a quarter too large. Use `fit_curvature`.
+
+    Parameters
+    ----------
+    tips : array_like, shape (..., K, 3)
+        Measured tips [m].
+
+    Returns
+    -------
+    ndarray, shape (...)
+        1 / r [1/m].
+    """
+    tips = np.asarray(tips, dtype=float)
+    centred = tips - np.mean(tips, axis=-2, keepdims=True)
+    _, _, axes = np.linalg.svd(centred, full_matrices=False)
+    flat = centred @ np.swapaxes(axes[..., :2, :], -1, -2)
+    squared = np.sum(flat**2, axis=-1)
+    design = np.concatenate([2.0 * flat, np.ones_like(flat[..., :1])], axis=-1)
+    transposed = np.swapaxes(design, -1, -2)
+    solution = np.linalg.solve(transposed @ design, transposed @ squared[..., None])[..., 0]
+    radius = np.sqrt(solution[..., 2] + np.sum(solution[..., :2] ** 2, axis=-1))
+    return np.asarray(1.0 / radius)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import argparse
 import math
 import sys
 from collections.abc import Sequence
@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from needle_controller.curvature.arc_order import check_order
-from needle_controller.curvature.circle_fit import circle_curvature
-from needle_controller.curvature.curvature_checks import CheckedFit, fit_checked
+from needle_controller.curvature.curvature_checks import (
+    CheckedFit,
+    check_independent_residuals,
+    fit_checked,
+)
 from needle_controller.curvature.curvature_data import InsertionRecord, read_record
-from needle_controller.curvature.curvature_fit import CurvatureFitSettings
+from needle_controller.curvature.curvature_fit import CurvatureFitSettings, circle_curvature
 from needle_controller.curvature.tip_forecast import forecast_tip
 from needle_core.commands.cli import (
     EXIT_DONE,
@@ -70,24 +72,21 @@ way, too short, not finite, ...), 130 interrupted.
 """
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Options of the command; mm and degrees, as the user writes them."""
-
-    source: Path
-    insertion: Path | None
-    json: Path | None
-    from_mm: float
-    until_mm: float
-    entry_std_mm: float
-    heading_std_deg: float
-    repeating_error_mm: float
-    rotation_tolerance_deg: float
-    forecast_mm: float | None
+_BOUNDS = {
+    "from_mm": (0.0, 1000.0),
+    "until_mm": (0.0, math.inf),
+    "entry_std_mm": (0.001, math.inf),
+    "heading_std_deg": (0.01, math.inf),
+    "repeating_error_mm": (0.0, 100.0),
+    "rotation_tolerance_deg": (0.0, 10.0),
+    "forecast_mm": (1.0, 1000.0),
+}
+"""Bounds of the options with a number, whose names end in their units."""
+_OUTLIER_WEIGHT = 0.5
 
 
-def parse(arguments: Sequence[str]) -> Options:
-    """Return the options of a command line (without the program's name); raises UserError."""
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Return the options of a command line, with numbers in mm and deg; raises UserError."""
     parser = CommandParser("identify_curvature", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("source", type=Path, metavar="BAG_OR_CSV", help="a bag's directory, or a CSV of tips")
@@ -126,29 +125,17 @@ def parse(arguments: Sequence[str]) -> Options:
         metavar="D",
         help="say where the tip of the needle will be at this insertion, if it is not turned",
     )
-    given = parser.parse_args(arguments)
-    return Options(
-        source=given.source,
-        insertion=given.insertion,
-        json=output_file("--json", given.json),
-        from_mm=number("--from-mm", given.from_mm, 0.0, 1000.0, "mm"),
-        until_mm=number("--until-mm", given.until_mm, 0.0, math.inf, "mm"),
-        entry_std_mm=number("--entry-std-mm", given.entry_std_mm, 0.001, math.inf, "mm"),
-        heading_std_deg=number("--heading-std-deg", given.heading_std_deg, 0.01, math.inf, "deg"),
-        repeating_error_mm=number(
-            "--repeating-error-mm", given.repeating_error_mm, 0.0, 100.0, "mm"
-        ),
-        rotation_tolerance_deg=number(
-            "--rotation-tolerance-deg", given.rotation_tolerance_deg, 0.0, 10.0, "deg"
-        ),
-        forecast_mm=None
-        if given.forecast_mm is None
-        else number("--forecast-mm", given.forecast_mm, 1.0, 1000.0, "mm"),
-    )
+    options = parser.parse_args(arguments)
+    options.json = output_file("--json", options.json)
+    for name, (lower, upper) in _BOUNDS.items():
+        if (text := getattr(options, name)) is not None:
+            flag, unit = f"--{name.replace('_', '-')}", name.rpartition("_")[2]
+            setattr(options, name, number(flag, text, lower, upper, unit))
+    return options
 
 
-def identify(options: Options) -> tuple[InsertionRecord, CheckedFit]:
-    """Read, check and fit; raises UserError."""
+def identify(options: argparse.Namespace) -> tuple[InsertionRecord, CheckedFit]:
+    """Read and check the tips, and fit the curvature; raises UserError."""
     record = read_record(options.source, options.insertion)
     record = record.between(options.from_mm * 1e-3, options.until_mm * 1e-3)
     record.check_pure(math.radians(options.rotation_tolerance_deg))
@@ -160,7 +147,7 @@ def identify(options: Options) -> tuple[InsertionRecord, CheckedFit]:
     try:
         checked = fit_checked(record.tips, record.insertion, settings)
         if record.rotation is None:
-            check_order(checked.fit.misses, settings.repeating_error)
+            check_independent_residuals(checked.fit.residuals, settings.repeating_error)
         return record, checked
     except UserError as error:
         raise UserError(f"{options.source}: {error}") from error
@@ -194,9 +181,9 @@ def summary(record: InsertionRecord, checked: CheckedFit) -> dict[str, JsonValue
 
 
 def _forecast(
-    options: Options, record: InsertionRecord, checked: CheckedFit
+    options: argparse.Namespace, record: InsertionRecord, checked: CheckedFit
 ) -> dict[str, JsonValue]:
-    """Return where the tip will be, and half the widths of the 95 % intervals; null: not asked."""
+    """Return the predicted tip and half the widths of its 95 % intervals, if requested."""
     names = [f"forecast_{what}_mm" for what in ("x", "y", "z", "x_95", "y_95", "z_95")]
     if options.forecast_mm is None:
         return dict.fromkeys(names)
@@ -205,9 +192,6 @@ def _forecast(
     )
     values = 1e3 * np.concatenate([ahead.tip, ahead.interval()])
     return dict(zip(names, values.tolist(), strict=True))
-
-
-_OUTLIER_WEIGHT = 0.5
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -232,8 +216,8 @@ def _run(arguments: Sequence[str]) -> int:
     if options.json is not None:
         write_json(options.json, values)
     low, high = (1e3 * float(radius) for radius in fit.radius_interval())
-    believable = f"{low:.1f} to {high:.1f} mm" if math.isfinite(high) else f"more than {low:.1f} mm"
-    print(f"1/kappa = {1e3 * float(fit.radius):.1f} mm (95 %: {believable})")
+    interval = f"{low:.1f} to {high:.1f} mm" if math.isfinite(high) else f"more than {low:.1f} mm"
+    print(f"1/kappa = {1e3 * float(fit.radius):.1f} mm (95 %: {interval})")
     print(f"curvature: {float(fit.curvature):.4g}  # 1/m, +- {float(fit.std):.2g}")
     print(
         f"{values['tips']} tips over {float(values['arc_mm'] or 0.0):.1f} mm, "

@@ -1,24 +1,29 @@
-"""The arc of a pure insertion ([KC09] IV-B): its points, and how they move with what is unknown.
+"""Arc of a pure insertion ([KC09] IV-B): its points, and their derivatives by the unknowns.
 
 The unknowns, (..., 7): the entry [m], two angles of the heading there [rad], and the two components
-of kappa n across the heading [1/m], n being the direction the needle bends to. In these there is no
-singular point at kappa = 0. Leading axes broadcast.
+of kappa n across the heading [1/m], where n is the direction to which the needle bends. There is no
+singularity at kappa = 0. Leading axes broadcast.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from needle_controller.model.arc_motion import cross_matrix, left_jacobian, rotation_exp
+from needle_controller.model.arc_motion import (
+    SERIES_BELOW,
+    cross_matrix,
+    left_jacobian,
+    rodrigues_factors,
+    rotation_exp,
+)
 from needle_controller.model.arrays import Array
 
 ENTRY, HEADING, BEND = slice(0, 3), slice(3, 5), slice(5, 7)
 UNKNOWNS = 7
-_SERIES_BELOW = 1e-2
 
 
 def frame(heading: Array) -> Array:
-    """Return axes (as columns) of which the third is a heading."""
+    """Return axes as columns, of which the third is the heading."""
     aside = np.eye(3)[np.argmin(np.abs(heading))]
     first = np.cross(aside, heading)
     first /= np.linalg.norm(first)
@@ -26,7 +31,7 @@ def frame(heading: Array) -> Array:
 
 
 def headings(angles: Array) -> Array:
-    """Return the frames whose third axis is turned by two angles, shape (..., 3, 3)."""
+    """Return the frames whose third axis is rotated by two angles, shape (..., 3, 3)."""
     return rotation_exp(_with_zero(angles))
 
 
@@ -62,17 +67,12 @@ def arc_points(unknowns: Array, length: Array) -> tuple[Array, Array, Array]:
 
 def _arc_factors(q: Array) -> tuple[Array, Array, Array, Array]:
     """Return sin(a)/a, (1 - cos(a))/a^2 of q = a^2 and their derivatives by q."""
-    small = q < _SERIES_BELOW
+    along, across, _ = rodrigues_factors(q)
+    small = q < SERIES_BELOW
     safe = np.where(small, 1.0, q)
-    a = np.sqrt(safe)
-    along = np.where(small, 1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0)), np.sin(a) / a)
-    across = np.where(
-        small,
-        0.5 * (1.0 - q / 12.0 * (1.0 - q / 30.0 * (1.0 - q / 56.0))),
-        2.0 * (np.sin(0.5 * a) / a) ** 2,
-    )
+    cosine = np.cos(np.sqrt(safe))
     d_along = np.where(
-        small, -1.0 / 6.0 + q / 60.0 - q * q / 1680.0, (np.cos(a) - along) / (2.0 * safe)
+        small, -1.0 / 6.0 + q / 60.0 - q * q / 1680.0, (cosine - along) / (2.0 * safe)
     )
     d_across = np.where(
         small, -1.0 / 24.0 + q / 360.0 - q * q / 13440.0, (along - 2.0 * across) / (2.0 * safe)

@@ -1,15 +1,15 @@
 """Forecast of the tip from the first part of a pure insertion, with its uncertainty.
 
-An arc alone is too sure of itself: real tissue bends a needle a little otherwise from place to
-place. So the path is an arc plus what a local curvature adds, which is a stationary random process,
+The uncertainty of an arc alone is too small, because the curvature varies slightly in real tissue.
+So the path is an arc plus the effect of a local curvature c, a stationary random process:
 
     p(s) = arc(s) + integral over u < s of c(u) x (arc(s) - arc(u)) du,
-    E[c(u) c(v)^T] = spread^2 exp(-|u - v| / length) across the path,
+    E[c(u) c(v)^T] = spread^2 exp(-|u - v| / length) across the path.
 
-and the curvature of the arc is normal about 0 in each direction, with a standard deviation of which
-only the order of magnitude is thought to be known: each of `SCALES` is a hypothesis, weighed by how
-well it explains the tips. So a stiff needle's arc, which its noisy tips hardly show, is not
-extrapolated as if it were known, and a flexible one's is not made straighter.
+The curvature of the arc is normal about 0 in each direction. Only the order of magnitude of its
+standard deviation is known: each of `SCALES` is a hypothesis, weighted by the evidence of the tips.
+So the uncertain arc of a stiff needle is not extrapolated as if it were known, and that of a
+flexible needle is not straightened.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ LOCAL_SPREAD, LOCAL_LENGTH = 0.4, 0.02
 insertions of a stiff needle (2022-08-31 to 10-13 of maribernardes/trajcontrol_lisa), whose tips at
 98 mm are within the 95 % intervals of a forecast from 50 mm in 96 % of cases."""
 SCALES: Array = np.geomspace(0.05, 50.0, 13)
-"""Standard deviations of the arc's curvature, each as likely as the others beforehand [1/m]."""
+"""Standard deviations of the arc's curvature, with equal prior probabilities [1/m]."""
 _CELL = 0.004
-"""Length over which the local curvature is taken as constant [m]."""
+"""Length over which the local curvature is constant [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TipForecast:
-    """Place of a tip that is not there yet.
+    """Predicted tip.
 
     Attributes
     ----------
@@ -48,30 +48,30 @@ class TipForecast:
     covariance: Array
 
     def interval(self, deviations: float = 1.96) -> Array:
-        """Return half the width of each coordinate's interval, (3,) [m], by default of 95 %."""
+        """Return half the interval of each coordinate, (3,) [m], by default that of 95 %."""
         return np.asarray(deviations * np.sqrt(np.diagonal(self.covariance)))
 
 
 def forecast_tip(
     tips: Array, insertion_known: bool, checked: CheckedFit, insertion: float
 ) -> TipForecast:
-    """Return where the tip will be at an insertion without rotation.
+    """Return the predicted tip at an insertion without rotation.
 
     Parameters
     ----------
     tips : ndarray, shape (K, 3)
         Measured tips in `rig` [m].
     insertion_known : bool
-        Whether the fit was told their insertion; if not, that of the forecast is along the path.
+        Whether the fit has used their insertion; if not, that of the forecast is along the path.
     checked : CheckedFit
         The arc through them.
     insertion : float
-        At the forecast, above 0 [m].
+        Insertion of the forecast, > 0 [m].
 
     Returns
     -------
     TipForecast
-        With its uncertainty, for noise as the fit has found it.
+        Predicted tip and its uncertainty, for the fitted noise.
     """
     fit, settings = checked.fit, checked.settings
     axes, entry = frame(np.asarray(settings.heading)), np.asarray(settings.entry)
@@ -85,13 +85,13 @@ def forecast_tip(
     residual = (tips - entry) @ axes - points[:-1]
     seen = design[:-1]
     if not insertion_known:
-        # Only what lies across the path counts.
+        # Only the residual across the path counts.
         along = tangents[:-1]
         residual = residual - along * np.sum(residual * along, axis=-1, keepdims=True)
         seen = seen - along[..., None] * np.einsum("ki,kij->kj", along, seen)[:, None]
     rows = seen.reshape(-1, seen.shape[-1])
-    weighed = rows.T * np.repeat(fit.weights / fit.measurement_std**2, 3)
-    told, pull = weighed @ rows, weighed @ residual.ravel()
+    weighted = rows.T * np.repeat(fit.weights / fit.measurement_std**2, 3)
+    information, pull = weighted @ rows, weighted @ residual.ravel()
     precision = _prior(settings.precision(), insertion_known, design.shape[-1])
     offset = np.zeros(design.shape[-1])
     offset[: UNKNOWNS + 1] = -fit.unknowns
@@ -99,13 +99,13 @@ def forecast_tip(
     for scale in SCALES:
         precision[BEND, BEND] = np.eye(2) * scale**-2.0
         # Least squares about the arc: (D^T W D + P) x = D^T W r + P x0
-        covariance = np.linalg.inv(told + precision)
-        wanted = pull + precision @ offset
-        change = covariance @ wanted
+        covariance = np.linalg.inv(information + precision)
+        right_side = pull + precision @ offset
+        change = covariance @ right_side
         means.append(points[-1] + design[-1] @ change)
         covariances.append(design[-1] @ covariance @ design[-1].T)
         log_det = np.linalg.slogdet(covariance)[1] - 4.0 * np.log(scale)
-        evidence.append(0.5 * (log_det + wanted @ change - offset @ precision @ offset))
+        evidence.append(0.5 * (log_det + right_side @ change - offset @ precision @ offset))
     share = np.exp(np.array(evidence) - np.max(evidence))
     share /= np.sum(share)
     mean = share @ np.array(means)
@@ -115,14 +115,14 @@ def forecast_tip(
 
 
 def _local_slopes(unknowns: Array, stations: Array) -> Array:
-    """Return how points on the arc move with the local curvature of each cell, (K, 3, 2 M) [m^2].
+    """Return the derivatives of points by the local curvature of each cell, (K, 3, 2 M) [m^2].
 
     Parameters
     ----------
     unknowns : ndarray, shape (8,)
         Of the arc.
     stations : ndarray, shape (K,)
-        Of the points along it, the farthest last [m].
+        Positions of the points along it, the farthest last [m].
     """
     cells = np.arange(0.5 * _CELL, stations[-1], _CELL)
     points, _, _ = arc_points(unknowns[:UNKNOWNS], stations)
@@ -139,9 +139,9 @@ def _local_slopes(unknowns: Array, stations: Array) -> Array:
 
 
 def _prior(precision: Array, insertion_known: bool, count: int) -> Array:
-    """Return the inverse covariance of all unknowns, (count, count), but for the arc's bend."""
+    """Return the inverse prior covariance of all unknowns except the arc's bend, (count, count)."""
     if not insertion_known:
-        # Where the path begins along itself is what the arc says.
+        # The position along the path is that of the arc.
         precision = precision.copy()
         precision[2] = max(precision[2], 1e6)
     whole = np.zeros((count, count))

@@ -1,4 +1,4 @@
-"""Assumptions of the hypothesis filter: noise, entry, torsion, and when a hypothesis is dropped."""
+"""Settings of the hypothesis filter: prior hypotheses, noise, drifts and limits."""
 
 from __future__ import annotations
 
@@ -9,19 +9,11 @@ from typing import Annotated, cast
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.filter.hypotheses import (
-    LASTING,
-    NORMAL,
-    UNIFORM,
-    NoiseHypothesis,
-    RollHypothesis,
-    TorsionHypothesis,
-)
 from needle_controller.filter.records import (
     ASSUMPTIONS,
     E_KAPPA,
     E_SCALE,
-    E_SIZE,
+    E_TORSION,
     E_TURN,
     HYPOTHESIS,
     NOISES,
@@ -31,14 +23,129 @@ from needle_controller.model.kinematics import rotation_from_angles
 from needle_core.errors import UserError
 from needle_core.settings.bounds import Bounds, check_bounded_fields
 
+# Read by compiled code.
+PLAY, LAG, GAIN = range(3)
+"""Parameters of a torsion, of which each hypothesis estimates one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TorsionHypothesis:
+    """Model of how the tip's roll follows the base; one parameter is estimated.
+
+    Attributes
+    ----------
+    play : float
+        Half width of the dead band between base and tip [rad].
+    lag_length : float
+        Inserted length over which the tip follows [m]; 0 for no lag.
+    parameter_std : float
+        Prior standard deviation of the estimated parameter: of the lag length [m] if there is one,
+        otherwise of the play [rad]; without either, of the share of the base's rotation that
+        reaches the tip, about 1.
+    weight : float
+        Prior weight, relative to the others'.
+    heading_drift, roll_drift : float
+        Growth of the standard deviations of pitch and yaw, and of the roll, over a metre, for a tip
+        that turns by itself [rad/sqrt(m)].
+    """
+
+    play: Annotated[float, Bounds(0.0, math.pi, "rad")]
+    lag_length: Annotated[float, Bounds(0.0, 0.1, "m")]
+    parameter_std: Annotated[float, Bounds(0.0, math.pi, "m or rad")]
+    weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
+    heading_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.05
+    roll_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.05
+
+    def __post_init__(self) -> None:
+        """Check every field; raises OutOfBoundsError."""
+        check_bounded_fields(self)
+
+    @property
+    def kind(self) -> int:
+        """Estimated parameter: `PLAY`, `LAG` or `GAIN`."""
+        if self.lag_length > 0.0:
+            return LAG
+        return PLAY if self.play > 0.0 else GAIN
+
+
+@dataclasses.dataclass(frozen=True)
+class RollHypothesis:
+    """Possible roll of the tip at the entry, relative to the base.
+
+    Attributes
+    ----------
+    roll : float
+        Mean [rad].
+    std : float
+        Standard deviation [rad].
+    weight : float
+        Prior weight, relative to the others'.
+    """
+
+    roll: Annotated[float, Bounds(-math.pi, math.pi, "rad")]
+    std: Annotated[float, Bounds(1e-6, math.pi, "rad")]
+    weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
+
+    def __post_init__(self) -> None:
+        """Check every field; raises OutOfBoundsError."""
+        check_bounded_fields(self)
+
+
+# Read by compiled code.
+NORMAL, UNIFORM, CORRELATED = range(3)
+"""Noise shapes: normal, or uniform within a bound, both equal in all coordinates and independent
+between tips; or normal with a size for each coordinate and correlated between tips."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NoiseHypothesis:
+    """Possible noise of a measured coordinate, relative to the claimed noise.
+
+    Attributes
+    ----------
+    shape : int
+        `NORMAL`, `UNIFORM` or `CORRELATED`.
+    multiples : tuple of float
+        Possible sizes: bounds relative to the claimed bound, or standard deviations relative to the
+        claimed one (for a bound, bound / sqrt(3)); at most 6.
+    shares : tuple of float
+        Prior probability of each size; the sum is 1.
+    weight : float
+        Prior weight, relative to the others'.
+    correlations : tuple of float
+        For `CORRELATED` noise, the correlation of an error with that of the tip before, for each
+        size, in [0, 1); empty for the others.
+    """
+
+    shape: int
+    multiples: tuple[float, ...]
+    shares: tuple[float, ...]
+    weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
+    correlations: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check every field; raises UserError."""
+        check_bounded_fields(self)
+        text = f"multiples = {self.multiples}, shares = {self.shares}"
+        if not 0 < len(self.multiples) == len(self.shares) <= NOISES:
+            raise UserError(f"{text}: want 1 to {NOISES} of each")
+        if min(self.multiples + self.shares) <= 0.0 or abs(sum(self.shares) - 1.0) > 1e-9:
+            raise UserError(f"{text}: want multiples > 0, and shares > 0 whose sum is 1")
+        wanted = len(self.multiples) if self.shape == CORRELATED else 0
+        if len(self.correlations) != wanted or not all(
+            0.0 <= each < 1.0 for each in self.correlations
+        ):
+            raise UserError(f"correlations = {self.correlations}, wants {wanted} numbers in [0, 1)")
+
+
 TORSION_HYPOTHESES = (
     TorsionHypothesis(0.0, 0.0, 0.015, 0.55),
     TorsionHypothesis(math.radians(35.0), 0.0, 0.25, 0.3),
     TorsionHypothesis(0.0, 0.006, 0.003, 0.11),
     TorsionHypothesis(0.0, 0.0, 0.15, 0.1, heading_drift=0.15, roll_drift=1.2),
 )
-"""None, play, lag, and a tip that turns by itself: tissue pushes it aside, it
-rolls, or it follows part of the base's rotation only. Each one's size is estimated."""
+"""No torsion, play, lag, and a tip that turns by itself, because tissue pushes it aside, it rolls,
+or it follows only a part of the base's rotation."""
 ROLL_HYPOTHESES = tuple(
     RollHypothesis(math.radians(roll), math.radians(std), weight)
     for roll, std, weight in (
@@ -49,27 +156,27 @@ ROLL_HYPOTHESES = tuple(
         *((roll, 22.0, 0.057) for roll in (153.0, -153.0)),
     )
 )
-"""Most likely as the base puts it, to some 30 deg; else anywhere. Narrow ones, for a filter that is
-linear in the roll knows less than it thinks when its roll is wide."""
-LASTING_NOISE = NoiseHypothesis(
-    LASTING, (1.0, 2.0, 1.0, 1.0), (0.25,) * 4, 0.1, (0.0, 0.0, 0.7, 0.95)
+"""Most likely within 30 deg of the base's rotation, otherwise anywhere. Each is narrow, because a
+filter that is linear in the roll is overconfident if the roll is uncertain."""
+CORRELATED_NOISE = NoiseHypothesis(
+    CORRELATED, (1.0, 2.0, 1.0, 1.0), (0.25,) * 4, 0.1, (0.0, 0.0, 0.7, 0.95)
 )
-"""Whatever is claimed: some coordinates are worse than others, or errors last for some tips, or for
-so many that they are as good as a bias that wanders."""
+"""Independent of the claim: some coordinates are worse than others, or errors persist for some
+tips, or for so many that they act as a slowly changing bias."""
 NORMAL_NOISE = (
     NoiseHypothesis(
         NORMAL, (1.0, 0.5, 0.25, 2.0, 4.0, 8.0), (0.4, 0.15, 0.15, 0.15, 0.1, 0.05), 1.0
     ),
-    LASTING_NOISE,
+    CORRELATED_NOISE,
 )
-"""Where a covariance is claimed: normal, smaller than claimed, as claimed or larger."""
+"""For a claimed covariance: normal noise that is smaller than claimed, as claimed, or larger."""
 BOUNDED_NOISE = (
     NoiseHypothesis(UNIFORM, (1.0, 1.3, 1.7, 2.2), (0.85, 0.05, 0.05, 0.05), 0.8),
     NoiseHypothesis(NORMAL, (1.0, 0.5, 0.25, 1.6, 2.6), (0.4, 0.15, 0.15, 0.15, 0.15), 0.2),
-    LASTING_NOISE,
+    CORRELATED_NOISE,
 )
-"""Where a bound is claimed: most likely it holds; else a larger one, or none. Were no small normal
-noise thought possible, small errors would look like errors that last."""
+"""For a claimed bound: most likely it holds; otherwise a larger one, or none. Without hypotheses of
+small normal noise, small errors would look like correlated ones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,51 +188,51 @@ class FilterSettings:
     curvature : float
         Curvature of the needle's path, kappa [1/m].
     curvature_spread : float
-        Its standard deviation at the start, as a share of it.
+        Initial standard deviation of the curvature, relative to it.
     curvature_range : tuple of float
-        Least and most that is believed, as shares of it.
+        Smallest and largest estimated curvature, relative to `curvature`.
     curvature_drift : float
-        Growth of its standard deviation over a metre, as a share of it [1/sqrt(m)].
+        Growth of the relative standard deviation over a metre [1/sqrt(m)].
     scale_spread : float
-        Standard deviation of the insertion scale at the start: how far the needle goes in for each
-        unit that the stage moves, about 1.
+        Initial standard deviation of the insertion scale, the needle's insertion per insertion of
+        the stage, about 1.
     scale_drift : float
-        Growth of it over a metre [1/sqrt(m)].
+        Growth of this standard deviation over a metre [1/sqrt(m)].
     tip_noise_bound : float
-        Largest error claimed of a measured coordinate where a tip comes without covariance [m].
+        Claimed largest error of a measured coordinate of tips without covariance [m].
     outlier_share : float
-        Share of tips that have nothing to do with the needle.
+        Share of tips that are outliers.
     outlier_reach : float
-        Size of where these are found, as a multiple of the claimed bound (of sqrt(3) standard
+        Size of the region of outliers, relative to the claimed bound (to sqrt(3) standard
         deviations).
     model_error : float
-        What the model leaves out of a tip's position [m]. A better sensor is not believed beyond
-        it: a filter that is linear in the roll would hold a wrong one for certain. Its square is
-        added to a tip's covariance, and a bound is taken as at least twice as large.
+        Error of the model's tip position [m]. Its square is added to a tip's covariance, and a
+        bound is at least twice as large: with a more accurate sensor, a filter that is linear in
+        the roll would be certain of a wrong one.
     jump_share : float
-        How likely a tip that looks like an outlier shows that phantom or tracker were displaced,
-        against that it is one.
+        Probability that an apparent outlier is a displacement of phantom or tracker, relative to
+        that of an outlier.
     jump_turn_std : float
-        How far they may be turned at once [rad].
+        Standard deviation of the rotation in such a displacement [rad].
     initial_angle_std : float
-        How well pitch and yaw at the entry are known [rad].
+        Standard deviation of pitch and yaw at the entry [rad].
     entry_std : float
-        How far from the entry point, along the needle, its tip may be with the stage at 0 [m].
+        Standard deviation of the tip's position along the needle with the stage at 0 [m].
     play_drift, lag_drift : float
         Growth of the standard deviations of play [rad/sqrt(m)] and lag length [sqrt(m)] over a
-        metre, where they are estimated: what keeps them open for what the model does not know.
+        metre if they are estimated, which allows for effects beyond the model.
     prune_ratio : float
-        A hypothesis ends when it is less likely than the likeliest one by this factor.
+        A hypothesis that is less likely than the likeliest one by this factor is removed.
     merge_angle : float
-        Hypotheses of the same torsion whose rolls are nearer than this become one [rad].
+        Hypotheses of the same torsion whose rolls differ by less are merged [rad].
     longest_step : float
         Longer advances are divided [m].
     play_limit : float
-        Most that play is believed to be [rad].
+        Largest estimated play [rad].
     lag_range : tuple of float
-        Least and most that a lag length is believed to be [m].
+        Smallest and largest estimated lag length [m].
     torsion_hypotheses, roll_hypotheses, noise_hypotheses : tuple
-        Every torsion is tried with every roll and every noise, of each shape at most one.
+        All combinations are tried; at most one noise hypothesis of each shape.
     """
 
     curvature: Annotated[float, Bounds(0.1, 100.0, "1/m")] = 1.0 / 0.122
@@ -159,7 +266,7 @@ class FilterSettings:
         Raises
         ------
         UserError
-            A value out of bounds, a range that is none, or no hypotheses.
+            A value out of bounds, an invalid range, or no hypotheses.
         """
         check_bounded_fields(self)
         for name, (least, most) in (
@@ -173,35 +280,35 @@ class FilterSettings:
                 raise UserError(f"{name} = (), wants at least one")
 
     @property
-    def believed_bound(self) -> float:
-        """Largest error of a measured coordinate that is reckoned with [m]."""
+    def effective_bound(self) -> float:
+        """Assumed largest error of a measured coordinate [m]."""
         return max(self.tip_noise_bound, 2.0 * self.model_error)
 
     def assumptions(self) -> np.void:
-        """Return what the compiled code needs of this."""
-        known = np.zeros(1, ASSUMPTIONS)[0]
-        known["noises"] = self.noises()
-        known["curvature"] = self.curvature
-        known["smallest_curvature"] = self.curvature_range[0] * self.curvature
-        known["largest_curvature"] = self.curvature_range[1] * self.curvature
-        known["curvature_drift"] = (self.curvature_drift * self.curvature) ** 2
-        known["scale_spread"] = self.scale_spread
-        known["scale_drift"] = self.scale_drift**2
-        known["size_drift"] = self.play_drift**2, self.lag_drift**2, 0.0
-        known["largest_play"] = self.play_limit
-        known["smallest_lag"] = self.lag_range[0]
-        known["largest_lag"] = self.lag_range[1]
-        known["longest_step"] = self.longest_step
-        known["believed_bound"] = self.believed_bound
-        known["entry_std"] = self.entry_std
-        known["model_error"] = self.model_error**2
-        known["outlier_share"] = self.outlier_share
-        known["outlier_density"] = self.outlier_reach**-3
-        known["jump_share"] = self.jump_share
-        known["jump_turn_variance"] = self.jump_turn_std**2
-        known["smallest_weight"] = 1.0 / self.prune_ratio
-        known["merge_angle"] = self.merge_angle
-        return cast(np.void, known)
+        """Return the settings for compiled code."""
+        assumed = np.zeros(1, ASSUMPTIONS)[0]
+        assumed["noises"] = self.noises()
+        assumed["curvature"] = self.curvature
+        assumed["smallest_curvature"] = self.curvature_range[0] * self.curvature
+        assumed["largest_curvature"] = self.curvature_range[1] * self.curvature
+        assumed["curvature_drift"] = (self.curvature_drift * self.curvature) ** 2
+        assumed["scale_spread"] = self.scale_spread
+        assumed["scale_drift"] = self.scale_drift**2
+        assumed["torsion_drift"] = self.play_drift**2, self.lag_drift**2, 0.0
+        assumed["largest_play"] = self.play_limit
+        assumed["smallest_lag"] = self.lag_range[0]
+        assumed["largest_lag"] = self.lag_range[1]
+        assumed["longest_step"] = self.longest_step
+        assumed["effective_bound"] = self.effective_bound
+        assumed["entry_std"] = self.entry_std
+        assumed["model_error"] = self.model_error**2
+        assumed["outlier_share"] = self.outlier_share
+        assumed["outlier_density"] = self.outlier_reach**-3
+        assumed["jump_share"] = self.jump_share
+        assumed["jump_turn_variance"] = self.jump_turn_std**2
+        assumed["smallest_weight"] = 1.0 / self.prune_ratio
+        assumed["merge_angle"] = self.merge_angle
+        return cast(np.void, assumed)
 
     def noises(self) -> Array:
         """Return multiples, shares and correlations of each shape, (3, 3, NOISES)."""
@@ -209,11 +316,11 @@ class FilterSettings:
         for noise in self.noise_hypotheses:
             count = len(noise.shares)
             numbers[noise.shape, :2, :count] = noise.multiples, noise.shares
-            numbers[noise.shape, 2, : len(noise.lasting)] = noise.lasting
+            numbers[noise.shape, 2, : len(noise.correlations)] = noise.correlations
         return numbers
 
     def prior(self) -> npt.NDArray[np.void]:
-        """Return all hypotheses of a needle that enters along z with its base at 0, shape (H,)."""
+        """Return the hypotheses of a needle that enters along z with its base at 0, shape (H,)."""
         noises = self.noises()
         every = [
             (noise, number, torsion, roll)
@@ -228,7 +335,7 @@ class FilterSettings:
             h["noise_weights"] = noises[noise.shape, 1]
             h["curvature"], h["scale"] = self.curvature, 1.0
             h["play"], h["lag"], h["gain"] = torsion.play, torsion.lag_length, 1.0
-            h["sized"] = torsion.sized
+            h["torsion_kind"] = torsion.kind
             h["heading_drift"], h["roll_drift"] = torsion.heading_drift**2, torsion.roll_drift**2
             h["rotation"] = rotation_from_angles([0.0, 0.0, roll.roll])
             covariance = h["covariance"]
@@ -236,7 +343,7 @@ class FilterSettings:
                 covariance[E_TURN + k, E_TURN + k] = self.initial_angle_std**2
             covariance[E_TURN + 2, E_TURN + 2] = roll.std**2
             covariance[E_KAPPA, E_KAPPA] = (self.curvature_spread * self.curvature) ** 2
-            covariance[E_SIZE, E_SIZE] = torsion.size_std**2
+            covariance[E_TORSION, E_TORSION] = torsion.parameter_std**2
             covariance[E_SCALE, E_SCALE] = self.scale_spread**2
         prior["weight"] /= np.max(prior["weight"])
         return prior

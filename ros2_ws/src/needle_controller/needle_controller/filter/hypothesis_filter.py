@@ -1,7 +1,8 @@
 """A bank of extended Kalman filters on SE(3), one for each hypothesis of torsion, roll and noise.
 
-Each estimates the tip's full pose, the curvature and the size of its torsion from all three
-coordinates of the measured tips. Hypotheses that explain the tips badly lose weight and end.
+Each estimates the tip's full pose, the curvature and one torsion parameter from all three
+coordinates of the measured tips. Hypotheses that explain the tips badly lose weight and are
+removed.
 """
 
 from __future__ import annotations
@@ -11,31 +12,31 @@ import numpy.typing as npt
 
 from needle_controller.filter.bank import advance_needle, correct_needle, start_needle
 from needle_controller.filter.filter_settings import FilterSettings
-from needle_controller.filter.mixture import estimate_from, estimate_needle
+from needle_controller.filter.mixture import estimate_from_record, estimate_needle
 from needle_controller.filter.records import ERROR, ESTIMATE, EVENT, HYPOTHESIS, NEEDLE, TORSION
 from needle_controller.model.arrays import Array
 from needle_controller.observers.estimator import Estimate
 
 AMBIGUOUS_WEIGHT = 0.1
 _EVENTS = 4096
-"""Tips of the first 2 cm that are kept, to ask whether they are late."""
+"""Largest number of recorded events of the first 2 cm, for the detection of late tips."""
 
 
 class HypothesisFilter:
     """Estimates the tip's pose, curvature and torsion; see `estimator.Estimator`.
 
-    Tips may be older than they say: that shows over the first 2 cm (`late_tips`).
+    Tips may be older than their stamps; this is detected over the first 2 cm (`late_tips`).
 
     Parameters
     ----------
     settings : FilterSettings
-        What is assumed.
+        Assumptions.
     initial_rotation : array_like, shape (3, 3), optional
         Orientation of a needle at its entry with the base's rotation at 0, in `target_plane`;
         identity by default.
     entry : array_like, shape (3,), optional
-        Where the needle enters, in `target_plane` [m]: where its tip is with the stage at 0, along
-        the needle to within `FilterSettings.entry_std`. Not known if none is given.
+        Entry point in `target_plane` [m]: position of the tip with the stage at 0, along the needle
+        to within `FilterSettings.entry_std`; unknown by default.
     """
 
     def __init__(
@@ -45,7 +46,7 @@ class HypothesisFilter:
         entry: npt.ArrayLike | None = None,
     ) -> None:
         self.settings = settings
-        self._prior, self._known = settings.prior(), settings.assumptions()
+        self._prior, self._assumed = settings.prior(), settings.assumptions()
         self.needle = np.zeros(1, NEEDLE)[0]
         self.needle["initial_rotation"] = (
             np.eye(3) if initial_rotation is None else initial_rotation
@@ -63,7 +64,7 @@ class HypothesisFilter:
 
     @property
     def hypotheses(self) -> npt.NDArray[np.void]:
-        """The hypotheses that have not ended, shape (H,), `records.HYPOTHESIS`; a view."""
+        """View of the present hypotheses, shape (H,), `records.HYPOTHESIS`."""
         return self._hypotheses[: self.needle["count"]]
 
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
@@ -76,26 +77,26 @@ class HypothesisFilter:
             np.array(tip, dtype=float),
             insertion,
             turn,
-            self._known,
+            self._assumed,
         )
 
     def advance(self, d_insertion: float, d_rotation: float) -> None:
-        """Move on by what really happened; see `Estimator.advance`."""
+        """Advance by the actual motion; see `Estimator.advance`."""
         length, turn = float(d_insertion), float(d_rotation)
         if not (np.isfinite(length) and length >= 0.0):
             raise ValueError(f"d_insertion = {length!r} m, wants finite and >= 0")
         if not np.isfinite(turn):
             raise ValueError(f"d_rotation = {turn!r} rad, wants finite")
-        advance_needle(self.needle, self._hypotheses, self._events, length, turn, self._known)
+        advance_needle(self.needle, self._hypotheses, self._events, length, turn, self._assumed)
 
     def correct(
         self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
     ) -> None:
-        """Take a measurement; see `Estimator.correct`.
+        """Correct by a measured tip; see `Estimator.correct`.
 
-        Without a covariance the noise is taken as bounded (`tip_noise_bound`), with one as
-        Gaussian; neither as less than `model_error` allows. A tip older than the last one is
-        dropped, and `estimate` says so.
+        Without a covariance the noise is assumed to be bounded (`tip_noise_bound`), otherwise
+        Gaussian; in both cases it includes `model_error`. A tip older than the last one is dropped
+        with a warning.
         """
         correct_needle(
             self.needle,
@@ -106,18 +107,18 @@ class HypothesisFilter:
             np.zeros((3, 3)) if covariance is None else np.array(covariance, dtype=float),
             covariance is not None,
             float(age),
-            self._known,
+            self._assumed,
         )
 
     def estimate(self) -> Estimate:
-        """Return what is known now; see `Estimator.estimate`."""
-        said = np.zeros(1, ESTIMATE)[0]
+        """Return the present estimate; see `Estimator.estimate`."""
+        record = np.zeros(1, ESTIMATE)[0]
         torsions = np.zeros(len(self.settings.torsion_hypotheses), TORSION)
-        estimate_needle(self.needle, self._hypotheses, said, torsions, self._known)
-        return estimate_from(said, torsions, self._warnings(float(said["ambiguous"])))
+        estimate_needle(self.needle, self._hypotheses, record, torsions, self._assumed)
+        return estimate_from_record(record, torsions, self._warnings(float(record["ambiguous"])))
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
-        """Express everything in another target plane; see `Estimator.change_frame`."""
+        """Transform everything into another target plane; see `Estimator.change_frame`."""
         transform = np.asarray(T_new_old, dtype=float)
         turn, shift = transform[:3, :3], transform[:3, 3]
         needle, h = self.needle, self.hypotheses
@@ -138,8 +139,8 @@ class HypothesisFilter:
         warnings = []
         if ambiguous > AMBIGUOUS_WEIGHT:
             warnings.append(f"the roll is not known yet: {100.0 * ambiguous:.0f} % says otherwise")
-        if self.needle["refused"] > 0.5:
+        if self.needle["outlier_probability"] > 0.5:
             warnings.append("tip refused as an outlier")
-        if self.needle["too_late"]:
+        if self.needle["tip_too_late"]:
             warnings.append("tip dropped: it is older than the last one used")
         return tuple(warnings)

@@ -1,11 +1,11 @@
-"""Tips that come late without saying so: told from the first centimetres; compiled.
+"""Detection of tips that are older than their stamps, from the first centimetres; compiled.
 
-A filter that is not told of it goes on from where the needle was, and takes each turn of the base
-for one that the tip follows late. What shows is that as much of the insertion is missing from the
-first millimetres on, and no more later: a needle that slips loses more the farther it goes.
+A filter that ignores the age would continue from an old position, and would interpret each turn of
+the base as a lag of the tip. With late tips, the same length of insertion is missing from the first
+millimetres on; with a needle that slips, the missing length grows.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from needle_controller.model.arrays import Array
 from needle_core.compiled import compiled
 
 FIRST, LAST = 0.004, 0.020
-"""Insertion since the start between which tips are asked: beyond, a needle bends too much [m]."""
+"""Range of insertion in which tips are evaluated; later, a needle is too bent [m]."""
 _LEAST_TIPS = 5
 _SURE = 3.0
 _OUTLIER = 4.0
 
 
 @compiled
-def untold_age(
+def hidden_age(
     inserted: Array,
     ways: Array,
     too_deep: float,
@@ -32,21 +32,21 @@ def untold_age(
     bound: float,
     scale_spread: float,
 ) -> float:
-    """Return how old tips are that say they are new, in insertion [m]; 0 where that is not sure.
+    """Return the hidden age of tips, in insertion [m]; 0 if it is not significant.
 
-    A straight line through what the tips do not show of the insertion: its slope is slip, and what
-    it begins with is age, beside the error of the first tip.
+    It is the intercept of a straight line through the missing insertion, beside the error of the
+    first tip; the slope of the line is the slip.
 
     Parameters
     ----------
     inserted : ndarray, shape (K,)
-        Since the first tip, at each one's exposure as it says [m].
+        Insertion since the first tip at each stated exposure [m].
     ways : ndarray, shape (K, 3)
-        From the first tip to each of them [m]; NaN where there is none.
+        From the first tip to each tip [m]; NaN if there is none.
     too_deep : float
-        How far the first tip was beyond where the needle is known to enter [m].
+        Distance of the first tip beyond the place where the needle is known to enter [m].
     entry_std : float
-        How well that is known [m]; infinite if not at all.
+        Standard deviation of the entry [m]; infinite if it is not known.
     bound : float
         Largest error claimed of a coordinate [m].
     scale_spread : float
@@ -55,7 +55,7 @@ def untold_age(
     least, count = bound**2 / 3.0, 0
     at, missing = np.empty(inserted.size), np.empty(inserted.size)
     for k in range(inserted.size):
-        # Noise across the way makes it longer: two coordinates of both tips.
+        # Lateral noise, in two coordinates of both tips, makes the distance longer.
         square = ways[k, 0] ** 2 + ways[k, 1] ** 2 + ways[k, 2] ** 2 - 4.0 * least
         if FIRST <= inserted[k] <= LAST + 1e-9 and math.isfinite(square):
             at[count] = inserted[k]

@@ -1,4 +1,4 @@
-"""Hypotheses of a needle that have become the same become one; compiled."""
+"""Merging of hypotheses that have become equal; compiled."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.filter.motion import rotate
-from needle_controller.filter.records import E_KAPPA, E_SCALE, E_SIZE, E_TURN, ERROR, HYPOTHESIS
+from needle_controller.filter.records import E_KAPPA, E_SCALE, E_TORSION, E_TURN, ERROR, HYPOTHESIS
 from needle_controller.model.arrays import Array
 from needle_core.compiled import compiled
 
@@ -22,8 +22,8 @@ _NUMBERS = HYPOTHESIS.itemsize // 8
 
 @compiled
 def copy_hypothesis(source: Records, n: int, target: Records, m: int) -> None:
-    """Copy hypothesis n of some to place m of others."""
-    # Number by number: a whole record in one assignment takes seconds to compile.
+    """Copy hypothesis n of `source` to place m of `target`."""
+    # Number by number: the assignment of a whole record takes seconds to compile.
     of, to = source.view(np.float64), target.view(np.float64)
     for k in range(_NUMBERS):
         to[m * _NUMBERS + k] = of[n * _NUMBERS + k]
@@ -31,14 +31,14 @@ def copy_hypothesis(source: Records, n: int, target: Records, m: int) -> None:
 
 @compiled
 def merge(needle: Any, hypotheses: Records, angle: float) -> None:
-    """Join hypotheses of the same torsion and noise that have become the same.
+    """Merge equal hypotheses of the same torsion and noise.
 
     Parameters
     ----------
     needle, hypotheses : NEEDLE, ndarray of HYPOTHESIS, changed
         See `start_needle`.
     angle : float
-        Between rolls that count as the same [rad].
+        Angle between rolls that count as equal [rad].
     """
     difference, cosine = np.empty(ERROR), math.cos(angle)
     for first in range(needle.count):
@@ -57,7 +57,7 @@ def merge(needle: Any, hypotheses: Records, angle: float) -> None:
 
 @compiled
 def _are_same(a: Any, b: Any, angle: float, cosine: float) -> bool:
-    """Return whether two are one: rolls, pitches and sizes of the torsion are near."""
+    """Return whether rolls, pitches and torsion parameters of two hypotheses are close."""
     if a.torsion != b.torsion or a.shape != b.shape:
         return False
     p, q = a.rotation, b.rotation
@@ -68,14 +68,14 @@ def _are_same(a: Any, b: Any, angle: float, cosine: float) -> bool:
         and abs(a.play - b.play) < 0.5 * angle
         and abs(a.lag - b.lag) < _SAME_LAG
         and abs(a.gain - b.gain) < _SAME_GAIN
-        # Else one of them has jumped.
+        # Otherwise one of them has jumped.
         and (a.position[0] - b.position[0]) ** 2 < max(a.covariance[0, 0], b.covariance[0, 0])
     )
 
 
 @compiled
 def _join(a: Any, b: Any, difference: Array) -> None:
-    """Put the mixture of two into the first, with its mean and covariance; the other gets weight 0.
+    """Replace the first by the mean and covariance of both; set the weight of the second to 0.
 
     With s the share of b and d = b - a: mean a + s d, P = (1 - s) P_a + s P_b + s (1 - s) d d^T.
     """
@@ -90,7 +90,7 @@ def _join(a: Any, b: Any, difference: Array) -> None:
             turn -= b.rotation[left, m] * a.rotation[right, m]
         difference[E_TURN + k] = 0.5 * turn
     difference[E_KAPPA] = b.curvature - a.curvature
-    difference[E_SIZE] = b.play - a.play + b.lag - a.lag + b.gain - a.gain
+    difference[E_TORSION] = b.play - a.play + b.lag - a.lag + b.gain - a.gain
     difference[E_SCALE] = b.scale - a.scale
     for k in range(ERROR):
         for m in range(ERROR):
@@ -104,7 +104,7 @@ def _join(a: Any, b: Any, difference: Array) -> None:
     a.gain += s * (b.gain - a.gain)
     a.tip_angle += s * (b.tip_angle - a.tip_angle)
     a.behind_play += s * (b.behind_play - a.behind_play)
-    a.dtip_dsize += s * (b.dtip_dsize - a.dtip_dsize)
+    a.dtip_dtorsion += s * (b.dtip_dtorsion - a.dtip_dtorsion)
     for k in range(3):
         a.position[k] += s * difference[k]
         a.residual[k] += s * (b.residual[k] - a.residual[k])

@@ -1,6 +1,5 @@
-"""All hypotheses of a needle as one estimate: mean pose, covariance, what laws read; compiled."""
+"""Combination of all hypotheses of a needle into one estimate; compiled."""
 
-# Compiled code takes keywords slowly or not at all.
 from __future__ import annotations
 
 import math
@@ -9,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.filter.bank import looked_ahead
-from needle_controller.filter.hypotheses import LASTING, NORMAL
+from needle_controller.filter.bank import predicted_hypotheses
+from needle_controller.filter.filter_settings import CORRELATED, NORMAL
 from needle_controller.filter.records import E_TURN, NEAR, NOISES
 from needle_controller.filter.tip_update import SMALLEST_VARIANCE
 from needle_controller.model.arrays import Array
@@ -28,15 +27,15 @@ WARNINGS = (
     "the curvature is at its limit",
     LATE,
 )
-"""What a user should know of an estimate, whatever it makes of it."""
-LARGEST_UNEXPLAINED = 0.35
-"""Share of the last ten tips or so that were outliers."""
+"""Warnings of an estimate, in the order of their bits."""
+MAX_OUTLIER_PROBABILITY = 0.35
+"""Share of outliers among about the last ten tips."""
 LARGEST_NOISE = 3.0
-"""Noise as a multiple of what is claimed."""
+"""Noise, relative to the claimed one."""
 LARGEST_SLIP = 0.15
 """Distance of the insertion scale from 1."""
 HIDDEN_SHARE = 0.5
-"""Share of a claimed variance that the tips do not show, which may be an error they all have."""
+"""Assumed systematic part of a claimed variance that the tips do not show."""
 _AT_LIMIT = 0.03
 _AMBIGUOUS_COSINE = math.cos(math.radians(60.0))
 _NO_MEAN_ROLL = 0.1
@@ -44,27 +43,23 @@ _NO_MEAN_ROLL = 0.1
 
 @compiled
 def estimate_needle(
-    needle: Any,
-    hypotheses: Records,
-    estimate: Any,
-    torsions: Records,
-    known: Any,
+    needle: Any, hypotheses: Records, estimate: Any, torsions: Records, assumed: Any
 ) -> None:
-    """Write what is known of a needle now.
+    """Compute the estimate of a needle.
 
     Parameters
     ----------
     needle, hypotheses : NEEDLE, ndarray of HYPOTHESIS
         See `bank.start_needle`.
-    estimate : ESTIMATE, written
-        The tip is the weighted mean; the heading is the mean heading, the roll the mean direction
-        of the tip's x axis about it, the likeliest one's where those cancel.
-    torsions : ndarray of TORSION, shape (K,), written
-        The mean over each torsion.
-    known : ASSUMPTIONS
+    estimate : ESTIMATE, changed
+        Position and heading are weighted means; the roll is the mean direction of the tip's x axis
+        about the heading, or that of the likeliest hypothesis if the directions cancel.
+    torsions : ndarray of TORSION, shape (K,), changed
+        Mean over the hypotheses of each torsion.
+    assumed : ASSUMPTIONS
         As of `bank.advance_needle`.
     """
-    every = looked_ahead(needle, hypotheses, known)
+    every = predicted_hypotheses(needle, hypotheses, assumed)
     whole, best = 0.0, 0
     for n in range(needle.count):
         whole += every[n].weight
@@ -88,9 +83,9 @@ def estimate_needle(
         scale += w * h.scale
         # A turn w changes sin(pitch), the heading's x, by w_y heading_z - w_z heading_y.
         x, y_y, z_z = h.position[0], p[E_TURN + 1, E_TURN + 1], p[E_TURN + 2, E_TURN + 2]
-        x_x = p[0, 0] + known.model_error + _hidden_share(h, known) * needle.claimed[0]
+        x_x = p[0, 0] + assumed.model_error + _hidden_share(h, assumed) * needle.claimed[0]
         xx += w * (x_x + x * x)
-        miss += w * beyond(x, x_x)
+        miss += w * exceedance_probability(x, x_x)
         of_both = p[0, E_TURN + 1] * r[2, 2] - p[0, E_TURN + 2] * r[1, 2]
         x_pitch += w * (of_both + x * r[0, 2])
         variance = y_y * r[2, 2] ** 2 + z_z * r[1, 2] ** 2
@@ -111,41 +106,41 @@ def estimate_needle(
     estimate.uncertainty[1] = x_pitch - position[0] * heading[0]
     estimate.uncertainty[2] = pitch_pitch - heading[0] * heading[0]
     estimate.curvature, estimate.scale, estimate.ambiguous = curvature, scale, ambiguous
-    estimate.noise = _noise_size(every[best], known.noises)
+    estimate.noise = _noise_size(every[best], assumed.noises)
     estimate.base = needle.base
     for k in range(needle.pending):
         estimate.base += needle.pending_turn[k]
     estimate.wound = estimate.base + needle.start_turn
     estimate.miss = miss
-    estimate.warnings = _warnings(needle, estimate, known)
+    estimate.warnings = _warnings(needle, estimate, assumed)
     _average_torsions(every, whole, torsions)
-    _write_covariance(needle, every, whole, estimate, known)
+    _write_covariance(needle, every, whole, estimate, assumed)
 
 
 @compiled
-def _hidden_share(h: Any, known: Any) -> float:
-    """Return what share of the claimed variance may be an error that all tips have in common.
+def _hidden_share(h: Any, assumed: Any) -> float:
+    """Return the share of the claimed variance that may be an error common to all tips.
 
-    No number of tips averages it out, nor what the model leaves out of a tip.
+    Like the error of the model, it does not average out.
     """
     unseen = 0.0
     if h.shape == NORMAL:
         for m in range(NOISES):
-            share = 1.0 - known.noises[NORMAL, 0, m] ** 2
+            share = 1.0 - assumed.noises[NORMAL, 0, m] ** 2
             unseen += h.noise_weights[0, m] * max(share, 0.0)
     return HIDDEN_SHARE * unseen
 
 
 @compiled
-def beyond(x: float, variance: float) -> float:
-    """Return the probability that a normal number is farther from 0 than `NEAR`."""
+def exceedance_probability(x: float, variance: float) -> float:
+    """Return the probability that a normal variable is farther from 0 than `NEAR`."""
     per_sqrt_2 = 1.0 / math.sqrt(2.0 * max(variance, SMALLEST_VARIANCE))
     return 0.5 * (math.erfc((NEAR - x) * per_sqrt_2) + math.erfc((NEAR + x) * per_sqrt_2))
 
 
 @compiled
 def _write_angles(axis: Array, side: Array, coordinates: Array) -> None:
-    """Write yaw, pitch and roll of a mean heading and a mean x axis of the tip."""
+    """Compute yaw, pitch and roll from a mean heading and a mean x axis of the tip."""
     norm = math.sqrt(axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2])
     x, y, z = axis[0] / norm, axis[1] / norm, axis[2] / norm
     along = side[0] * x + side[1] * y + side[2] * z
@@ -158,9 +153,9 @@ def _write_angles(axis: Array, side: Array, coordinates: Array) -> None:
 
 @compiled
 def _noise_size(h: Any, noises: Array) -> float:
-    """Return the size of the noisiest coordinate, as a multiple of what is claimed."""
+    """Return the noise of the noisiest coordinate, relative to the claimed one."""
     largest = 0.0
-    for i in range(3 if h.shape == LASTING else 1):
+    for i in range(3 if h.shape == CORRELATED else 1):
         size = 0.0
         for m in range(NOISES):
             size += h.noise_weights[i, m] * noises[h.shape, 0, m]
@@ -169,12 +164,12 @@ def _noise_size(h: Any, noises: Array) -> float:
 
 
 @compiled
-def _warnings(needle: Any, estimate: Any, known: Any) -> int:
-    """Return which of `WARNINGS` hold, as bits."""
-    low, high = known.smallest_curvature, known.largest_curvature
-    margin = _AT_LIMIT * known.curvature
+def _warnings(needle: Any, estimate: Any, assumed: Any) -> int:
+    """Return the active `WARNINGS` as bits."""
+    low, high = assumed.smallest_curvature, assumed.largest_curvature
+    margin = _AT_LIMIT * assumed.curvature
     return int(
-        (needle.unexplained > LARGEST_UNEXPLAINED)
+        (needle.mean_outlier_probability > MAX_OUTLIER_PROBABILITY)
         + 2 * (estimate.noise > LARGEST_NOISE)
         + 4 * (abs(estimate.scale - 1.0) > LARGEST_SLIP)
         + 8 * (estimate.curvature < low + margin or estimate.curvature > high - margin)
@@ -184,7 +179,7 @@ def _warnings(needle: Any, estimate: Any, known: Any) -> int:
 
 @compiled
 def _average_torsions(every: Records, whole: float, torsions: Records) -> None:
-    """Write the mean over the hypotheses of each torsion."""
+    """Compute the mean over the hypotheses of each torsion."""
     for k in range(torsions.size):
         t = torsions[k]
         across = along = 0.0
@@ -220,8 +215,10 @@ def _average_torsions(every: Records, whole: float, torsions: Records) -> None:
 
 
 @compiled
-def _write_covariance(needle: Any, every: Records, whole: float, estimate: Any, known: Any) -> None:
-    """Write the covariance of the mixture about its mean, of position and rotation vector."""
+def _write_covariance(
+    needle: Any, every: Records, whole: float, estimate: Any, assumed: Any
+) -> None:
+    """Compute the covariance of the mixture for position and rotation vector."""
     q, error = estimate.coordinates, np.empty(6)
     ca, sa, cb, sb = math.cos(q[3]), math.sin(q[3]), math.cos(q[4]), math.sin(q[4])
     cg, sg = math.cos(q[5]), math.sin(q[5])
@@ -233,8 +230,7 @@ def _write_covariance(needle: Any, every: Records, whole: float, estimate: Any, 
     estimate.covariance[:] = 0.0
     for n in range(every.size):
         h = every[n]
-        # D = R_n R^T takes the mean to this one; as a vector it is (D - D^T) / 2 times angle /
-        # sin(angle).
+        # The rotation vector of D = R_n R^T is (D - D^T) / 2 times angle / sin(angle).
         trace = 0.0
         for i in range(3):
             left, right, turn = (i + 1) % 3, (i + 2) % 3, 0.0
@@ -250,26 +246,28 @@ def _write_covariance(needle: Any, every: Records, whole: float, estimate: Any, 
             for j in range(6):
                 spread = h.covariance[i, j] + error[i] * error[j]
                 estimate.covariance[i, j] += h.weight / whole * spread
-        hidden = _hidden_share(h, known)
+        hidden = _hidden_share(h, assumed)
         for i in range(3):
-            common = known.model_error + hidden * needle.claimed[i]
+            common = assumed.model_error + hidden * needle.claimed[i]
             estimate.covariance[i, i] += h.weight / whole * common
 
 
-def estimate_from(said: np.void, torsions: Records, warnings: tuple[str, ...] = ()) -> Estimate:
-    """Return what was written, an ESTIMATE and TORSION, shape (K,), as an estimate."""
-    warnings += tuple(why for k, why in enumerate(WARNINGS) if said["warnings"] >> k & 1)
+def estimate_from_record(
+    record: np.void, torsions: Records, warnings: tuple[str, ...] = ()
+) -> Estimate:
+    """Return the `Estimate` of a record, an ESTIMATE with its TORSION, shape (K,)."""
+    warnings += tuple(why for k, why in enumerate(WARNINGS) if record["warnings"] >> k & 1)
     # A change of the angles turns the tip by axes @ change.
     to_angles = np.eye(6)
-    to_angles[3:, 3:] = np.linalg.inv(angle_axes(said["coordinates"][3:]))
+    to_angles[3:, 3:] = np.linalg.inv(angle_axes(record["coordinates"][3:]))
     return Estimate(
-        coordinates=said["coordinates"],
-        linearized=said["linearized"],
-        curvature=float(said["curvature"]),
-        covariance=to_angles @ said["covariance"] @ to_angles.T,
+        coordinates=record["coordinates"],
+        linearized=record["linearized"],
+        curvature=float(record["curvature"]),
+        covariance=to_angles @ record["covariance"] @ to_angles.T,
         warnings=warnings,
-        miss=float(said["miss"]),
+        miss=float(record["miss"]),
         hypotheses=Hypotheses(
-            torsions, float(said["base"]), float(said["wound"]), said["uncertainty"]
+            torsions, float(record["base"]), float(record["wound"]), record["uncertainty"]
         ),
     )

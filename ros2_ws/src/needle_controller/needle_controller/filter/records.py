@@ -1,4 +1,4 @@
-"""Records of the hypothesis filter: a hypothesis, a needle, what happened to it, its estimate.
+"""Records of the hypothesis filter: hypothesis, needle, event, estimate, torsion, assumptions.
 
 Compiled code reads and writes the fields by name. Everything is SI, in the frame `target_plane`.
 """
@@ -10,20 +10,20 @@ import numpy as np
 
 ERROR = 9
 """Length of a hypothesis's error: position [m], rotation vector [rad] (the true orientation is
-exp(error) R, its axes those of `target_plane`), curvature [1/m], size of the torsion [rad] or [m],
+exp(error) R, its axes those of `target_plane`), curvature [1/m], torsion parameter [rad] or [m],
 insertion scale [-]."""
-E_POSITION, E_TURN, E_KAPPA, E_SIZE, E_SCALE = 0, 3, 6, 7, 8
-"""Where each begins in the error."""
+E_POSITION, E_TURN, E_KAPPA, E_TORSION, E_SCALE = 0, 3, 6, 7, 8
+"""Index of each part in the error."""
 NOISES = 6
-"""Most noise models of one shape."""
+"""Largest number of noise models of one shape."""
 LONGEST_QUEUE = 64
 NEAR = 1e-3
-"""Distance from plane or point at which the needle counts as there, [KC09] IV-A [m]."""
+"""Distance from plane or point at which the target counts as reached, [KC09] IV-A [m]."""
 
 HYPOTHESIS = np.dtype(
     [
         ("position", np.float64, 3),  # of the tip [m]
-        ("rotation", np.float64, (3, 3)),  # of the tip: the heading is the last column
+        ("rotation", np.float64, (3, 3)),  # of the tip; the heading is the last column
         ("curvature", np.float64),  # of the path [1/m]
         ("scale", np.float64),  # insertion of the needle per insertion of the stage
         ("play", np.float64),  # half width of the dead band between base and tip [rad]
@@ -31,16 +31,16 @@ HYPOTHESIS = np.dtype(
         ("gain", np.float64),  # share of the base's rotation that reaches the shaft in the tissue
         ("tip_angle", np.float64),  # rotation of the tip since the start [rad]
         ("behind_play", np.float64),  # and of the shaft behind the play [rad]
-        ("dtip_dsize", np.float64),  # derivative of tip_angle by the torsion's size
-        ("sized", np.int64),  # which of play, lag and gain that is, see `hypotheses`
+        ("dtip_dtorsion", np.float64),  # derivative of tip_angle by the torsion parameter
+        ("torsion_kind", np.int64),  # estimated parameter: PLAY, LAG or GAIN of `filter_settings`
         ("covariance", np.float64, (ERROR, ERROR)),
-        ("noise_weights", np.float64, (3, NOISES)),  # probability of each noise model; of noise
-        # that lasts for each coordinate, else in the first row
-        ("residual", np.float64, 3),  # last tip minus what was then estimated of it [m]
+        ("noise_weights", np.float64, (3, NOISES)),  # probability of each noise model: per
+        # coordinate if CORRELATED, otherwise in the first row
+        ("residual", np.float64, 3),  # last tip minus its estimate after the update [m]
         ("heading_drift", np.float64),  # variance of pitch and yaw per length [rad^2/m]
         ("roll_drift", np.float64),  # and of the roll [rad^2/m]
         ("torsion", np.int64),  # number of the torsion hypothesis
-        ("shape", np.int64),  # shape of the noise, see `hypotheses`
+        ("shape", np.int64),  # shape of the noise, see `filter_settings`
         ("weight", np.float64),  # relative probability; the heaviest has 1
         ("evidence", np.float64),  # likelihood of the last tip
         ("outlier", np.float64),  # probability that the last tip was an outlier
@@ -51,22 +51,22 @@ NEEDLE = np.dtype(
         ("count", np.int64),  # of its hypotheses
         ("base", np.float64),  # rotation of the base since the start [rad]
         ("start_turn", np.float64),  # and at the start [rad]
-        ("refused", np.float64),  # probability that the last tip was an outlier
-        ("unexplained", np.float64),  # the same, in the running mean of the last tips
-        ("tips", np.int64),  # taken so far
+        ("outlier_probability", np.float64),  # probability that the last tip was an outlier
+        ("mean_outlier_probability", np.float64),  # its running mean over the last tips
+        ("tips", np.int64),  # number of tips used
         ("claimed", np.float64, 3),  # variance of each coordinate of the last one [m^2]
-        ("too_late", np.bool_),  # whether the last tip was older than the one before
-        ("pending", np.int64),  # advances that wait for a tip, in
+        ("tip_too_late", np.bool_),  # whether the last tip was older than the one before
+        ("pending", np.int64),  # number of queued advances
         ("pending_length", np.float64, LONGEST_QUEUE),  # [m]
         ("pending_turn", np.float64, LONGEST_QUEUE),  # [rad]
         ("initial_rotation", np.float64, (3, 3)),  # at the entry, with the base at 0
-        ("has_entry", np.bool_),  # whether the entry point is known, which is
-        ("entry", np.float64, 3),  # [m]
+        ("has_entry", np.bool_),  # whether the entry point is known
+        ("entry", np.float64, 3),  # entry point [m]
         ("start", np.float64, 3),  # the first tip [m]
         ("start_insertion", np.float64),  # [m]
         ("inserted", np.float64),  # since the start [m]
-        ("events", np.int64),  # kept of the first centimetres; -1: no longer
-        ("late", np.float64),  # insertion by which tips are older than they say [m]
+        ("events", np.int64),  # number of recorded events; -1 after the first centimetres
+        ("late", np.float64),  # hidden age of the tips [m]
     ]
 )
 EVENT = np.dtype(
@@ -74,7 +74,7 @@ EVENT = np.dtype(
         ("length", np.float64),  # inserted before the tip [m]
         ("turn", np.float64),  # of the base [rad]
         ("is_tip", np.bool_),
-        ("tip", np.float64, 3),  # [m]; NaN where it was not found
+        ("tip", np.float64, 3),  # [m]; NaN if it was not found
         ("has_covariance", np.bool_),
         ("covariance", np.float64, (3, 3)),  # [m^2]
         ("age", np.float64),  # [m]
@@ -86,13 +86,13 @@ ESTIMATE = np.dtype(
         ("linearized", np.float64, 3),  # mean of the linearized states (6)
         ("uncertainty", np.float64, 3),  # var(x), cov(x, sin(pitch)), var(sin(pitch))
         ("covariance", np.float64, (6, 6)),  # of tip and rotation vector
-        ("miss", np.float64),  # probability that the tip is farther from the plane than `NEAR`
+        ("miss", np.float64),  # probability that the tip is farther than `NEAR` from the plane
         ("curvature", np.float64),  # [1/m]
         ("scale", np.float64),  # insertion scale
-        ("noise", np.float64),  # as a multiple of what is claimed
+        ("noise", np.float64),  # relative to the claimed one
         ("ambiguous", np.float64),  # weight of rolls more than 60 deg from the likeliest
         ("base", np.float64),  # rotation of the base since the start [rad]
-        ("wound", np.float64),  # rotation of the base as the joint says it [rad]
+        ("wound", np.float64),  # position of the rotation joint [rad]
         ("warnings", np.int64),  # bit k: number k of `WARNINGS`
     ]
 )
@@ -106,10 +106,10 @@ TORSION = np.dtype(
         ("play", np.float64),
         ("lag", np.float64),
         ("gain", np.float64),
-        ("weight", np.float64),  # 0 where nothing is left of it
+        ("weight", np.float64),  # 0 without hypotheses
     ]
 )
-"""Mean over all hypotheses of the same torsion: what the laws read."""
+"""Mean over all hypotheses of the same torsion, for the laws."""
 ASSUMPTIONS = np.dtype(
     [
         ("noises", np.float64, (3, 3, NOISES)),  # multiples, shares, correlations of each shape
@@ -119,12 +119,12 @@ ASSUMPTIONS = np.dtype(
         ("curvature_drift", np.float64),
         ("scale_spread", np.float64),
         ("scale_drift", np.float64),
-        ("size_drift", np.float64, 3),  # of play, lag and gain
+        ("torsion_drift", np.float64, 3),  # of play, lag and gain
         ("largest_play", np.float64),
         ("smallest_lag", np.float64),
         ("largest_lag", np.float64),
         ("longest_step", np.float64),
-        ("believed_bound", np.float64),
+        ("effective_bound", np.float64),
         ("entry_std", np.float64),
         ("model_error", np.float64),
         ("outlier_share", np.float64),
@@ -135,5 +135,5 @@ ASSUMPTIONS = np.dtype(
         ("merge_angle", np.float64),
     ]
 )
-"""What compiled code needs of `FilterSettings`, where it is explained; standard deviations and
-drifts of which only squares are used as squares."""
+"""`FilterSettings` for compiled code; standard deviations and drifts are squared if only their
+squares are used."""

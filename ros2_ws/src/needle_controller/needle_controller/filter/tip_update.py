@@ -1,23 +1,23 @@
-"""One measured tip into a hypothesis, whatever its noise may be; compiled.
+"""Update of a hypothesis by one measured tip with unknown noise; compiled.
 
-Several noise models are thought possible, each uniform within a bound or normal, and besides them
-that the tip is an outlier, which says nothing. Uniform noise says that the tip lies in a box around
-the measured one: the posterior of a Gaussian prior is that Gaussian cut off outside the box.
-Coordinate after coordinate the mixture of what the models say is replaced by the Gaussian of the
-same mean and variance (assumed-density filtering; truncated normals have these in closed form). In
-the end the estimate is the mixture of that and of what it was before, by how likely the tip was an
-outlier. A correlated tip is taken along directions in which its errors are independent.
+Several noise models are possible, each uniform within a bound or normal; the tip may also be an
+outlier, which carries no information. With uniform noise the tip lies in a box around the
+measurement, so the posterior of a Gaussian prior is that Gaussian truncated to the box. One
+coordinate after the other, the mixture over the models is replaced by the Gaussian of the same mean
+and variance (assumed-density filtering; truncated normals have these in closed form). The final
+estimate is the mixture of the updated and the old one, weighted by the probability of an outlier.
+A tip with a correlated covariance is split along directions in which its errors are independent.
 
-Where a share c of an error is left in the next one, e' = c e + sqrt(1 - c^2) w, w of variance R,
-what a tip is off the estimate, less c times what the one before was (after its update), is
+If errors are correlated from tip to tip, e' = c e + sqrt(1 - c^2) w with w of variance R, the
+innovation less c times the residual of the tip before is
 
     d' - c d + sqrt(1 - c^2) w
 
-with d and d' what the estimate is off the needle at both. Of the variance of d' as much as R was
-there before, for no estimate is less certain than its tip; the rest is new.
+where d and d' are the errors of the estimate at both tips. A part of the variance of d', at most R,
+was there at the tip before, because no estimate is less certain than its tip; the rest is new.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -27,21 +27,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.filter.hypotheses import GAIN, LAG, LASTING, UNIFORM
+from needle_controller.filter.filter_settings import CORRELATED, GAIN, LAG, UNIFORM
 from needle_controller.filter.motion import rotate
-from needle_controller.filter.records import (
-    E_KAPPA,
-    E_SCALE,
-    E_SIZE,
-    E_TURN,
-    ERROR,
-    NOISES,
-)
+from needle_controller.filter.records import E_KAPPA, E_SCALE, E_TORSION, E_TURN, ERROR, NOISES
 from needle_controller.model.arrays import Array
 from needle_core.compiled import compiled
 
 SMALLEST_VARIANCE = 1e-18
-"""Of a measured coordinate [m^2]: an exact one would leave nothing to divide by."""
+"""Smallest variance of a measured coordinate [m^2], which avoids a division by 0."""
 _SMALLEST_SHARE = 0.02
 _SMALLEST_GAIN, _LARGEST_GAIN = 0.3, 1.5
 _NO_MASS = 1e-30
@@ -52,29 +45,29 @@ _DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 class Reading(NamedTuple):
-    """A tip along directions in which its errors are independent."""
+    """A tip, and its components along directions in which its errors are independent."""
 
     tip: Array  # shape (3,) [m]
     covariance: Array  # (3, 3) [m^2]
     directions: Array  # rows, (3, 3): those of L^-1, covariance = L D L^T
-    values: Array  # the tip along them, (3,) [m]
-    bounds: Array  # what is claimed, (3,): sqrt(3) standard deviations [m]
+    values: Array  # components of the tip, (3,) [m]
+    bounds: Array  # claimed bounds, (3,): sqrt(3) standard deviations [m]
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Working memory of an update."""
 
-    covaried: Array  # of each coordinate with the error, after those before it, (3, 9)
-    narrowing: Array  # how much each coordinate narrows the covariance along that, (3,)
-    change: Array  # of the error's mean, (9,)
+    cross_covariance: Array  # with the error, of each coordinate in turn, (3, 9)
+    reduction: Array  # of the covariance by each coordinate, (3,)
+    change: Array  # of the mean of the error, (9,)
     shares: Array  # probability of each noise model by each coordinate, (3, NOISES)
-    possible: npt.NDArray[np.int64]  # numbers of the noise models that are, (NOISES,)
+    possible: npt.NDArray[np.int64]  # numbers of the noise models with a probability > 0
 
 
 @compiled
-def new_work() -> Work:
-    """Return working memory."""
-    return Work(
+def new_workspace() -> Workspace:
+    """Return uninitialised working memory."""
+    return Workspace(
         np.empty((3, ERROR)),
         np.empty(3),
         np.empty(ERROR),
@@ -85,13 +78,13 @@ def new_work() -> Work:
 
 @compiled
 def new_reading() -> Reading:
-    """Return room for a tip."""
+    """Return an uninitialised reading."""
     return Reading(np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3))
 
 
 @compiled
-def read_tip(reading: Reading) -> bool:
-    """Write all that follows from tip and covariance; return whether both are finite."""
+def prepare_reading(reading: Reading) -> bool:
+    """Compute directions, values and bounds; return whether tip and covariance are finite."""
     tip, covariance = reading.tip, reading.covariance
     for i in range(3):
         if not math.isfinite(tip[i]):
@@ -118,58 +111,57 @@ def read_tip(reading: Reading) -> bool:
 
 
 @compiled
-def update_hypothesis(h: Any, reading: Reading, known: Any, work: Work) -> None:
-    """Take a tip.
+def update_hypothesis(h: Any, reading: Reading, assumed: Any, work: Workspace) -> None:
+    """Update a hypothesis by a tip.
 
     Parameters
     ----------
     h : HYPOTHESIS, changed
         The hypothesis. `evidence` becomes the tip's likelihood, relative to noise within the
-        claimed bounds, `outlier` the share of it that outliers have.
+        claimed bounds, and `outlier` the probability of an outlier.
     reading : Reading
-        The tip, after `read_tip`.
-    known : ASSUMPTIONS
-        What the estimates are kept to, which noise is thought possible, and how many tips are
-        outliers.
-    work : Work
+        The tip, after `prepare_reading`.
+    assumed : ASSUMPTIONS
+        Limits of the estimates, noise models, and share of outliers.
+    work : Workspace
         Working memory.
     """
     work.change[:] = 0.0
     for i in range(3):
         for m in range(NOISES):
             work.shares[i, m] = h.noise_weights[i, m]
-    likelihood, spread = 1.0, known.outlier_density
+    likelihood, spread = 1.0, assumed.outlier_density
     for i in range(3):
         innovation, variance = _innovation(h, reading, i, work)
         bound = reading.bounds[i]
-        # Outliers are spread over a multiple of where the tip is expected.
+        # Outliers are spread over a multiple of the region where the tip is expected.
         spread *= bound / math.sqrt(bound * bound + 3.0 * variance)
-        mass, mean, share = _weigh_noises(h, reading, i, innovation, variance, known, work)
+        mass, mean, share = _weigh_noises(h, reading, i, innovation, variance, assumed, work)
         likelihood *= mass
         # e <- e + c mean / sigma, P <- P - c c^T (1 - share) / sigma^2
-        work.narrowing[i] = (1.0 - share) / variance
+        work.reduction[i] = (1.0 - share) / variance
         moved = mean / math.sqrt(variance)
         for k in range(ERROR):
-            work.change[k] += work.covaried[i, k] * moved
-    outlier = known.outlier_share * spread
-    evidence = outlier + (1.0 - known.outlier_share) * likelihood
+            work.change[k] += work.cross_covariance[i, k] * moved
+    outlier = assumed.outlier_share * spread
+    evidence = outlier + (1.0 - assumed.outlier_share) * likelihood
     h.evidence, h.outlier = evidence, outlier / evidence
-    _learn_noise(h, known, work)
-    _narrow(h.covariance, h.outlier, work)
-    _apply(h, reading, known, work)
+    _update_noise_weights(h, assumed, work)
+    _reduce_covariance(h.covariance, h.outlier, work)
+    _apply_change(h, reading, assumed, work)
 
 
 @compiled
-def _innovation(h: Any, reading: Reading, i: int, work: Work) -> tuple[float, float]:
-    """Return innovation and variance of one coordinate; write its covariances with the error."""
-    p, c, y = h.covariance, work.covaried, reading.values[i]
+def _innovation(h: Any, reading: Reading, i: int, work: Workspace) -> tuple[float, float]:
+    """Return innovation and variance of one coordinate; compute its covariances with the error."""
+    p, c, y = h.covariance, work.cross_covariance, reading.values[i]
     ux, uy, uz = reading.directions[i, 0], reading.directions[i, 1], reading.directions[i, 2]
     # c = P u, u the direction of the reading in the position ...
     for k in range(ERROR):
         c[i, k] = ux * p[0, k] + uy * p[1, k] + uz * p[2, k]
-    # ... less what the coordinates before have narrowed: (P - sum_b n_b c_b c_b^T) u.
+    # ... less the reduction by the coordinates before: (P - sum_b n_b c_b c_b^T) u.
     for b in range(i):
-        by = work.narrowing[b] * (ux * c[b, 0] + uy * c[b, 1] + uz * c[b, 2])
+        by = work.reduction[b] * (ux * c[b, 0] + uy * c[b, 1] + uz * c[b, 2])
         for k in range(ERROR):
             c[i, k] -= by * c[b, k]
     # nu = y - u (p + dp), variance u^T P u
@@ -185,28 +177,28 @@ def _weigh_noises(
     i: int,
     innovation: float,
     variance: float,
-    known: Any,
-    work: Work,
+    assumed: Any,
+    work: Workspace,
 ) -> tuple[float, float, float]:
-    """Mix what the noise models say of one coordinate.
+    """Mix the updates of all noise models for one coordinate.
 
     Returns
     -------
     mass, mean, share : float
-        The coordinate's likelihood, relative to that within the claimed bound; by how many standard
-        deviations it moves the estimate; and what is left of the variance, as a share of it.
+        Likelihood of the coordinate, relative to that within the claimed bound; change of the
+        estimate in standard deviations; remaining share of the variance.
     """
     bound, deviation, shape = reading.bounds[i], math.sqrt(variance), h.shape
-    shares, noises = work.shares, known.noises
-    # Noise that is the same in all coordinates is what the coordinates before have shown of it.
-    row = i if shape == LASTING else 0
+    shares, noises = work.shares, assumed.noises
+    # Equal noise in all coordinates: continue with the probabilities of the coordinate before.
+    row = i if shape == CORRELATED else 0
     per_deviation, per_variance = 1.0 / deviation, 1.0 / variance
-    claimed = max(bound * bound / 3.0, known.model_error)
-    last = taken = 0.0
+    claimed = max(bound * bound / 3.0, assumed.model_error)
+    last = moved_by = 0.0
     for k in range(3):
         last += reading.directions[i, k] * h.residual[k]
-        taken += reading.directions[i, k] * work.change[k]
-    # Only models that are thought possible: a compiler reckons a branch for all, and then picks.
+        moved_by += reading.directions[i, k] * work.change[k]
+    # Skip impossible models explicitly: the compiler would evaluate a branch for all of them.
     possible, count = work.possible, 0
     for m in range(NOISES):
         if shares[row, m] > 0.0:
@@ -217,27 +209,27 @@ def _weigh_noises(
         m = possible[n]
         size = noises[shape, 0, m] * bound
         if shape == UNIFORM:
-            # Prior N(0, sigma^2) of the coordinate, cut off outside nu +- size.
+            # Prior N(0, sigma^2) of the coordinate, truncated to nu +- size.
             likely, middle, rest = truncated_moments(
                 (innovation - size) * per_deviation, (innovation + size) * per_deviation
             )
             likely *= bound / size
         else:
-            c, measured = noises[shape, 2, m], max(size * size / 3.0, known.model_error)
+            c, measured = noises[shape, 2, m], max(size * size / 3.0, assumed.model_error)
             old = min(variance, measured)
-            # Variance of d' - c d: what the model leaves out does not last.
-            new = variance - c * (2.0 - c) * old + 2.0 * c * c * known.model_error
+            # Variance of d' - c d; the error of the model is not correlated.
+            new = variance - c * (2.0 - c) * old + 2.0 * c * c * assumed.model_error
             total = new + (1.0 - c * c) * measured
-            off = innovation - c * (last - taken * old * per_variance)
+            difference = innovation - c * (last - moved_by * old * per_variance)
             per_total = 1.0 / total
             likely = 2.0 * bound * _DENSITY * math.sqrt(per_total)
-            likely *= math.exp(-0.5 * off * off * per_total)
-            # Noise that is smaller than claimed is thought possible, but not relied upon.
+            likely *= math.exp(-0.5 * difference * difference * per_total)
+            # Noise smaller than claimed is possible, but the gain does not rely on it.
             if measured < claimed:
                 total = new + (1.0 - c * c) * claimed
                 per_total = 1.0 / total
             gain = (variance - c * old) * per_deviation * per_total
-            middle, rest = gain * off, 1.0 - gain * gain * total
+            middle, rest = gain * difference, 1.0 - gain * gain * total
         shares[row, m] *= likely
         mass += shares[row, m]
         mean += shares[row, m] * middle
@@ -252,9 +244,9 @@ def _weigh_noises(
 
 @compiled
 def tail_ratio(z: float) -> float:
-    """Return P(Z > z) / exp(-z^2 / 2) of a standard normal Z for z in [0, 5.7], to 1.4e-8 of it.
+    """Return P(Z > z) / exp(-z^2 / 2) of a standard normal Z for z in [0, 5.7].
 
-    A polynomial in 1 / (1 + 0.3 z), fitted for the least largest relative error: half of the time
+    A minimax polynomial in 1 / (1 + 0.3 z) with a relative error of 1.4e-8; it takes half the time
     of `math.erfc`.
     """
     t = 1.0 / (1.0 + 0.3 * z)
@@ -269,12 +261,12 @@ def tail_ratio(z: float) -> float:
 def truncated_moments(lower: float, upper: float) -> tuple[float, float, float]:
     """Return mass, mean and variance of a standard normal between two bounds.
 
-    Where the mass vanishes, mean and variance mean nothing (they are finite).
+    Without mass, mean and variance are meaningless, but finite.
 
     Parameters
     ----------
     lower, upper : float
-        The bounds; those beyond 5.5 count as none (an error below 1e-6).
+        The bounds; those beyond 5.5 are ignored (an error below 1e-6).
     """
     if lower <= -_FAR and upper >= _FAR:
         return 1.0, 0.0, 1.0
@@ -284,7 +276,7 @@ def truncated_moments(lower: float, upper: float) -> tuple[float, float, float]:
     bell_upper = math.exp(-0.5 * above * above) if above < _FAR else 0.0
     tail_lower, tail_upper = bell_lower * tail_ratio(below), bell_upper * tail_ratio(above)
     bell_lower, bell_upper = _DENSITY * bell_lower, _DENSITY * bell_upper
-    # Differences of small tails, not of numbers near 1.
+    # Differences of small tails are more accurate than of numbers near 1.
     if lower > 0.0:
         mass = tail_lower - tail_upper
     elif upper < 0.0:
@@ -299,15 +291,15 @@ def truncated_moments(lower: float, upper: float) -> tuple[float, float, float]:
 
 
 @compiled
-def _learn_noise(h: Any, known: Any, work: Work) -> None:
-    """Take what the tip shows of the noise, by how likely it was none."""
+def _update_noise_weights(h: Any, assumed: Any, work: Workspace) -> None:
+    """Update the noise weights, unless the tip is an outlier."""
     weights = h.noise_weights
-    for i in range(3 if h.shape == LASTING else 1):
+    for i in range(3 if h.shape == CORRELATED else 1):
         kept = 0.0
         for m in range(NOISES):
             likely = (1.0 - h.outlier) * work.shares[i, m] + h.outlier * weights[i, m]
             # After an outlier, widen the weights of the noise models.
-            likely += _REOPENED * h.outlier * (known.noises[h.shape, 1, m] - likely)
+            likely += _REOPENED * h.outlier * (assumed.noises[h.shape, 1, m] - likely)
             weights[i, m] = likely if likely > _GIVEN_UP else 0.0
             kept += weights[i, m]
         for m in range(NOISES):
@@ -315,13 +307,13 @@ def _learn_noise(h: Any, known: Any, work: Work) -> None:
 
 
 @compiled
-def _narrow(p: Array, outlier: float, work: Work) -> None:
-    """Narrow the covariance; mix with what was before, by how likely the tip was an outlier.
+def _reduce_covariance(p: Array, outlier: float, work: Workspace) -> None:
+    """Reduce the covariance; mix it with the old one by the probability of an outlier.
 
     P <- P - (1 - o) sum_i n_i c_i c_i^T + o (1 - o) e e^T
     """
     inside = 1.0 - outlier
-    n, c, change = work.narrowing, work.covaried, work.change
+    n, c, change = work.reduction, work.cross_covariance, work.change
     for a in range(ERROR):
         n0, n1, n2 = inside * n[0] * c[0, a], inside * n[1] * c[1, a], inside * n[2] * c[2, a]
         apart = inside * outlier * change[a]
@@ -330,8 +322,8 @@ def _narrow(p: Array, outlier: float, work: Work) -> None:
 
 
 @compiled
-def _apply(h: Any, reading: Reading, known: Any, work: Work) -> None:
-    """Change the estimate; a torsion's size has turned the tip all along."""
+def _apply_change(h: Any, reading: Reading, assumed: Any, work: Workspace) -> None:
+    """Apply the change of the error; a torsion parameter has affected the tip's angle so far."""
     inside, change = 1.0 - h.outlier, work.change
     for k in range(ERROR):
         change[k] *= inside
@@ -339,18 +331,18 @@ def _apply(h: Any, reading: Reading, known: Any, work: Work) -> None:
         h.position[k] += change[k]
         h.residual[k] += inside * (reading.tip[k] - h.position[k] - h.residual[k])
     kappa = h.curvature + change[E_KAPPA]
-    h.curvature = min(max(kappa, known.smallest_curvature), known.largest_curvature)
+    h.curvature = min(max(kappa, assumed.smallest_curvature), assumed.largest_curvature)
     h.scale += change[E_SCALE]
-    if h.sized == GAIN:
-        gain = min(max(h.gain + change[E_SIZE], _SMALLEST_GAIN), _LARGEST_GAIN)
-        h.tip_angle += h.dtip_dsize * (gain - h.gain)
+    if h.torsion_kind == GAIN:
+        gain = min(max(h.gain + change[E_TORSION], _SMALLEST_GAIN), _LARGEST_GAIN)
+        h.tip_angle += h.dtip_dtorsion * (gain - h.gain)
         h.gain, h.behind_play = gain, h.tip_angle
-    elif change[E_SIZE] != 0.0 and h.sized == LAG:
-        lag = min(max(h.lag + change[E_SIZE], known.smallest_lag), known.largest_lag)
-        h.tip_angle += h.dtip_dsize * (lag - h.lag)
+    elif change[E_TORSION] != 0.0 and h.torsion_kind == LAG:
+        lag = min(max(h.lag + change[E_TORSION], assumed.smallest_lag), assumed.largest_lag)
+        h.tip_angle += h.dtip_dtorsion * (lag - h.lag)
         h.lag = lag
-    elif change[E_SIZE] != 0.0:
-        play = min(max(h.play + change[E_SIZE], 0.0), known.largest_play)
-        h.tip_angle += h.dtip_dsize * (play - h.play)
+    elif change[E_TORSION] != 0.0:
+        play = min(max(h.play + change[E_TORSION], 0.0), assumed.largest_play)
+        h.tip_angle += h.dtip_dtorsion * (play - h.play)
         h.play, h.behind_play = play, h.tip_angle
     rotate(h.rotation, change[E_TURN], change[E_TURN + 1], change[E_TURN + 2])

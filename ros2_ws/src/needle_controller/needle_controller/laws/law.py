@@ -1,6 +1,5 @@
-"""From an estimate to the rotation of the next step ([KC09] (7), (10))."""
+"""Control laws: from an estimate to the rotation of the next step ([KC09] (7), (10))."""
 
-# Compiled code takes keywords slowly or not at all.
 from __future__ import annotations
 
 import dataclasses
@@ -14,23 +13,22 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.model.kinematics import ROLL
 from needle_controller.observers.estimator import Estimate
-from needle_controller.observers.luenberger import keep_inside
+from needle_controller.observers.luenberger import saturation_factor
 from needle_core.compiled import compiled
 
 
 @dataclasses.dataclass(frozen=True)
 class SteeringCommand:
-    """The law's command for the next step.
+    """Command of a law for the next step.
 
     Attributes
     ----------
     virtual_input : float
-        v [1/m^2], as wanted by (10), before what limits the rotation.
+        v [1/m^2] of (10), before the rotation is limited.
     rotation_rate : float
         u, rotation of the base per inserted length, after all limits [rad/m].
     insertion_left : float, optional
-        Insertion after which the needle is there, < 0 beyond it [m]; None from a law that does not
-        say: then the depth does.
+        Remaining insertion to the target, < 0 beyond it [m]; None if the depth determines the end.
     """
 
     virtual_input: float
@@ -39,7 +37,7 @@ class SteeringCommand:
 
 
 StepLaw = Callable[[Estimate, float], SteeringCommand]
-"""Takes the estimate and the insertion it is of [m]."""
+"""Function of an estimate and its insertion [m]."""
 
 
 class LinearizingGains(NamedTuple):
@@ -52,7 +50,7 @@ class LinearizingGains(NamedTuple):
     step_length : float
         Inserted length over which u is held [m].
     demand_margin : float
-        Distance of the demanded state from the border of (6)'s region, in [0, 1).
+        Distance of the demanded state from the border of the region of (6), in [0, 1).
     max_rotation_per_length : float
         Largest |u| [rad/m].
     """
@@ -67,13 +65,12 @@ class LinearizingGains(NamedTuple):
 def linearizing_rate(
     s: Array, roll: float, curvature: float, law: LinearizingGains
 ) -> tuple[float, float]:
-    """Return v [1/m^2] and u [rad/m]: v = -K s (10); u from (7), integrated over the step; capped.
+    """Return v [1/m^2] and u [rad/m]: v = -K s (10); u from (7), integrated over the step; limited.
 
-    u is held over a step, during which cos(roll) changes: the inverse of (7) at the step's start
-    would, near roll +-90 deg, divide by almost 0 and carry the roll past that border, where s
-    cannot say so. So the wanted v is held over the step in (8) instead, the s it leads to is
-    saturated as the paper saturates the estimate, and u is what takes the roll there. For short
-    steps this is (7).
+    u is held over a step, during which cos(roll) changes. Near roll +-90 deg, the inverse of (7) at
+    the start of the step would divide by almost 0 and move the roll beyond that border, where s is
+    ambiguous. Instead, v is held over the step in (8), the resulting s is saturated as the paper
+    saturates the estimate, and u turns the roll to that of s. For short steps this is (7).
 
     Parameters
     ----------
@@ -88,15 +85,16 @@ def linearizing_rate(
     v = -(s[0] * law.feedback[0] + s[1] * law.feedback[1] + s[2] * law.feedback[2])
     s2 = s[1] + length * (s[2] + 0.5 * length * v)
     sine = (s[2] + length * v) / curvature
-    scale = keep_inside(s2, sine, law.demand_margin)
+    scale = saturation_factor(s2, sine, law.demand_margin)
     s2, sine = scale * s2, scale * sine
-    wanted_roll = math.atan2(sine, math.sqrt(1.0 - s2 * s2 - sine * sine))
-    # The roll's own drift, (5): -kappa cos(roll) tan(pitch), by (6) without their slow functions.
+    desired_roll = math.atan2(sine, math.sqrt(1.0 - s2 * s2 - sine * sine))
+    # The drift of the roll, (5): -kappa cos(roll) tan(pitch), by (6) without trigonometric
+    # functions.
     squared = s[1] * s[1]
     cosines = math.sqrt(max(1.0 - squared - (s[2] / curvature) ** 2, 0.0))
     cosines = math.copysign(cosines, 0.5 * math.pi - abs(roll))
     drift = -curvature * cosines * s[1] / (1.0 - squared)
-    rate = (wanted_roll - roll) / length - drift
+    rate = (desired_roll - roll) / length - drift
     return v, min(max(rate, -limit), limit)
 
 
@@ -115,7 +113,7 @@ class LinearizingLaw:
 
 
 class OpenLoopLaw:
-    """u = 0: the needle bends as it will; v says what that does to s3."""
+    """u = 0: the needle bends freely; v is the resulting change of s3."""
 
     def __call__(self, estimate: Estimate, _insertion: float = 0.0) -> SteeringCommand:
         """Return no rotation."""

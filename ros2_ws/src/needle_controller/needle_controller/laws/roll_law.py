@@ -1,13 +1,13 @@
-"""The law of preset `best`: what roll takes the needle to the plane, and the turn that gives it.
+"""The law of preset `best`: the roll that leads to the plane, and the rotation of the base for it.
 
-In the linearized state s of [KC09] (6), x and sin(pitch) are the mean over all hypotheses. Far from
-the plane the wanted pitch is the steepest from which the needle can still level out with a share of
-its curvature, near it a straight line through 0; the wanted s3 takes the pitch there, and the roll
-is turned the nearest way to one of the two that have this s3. Every torsion then says which turn of
-the base takes the tip there through its play and lag; the turns are averaged by weight.
+In the linearized state s of [KC09] (6), x and sin(pitch) are means over all hypotheses. Far from
+the plane, the desired pitch is the steepest from which the needle can level out with a share of its
+curvature; near it, it is proportional to the distance. The desired s3 turns the pitch to it, and
+the roll turns the shorter way to one of the two that have this s3. Each torsion determines the
+rotation of the base that turns the tip through play and lag; the mean over all torsions is used.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -40,38 +40,38 @@ class RollLawSettings(NamedTuple):
     step_length : float
         Inserted length over which a command is held [m].
     max_rotation_per_length : float
-        Most the base turns per inserted length [rad/m].
+        Largest rotation of the base per inserted length [rad/m].
     max_winding : float
-        The base's angle is kept within +- this: the turn then goes the other way round [rad].
+        Largest absolute angle of the base; beyond it, the turn goes the other way round [rad].
     plane_gain : float
-        Wanted sin(pitch) per distance from the plane, near it [1/m].
+        Desired sin(pitch) per distance near the plane [1/m].
     pitch_gain : float
-        Wanted s3 per error of sin(pitch) [1/m].
+        Desired s3 per error of sin(pitch) [1/m].
     braking_share : float
-        Share of the curvature that the approach counts on for levelling out.
+        Share of the curvature that is planned for levelling out.
     braking_share_added : float
-        What is added to it far from the plane.
+        Increase of this share far from the plane.
     braking_from, braking_over : float
-        Distance at which that begins, and over which it grows to the whole [m].
+        Distance at which the increase begins, and over which it becomes complete [m].
     lag_caution : float
-        Share by which both gains are lowered at a lag of 8 mm.
+        Relative reduction of both gains at a lag of 8 mm.
     braking_caution : float
-        Share by which the braking share is lowered at a lag of 8 mm or a play of 40 deg.
-    doubt : float
-        How much the demand on s3 shrinks with the uncertainty of what it is made of: by 1 /
-        sqrt(1 + (doubt std(s3 demand) / curvature)^2). Without it, a needle whose pitch is hardly
-        known is spun to and fro, which hides its roll.
+        Relative reduction of the braking share at a lag of 8 mm or a play of 40 deg.
+    uncertainty_weight : float
+        Reduction of the desired s3 by its uncertainty, by 1 / sqrt(1 + (weight std(s3) /
+        curvature)^2). Without it, a needle with an uncertain pitch would be turned back and forth,
+        which hides its roll.
     scatter_dead_band : float
-        What is added to the dead band where the hypotheses' rolls point everywhere, in proportion
-        to how little they agree: a needle that is left alone shows its roll soonest [rad].
+        Increase of the dead band in proportion to the disagreement of the hypotheses' rolls: a
+        needle that is not turned shows its roll soonest [rad].
     near : float
         Distance from the plane within which `near_dead_band` holds [m].
     near_dead_band, far_dead_band : float
-        Errors of the roll that are left alone, which saves rotation [rad].
+        Largest errors of the roll that are not corrected, which saves rotation [rad].
     largest_turn : float
-        Most that a single hypothesis asks of a step, before the mean [rad].
+        Largest rotation for a single torsion in one step, before the mean [rad].
     smallest_weight : float
-        Hypotheses that weigh less than this share of the heaviest have no say in the turn.
+        Torsions with a smaller weight, relative to the heaviest, are ignored.
     """
 
     step_length: Annotated[float, Bounds(1e-5, 0.1, "m")] = 0.001
@@ -87,7 +87,7 @@ class RollLawSettings(NamedTuple):
     braking_over: Annotated[float, Bounds(1e-6, 1.0, "m")] = 0.003
     lag_caution: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.45
     braking_caution: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.5
-    doubt: Annotated[float, Bounds(0.0, 10.0, "-")] = 0.4
+    uncertainty_weight: Annotated[float, Bounds(0.0, 10.0, "-")] = 0.4
     scatter_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 1.0
     near: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.0005
     near_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.35
@@ -97,7 +97,7 @@ class RollLawSettings(NamedTuple):
 
 
 class RollLaw:
-    """Turns the base to the roll that takes the needle to the plane.
+    """Turns the base to the roll that leads the needle to the plane.
 
     Parameters
     ----------
@@ -120,15 +120,15 @@ class RollLaw:
         Parameters
         ----------
         estimate : Estimate
-            Of the hypothesis filter, or of any other estimator: then as one hypothesis without
-            torsion.
+            Of the hypothesis filter; an estimate of another estimator is treated as one hypothesis
+            without torsion.
         bend_sign : float
-            Wanted sign of cos(roll), which says to what side the needle bends within the plane; 0
-            leaves it to what is nearest. A change of sign is a turn by pi - 2 roll, which keeps the
-            curvature out of the plane.
+            Desired sign of cos(roll), the side to which the needle bends within the plane; 0 for
+            the nearer one. A change of sign is a turn by pi - 2 roll, which keeps the curvature
+            out of the plane.
         """
         known, s = hypotheses_of(estimate), estimate.linearized
-        turn, wanted = roll_turn(
+        turn, desired = roll_turn(
             float(s[0]),
             float(s[1]),
             known.uncertainty,
@@ -139,13 +139,13 @@ class RollLaw:
             self.settings,
         )
         length = self.settings.step_length
-        return SteeringCommand((wanted - float(s[2])) / length, turn / length)
+        return SteeringCommand((desired - float(s[2])) / length, turn / length)
 
 
 def hypotheses_of(estimate: Estimate) -> Hypotheses:
-    """Return an estimate's hypotheses: those behind a mixture, else the estimate as the only one.
+    """Return the hypotheses of an estimate, or the estimate as the only one.
 
-    Without a bank the winding of the base is not known and counts as 0.
+    In the latter case the angle of the base is not known and assumed to be 0.
     """
     if estimate.hypotheses is not None:
         return estimate.hypotheses
@@ -171,7 +171,7 @@ def roll_turn(
     bend_sign: float,
     settings: RollLawSettings,
 ) -> tuple[float, float]:
-    """Return the turn of the base over the next step [rad] and the wanted s3 [1/m].
+    """Return the rotation of the base over the next step [rad] and the desired s3 [1/m].
 
     Parameters
     ----------
@@ -180,9 +180,9 @@ def roll_turn(
     uncertainty, torsions, base, wound :
         See `Hypotheses`.
     bend_sign : float
-        Wanted sign of cos(roll); 0 is either.
+        Desired sign of cos(roll); 0 for either.
     settings : RollLawSettings
-        The settings.
+        Settings of the law.
     """
     limit = settings.max_rotation_per_length * settings.step_length
     least = settings.smallest_weight * heaviest(torsions)
@@ -191,14 +191,14 @@ def roll_turn(
         t = torsions[k]
         if t.weight < least or t.weight == 0.0:
             continue
-        s3, sine = wanted_bend(x, sin_pitch, uncertainty, t, settings)
+        s3, sine = desired_bend(x, sin_pitch, uncertainty, t, settings)
         tip_turn = nearest_turn(t.roll, sine, bend_sign, wound, settings.max_winding)
         dead_band = settings.far_dead_band if abs(x) > settings.near else settings.near_dead_band
         dead_band += settings.scatter_dead_band * (1.0 - t.agreement)
         if abs(tip_turn) < dead_band:
             tip_turn = 0.0
-        asked = base_turn(t, tip_turn, base, settings.step_length)
-        turns += t.weight * min(max(asked, -settings.largest_turn), settings.largest_turn)
+        rotation = base_turn(t, tip_turn, base, settings.step_length)
+        turns += t.weight * min(max(rotation, -settings.largest_turn), settings.largest_turn)
         s3_mean += t.weight * s3
         weights += t.weight
     return min(max(turns / weights, -limit), limit), s3_mean / weights
@@ -214,21 +214,21 @@ def heaviest(torsions: Records) -> float:
 
 
 @compiled
-def wanted_bend(
+def desired_bend(
     x: float, sin_pitch: float, uncertainty: Array, t: Any, settings: RollLawSettings
 ) -> tuple[float, float]:
-    """Return the wanted s3 [1/m] and the sine of the roll that has it.
+    """Return the desired s3 [1/m] and the sine of the roll that has it.
 
     Parameters
     ----------
     x, sin_pitch : float
         Distance from the plane [m] and sine of the pitch, over all hypotheses.
     uncertainty : ndarray, shape (3,)
-        Of both, see `Hypotheses`.
+        Of both; see `Hypotheses`.
     t : TORSION
         A torsion.
     settings : RollLawSettings
-        The settings.
+        Settings of the law.
     """
     lag = min(t.lag / _USUAL_LAG, 1.0)
     caution = 1.0 - settings.lag_caution * lag
@@ -243,15 +243,15 @@ def wanted_bend(
     if descent > steepest:
         descent = steepest
         slope = 0.5 * steepest / distance
-    wanted_pitch = -descent if x > 0.0 else descent
+    desired_pitch = -descent if x > 0.0 else descent
     steerable = t.curvature * math.sqrt(max(1e-6, 1.0 - sin_pitch * sin_pitch))
     gain = settings.pitch_gain * caution
-    # Standard deviation of the demand as a share of what steering can do.
+    # Standard deviation of the desired s3, relative to the largest possible one.
     variance = uncertainty[2] + slope * (2.0 * uncertainty[1] + slope * uncertainty[0])
-    doubt = gain / steerable * math.sqrt(max(variance, 0.0))
-    gain /= math.sqrt(1.0 + (settings.doubt * doubt) ** 2)
-    # s3 = gain (wanted sin(pitch) - sin(pitch)), as far as the needle bends
-    s3 = gain * (wanted_pitch - sin_pitch)
+    uncertain = gain / steerable * math.sqrt(max(variance, 0.0))
+    gain /= math.sqrt(1.0 + (settings.uncertainty_weight * uncertain) ** 2)
+    # s3 = gain (desired sin(pitch) - sin(pitch)), limited by the curvature
+    s3 = gain * (desired_pitch - sin_pitch)
     s3 = min(max(s3, -steerable), steerable)
     return s3, min(max(s3 / steerable, -1.0), 1.0)
 
@@ -260,20 +260,20 @@ def wanted_bend(
 def nearest_turn(
     roll: float, sine: float, bend_sign: float, wound: float, max_winding: float
 ) -> float:
-    """Return the turn [rad] to a roll of a given sine that the winding allows.
+    """Return the shortest turn [rad] to a roll of a given sine within the limits of the base.
 
     Parameters
     ----------
     roll : float
-        Of the tip now [rad].
+        Present roll of the tip [rad].
     sine : float
-        Of the wanted roll.
+        Sine of the desired roll.
     bend_sign : float
-        Wanted sign of its cosine; 0 is either.
+        Desired sign of its cosine; 0 for either.
     wound : float
         Angle of the base [rad].
     max_winding : float
-        What its size is kept to [rad]; if no way does that, it is the way that unwinds.
+        Limit of its absolute value [rad]; if every turn exceeds it, the one that unwinds is chosen.
     """
     upright = math.asin(sine)
     best = cheapest = math.inf
@@ -282,8 +282,8 @@ def nearest_turn(
             continue
         if bend_sign < 0.0 and side == 0:
             continue
-        wanted = upright if side == 0 else math.pi - upright
-        turn, cost = allowed_turn(wanted - roll, wound, max_winding)
+        desired = upright if side == 0 else math.pi - upright
+        turn, cost = allowed_turn(desired - roll, wound, max_winding)
         if cost < cheapest:
             best, cheapest = turn, cost
     return best
@@ -291,12 +291,12 @@ def nearest_turn(
 
 @compiled
 def allowed_turn(turn: float, wound: float, max_winding: float) -> tuple[float, float]:
-    """Return the shorter way to an angle that the winding allows, and its cost [rad].
+    """Return the shorter turn to an angle within the limits of the base, and its cost [rad].
 
     Parameters
     ----------
     turn : float
-        To the angle, by any way [rad].
+        Any turn to the angle [rad].
     wound, max_winding : float
         See `nearest_turn`.
     """
@@ -316,21 +316,21 @@ def allowed_turn(turn: float, wound: float, max_winding: float) -> tuple[float, 
 
 @compiled
 def base_turn(t: Any, tip_turn: float, base: float, length: float) -> float:
-    """Return how far the base has to turn over a step for the tip to turn by `tip_turn` [rad].
+    """Return the rotation of the base over a step that turns the tip by `tip_turn` [rad].
 
     Parameters
     ----------
     t : TORSION
         A torsion.
     tip_turn : float
-        Wanted turn of the tip [rad]; 0 asks for no motion of it.
+        Desired turn of the tip [rad].
     base : float
         Rotation of the base since the start [rad].
     length : float
         Inserted length of the step [m].
     """
     if t.lag > _SMALLEST_LAG:
-        # The tip goes this share of the way to the angle behind the play in one step.
+        # In one step the tip follows a share of the difference to the angle behind the play.
         goal = t.tip_angle + tip_turn / (1.0 - math.exp(-length / t.lag))
     elif tip_turn == 0.0:
         goal = t.behind_play

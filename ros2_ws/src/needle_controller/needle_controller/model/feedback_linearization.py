@@ -4,11 +4,10 @@ Paper symbols: r = (x, pitch, roll) is the reduced state, s = (x, sin(pitch), ka
 sin(roll)) the linearized state, v the virtual input ds3/dl, u the rotation rate. Leading axes
 broadcast.
 
-s can say only |roll| < pi/2: a roll beyond +-90 deg has the s of its mirror image. The inverse of
-(7) divides by kappa cos(pitch) cos(roll), which is 0 there; `rotation_rate` bounds that divisor
-away from 0, so that it never returns an infinite rate, and `saturation` keeps estimates off that
-boundary. The law and the observer hold u over a step and use (7) integrated over it (`law`,
-`luenberger`).
+s only represents |roll| < pi/2: a roll beyond +-90 deg has the s of its mirror image. The inverse
+of (7) divides by kappa cos(pitch) cos(roll), which is 0 there; `luenberger.saturate` keeps
+estimates off that boundary. The law and the observer hold u over a step and use (7) integrated over
+it (`law`, `luenberger`).
 """
 
 from __future__ import annotations
@@ -26,12 +25,9 @@ C: Array = np.array([[1.0, 0.0, 0.0]])
 _POWERS: Array = np.stack([np.eye(3), A, 0.5 * (A @ A)])
 _EXPONENTS: Array = np.add.outer(np.arange(3), np.arange(3)) + 1.0
 
-SMALLEST_STEERING = 1e-3
-"""Bound on |cos(pitch) cos(roll)| in the inverse of (7): nearer to 0, turning does not steer."""
-
 
 def linearized_from_reduced(reduced: npt.ArrayLike, curvature: npt.ArrayLike) -> Array:
-    """Return s of r: (6).
+    """Return the linearized state s of the reduced state r: (6).
 
     Parameters
     ----------
@@ -52,25 +48,25 @@ def linearized_from_reduced(reduced: npt.ArrayLike, curvature: npt.ArrayLike) ->
 
 
 def reduced_from_linearized(linearized: npt.ArrayLike, curvature: npt.ArrayLike) -> Array:
-    """Return r of s, the inverse of (6), with |roll| <= pi/2.
+    """Return the reduced state r of s, with |roll| <= pi/2: the inverse of (6).
 
     Parameters
     ----------
     linearized : array_like, shape (..., 3)
-        s within s2^2 + (s3 / kappa)^2 < 1 (see `saturation`).
+        s within s2^2 + (s3 / kappa)^2 < 1 (see `luenberger.saturate`).
     curvature : array_like, shape (...)
         Curvature of the needle's path, kappa [1/m].
 
     Returns
     -------
     ndarray, shape (..., 3)
-        x [m], pitch, roll [rad]; NaN where s lies outside the region.
+        x [m], pitch, roll [rad]; NaN if s lies outside the region.
     """
     linearized = np.asarray(linearized, dtype=float)
     x, s2 = linearized[..., 0], linearized[..., 1]
     sine = linearized[..., 2] / np.asarray(curvature, dtype=float)
     with np.errstate(invalid="ignore"):
-        # atan2 of both sides rather than asin of a quotient: exact also near roll +-90 deg.
+        # atan2 instead of asin of a quotient is accurate near roll +-90 deg, too.
         pitch = np.arcsin(s2)
         roll = np.arctan2(sine, np.sqrt(1.0 - s2 * s2 - sine * sine))
     return np.stack(np.broadcast_arrays(x, pitch, roll), axis=-1)
@@ -79,7 +75,7 @@ def reduced_from_linearized(linearized: npt.ArrayLike, curvature: npt.ArrayLike)
 def virtual_input(
     reduced: npt.ArrayLike, rotation_rate: npt.ArrayLike, curvature: npt.ArrayLike
 ) -> Array:
-    """Return v = ds3/dl that a rotation rate u causes: (7).
+    """Return the virtual input v = ds3/dl of a rotation rate u: (7).
 
     Parameters
     ----------
@@ -102,40 +98,8 @@ def virtual_input(
     return np.asarray(curvature * (turning - curvature * np.sin(pitch)))
 
 
-def rotation_rate(
-    reduced: npt.ArrayLike, virtual: npt.ArrayLike, curvature: npt.ArrayLike
-) -> Array:
-    """Return u that causes the virtual input v: the inverse of (7).
-
-    Exact while |cos(pitch) cos(roll)| >= `SMALLEST_STEERING`. Nearer to roll +-90 deg no finite u
-    gives the wanted v; the divisor is then held at that bound with its own sign (that of +0 at 0),
-    and the caller caps the result.
-
-    Parameters
-    ----------
-    reduced : array_like, shape (..., 3)
-        x [m], pitch, roll [rad].
-    virtual : array_like, shape (...)
-        Virtual input v [1/m^2].
-    curvature : array_like, shape (...)
-        Curvature of the needle's path, kappa [1/m].
-
-    Returns
-    -------
-    ndarray, shape (...)
-        u [rad/m].
-    """
-    reduced = np.asarray(reduced, dtype=float)
-    curvature = np.asarray(curvature, dtype=float)
-    pitch, roll = reduced[..., 1], reduced[..., 2]
-    steering = np.cos(pitch) * np.cos(roll)
-    steering = np.copysign(np.maximum(np.abs(steering), SMALLEST_STEERING), steering)
-    drift = curvature * np.sin(pitch)
-    return np.asarray((np.asarray(virtual, dtype=float) / curvature + drift) / steering)
-
-
 def transition(length: npt.ArrayLike) -> Array:
-    """Return F = exp(A l), the undriven motion of (8) over an inserted length, exactly.
+    """Return F = exp(A l), the exact undriven motion of (8) over an inserted length.
 
     Parameters
     ----------
@@ -152,7 +116,7 @@ def transition(length: npt.ArrayLike) -> Array:
 
 
 def process_covariance(density: Array, length: npt.ArrayLike) -> Array:
-    """Return the covariance that process noise adds to s over an inserted length, exactly.
+    """Return the exact covariance that process noise adds to s over an inserted length.
 
     Parameters
     ----------
@@ -181,7 +145,7 @@ def reduced_covariance(covariance: Array, reduced: Array, curvature: npt.ArrayLi
     covariance : ndarray, shape (..., 3, 3)
         Of s.
     reduced : ndarray, shape (..., 3)
-        Where: x [m], pitch, roll [rad], roll off +-90 deg.
+        x [m], pitch, roll [rad]; the roll must not be +-90 deg.
     curvature : array_like, shape (...)
         kappa [1/m].
 

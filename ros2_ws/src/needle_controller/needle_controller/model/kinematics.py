@@ -1,9 +1,8 @@
-"""The needle's generalised coordinates and how they change with insertion ([KC09] (3)-(5)).
+"""The needle's generalised coordinates ([KC09] (3)) and its orientation.
 
 Paper symbols: q = (x, y, z, alpha, beta, gamma) are the coordinates (tip position, yaw, pitch,
-roll), r = (x, beta, gamma) the reduced state, kappa the curvature, u the rotation rate per inserted
-length, l the inserted length. All of them are in the frame `target_plane`, whose y-z plane is the
-wanted one. Leading axes broadcast.
+roll), r = (x, beta, gamma) the reduced state. All are in the frame `target_plane`, whose y-z plane
+is the desired one. Leading axes broadcast.
 """
 
 from __future__ import annotations
@@ -77,8 +76,7 @@ def angles_from_rotation(rotation: npt.ArrayLike) -> Array:
     -------
     ndarray, shape (..., 3)
         Yaw and roll in (-pi, pi], pitch in [-pi/2, pi/2] [rad]. At pitch +-pi/2 only the sum or
-        difference of yaw and roll is defined (the singularity of (3)); there they are what rounding
-        makes of them.
+        difference of yaw and roll is defined (the singularity of (3)); rounding determines both.
     """
     rotation = np.asarray(rotation, dtype=float)
     yaw = np.arctan2(-rotation[..., 1, 2], rotation[..., 2, 2])
@@ -113,66 +111,3 @@ def angle_axes(angles: npt.ArrayLike) -> Array:
         [np.sin(pitch), -np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch)], axis=-1
     )
     return np.stack([about_yaw, about_pitch, heading], axis=-1)
-
-
-def coordinate_rates(
-    coordinates: npt.ArrayLike, rotation_rate: npt.ArrayLike, curvature: npt.ArrayLike
-) -> Array:
-    """Return dq/dl, the change of the coordinates per inserted length: (4) with u1 = 1.
-
-    Parameters
-    ----------
-    coordinates : array_like, shape (..., 6)
-        x, y, z [m], yaw, pitch, roll [rad].
-    rotation_rate : array_like, shape (...)
-        Rotation of the base per inserted length, u [rad/m].
-    curvature : array_like, shape (...)
-        Curvature of the needle's path, kappa [1/m].
-
-    Returns
-    -------
-    ndarray, shape (..., 6)
-        Per metre inserted; infinite at pitch +-pi/2, where (3) is singular.
-    """
-    coordinates = np.asarray(coordinates, dtype=float)
-    yaw, pitch, roll = (coordinates[..., i] for i in (YAW, PITCH, ROLL))
-    curvature = np.asarray(curvature, dtype=float)
-    rates = [
-        np.sin(pitch),
-        -np.cos(pitch) * np.sin(yaw),
-        np.cos(yaw) * np.cos(pitch),
-        curvature * np.cos(roll) / np.cos(pitch),
-        curvature * np.sin(roll),
-        -curvature * np.cos(roll) * np.tan(pitch) + np.asarray(rotation_rate, dtype=float),
-    ]
-    return np.stack(np.broadcast_arrays(*rates), axis=-1)
-
-
-def reduced_rates(
-    reduced: npt.ArrayLike, rotation_rate: npt.ArrayLike, curvature: npt.ArrayLike
-) -> Array:
-    """Return dr/dl, the change of the reduced state per inserted length: (5).
-
-    Parameters
-    ----------
-    reduced : array_like, shape (..., 3)
-        Distance from the plane x [m], pitch, roll [rad].
-    rotation_rate : array_like, shape (...)
-        Rotation of the base per inserted length, u [rad/m].
-    curvature : array_like, shape (...)
-        Curvature of the needle's path, kappa [1/m].
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        Per metre inserted.
-    """
-    reduced = np.asarray(reduced, dtype=float)
-    pitch, roll = reduced[..., 1], reduced[..., 2]
-    curvature = np.asarray(curvature, dtype=float)
-    rates = [
-        np.sin(pitch),
-        curvature * np.sin(roll),
-        -curvature * np.cos(roll) * np.tan(pitch) + np.asarray(rotation_rate, dtype=float),
-    ]
-    return np.stack(np.broadcast_arrays(*rates), axis=-1)

@@ -1,12 +1,12 @@
-"""Whether the needle can still reach the wanted plane, and the smallest depth at which it can.
+"""Reachability of the target plane, and the smallest depth at which the needle can lie in it.
 
-On the reduced model (5) of [KC09], with the roll free to choose, the pitch changes by at most kappa
-per inserted length, and x by sin(pitch): a double integrator with |x''| <= kappa to first order.
-The soonest way into the plane and along it is roll +90 deg, then -90 deg (or the other way round),
-with a straight stretch at the largest pitch in between if that is met. Along arcs of roll +-90 deg
-everything is closed form: over a length l the pitch changes by kappa l, and from pitch b0 to b1 x
-changes by +-(cos b0 - cos b1) / kappa. That is exact but for the turning of the roll itself, which
-is taken to need no insertion: the depths here are the least that any law can need.
+In the reduced model (5) of [KC09], with a free choice of the roll, the pitch changes by at most
+kappa per inserted length, and x by sin(pitch): a double integrator with |x''| <= kappa to first
+order. The shortest path into the plane is an arc at roll +90 deg, then one at -90 deg (or vice
+versa), with a straight part at the largest pitch between them if that limit is met. Arcs at roll
++-90 deg have a closed form: over a length l the pitch changes by kappa l, and from pitch b0 to b1 x
+changes by +-(cos b0 - cos b1) / kappa. This neglects the insertion during which the roll turns, so
+the depths are lower bounds for every law.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from needle_controller.model.arrays import Array
 from needle_core.errors import OutOfBoundsError, UserError
 
 LARGEST_PITCH = math.radians(80.0)
-"""Beyond this the coordinates (3) fail, and no needle should go there."""
+"""Largest pitch on the way: beyond it the coordinates (3) fail, and no needle should go there."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Reachability:
-    """Whether the plane can still be reached.
+    """Result for a plane or a point.
 
     Attributes
     ----------
     reachable : ndarray of bool, shape (...)
-        Whether the needle can lie in the plane at the insertion at which it ends.
+        Whether the needle can be there at the final insertion.
     depth : ndarray, shape (...)
-        Smallest insertion at which it can [m].
+        Smallest insertion at which it can be there [m].
     """
 
     reachable: npt.NDArray[np.bool_]
@@ -46,10 +46,9 @@ def reachability(
     *,
     insertion: npt.ArrayLike,
     end: npt.ArrayLike,
-    pitch_limit: float = LARGEST_PITCH,
     tolerance: float = 0.0,
 ) -> Reachability:
-    """Return whether the plane can still be reached in the insertion that is left.
+    """Return whether the plane can be reached within the remaining insertion.
 
     Parameters
     ----------
@@ -58,37 +57,29 @@ def reachability(
     curvature : array_like, shape (...)
         kappa [1/m].
     insertion, end : array_like, shape (...)
-        Present insertion, and the one at which steering ends [m].
-    pitch_limit : float
-        Largest pitch on the way, in (0, 90 deg) [rad].
+        Present and final insertion [m].
     tolerance : float
         Distance from the plane that counts as in it [m].
 
     Returns
     -------
     Reachability
-        The answer, and the smallest insertion at which it is yes.
+        Whether it can, and the smallest insertion at which it can.
 
     Raises
     ------
     OutOfBoundsError
-        A curvature, pitch, limit or tolerance out of bounds.
+        A curvature, pitch or tolerance out of bounds.
     """
     insertion = np.asarray(insertion, dtype=float)
-    depth = insertion + least_insertion(
-        reduced, curvature, pitch_limit=pitch_limit, tolerance=tolerance
-    )
+    depth = insertion + least_insertion(reduced, curvature, tolerance=tolerance)
     return Reachability(np.asarray(depth <= np.asarray(end, dtype=float)), depth)
 
 
 def least_insertion(
-    reduced: npt.ArrayLike,
-    curvature: npt.ArrayLike,
-    *,
-    pitch_limit: float = LARGEST_PITCH,
-    tolerance: float = 0.0,
+    reduced: npt.ArrayLike, curvature: npt.ArrayLike, *, tolerance: float = 0.0
 ) -> Array:
-    """Return the least insertion after which the needle can lie in the plane, pitch 0.
+    """Return the least insertion after which the needle can lie in the plane, at pitch 0.
 
     Parameters
     ----------
@@ -96,8 +87,6 @@ def least_insertion(
         x [m], pitch, roll [rad]; the roll does not matter.
     curvature : array_like, shape (...)
         kappa [1/m].
-    pitch_limit : float
-        Largest pitch on the way, in (0, 90 deg); a needle that is steeper already gets no steeper.
     tolerance : float
         Distance from the plane that counts as in it [m].
 
@@ -109,10 +98,10 @@ def least_insertion(
     Raises
     ------
     OutOfBoundsError
-        A curvature, pitch, limit or tolerance out of bounds.
+        A curvature, pitch or tolerance out of bounds.
     """
     reduced, curvature = np.asarray(reduced, dtype=float), np.asarray(curvature, dtype=float)
-    _check(curvature, pitch_limit)
+    _check_curvature(curvature)
     if not 0.0 <= tolerance < math.inf:
         raise OutOfBoundsError("tolerance", tolerance, 0.0, math.inf, "m")
     x, pitch = reduced[..., 0], reduced[..., 1]
@@ -120,15 +109,15 @@ def least_insertion(
     if np.any(steepest >= 0.5 * np.pi):
         worst = float(np.max(steepest))
         raise OutOfBoundsError("|pitch|", worst, 0.0, 0.5 * math.pi, "rad")
-    # Where it would lie if it levelled out at once.
+    # Position after levelling out at once.
     level_x = x + np.sign(pitch) * (1.0 - np.cos(pitch)) / curvature
-    # The nearest place in the plane's band; below it the needle goes up first (+x).
+    # Distance to the band around the plane; below it, the needle goes up first (+x).
     way = level_x - np.clip(level_x, -tolerance, tolerance)
     up = np.where(way > 0.0, -1.0, 1.0)
     distance, start = up * (x - (level_x - way)), up * pitch
     # Up to the pitch `top`, then level out: x gains (cos start - 2 cos top + 1) / kappa.
     cosine = 0.5 * (1.0 + np.cos(start) + curvature * distance)
-    limit = np.maximum(pitch_limit, start)
+    limit = np.maximum(LARGEST_PITCH, start)
     top = np.minimum(np.arccos(np.clip(cosine, -1.0, 1.0)), limit)
     top = np.maximum(top, start)
     short = 2.0 * (np.cos(top) - cosine) / curvature
@@ -139,13 +128,9 @@ def least_insertion(
 
 
 def farthest_offsets(
-    pitch: npt.ArrayLike,
-    curvature: npt.ArrayLike,
-    length: npt.ArrayLike,
-    *,
-    pitch_limit: float = LARGEST_PITCH,
+    pitch: npt.ArrayLike, curvature: npt.ArrayLike, length: npt.ArrayLike
 ) -> tuple[Array, Array]:
-    """Return how far below and above the tip the planes are that an insertion can reach.
+    """Return the range of planes that can be reached within an insertion.
 
     Parameters
     ----------
@@ -154,30 +139,28 @@ def farthest_offsets(
     curvature : array_like, shape (...)
         kappa [1/m].
     length : array_like, shape (...)
-        Insertion that is left, >= 0 [m].
-    pitch_limit : float
-        Largest pitch on the way, in (0, 90 deg) [rad].
+        Remaining insertion, >= 0 [m].
 
     Returns
     -------
     lowest, highest : ndarray, shape (...)
-        Offsets of planes from the tip along their x axis [m]; NaN where the length does not even
-        do to level out.
+        Offsets of planes from the tip along their x axis [m]; NaN if the length is too short for
+        levelling out.
 
     Raises
     ------
     OutOfBoundsError
-        A curvature or limit out of bounds.
+        A curvature out of bounds.
     """
     pitch, curvature = np.asarray(pitch, dtype=float), np.asarray(curvature, dtype=float)
     length = np.asarray(length, dtype=float)
-    _check(curvature, pitch_limit)
-    highest = _highest(pitch, curvature, length, pitch_limit)
-    return -_highest(-pitch, curvature, length, pitch_limit), highest
+    _check_curvature(curvature)
+    highest = _highest(pitch, curvature, length)
+    return -_highest(-pitch, curvature, length), highest
 
 
 def check_offset(offset: float, curvature: float, depth: float, pitch: float = 0.0) -> None:
-    """Check that a plane can be reached by a needle that is still out.
+    """Check that a needle that is still out can reach a plane.
 
     Parameters
     ----------
@@ -193,8 +176,8 @@ def check_offset(offset: float, curvature: float, depth: float, pitch: float = 0
     Raises
     ------
     UserError
-        The plane is farther than the needle can ever go: says how far it can, and from what depth
-        on it could.
+        The plane is out of reach; the message gives the range of reachable planes and the insertion
+        that this one needs.
     """
     lowest, highest = (float(limit) for limit in farthest_offsets(pitch, curvature, depth))
     if lowest <= offset <= highest:
@@ -209,8 +192,8 @@ def check_offset(offset: float, curvature: float, depth: float, pitch: float = 0
     )
 
 
-def _highest(pitch: Array, curvature: Array, length: Array, pitch_limit: float) -> Array:
-    limit = np.maximum(pitch_limit, pitch)
+def _highest(pitch: Array, curvature: Array, length: Array) -> Array:
+    limit = np.maximum(LARGEST_PITCH, pitch)
     top = np.minimum(0.5 * (curvature * length + pitch), limit)
     straight = length - (2.0 * top - pitch) / curvature
     offset = (np.cos(pitch) - 2.0 * np.cos(top) + 1.0) / curvature + straight * np.sin(limit)
@@ -219,10 +202,8 @@ def _highest(pitch: Array, curvature: Array, length: Array, pitch_limit: float) 
     return np.asarray(np.where(possible, offset, np.nan))
 
 
-def _check(curvature: Array, pitch_limit: float) -> None:
+def _check_curvature(curvature: Array) -> None:
     bad = ~(np.isfinite(curvature) & (curvature > 0.0))
     if np.any(bad):
         value = float(np.asarray(curvature)[bad].ravel()[0])
         raise OutOfBoundsError("curvature", value, float(np.nextafter(0.0, 1.0)), math.inf, "1/m")
-    if not 0.0 < pitch_limit < 0.5 * math.pi:
-        raise OutOfBoundsError("pitch_limit", pitch_limit, 0.0, 0.5 * math.pi, "rad")

@@ -1,4 +1,4 @@
-"""The wanted plane: a frame in `rig` whose y-z plane it is."""
+"""The target plane: the y-z plane of a frame in `rig`."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from needle_core.errors import UserError
 
 _UNIT_TOLERANCE = 1e-3
 RIG = "rig"
-SHORTEST_JUDGED_DEPTH = 0.12
-"""Depth of the insertions of [KC09] IV-B [m]; shorter runs are parts of one."""
+SHORTEST_CHECKED_DEPTH = 0.12
+"""Depth of the insertions of [KC09] IV-B [m]; shorter runs count as parts of one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +51,7 @@ class TargetPlane:
 
 
 def offset_plane(offset: float) -> TargetPlane:
-    """Return the plane x = offset [m] of `rig`: the default one."""
+    """Return the default plane, x = offset [m] of `rig`."""
     transform = np.eye(4)
     transform[0, 3] = offset
     return TargetPlane(transform)
@@ -60,12 +60,12 @@ def offset_plane(offset: float) -> TargetPlane:
 def plane_from_pose(
     frame_id: str, position: npt.ArrayLike, quaternion: npt.ArrayLike
 ) -> TargetPlane:
-    """Return the plane that a pose asks for.
+    """Return the plane of a received pose.
 
     Parameters
     ----------
     frame_id : str
-        The frame the pose is given in; must be `rig`.
+        Frame of the pose; must be `rig`.
     position : array_like, shape (3,)
         Origin of `target_plane` [m].
     quaternion : array_like, shape (4,)
@@ -79,8 +79,8 @@ def plane_from_pose(
     Raises
     ------
     UserError
-        Another frame, numbers that are not finite, a quaternion that is not of unit length, or a
-        plane that the entering needle stands on at right angles.
+        Another frame, a number that is not finite, a quaternion that is not of unit length, or a
+        plane that is almost perpendicular to the entering needle.
     """
     if frame_id != RIG:
         raise UserError(f"target_plane is given in frame '{frame_id}', wants '{RIG}'")
@@ -104,22 +104,21 @@ def plane_from_pose(
 
 
 def check_within_reach(plane: TargetPlane, curvature: float, depth: float) -> None:
-    """Check that a needle that is still out could be steered into a plane.
+    """Check that a needle that is still out can be steered into a plane.
 
     Parameters
     ----------
     plane : TargetPlane
-        The wanted plane.
+        The target plane.
     curvature : float
         kappa [1/m].
     depth : float
-        Insertion at which steering ends [m]; a run that is shorter than `SHORTEST_JUDGED_DEPTH` is
-        judged as if it went on to there.
+        Insertion at which steering ends [m]; at least `SHORTEST_CHECKED_DEPTH` is assumed.
 
     Raises
     ------
     UserError
-        The plane is farther than the needle can ever go: says how far it can.
+        The plane is out of reach.
     """
     pitch = float(np.arcsin(np.clip(plane.T_plane_rig[0, 2], -1.0, 1.0)))
-    check_offset(plane.offset, curvature, max(depth, SHORTEST_JUDGED_DEPTH), pitch)
+    check_offset(plane.offset, curvature, max(depth, SHORTEST_CHECKED_DEPTH), pitch)

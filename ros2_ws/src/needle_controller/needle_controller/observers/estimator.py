@@ -1,4 +1,4 @@
-"""Interface of every estimator: of one needle, in the frame `target_plane`, SI."""
+"""Interface of estimators: one needle, in the frame `target_plane`, in SI units."""
 
 from __future__ import annotations
 
@@ -10,25 +10,21 @@ import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import linearized_from_reduced
-from needle_controller.model.kinematics import (
-    REDUCED,
-    angles_from_rotation,
-    rotation_from_angles,
-)
+from needle_controller.model.kinematics import REDUCED, angles_from_rotation, rotation_from_angles
 
 
 @dataclasses.dataclass(frozen=True)
 class Hypotheses:
-    """The part of an estimate over several hypotheses that a law needs.
+    """Estimate over several hypotheses, as far as laws need it.
 
     Attributes
     ----------
     torsions : ndarray, shape (K,)
-        The mean over each torsion, `filter.records.TORSION`.
+        Mean over the hypotheses of each torsion, `filter.records.TORSION`.
     base : float
-        Rotation of the base since the start [rad]; the torsions' angles count from there too.
+        Rotation of the base since the start [rad], to which the torsions' angles refer, too.
     wound : float
-        Rotation of the base as the joint says it [rad].
+        Position of the rotation joint [rad].
     uncertainty : ndarray, shape (3,)
         Variance of x [m^2], its covariance with sin(pitch) [m], variance of sin(pitch).
     """
@@ -41,7 +37,7 @@ class Hypotheses:
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """State of the needle as known after the last measurement.
+    """Estimated state of the needle after the last measurement.
 
     Attributes
     ----------
@@ -54,12 +50,12 @@ class Estimate:
     covariance : ndarray, shape (6, 6)
         Covariance of `coordinates`, in their order.
     warnings : tuple of str
-        What a user should know of this estimate; empty as a rule.
+        Warnings for the user; usually empty.
     miss : float, optional
-        Probability that the tip is more than 1 mm from the plane x = 0; None from an estimator that
-        does not judge itself.
+        Probability that the tip is more than 1 mm from the plane x = 0; None if the estimator does
+        not report it.
     hypotheses : Hypotheses, optional
-        Of what it is the mean; None from an estimator that knows one state only.
+        The underlying hypotheses; None from an estimator with a single state.
     """
 
     coordinates: Array
@@ -93,20 +89,20 @@ def pose_estimate(
     covariance: npt.ArrayLike,
     warnings: tuple[str, ...] = (),
 ) -> Estimate:
-    """Return the estimate that a pose in the target plane is.
+    """Return the estimate of a pose in the target plane.
 
     Parameters
     ----------
     position : array_like, shape (3,)
         The tip [m].
     rotation : array_like, shape (3, 3)
-        Its orientation: the heading is the last column, the needle bends to -y.
+        Orientation: the heading is the last column, the needle bends to -y.
     curvature : float
         Of the needle's path [1/m].
     covariance : array_like, shape (6, 6)
         Of x, y, z [m], yaw, pitch, roll [rad].
     warnings : tuple of str
-        What a user should know of it.
+        Warnings for the user.
     """
     coordinates = np.concatenate(
         [np.asarray(position, dtype=float), angles_from_rotation(rotation)]
@@ -121,7 +117,7 @@ def pose_estimate(
 
 
 class Estimator(Protocol):
-    """Estimates the tip's pose from where it was seen and from what the base really did."""
+    """Estimates the tip's pose from measured tips and from the actual motion of the base."""
 
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
         """Start over at a first measurement.
@@ -135,7 +131,7 @@ class Estimator(Protocol):
         """
 
     def advance(self, d_insertion: float, d_rotation: float) -> None:
-        """Move on by what really happened since the last call, the rotation spread evenly over it.
+        """Advance by the actual motion since the last call, with evenly distributed rotation.
 
         Parameters
         ----------
@@ -153,26 +149,26 @@ class Estimator(Protocol):
     def correct(
         self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
     ) -> None:
-        """Take a measurement of the tip.
+        """Correct by a measured tip.
 
         Parameters
         ----------
         tip : array_like, shape (3,)
-            The tip [m]; NaN where it was not found.
+            The tip [m]; NaN if it was not found.
         covariance : array_like, shape (3, 3), optional
-            Its covariance [m^2]; the estimator's own assumption if none is given.
+            Its covariance [m^2]; by default the assumption of the estimator.
         age : float
-            Length inserted since the exposure [m]; 0 when `advance` stopped at it.
+            Length inserted since the exposure [m]; 0 if `advance` stopped there.
         """
 
     def estimate(self) -> Estimate:
-        """Return what is known now."""
+        """Return the present estimate."""
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
-        """Express everything in another target plane.
+        """Transform everything into another target plane.
 
         Parameters
         ----------
         T_new_old : array_like, shape (4, 4)
-            The old target plane's pose in the new one.
+            Pose of the old target plane in the new one.
         """

@@ -1,6 +1,5 @@
-"""The paper's observer ([KC09] (9)): a steady gain on the tip's distance from the plane."""
+"""The paper's observer ([KC09] (9)): a constant gain on the tip's distance from the plane."""
 
-# Compiled code takes keywords slowly or not at all.
 from __future__ import annotations
 
 import dataclasses
@@ -31,7 +30,7 @@ OBSERVER = np.dtype(
         ("saturated", np.bool_),  # whether the estimate was projected
     ]
 )
-"""What the observer knows of a needle."""
+"""State of the observer for one needle."""
 
 
 class ObserverModel(NamedTuple):
@@ -53,13 +52,13 @@ class LuenbergerSettings:
     observer_poles : ndarray of complex, shape (3,)
         Eigenvalues of A - L C [1/m], from `gains.design_gains`.
     process_noise : ndarray, shape (3, 3)
-        Covariance of white noise on ds/dl per metre; enters the covariance only.
+        Covariance of white noise on ds/dl per metre; for the covariance only.
     measurement_std : float
-        Standard deviation of one measured coordinate [m]; enters the covariance only.
+        Standard deviation of one measured coordinate [m]; for the covariance only.
     saturation_margin : float
-        Distance of the estimate from the border of (6)'s region, in [0, 1).
+        Distance of the estimate from the border of the region of (6), in [0, 1).
     initial_yaw_std, initial_pitch_std, initial_roll_std : float
-        How well the orientation at the entry is known [rad]; enters the covariance only.
+        Standard deviations of the orientation at the entry [rad]; for the covariance only.
     """
 
     curvature: float
@@ -73,16 +72,16 @@ class LuenbergerSettings:
 
     @property
     def model(self) -> ObserverModel:
-        """The part that compiled code needs."""
+        """The settings for compiled code."""
         return ObserverModel(self.curvature, self.saturation_margin, self.observer_poles)
 
 
 class LuenbergerObserver:
-    """Observer (9), sampled for the insertion that really happened, saturated as in [KC09] IV-A.
+    """Observer (9), sampled for the actual insertion, saturated as in [KC09] IV-A.
 
-    It starts at (first measurement, 0, 0) where the needle enters along the plane with roll 0, and
-    in general at the orientation the base gives it. x is estimated; y and z are the last measured
-    tip; the yaw is integrated from its start by (4) and is not observed.
+    It starts at the first measurement with the orientation of the base: at (x, 0, 0) if the needle
+    enters along the plane with roll 0. x is estimated; y and z are the last measured tip; the yaw
+    is integrated from the start by (4), without observation.
 
     Parameters
     ----------
@@ -111,7 +110,7 @@ class LuenbergerObserver:
         settings, turn = self._settings, float(np.asarray(joints, dtype=float)[1])
         self._tip = np.array(tip, dtype=float)
         start = self.initial_rotation @ rotation_from_angles([0.0, 0.0, turn])
-        self._place(float(self._tip[0]), start)
+        self._set_pose(float(self._tip[0]), start)
         self._needle["since_correction"] = self._inserted = 0.0
         self._tip_covariance = np.eye(3) * settings.measurement_std**2
         stds = (
@@ -122,7 +121,7 @@ class LuenbergerObserver:
         self._covariance = np.diag(np.square(stds))
 
     def advance(self, d_insertion: float, d_rotation: float) -> None:
-        """Move on by what really happened; see `Estimator.advance`."""
+        """Advance by the actual motion; see `Estimator.advance`."""
         length = float(d_insertion)
         if not (math.isfinite(length) and length >= 0.0):
             raise ValueError(f"d_insertion = {length!r} m, wants finite and >= 0")
@@ -136,10 +135,10 @@ class LuenbergerObserver:
     def correct(
         self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
     ) -> None:
-        """Take a measurement; see `Estimator.correct`.
+        """Correct by a measured tip; see `Estimator.correct`.
 
-        The gain is steady: it does not use `covariance`, which only passes into the estimate's. The
-        tip `age` ago is taken as x - age s2 + age^2 / 2 s3.
+        The constant gain does not use `covariance`, which only enters the estimate's covariance.
+        The tip `age` ago is x - age s2 + age^2 / 2 s3.
         """
         seen, noise = np.array(tip, dtype=float), self._settings.measurement_std**2
         found = bool(np.all(np.isfinite(seen)))
@@ -161,7 +160,7 @@ class LuenbergerObserver:
         self._covariance = keep @ self._covariance @ keep.T + noise * np.outer(gain, gain)
 
     def estimate(self) -> Estimate:
-        """Return what is known now; see `Estimator.estimate`."""
+        """Return the present estimate; see `Estimator.estimate`."""
         curvature, s = self._settings.curvature, np.array(self._needle["linearized"])
         x, pitch, roll = reduced_from_linearized(s, curvature)
         yaw = float(self._needle["yaw"])
@@ -179,16 +178,16 @@ class LuenbergerObserver:
         )
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
-        """Express everything in another target plane; see `Estimator.change_frame`."""
+        """Transform everything into another target plane; see `Estimator.change_frame`."""
         transform = np.asarray(T_new_old, dtype=float)
         turn, shift = transform[:3, :3], transform[:3, 3]
         known = self.estimate()
         self._tip = turn @ self._tip + shift
         self._tip_covariance = turn @ self._tip_covariance @ turn.T
         self.initial_rotation = turn @ self.initial_rotation
-        self._place(float((turn @ known.position + shift)[0]), turn @ known.rotation)
+        self._set_pose(float((turn @ known.position + shift)[0]), turn @ known.rotation)
 
-    def _place(self, x: float, rotation: Array) -> None:
+    def _set_pose(self, x: float, rotation: Array) -> None:
         yaw, pitch, roll = angles_from_rotation(rotation)
         self._needle["linearized"] = linearized_from_reduced(
             np.array([x, pitch, roll]), self._settings.curvature
@@ -197,7 +196,7 @@ class LuenbergerObserver:
         saturate(self._needle, self._model)
 
     def _coordinate_covariance(self, reduced: Array) -> Array:
-        """Return the covariance of q, linear in the estimate's error."""
+        """Return the covariance of q, to first order."""
         curvature = self._settings.curvature
         covariance = np.zeros((6, 6))
         index = np.array([0, 4, 5])
@@ -205,15 +204,14 @@ class LuenbergerObserver:
             self._covariance, reduced, curvature
         )
         covariance[1:3, 1:3] = self._tip_covariance[1:3, 1:3]
-        # Not observed: what was unknown at the start, and all the turning that wrong rolls can have
-        # hidden.
+        # The yaw is not observed: its initial variance, and all the yaw that wrong rolls can cause.
         covariance[YAW, YAW] = self._settings.initial_yaw_std**2 + (curvature * self._inserted) ** 2
         return covariance
 
 
 @compiled
-def keep_inside(s2: float, sine: float, margin: float) -> float:
-    """Return what scales s2 and s3 / kappa onto s2^2 + (s3 / kappa)^2 <= 1 - margin; <= 1."""
+def saturation_factor(s2: float, sine: float, margin: float) -> float:
+    """Return the factor that scales s2 and s3 / kappa into s2^2 + (s3 / kappa)^2 <= 1 - margin."""
     squared = s2 * s2 + sine * sine
     if squared > 1.0 - margin:
         return math.sqrt((1.0 - margin) / squared)
@@ -224,13 +222,13 @@ def keep_inside(s2: float, sine: float, margin: float) -> float:
 def saturate(needle: Any, model: ObserverModel) -> None:
     """Project s radially onto s2^2 + (s3 / kappa)^2 <= 1 - margin ([KC09] IV-A).
 
-    The region is where a pitch and a roll within +-90 deg exist for s; s1 is free. In the
-    coordinates (s2, s3 / kappa) it is a disc and the projection the closest point, as in the paper:
-    [0, 1.5, 0] becomes [0, 1, 0] as the margin vanishes. The margin keeps cos(pitch) cos(roll) >=
-    sqrt(margin), which the inverse of (7) divides by.
+    In this region s has a pitch and a roll within +-90 deg; s1 is free. In the coordinates (s2, s3
+    / kappa) it is a disc, and the projection is the closest point, as in the paper: [0, 1.5, 0]
+    becomes [0, 1, 0] without margin. The inverse of (7) divides by cos(pitch) cos(roll) >=
+    sqrt(margin).
     """
     s = needle.linearized
-    scale = keep_inside(s[1], s[2] / model.curvature, model.margin)
+    scale = saturation_factor(s[1], s[2] / model.curvature, model.margin)
     needle.saturated = scale < 1.0
     s[1] *= scale
     s[2] *= scale
@@ -238,10 +236,10 @@ def saturate(needle: Any, model: ObserverModel) -> None:
 
 @compiled
 def advance_observer(needle: Any, length: float, turn: float, model: ObserverModel) -> None:
-    """Move the linearized state on by what really happened.
+    """Advance the linearized state by the actual motion.
 
-    v is the one that takes the roll where (5) with u takes it over this length, held over it: (7)
-    for short steps, and finite also where the needle only turned. Past +-90 deg s cannot follow.
+    v is constant over the length, with the value that leads to the same roll as (5) with u: (7) for
+    short steps, and finite even for a rotation without insertion. s cannot follow beyond +-90 deg.
 
     Parameters
     ----------
@@ -250,11 +248,11 @@ def advance_observer(needle: Any, length: float, turn: float, model: ObserverMod
     length, turn : float
         Inserted length [m] and rotation of the base [rad].
     model : ObserverModel
-        What is assumed.
+        Assumptions.
     """
     s, kappa = needle.linearized, model.curvature
     s2, s3 = s[1], s[2]
-    # Within (6)'s region cos(pitch) and cos(roll) are positive square roots.
+    # In the region of (6), cos(pitch) and cos(roll) are positive square roots.
     cos_pitch = math.sqrt(1.0 - s2 * s2)
     sin_roll = s3 / (kappa * cos_pitch)
     cos_roll = math.sqrt(max(1.0 - sin_roll * sin_roll, 0.0))
@@ -262,7 +260,7 @@ def advance_observer(needle: Any, length: float, turn: float, model: ObserverMod
     turn -= kappa * cos_roll * s2 / cos_pitch * length
     sin_turn, cos_turn = math.sin(turn), math.cos(turn)
     sin_turned = sin_roll * cos_turn + cos_roll * sin_turn
-    # |roll| <= 90 deg: a turn takes it past +-90 deg on the side it turns to.
+    # |roll| <= 90 deg: a turn beyond +-90 deg ends at that side.
     if cos_roll * cos_turn - sin_roll * sin_turn < 0.0 or abs(turn) >= math.pi:
         sin_turned = math.copysign(1.0, turn)
     sin_pitched = s2 + length * s3
@@ -291,13 +289,13 @@ def correct_observer(
     needle : OBSERVER, changed
         The needle.
     x : float
-        Of the tip [m].
+        Distance of the tip [m].
     age : float
-        Inserted since [m].
+        Insertion since its exposure [m].
     gain : tuple of float
-        L, of `sampled_observer_gain` over what was inserted since the last correction.
+        L, of `sampled_observer_gain` over the insertion since the last correction.
     model : ObserverModel
-        What is assumed.
+        Assumptions.
     """
     s = needle.linearized
     # s <- s + L (w - C F(-age) s)

@@ -1,21 +1,22 @@
 """Proof that no path to a target exists, by a flood fill; compiled.
 
-The places that a path may pass are filled plane by plane from the entry on. What is asked of them
-is necessary, not sufficient, so where the fill does not come to the target no path does, however
-long it is searched for. Of a curve whose curvature nowhere exceeds kappa two things are asked:
+The cells that a path may pass are filled plane by plane, from the entry on. The conditions on them
+are necessary, not sufficient: if the fill does not reach the target, no path does. They hold for
+every curve whose curvature nowhere exceeds kappa:
 
 - A point at a distance D lies outside the circles that touch the curve's heading, so its direction
-  is at most bend(D) = asin(kappa D / 2) off that. So for points a, b, c of the curve, in order:
-  angle(b - a, c - b) <= bend(|b - a|) + bend(|c - b|).
-- Between points at a distance D it strays from their chord by at most sag(D) = R - sqrt(R^2 - D^2 /
-  4), R = 1 / kappa. A chord nearer to an obstacle's axis than radius + clear - sag is no way.
+  differs from the heading by at most bend(D) = asin(kappa D / 2). So for points a, b, c of the
+  curve, in order: angle(b - a, c - b) <= bend(|b - a|) + bend(|c - b|).
+- Between points at a distance D the curve is within sag(D) = R - sqrt(R^2 - D^2 / 4), R = 1 /
+  kappa, of their chord. A chord nearer to an obstacle's axis than radius + clearance - sag is
+  blocked.
 
-Places are cells of a grid, which stand for all within rho of their middles: lengths are uncertain
-by that, and directions by asin(rho / length). The needle is taken to go on forward, less than 90
-deg off its heading at the entry.
+A cell of the grid stands for all points within rho of its middle: lengths are uncertain by rho, and
+directions by asin(rho / length). The needle always moves forward, less than 90 deg off its heading
+at the entry.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -25,41 +26,41 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
-from needle_controller.planning.path_settings import Question
-from needle_controller.planning.segments import segment_distance
+from needle_controller.planning.obstacles import segment_distance
+from needle_controller.planning.path_evaluation import PathProblem
 from needle_core.compiled import compiled
 
 _PLANES_APART = 0.010
-"""Largest distance of two planes [m]: in so much, a needle bends 0.1 mm aside."""
+"""Largest distance of two planes [m], over which a needle bends 0.1 mm aside."""
 _CELL = 0.0005
 _UNCERTAIN = _CELL / math.sqrt(2.0)
-"""rho: distance of a cell's corners from its middle [m]."""
+"""rho, the distance of a cell's corners from its middle [m]."""
 _ENTRY = np.zeros(3)
 _Cells = npt.NDArray[np.bool_]
 
 
-def may_have_path(question: Question) -> bool:
-    """Return False where it is certain that no path leads to a target.
+def may_have_path(problem: PathProblem) -> bool:
+    """Return False if there is certainly no path to the target.
 
     Parameters
     ----------
-    question : Question
-        What is wanted of a path: whose start is the entry, and is known.
+    problem : PathProblem
+        Task of the path, whose start is the entry, with a known pose.
     """
-    settings, table, tolerance = question.settings, question.table, question.settings.goal_tolerance
-    axes, tip = question.start[:, :3], question.start[:, 3]
-    goal = (question.target - tip) @ axes
+    settings, table, tolerance = problem.settings, problem.table, problem.settings.goal_tolerance
+    axes, tip = problem.start[:, :3], problem.start[:, 3]
+    goal = (problem.target - tip) @ axes
     if goal[2] <= tolerance:
         return False
     ends = (table[:, :6].reshape(-1, 2, 3) - tip) @ axes
-    capsules = np.column_stack([ends.reshape(-1, 6), table[:, 6] + settings.least_clear])
-    return bool(_fill(goal, question.curvature, capsules, tolerance))
+    capsules = np.column_stack([ends.reshape(-1, 6), table[:, 6] + settings.least_clearance])
+    return bool(_fill(goal, problem.curvature, capsules, tolerance))
 
 
 @compiled
 def _fill(goal: Array, curvature: float, capsules: Array, tolerance: float) -> bool:
-    """Return whether the fill comes to the target; all in the entry's axes, the heading z."""
-    # Paths end in a ball around the target, at its first plane the latest.
+    """Return whether the fill reaches the target; all in the entry's axes, with z the heading."""
+    # Paths end in a ball around the target, at the latest at its first plane.
     depth = goal[2] - tolerance
     planes = math.ceil(depth / _PLANES_APART)
     aside = _sag(_distance(_ENTRY, goal) + tolerance, curvature) + 4.0 * (tolerance + _CELL)
@@ -77,11 +78,11 @@ def _fill(goal: Array, curvature: float, capsules: Array, tolerance: float) -> b
             for j in range(size):
                 place[0] = slope[0] * place[2] + (i - middle) * _CELL
                 place[1] = slope[1] * place[2] + (j - middle) * _CELL
-                came = _reach_bend(_distance(_ENTRY, place), curvature)
+                arrival = _reach_bend(_distance(_ENTRY, place), curvature)
                 ahead = _goal_bend(_distance(place, goal), curvature, tolerance)
-                if math.atan2(math.hypot(place[0], place[1]), place[2]) > came:
+                if math.atan2(math.hypot(place[0], place[1]), place[2]) > arrival:
                     continue
-                if _corner(_ENTRY, place, goal) > came + ahead:
+                if _corner(_ENTRY, place, goal) > arrival + ahead:
                     continue
                 if _is_entered(place, goal, ahead, first, before, box, curvature, capsules):
                     here[i, j] = True
@@ -90,7 +91,7 @@ def _fill(goal: Array, curvature: float, capsules: Array, tolerance: float) -> b
         if high_i < 0:
             return False
         if min(low_i, low_j) == 0 or max(high_i, high_j) == size - 1:
-            # The grid is too small to tell.
+            # The grid is too small for a decision.
             return True
         box = (low_i, high_i, low_j, high_j)
         before, here = here, before
@@ -108,7 +109,7 @@ def _is_entered(
     curvature: float,
     capsules: Array,
 ) -> bool:
-    """Return whether a place can be come to from one of the plane before, at first[2]."""
+    """Return whether a place can be reached from a cell of the previous plane, at first[2]."""
     middle = before.shape[0] // 2
     for i in range(box[0], box[1] + 1):
         for j in range(box[2], box[3] + 1):
@@ -136,13 +137,13 @@ def _is_entered(
 
 @compiled
 def _reach_bend(distance: float, curvature: float) -> float:
-    """Return the largest angle between a place's direction from the entry and a heading [rad]."""
+    """Return the largest angle between the direction from the entry and a heading [rad]."""
     return _bend(distance + _UNCERTAIN, curvature) + _tilt(_UNCERTAIN, distance)
 
 
 @compiled
 def _goal_bend(distance: float, curvature: float, tolerance: float) -> float:
-    """Return the same of a heading and the direction to the target [rad]."""
+    """Return the largest angle between a heading and the direction to the target [rad]."""
     uncertain = tolerance + _UNCERTAIN
     return _bend(distance + uncertain, curvature) + _tilt(uncertain, distance)
 
@@ -154,7 +155,7 @@ def _bend(distance: float, curvature: float) -> float:
 
 @compiled
 def _tilt(uncertain: float, length: float) -> float:
-    """Return by how much the direction of a length is uncertain [rad]."""
+    """Return the uncertainty of a direction over a length [rad]."""
     return math.asin(uncertain / length) if length > uncertain else math.pi
 
 
@@ -172,7 +173,7 @@ def _distance(first: Array, second: Array) -> float:
 
 @compiled
 def _corner(first: Array, second: Array, third: Array) -> float:
-    """Return by how much the way over three points turns at the second [rad]."""
+    """Return the turn at the second of three points [rad]."""
     ax, ay, az = second[0] - first[0], second[1] - first[1], second[2] - first[2]
     bx, by, bz = third[0] - second[0], third[1] - second[1], third[2] - second[2]
     x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx

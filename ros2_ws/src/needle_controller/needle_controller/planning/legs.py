@@ -1,11 +1,11 @@
-"""A leg of a path: the bevel is turned towards an aim, the needle bends, then goes on straight.
+"""Legs of a path: the bevel turns towards an aim, the needle follows an arc, then a straight line.
 
-While the bevel turns at its greatest rate the tip follows a helix; then an arc of the needle's
-curvature leads until the aim is straight ahead; then, the bevel turned to and fro or spun, the mean
+While the bevel turns at its largest rate, the tip follows a helix; then an arc of the needle's
+curvature, until the aim is straight ahead; then the bevel alternates or spins, so that the mean
 path is straight. Poses are (3, 4) arrays: the rotation's columns, then the position, in `rig`.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from needle_core.compiled import compiled
 _TURN_ITERATIONS = 10
 _TURN_FOUND = 2e-3
 _LARGEST_TURN = 1.3 * math.pi
-"""Where the way is longer, the other way round is taken [rad]."""
+"""Largest turn: a longer one is replaced by a turn in the other direction [rad]."""
 _LONGEST_CHORD = 0.005
-"""An arc of 122 mm radius is 0.03 mm off such a chord [m]."""
+"""Longest chord [m], which is within 0.03 mm of an arc of 122 mm radius."""
 _LONGEST_STRAIGHT = 0.01
 MOST_POINTS = 96
 _AHEAD = 1e-4
-"""Distance aside within which an aim counts as straight ahead [m]."""
+"""Lateral distance within which an aim counts as straight ahead [m]."""
 
 
 class Leg(NamedTuple):
@@ -37,13 +37,13 @@ class Leg(NamedTuple):
     turn : float
         Of the bevel at its start [rad].
     turning, bend, straight : float
-        Lengths: while the bevel turns, of the arc after that, and of the straight rest [m].
+        Lengths of the helix during the turn, of the arc, and of the straight line [m].
     curvature : float
         Of the arc [1/m].
     miss : float
-        Distance by which it passes the aim; 0 where it leads there [m].
-    scarce : float
-        The same for a share of the curvature: the rest is held back to correct with [m].
+        Distance by which the leg misses the aim; 0 if it leads there [m].
+    gentle_miss : float
+        The same for a share of the curvature [m].
     """
 
     turn: float
@@ -52,21 +52,21 @@ class Leg(NamedTuple):
     straight: float
     curvature: float
     miss: float
-    scarce: float
+    gentle_miss: float
 
 
 @compiled
-def move(pose: Array, length: float, turn: float, curvature: float, moved: Array) -> None:
-    """Write where one advance takes a tip: exp((V1 length + V2 turn)^) of [KC09] (2).
+def advance_pose(pose: Array, length: float, turn: float, curvature: float, moved: Array) -> None:
+    """Compute the pose after one advance: exp((V1 length + V2 turn)^) of [KC09] (2).
 
     Parameters
     ----------
     pose, moved : ndarray, shape (3, 4)
-        Before and, written, after; may be the same.
+        Before and after; may be the same array.
     length : float
-        Inserted [m].
+        Inserted length [m].
     turn : float
-        Of the tip about its axis over it [rad].
+        Rotation of the tip about its axis [rad].
     curvature : float
         kappa [1/m].
     """
@@ -89,7 +89,7 @@ def move(pose: Array, length: float, turn: float, curvature: float, moved: Array
 
 
 @compiled
-def seen_from(pose: Array, aim: Array) -> tuple[float, float, float]:
+def in_tip_axes(pose: Array, aim: Array) -> tuple[float, float, float]:
     """Return a point in the axes of a tip [m].
 
     Parameters
@@ -109,25 +109,25 @@ def seen_from(pose: Array, aim: Array) -> tuple[float, float, float]:
 
 @compiled
 def leg_towards(pose: Array, aim: Array, curvature: float, share: float, turn_rate: float) -> Leg:
-    """Return the leg that leads from a tip to an aim.
+    """Return the leg from a tip to an aim.
 
-    The turn, after which the aim lies in the plane of the bend, is found by iteration; arc and
-    straight rest are the tangent to the arc's circle through the aim, in closed form.
+    The turn after which the aim lies in the plane of the arc is found by iteration; the straight
+    line is the tangent to the arc's circle through the aim, in closed form.
 
     Parameters
     ----------
     pose : ndarray, shape (3, 4)
         Of the tip.
     aim : ndarray, shape (3,)
-        Where to [m].
+        Position of the aim [m].
     curvature : float
         kappa [1/m].
     share : float
-        Share of it that `scarce` is for.
+        Share of the curvature for `gentle_miss`.
     turn_rate : float
-        Most that the bevel turns per inserted length [rad/m].
+        Largest rotation of the bevel per inserted length [rad/m].
     """
-    x, y, z = seen_from(pose, aim)
+    x, y, z = in_tip_axes(pose, aim)
     turn, change = 0.0, 0.0
     turned = np.empty((3, 4))
     first, aside, ahead = math.atan2(x, -y), math.hypot(x, y), z
@@ -136,40 +136,40 @@ def leg_towards(pose: Array, aim: Array, curvature: float, share: float, turn_ra
         for _ in range(_TURN_ITERATIONS):
             turn += change
             if abs(turn) > _LARGEST_TURN:
-                # The other way round is shorter.
+                # The turn in the other direction is shorter.
                 turn -= math.copysign(2.0 * math.pi, turn)
-            move(pose, abs(turn) / turn_rate, turn, curvature, turned)
-            x, y, z = seen_from(turned, aim)
+            advance_pose(pose, abs(turn) / turn_rate, turn, curvature, turned)
+            x, y, z = in_tip_axes(turned, aim)
             change = math.atan2(x, -y)
             if abs(change) < _TURN_FOUND:
                 break
     gentle = 2.0 * aside / (aside * aside + ahead * ahead)
     if abs(change) >= _TURN_FOUND and gentle < curvature * share and ahead > 0.0:
-        # So nearly ahead that the bevel bends past it while it turns: to and fro, on the mean.
+        # Almost ahead: the needle would pass it while the bevel turns, so the bevel alternates.
         angle = 2.0 * math.atan2(aside, ahead)
         return Leg(first, 0.0, angle / gentle, 0.0, gentle, 0.0, 0.0)
     aside, turning = math.hypot(x, y), abs(turn) / turn_rate
     if z <= 0.0:
         return Leg(turn, turning, 0.0, 0.0, curvature, aside - z, aside - z)
-    # Within a circle the aim is missed by how deep it lies.
+    # An aim within the circle is missed by its distance from the circle.
     wider, radius = 1.0 / (curvature * share), 1.0 / curvature
-    scarce = max(wider - math.hypot(z, wider - aside), 0.0)
+    gentle_miss = max(wider - math.hypot(z, wider - aside), 0.0)
     center = math.hypot(z, radius - aside)
     miss, straight = max(radius - center, 0.0), math.sqrt(max(center**2 - radius**2, 0.0))
     angle = math.atan2(z, radius - aside) - math.atan2(straight, radius)
-    return Leg(turn, turning, max(angle, 0.0) * radius, straight, curvature, miss, scarce)
+    return Leg(turn, turning, max(angle, 0.0) * radius, straight, curvature, miss, gentle_miss)
 
 
 @compiled
-def cut_short(leg: Leg, longest: float) -> Leg:
-    """Return a leg that ends after a length [m], or where it ends anyway."""
+def truncated(leg: Leg, longest: float) -> Leg:
+    """Return a leg that ends after at most a length [m]."""
     turning = min(leg.turning, longest)
     turn = leg.turn
     if turning < leg.turning:
         turn *= turning / leg.turning
     bend = min(leg.bend, longest - turning)
     straight = min(leg.straight, longest - turning - bend)
-    return Leg(turn, turning, bend, straight, leg.curvature, leg.miss, leg.scarce)
+    return Leg(turn, turning, bend, straight, leg.curvature, leg.miss, leg.gentle_miss)
 
 
 @compiled
@@ -179,22 +179,24 @@ def leg_length(leg: Leg) -> float:
 
 
 @compiled
-def trace(pose: Array, leg: Leg, curvature: float, length: float, points: Array, end: Array) -> int:
-    """Write the corners of a chain that follows a leg; return how many.
+def trace_leg(
+    pose: Array, leg: Leg, curvature: float, length: float, points: Array, end: Array
+) -> int:
+    """Compute the corners of a chain along a leg; return their number.
 
     Parameters
     ----------
     pose : ndarray, shape (3, 4)
-        Where it starts.
+        Start of the leg.
     leg : Leg
-        What is followed.
+        The leg.
     curvature : float
         kappa [1/m].
     length : float
-        Of the path up to there [m].
-    points : ndarray, shape (MOST_POINTS, 4), written
-        Corners, the start among them, and the path's length there [m].
-    end : ndarray, shape (3, 4), written
+        Length of the path up to the start [m].
+    points : ndarray, shape (MOST_POINTS, 4), changed
+        Corners, including the start, and the path's length there [m].
+    end : ndarray, shape (3, 4), changed
         The tip's pose at the end.
     """
     end[:] = pose
@@ -202,7 +204,7 @@ def trace(pose: Array, leg: Leg, curvature: float, length: float, points: Array,
     points[0, 3] = length
     count = 1
     if leg.turning == 0.0:
-        move(end, 0.0, leg.turn, 0.0, end)
+        advance_pose(end, 0.0, leg.turn, 0.0, end)
     parts = (
         (leg.turning, leg.turn, curvature, _LONGEST_CHORD),
         (leg.bend, 0.0, leg.curvature, _LONGEST_CHORD),
@@ -213,7 +215,7 @@ def trace(pose: Array, leg: Leg, curvature: float, length: float, points: Array,
             continue
         pieces = min(math.ceil(inserted / longest), (MOST_POINTS - 1) // 3)
         for _ in range(pieces):
-            move(end, inserted / pieces, turn / pieces, bend, end)
+            advance_pose(end, inserted / pieces, turn / pieces, bend, end)
             length += inserted / pieces
             points[count, :3] = end[:, 3]
             points[count, 3] = length

@@ -1,9 +1,9 @@
-"""The search for a path: via points, moved by an evolution strategy until their path is good.
+"""Search for a path: an evolution strategy optimises its via points.
 
-A path is a chain of legs (`legs`) over m via points, the last to the target. For x, the 3 m
-coordinates of the via points, its cost J (`clearance`) says how good it is; MA-ES (H.-G. Beyer, B.
-Sendhoff, "Simplify your covariance matrix adaptation evolution strategy", IEEE Trans. Evolutionary
-Computation 21(5), 2017) minimises that, with its own constants and without derivatives:
+A path is a chain of legs (`legs`) over m via points to the target. MA-ES (H.-G. Beyer, B. Sendhoff,
+"Simplify your covariance matrix adaptation evolution strategy", IEEE Trans. Evolutionary
+Computation 21(5), 2017) minimises its cost J (`path_evaluation`) over x, the 3 m coordinates of the
+via points, with its default constants and without derivatives:
 
     z_k ~ N(0, I),  d_k = M z_k,  x_k = y + sigma d_k,  k = 1 .. lambda, sorted by cost
     y     <- y + sigma sum_k w_k d_k                                   k = 1 .. mu = lambda / 2
@@ -11,12 +11,12 @@ Computation 21(5), 2017) minimises that, with its own constants and without deri
     M     <- M (I + c_1 / 2 (s s' - I) + c_w / 2 (sum_k w_k z_k z_k' - I))
     sigma <- sigma exp(c_s / 2 (|s| / E|N(0, I)| - 1))
 
-It finds the narrow ways that points strewn beforehand miss, since every path that was tried, also
-one that touches something, says where better ones lie. The draws z depend on the start's number
-alone: the same question has the same answer.
+It finds narrow passages that random samples miss, because every candidate, even one that touches an
+obstacle, shows the direction of better ones. The draws z depend only on the number of the start, so
+the same problem has the same solution.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -27,54 +27,51 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
-from needle_controller.planning.clearance import Assessment, assess
-from needle_controller.planning.path_settings import Question
+from needle_controller.planning.path_evaluation import PathEvaluation, PathProblem, evaluate_path
 from needle_core.compiled import compiled
 
 MOST_VIA_POINTS = 3
 _Indices = npt.NDArray[np.int64]
 QUICK_STARTS, THOROUGH_STARTS = 3, 250
-"""Starts of the search on the way, and before insertion where those find nothing: about 10 ms and 2
-s of one core."""
+"""Starts of the search at every step (about 10 ms), and before insertion if those fail (2 s)."""
 _PATHS = 10
 """lambda, paths of a generation, of a quick start; the others have twice as many, which find more
 per start (A. Auger, N. Hansen, "A restart CMA evolution strategy with increasing population size",
 2005)."""
 _GENERATIONS = 60
 _SPREAD, _LEAST_SPREAD = 0.004, 1e-5
-"""sigma at the start, and below which via points no longer matter [m]."""
+"""sigma at the start, and at which the search ends [m]."""
 _SHORTEST_LEG = 0.01
-"""To a via point [m]: the bevel's half turn takes 6 mm, and nearer points are aimed at badly."""
+"""Least length of a leg to a via point [m]: half a turn of the bevel takes 6 mm."""
 _WIDTH = 0.03
-"""Of the tube around the straight way in which searches start [m]: the widest obstacle's and more.
-"""
+"""Width of the tube around the straight line in which searches start [m]."""
 _PLACES = 1.1127756842787055 ** -np.arange(1.0, 2 * MOST_VIA_POINTS + 1)
 """Steps of the R sequence in 6 dimensions (M. Roberts 2018), of which g^7 = g + 1."""
 
 
-def first_guess(tip: Array, target: Array, number: int) -> tuple[Array, Array]:
-    """Return where one start of the search begins, and its draws.
+def initial_legs(tip: Array, target: Array, number: int) -> tuple[Array, Array]:
+    """Return the initial via points of one start of the search, and its draws.
 
     Parameters
     ----------
     tip, target : ndarray, shape (3,)
-        Where from and where to [m].
+        Beginning and end of the path [m].
     number : int
-        Of the start, from 0 on.
+        Number of the start, from 0 on.
 
     Returns
     -------
     legs : ndarray, shape (m + 1, 4)
-        What each is steered towards, and inf. The via points divide the straight way evenly and lie
-        aside of it [m].
+        Aim of each leg, and inf. The via points divide the straight line evenly and lie beside it
+        [m].
     draws : ndarray, shape (generations, lambda, 3 m)
-        See `improve`.
+        See `optimize_legs`.
     """
     count = 1 + number % MOST_VIA_POINTS
     share = np.arange(1.0, count + 1.0)[:, np.newaxis] / (count + 1.0)
     points = tip + share * (target - tip)
-    aside = np.mod(0.5 + number * _PLACES[: 2 * count], 1.0) - 0.5
-    points[:, :2] += 4.0 * share * (1.0 - share) * _WIDTH * aside.reshape(-1, 2)
+    offsets = np.mod(0.5 + number * _PLACES[: 2 * count], 1.0) - 0.5
+    points[:, :2] += 4.0 * share * (1.0 - share) * _WIDTH * offsets.reshape(-1, 2)
     legs = np.full((count + 1, 4), math.inf)
     legs[:count, :3], legs[count, :3] = points, target
     paths = _PATHS if number < QUICK_STARTS else 2 * _PATHS
@@ -83,18 +80,17 @@ def first_guess(tip: Array, target: Array, number: int) -> tuple[Array, Array]:
 
 
 @compiled
-def improve(legs: Array, question: Question, draws: Array) -> Assessment:
-    """Move via points until their path is good; return what is to be said of it.
+def optimize_legs(legs: Array, problem: PathProblem, draws: Array) -> PathEvaluation:
+    """Optimise the via points of a path; return its evaluation.
 
     Parameters
     ----------
-    legs : ndarray, shape (m + 1, 4)
-        Of each leg what it is steered towards, and its length [m]; the via points are the best
-        that were found, and the lengths those of their path: written.
-    question : Question
-        What is wanted of the path.
+    legs : ndarray, shape (m + 1, 4), changed
+        Aim and length of each leg [m], which become those of the best path found.
+    problem : PathProblem
+        Task of the path.
     draws : ndarray, shape (generations, lambda, 3 m)
-        z: normal numbers.
+        z: standard normal numbers.
     """
     generations, paths, size = draws.shape
     rates = _rates(size, paths // 2)
@@ -102,20 +98,20 @@ def improve(legs: Array, question: Question, draws: Array) -> Assessment:
     for i in range(size):
         mean[i] = legs[i // 3, i % 3]
     d, costs, order = np.empty((paths, size)), np.empty(paths), np.empty(paths, np.int64)
-    tried = legs.copy()
-    best = assess(legs, question, _SHORTEST_LEG)
+    candidate = legs.copy()
+    best = evaluate_path(legs, problem, _SHORTEST_LEG)
     for generation in range(generations):
         z = draws[generation]
         for k in range(paths):
             _multiply(matrix, z[k], d[k])
             for i in range(size):
-                tried[i // 3, i % 3] = mean[i] + sigma * d[k, i]
-            tried[:, 3] = math.inf
-            assessed = assess(tried, question, _SHORTEST_LEG)
+                candidate[i // 3, i % 3] = mean[i] + sigma * d[k, i]
+            candidate[:, 3] = math.inf
+            assessed = evaluate_path(candidate, problem, _SHORTEST_LEG)
             costs[k] = assessed.cost
             if assessed.cost < best.cost:
                 best = assessed
-                legs[:] = tried
+                legs[:] = candidate
             place = k
             while place > 0 and costs[order[place - 1]] > costs[k]:
                 order[place] = order[place - 1]
@@ -166,7 +162,7 @@ def _adapt(
     path: Array,
     matrix: Array,
 ) -> float:
-    """Update y, s and M, of the best paths of a generation; return the factor of sigma."""
+    """Update y, s and M from the best paths of a generation; return the factor of sigma."""
     size, c_s, c_1, c_w = path.size, rates.c_s, rates.c_1, rates.c_w
     gain, squared = math.sqrt(rates.effective * c_s * (2.0 - c_s)), 0.0
     for i in range(size):
@@ -175,7 +171,7 @@ def _adapt(
             mean[i] += sigma * rates.weights[k] * d[order[k], i]
             path[i] += gain * rates.weights[k] * z[order[k], i]
         squared += path[i] * path[i]
-    # M times the bracket: M s is made first, M z is d.
+    # M times the bracket: M s is computed first, M z is d.
     turned = np.empty(size)
     _multiply(matrix, path, turned)
     for i in range(size):
@@ -189,7 +185,7 @@ def _adapt(
 
 @compiled
 def _multiply(matrix: Array, vector: Array, product: Array) -> None:
-    """Write a product, without BLAS: its sums' order is not the same everywhere."""
+    """Compute a product without BLAS, whose order of summation differs between machines."""
     for i in range(vector.size):
         product[i] = 0.0
         for j in range(vector.size):

@@ -1,4 +1,4 @@
-"""An estimator of another package: tried when it is loaded, and never believed unseen."""
+"""Estimators of other packages, tried when they are loaded and checked at every step."""
 
 from __future__ import annotations
 
@@ -13,29 +13,36 @@ from needle_controller.observers.estimator import Estimate
 from needle_controller.presets.own_parts import OwnPart, own_part
 from needle_controller.presets.steering_settings import SteeringSettings
 
-_TRIED_STEPS, _STEP = 20, 0.001
-_NEAR = 0.005
-"""Farther from an exact tip than this, after all these steps, is no estimate [m]."""
+_TRIAL_STEPS, _STEP = 20, 0.001
+_LARGEST_ERROR = 0.005
+"""Largest distance from an exact tip at the end of the trial [m]."""
 _FRAME_TOLERANCE = 1e-4
+_CHECKS = (
+    ("coordinates", (6,), "numbers x, y, z [m], yaw, pitch, roll [rad]"),
+    ("linearized", (3,), "numbers s1, s2, s3 of (6)"),
+    ("curvature", (), "curvature [1/m]"),
+    ("covariance", (6, 6), "the covariance of the coordinates, in their order"),
+)
+"""Attributes of an estimate, their shapes, and their descriptions."""
 
 
 class OwnEstimator:
-    """An own estimator as the rest knows one; see `estimator.Estimator`.
+    """An estimator of another package as an `estimator.Estimator`.
 
-    What it raises, and what it says that cannot be, is an `OwnPartError` that names it.
+    Exceptions and invalid estimates become an `OwnPartError` that names the package.
 
     Parameters
     ----------
     part : OwnPart
-        Which.
+        The estimator.
     settings : SteeringSettings
         Of the controller.
     initial_rotation : array_like, shape (3, 3)
-        Orientation of a needle at its entry with the base's rotation at 0, in `target_plane`.
+        Orientation at the entry with the base's rotation at 0, in `target_plane`.
     entry : array_like, shape (3,), optional
-        Where it enters, in `target_plane` [m]; not known if none is given.
+        Entry point in `target_plane` [m]; None if it is not known.
     rng : numpy.random.Generator
-        All chance that the estimator may use.
+        Source of all randomness of the estimator.
     """
 
     def __init__(
@@ -47,84 +54,73 @@ class OwnEstimator:
         rng: np.random.Generator,
     ) -> None:
         self._part = part
-        turn = np.array(initial_rotation, dtype=float)
         place = None if entry is None else np.array(entry, dtype=float)
-        with part.blamed(f"{part.made_by.__name__}(settings, initial_rotation, entry, rng)"):
-            self._own = part.made_by(settings, turn, place, rng)
+        self._own = part.make(settings, np.array(initial_rotation, dtype=float), place, rng)
 
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
         """Start over at a first measurement; see `Estimator.reset`."""
-        with self._part.blamed("reset"):
+        with self._part.errors_in("reset"):
             self._own.reset(np.array(tip, dtype=float), np.array(joints, dtype=float))
 
     def advance(self, d_insertion: float, d_rotation: float) -> None:
-        """Move on by what really happened; see `Estimator.advance`."""
-        with self._part.blamed("advance"):
+        """Advance by the actual motion; see `Estimator.advance`."""
+        with self._part.errors_in("advance"):
             self._own.advance(float(d_insertion), float(d_rotation))
 
     def correct(
         self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: float = 0.0
     ) -> None:
-        """Take a measurement; see `Estimator.correct`."""
-        known = None if covariance is None else np.array(covariance, dtype=float)
-        with self._part.blamed("correct"):
-            self._own.correct(np.array(tip, dtype=float), known, float(age))
+        """Correct by a measured tip; see `Estimator.correct`."""
+        matrix = None if covariance is None else np.array(covariance, dtype=float)
+        with self._part.errors_in("correct"):
+            self._own.correct(np.array(tip, dtype=float), matrix, float(age))
 
     def estimate(self) -> Estimate:
-        """Return what is known now; see `Estimator.estimate`."""
+        """Return the present estimate; see `Estimator.estimate`."""
         part = self._part
-        with part.blamed("estimate"):
-            said = self._own.estimate()
-        if not isinstance(said, Estimate):
+        with part.errors_in("estimate"):
+            estimate = self._own.estimate()
+        if not isinstance(estimate, Estimate):
             raise part.error(
-                f"estimate() returned {type(said).__name__}, wants an Estimate "
+                f"estimate() returned {type(estimate).__name__}, wants an Estimate "
                 "(needle_controller.observers.estimator.pose_estimate makes one)"
             )
-        checked = part.checked
-        checked(
-            "estimate().coordinates",
-            said.coordinates,
-            (6,),
-            "numbers x, y, z [m], yaw, pitch, roll [rad]",
-        )
-        checked("estimate().linearized", said.linearized, (3,), "numbers s1, s2, s3 of (6)")
-        checked("estimate().curvature", said.curvature, (), "curvature [1/m]")
-        meaning = "the covariance of the coordinates, in their order"
-        checked("estimate().covariance", said.covariance, (6, 6), meaning)
-        return said
+        for name, shape, meaning in _CHECKS:
+            part.checked(f"estimate().{name}", getattr(estimate, name), shape, meaning)
+        return estimate
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
-        """Express everything in another target plane; see `Estimator.change_frame`."""
-        with self._part.blamed("change_frame"):
+        """Transform everything into another target plane; see `Estimator.change_frame`."""
+        with self._part.errors_in("change_frame"):
             self._own.change_frame(np.array(T_new_old, dtype=float))
 
 
 @cache
 def tried_estimator(name: str) -> OwnPart:
-    """Return an own estimator's class that has followed a needle.
+    """Return the class of an estimator of another package, after a trial with one needle.
 
     Raises
     ------
     OwnPartError
-        As of `own_part`; also where it raises, says what no estimate can be, loses a needle whose
-        tips are exact, does not bear a tip that was not found, or moves wrongly with the plane.
+        As of `own_part`; also if the estimator raises, returns an invalid estimate, loses a needle
+        whose tips are exact, fails at a missing tip, or transforms wrongly with the plane.
     """
     part = own_part("estimator", name)
     settings = SteeringSettings()
     rng = np.random.default_rng(0)
     estimator = OwnEstimator(part, settings, np.eye(3), np.zeros(3), rng)
-    known = np.eye(3) * settings.measurement_std**2
+    covariance = np.eye(3) * settings.measurement_std**2
     estimator.reset(np.zeros(3), np.zeros(2))
     tip: Array = np.zeros(3)
-    for k in range(1, _TRIED_STEPS + 1):
+    for k in range(1, _TRIAL_STEPS + 1):
         tip = arc(k * _STEP, 0.0, settings.curvature).shift
         estimator.advance(_STEP, 0.0)
-        estimator.correct(tip, None if k % 2 else known, 0.0)
+        estimator.correct(tip, None if k % 2 else covariance, 0.0)
         estimator.estimate()
-    off = float(np.linalg.norm(estimator.estimate().position - tip))
-    if off > _NEAR:
+    error = float(np.linalg.norm(estimator.estimate().position - tip))
+    if error > _LARGEST_ERROR:
         raise part.error(
-            f"after {_TRIED_STEPS} exact tips, 1 mm apart, its position is {off:.3g} m "
+            f"after {_TRIAL_STEPS} exact tips, 1 mm apart, its position is {error:.3g} m "
             "off; it is wanted in m, in the target plane, z along the insertion"
         )
     estimator.advance(_STEP, 0.0)

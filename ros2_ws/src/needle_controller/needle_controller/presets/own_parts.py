@@ -1,7 +1,7 @@
 """Estimators, laws and planners of other packages, found by their entry points.
 
 A package offers one in its pyproject.toml, and plane_controller, `monte_carlo`, `rerun` and
-`simulate` take it by name:
+`simulate` select it by name:
 
     [project.entry-points."needle_controller.estimators"]
     particle_filter = "particle_filter:ParticleFilter"
@@ -30,8 +30,8 @@ GROUPS = {
     "law": "needle_controller.laws",
     "planner": "needle_controller.planners",
 }
-"""What can be an own one, and the group of entry points that offers it."""
-METHODS: Mapping[str, Mapping[str, str]] = {
+"""Kinds of parts, and the group of entry points of each."""
+_METHODS: Mapping[str, Mapping[str, str]] = {
     "estimator": {
         "reset": "(tip, joints)",
         "advance": "(d_insertion, d_rotation)",
@@ -42,17 +42,17 @@ METHODS: Mapping[str, Mapping[str, str]] = {
     "law": {"to_plane": "(estimate, insertion)"},
     "planner": {"via_points": "(tip, target, obstacles)"},
 }
-"""What each must have, and with what it is called; a law may have `to_point`, too."""
-MADE_WITH = {
+"""Required methods and their arguments; a law may also have `to_point`."""
+_CONSTRUCTORS = {
     "estimator": "(settings, initial_rotation, entry, rng)",
     "law": "(settings)",
     "planner": "(settings)",
 }
-PAGE = "docs/own_controllers.md"
+_PAGE = "docs/own_controllers.md"
 
 
 class OwnPartError(UserError):
-    """An own estimator, law or planner that is not there, or not what it must be."""
+    """An error of an estimator, law or planner of another package."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,57 +64,62 @@ class OwnPart:
     kind : str
         One of `GROUPS`.
     name : str
-        By which it was asked for.
+        Name of its entry point.
     origin : str
-        Package, version and place of the class.
-    made_by : type
+        Package, version and location of the class.
+    cls : type
         The class.
     """
 
     kind: str
     name: str
     origin: str
-    made_by: type[Any]
+    cls: type[Any]
 
-    def error(self, what: str) -> OwnPartError:
-        """Return an error that says whose it is."""
-        return OwnPartError(f"{self.kind} {self.name!r} ({self.origin}): {what} ({PAGE})")
+    def make(self, *arguments: Any) -> Any:
+        """Return an instance."""
+        with self.errors_in(f"{self.cls.__name__}{_CONSTRUCTORS[self.kind]}"):
+            return self.cls(*arguments)
+
+    def error(self, text: str) -> OwnPartError:
+        """Return an error that names the part and its origin."""
+        return OwnPartError(f"{self.kind} {self.name!r} ({self.origin}): {text} ({_PAGE})")
 
     @contextmanager
-    def blamed(self, call: str) -> Iterator[None]:
-        """Turn whatever the package raises in a call into an `OwnPartError` that names it."""
+    def errors_in(self, call: str) -> Iterator[None]:
+        """Convert exceptions of the package in a call into `OwnPartError`."""
         try:
             yield
         except OwnPartError:
             raise
         except Exception as error:
             frames = traceback.extract_tb(error.__traceback__)
-            # The deepest line of the author's own says more than one of a library below.
-            file = getattr(sys.modules.get(self.made_by.__module__), "__file__", None)
+            # The deepest line of the author's own code is more useful than one of a library.
+            file = getattr(sys.modules.get(self.cls.__module__), "__file__", None)
             frame = [one for one in frames if one.filename == file][-1:] or frames[-1:]
             where = f"{Path(frame[0].filename).name}:{frame[0].lineno}"
             words = " ".join(f"{type(error).__name__}: {error}".split())
-            given = METHODS[self.kind].get(call, "")
-            raise self.error(f"{call}{given} raised {words} at {where}") from error
+            arguments = _METHODS[self.kind].get(call, "")
+            raise self.error(f"{call}{arguments} raised {words} at {where}") from error
 
     def checked(self, what: str, values: Any, shape: tuple[int, ...], meaning: str) -> Array:
-        """Return what it gave as an array.
+        """Return a result of the part as an array.
 
         Parameters
         ----------
         what : str
-            What it is, as the package's author calls it.
+            Name of the result.
         values : array_like
-            What was given.
+            The result.
         shape : tuple of int
-            What it must have.
+            Required shape.
         meaning : str
-            What is wanted, with units.
+            Description with units.
 
         Raises
         ------
         OwnPartError
-            Another shape, no numbers, or a number that is not finite.
+            Another shape, values that are not numbers, or a number that is not finite.
         """
         try:
             array = np.asarray(values, dtype=float)
@@ -130,28 +135,28 @@ class OwnPart:
 
 
 def check_is_offered(kind: str, name: str) -> EntryPoint:
-    """Return the one entry point that offers an own part; nothing of it is loaded.
+    """Return the entry point of a part, without loading it.
 
     Parameters
     ----------
     kind : str
         One of `GROUPS`.
     name : str
-        Its name.
+        Name of the entry point.
 
     Raises
     ------
     OwnPartError
-        None offers it, or several packages do.
+        No package offers it, or several do.
     """
     offered = sorted(entry_points(group=GROUPS[kind]), key=lambda one: one.name)
-    # A package that is on the path twice is one.
+    # A package may be on the path twice.
     found = {(one.value, _package(one)): one for one in offered if one.name == name}
     if not found:
         names = ", ".join(dict.fromkeys(f"{one.name} ({_package(one)})" for one in offered))
         raise OwnPartError(
             f"{kind} = {name!r}: no installed package offers it; offered: {names or 'none'}. One "
-            f"is offered by an entry point of group {GROUPS[kind]!r}: {PAGE}"
+            f"is offered by an entry point of group {GROUPS[kind]!r}: {_PAGE}"
         )
     if len(found) > 1:
         packages = ", ".join(package for _, package in found)
@@ -160,23 +165,27 @@ def check_is_offered(kind: str, name: str) -> EntryPoint:
 
 
 def own_part(kind: str, name: str) -> OwnPart:
-    """Return an own part, loaded, that has the methods of its kind.
+    """Return a loaded part that has the methods of its kind.
 
-    Parameters, and what is raised, as of `check_is_offered`; also for a module that cannot be
-    imported, what is not a class, and a method that is missing.
+    The parameters are those of `check_is_offered`, which raises, too.
+
+    Raises
+    ------
+    OwnPartError
+        A module that cannot be imported, an object that is no class, or a missing method.
     """
     entry = check_is_offered(kind, name)
     origin = f"{_package(entry)}, {entry.value}"
     part = OwnPart(kind, name, origin, object)
-    with part.blamed("loading it"):
+    with part.errors_in("loading it"):
         loaded = entry.load()
     if not inspect.isclass(loaded):
         raise part.error(
             f"{entry.value} is a {type(loaded).__name__}, wants a class that is made with "
-            f"{MADE_WITH[kind]}"
+            f"{_CONSTRUCTORS[kind]}"
         )
-    wanted = METHODS[kind]
-    missing = [f"{m}{wanted[m]}" for m in wanted if not callable(getattr(loaded, m, None))]
+    methods = _METHODS[kind]
+    missing = [f"{m}{methods[m]}" for m in methods if not callable(getattr(loaded, m, None))]
     if missing:
         raise part.error(f"{loaded.__name__} lacks {', '.join(missing)}")
     return OwnPart(kind, name, origin, cast("type[Any]", loaded))

@@ -1,8 +1,10 @@
-"""Steering to a point past obstacles: the law for points, led along a planned path."""
+"""Steering to a point along a planned path, by the planner here or that of another package."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from functools import cache
 
 import numpy as np
 
@@ -11,17 +13,90 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import PITCH, YAW, X
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate
-from needle_controller.planning.entry import NoPath, entry_state, first_path
+from needle_controller.planning.entry import entry_state, first_path
 from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
-from needle_controller.planning.path_settings import PathSettings
-from needle_controller.presets.own_planner import OwnPlanner, Route, tried_planner
+from needle_controller.presets.own_parts import OwnPart, own_part
 from needle_controller.presets.point_steering import prompt_point_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
+_VIA_POINTS = "via points x, y, z in rig [m], the target last"
+_TARGET_TOLERANCE = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class Route:
+    """Beginning of a planned path.
+
+    Attributes
+    ----------
+    aim : ndarray, shape (3,)
+        Point in `rig` towards which the needle is steered first [m].
+    length : float or None
+        Length of the whole path [m]; None if `aim` is the target.
+    """
+
+    aim: Array
+    length: float | None
+
+
+class OwnPlanner:
+    """A planner of another package, whose via points are checked at every step.
+
+    Parameters
+    ----------
+    part : OwnPart
+        The planner.
+    settings : SteeringSettings
+        Of the controller.
+    """
+
+    def __init__(self, part: OwnPart, settings: SteeringSettings) -> None:
+        self.part = part
+        self._planner = part.make(settings)
+
+    def route(self, tip: TipState, target: Array, obstacles: Obstacles) -> Route | None:
+        """Return the route from a tip to a target; None if the planner finds none.
+
+        Raises
+        ------
+        OwnPartError
+            An exception of the planner, or points that are invalid or do not end at the target.
+        """
+        part = self.part
+        with part.errors_in("via_points"):
+            result = self._planner.via_points(tip, target.copy(), obstacles.table.copy())
+        if result is None:
+            return None
+        count = len(result) if np.ndim(result) == 2 else 1
+        points = part.checked("via_points()", result, (count, 3), _VIA_POINTS)
+        if count < 1 or float(np.linalg.norm(points[-1] - target)) > _TARGET_TOLERANCE:
+            raise part.error(f"via_points() does not end at the target {target.tolist()} m")
+        if count == 1:
+            return Route(target, None)
+        legs = np.diff(np.vstack([tip.position, points]), axis=0)
+        return Route(points[0], float(np.sum(np.linalg.norm(legs, axis=1))))
+
+
+@cache
+def tried_planner(name: str) -> OwnPart:
+    """Return the class of a planner of another package, after a trial with a straight path.
+
+    Raises
+    ------
+    OwnPartError
+        As of `own_part`; also if the planner raises, or returns an invalid route.
+    """
+    part = own_part("planner", name)
+    settings = SteeringSettings()
+    tip = entry_state(settings.curvature)
+    OwnPlanner(part, settings).route(tip, np.array([0.0, 0.0, 0.08]), Obstacles([]))
+    return part
+
 
 def path_planner(settings: SteeringSettings) -> PathPlanner:
-    """Return the planner of a rig's needle."""
+    """Return the planner for a rig's needle."""
     return PathPlanner(
         PathSettings(
             max_rotation_per_length=settings.max_rotation_per_length,
@@ -35,30 +110,21 @@ def path_planner(settings: SteeringSettings) -> PathPlanner:
 def configured_obstacles(settings: SteeringSettings) -> Obstacles:
     """Return the obstacles of the settings; raises UserError as `Obstacles` does."""
     rows = np.reshape(settings.obstacles, (-1, 7))
-    return Obstacles(
-        [
-            Obstacle(
-                (float(row[0]), float(row[1]), float(row[2])),
-                (float(row[3]), float(row[4]), float(row[5])),
-                float(row[6]),
-            )
-            for row in rows
-        ]
-    )
+    return Obstacles([Obstacle(row[:3], row[3:6], row[6]) for row in rows])
 
 
 class PathSteering:
-    """Leads one needle past obstacles, by our planner or that of another package.
+    """Steers one needle past obstacles.
 
     Parameters
     ----------
     settings : SteeringSettings
-        The rig's.
+        Of the rig.
 
     Attributes
     ----------
     path : NeedlePath or None
-        What is followed; None by another package's planner, which plans every step anew.
+        Present path; None with another package's planner, which plans again at every step.
     """
 
     def __init__(self, settings: SteeringSettings) -> None:
@@ -70,30 +136,32 @@ class PathSteering:
         self._law = prompt_point_law(settings)
         self.path: NeedlePath | None = None
 
-    def why_not(self, target: Array, obstacles: Obstacles, rotation: float) -> str:
-        """Return why a needle that is out cannot be led to a target, empty if it can.
-
-        The path that is found is the first to be followed.
+    def find_first(self, target: Array, obstacles: Obstacles, rotation: float) -> str:
+        """Find the first path of a needle that is out; return why there is none, empty if found.
 
         Parameters
         ----------
         target : ndarray, shape (3,)
             In `rig` [m].
         obstacles : Obstacles
-            What it must not touch.
+            Obstacles to avoid.
         rotation : float
-            Of the base [rad].
+            Rotation of the base [rad].
         """
         settings = self._settings
         entry = entry_state(
             settings.curvature, rotation=rotation, heading_std=settings.entry_angle_std
         )
         if self._own is not None:
-            route = self._own.route(entry, target, obstacles)
-            return "" if route is not None else self._own.why_not(obstacles)
+            if self._own.route(entry, target, obstacles) is not None:
+                return ""
+            return (
+                f"planner {self._own.part.name} finds no path to the target point past "
+                f"{len(obstacles)} obstacles"
+            )
         found = first_path(self._planner, entry, target, obstacles)
-        self.path = None if isinstance(found, NoPath) else found
-        return found.why if isinstance(found, NoPath) else ""
+        self.path = None if isinstance(found, str) else found
+        return found if isinstance(found, str) else ""
 
     def command(
         self,
@@ -103,20 +171,20 @@ class PathSteering:
         obstacles: Obstacles,
         insertion: float,
     ) -> SteeringCommand | None:
-        """Return the command for the next step, None where no way on is clear.
+        """Return the command for the next step; None if no path is clear.
 
         Parameters
         ----------
         estimate : Estimate
             In `plane`.
         plane : TargetPlane
-            Its frame.
+            Frame of the estimate.
         target : ndarray, shape (3,)
             In `rig` [m].
         obstacles : Obstacles
-            What the needle must not touch.
+            Obstacles to avoid.
         insertion : float
-            That the estimate is of [m].
+            Present insertion [m].
         """
         route = self.route(tip_state(estimate, plane), target, obstacles, insertion)
         if route is None:
@@ -129,11 +197,11 @@ class PathSteering:
     def route(
         self, tip: TipState, target: Array, obstacles: Obstacles, insertion: float
     ) -> Route | None:
-        """Return the way to go on from a tip, None where none is clear; see `command`."""
+        """Return the route from a tip; None if no path is clear; see `command`."""
         if self._own is not None:
             return self._own.route(tip, target, obstacles)
         path = self.path = self._planner.path(
-            tip, target, obstacles, insertion=insertion, followed=self.path
+            tip, target, obstacles, insertion=insertion, previous=self.path
         )
         if path is None:
             return None
@@ -141,7 +209,7 @@ class PathSteering:
 
 
 def tip_state(estimate: Estimate, plane: TargetPlane) -> TipState:
-    """Return the tip that an estimate in a plane's frame is of, in `rig`."""
+    """Return the tip of an estimate in a plane's frame, in `rig`."""
     turn, shift = plane.T_rig_plane[:3, :3], plane.T_rig_plane[:3, 3]
     variance = np.maximum(np.diagonal(estimate.covariance), 0.0)
     across, heading = max(variance[X], variance[X + 1]), max(variance[PITCH], variance[YAW])

@@ -1,4 +1,4 @@
-"""The controllers a rig can be run with: an estimator and a law for each preset."""
+"""Controllers of a rig: an estimator and a law for each preset."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from needle_controller.presets.steering_settings import SteeringSettings
 
 
 def make_law(settings: SteeringSettings, gains: Gains) -> LinearizingLaw | OpenLoopLaw:
-    """Return the law of preset `paper`, (7) and (10) with these gains, or of `open_loop`."""
+    """Return the law of preset `paper`, (7) and (10) with these gains, or that of `open_loop`."""
     if settings.preset == "open_loop":
         return OpenLoopLaw()
     return LinearizingLaw(
@@ -33,7 +33,7 @@ def make_law(settings: SteeringSettings, gains: Gains) -> LinearizingLaw | OpenL
 
 
 def filter_settings(settings: SteeringSettings) -> FilterSettings:
-    """Return what the filter of preset `best` assumes."""
+    """Return the filter settings of preset `best`."""
     return FilterSettings(
         curvature=settings.curvature,
         tip_noise_bound=settings.tip_noise_bound,
@@ -43,7 +43,7 @@ def filter_settings(settings: SteeringSettings) -> FilterSettings:
 
 
 def observer_settings(settings: SteeringSettings, gains: Gains) -> LuenbergerSettings:
-    """Return what the observer of presets `paper` and `open_loop` assumes."""
+    """Return the observer settings of presets `paper` and `open_loop`."""
     return LuenbergerSettings(
         curvature=settings.curvature,
         observer_poles=gains.observer_poles,
@@ -57,7 +57,7 @@ def observer_settings(settings: SteeringSettings, gains: Gains) -> LuenbergerSet
 
 
 def roll_law(settings: SteeringSettings) -> StepLaw:
-    """Return the law of preset `best`; without flips it bends to whatever side is nearer."""
+    """Return the law of preset `best`; without flips the needle bends to the nearer side."""
     law, plan = RollLaw(RollLawSettings(**settings.turning)), FlipPlan(settings.flip_depths)
     if not plan.depths:
         return lambda estimate, _: law(estimate)
@@ -71,25 +71,23 @@ def make_controller(
     *,
     number: int = 0,
 ) -> tuple[Estimator, StepLaw]:
-    """Return estimator and law of one needle.
-
-    They are a preset's, or those of another package where the settings name one.
+    """Return estimator and law of one needle: of the preset, or of another package if selected.
 
     Parameters
     ----------
     settings : SteeringSettings
-        The preset and its numbers.
+        Preset and parameters.
     initial_rotation : array_like, shape (3, 3)
-        Orientation of a needle at its entry with the base's rotation at 0, in `target_plane`.
+        Orientation at the entry with the base's rotation at 0, in `target_plane`.
     entry : array_like, shape (3,), optional
-        Where it enters, in `target_plane` [m]; not known if none is given.
+        Entry point in `target_plane` [m]; unknown by default.
     number : int
-        Of the needle in a study, which keys the chance of an own estimator beside the seed.
+        Number of the needle in a study, part of the seed of another package's estimator.
 
     Raises
     ------
     OwnPartError
-        An estimator or law of another package that is not what it must be.
+        An invalid estimator or law of another package.
     """
     estimator, law = _of_preset(settings, initial_rotation, entry)
     if settings.estimator:

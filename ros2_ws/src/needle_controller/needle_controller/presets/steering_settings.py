@@ -1,4 +1,4 @@
-"""Settings of steering: the parameters of plane_controller."""
+"""Settings of steering, which are the parameters of plane_controller."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.model.arrays import Array
-from needle_controller.model.gains import Gains, gains_by_diagonals
+from needle_controller.model.gains import Gains, design_gains
 from needle_controller.model.point_reach import check_point
 from needle_controller.model.target_plane import TargetPlane, check_within_reach, offset_plane
 from needle_controller.presets.own_parts import GROUPS, check_is_offered, own_part
@@ -19,38 +19,38 @@ from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter, parameter
 
 ONE_SIDED_PRESETS = ("paper", "open_loop")
-"""Their coordinates end at roll +-90 deg."""
+"""Presets whose coordinates are limited to roll +-90 deg."""
 PRESETS = ("best", *ONE_SIDED_PRESETS)
 POINT_PRESETS = ("best",)
-"""Those that estimate the whole pose, and so can steer to a point."""
+"""Presets that estimate the whole pose, and can steer to a point."""
 INSERTIONS = ("stepwise", "continuous")
 TIP_NOISES = ("bounded", "normal")
 TIP_COVARIANCES = ("configured", "from_tip_pose")
-"""Where a tip's covariance comes from."""
+"""Sources of a tip's covariance."""
 PAPER_NOISE: dict[str, Any] = {
     "tip_covariance": "configured",
     "tip_noise": "bounded",
     "tip_noise_bound": 0.001,
     "measurement_std": 0.001 / math.sqrt(3.0),
 }
-"""Coordinates uniformly off by up to 1 mm, as the simulations of [KC09] have them."""
+"""Uniform errors of the coordinates up to 1 mm, as in the simulations of [KC09]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SteeringSettings:
-    """Settings of estimator, law and step protocol; taken as a whole or refused.
+    """Settings of estimator, law and step protocol.
 
     Raises
     ------
     UserError
-        A value out of its bounds, weights that give no stable gains, or flips with a preset that
-        cannot make them.
+        A value out of its bounds, weights without stable gains, or settings that exclude each
+        other.
     """
 
     preset: str = parameter(
         "best",
-        unit="-",
-        description="best = hypothesis filter and roll law, paper = observer and law of [KC09], "
+        "-",
+        "best = hypothesis filter and roll law, paper = observer and law of [KC09], "
         "open_loop = no rotation.",
         choices=PRESETS,
     )
@@ -68,59 +68,39 @@ class SteeringSettings:
         0, "-", "Of what chance another package's estimator uses; ours use none.", 0, 2**31 - 1
     )
     curvature: float = parameter(
-        1.0 / 0.122,
-        unit="1/m",
-        description="Curvature of the needle's path in the tissue.",
-        lower=0.1,
-        upper=100.0,
+        1.0 / 0.122, "1/m", "Curvature of the needle's path in the tissue.", 0.1, 100.0
     )
     needle_diameter: float = fixed_parameter(
         0.0007, "m", "Diameter of the needle, which is led past obstacles.", 0.2e-3, 3e-3
     )
     goal_tolerance: float = parameter(
-        0.001,
-        unit="m",
-        description="Distance by which a path past obstacles may pass its target point.",
-        lower=0.0,
-        upper=0.01,
+        0.001, "m", "Distance by which a path past obstacles may pass its target point.", 0.0, 0.01
     )
     target_offset: float = parameter(
-        0.0,
-        unit="m",
-        description="x of the wanted plane in rig, until a target_plane is given.",
-        lower=-0.1,
-        upper=0.1,
+        0.0, "m", "x of the wanted plane in rig, until a target_plane is given.", -0.1, 0.1
     )
     target_point: tuple[float, ...] = parameter(
         (),
-        unit="m",
-        description="x, y, z in rig of the point to steer to in place of the plane, until a "
+        "m",
+        "x, y, z in rig of the point to steer to in place of the plane, until a "
         "target_point or target_plane is given; empty = the plane. Not with flip_depths, and with "
         "presets that estimate the whole pose only.",
-        lower=-1.0,
-        upper=1.0,
+        -1.0,
+        1.0,
     )
     obstacles: tuple[float, ...] = parameter(
         (),
-        unit="m",
-        description="What the needle must not touch on its way to a point, until obstacles are "
+        "m",
+        "What the needle must not touch on its way to a point, until obstacles are "
         "given: of each the x, y, z in rig of both ends of its axis, and its radius.",
-        lower=-1.0,
-        upper=1.0,
+        -1.0,
+        1.0,
     )
     depth: float = parameter(
-        0.12,
-        unit="m",
-        description="Insertion at which steering is done; of a point, at the latest.",
-        lower=0.0,
-        upper=1.0,
+        0.12, "m", "Insertion at which steering is done; of a point, at the latest.", 0.0, 1.0
     )
     step_length: float = parameter(
-        0.001,
-        unit="m",
-        description="Insertion of one step; the last one ends at the depth.",
-        lower=1e-4,
-        upper=0.01,
+        0.001, "m", "Insertion of one step; the last one ends at the depth.", 1e-4, 0.01
     )
     insertion: str = fixed_parameter(
         "stepwise",
@@ -131,179 +111,145 @@ class SteeringSettings:
     )
     horizon: float = parameter(
         0.002,
-        unit="m",
-        description="Continuous insertion: how far beyond the newest tip the path leads, and the "
+        "m",
+        "Continuous insertion: how far beyond the newest tip the path leads, and the "
         "needle at most; the device's max_step_length or less.",
-        lower=2e-4,
-        upper=0.005,
+        2e-4,
+        0.005,
     )
-    nominal_speed: float = parameter(
-        0.002,
-        unit="m/s",
-        description="Insertion speed at speed scale 1.",
-        lower=1e-5,
-        upper=0.05,
-    )
+    nominal_speed: float = parameter(0.002, "m/s", "Insertion speed at speed scale 1.", 1e-5, 0.05)
     max_rotation_per_length: float = parameter(
         math.radians(30.0) / 0.001,
-        unit="rad/m",
-        description="Most the base is turned per inserted length.",
-        lower=0.0,
-        upper=1000.0,
+        "rad/m",
+        "Most the base is turned per inserted length.",
+        0.0,
+        1000.0,
     )
     max_winding: float = parameter(
         6.0 * math.pi,
-        unit="rad",
-        description="The roll law keeps rotation_joint within +- this: beyond, it turns the other "
+        "rad",
+        "The roll law keeps rotation_joint within +- this: beyond, it turns the other "
         "way round. (The law of [KC09] never winds up.)",
-        lower=2.0 * math.pi,
-        upper=1000.0,
+        2.0 * math.pi,
+        1000.0,
     )
     rotation_budget: float = parameter(
         1e6,
-        unit="rad",
-        description="Most the base turns, either way, from the first tip to a point: with less it "
+        "rad",
+        "Most the base turns, either way, from the first tip to a point: with less it "
         "turns more seldom, and corrects less. Not past obstacles.",
-        lower=0.0,
-        upper=1e6,
+        0.0,
+        1e6,
     )
     tip_timeout: float = parameter(
-        2.0,
-        unit="s",
-        description="Time without a good tip (steady clock) until WAITING_FOR_TIP.",
-        lower=0.01,
-        upper=60.0,
+        2.0, "s", "Time without a good tip (steady clock) until WAITING_FOR_TIP.", 0.01, 60.0
     )
     tip_covariance: str = parameter(
         "from_tip_pose",
-        unit="-",
-        description="from_tip_pose = a tip has the covariance of the needle/tip_pose with its "
+        "-",
+        "from_tip_pose = a tip has the covariance of the needle/tip_pose with its "
         "stamp plus measurement_std squared, and is refused without one; configured = every tip "
         "has the noise of tip_noise: for a source of needle/tip alone.",
         choices=TIP_COVARIANCES,
     )
     result_timeout: float = parameter(
         10.0,
-        unit="s",
-        description="Time without device/result (steady clock) until FAULT, the device at rest.",
-        lower=0.1,
-        upper=600.0,
+        "s",
+        "Time without device/result (steady clock) until FAULT, the device at rest.",
+        0.1,
+        600.0,
     )
     tip_margin: float = parameter(
-        0.004,
-        unit="m",
-        description="What noise may add to a tip's distance from where the needle can be.",
-        lower=0.0,
-        upper=0.1,
+        0.004, "m", "What noise may add to a tip's distance from where the needle can be.", 0.0, 0.1
     )
     needle_out_insertion: float = parameter(
-        0.002,
-        unit="m",
-        description="Insertion up to which the needle counts as out.",
-        lower=0.0,
-        upper=0.01,
+        0.002, "m", "Insertion up to which the needle counts as out.", 0.0, 0.01
     )
     retraction_tolerance: float = parameter(
-        0.0002,
-        unit="m",
-        description="Backward motion that counts as a retraction.",
-        lower=1e-6,
-        upper=0.01,
+        0.0002, "m", "Backward motion that counts as a retraction.", 1e-6, 0.01
     )
     tip_noise: str = parameter(
         "normal",
-        unit="-",
-        description="Where tip_covariance is configured: a coordinate is off by up to "
+        "-",
+        "Where tip_covariance is configured: a coordinate is off by up to "
         "tip_noise_bound (bounded, used as such by best), or "
         "with standard deviation measurement_std (normal).",
         choices=TIP_NOISES,
     )
     tip_noise_bound: float = parameter(
         0.001,
-        unit="m",
-        description="Largest error of one measured tip coordinate, where tip_noise is bounded.",
-        lower=1e-6,
-        upper=0.1,
+        "m",
+        "Largest error of one measured tip coordinate, where tip_noise is bounded.",
+        1e-6,
+        0.1,
     )
     flip_depths: tuple[float, ...] = parameter(
         (),
-        unit="m",
-        description="Insertions at which the bevel is flipped within the plane, increasing; not "
+        "m",
+        "Insertions at which the bevel is flipped within the plane, increasing; not "
         "with presets paper and open_loop.",
-        lower=0.0,
-        upper=1.0,
+        0.0,
+        1.0,
     )
     state_weights: tuple[float, ...] = parameter(
-        (1.0e6, 280.0, 0.0),
-        unit="1/m^2, -, m^2",
-        description="Cost of s1^2, s2^2, s3^2 per inserted length.",
-        lower=0.0,
+        (1.0e6, 280.0, 0.0), "1/m^2, -, m^2", "Cost of s1^2, s2^2, s3^2 per inserted length.", 0.0
     )
-    input_weight: float = parameter(
-        2.9e-10,
-        unit="m^4",
-        description="Cost of v^2 per inserted length.",
-        lower=0.0,
-    )
+    input_weight: float = parameter(2.9e-10, "m^4", "Cost of v^2 per inserted length.", 0.0)
     process_noise: tuple[float, ...] = parameter(
         (5.0e-7, 0.13, 24.0),
-        unit="m, 1/m, 1/m^3",
-        description="Variance per metre of white noise on the derivatives of s, for the observer.",
-        lower=0.0,
+        "m, 1/m, 1/m^3",
+        "Variance per metre of white noise on the derivatives of s, for the observer.",
+        0.0,
     )
     measurement_std: float = parameter(
         1e-4,
-        unit="m",
-        description="Standard deviation of one measured tip coordinate; with tip_covariance "
+        "m",
+        "Standard deviation of one measured tip coordinate; with tip_covariance "
         "from_tip_pose of what its covariance leaves out.",
-        lower=1e-7,
-        upper=0.1,
+        1e-7,
+        0.1,
     )
     saturation_margin: float = parameter(
-        0.11,
-        unit="-",
-        description="The estimate is kept within s2^2 + (s3/curvature)^2 <= 1 - this.",
-        lower=1e-6,
-        upper=0.9,
+        0.11, "-", "The estimate is kept within s2^2 + (s3/curvature)^2 <= 1 - this.", 1e-6, 0.9
     )
     demand_margin: float = parameter(
         0.26,
-        unit="-",
-        description="The state the law demands is kept within s2^2 + (s3/curvature)^2 <= 1 - this.",
-        lower=1e-6,
-        upper=0.9,
+        "-",
+        "The state the law demands is kept within s2^2 + (s3/curvature)^2 <= 1 - this.",
+        1e-6,
+        0.9,
     )
     entry_angle_std: float = parameter(
         math.radians(8.0),
-        unit="rad",
-        description="How well pitch and yaw at the entry are known, for preset best and for paths.",
-        lower=1e-3,
-        upper=math.pi,
+        "rad",
+        "How well pitch and yaw at the entry are known, for preset best and for paths.",
+        1e-3,
+        math.pi,
     )
     initial_yaw_std: float = parameter(
         math.radians(10.0),
-        unit="rad",
-        description="How well the yaw at the entry is known (covariance only).",
-        lower=0.0,
-        upper=math.pi,
+        "rad",
+        "How well the yaw at the entry is known (covariance only).",
+        0.0,
+        math.pi,
     )
     initial_pitch_std: float = parameter(
         math.radians(10.0),
-        unit="rad",
-        description="How well the pitch at the entry is known (covariance only).",
-        lower=0.0,
-        upper=math.pi,
+        "rad",
+        "How well the pitch at the entry is known (covariance only).",
+        0.0,
+        math.pi,
     )
     initial_roll_std: float = parameter(
         math.radians(30.0),
-        unit="rad",
-        description="How well the roll at the entry is known (covariance only).",
-        lower=0.0,
-        upper=math.pi,
+        "rad",
+        "How well the roll at the entry is known (covariance only).",
+        0.0,
+        math.pi,
     )
 
     def __post_init__(self) -> None:
-        """Check the whole; the gains where the preset has any."""
+        """Check all settings, and the gains of presets that have any."""
         check_fields(self)
         for name in ("state_weights", "process_noise"):
             numbers = getattr(self, name)
@@ -331,49 +277,49 @@ class SteeringSettings:
             self.gains()
 
     def gains(self) -> Gains:
-        """Return the gains the weights give; raises UserError as `gains.design_gains` does."""
-        return gains_by_diagonals(
-            tuple(self.state_weights),
-            self.input_weight,
-            tuple(self.process_noise),
-            self.measurement_std,
-            self.step_length,
+        """Return the gains that follow from the weights; see `design_gains`."""
+        return design_gains(
+            state_weights=self.state_weights,
+            input_weight=self.input_weight,
+            process_noise=self.process_noise,
+            measurement_std=self.measurement_std,
+            step_length=self.step_length,
         )
 
     @property
     def controller(self) -> str:
-        """Name of the controller: the preset, and its parts from other packages."""
+        """Name of the controller: the preset, and parts of other packages."""
         own = [f"{kind} {getattr(self, kind)}" for kind in GROUPS if getattr(self, kind)]
         return f"{self.preset} with {', '.join(own)}" if own else self.preset
 
     @property
     def turning(self) -> dict[str, float]:
-        """Settings common to all laws that turn the bevel, by name."""
+        """Settings common to all laws that turn the bevel."""
         names = ("step_length", "max_rotation_per_length", "max_winding")
         return {name: getattr(self, name) for name in names}
 
     @property
     def has_bounded_noise(self) -> bool:
-        """Whether a bound is claimed of the tips' noise, not a covariance."""
+        """Whether the tips have bounded noise instead of a covariance."""
         return self.tip_covariance == "configured" and self.tip_noise == "bounded"
 
     def configured_covariance(self) -> Array | None:
-        """Return a tip's covariance [m^2], shape (3, 3); None where the noise is bounded."""
+        """Return the configured covariance [m^2], shape (3, 3); None for bounded noise."""
         if self.tip_noise == "bounded":
             return None
         return np.asarray(np.eye(3) * self.measurement_std**2)
 
     def plane(self) -> TargetPlane:
-        """Return the wanted plane, until another one is given."""
+        """Return the configured target plane."""
         return offset_plane(self.target_offset)
 
     def check_point(self, point: npt.ArrayLike) -> None:
-        """Refuse a point, (3,) in `rig` [m], that these settings cannot steer to; UserError."""
+        """Check that a point, (3,) in `rig` [m], can be reached; raises UserError."""
         self.check_steers_to_points()
         check_point(point, self.curvature, self.depth)
 
     def check_steers_to_points(self) -> None:
-        """Refuse points altogether, with a law or a plan that is for planes; UserError."""
+        """Check that preset, law and plan allow target points; raises UserError."""
         if self.law and not self.steers_to_points:
             raise own_part("law", self.law).error(
                 "cannot steer to a point: it lacks to_point(estimate, target)"
@@ -388,11 +334,11 @@ class SteeringSettings:
 
     @property
     def steers_to_points(self) -> bool:
-        """Whether the law is one for points, too."""
+        """Whether the law can steer to points."""
         if self.law:
-            return callable(getattr(own_part("law", self.law).made_by, "to_point", None))
+            return callable(getattr(own_part("law", self.law).cls, "to_point", None))
         return self.preset in POINT_PRESETS
 
     def check_plane(self, plane: TargetPlane) -> None:
-        """Refuse a wanted plane that is out of reach; raises UserError."""
+        """Check that a target plane can be reached; raises UserError."""
         check_within_reach(plane, self.curvature, self.depth)

@@ -1,14 +1,13 @@
-"""Continuous insertion: the path ahead, made anew from every step length, sent anew with every tip.
+"""Continuous insertion: each tip renews a path ahead, which is recomputed every step length.
 
-A path says where the base is turned at each insertion, whatever the speed. Its knots do not depend
-on when it is sent: where a tip was used, and one step length on, by where the turn that the law
-wants is done; from there on the base is not turned before the next tip was used. So the time from
-an exposure to the answer costs no turn, it only bends the way to it.
+A path gives the base's rotation over insertion, whatever the speed. Its points do not depend on
+the time at which it is sent: it begins where a tip was used; one step length on, the rotation that
+the law commands is complete; from there on the base does not turn until the next tip is used. So
+the delay from exposure to command loses no rotation; it only bends the way to it.
 
-A tip is used where the needle has gone in by a step length since the last used one, and at the end
-of the way. Others say that the camera lives and renew the path's stamp: at rest, or slowly, they
-are measurements of one place, whose errors may be one error, so that nothing depends on how many
-there are.
+A tip is used once the needle has advanced by a step length since the last used one, and at the end
+of the path. Other tips show that the camera works and renew the path's stamp. At rest or at low
+speed they measure one place and their errors may be equal, so nothing depends on their number.
 """
 
 from __future__ import annotations
@@ -17,47 +16,48 @@ import math
 
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.next_step import next_step
-from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.steering_types import (
+from needle_controller.protocol.actions import (
     Action,
     Awaiting,
     SendPath,
     SendStep,
     StartReply,
     SteeringState,
+    next_step,
 )
-from needle_controller.protocol.tip_gate import AcceptedTip
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.steering import Steering
+from needle_controller.protocol.tip_checks import AcceptedTip
 from needle_core.component import Log
 from needle_core.status_messages import DeviceStatus
 
-_AS_GOOD_AS_A_STEP = 1.0 - 1e-3
-_AT_END = 1e-5
-"""Insertion short of the end of the way that counts as there [m]: an axis rests beside it."""
-_PIECES = 4
-"""So finely a step length is followed where rotation was not in proportion to insertion."""
+_STEP_SHARE = 1.0 - 1e-3
+"""Share of a step length after which a tip is used."""
+_END_TOLERANCE = 1e-5
+"""Distance from the end of the path at which it counts as reached [m]: an axis rests beside it."""
+_SAMPLES_PER_STEP = 4
+"""Intermediate joint samples per step length, where rotation was not proportional to insertion."""
 
 
 def make_steering(settings: SteeringSettings) -> Steering:
-    """Return the protocol that the settings ask for."""
+    """Return the protocol for stepwise or continuous insertion."""
     continuous = settings.insertion == "continuous"
     return ContinuousSteering(settings) if continuous else Steering(settings)
 
 
 class PathAhead:
-    """Knots of the path from one used tip on.
+    """Path from one used tip on.
 
     Parameters
     ----------
     joints : JointSample
-        At the used tip.
+        Joint positions at the used tip.
     command : SteeringCommand
-        What the law wants.
+        Output of the control law.
     settings : SteeringSettings
         Step length, depth and speed.
     slowly : bool
-        Whether to go at half the speed.
+        Whether to move at half the speed.
     """
 
     def __init__(
@@ -72,20 +72,20 @@ class PathAhead:
         step = next_step(joints.stamp_ns, joints, command, settings, slowly=slowly)
         self.is_done = step is None
         self.start = joints
-        # Where the turn is done; of a needle that is there nothing is left.
+        # End of the rotation; at the target, no motion is left.
         self._knot = step or SendStep(joints.stamp_ns, joints.insertion, joints.rotation, 0.0)
         self.end = settings.depth
         if command.insertion_left is not None:
             self.end = min(self.end, joints.insertion + float(command.insertion_left))
         self._speed = (
-            math.inf if step is None else (step.insertion - joints.insertion) / (step.duration)
+            math.inf if step is None else (step.insertion - joints.insertion) / step.duration
         )
 
     def points(self, insertion: float) -> tuple[tuple[float, float, float], ...]:
-        """Return the path for a needle that is at an insertion [m], as `SendPath` has it."""
+        """Return the points of `SendPath` for a needle at an insertion [m]."""
         start, knot = self.start, self._knot
         end = max(min(insertion + self._settings.horizon, self.end), knot.insertion)
-        # A needle that went back begins where it is: a path never begins ahead of the needle.
+        # A path never begins ahead of the needle, even if the needle went back.
         begin = min(start.insertion, insertion)
         places = [(begin, start.rotation), (knot.insertion, knot.rotation)]
         if end > knot.insertion:
@@ -94,86 +94,83 @@ class PathAhead:
 
 
 class ContinuousSteering(Steering):
-    """The protocol of one needle that goes on while a person holds.
+    """The protocol of one needle that moves as long as a person holds.
 
-    States, and what is refused, are those of stepwise insertion.
+    States and rejections are those of stepwise insertion.
     """
 
-    _goes_on = True
+    _moves_while_awaiting_tip = True
 
     def __init__(self, settings: SteeringSettings) -> None:
         super().__init__(settings)
         self._ahead: PathAhead | None = None
-        # Stamp of the newest path that was on its way when a refusal was heard [ns].
-        self._refusal_known_ns = 0
+        # Stamp of the newest path that had been sent when the last abort arrived [ns].
+        self._abort_known_ns = 0
 
     def on_start(self) -> tuple[StartReply, list[Action]]:
-        """Begin steering, or say why not."""
-        self._refusal_known_ns = 0
+        """Start steering, or reply why it cannot start."""
+        self._abort_known_ns = 0
         reply, actions = super().on_start()
         if not self.control.started:
             self._ahead = None
         return reply, actions
 
     def on_result(self, stamp_ns: int, text: str, sent_ns: int = 0) -> list[Action]:
-        """Take the driver's answer to a path; newer ones may be on their way.
+        """Handle the driver's answer to a path, after which newer paths may have been sent.
 
-        Those that were sent before a refusal was heard say nothing new.
+        Aborts of paths sent before an earlier abort arrived are ignored.
 
         Parameters
         ----------
         stamp_ns : int
-            The command's stamp [ns].
+            Stamp of the command [ns].
         text : str
-            "succeeded", "replaced", or why not.
+            "succeeded", "replaced", or the reason for the abort.
         sent_ns : int
-            When the device sent it; unused.
+            Time at which the device sent the answer; unused.
         """
-        if not self._steering or not self._refusal_known_ns < stamp_ns <= self.command_ns:
+        if not self._steering or not self._abort_known_ns < stamp_ns <= self.command_ns:
             return []
         if text in {"succeeded", "replaced"}:
-            self._failed.forget()
+            self._failures.reset()
             return []
-        self._refusal_known_ns = self.command_ns
-        return self._take_abort("path", "path", text)
-
-    def on_recorded_step(self, stamp_ns: int, end: JointSample) -> None:
-        """Do nothing: a path depends on joints, not on where the one before has led."""
+        self._abort_known_ns = self.command_ns
+        return self._on_abort("path", "path", text)
 
     def on_device(self, status: DeviceStatus) -> list[Action]:
-        """Take the driver's state."""
+        """Handle the driver's status."""
         actions = super().on_device(status)
         if self._steering and self.awaiting is Awaiting.TIP and not status.hold_owner:
             self.awaiting = Awaiting.HOLD
         return actions
 
-    def _go_on_from(self, accepted: AcceptedTip) -> list[Action]:
-        self.patience.restart()
+    def _on_accepted_tip(self, accepted: AcceptedTip) -> list[Action]:
+        self.watchdog.restart()
         actions: list[Action] = []
         tip, joints, ahead = accepted.tip, accepted.joints, self._ahead
         if ahead is None or self._is_due(joints, ahead):
-            way: list[JointSample] = []
+            intermediate: list[JointSample] = []
             if ahead is not None:
-                spacing = self.settings.step_length / _PIECES
-                way = self.intake.joints.between(ahead.start, joints, spacing)
+                spacing = self.settings.step_length / _SAMPLES_PER_STEP
+                intermediate = self.tips.joints.between(ahead.start, joints, spacing)
                 self.step += 1
-            update, actions = self._use(accepted, way)
+            update, actions = self._update_control(accepted, intermediate)
             if update is None:
                 return actions
-            slowly = self.trust.is_doubtful
+            slowly = self.confidence.is_doubtful
             ahead = self._ahead = PathAhead(joints, update.command, self.settings, slowly=slowly)
             if ahead.is_done:
-                return actions + self._end(update, joints)
+                return actions + self._finish(update, joints)
         elif self.state is SteeringState.WAITING_FOR_TIP:
             self.state, self.reason = SteeringState.STEERING, ""
             actions.append(Log("info", "STEERING: a good tip came"))
         return actions + self._send_path(SendPath(tip.stamp_ns, ahead.points(joints.insertion)))
 
     def _is_due(self, joints: JointSample, ahead: PathAhead) -> bool:
-        gone = joints.insertion - ahead.start.insertion
+        advanced = joints.insertion - ahead.start.insertion
         return (
-            gone >= _AS_GOOD_AS_A_STEP * self.settings.step_length
-            or joints.insertion >= ahead.end - _AT_END
+            advanced >= _STEP_SHARE * self.settings.step_length
+            or joints.insertion >= ahead.end - _END_TOLERANCE
         )
 
     def _send_path(self, path: SendPath) -> list[Action]:

@@ -1,4 +1,4 @@
-"""Joint positions at any instant between two samples."""
+"""Recent joint positions, checked for plausibility and interpolated between samples."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 
 CONFIRMED_BY = 5
-"""Samples that follow from one another and not from what is kept; so many are the new truth."""
+"""Consecutive samples, consistent with one another, that replace the history after a jump."""
 LARGEST_GAP_NS = 1_000_000_000
-"""Longest time between two samples of which one follows from the other [ns]."""
-_FASTEST_INSERTION, _FASTEST_ROTATION = 0.05, 30.0  # [m/s], [rad/s]: a hand's, a motor's.
+"""Longest time between two consistent samples [ns]."""
+_MAX_INSERTION_SPEED, _MAX_ROTATION_SPEED = 0.05, 30.0
+"""Of a needle pushed by hand [m/s], and of a motor [rad/s]."""
 _INSERTION_NOISE, _ROTATION_NOISE = 2e-4, 0.1  # [m], [rad]
 _LONGEST_MOTION = 0.04
-"""Joints are believed to have moved unseen for no longer [s]."""
+"""Longest motion that may happen between two samples [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class JointSample:
-    """The base's joints at one instant.
+    """Joint positions of the needle's base at one instant.
 
     Attributes
     ----------
@@ -31,7 +32,7 @@ class JointSample:
     rotation : float
         Rotation of the base [rad], not wrapped.
     sent_ns : int
-        When the device sent it, on its own clock [ns]; 0 where nobody knows.
+        Time at which the device sent the sample, on its own clock [ns]; 0 if unknown.
     """
 
     stamp_ns: int
@@ -39,92 +40,84 @@ class JointSample:
     rotation: float
     sent_ns: int = 0
 
-    def is_at(self, other: JointSample, insertion: float, rotation: float) -> bool:
-        """Return whether the joints are within tolerances [m], [rad] of where they were."""
+    def is_near(self, other: JointSample, insertion: float, rotation: float) -> bool:
+        """Return True if both joints are within tolerances [m], [rad] of another sample."""
         return (
             abs(self.insertion - other.insertion) <= insertion
             and abs(self.rotation - other.rotation) <= rotation
         )
 
 
-class Heard(enum.Enum):
-    """Verdict on a sample."""
+class SampleResult(enum.Enum):
+    """Result of adding a sample."""
 
-    TAKEN = "taken"
+    ACCEPTED = "accepted"
     REPEATED = "repeated"
-    DOUBTED = "doubted"
+    REJECTED = "rejected"
     JUMPED = "jumped"
 
 
 class JointHistory:
-    """The joints of the last seconds.
+    """Joint samples of the last seconds.
 
-    A sample counts if it follows from the one before: newer by at most a second, and no farther
-    than joints move meanwhile. Any other is kept back. A single spike is dropped so; where
-    `CONFIRMED_BY` of them follow from one another, the history starts again with them.
+    A sample is accepted if it is newer than the last one by at most a second and no farther away
+    than the joints can move in that time. Other samples are held back, which drops single spikes;
+    once `CONFIRMED_BY` of them are consistent with one another, the history restarts with them.
 
     Parameters
     ----------
     length : int
-        Samples kept; 1000 are 20 s at 50 Hz.
+        Number of samples kept; 1000 samples are 20 s at 50 Hz.
 
     Attributes
     ----------
-    doubted : int
-        Samples that did not follow from the one before.
-    complaint : str
-        Why the last sample is kept back; empty where it is not.
+    rejected : int
+        Number of samples that were inconsistent with the one before.
+    problem : str
+        Why the last sample is held back; empty if it was accepted.
     """
 
     def __init__(self, length: int = 1000) -> None:
         self._length = length
         self._samples: list[JointSample] = []
-        self._kept_back: list[JointSample] = []
-        self.doubted = 0
-        self.complaint = ""
+        self._held_back: list[JointSample] = []
+        self.rejected = 0
+        self.problem = ""
 
     @property
     def latest(self) -> JointSample | None:
-        """The newest sample, None before the first."""
+        """Newest sample; None before the first."""
         return self._samples[-1] if self._samples else None
 
     @property
     def oldest(self) -> JointSample | None:
-        """The oldest sample kept, None before the first."""
+        """Oldest sample kept; None before the first."""
         return self._samples[0] if self._samples else None
 
-    def add(self, sample: JointSample) -> Heard:
-        """Take a sample, or say what became of it."""
+    def add(self, sample: JointSample) -> SampleResult:
+        """Add a sample if it is consistent with the last one."""
+        if not (math.isfinite(sample.insertion) and math.isfinite(sample.rotation)):
+            return SampleResult.REJECTED
         latest = self.latest
-        finite = math.isfinite(sample.insertion) and math.isfinite(sample.rotation)
-        if latest is None or not finite:
-            if finite:
-                self._samples.append(sample)
-            return Heard.TAKEN if finite else Heard.DOUBTED
+        if latest is None:
+            self._samples.append(sample)
+            return SampleResult.ACCEPTED
         if 0 <= latest.stamp_ns - sample.stamp_ns <= LARGEST_GAP_NS:
-            return Heard.REPEATED
-        if not _follows(latest, sample):
-            return self._doubt(latest, sample)
-        self._kept_back.clear()
-        self.complaint = ""
+            return SampleResult.REPEATED
+        if not _is_consistent(latest, sample):
+            return self._hold_back(latest, sample)
+        self._held_back.clear()
+        self.problem = ""
         self._samples.append(sample)
-        # Dropped in bulk, not at each sample: a list shifts all it holds.
+        # Delete in bulk: deleting the first element of a list shifts all the others.
         if len(self._samples) >= 2 * self._length:
             del self._samples[: self._length]
-        return Heard.TAKEN
+        return SampleResult.ACCEPTED
 
     def at(self, stamp_ns: int) -> JointSample | None:
-        """Return the joints at an instant, linear between samples.
+        """Return the joint positions at an instant [ns], interpolated linearly.
 
-        Parameters
-        ----------
-        stamp_ns : int
-            The instant [ns].
-
-        Returns
-        -------
-        JointSample or None
-            None until samples at or before and at or after the instant have come.
+        Return None unless samples bracket the instant.
         """
         samples = self._samples
         if not samples or not samples[0].stamp_ns <= stamp_ns <= samples[-1].stamp_ns:
@@ -134,22 +127,22 @@ class JointHistory:
         if right.stamp_ns == stamp_ns:
             return right
         left = samples[after - 1]
-        part = (stamp_ns - left.stamp_ns) / (right.stamp_ns - left.stamp_ns)
+        share = (stamp_ns - left.stamp_ns) / (right.stamp_ns - left.stamp_ns)
         return JointSample(
             stamp_ns,
-            left.insertion + part * (right.insertion - left.insertion),
-            left.rotation + part * (right.rotation - left.rotation),
+            left.insertion + share * (right.insertion - left.insertion),
+            left.rotation + share * (right.rotation - left.rotation),
         )
 
     def between(self, start: JointSample, end: JointSample, spacing: float) -> list[JointSample]:
-        """Return samples on the way from one to another, whose insertions are spaced out.
+        """Return the samples between two others whose insertions are at least `spacing` [m] apart.
 
         Parameters
         ----------
         start, end : JointSample
-            Where the way begins and ends.
+            Ends of the motion; they are not returned.
         spacing : float
-            Least insertion from one to the next, and to the end [m].
+            Least insertion from one sample to the next, and to both ends [m].
         """
         kept, last = [], start.insertion
         for sample in self.after(start.stamp_ns):
@@ -165,31 +158,31 @@ class JointHistory:
         first = bisect_right(self._samples, stamp_ns, key=lambda sample: sample.stamp_ns)
         yield from self._samples[first:]
 
-    def _doubt(self, latest: JointSample, sample: JointSample) -> Heard:
-        self.doubted += 1
-        kept_back = self._kept_back
-        if kept_back and not _follows(kept_back[-1], sample):
-            kept_back.clear()
-        kept_back.append(sample)
-        if len(kept_back) >= CONFIRMED_BY:
-            self._samples, self._kept_back = kept_back, []
-            self.complaint = ""
-            return Heard.JUMPED
-        self.complaint = (
+    def _hold_back(self, latest: JointSample, sample: JointSample) -> SampleResult:
+        self.rejected += 1
+        held_back = self._held_back
+        if held_back and not _is_consistent(held_back[-1], sample):
+            held_back.clear()
+        held_back.append(sample)
+        if len(held_back) >= CONFIRMED_BY:
+            self._samples, self._held_back = held_back, []
+            self.problem = ""
+            return SampleResult.JUMPED
+        self.problem = (
             f"joint_states do not follow from the last: {sample.insertion:.4g} m, "
             f"{sample.rotation:.4g} rad after {latest.insertion:.4g} m, {latest.rotation:.4g} rad, "
             f"{(sample.stamp_ns - latest.stamp_ns) * 1e-9:.4g} s later"
         )
-        return Heard.DOUBTED
+        return SampleResult.REJECTED
 
 
-def _follows(before: JointSample, sample: JointSample) -> bool:
+def _is_consistent(before: JointSample, sample: JointSample) -> bool:
     gap_ns = sample.stamp_ns - before.stamp_ns
     if not 0 < gap_ns <= LARGEST_GAP_NS:
         return False
     time = min(gap_ns * 1e-9, _LONGEST_MOTION)
-    return sample.is_at(
+    return sample.is_near(
         before,
-        _FASTEST_INSERTION * time + _INSERTION_NOISE,
-        _FASTEST_ROTATION * time + _ROTATION_NOISE,
+        _MAX_INSERTION_SPEED * time + _INSERTION_NOISE,
+        _MAX_ROTATION_SPEED * time + _ROTATION_NOISE,
     )

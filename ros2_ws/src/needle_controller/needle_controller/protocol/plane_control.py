@@ -1,4 +1,4 @@
-"""One needle's estimator and law, from tips in `rig` to the rotation of the next step."""
+"""Estimator and law of one needle: from measured tips in `rig` to the rotation of the next step."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from needle_controller.presets.path_steering import PathSteering, configured_obs
 from needle_controller.presets.point_steering import PointSteering, point_law
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import ONE_SIDED_PRESETS, SteeringSettings
+from needle_controller.protocol.confidence import point_miss_probability
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.tip_gate import TipCovariance
-from needle_controller.protocol.trust import point_missed
+from needle_controller.protocol.tip_checks import TipCovariance
 
 LARGEST_START_ROLL = np.deg2rad(80.0)
-"""Of presets whose coordinates end at roll +-90 deg [rad]."""
+"""For presets whose coordinates are limited to roll +-90 deg [rad]."""
 _FAR_AWAY = Obstacles([Obstacle((0.5, 0.0, 0.01), (0.5, 0.0, 0.02), 0.001)])
 
 
@@ -46,45 +46,45 @@ class ControlUpdate:
         Rotation of the base since the first tip [rad].
     reach : Reachability
         Of the plane, or the point.
-    missed : float, optional
-        Probability that the tip is more than 1 mm from the plane, or from where the point is
-        expected; None where the estimator does not say.
+    miss_probability : float, optional
+        Probability that the tip is more than 1 mm from the plane, or from the expected position
+        of the point; None if the estimator reports none.
     blocked : bool
-        Whether no way on is clear of the obstacles: no further step then.
+        Whether no path is clear of the obstacles, so that there is no further step.
     """
 
     estimate: Estimate
     command: SteeringCommand
     turned: float
     reach: Reachability
-    missed: float | None
+    miss_probability: float | None
     blocked: bool = False
 
 
 class PlaneControl:
-    """Estimator and law of one needle, in the target plane's coordinates.
+    """Estimator and law of one needle, in the coordinates of the target plane.
 
-    While there is a target point the needle is steered to that, and the plane's frame is no more
-    than coordinates.
+    If there is a target point, the needle is steered to the point, and the plane only provides
+    the coordinates.
 
     Parameters
     ----------
     settings : SteeringSettings
-        What estimator and law are made of.
+        Settings of estimator and law.
     plane : TargetPlane
-        The wanted plane.
+        The target plane.
 
     Attributes
     ----------
     obstacles : Obstacles
-        What it must not touch on its way to a point; it may change at any time.
+        Obstacles on the way to a point; they may change at any time.
     """
 
     def __init__(self, settings: SteeringSettings, plane: TargetPlane) -> None:
         self._settings = settings
         self._plane = plane
         self._points: PointSteering | None = None
-        self.target_point = _point(settings)
+        self.target_point = _configured_point(settings)
         self.obstacles = configured_obstacles(settings)
         self._path = PathSteering(settings)
         self._estimator, self._law = _new_controller(settings, plane)
@@ -95,7 +95,7 @@ class PlaneControl:
 
     @property
     def plane(self) -> TargetPlane:
-        """The wanted plane; a new one carries the estimate over."""
+        """The target plane; setting a new one transforms the estimate."""
         return self._plane
 
     @plane.setter
@@ -105,9 +105,9 @@ class PlaneControl:
 
     @property
     def target_point(self) -> Array | None:
-        """Point that the tip is to reach, in `rig`, shape (3,) [m]; None: the plane.
+        """Target point in `rig`, shape (3,) [m]; None to steer to the plane.
 
-        What is set rests there; see `see_target_point`.
+        A point that is set does not move; see `observe_target_point`.
         """
         return None if self._points is None else self._points.motion.last
 
@@ -115,31 +115,32 @@ class PlaneControl:
     def target_point(self, point: Array | None) -> None:
         self._points = None
         if point is not None:
-            self.see_target_point(point, 0.0)
+            self.observe_target_point(point, 0.0)
 
-    def see_target_point(self, point: Array, time: float) -> None:
-        """Take where the target is at a time of the tips' clock; what moves is foretold.
+    def observe_target_point(self, point: Array, time: float) -> None:
+        """Add an observation of the target point, whose motion is predicted from all of them.
 
         Parameters
         ----------
         point : ndarray, shape (3,)
             In `rig` [m].
         time : float
-            When it was there [s].
+            Time of the observation on the clock of the tips [s].
         """
         if self._points is None:
             self._points = PointSteering(self._settings, TargetMotion())
         self._points.motion.see(time, point)
 
     def configure(self, settings: SteeringSettings) -> None:
-        """Take new settings; the estimated pose stays, plane and point unless their own change.
+        """Change the settings, and keep the estimated pose.
 
-        A preset that cannot steer to a point ends it.
+        Plane and point stay unless their own settings change; a preset that cannot steer to a
+        point removes it.
         """
         if self._joints is None:
             self._estimator, self._law = _new_controller(settings, self._plane)
         else:
-            # A new estimator that starts where the needle is now, its base turned as it is.
+            # The new estimator starts at the present pose, with the base turned as it is.
             now, joints = self._estimator.estimate(), self._joints
             unturned = rotation_from_angles([0.0, 0.0, -joints.rotation])
             self._estimator, self._law = make_controller(settings, now.rotation @ unturned)
@@ -147,32 +148,34 @@ class PlaneControl:
         if settings.target_offset != self._settings.target_offset:
             self.plane = settings.plane()
         if settings.target_point != self._settings.target_point:
-            self.target_point = _point(settings)
+            self.target_point = _configured_point(settings)
         if not settings.steers_to_points:
             self.target_point = None
         if settings.obstacles != self._settings.obstacles:
             self.obstacles = configured_obstacles(settings)
         self._path = PathSteering(settings)
         self._settings = settings
-        if self._points is not None:
-            self._points = PointSteering(settings, self._points.motion)
+        self._restart_point_steering()
 
     def restart(self) -> None:
         """Forget the needle: the next tip is the first."""
         self._estimator, self._law = _new_controller(self._settings, self._plane)
         self._joints = self._first_joints = None
         self._rotation = 0.0
+        self._restart_point_steering()
+
+    def _restart_point_steering(self) -> None:
         if self._points is not None:
             self._points = PointSteering(self._settings, self._points.motion)
 
     @property
     def started(self) -> bool:
-        """Whether a first tip was taken since the last restart."""
+        """Whether a tip was used since the last restart."""
         return self._joints is not None
 
     @property
     def largest_start_roll(self) -> float:
-        """Largest roll in the plane that the preset can start at [rad]."""
+        """Largest roll in the plane at which the preset can start [rad]."""
         one_sided = self._settings.preset in ONE_SIDED_PRESETS
         return float(LARGEST_START_ROLL) if one_sided else math.inf
 
@@ -185,67 +188,77 @@ class PlaneControl:
         self,
         tip: Array,
         joints: JointSample,
-        known: TipCovariance | None = None,
-        way: Sequence[JointSample] = (),
+        covariance: TipCovariance | None = None,
+        intermediate: Sequence[JointSample] = (),
     ) -> ControlUpdate:
-        """Take a tip.
+        """Update the estimate with a tip, and compute the next command.
 
         Parameters
         ----------
         tip : ndarray, shape (3,)
             The tip in `rig` [m].
         joints : JointSample
-            The joints at its exposure.
-        known : TipCovariance, optional
-            How well the tip is known, in `rig`; as configured if none is given. `measurement_std`
-            squared is added: no source knows what repeats from tip to tip, nor what the needle's
-            model leaves out, and a filter that believes in micrometres holds on to the wrong roll.
-        way : sequence of JointSample
-            Joints on the way since the last tip, where rotation was not in proportion to insertion.
+            Joint positions at its exposure.
+        covariance : TipCovariance, optional
+            Covariance of the tip in `rig`; the configured one by default. `measurement_std`
+            squared is added, for errors that repeat from tip to tip and errors of the model: a
+            filter that trusts micrometres would hold on to a wrong roll.
+        intermediate : sequence of JointSample
+            Joint positions since the last tip, where rotation was not proportional to insertion.
 
         Returns
         -------
         ControlUpdate
-            The estimate and what to do next.
+            Estimate and command.
         """
         position = self._plane.from_rig(tip)
         if self._joints is None or self._first_joints is None:
             self._first_joints = joints
             self._estimator.reset(position, np.array([joints.insertion, joints.rotation]))
         else:
-            for sample in (*way, joints):
-                self._advance(sample)
-            self._correct(position, known)
+            for sample in (*intermediate, joints):
+                self._advance(self._joints, sample)
+                self._joints = sample
+            self._correct(position, covariance)
         self._joints = joints
         estimate = self._estimator.estimate()
-        turned = joints.rotation - self._first_joints.rotation
         command = self._command(estimate, joints)
-        reach, missed = self._reach(estimate, joints), self._missed(estimate)
-        if command is None:
-            still = SteeringCommand(0.0, 0.0)
-            return ControlUpdate(estimate, still, turned, reach, missed, blocked=True)
-        return ControlUpdate(estimate, command, turned, reach, missed)
+        return ControlUpdate(
+            estimate=estimate,
+            command=command or SteeringCommand(0.0, 0.0),
+            turned=joints.rotation - self._first_joints.rotation,
+            reach=self._reach(estimate, joints),
+            miss_probability=self._miss_probability(estimate),
+            blocked=command is None,
+        )
 
-    def _advance(self, joints: JointSample) -> None:
-        assert self._joints is not None
-        # An encoder at rest may read a count less; drawing out is the protocol's business.
-        inserted = max(joints.insertion - self._joints.insertion, 0.0)
-        rotation = joints.rotation - self._joints.rotation
+    def _advance(self, before: JointSample, joints: JointSample) -> None:
+        # An encoder at rest may read one count less; the protocol handles retraction.
+        inserted = max(joints.insertion - before.insertion, 0.0)
+        rotation = joints.rotation - before.rotation
         self._rotation += abs(rotation)
         self._estimator.advance(inserted, rotation)
-        self._joints = joints
 
-    def path_obstacle(self, rotation: float) -> str:
-        """Return why no path leads a needle that is out to its point, empty if one does.
+    def _correct(self, position: Array, covariance: TipCovariance | None) -> None:
+        settings = self._settings
+        if covariance is None:
+            self._estimator.correct(position, settings.configured_covariance())
+            return
+        turn = self._plane.T_plane_rig[:3, :3]
+        matrix = turn @ covariance.matrix @ turn.T + np.eye(3) * settings.measurement_std**2
+        self._estimator.correct(position, matrix)
+
+    def reason_without_path(self, rotation: float) -> str:
+        """Return why no path leads a needle that is out to its point; empty if one does.
 
         Parameters
         ----------
         rotation : float
-            Of the base [rad].
+            Rotation of the base [rad].
         """
         if self.target_point is None or not self._is_planned:
             return ""
-        return self._path.why_not(self.target_point, self.obstacles, rotation)
+        return self._path.find_first(self.target_point, self.obstacles, rotation)
 
     def _command(self, estimate: Estimate, joints: JointSample) -> SteeringCommand | None:
         if self._points is None:
@@ -265,37 +278,24 @@ class PlaneControl:
 
     @property
     def _is_planned(self) -> bool:
-        """Whether a planner leads to the point: ours past obstacles, an own one always."""
+        """Whether a path is planned: past obstacles, and always with another package's planner."""
         return len(self.obstacles) > 0 or self._settings.planner != ""
 
     def _reach(self, estimate: Estimate, joints: JointSample) -> Reachability:
-        limits = {
-            "insertion": joints.insertion,
-            "end": self._settings.depth,
-            "tolerance": NEAR,
-        }
+        limits = {"insertion": joints.insertion, "end": self._settings.depth, "tolerance": NEAR}
         if self._points is None:
             return reachability(estimate.reduced, estimate.curvature, **limits)
         offset = self._plane.from_rig(self._points.aim) - estimate.position
         return point_reachability(estimate.rotation.T @ offset, estimate.curvature, **limits)
 
-    def _missed(self, estimate: Estimate) -> float | None:
+    def _miss_probability(self, estimate: Estimate) -> float | None:
         if self._points is None or estimate.miss is None:
             return estimate.miss
-        off = estimate.position - self._plane.from_rig(self._points.aim)
-        return float(point_missed(off, estimate.covariance[:3, :3]))
-
-    def _correct(self, position: Array, known: TipCovariance | None) -> None:
-        estimator, settings = self._estimator, self._settings
-        if known is None:
-            estimator.correct(position, settings.configured_covariance())
-            return
-        turn = self._plane.T_plane_rig[:3, :3]
-        covariance = turn @ known.matrix @ turn.T + np.eye(3) * settings.measurement_std**2
-        estimator.correct(position, covariance)
+        offset = estimate.position - self._plane.from_rig(self._points.aim)
+        return float(point_miss_probability(offset, estimate.covariance[:3, :3]))
 
     def _warm_up(self) -> None:
-        """Run what updates run: compiled code is made here, not while a needle waits for it."""
+        """Compile the code that updates run, which would delay the first steps otherwise."""
         settings, length = self._settings, self._settings.step_length
         estimator, law = make_controller(settings, np.eye(3))
         estimator.reset(np.zeros(3), np.zeros(2))
@@ -312,9 +312,9 @@ class PlaneControl:
 
 
 def _new_controller(settings: SteeringSettings, plane: TargetPlane) -> tuple[Estimator, StepLaw]:
-    """Return estimator and law of a needle that is out, along z of `rig` at its origin."""
+    """Return estimator and law of a needle that is out, at the origin of `rig` along its z axis."""
     return make_controller(settings, plane.T_plane_rig[:3, :3], plane.from_rig(np.zeros(3)))
 
 
-def _point(settings: SteeringSettings) -> Array | None:
+def _configured_point(settings: SteeringSettings) -> Array | None:
     return np.array(settings.target_point) if settings.target_point else None

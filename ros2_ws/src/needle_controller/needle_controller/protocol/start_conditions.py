@@ -1,4 +1,4 @@
-"""Conditions under which steering begins."""
+"""Conditions under which steering may start."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import dataclasses
 
 from needle_controller.presets.own_parts import OwnPartError
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.actions import DEPTH_TOLERANCE
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.next_step import DEPTH_TOLERANCE
 from needle_controller.protocol.plane_control import PlaneControl
 from needle_core.status_messages import DeviceStatus
 
@@ -15,17 +15,17 @@ _SAME_INSERTION, _SAME_ROTATION = 5e-5, 2e-2
 
 
 @dataclasses.dataclass(frozen=True)
-class Situation:
-    """State of the rig when somebody asks to start.
+class RigState:
+    """State of the rig at a request to start.
 
     Attributes
     ----------
     steering : bool
-        Whether it is steering already.
+        Whether the needle is being steered already.
     device : DeviceStatus or None
-        What the driver last said.
+        Last status of the driver.
     joints : JointSample or None
-        Where the joints are.
+        Present joint positions.
     withdrawal : str
         Why the needle must be drawn out first; empty if it need not be.
     """
@@ -37,42 +37,41 @@ class Situation:
 
 
 def is_out(joints: JointSample, settings: SteeringSettings) -> bool:
-    """Return whether the needle counts as out."""
+    """Return whether the needle counts as out of the tissue."""
     return joints.insertion <= settings.needle_out_insertion
 
 
-def obstacle(situation: Situation, control: PlaneControl, settings: SteeringSettings) -> str:
-    """Return why steering cannot begin, empty if it can.
+def reason_not_to_start(rig: RigState, control: PlaneControl, settings: SteeringSettings) -> str:
+    """Return why steering cannot start; empty if it can.
 
     Parameters
     ----------
-    situation : Situation
-        What is known of the rig.
+    rig : RigState
+        State of the rig.
     control : PlaneControl
-        Estimator and law, for how the needle would enter the target plane.
+        Estimator and law, for the roll at the entry and the path past obstacles.
     settings : SteeringSettings
-        The protocol's numbers.
+        Settings of the protocol.
     """
-    device, joints = situation.device, situation.joints
-    if situation.steering:
+    if rig.steering:
         return "already steering"
-    why = _device_obstacle(device)
-    if why or device is None:
-        return why
-    if joints is None:
-        return "no joint_states have come"
-    if not _agree(device, joints):
-        return (
-            f"waiting for joint_states to say what the device does ({joints.insertion:.4g} m, "
-            f"{joints.rotation:.4g} rad; the device {device.insertion_m:.4g} m, "
-            f"{device.rotation_rad:.4g} rad)"
-        )
-    return situation.withdrawal or _needle_obstacle(joints, control, settings)
-
-
-def _device_obstacle(device: DeviceStatus | None) -> str:
-    if device is None:
+    if rig.device is None:
         return "no device/status has come"
+    reason = _device_reason(rig.device)
+    if reason:
+        return reason
+    if rig.joints is None:
+        return "no joint_states have come"
+    if not _agree(rig.device, rig.joints):
+        return (
+            f"waiting for joint_states to say what the device does ({rig.joints.insertion:.4g} m, "
+            f"{rig.joints.rotation:.4g} rad; the device {rig.device.insertion_m:.4g} m, "
+            f"{rig.device.rotation_rad:.4g} rad)"
+        )
+    return rig.withdrawal or _needle_reason(rig.joints, control, settings)
+
+
+def _device_reason(device: DeviceStatus) -> str:
     if device.state == "MOVING":
         return "waiting for the device, which moves"
     if not device.homed:
@@ -83,14 +82,14 @@ def _device_obstacle(device: DeviceStatus | None) -> str:
 
 
 def _agree(device: DeviceStatus, joints: JointSample) -> bool:
-    """Return whether the joints are where the device has them: not those of a motion before."""
+    """Return whether the joints are those of the device's status, not of an earlier motion."""
     if device.insertion_m is None or device.rotation_rad is None:
         return True
-    there = JointSample(joints.stamp_ns, device.insertion_m, device.rotation_rad)
-    return joints.is_at(there, _SAME_INSERTION, _SAME_ROTATION)
+    reported = JointSample(joints.stamp_ns, device.insertion_m, device.rotation_rad)
+    return joints.is_near(reported, _SAME_INSERTION, _SAME_ROTATION)
 
 
-def _needle_obstacle(joints: JointSample, control: PlaneControl, settings: SteeringSettings) -> str:
+def _needle_reason(joints: JointSample, control: PlaneControl, settings: SteeringSettings) -> str:
     if joints.insertion >= settings.depth - DEPTH_TOLERANCE:
         return f"insertion {joints.insertion:g} m is at the depth {settings.depth:g} m"
     if not is_out(joints, settings):
@@ -107,6 +106,6 @@ def _needle_obstacle(joints: JointSample, control: PlaneControl, settings: Steer
             f"{joints.rotation:.4g} rad), wants within {control.largest_start_roll:.3g} rad"
         )
     try:
-        return control.path_obstacle(joints.rotation)
+        return control.reason_without_path(joints.rotation)
     except OwnPartError as error:
         return str(error)

@@ -1,4 +1,4 @@
-"""Tips of needles that are inserted without a turn."""
+"""Tips of pure insertions."""
 
 from __future__ import annotations
 

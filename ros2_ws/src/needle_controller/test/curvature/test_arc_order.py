@@ -1,4 +1,4 @@
-"""Tips that leave their arc in order are told from tips that miss it at random."""
+"""Detection of correlated residuals along an arc."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ import pytest
 from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 
-from needle_controller.curvature.arc_order import check_order, order
-from needle_controller.curvature.curvature_checks import fit_checked
+from needle_controller.curvature.curvature_checks import (
+    check_independent_residuals,
+    fit_checked,
+    neighbour_correlation,
+)
 from needle_controller.curvature.curvature_fit import CurvatureFitSettings
 from needle_controller.model.arrays import Array
 from needle_core.errors import UserError
@@ -23,7 +26,7 @@ TRACKER = 3e-5  # standard deviation of stereo_tracker's tips [m]
 
 
 def insertions(count: int, arc: float, turn: float, rng: Generator) -> tuple[Array, Array]:
-    """Return exact tips (count, K, 3) of needles that are turned once, half-way."""
+    """Return exact tips (count, K, 3) of needles that turn once, half-way."""
     poses = np.tile(np.eye(4), (count, 1, 1))
     tilted = Rotation.from_rotvec(rng.normal(0.0, math.radians(5.0), (count, 3)) * [1.0, 1.0, 0.0])
     rolled = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi, (count, 1)))
@@ -49,7 +52,9 @@ def refused(tips: Array, insertion: Array | None) -> int:
     count = 0
     for each in tips:
         try:
-            check_order(fit_checked(each, insertion, settings).fit.misses, REPEATING)
+            check_independent_residuals(
+                fit_checked(each, insertion, settings).fit.residuals, REPEATING
+            )
         except UserError:
             count += 1
     return count
@@ -58,31 +63,31 @@ def refused(tips: Array, insertion: Array | None) -> int:
 @pytest.mark.parametrize(
     ("size", "known"), [(None, True), (None, False), (TRACKER, True), (2e-4, True)]
 )
-def test_of_pure_insertions_none_is_refused(size: float | None, known: bool) -> None:
+def test_pure_insertions_are_accepted(size: float | None, known: bool) -> None:
     rng = default_rng(5)
     tips, insertion = insertions(20, 0.06, 0.0, rng)
     tips = tips + noise(tips.shape, size, rng)
     assert refused(tips, insertion if known else None) == 0
 
 
-def test_outliers_are_no_order() -> None:
+def test_outliers_are_not_correlated_residuals() -> None:
     rng = default_rng(6)
     tips, insertion = insertions(30, 0.06, 0.0, rng)
     tips = tips + noise(tips.shape, TRACKER, rng)
-    # Two in a row, the same way.
+    # Two consecutive outliers in the same direction.
     tips[:, 20:22] += [5e-3, 0.0, 0.0]
     assert refused(tips, insertion) == 0
 
 
-def test_errors_that_repeat_are_allowed_for() -> None:
+def test_repeating_errors_are_tolerated() -> None:
     """All tips bowed along the arc, three times, as by a calibration's error."""
     rng = default_rng(7)
     tips, insertion = insertions(1, 0.12, 0.0, rng)
     bowed = tips[0] + noise(tips[0].shape, 2e-6, rng)
     bowed[:, 1] += REPEATING * np.sin(6.0 * np.pi * insertion / 0.12)
     assert refused(bowed[None], insertion) == 0
-    off = fit_checked(bowed, insertion, CurvatureFitSettings()).fit.misses
-    shared, significance = order(off)
+    off = fit_checked(bowed, insertion, CurvatureFitSettings()).fit.residuals
+    shared, significance = neighbour_correlation(off)
     assert significance > 10.0
     assert 0.3 * REPEATING < shared < REPEATING
 
@@ -99,7 +104,7 @@ def test_errors_that_repeat_are_allowed_for() -> None:
         (0.12, None, 90.0),
     ],
 )
-def test_steered_insertions_are_refused(arc: float, size: float | None, degrees: float) -> None:
+def test_steered_insertions_are_rejected(arc: float, size: float | None, degrees: float) -> None:
     rng = default_rng(8)
     tips, insertion = insertions(10, arc, math.radians(degrees), rng)
     tips = tips + noise(tips.shape, size, rng)
@@ -107,10 +112,10 @@ def test_steered_insertions_are_refused(arc: float, size: float | None, degrees:
     assert refused(tips[:3], None) == 3
 
 
-def test_what_is_wrong_is_said_with_a_way_out() -> None:
+def test_the_error_names_a_remedy() -> None:
     misses = np.zeros((60, 3))
     misses[:, 0] = 1e-3 * np.sin(np.linspace(0.0, 2.0 * np.pi, 60))
     with pytest.raises(UserError, match=r"beside it, wants <= 0\.05 mm.*--until-mm.*rotation_rad"):
-        check_order(misses, REPEATING)
-    check_order(misses, 1e-3)
-    assert order(np.zeros((8, 3))) == (0.0, 0.0)
+        check_independent_residuals(misses, REPEATING)
+    check_independent_residuals(misses, 1e-3)
+    assert neighbour_correlation(np.zeros((8, 3))) == (0.0, 0.0)

@@ -10,9 +10,12 @@ import pytest
 from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
-from needle_controller.curvature.circle_fit import circle_curvature
 from needle_controller.curvature.curvature_checks import fit_checked
-from needle_controller.curvature.curvature_fit import CurvatureFitSettings, fit_curvature
+from needle_controller.curvature.curvature_fit import (
+    CurvatureFitSettings,
+    circle_curvature,
+    fit_curvature,
+)
 from needle_controller.curvature.insertion_arc import arc_points
 from needle_core.errors import UserError
 
@@ -67,7 +70,7 @@ def test_60_mm_of_noisy_tips(settings: CurvatureFitSettings, known: bool) -> Non
 
 
 @pytest.mark.parametrize(("entry_std", "slip"), [(1e-6, -0.1), (0.0005, 0.0), (0.0005, 0.05)])
-def test_a_stage_that_slips_is_seen_and_changes_no_curvature(slip: float, entry_std: float) -> None:
+def test_slip_is_estimated_without_bias_of_the_curvature(slip: float, entry_std: float) -> None:
     """Before slip was an unknown 5 % of it made 4 to 19 % of the radius."""
     rng = default_rng(12)
     tips, insertion = insertion_tips(160, 0.06, rng)
@@ -112,7 +115,7 @@ def test_broadcasting_equals_looping() -> None:
         np.testing.assert_allclose(whole.std[i], one.std, rtol=1e-5)
 
 
-def test_priors_that_the_tips_contradict_are_left_out_and_said() -> None:
+def test_contradicted_priors_are_not_used_and_reported() -> None:
     rng = default_rng(6)
     exact, insertion = insertion_tips(1, 0.1, rng)
     turn = Rotation.from_rotvec([0.0, 1.3, 0.0]).as_matrix()

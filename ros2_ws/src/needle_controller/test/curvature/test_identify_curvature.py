@@ -1,4 +1,4 @@
-"""The command: files and bags that it reads, and what it says of them."""
+"""The command `identify_curvature`: files, bags and messages."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def needle() -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_a_steered_insertion_is_refused_though_the_rotation_is_not_recorded(
+def test_a_steered_insertion_without_rotation_is_rejected(
     tmp_path: Path, known: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng = default_rng(3)
@@ -63,7 +63,7 @@ def test_a_steered_insertion_is_refused_though_the_rotation_is_not_recorded(
     assert "the tips follow no single arc" in error
     assert error.count("\n") == 1
     turned = np.zeros(len(insertion))
-    # Whoever has recorded that nothing turned is believed.
+    # A recorded rotation of 0 is accepted.
     assert command(write_csv(path, noisy, insertion, turned)) == 0
     if known:
         write_csv(path, noisy, insertion, None)
@@ -76,10 +76,7 @@ def command(*arguments: str | Path) -> int:
 
 @pytest.mark.parametrize("known", [True, False])
 def test_command_reads_a_csv(
-    tmp_path: Path,
-    needle: tuple[Array, Array],
-    known: bool,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, needle: tuple[Array, Array], known: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tips, insertion = needle
     path = write_csv(tmp_path / "tips.csv", tips, insertion if known else None, None)
@@ -95,7 +92,7 @@ def test_command_reads_a_csv(
     assert "not recorded" in err
 
 
-def test_command_takes_insertions_by_name(tmp_path: Path, needle: tuple[Array, Array]) -> None:
+def test_command_reads_insertions_by_name(tmp_path: Path, needle: tuple[Array, Array]) -> None:
     tips, insertion = needle
     path = write_csv(tmp_path / "tips.csv", tips, None, None)
     lines = [f"image_{i:03d}.png,{v}" for i, v in enumerate(insertion)]
@@ -113,7 +110,7 @@ def test_command_takes_insertions_by_name(tmp_path: Path, needle: tuple[Array, A
         read_record(path, by_name)
 
 
-def test_a_turned_base_is_refused_but_for_the_part_before(
+def test_a_turned_base_is_rejected_except_for_the_part_before(
     tmp_path: Path, needle: tuple[Array, Array], capsys: pytest.CaptureFixture[str]
 ) -> None:
     tips, insertion = needle
@@ -150,9 +147,7 @@ def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_bad_arguments_are_one_line(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     rows: list[list[str]] = [
@@ -171,7 +166,7 @@ def test_bad_arguments_are_one_line(
         assert error.count("\n") == 1
 
 
-def test_a_straight_path_is_a_miss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_straight_path_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     insertion = np.arange(0.0, 0.02, STEP)
     tips = uniform(insertion[:, None] * np.array([0.0, 0.0, 1.0]), default_rng(9))
     path = write_csv(tmp_path / "tips.csv", tips, insertion, 0.0 * insertion)
@@ -208,7 +203,7 @@ def test_command_reads_a_bag(
     tmp_path: Path, needle: tuple[Array, Array], capsys: pytest.CaptureFixture[str]
 ) -> None:
     tips, insertion = needle
-    # Drawn back at the end, which is left out.
+    # The retraction at the end is omitted.
     back = slice(-2, -32, -1)
     path = write_bag(
         tmp_path / "bag",
@@ -222,7 +217,7 @@ def test_command_reads_a_bag(
     assert "121 tips over 120.0 mm" in out
 
 
-def test_command_tells_the_slip_of_a_bag(
+def test_command_prints_the_slip_of_a_bag(
     tmp_path: Path, needle: tuple[Array, Array], capsys: pytest.CaptureFixture[str]
 ) -> None:
     tips, insertion = needle

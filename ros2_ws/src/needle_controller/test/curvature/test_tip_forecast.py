@@ -39,14 +39,14 @@ def test_an_arc_is_continued(radius: float, insertion_known: bool) -> None:
     ahead = forecast(arc(radius, INSERTION) + noise, insertion_known=insertion_known)
     off = np.abs(ahead.tip - arc(radius, np.array(AHEAD)))
     assert np.all(off <= 1.3 * ahead.interval() + 1e-5)
-    # Nobody forecasts 48 mm better than the tissue allows, nor is a parabola of use that is worse.
+    # The forecast is limited by the tissue, and better than a parabola.
     assert 3e-4 < ahead.interval()[1] < 3e-3
 
 
 def paths(count: int, rng: np.random.Generator) -> Array:
-    """Return paths of stiff needles in tissue that is not the same everywhere, (count, 99, 3).
+    """Return paths of stiff needles in tissue with a varying curvature, (count, 99, 3).
 
-    Integrated from curvatures every mm: of headings, arcs and local curvature by chance.
+    Headings, arcs and local curvatures are random; the curvature is integrated every mm.
     """
     places = np.arange(0.0, AHEAD + 1e-9, 0.001)
     apart = np.abs(np.subtract.outer(places, places))
@@ -70,17 +70,17 @@ def test_95_of_100_tips_are_in_the_interval() -> None:
     for path in paths(30, rng):
         seen = path[: len(INSERTION)] + rng.normal(0.0, NOISE, (len(INSERTION), 3))
         ahead = forecast(seen, insertion_known=False)
-        # Its way to the same depth
+        # Length of the path to the same depth
         off = path[-1] - ahead.tip
         off -= ahead.tip / ahead.tip[2] * off[2]
         inside.append(np.abs(off[:2]) <= ahead.interval()[:2])
     assert np.mean(inside) > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 60)
 
 
-def test_of_a_nearly_straight_needle_it_is_gaussian_process_regression(
+def test_the_forecast_of_a_straight_needle_is_gaussian_process_regression(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The same model in its other form: covariances of places, in place of unknowns."""
+    """The same model in the form of covariances between positions."""
     scale = 0.3
     monkeypatch.setattr(tip_forecast, "SCALES", np.array([scale]))
     settings = CurvatureFitSettings(slip_std=1e-6, measurement_std=NOISE, outlier_limit=math.inf)
@@ -113,7 +113,7 @@ def test_the_radius_of_a_stiff_needle_is_in_its_interval(radius: float) -> None:
     assert np.mean((low <= radius) & (radius <= high)) > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 60)
 
 
-def test_the_command_says_where_the_tip_will_be(
+def test_the_command_prints_the_forecast(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     noise = np.random.default_rng(4).normal(0.0, NOISE, (len(INSERTION), 3))

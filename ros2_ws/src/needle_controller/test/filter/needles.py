@@ -1,4 +1,4 @@
-"""Exact needles, their turns and noisy tips, and a filter that is driven along them."""
+"""Exact needles with noisy tips, and a filter that follows them."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ import numpy.typing as npt
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from needle_controller.filter.hypotheses import (
-    RollHypothesis,
-    TorsionHypothesis,
-)
+from needle_controller.filter.filter_settings import RollHypothesis, TorsionHypothesis
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles

@@ -1,4 +1,4 @@
-"""Preset `best` on needles that share no code with it: converged, and what unsettles it."""
+"""Closed loop of preset `best` with independently simulated needles."""
 
 from __future__ import annotations
 
@@ -93,10 +93,10 @@ def test_converges(least: float, largest_rms: float, trouble: dict[str, float]) 
         (1e-4, np.diag([4e-10, 1e-11, 1e-11]), 10.0),
     ],
 )
-def test_an_accurate_sensor_is_not_believed_too_much(
+def test_an_accurate_sensor_does_not_cause_overconfidence(
     noise: float, covariance: Array | None, play_deg: float
 ) -> None:
-    """A linear filter with tips that exact would hold the wrong roll for certain."""
+    """With tips this accurate, a linear filter would be certain of a wrong roll."""
     settings = FilterSettings(tip_noise_bound=noise)
     end = steered(13, noise=noise, settings=settings, covariance=covariance, play_deg=play_deg)
     assert np.mean(np.abs(end[-20:]) <= 0.001) >= 0.995

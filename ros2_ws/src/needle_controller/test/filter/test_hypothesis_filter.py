@@ -1,4 +1,4 @@
-"""The bank of filters: consistency, torsion recovered, shapes of noise, bad settings."""
+"""The filter bank: consistency, torsion, noise shapes, bad settings."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from needle_controller.filter.bank import advance_needle, correct_needle
-from needle_controller.filter.filter_settings import ROLL_HYPOTHESES, FilterSettings
-from needle_controller.filter.hypotheses import (
-    LASTING,
+from needle_controller.filter.filter_settings import (
+    CORRELATED,
     NORMAL,
+    ROLL_HYPOTHESES,
+    FilterSettings,
     NoiseHypothesis,
     RollHypothesis,
     TorsionHypothesis,
@@ -47,7 +48,7 @@ def test_finds_the_pose_from_positions() -> None:
 
 
 @pytest.mark.parametrize("roll", [-150.0, -75.0, 90.0, 180.0])
-def test_finds_a_roll_nobody_expected(roll: float) -> None:
+def test_finds_an_unexpected_roll(roll: float) -> None:
     turns = turns_for(80)
     poses = path(turns, 0.0, np.deg2rad(roll))
     estimate = drive(HypothesisFilter(FilterSettings()), turns, noisy(poses))
@@ -94,7 +95,7 @@ def test_covariance_is_honest_for_gaussian_noise() -> None:
         yaw, pitch = rng.normal(0.0, settings.initial_angle_std, 2)
         roll = rng.normal(0.0, roll_std)
         turns = turns_for(count, seed=int(rng.integers(1 << 30)))
-        # The estimator allows for curvature that varies; so does this needle's.
+        # The needle's curvature varies as the estimator assumes.
         poses = path(turns, pitch, roll, CURVATURE * (1.0 + rng.normal(0.0, 0.15)))
         turned = np.eye(4)
         turned[:3, :3] = Rotation.from_rotvec([yaw, 0.0, 0.0]).as_matrix()
@@ -123,7 +124,7 @@ def test_learns_that_the_needle_lags_behind_the_stage() -> None:
     assert not estimator.estimate().warnings
 
 
-def test_warns_of_tips_that_nothing_explains() -> None:
+def test_warns_of_many_outliers() -> None:
     rng = np.random.default_rng(3)
     turns = turns_for(40)
     tips = path(turns)[:, :3, 3]
@@ -134,8 +135,8 @@ def test_warns_of_tips_that_nothing_explains() -> None:
 
 
 @pytest.mark.parametrize("with_covariance", [False, True])
-def test_in_a_study_each_needle_is_as_the_node_has_it(with_covariance: bool) -> None:
-    """To the last bit, whatever the others do; late tips and missing ones, too."""
+def test_many_needles_equal_single_ones(with_covariance: bool) -> None:
+    """Bit for bit, with late and missing tips."""
     rng, count = np.random.default_rng(8), 6
     covariance = np.eye(3) * 1e-7 if with_covariance else None
     turns = np.stack([turns_for(30, seed) for seed in range(count)], axis=1)
@@ -168,22 +169,19 @@ def test_in_a_study_each_needle_is_as_the_node_has_it(with_covariance: bool) -> 
     "noise",
     [
         NoiseHypothesis(NORMAL, (1.0,), (1.0,), 1.0),
-        NoiseHypothesis(LASTING, (1.0,), (1.0,), 1.0, (0.5,)),
+        NoiseHypothesis(CORRELATED, (1.0,), (1.0,), 1.0, (0.5,)),
     ],
 )
-def test_another_plane_is_another_description_of_the_same_needle(noise: NoiseHypothesis) -> None:
+def test_a_change_of_frame_keeps_the_needle(noise: NoiseHypothesis) -> None:
     turn = rotation_from_angles([0.2, -0.1, 0.4])
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = turn, [0.002, 0.001, -0.003]
     turns = turns_for(30)
     tips = noisy(path(turns))
-    # One normal noise: a box, or a mixture, would turn its sides with the plane.
-    settings = FilterSettings(
-        noise_hypotheses=(noise,),
-        outlier_share=1e-6,
-    )
+    # A single normal noise: a box or a mixture would depend on the axes of the plane.
+    settings = FilterSettings(noise_hypotheses=(noise,), outlier_share=1e-6)
     old, new = HypothesisFilter(settings), HypothesisFilter(settings, turn)
-    # Noise that lasts has a size of its own along each axis.
+    # Correlated noise has a separate size for each axis.
     spread = np.diag([2e-7, 3e-7, 4e-7]) if noise.shape == NORMAL else np.eye(3) * 1e-6
     drive(old, turns[:20], tips[:21], spread)
     old.change_frame(transform)
@@ -211,7 +209,7 @@ def test_another_plane_is_another_description_of_the_same_needle(noise: NoiseHyp
         (0.0, (2.0, 0.3, 0.3)),
     ],
 )
-def test_says_how_sure_it_is_whatever_the_noise_is(
+def test_covariance_is_honest_for_any_noise(
     lasting: float, each: tuple[float, float, float]
 ) -> None:
     rng = np.random.default_rng(8)
@@ -251,14 +249,14 @@ def test_a_start_without_a_tip_takes_the_next_one() -> None:
     np.testing.assert_allclose(estimator.estimate().position, [-0.003, 0.001, 0.001], atol=1e-4)
 
 
-def test_says_that_the_roll_is_not_known_yet() -> None:
+def test_warns_of_an_ambiguous_roll() -> None:
     estimator = HypothesisFilter(FilterSettings(roll_hypotheses=ROLL_HYPOTHESES))
     estimator.reset(np.zeros(3), np.zeros(2))
     assert any("roll" in warning for warning in estimator.estimate().warnings)
 
 
 @pytest.mark.parametrize(("length", "turn"), [(-1e-6, 0.0), (np.nan, 0.0), (0.001, np.inf)])
-def test_refuses_to_advance_backwards_or_by_nothing_known(length: float, turn: float) -> None:
+def test_invalid_advances_raise_errors(length: float, turn: float) -> None:
     with pytest.raises(ValueError, match="wants finite"):
         HypothesisFilter(FilterSettings()).advance(length, turn)
 
@@ -275,12 +273,12 @@ def test_refuses_to_advance_backwards_or_by_nothing_known(length: float, turn: f
         {"roll_hypotheses": ()},
     ],
 )
-def test_settings_out_of_bounds_are_refused(change: dict[str, Any]) -> None:
+def test_settings_out_of_bounds_are_rejected(change: dict[str, Any]) -> None:
     with pytest.raises(UserError, match=next(iter(change))):
         FilterSettings(**change)
 
 
-def test_hypotheses_out_of_bounds_are_refused() -> None:
+def test_hypotheses_out_of_bounds_are_rejected() -> None:
     with pytest.raises(OutOfBoundsError, match="play"):
         TorsionHypothesis(-0.1, 0.0, 0.1, 1.0)
     with pytest.raises(OutOfBoundsError, match="std"):
@@ -291,7 +289,7 @@ def test_hypotheses_out_of_bounds_are_refused() -> None:
 
 
 def test_nothing_is_compiled_twice() -> None:
-    """With and without covariance the same machine code runs."""
+    """The same machine code runs with and without covariance."""
     for covariance in (None, np.eye(3) * 1e-6):
         estimator = HypothesisFilter(FilterSettings())
         estimator.reset(np.zeros(3), np.zeros(2))

@@ -1,4 +1,4 @@
-"""Tips that are late and do not say so, and what only looks like it."""
+"""Detection of late tips, and of effects that resemble them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
-from needle_controller.filter.late_tips import FIRST, untold_age
+from needle_controller.filter.late_tips import FIRST, hidden_age
 from needle_controller.filter.mixture import LATE, WARNINGS
 from needle_controller.many_needles import ManyFilters
 from needle_controller.model.arrays import Array
@@ -26,15 +26,10 @@ def arc(inserted: Array | float) -> Array:
     return np.stack([x, np.zeros_like(x), RADIUS * np.sin(angle)], axis=-1)
 
 
-def inserted_by(
-    steps: int,
-    *,
-    late: int = 0,
-    frame: Array | None = None,
-) -> HypothesisFilter:
-    """Return what has seen a needle that is inserted without a turn, tips with +-1 mm noise.
+def inserted_by(steps: int, *, late: int = 0, frame: Array | None = None) -> HypothesisFilter:
+    """Return a filter after a pure insertion with +-1 mm noise.
 
-    In the middle of it everything may be expressed in another frame, (4, 4).
+    Half-way, everything may be transformed into another frame, (4, 4).
     """
     rng = np.random.default_rng(7)
     turn, offset = (np.eye(3), np.zeros(3)) if frame is None else (frame[:3, :3], frame[:3, 3])
@@ -58,7 +53,7 @@ def many_inserted_by(
     bump: float = 0.0,
     outliers: float = 0.0,
 ) -> ManyFilters:
-    """Return what has seen twenty such needles."""
+    """Return twenty such filters."""
     rng = np.random.default_rng(7)
     filters = ManyFilters(FilterSettings(), NEEDLES, STEP)
     filters.start(rng.uniform(-STEP, STEP, (NEEDLES, 3)))
@@ -77,17 +72,17 @@ def called_late(filters: ManyFilters) -> Array:
 
 
 @pytest.mark.parametrize("late", [3, 5])
-def test_late_tips_are_taken_as_late_and_said(late: int) -> None:
+def test_late_tips_are_detected_and_reported(late: int) -> None:
     filters = many_inserted_by(40, late=late)
     np.testing.assert_array_equal(called_late(filters), 1)
-    # Where the needle is, not where it was.
+    # The estimate is at the present position.
     off = filters.estimates["coordinates"][:, 2] - arc(40 * STEP)[2]
     assert np.sqrt(np.mean(off**2)) < 0.6 * STEP
 
 
 def test_late_tips_are_the_same_in_another_frame() -> None:
     at = np.eye(4)
-    # Axis for axis: noise is bounded along each.
+    # Axes are only permuted, because the noise is bounded along each.
     at[:3] = [[0.0, 1.0, 0.0, 0.01], [-1.0, 0.0, 0.0, -0.02], [0.0, 0.0, 1.0, 0.03]]
     elsewhere, here = (
         inserted_by(30, late=3, frame=at).estimate(),
@@ -99,7 +94,7 @@ def test_late_tips_are_the_same_in_another_frame() -> None:
     )
 
 
-def test_tips_that_are_taken_again_come_with_their_covariance_in_the_new_frame() -> None:
+def test_replayed_tips_have_their_covariance_in_the_new_frame() -> None:
     at, known = np.eye(4), np.diag([1e-7, 2e-7, 3e-7])
     at[:3, :3] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
     turn, stays = at[:3, :3], HypothesisFilter(FilterSettings(), None, np.zeros(3))
@@ -116,7 +111,7 @@ def test_tips_that_are_taken_again_come_with_their_covariance_in_the_new_frame()
     here, there = stays.estimate(), goes.estimate()
     assert LATE in here.warnings
     assert LATE in there.warnings
-    # Coordinates come in another order, which is all that differs.
+    # Only the order of the coordinates differs.
     np.testing.assert_allclose(there.position, turn @ here.position, atol=2e-4)
 
 
@@ -132,43 +127,43 @@ def test_tips_that_are_taken_again_come_with_their_covariance_in_the_new_frame()
         {"late": 3, "age": 3 * STEP},
     ],
 )
-def test_what_is_not_late_or_says_so_is_not_called_late(other: dict[str, float]) -> None:
+def test_punctual_tips_and_stated_ages_are_not_detected_as_late(other: dict[str, float]) -> None:
     assert not np.any(called_late(many_inserted_by(40, **other)))  # type: ignore[arg-type]
 
 
 def seen(late: float, slip: float = 0.0) -> tuple[Array, Array]:
-    """Return insertions, and the ways of tips without noise."""
+    """Return insertions and displacements of exact tips."""
     inserted = np.arange(1, 21, dtype=np.float64) * STEP
     return inserted, arc(np.maximum(inserted - late, 0.0) / (1.0 + slip))
 
 
 def test_an_age_is_not_a_slip() -> None:
     inserted, ways = seen(0.003)
-    # Two coordinates of two tips are off by what is claimed, in the mean.
+    # Mean error of two coordinates of two tips, as claimed.
     ways *= np.sqrt(1.0 + 4.0 * STEP**2 / 3.0 / np.sum(ways**2, axis=-1, keepdims=True).clip(1e-9))
-    assert untold_age(inserted, ways, 0.0, *KNOWN) == pytest.approx(0.003, abs=1e-4)
+    assert hidden_age(inserted, ways, 0.0, *KNOWN) == pytest.approx(0.003, abs=1e-4)
     inserted, ways = seen(0.0, 0.2)
-    assert untold_age(inserted, ways, 0.0, *KNOWN) == 0.0
+    assert hidden_age(inserted, ways, 0.0, *KNOWN) == 0.0
 
 
 def test_a_first_tip_that_was_too_deep_is_not_an_age() -> None:
     inserted, ways = seen(0.0)
     ways[:, 2] -= 0.0022
-    assert untold_age(inserted, ways, 0.0, np.inf, *KNOWN[1:]) > 0.0
-    assert untold_age(inserted, ways, 0.0022, *KNOWN) == 0.0
+    assert hidden_age(inserted, ways, 0.0, np.inf, *KNOWN[1:]) > 0.0
+    assert hidden_age(inserted, ways, 0.0022, *KNOWN) == 0.0
 
 
-def test_nothing_is_said_without_a_start_or_without_tips() -> None:
+def test_no_age_is_detected_without_a_start_or_tips() -> None:
     inserted, ways = seen(0.003)
     few = np.where((inserted < FIRST + 4.5 * STEP)[:, None], ways, np.nan)
-    ages = [untold_age(inserted, w, 0.0, *KNOWN) for w in (few, np.full_like(ways, np.nan), ways)]
+    ages = [hidden_age(inserted, w, 0.0, *KNOWN) for w in (few, np.full_like(ways, np.nan), ways)]
     np.testing.assert_array_equal(np.array(ages) > 0.0, [True, False, True])
     few[np.argmax(inserted >= FIRST)] = np.nan
-    assert untold_age(inserted, few, 0.0, *KNOWN) == 0.0
+    assert hidden_age(inserted, few, 0.0, *KNOWN) == 0.0
 
 
 def test_a_known_insertion_scale_leaves_no_slip() -> None:
     inserted, ways = seen(0.0, 0.2)
-    assert untold_age(inserted, ways, 0.0, *KNOWN) == 0.0
-    # What a slip would explain is then an age.
-    assert untold_age(inserted, ways, 0.0, *KNOWN[:2], 0.0) > 0.0
+    assert hidden_age(inserted, ways, 0.0, *KNOWN) == 0.0
+    # Without slip, the missing insertion is an age.
+    assert hidden_age(inserted, ways, 0.0, *KNOWN[:2], 0.0) > 0.0

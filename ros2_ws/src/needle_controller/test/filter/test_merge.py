@@ -1,4 +1,4 @@
-"""Which hypotheses are the same, and what is made of two of them."""
+"""Merging of equal hypotheses."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def merged(h: Records) -> Records:
     return h[: needle["count"]]
 
 
-def test_only_what_is_the_same_is_joined() -> None:
+def test_only_equal_hypotheses_are_merged() -> None:
     h = hypotheses(np.array([0.0, 0.2, 1.0, 0.1, 3.1, -3.1]))
     h["torsion"][3] = 1
     # 0 and 0.2; 3.1 and -3.1, across the border; 0.1 is of another torsion.
@@ -42,14 +42,14 @@ def test_only_what_is_the_same_is_joined() -> None:
 @pytest.mark.parametrize(
     ("name", "other"), [("play", ANGLE), ("shape", 1), ("position", [0.02, 0.0, 0.0])]
 )
-def test_what_differs_stays_apart(name: str, other: Any) -> None:
+def test_different_hypotheses_are_not_merged(name: str, other: Any) -> None:
     h = hypotheses(np.array([0.0, 0.1]))
     h[name][1] = other
     np.testing.assert_array_equal(merged(h)["weight"], 1.0)
 
 
 def test_the_joined_estimate_has_the_mixtures_moments() -> None:
-    """Against samples of both Gaussians together."""
+    """Against samples of both Gaussians."""
     rng = np.random.default_rng(5)
     factor = rng.normal(size=(2, ERROR, ERROR)) * 0.02
     both = factor @ np.swapaxes(factor, -1, -2)

@@ -9,25 +9,17 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from needle_controller.filter.filter_settings import FilterSettings
-from needle_controller.filter.hypotheses import GAIN, LAG, PLAY
+from needle_controller.filter.filter_settings import GAIN, LAG, PLAY, FilterSettings
 from needle_controller.filter.motion import (
     LARGEST_TURN,
     advance_hypothesis,
     rotate,
     rotation_factors,
 )
-from needle_controller.filter.records import E_KAPPA, E_SCALE, E_SIZE, ERROR, HYPOTHESIS
+from needle_controller.filter.records import E_KAPPA, E_SCALE, E_TORSION, ERROR, HYPOTHESIS
 from needle_controller.model.arrays import Array
 
-CASES = [
-    (0.001, 0.2),
-    (0.001, -0.5),
-    (0.002, 0.0),
-    (0.001, LARGEST_TURN),
-    (0.0, 0.4),
-    (0.01, 0.7),
-]
+CASES = [(0.001, 0.2), (0.001, -0.5), (0.002, 0.0), (0.001, LARGEST_TURN), (0.0, 0.4), (0.01, 0.7)]
 TORSIONS = [(0.1, 0.0), (0.25, 0.0), (0.0, 0.004), (0.0, 0.008), (0.1, 0.002), (0.0, 0.0)]
 SIZES = ("play", "lag", "gain")
 SCALES = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 1.0, 0.1, 0.05])
@@ -36,15 +28,19 @@ NO_DRIFT = FilterSettings(curvature_drift=0.0, scale_drift=0.0, play_drift=0.0, 
 
 def hypothesis(play: float = 0.0, lag: float = 0.0) -> Any:
     rng, seed = np.random.default_rng(1), 1
-    sized = LAG if lag else PLAY if play else GAIN
+    torsion_kind = LAG if lag else PLAY if play else GAIN
     h = np.zeros(1, HYPOTHESIS)[0]
     h["position"] = rng.normal(0.0, 0.01, 3)
     h["rotation"] = Rotation.random(random_state=seed).as_matrix()
     h["curvature"], h["scale"] = rng.uniform(5.0, 11.0), rng.uniform(0.9, 1.1)
     factor = rng.normal(size=(ERROR, ERROR)) * SCALES[:, None]
     h["covariance"] = factor @ factor.T
-    h["play"], h["lag"], h["gain"] = play, lag, rng.uniform(0.8, 1.0) if sized == GAIN else 1.0
-    h["sized"] = sized
+    h["play"], h["lag"], h["gain"] = (
+        play,
+        lag,
+        rng.uniform(0.8, 1.0) if torsion_kind == GAIN else 1.0,
+    )
+    h["torsion_kind"] = torsion_kind
     return h
 
 
@@ -80,10 +76,10 @@ def test_the_step_is_the_exponential_of_the_twist(length: float, turn: float) ->
 
 @pytest.mark.parametrize(("length", "turn"), CASES)
 @pytest.mark.parametrize(("play", "lag"), TORSIONS)
-def test_covariance_goes_by_the_steps_derivative(
+def test_the_covariance_follows_the_steps_derivative(
     length: float, turn: float, play: float, lag: float
 ) -> None:
-    """F by central differences of the step itself, in the error's own coordinates."""
+    """F by central differences of the step, in the coordinates of the error."""
     before = hypothesis(play, lag)
 
     def end(error: Array) -> Any:
@@ -92,7 +88,7 @@ def test_covariance_goes_by_the_steps_derivative(
         start["rotation"] = Rotation.from_rotvec(error[3:6]).as_matrix() @ before["rotation"]
         start["curvature"] += error[E_KAPPA]
         start["scale"] += error[E_SCALE]
-        start[SIZES[before["sized"]]] += error[E_SIZE]
+        start[SIZES[before["torsion_kind"]]] += error[E_TORSION]
         return moved(start, length, turn)
 
     transition = np.eye(ERROR)
@@ -103,8 +99,8 @@ def test_covariance_goes_by_the_steps_derivative(
         transition[:3, i] = (ahead["position"] - behind["position"]) / (2.0 * error[i])
         turned = ahead["rotation"] @ behind["rotation"].T
         transition[3:6, i] = Rotation.from_matrix(turned).as_rotvec() / (2.0 * error[i])
-    # The path's own shift with the torsion is left out: curvature length^2 of what it turns.
-    transition[:3, E_SIZE] = 0.0
+    # The filter neglects the shift of the path by the torsion, of order curvature length^2.
+    transition[:3, E_TORSION] = 0.0
     wanted = transition @ before["covariance"] @ transition.T
     found = moved(before, length, turn)["covariance"]
     scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
@@ -112,7 +108,7 @@ def test_covariance_goes_by_the_steps_derivative(
     np.testing.assert_array_equal(found, found.T)
 
 
-def test_torsions_angles_are_kept() -> None:
+def test_torsion_angles_are_updated() -> None:
     for play, lag in TORSIONS:
         before = hypothesis(play, lag)
         after = moved(before, 0.001, 0.5)
@@ -121,7 +117,7 @@ def test_torsions_angles_are_kept() -> None:
             assert 0.0 < after["tip_angle"] < after["behind_play"]
         else:
             assert after["tip_angle"] == after["behind_play"]
-            assert after["dtip_dsize"] == (-1.0 if play else 0.5)
+            assert after["dtip_dtorsion"] == (-1.0 if play else 0.5)
 
 
 @pytest.mark.parametrize(("play", "lag"), [(0.1, 0.0), (0.0, 0.004), (0.0, 0.0)])
@@ -135,19 +131,19 @@ def test_process_noise_is_added_where_it_belongs(play: float, lag: float) -> Non
     )
     before = hypothesis(play, lag)
     before["covariance"] = 0.0
-    before["covariance"][E_SIZE, E_SIZE] = 1e-30
+    before["covariance"][E_TORSION, E_TORSION] = 1e-30
     before["heading_drift"], before["roll_drift"] = 2.0, 6.0
     added = moved(before, 0.001, 0.0, settings)
     covariance = 1000.0 * added["covariance"]
-    wanted = [0.0, 0.0, 0.0, 3.0, (5.0, 1.0, 0.0)[before["sized"]], 4.0]
+    wanted = [0.0, 0.0, 0.0, 3.0, (5.0, 1.0, 0.0)[before["torsion_kind"]], 4.0]
     np.testing.assert_allclose(np.diag(covariance)[[0, 1, 2, 6, 7, 8]], wanted, atol=1e-9)
-    # About the heading, the last column, it is the roll that drifts.
+    # The roll drifts about the heading, the last column.
     axes = added["rotation"]
     drift = axes.T @ covariance[3:6, 3:6] @ axes
     np.testing.assert_allclose(drift, np.diag([2.0, 2.0, 6.0]), atol=1e-9)
-    # A size that is known exactly stays so.
-    before["covariance"][E_SIZE, E_SIZE] = 0.0
-    assert moved(before, 0.001, 0.0, settings)["covariance"][E_SIZE, E_SIZE] == 0.0
+    # A torsion parameter without variance stays exact.
+    before["covariance"][E_TORSION, E_TORSION] = 0.0
+    assert moved(before, 0.001, 0.0, settings)["covariance"][E_TORSION, E_TORSION] == 0.0
 
 
 def test_rotate_turns_about_the_frames_axes_but_not_too_far() -> None:

@@ -1,4 +1,4 @@
-"""Wrong tips, and needles that are displaced."""
+"""Outliers and displaced needles."""
 
 from __future__ import annotations
 
@@ -9,16 +9,10 @@ import numpy as np
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 
-from .needles import (
-    STEP,
-    drive,
-    noisy,
-    path,
-    turns_for,
-)
+from .needles import STEP, drive, noisy, path, turns_for
 
 
-def test_an_outlier_is_refused_and_a_jump_is_believed() -> None:
+def test_an_outlier_is_ignored_and_a_jump_is_followed() -> None:
     turns = turns_for(60)
     tips = noisy(path(turns))
     estimator = HypothesisFilter(FilterSettings())
@@ -38,10 +32,10 @@ def test_an_outlier_is_refused_and_a_jump_is_believed() -> None:
     assert not moved.warnings
 
 
-def test_what_takes_a_tip_for_an_outlier_comes_back_displaced_with_its_share() -> None:
+def test_outliers_add_displaced_hypotheses_with_their_weight() -> None:
     turns = turns_for(9)
     tips = noisy(path(turns))
-    # Early, while several rolls are possible; the later ones have mostly ended.
+    # Early, while several rolls are possible.
     tips[9, 0] += 0.0025
 
     def hypotheses(jump_share: float) -> Any:
@@ -56,12 +50,12 @@ def test_what_takes_a_tip_for_an_outlier_comes_back_displaced_with_its_share() -
     known = hypotheses(settings.jump_share)
     displaced = np.isclose(known["position"][:, 0], tips[9, 0], rtol=0.0, atol=1e-12)
     seen = np.sort(known["weight"][displaced])
-    # As far as there is room: the likeliest.
+    # The likeliest ones, as far as there is storage.
     assert len(seen) > 5
     np.testing.assert_allclose(seen, wanted[-len(seen) :])
 
 
-def test_what_comes_back_displaced_knows_its_place_as_well_as_the_tip() -> None:
+def test_displaced_hypotheses_have_the_tips_covariance() -> None:
     turns = turns_for(20)
     tips = path(turns)[:, :3, 3]
     noise = 1e-8 * np.array([[4.0, 1.5, -1.0], [1.5, 3.0, 0.5], [-1.0, 0.5, 5.0]])

@@ -1,4 +1,4 @@
-"""Tips that are late and say so, too old, or missing."""
+"""Tips with a stated age, too old tips, missing tips."""
 
 from __future__ import annotations
 
@@ -7,17 +7,11 @@ import numpy as np
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 
-from .needles import (
-    STEP,
-    drive,
-    noisy,
-    path,
-    turns_for,
-)
+from .needles import STEP, drive, noisy, path, turns_for
 
 
 def test_a_late_tip_is_used_at_its_exposure() -> None:
-    """One step late all along is the on-time filter, seen one step ahead without its last tip."""
+    """A filter with tips one step late equals the punctual one predicted by one step."""
     turns = turns_for(40)
     tips = noisy(path(turns))
     late, on_time = (HypothesisFilter(FilterSettings()) for _ in range(2))
@@ -40,7 +34,7 @@ def test_a_late_tip_is_used_at_its_exposure() -> None:
 
 
 def test_a_late_tip_between_two_stops() -> None:
-    """An exposure within an advance: as if the advance had been divided there."""
+    """An exposure within an advance divides the advance."""
     turns = turns_for(20)
     tips = noisy(path(turns))
     one, two = (HypothesisFilter(FilterSettings()) for _ in range(2))

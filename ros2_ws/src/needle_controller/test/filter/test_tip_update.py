@@ -1,4 +1,4 @@
-"""Updates by one tip: uniform and normal noise, outliers, and what a tip shows of the noise."""
+"""Updates by one tip: uniform and normal noise, outliers, learning of the noise."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal, norm, truncnorm
 
-from needle_controller.filter.filter_settings import FilterSettings
-from needle_controller.filter.hypotheses import LASTING, NoiseHypothesis
+from needle_controller.filter.filter_settings import CORRELATED, FilterSettings, NoiseHypothesis
 from needle_controller.filter.records import E_KAPPA, E_SCALE, ERROR, HYPOTHESIS
 from needle_controller.filter.tip_update import (
     new_reading,
-    new_work,
-    read_tip,
+    new_workspace,
+    prepare_reading,
     truncated_moments,
     update_hypothesis,
 )
@@ -30,7 +29,7 @@ PLAIN = FilterSettings(outlier_share=1e-6, curvature_range=(0.01, 100.0))
 LASTS = dataclasses.replace(
     PLAIN,
     model_error=0.0,
-    noise_hypotheses=(NoiseHypothesis(LASTING, (1.0,), (1.0,), 1.0, (0.6,)),),
+    noise_hypotheses=(NoiseHypothesis(CORRELATED, (1.0,), (1.0,), 1.0, (0.6,)),),
 )
 WITH_OUTLIERS = FilterSettings()
 Records = npt.NDArray[np.void]
@@ -39,7 +38,7 @@ Records = npt.NDArray[np.void]
 def estimates(
     covariance: Array | None = None, *, is_uniform: bool = False, seed: int = 3
 ) -> Records:
-    """Eight estimates about `MIDDLE`, by default none like another; noise is as claimed."""
+    """Eight different estimates about `MIDDLE`; noise as claimed."""
     rng = np.random.default_rng(seed)
     h = np.zeros(COUNT, HYPOTHESIS)
     h["position"] = MIDDLE
@@ -62,16 +61,16 @@ def taken(
     settings: FilterSettings = PLAIN,
 ) -> Records:
     after: Records = before.copy()
-    reading, work = new_reading(), new_work()
+    reading, work = new_reading(), new_workspace()
     reading.tip[:], reading.covariance[:] = tip, noise
-    assert read_tip(reading)
+    assert prepare_reading(reading)
     for h in after:
         update_hypothesis(h, reading, settings.assumptions(), work)
     return after
 
 
 def changes(before: Records, after: Records) -> Array:
-    """What was added to the error's nine elements, (COUNT, 9)."""
+    """Change of the nine elements of the error, (COUNT, 9)."""
     turned = after["rotation"] @ np.swapaxes(before["rotation"], -1, -2)
     turn = Rotation.from_matrix(turned).as_rotvec()
     other = [after[name] - before[name] for name in ("curvature", "play", "scale")]
@@ -81,13 +80,13 @@ def changes(before: Records, after: Records) -> Array:
 @pytest.mark.parametrize(
     ("lower", "upper"), [(-1.0, 0.5), (0.3, 2.0), (-9.0, 1.0), (-7.0, 8.0), (3.0, 4.5)]
 )
-def test_moments_of_a_normal_cut_off_are_scipys(lower: float, upper: float) -> None:
+def test_truncated_moments_equal_scipys(lower: float, upper: float) -> None:
     mass, mean, variance = truncated_moments(lower, upper)
     cut = truncnorm(lower, upper)
     assert mass == pytest.approx(norm.cdf(upper) - norm.cdf(lower), rel=1e-5)
     assert mean == pytest.approx(cut.mean(), abs=1e-5)
     assert variance == pytest.approx(cut.var(), abs=1e-4)
-    # Mirrored, it is the same.
+    # Mirrored bounds.
     other = truncated_moments(-upper, -lower)
     np.testing.assert_allclose(other, [mass, -mean, variance], rtol=1e-9, atol=1e-12)
 
@@ -96,11 +95,11 @@ def test_a_missing_tip_is_none() -> None:
     for tip, spread in (([np.nan, 0.0, 0.0], 1.0), ([0.0, 0.0, 0.0], np.inf)):
         reading = new_reading()
         reading.tip[:], reading.covariance[:] = tip, np.full((3, 3), spread)
-        assert not read_tip(reading)
+        assert not prepare_reading(reading)
 
 
 def test_uniform_noise_gives_the_posteriors_moments() -> None:
-    """Against samples of the prior, those in the box kept; one coordinate measured."""
+    """Against samples of the prior inside the box; one coordinate is measured."""
     rng = np.random.default_rng(4)
     covariance = np.zeros((ERROR, ERROR))
     used = [0, 4, E_KAPPA, E_SCALE]
@@ -126,40 +125,40 @@ def test_uniform_noise_gives_the_posteriors_moments() -> None:
     )
 
 
-CORRELATED = np.array([[4e-7, 1e-7, 0.0], [1e-7, 9e-7, -2e-7], [0.0, -2e-7, 2.5e-7]])
+DEPENDENT = np.array([[4e-7, 1e-7, 0.0], [1e-7, 9e-7, -2e-7], [0.0, -2e-7, 2.5e-7]])
 
 
 def test_normal_noise_gives_kalmans_update() -> None:
     before = estimates()
     tip = np.array([0.0105, 0.0193, 0.031])
-    after = taken(before, tip, CORRELATED)
+    after = taken(before, tip, DEPENDENT)
     measured = np.eye(ERROR)[:3]
     found = changes(before, after)
     for h in range(COUNT):
         covariance, expected = before["covariance"][h], before["position"][h]
-        spread = measured @ covariance @ measured.T + CORRELATED
+        spread = measured @ covariance @ measured.T + DEPENDENT
         gain = covariance @ measured.T @ np.linalg.inv(spread)
         wanted = gain @ (tip - expected)
         np.testing.assert_allclose(found[h, :7], wanted[:7], rtol=1e-4, atol=1e-8)
         keep = np.eye(ERROR) - gain @ measured
-        wanted = keep @ covariance @ keep.T + gain @ CORRELATED @ gain.T
+        wanted = keep @ covariance @ keep.T + gain @ DEPENDENT @ gain.T
         scale = np.outer(np.sqrt(np.diag(wanted)), np.sqrt(np.diag(wanted)))
         np.testing.assert_allclose(after["covariance"][h] / scale, wanted / scale, atol=2e-4)
         # Relative to the density of uniform noise of the same variances.
         density = multivariate_normal(expected, spread).pdf(tip)
-        in_box = 1.0 / np.sqrt(12.0**3 * np.linalg.det(CORRELATED))
+        in_box = 1.0 / np.sqrt(12.0**3 * np.linalg.det(DEPENDENT))
         assert after["evidence"][h] == pytest.approx(density / in_box, rel=1e-4)
 
 
 def with_lasting_noise(h: Records, shares: tuple[float, ...]) -> Records:
-    h["shape"] = LASTING
+    h["shape"] = CORRELATED
     h["noise_weights"] = 0.0
     h["noise_weights"][:, :, : len(shares)] = shares
     return h
 
 
-def test_errors_that_last_are_told_from_the_estimates_own() -> None:
-    """Against a Kalman filter whose state has the tip's error, too."""
+def test_correlated_errors_are_separated_from_the_estimates_own() -> None:
+    """Against a Kalman filter whose state includes the tip's error."""
     known = np.array([2e-4, 4e-4, 5e-4]) ** 2
     before = with_lasting_noise(estimates(np.diag([*known, *SCALES[3:] ** 2])), (1.0,))
     rest = np.array([7e-4, -2e-4, 1e-4])
@@ -168,7 +167,7 @@ def test_errors_that_last_are_told_from_the_estimates_own() -> None:
     after = taken(before, MIDDLE + off, settings=LASTS)
     likelihood = 1.0
     for axis in range(3):
-        # What the estimate is off, and the tip's error; at the tip before their sum was seen.
+        # Errors of estimate and tip, whose sum was observed at the tip before.
         mean = np.array([0.0, 0.6 * rest[axis]])
         covariance = known[axis] * np.array([[1.0, -0.6], [-0.6, 0.36]])
         covariance[1, 1] += (1.0 - 0.6**2) * BOUND**2 / 3.0
@@ -187,14 +186,14 @@ def test_errors_that_last_are_told_from_the_estimates_own() -> None:
     np.testing.assert_allclose(after["evidence"], likelihood, rtol=1e-4)
 
 
-def test_where_nothing_was_known_before_no_error_is_taken_off() -> None:
+def test_a_wide_prior_removes_no_correlated_error() -> None:
     before = with_lasting_noise(estimates(np.eye(ERROR) * 0.02**2), (1.0,))
     after = taken(before, MIDDLE + 0.01, settings=LASTS)
     np.testing.assert_allclose(changes(before, after)[:, :3], 0.01, rtol=0.005)
 
 
-def test_tips_show_which_coordinate_is_noisier() -> None:
-    noise = NoiseHypothesis(LASTING, (1.0, 2.0), (0.5, 0.5), 1.0, (0.0, 0.0))
+def test_the_noisier_coordinate_is_learnt() -> None:
+    noise = NoiseHypothesis(CORRELATED, (1.0, 2.0), (0.5, 0.5), 1.0, (0.0, 0.0))
     settings = dataclasses.replace(PLAIN, noise_hypotheses=(noise,))
     known = with_lasting_noise(estimates(np.eye(ERROR) * 1e-10), (0.5, 0.5))
     rng = np.random.default_rng(5)
@@ -207,13 +206,13 @@ def test_tips_show_which_coordinate_is_noisier() -> None:
 
 
 def with_state_of(after: Records, before: Records) -> Records:
-    """What was learned of the noise, with the estimates as they were."""
+    """The learnt noise, with the old estimates."""
     h: Records = before.copy()
     h["noise_weights"] = after["noise_weights"]
     return h
 
 
-def test_an_exact_tip_is_taken() -> None:
+def test_an_exact_tip_is_used() -> None:
     after = taken(estimates(), MIDDLE, np.zeros((3, 3)))
     for name in HYPOTHESIS.names or ():
         assert np.all(np.isfinite(after[name]))
@@ -229,7 +228,7 @@ def test_an_outlier_changes_nothing(is_uniform: bool) -> None:
 
 
 def test_a_doubtful_tip_gives_the_mixtures_moments() -> None:
-    """Half an outlier: the covariance of what was and of what would be, about their mean."""
+    """Probability 1/2 of an outlier: the mixture of the old and the updated covariance."""
     before = estimates(np.diag((SCALES * 0.3) ** 2))
     tip = MIDDLE + np.array([0.0022, 0.0, 0.0])
     whole, after = taken(before, tip), taken(before, tip, settings=WITH_OUTLIERS)
@@ -243,7 +242,7 @@ def test_a_doubtful_tip_gives_the_mixtures_moments() -> None:
 
 
 @pytest.mark.parametrize("is_uniform", [False, True])
-def test_tips_show_how_large_the_noise_is(is_uniform: bool) -> None:
+def test_the_size_of_the_noise_is_learnt(is_uniform: bool) -> None:
     settings = FilterSettings()
     known = estimates(np.diag((SCALES * 0.1) ** 2), is_uniform=is_uniform)
     shares = settings.noises()[int(is_uniform), 1]

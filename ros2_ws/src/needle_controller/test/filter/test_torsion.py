@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_controller.filter.torsion import turn_tip
+from needle_controller.filter.motion import turn_tip
 from needle_controller.model.arrays import Array
 
 TURNS = np.array([0.5, 0.3, -0.2, -0.9, 0.0, -0.4, 1.2, 0.1])

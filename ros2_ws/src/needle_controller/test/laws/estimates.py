@@ -1,4 +1,4 @@
-"""Estimates of needles that are known, or of equally likely hypotheses."""
+"""Estimates of known needles, or of equally likely hypotheses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CAP = np.deg2rad(30.0) / STEP
 
 
 def known(coordinates: Array, std: float = 0.0) -> Estimate:
-    """Return what an estimator says that knows (6,) coordinates, the pitch to `std` [rad]."""
+    """Return an estimate with (6,) coordinates and a standard deviation of the pitch [rad]."""
     covariance = np.zeros((6, 6))
     covariance[4, 4] = std**2
     return Estimate(
@@ -30,7 +30,7 @@ def known(coordinates: Array, std: float = 0.0) -> Estimate:
 
 
 def mixture(rolls: list[float], *, wound: float = 0.0, **first: float) -> Estimate:
-    """Return torsions of these rolls [rad], equally likely, of a needle at its entry.
+    """Return equally likely torsions of a needle at its entry with these rolls [rad].
 
     `first` changes fields of the first one.
     """

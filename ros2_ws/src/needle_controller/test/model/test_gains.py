@@ -1,4 +1,4 @@
-"""Gains of (9) and (10) against the Riccati equations, solved another way."""
+"""Gains of (9) and (10) against scipy's solution of the Riccati equations."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from needle_core.errors import UserError
 
 STD = 0.001 / np.sqrt(3.0)
 WEIGHTS: dict[str, Any] = {
-    "state_weights": np.diag([1.0e6, 900.0, 0.1]),
+    "state_weights": (1.0e6, 900.0, 0.1),
     "input_weight": 1.0e-4,
-    "process_noise": np.diag([1e-7, 1e-3, 1.0]),
+    "process_noise": (1e-7, 1e-3, 1.0),
     "measurement_std": STD,
     "step_length": 0.001,
 }
@@ -27,20 +27,19 @@ def gains(**changes: Any) -> Gains:
     return design_gains(**{**WEIGHTS, **changes})
 
 
-def test_gains_are_those_of_the_riccati_equations() -> None:
+def test_gains_solve_the_riccati_equations() -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        root = rng.normal(size=(3, 3)) * 10.0 ** rng.uniform(-0.5, 0.5, (3, 1))
-        # Weights and noise that are not diagonal; rows in the units of s and of ds/dl.
-        state_weights = (root @ root.T) * np.outer([1e3, 30.0, 0.3], [1e3, 30.0, 0.3])
-        process_noise = (root @ root.T) * np.outer([3e-4, 0.03, 1.0], [3e-4, 0.03, 1.0])
-        found = gains(state_weights=state_weights, process_noise=process_noise)
+        # In the units of s and of ds/dl.
+        state_weights = rng.lognormal(size=3) * np.square([1e3, 30.0, 0.3])
+        process_noise = rng.lognormal(size=3) * np.square([3e-4, 0.03, 1.0])
+        found = gains(state_weights=tuple(state_weights), process_noise=tuple(process_noise))
         # In units of 20 mm, so that the solver's matrices are well scaled.
         units = np.array([50.0, 1.0, 0.02])
-        scaled = state_weights / np.outer(units, units) * 0.02**4 / WEIGHTS["input_weight"]
+        scaled = np.diag(state_weights) / np.outer(units, units) * 0.02**4 / WEIGHTS["input_weight"]
         cost = linalg.solve_continuous_are(A, B, scaled, np.eye(1))
         np.testing.assert_allclose(found.feedback, cost[2] * units / 0.02**2, rtol=1e-9)
-        scaled = process_noise * np.outer(units, units) * 0.02**4 / (STD**2 * 0.001)
+        scaled = np.diag(process_noise) * np.outer(units, units) * 0.02**4 / (STD**2 * 0.001)
         covariance = linalg.solve_continuous_are(A.T, C.T, scaled, np.eye(1))
         np.testing.assert_allclose(found.observer, covariance[0] / units / 0.02**2, rtol=1e-9)
         poles = np.linalg.eigvals(A - found.observer[:, None] @ C)
@@ -78,19 +77,11 @@ def test_the_defaults_are_stable_in_steps() -> None:
     assert np.max(design.observer_poles.real) < 0.0
 
 
-def test_bad_weights_are_refused_with_what_and_why() -> None:
+def test_weights_without_gains_are_rejected() -> None:
     rows: list[tuple[dict[str, Any], str]] = [
-        ({"state_weights": np.diag([1.0, np.nan, 1.0])}, "not finite"),
-        ({"state_weights": np.diag([1.0, -2.0, 1.0])}, "-2"),
-        ({"state_weights": [[1, 2, 0], [0, 1, 0], [0, 0, 1]]}, "not symmetric"),
-        ({"state_weights": np.eye(2)}, r"\(3, 3\)"),
-        ({"process_noise": [[1, 2, 0], [2, 1, 0], [0, 0, 1]]}, "-1"),
-        ({"process_noise": np.zeros((3, 3))}, "process_noise"),
-        ({"state_weights": np.zeros((3, 3))}, "state_weights"),
+        ({"process_noise": (0.0, 0.0, 0.0)}, "process_noise"),
+        ({"state_weights": (0.0, 0.0, 0.0)}, "state_weights"),
         ({"input_weight": 0.0}, "input_weight = 0"),
-        ({"input_weight": np.nan}, "input_weight"),
-        ({"measurement_std": -1.0}, "measurement_std"),
-        ({"step_length": 0.0}, "step_length"),
         ({"step_length": 0.05}, "unstable"),
     ]
     for change, said in rows:

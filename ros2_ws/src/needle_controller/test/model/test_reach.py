@@ -1,4 +1,4 @@
-"""Reach of planes and points: closed forms against paths that are integrated step by step."""
+"""Reachability of planes and points: closed forms against integrated paths."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from needle_controller.model.point_reach import (
     widest_at,
 )
 from needle_controller.model.reachability import (
+    LARGEST_PITCH,
     check_offset,
     farthest_offsets,
     least_insertion,
@@ -29,7 +30,7 @@ from needle_sim.needle.plant import NeedlePlant, initial_pose
 CURVATURE = 1.0 / 0.122
 
 
-def test_the_plant_gets_there_in_the_least_insertion() -> None:
+def test_the_plant_reaches_the_plane_in_the_least_insertion() -> None:
     """On SE(3), rolls of +-90 deg: the closed form is exact."""
     x, pitch = -0.004, 0.05
     least = float(least_insertion([x, pitch, 0.0], CURVATURE))
@@ -60,15 +61,14 @@ def test_random_rolls_never_beat_the_farthest_offsets_and_those_take_all_inserti
             assert float(least) == pytest.approx(far, rel=1e-9)
 
 
-def test_a_pitch_limit_adds_a_straight_stretch() -> None:
-    limit = math.radians(20.0)
-    least = float(least_insertion([-0.05, 0.0, 0.0], CURVATURE, pitch_limit=limit))
-    arcs = 2.0 * (1.0 - math.cos(limit)) / CURVATURE
-    expected = 2.0 * limit / CURVATURE + (0.05 - arcs) / math.sin(limit)
+def test_the_largest_pitch_adds_a_straight_part() -> None:
+    least = float(least_insertion([-0.5, 0.0, 0.0], CURVATURE))
+    arcs = 2.0 * (1.0 - math.cos(LARGEST_PITCH)) / CURVATURE
+    expected = 2.0 * LARGEST_PITCH / CURVATURE + (0.5 - arcs) / math.sin(LARGEST_PITCH)
     assert least == pytest.approx(expected, rel=1e-12)
 
 
-def test_up_and_down_are_alike_and_needles_are_judged_one_by_one() -> None:
+def test_reach_is_symmetric_and_broadcasts() -> None:
     reduced = default_rng(2).uniform(-1, 1, (50, 3)) * [0.02, 1.2, 3.0]
     whole = least_insertion(reduced, CURVATURE, tolerance=1e-3)
     np.testing.assert_allclose(least_insertion(-reduced, CURVATURE, tolerance=1e-3), whole)
@@ -78,7 +78,7 @@ def test_up_and_down_are_alike_and_needles_are_judged_one_by_one() -> None:
     assert np.isnan(least_insertion([np.nan, 0.0, 0.0], CURVATURE))
 
 
-def test_what_is_left_of_the_depth_decides() -> None:
+def test_the_remaining_depth_decides_reachability() -> None:
     reduced = [-0.003, 0.0, 0.3]
     needed = float(least_insertion(reduced, CURVATURE))
     for spare, expected in ((1e-6, True), (-1e-6, False)):
@@ -91,7 +91,7 @@ def test_what_is_left_of_the_depth_decides() -> None:
         assert float(point.depth) == pytest.approx(0.1)
 
 
-def test_calls_that_make_no_sense_are_refused_with_what_and_why() -> None:
+def test_invalid_arguments_raise_errors_with_the_value() -> None:
     check_offset(0.028, CURVATURE, 0.12)
     with pytest.raises(UserError, match=r"0\.03 m cannot be reached.*-0\.0289.* to 0\.0289"):
         check_offset(0.03, CURVATURE, 0.12)
@@ -100,9 +100,6 @@ def test_calls_that_make_no_sense_are_refused_with_what_and_why() -> None:
     for curvature in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(UserError, match="curvature"):
             least_insertion([0.0, 0.0, 0.0], curvature)
-    for limit in (0.0, 0.5 * math.pi):
-        with pytest.raises(UserError, match="pitch_limit"):
-            least_insertion([0.0, 0.0, 0.0], CURVATURE, pitch_limit=limit)
     with pytest.raises(UserError, match="pitch"):
         least_insertion([0.0, 1.6, 0.0], CURVATURE)
     with pytest.raises(UserError, match="tolerance"):
@@ -138,7 +135,8 @@ def test_no_path_ends_sooner_than_it_may_nor_beyond_the_widest_place() -> None:
         widest = widest_at(ahead, CURVATURE)
         assert not np.isnan(least_insertion_to_point([0.0, widest - 1e-6, ahead], CURVATURE))
         assert np.isnan(least_insertion_to_point([0.0, widest + 1e-6, ahead], CURVATURE))
-    # Within the circle a tolerance may help; beside or behind it is there already.
+    # Within the circle a tolerance may help; a target beside or behind the tip may be reached
+    # already.
     radius = 1.0 / CURVATURE
     inside = np.array([radius - np.sqrt((radius - 0.0005) ** 2 - 0.06**2), 0.0, 0.06])
     assert least_insertion_to_point(inside, CURVATURE, tolerance=0.001) == pytest.approx(
@@ -161,7 +159,7 @@ def test_refusals_of_a_point_say_why_and_from_where_it_would_go() -> None:
     aside = np.array([0.03, -0.04, 0.06])
     with pytest.raises(UserError, match="in place of") as refusal:
         check_point(aside, CURVATURE, 0.15)
-    # From that entry it can be reached, from a little less far not.
+    # The point can be reached from that entry, but not from a slightly nearer one.
     (place,) = re.findall(r"entering at \((.*?)\)", str(refusal.value))
     entry = np.array([*(float(part) for part in place.split(",")), 0.0])
     check_point(aside - 1.001 * entry, CURVATURE, 0.15)

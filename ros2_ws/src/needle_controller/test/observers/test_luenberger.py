@@ -10,7 +10,7 @@ from numpy.random import default_rng
 from needle_controller.laws.law import LinearizingLaw, OpenLoopLaw
 from needle_controller.many_needles import ManyObservers
 from needle_controller.model.arrays import Array
-from needle_controller.model.feedback_linearization import rotation_rate
+from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.observers.luenberger import (
     OBSERVER,
@@ -80,7 +80,7 @@ def test_starts_at_the_orientation_the_base_gives() -> None:
 
 
 def test_prediction_follows_the_plant_from_a_known_state() -> None:
-    """No correction: the prediction alone, against SE(3), errs only by what v does in a step."""
+    """Prediction alone against SE(3): its error is that of a constant v in a step."""
     plant, one = NeedlePlant(poses(np.zeros(3)), curvature=CURVATURE), observer()
     one.reset(np.zeros(3), [0.0, 0.0])
     rng = default_rng(7)
@@ -140,7 +140,7 @@ def test_closed_loop_brings_the_needle_into_the_plane(x: float) -> None:
 
 
 def test_closed_loop_from_a_known_state_settles_within_the_needle() -> None:
-    """The law alone, true state known: the sign of every term matters here."""
+    """The law with the true state: the sign of every term matters."""
     plant, one, steer = (
         NeedlePlant(poses(np.array([0.003, 0.0, 0.0])), curvature=CURVATURE),
         observer(),
@@ -160,17 +160,17 @@ def test_law_is_7_for_short_steps() -> None:
     one.initial_rotation = rotation_from_angles([0.0, 0.5, 0.0])
     one.reset([1e-6, 0.0, 0.0], [0.0, 0.1])
     estimate = one.estimate()
-    # Enough pitch for the roll's own drift to matter: it is 4.5 rad/m here.
+    # With this pitch the roll drifts by 4.5 rad/m.
     assert abs(CURVATURE * np.tan(estimate.reduced[1])) > 1.0
     gains = law().gains._replace(step_length=1e-9, demand_margin=0.0, max_rotation_per_length=1e9)
     short = LinearizingLaw(gains)
     command = short(estimate)
-    expected = rotation_rate(estimate.reduced, command.virtual_input, CURVATURE)
-    assert float(command.rotation_rate) == pytest.approx(float(expected), rel=1e-5)
+    caused = virtual_input(estimate.reduced, command.rotation_rate, CURVATURE)
+    assert float(caused) == pytest.approx(command.virtual_input, rel=1e-5)
     assert float(command.virtual_input) == pytest.approx(-estimate.linearized @ gains.feedback)
 
 
-def test_law_caps_the_rotation_and_open_loop_never_turns() -> None:
+def test_law_limits_the_rotation_and_open_loop_never_turns() -> None:
     one = observer()
     slow = LinearizingLaw(law().gains._replace(max_rotation_per_length=10.0))
     for x, rate in ((0.02, -10.0), (-0.02, 10.0)):
@@ -186,7 +186,7 @@ def test_pure_rotation_turns_the_roll_alone() -> None:
     np.testing.assert_allclose(one.estimate().reduced, [0.001, 0.0, 0.5], atol=1e-12)
 
 
-def test_in_a_study_each_needle_is_as_the_node_has_it() -> None:
+def test_many_needles_equal_single_ones() -> None:
     rng, count = default_rng(8), 5
     tips = rng.normal(0.0, 2e-3, (20, count, 3))
     turns = rng.normal(0.0, 0.1, (20, count))
@@ -253,7 +253,7 @@ def test_a_late_tip_is_compared_with_where_the_tip_was() -> None:
 
 
 def test_covariance_is_honest() -> None:
-    """Over many noisy runs the spread of the errors is within what the covariance says."""
+    """Over many noisy runs the errors agree with the covariance."""
     rng, count = default_rng(9), 60
     squares = []
     for _ in range(count):
@@ -273,12 +273,12 @@ def test_covariance_is_honest() -> None:
         squares.append(error**2 / np.diag(known.covariance)[[0, 4, 5]])
     assert np.all(np.sqrt(np.mean(squares, axis=0)) < 1.3)
     assert np.all(np.linalg.eigvalsh(known.covariance) > 0.0)
-    # y and z are as measured; the yaw is not observed.
+    # y and z are measured; the yaw is not observed.
     assert known.covariance[1, 1] == pytest.approx(SETTINGS.measurement_std**2)
     assert known.covariance[3, 3] >= SETTINGS.initial_yaw_std**2
 
 
-def test_saturation_is_said() -> None:
+def test_saturation_is_reported() -> None:
     one = observer()
     one.reset([0.0, 0.0, 0.0], [0.0, 1.5])
     assert any("saturated" in warning for warning in one.estimate().warnings)

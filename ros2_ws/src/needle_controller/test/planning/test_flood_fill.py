@@ -1,4 +1,4 @@
-"""Where no path exists: proved of what is closed, never said of what has a path."""
+"""Proof that no path exists, by the flood fill."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import pytest
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.planning import entry as entries
-from needle_controller.planning.entry import NoPath, first_path
+from needle_controller.planning.entry import first_path
 from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
-from needle_controller.planning.path_settings import PathSettings
 
 CURVATURE = 1.0 / 0.1356
-SETTINGS = PathSettings(math.radians(30.0) / 0.001, curvature_share=1.0, comfortable_share=1.0)
+SETTINGS = PathSettings(math.radians(30.0) / 0.001, curvature_share=1.0, gentle_share=1.0)
 PLANNER = PathPlanner(SETTINGS)
 ENTRY = TipState(np.zeros(3), np.eye(3), CURVATURE)
 TARGET = np.array([0.0, 0.0, 0.1])
@@ -24,7 +24,7 @@ RADIUS = 0.003
 
 
 def wall(gap: float, middle: float = 0.0, depth: float = 0.05) -> Obstacles:
-    """A wall of rods across the way; between two of them is a gap, its middle aside in x [m]."""
+    """A wall of rods with a gap between two of them, whose middle is displaced in x [m]."""
     places = np.arange(0.5 * gap + RADIUS, 0.07, RADIUS)
     rods = [middle + sign * place for sign in (-1.0, 1.0) for place in places]
     return Obstacles([Obstacle((x, -0.08, depth), (x, 0.08, depth), RADIUS) for x in rods])
@@ -36,32 +36,31 @@ def may(obstacles: Obstacles, tip: TipState = ENTRY, target: Array = TARGET) -> 
 
 @pytest.fixture(scope="module", autouse=True)
 def _loaded() -> None:
-    """What is compiled is loaded once, and by no test."""
+    """Compiled code is loaded once, outside of the tests."""
     may(Obstacles())
 
 
 @pytest.fixture
 def _no_hint(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No entry near by is looked for, which takes seconds past a wall of rods."""
+    """Skip the search for another entry, which takes seconds at a wall of rods."""
     monkeypatch.setattr(entries, "nearest_entry", lambda *_: None)
 
 
 @pytest.mark.usefixtures("_no_hint")
 def test_a_wall_with_a_gap_has_a_path_and_one_without_has_none() -> None:
-    clear = 2.0 * SETTINGS.least_clear
+    clear = 2.0 * SETTINGS.least_clearance
     assert may(Obstacles())
     assert may(wall(clear + 0.001))
-    # A cell's size and 0.1 mm of bending are what the fill cannot tell apart.
+    # The resolution of the fill is a cell and 0.1 mm of bending.
     assert not may(wall(clear - 0.0015))
     found = first_path(PLANNER, ENTRY, TARGET, wall(clear - 0.0015))
-    assert isinstance(found, NoPath)
-    assert found.exists_none
-    assert "no path to the target point is clear of the" in found.why
+    assert isinstance(found, str)
+    assert "no path to the target point is clear of the" in found
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_gap_counts_only_where_a_needle_can_come_to_it_and_on_to_the_target(sign: float) -> None:
-    # Over half of 100 mm a needle that comes back gets 9.2 mm aside, one that need not 9.6 mm.
+def test_a_gap_counts_only_within_reach_of_needle_and_target(sign: float) -> None:
+    # Over half of 100 mm a needle that returns gets 9.2 mm aside, one that does not 9.6 mm.
     assert may(wall(0.004, sign * 0.004))
     assert not may(wall(0.004, sign * 0.014))
     aside = np.array([sign * 0.025, 0.0, 0.1])
@@ -69,8 +68,8 @@ def test_a_gap_counts_only_where_a_needle_can_come_to_it_and_on_to_the_target(si
     assert not may(wall(0.004, -sign * 0.004), target=aside)
 
 
-def test_a_target_is_reached_by_all_the_curvature_and_the_tolerance_but_no_more() -> None:
-    # The circle of the largest curvature, 0.1 m on, and how far it is aside there.
+def test_curvature_and_tolerance_bound_the_reachable_targets() -> None:
+    # Lateral position of the circle of the largest curvature, 0.1 m ahead.
     radius = 1.0 / CURVATURE
     aside = radius - math.sqrt(radius**2 - 0.1**2)
     for beyond, reached in ((0.0005, True), (0.0030, False)):
@@ -80,11 +79,11 @@ def test_a_target_is_reached_by_all_the_curvature_and_the_tolerance_but_no_more(
         assert may(Obstacles(), tip, tip.position + target) is reached
 
 
-def test_what_is_not_ahead_has_no_path() -> None:
+def test_a_target_behind_the_needle_has_no_path() -> None:
     assert not may(Obstacles(), target=np.array([0.0, 0.0, -0.01]))
 
 
-def test_what_has_a_path_is_never_said_to_have_none() -> None:
+def test_the_flood_fill_never_excludes_an_existing_path() -> None:
     paths = 0
     for seed in range(16):
         rng = np.random.default_rng([5, seed])
@@ -104,17 +103,16 @@ def test_what_has_a_path_is_never_said_to_have_none() -> None:
 
 
 @pytest.mark.usefixtures("_no_hint")
-def test_what_is_not_found_is_not_said_to_be_impossible(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Wide enough for the fill, by its cells' size, and too narrow for a needle.
-    narrow = wall(2.0 * SETTINGS.least_clear - 0.0003)
+def test_a_failed_search_is_not_reported_as_proof(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Wide enough for the resolution of the fill, too narrow for a needle.
+    narrow = wall(2.0 * SETTINGS.least_clearance - 0.0003)
     monkeypatch.setattr(entries, "THOROUGH_STARTS", 5)
     found = first_path(PLANNER, ENTRY, TARGET, narrow)
-    assert isinstance(found, NoPath)
-    assert not found.exists_none
-    assert "was found clear of the" in found.why
+    assert isinstance(found, str)
+    assert "was found clear of the" in found
 
 
-def test_the_thorough_search_finds_what_the_quick_one_misses() -> None:
+def test_the_thorough_search_finds_more_than_the_quick_one() -> None:
     # Scene 182 of the obstacle study of seed 909.
     rows = [
         (-0.00113, 0.01008, 0.07275, 0.01968, 0.00163, 0.04861, 0.00685),

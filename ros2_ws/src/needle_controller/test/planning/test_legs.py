@@ -1,4 +1,4 @@
-"""Legs: the advance against scipy's exponential, what they lead to, miss, and are cut to."""
+"""Legs: the advance against scipy's exponential, aims, misses, truncation."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.planning.legs import (
     MOST_POINTS,
-    cut_short,
+    advance_pose,
     leg_length,
     leg_towards,
-    move,
-    trace,
+    trace_leg,
+    truncated,
 )
 
 CURVATURE = 1.0 / 0.122
@@ -33,13 +33,13 @@ def test_an_advance_is_the_exponential_of_its_twist() -> None:
     pose, moved = pose_of(0.7, 0.3, -0.2), np.empty((3, 4))
     before = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
     for length, turn in ((0.03, 1.5), (1e-5, 0.0), (0.002, -3.0), (0.0, 1.0)):
-        move(pose, length, turn, CURVATURE, moved)
+        advance_pose(pose, length, turn, CURVATURE, moved)
         twist = np.zeros((4, 4))
         twist[1, 2], twist[2, 1] = -CURVATURE * length, CURVATURE * length
         twist[0, 1], twist[1, 0], twist[2, 3] = -turn, turn, length
         np.testing.assert_allclose(moved, (before @ expm(twist))[:3], atol=1e-12)
     in_place = pose.copy()
-    move(in_place, 0.0, 1.0, CURVATURE, in_place)
+    advance_pose(in_place, 0.0, 1.0, CURVATURE, in_place)
     np.testing.assert_allclose(in_place, moved)
 
 
@@ -50,8 +50,8 @@ def test_a_leg_leads_to_its_aim() -> None:
         pose = pose_of(*rng.uniform([-math.pi, -0.3, -0.3], [math.pi, 0.3, 0.3]))
         aim = pose[:, :3] @ [*rng.uniform(-0.008, 0.008, 2), rng.uniform(0.06, 0.12)]
         leg = leg_towards(pose, aim, CURVATURE, 0.8, RATE)
-        count = trace(pose, leg, CURVATURE, 0.01, points, end)
-        assert leg.miss == leg.scarce == 0.0
+        count = trace_leg(pose, leg, CURVATURE, 0.01, points, end)
+        assert leg.miss == leg.gentle_miss == 0.0
         assert leg.turning in (0.0, pytest.approx(abs(leg.turn) / RATE))
         assert leg.curvature <= CURVATURE
         assert abs(leg.turn) <= 1.31 * math.pi
@@ -62,33 +62,33 @@ def test_a_leg_leads_to_its_aim() -> None:
         assert np.all(np.linalg.norm(np.diff(points[:count, :3], axis=0), axis=1) < 0.0101)
 
 
-def test_an_aim_within_the_circle_is_missed_by_how_deep_it_lies() -> None:
+def test_an_aim_within_the_circle_is_missed_by_its_depth() -> None:
     # The needle bends to -y; the circle's centre is at y = -R. Here 3 mm within it.
     radius = 1.0 / CURVATURE
     inner = radius - 0.003
     aim = np.array([0.0, -radius + inner * math.cos(0.4), inner * math.sin(0.4)])
     leg = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
     assert leg.miss == pytest.approx(0.003, abs=1e-6)
-    assert leg.scarce > leg.miss
+    assert leg.gentle_miss > leg.miss
     behind = leg_towards(pose_of(), np.array([0.0, -0.001, -0.02]), CURVATURE, 0.8, RATE)
     assert behind.miss > 0.02
-    # Scarce is what a share of the curvature misses.
+    # gentle_miss is the miss with a share of the curvature.
     aim = np.array([0.0, -0.0148, 0.0605])
     full = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
     share = leg_towards(pose_of(), aim, 0.8 * CURVATURE, 1.0, RATE)
     assert full.miss == 0.0
-    assert full.scarce == pytest.approx(share.miss)
-    assert full.scarce > 1e-4
+    assert full.gentle_miss == pytest.approx(share.miss)
+    assert full.gentle_miss > 1e-4
 
 
-def test_a_leg_is_cut_where_its_whole_goes_through() -> None:
+def test_a_truncated_leg_continues_as_the_whole_leg() -> None:
     aim = np.array([0.006, 0.003, 0.09])
     whole = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
     points, end = np.empty((MOST_POINTS, 4)), np.empty((3, 4))
     for longest in (0.001, 0.01, 0.06, 1.0):
-        part = cut_short(whole, longest)
+        part = truncated(whole, longest)
         assert leg_length(part) == pytest.approx(min(longest, leg_length(whole)))
-        trace(pose_of(), part, CURVATURE, 0.0, points, end)
+        trace_leg(pose_of(), part, CURVATURE, 0.0, points, end)
         rest = leg_towards(end, aim, CURVATURE, 0.8, RATE)
         both = leg_length(part) + leg_length(rest)
         assert both == pytest.approx(leg_length(whole), abs=1e-4)

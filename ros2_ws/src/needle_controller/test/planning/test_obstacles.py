@@ -1,4 +1,4 @@
-"""Obstacles: distances against least squares, and where they are given: file, message, settings."""
+"""Obstacles: distances against least squares; files, messages and settings."""
 
 from __future__ import annotations
 
@@ -11,12 +11,22 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from needle_controller.planning.clearance import chain_margin, needed
-from needle_controller.planning.marked_obstacles import CYLINDER, SPHERE, obstacles_from_markers
-from needle_controller.planning.obstacle_files import read_obstacles
-from needle_controller.planning.obstacles import MOST_OBSTACLES, Obstacle, Obstacles
-from needle_controller.planning.path_settings import PathSettings, Unknown
-from needle_controller.planning.segments import segment_distance
+from needle_controller.planning.obstacles import (
+    CYLINDER,
+    MOST_OBSTACLES,
+    SPHERE,
+    Obstacle,
+    Obstacles,
+    obstacles_from_markers,
+    read_obstacles,
+    segment_distance,
+)
+from needle_controller.planning.path_evaluation import (
+    PathSettings,
+    PoseUncertainty,
+    chain_margin,
+    required_clearance,
+)
 from needle_core.errors import UserError
 from needle_core.messages import Marker, Markers
 
@@ -33,7 +43,7 @@ capsules:
 """
 
 
-def test_the_distance_of_segments_is_the_least_of_any_two_of_their_points() -> None:
+def test_segment_distance_is_the_least_distance_of_points() -> None:
     rng = np.random.default_rng(3)
     for _ in range(20):
         a, b, c, d = rng.normal(size=(4, 3))
@@ -53,18 +63,20 @@ def test_clearance_is_from_the_surface_of_the_nearest() -> None:
 
 
 @pytest.mark.parametrize(("unknown", "worst"), [((0.001, 0.0), 0.0), ((0.0, 0.2), 0.01)])
-def test_a_chord_is_as_clear_as_it_must_be_at_the_worse_of_its_ends(
+def test_a_chord_has_the_required_clearance_of_its_worse_end(
     unknown: tuple[float, float], worst: float
 ) -> None:
     settings = PathSettings(200.0)
-    # Place, and the path's length there.
+    # Position, and the path's length there.
     points = np.array([[1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.01, 0.01]])
     table = np.array([[1.02, 0.0, 0.005, 1.02, 0.0, 0.005, 0.003]])
-    margin = chain_margin(points, 2, table, Unknown(*unknown), settings)
-    assert margin == pytest.approx(0.017 - needed(worst, Unknown(*unknown), settings))
+    margin = chain_margin(points, 2, table, PoseUncertainty(*unknown), settings)
+    assert margin == pytest.approx(
+        0.017 - required_clearance(worst, PoseUncertainty(*unknown), settings)
+    )
 
 
-def test_what_is_no_obstacle_is_refused_by_name() -> None:
+def test_invalid_obstacles_are_rejected_by_number() -> None:
     for obstacles, words in (
         ([Obstacle((0.0, math.nan, 0.0), (0.0, 0.0, 0.0), 0.01)], "y of obstacle 1 = nan"),
         ([ROUND, Obstacle((0.0, 0.0, 50.0), (0.0, 0.0, 50.0), 0.01)], "z of obstacle 2 = 50 m"),
@@ -75,7 +87,7 @@ def test_what_is_no_obstacle_is_refused_by_name() -> None:
             Obstacles(obstacles)
 
 
-def test_a_file_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_file_is_read_or_rejected_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "obstacles.yaml"
     path.write_text(FILE, encoding="utf-8")
     np.testing.assert_allclose(
@@ -101,7 +113,7 @@ def test_a_file_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
         read_obstacles(tmp_path / "no.yaml")
 
 
-def test_markers_become_capsules_or_are_named() -> None:
+def test_markers_become_capsules_or_are_rejected_by_name() -> None:
     half = math.sqrt(0.5)
     # A quarter turn about x takes z to -y.
     lying = dataclasses.replace(

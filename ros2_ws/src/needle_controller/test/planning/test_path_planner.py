@@ -1,6 +1,6 @@
-"""Paths past obstacles: what they lead to, clear, refuse, and from where there are any.
+"""Paths past obstacles: targets, clearance, rejections, safe starts.
 
-Paths are driven again with scipy's exponential, and their clearance is sampled densely.
+Paths are simulated with scipy's exponential, and their clearance is sampled densely.
 """
 
 from __future__ import annotations
@@ -14,11 +14,10 @@ from scipy.linalg import expm
 
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
-from needle_controller.planning.legs import cut_short, leg_towards, move, seen_from
+from needle_controller.planning.legs import advance_pose, in_tip_axes, leg_towards, truncated
 from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
-from needle_controller.planning.path_settings import PathSettings
-from needle_controller.planning.safe_starts import SafeStarts, safe_starts
 from needle_core.errors import UserError
 
 CURVATURE = 1.0 / 0.122
@@ -40,13 +39,13 @@ def found(path: NeedlePath | None) -> NeedlePath:
 
 
 def driven(tip: TipState, path: NeedlePath, curvature: float) -> Array:
-    """Return places of a needle that is driven along a path, 0.25 mm apart, shape (N, 3)."""
+    """Return positions of a needle simulated along a path, 0.25 mm apart, shape (N, 3)."""
     pose = np.vstack([tip.pose, [0.0, 0.0, 0.0, 1.0]])
     places = [pose[:3, 3]]
     for row in path.legs:
         leg = leg_towards(pose[:3], row[:3], curvature, 1.0, RATE)
-        leg = cut_short(leg, row[3])
-        # Where it bends less than it can, the bevel goes to and fro: this is the mean.
+        leg = truncated(leg, row[3])
+        # With less than the full curvature, the bevel alternates: this is the mean path.
         assert leg.curvature < curvature or abs(leg.turn) <= RATE * leg.turning + 1e-9
         assert leg.curvature <= curvature
         for length, turn, kappa in (
@@ -66,7 +65,7 @@ def driven(tip: TipState, path: NeedlePath, curvature: float) -> Array:
 
 
 def sampled_clearance(places: Array, obstacles: Obstacles) -> float:
-    """Return the least distance of places from points strewn on capsules' axes, less the radii."""
+    """Return the least distance of positions from samples of the capsules' axes, less the radii."""
     shares = np.linspace(0.0, 1.0, 201)[:, np.newaxis]
     least = math.inf
     for row in obstacles.table:
@@ -76,8 +75,8 @@ def sampled_clearance(places: Array, obstacles: Obstacles) -> float:
     return least
 
 
-def test_a_path_that_is_driven_again_is_clear_and_ends_within_the_tolerance() -> None:
-    settings = PathSettings(RATE, curvature_share=0.9, comfortable_share=0.9)
+def test_a_simulated_path_is_clear_and_ends_within_the_tolerance() -> None:
+    settings = PathSettings(RATE, curvature_share=0.9, gentle_share=0.9)
     plans, paths = PathPlanner(settings), 0
     for seed in range(30):
         rng = np.random.default_rng([8, seed])
@@ -101,14 +100,14 @@ def test_a_path_that_is_driven_again_is_clear_and_ends_within_the_tolerance() ->
         assert path.length == pytest.approx(length, rel=1e-3)
         assert np.linalg.norm(places[-1] - target) <= settings.goal_tolerance + 1e-4
         # Chords of 5 mm are up to 0.03 mm off their arcs.
-        clear = sampled_clearance(places, obstacles) - settings.least_clear
+        clear = sampled_clearance(places, obstacles) - settings.least_clearance
         assert clear >= -3e-5
         assert path.margin == pytest.approx(clear, abs=6e-5)
     assert paths > 5
 
 
-def test_the_goal_tolerance_is_what_a_path_may_pass_its_target_by() -> None:
-    # Within the circle of 90 % of the curvature, once the bevel has turned, by less than 1 mm.
+def test_the_goal_tolerance_limits_the_distance_from_the_target() -> None:
+    # Less than 1 mm within the circle of 90 % of the curvature after the turn of the bevel.
     radius = 1.0 / (0.9 * CURVATURE)
     inner = radius - 0.0006
     target = np.array([0.0, inner * math.cos(0.7) - radius, inner * math.sin(0.7)])
@@ -120,7 +119,7 @@ def test_the_goal_tolerance_is_what_a_path_may_pass_its_target_by() -> None:
             assert np.linalg.norm(end - target) == pytest.approx(0.0006, abs=2e-5)
 
 
-def test_a_plan_depends_on_the_question_alone() -> None:
+def test_a_plan_depends_on_the_problem_alone() -> None:
     first, other = planner(), planner()
     other.path(ENTRY, [0.0, 0.01, 0.08], IN_THE_WAY)
     for _ in range(2):
@@ -138,31 +137,31 @@ def test_without_obstacles_the_path_is_one_leg_to_the_target() -> None:
     assert path.length == pytest.approx(np.linalg.norm(TARGET), rel=0.01)
 
 
-def test_a_needle_whose_pose_is_known_is_led_past_what_is_in_the_way() -> None:
+def test_a_needle_with_known_pose_passes_an_obstacle() -> None:
     plans, pose, least, insertion = planner(), ENTRY.pose, math.inf, 0.0
     paths: list[NeedlePath] = []
-    while (ahead := seen_from(pose, TARGET)[2]) > 1e-5:
+    while (ahead := in_tip_axes(pose, TARGET)[2]) > 1e-5:
         tip = TipState(pose[:, 3], pose[:, :3], CURVATURE)
-        followed = paths[-1] if paths else None
-        path = plans.path(tip, TARGET, IN_THE_WAY, insertion=insertion, followed=followed)
+        previous = paths[-1] if paths else None
+        path = plans.path(tip, TARGET, IN_THE_WAY, insertion=insertion, previous=previous)
         paths.append(found(path))
         length = min(0.002, ahead)
-        x, y, _ = seen_from(pose, paths[-1].aim)
+        x, y, _ = in_tip_axes(pose, paths[-1].aim)
         turn = min(max(math.atan2(x, -y), -RATE * length), RATE * length)
         for _ in range(4):
-            move(pose, length / 4, turn / 4, CURVATURE, pose)
+            advance_pose(pose, length / 4, turn / 4, CURVATURE, pose)
             least = min(least, IN_THE_WAY.clearance(pose[:, 3]) - NEEDLE)
         insertion += length
     assert len(paths[0].legs) > 1
     assert np.linalg.norm(pose[:, 3] - TARGET) < 1e-3
     assert least > 0.0
-    # It does not change its mind with every step; asked anew it says the same.
+    # The plan does not change at every step.
     assert sum(len(b.legs) != len(a.legs) for a, b in itertools.pairwise(paths)) <= 4
     again = found(planner().path(ENTRY, TARGET, IN_THE_WAY))
     np.testing.assert_array_equal(again.legs, paths[0].legs)
 
 
-def test_there_is_no_path_across_a_wall_nor_what_bends_too_little_or_is_too_short() -> None:
+def test_walls_stiff_needles_and_short_needles_have_no_path() -> None:
     rows = [
         Obstacle((-0.05, y, 0.05), (0.05, y, 0.05), 0.005) for y in np.arange(-0.06, 0.061, 0.008)
     ]
@@ -173,73 +172,39 @@ def test_there_is_no_path_across_a_wall_nor_what_bends_too_little_or_is_too_shor
     assert planner(longest=0.12).path(ENTRY, TARGET, Obstacles(), insertion=0.03) is None
 
 
-def test_what_is_unknown_widens_what_must_be_clear() -> None:
+def test_uncertainty_increases_the_required_clearance() -> None:
     near = Obstacles([Obstacle((0.0, 0.004, 0.02), (0.0, 0.004, 0.02), 0.003)])
     straight = np.array([0.0, 0.0, 0.09])
-    # The needle bends to -y before it is turned: away from the sphere.
+    # Before the turn the needle bends to -y, away from the sphere.
     known = found(planner().path(ENTRY, straight, near))
     unsure = TipState(np.zeros(3), np.eye(3), CURVATURE, 0.0003, math.radians(3.0))
     doubted = planner().path(unsure, straight, near)
     assert (-1.0 if doubted is None else doubted.margin) < known.margin
 
 
-def test_a_followed_path_goes_on_from_where_the_needle_is_unless_it_runs_into_something() -> None:
+def test_the_previous_path_continues_unless_it_is_blocked() -> None:
     plans = planner()
     path = found(plans.path(ENTRY, TARGET, IN_THE_WAY))
     first = float(path.legs[0, 3])
-    left = path.rest(0.5 * first)
+    left = path.remaining_legs(0.5 * first)
     assert left[0, 3] == pytest.approx(0.5 * first)
     np.testing.assert_array_equal(left[:, :3], path.legs[:, :3])
-    np.testing.assert_array_equal(path.rest(first)[:, :3], path.legs[1:, :3])
-    np.testing.assert_array_equal(path.rest(1.0)[:, :3], path.legs[-1:, :3])
-    # A target that moves is followed.
+    np.testing.assert_array_equal(path.remaining_legs(first)[:, :3], path.legs[1:, :3])
+    np.testing.assert_array_equal(path.remaining_legs(1.0)[:, :3], path.legs[-1:, :3])
+    # The path follows a moving target.
     moved = TARGET + np.array([0.002, 0.0, 0.0])
-    again = found(plans.path(ENTRY, moved, IN_THE_WAY, followed=path))
+    again = found(plans.path(ENTRY, moved, IN_THE_WAY, previous=path))
     np.testing.assert_allclose(again.legs[-1, :3], moved)
     direct = found(plans.path(ENTRY, TARGET, Obstacles()))
-    around = found(plans.path(ENTRY, TARGET, IN_THE_WAY, followed=direct))
+    around = found(plans.path(ENTRY, TARGET, IN_THE_WAY, previous=direct))
     assert around.margin >= 0.0
     assert len(around.legs) > 1
-    assert plans.path(ENTRY, TARGET, BURIED, followed=direct) is None
+    assert plans.path(ENTRY, TARGET, BURIED, previous=direct) is None
 
 
-def test_bad_calls_are_refused_with_the_value() -> None:
+def test_invalid_calls_raise_errors_with_the_value() -> None:
     with pytest.raises(UserError, match="sigmas = -1"):
         planner(sigmas=-1.0)
     bent = TipState(np.zeros(3), np.eye(3), math.nan)
     with pytest.raises(UserError, match="curvature = nan"):
         planner().path(bent, TARGET, Obstacles())
-
-
-def starts_of(obstacles: Obstacles) -> SafeStarts:
-    return safe_starts(
-        planner(),
-        [0.0, 0.0, 0.1],
-        obstacles,
-        CURVATURE,
-        offsets=np.array([-0.025, -0.01, 0.0, 0.01, 0.025]),
-        angles=np.radians([-30.0, -5.0, 0.0, 5.0, 30.0]),
-    )
-
-
-def test_safe_starts_are_those_with_a_path() -> None:
-    starts = starts_of(Obstacles())
-    # At 0.1 m a needle of 90 % of this curvature gets 44 mm aside, less while it turns;
-    # tilted by 30 deg the target lies 50 mm aside of 87 mm ahead.
-    assert np.all(starts.shifted)
-    assert np.all(starts.tilted[1:4, 1:4])
-    assert not np.any(starts.tilted[0, :])
-    assert not np.any(starts.tilted[:, 4])
-    assert starts.largest_shift == pytest.approx(0.025)
-    assert math.degrees(starts.largest_tilt) == pytest.approx(5.0 * math.sqrt(2.0))
-
-
-def test_safe_starts_are_not_in_an_obstacle_or_behind_it() -> None:
-    # An axis is x first: beside the entry in +x, from the surface to near the target.
-    shaded = starts_of(Obstacles([Obstacle((0.03, -0.05, 0.01), (0.03, 0.05, 0.01), 0.008)]))
-    assert not np.any(shaded.shifted[4, :])
-    assert np.all(shaded.shifted[:3, :])
-    assert shaded.largest_shift < 0.03
-    none = starts_of(BURIED)
-    assert not none.shifted[2, 2]
-    assert (none.largest_shift, none.largest_tilt) == (0.0, 0.0)

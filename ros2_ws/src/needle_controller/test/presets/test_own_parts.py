@@ -1,4 +1,4 @@
-"""Estimators, laws and planners of other packages: found, tried when loaded, held to what is."""
+"""Estimators, laws and planners of other packages: discovery, trials and limits."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.presets.own_estimator import tried_estimator
 from needle_controller.presets.own_law import OwnLaw, tried_law
 from needle_controller.presets.own_parts import GROUPS, OwnPartError
-from needle_controller.presets.own_planner import tried_planner
-from needle_controller.presets.path_steering import PathSteering
+from needle_controller.presets.path_steering import PathSteering, tried_planner
 from needle_controller.presets.point_steering import prompt_point_law
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
@@ -90,7 +89,7 @@ NUMBERS = itertools.count()
 
 @pytest.fixture
 def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Offer]:
-    """Return what makes a package that offers a class `Own` of a module; it returns its name."""
+    """Return a function that installs a package with a class `Own`, and returns its name."""
     modules = []
 
     def make(kind: str, source: str, package: str = "", name: str = "") -> str:
@@ -114,12 +113,12 @@ def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Offer]:
         sys.modules.pop(module, None)
 
 
-def test_an_own_estimator_stands_in_the_preset_s_place(offer: Offer) -> None:
+def test_an_own_estimator_replaces_the_presets(offer: Offer) -> None:
     name = offer("estimator", ESTIMATOR)
     settings = SteeringSettings(estimator=name, **PAPER_NOISE)
     assert settings.controller == f"best with estimator {name}"
     chances = []
-    # Chance is keyed by the seed and the needle.
+    # The random numbers depend on seed and needle.
     for seed, number in ((0, 0), (0, 500), (1, 0), (0, 500)):
         settings = SteeringSettings(estimator=name, seed=seed, **PAPER_NOISE)
         estimator, law = make_controller(settings, np.eye(3), number=number)
@@ -134,7 +133,7 @@ def test_an_own_estimator_stands_in_the_preset_s_place(offer: Offer) -> None:
     assert float(law(found, 0.001).rotation_rate) != 0.0
 
 
-def test_what_no_estimator_can_be_is_named(offer: Offer) -> None:
+def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
     for sound, wrong, said in (
         ("    def correct(self", "    def not_correct(self", "lacks correct(tip, covariance, age)"),
         ("def change_frame(", "def not_change_frame(", "lacks change_frame(T_new_old)"),
@@ -177,9 +176,7 @@ def test_a_name_is_offered_by_one_package_and_is_a_class(offer: Offer) -> None:
         tried_law(function)
 
 
-def test_an_own_law_turns_no_faster_than_the_rig_may_and_knows_how_far_points_are(
-    offer: Offer,
-) -> None:
+def test_an_own_law_is_limited_and_gets_the_remaining_insertion(offer: Offer) -> None:
     settings = SteeringSettings(law=offer("law", LAW), max_rotation_per_length=10.0)
     _, law = make_controller(settings, np.eye(3))
     estimate = pose_estimate(np.zeros(3), np.eye(3), 8.0, np.eye(6))
@@ -189,7 +186,7 @@ def test_an_own_law_turns_no_faster_than_the_rig_may_and_knows_how_far_points_ar
         OwnLaw(tried_law(settings.law), settings).to_point,
         prompt_point_law(settings),
     ):
-        # A quarter of a circle of 50 mm radius, and straight on, either way.
+        # A quarter of a circle of 50 mm radius, straight ahead, and behind.
         for target, left in (
             ((0.05, 0.0, 0.05), 0.05 * np.pi / 2.0),
             ((0.0, 0.0, 0.1), 0.1),
@@ -200,7 +197,7 @@ def test_an_own_law_turns_no_faster_than_the_rig_may_and_knows_how_far_points_ar
             assert float(said) == pytest.approx(left)
 
 
-def test_what_no_law_can_be_is_named(offer: Offer) -> None:
+def test_invalid_laws_are_rejected_with_the_reason(offer: Offer) -> None:
     rate = "40.0 * insertion"
     for wrong, said in (
         ("np.nan", "holds nan"),
@@ -211,7 +208,7 @@ def test_what_no_law_can_be_is_named(offer: Offer) -> None:
         with pytest.raises(OwnPartError) as error:
             tried_law(offer("law", LAW.replace(rate, wrong)))
         assert said in str(error.value)
-    # One for planes alone is not asked for a point.
+    # A law for planes alone is not tried with a point.
     name = offer("law", LAW.replace("def to_point", "def not_to_point"))
     with pytest.raises(UserError, match=r"cannot steer to a point: it lacks to_point"):
         SteeringSettings(law=name, target_point=(0.0, 0.0, 0.1))
@@ -219,7 +216,7 @@ def test_what_no_law_can_be_is_named(offer: Offer) -> None:
         SteeringSettings(law=name, flip_depths=(0.05,))
 
 
-def test_an_own_planner_leads_by_its_via_points_to_the_target(offer: Offer) -> None:
+def test_an_own_planner_steers_by_its_via_points(offer: Offer) -> None:
     settings = SteeringSettings(planner=offer("planner", PLANNER))
     way, target = PathSteering(settings), np.array([0.0, 0.0, 0.08])
     tip = entry_state(settings.curvature)
@@ -232,8 +229,8 @@ def test_an_own_planner_leads_by_its_via_points_to_the_target(offer: Offer) -> N
     assert around is not None
     np.testing.assert_allclose(around.aim, [0.0, -0.01, 0.04])
     assert around.length == pytest.approx(2.0 * np.hypot(0.01, 0.04))
-    assert way.why_not(target, Obstacles([sphere]), 0.0) == ""
-    none = way.why_not(target, Obstacles([sphere, sphere]), 0.0)
+    assert way.find_first(target, Obstacles([sphere]), 0.0) == ""
+    none = way.find_first(target, Obstacles([sphere, sphere]), 0.0)
     assert none == f"planner {settings.planner} finds no path to the target point past 2 obstacles"
     name = offer("planner", PLANNER.replace("return [target]", "return [target + 0.01]"))
     with pytest.raises(OwnPartError, match=r"does not end at the target \[0.0, 0.0, 0.08\] m"):

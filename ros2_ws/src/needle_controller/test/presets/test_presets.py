@@ -1,4 +1,4 @@
-"""What presets' settings must not be, and a sample of [KC09] section IV's study."""
+"""Invalid settings of presets, and a sample of the study of [KC09] section IV."""
 
 from __future__ import annotations
 
@@ -39,22 +39,19 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
     ("cannot be reached", {"target_point": (0.04, 0.0, 0.06)}),
     ("target_point", {"target_point": (0.0, 0.0, 2.0)}),
     ("paper cannot steer to a point", {"preset": "paper", "target_point": (0.0, 0.0, 0.1)}),
-    (
-        "flip_depths do not go together",
-        {"flip_depths": (0.05,), "target_point": (0.0, 0.0, 0.1)},
-    ),
+    ("flip_depths do not go together", {"flip_depths": (0.05,), "target_point": (0.0, 0.0, 0.1)}),
 ]
-"""What the refusal names, and the values."""
+"""Name in the error, and the values."""
 
 
-def test_what_cannot_be_steered_with_is_refused_by_name() -> None:
+def test_invalid_settings_are_rejected_by_name() -> None:
     for named, changes in REFUSED:
         with pytest.raises(UserError, match=named):
             SteeringSettings(**changes)
 
 
 def test_only_what_a_preset_uses_is_checked() -> None:
-    """Gains are of the paper's law, which is unstable over long steps."""
+    """Only the paper's law has gains, and it is unstable over long steps."""
     assert SteeringSettings(step_length=0.005).step_length == 0.005
     with pytest.raises(UserError, match="unstable"):
         SteeringSettings(preset="paper", step_length=0.005)

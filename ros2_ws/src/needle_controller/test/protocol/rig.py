@@ -1,4 +1,4 @@
-"""The other side of the step protocol, and what it is asked."""
+"""Simulated rig around the step protocol, and helpers for its tests."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Callable
 import numpy as np
 
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.actions import Action, Awaiting, SendStep, SteeringState
 from needle_controller.protocol.continuous import make_steering
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import Action, Awaiting, SendStep, SteeringState
-from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_controller.protocol.tip_checks import TipMeasurement
 from needle_core.component import Log
 from needle_core.status_messages import DeviceStatus
 
 TICK = 20_000_000
 SECOND = 10**9
 ENOUGH = 5
-"""So many good tips must be enough to go on after whatever was wrong."""
+"""Number of good tips that must suffice for a recovery."""
 
 
 def device(state: str, homed: bool = True, owner: str = "", reason: str = "") -> DeviceStatus:
@@ -31,7 +31,7 @@ FREE = device("HOLDING")
 
 
 class Rig:
-    """The other side of the protocol: joints, tips and answers, on its own clock."""
+    """Simulated rig: joints, tips and answers, on its own clock."""
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class Rig:
             assert self.start() == "steering"
 
     def start(self) -> str:
-        """Ask to steer; return the answer, which is "steering" where it does."""
+        """Request a start; return the reply, "steering" on success."""
         reply, actions = self.steering.on_start()
         assert reply.success == (reply.message == "steering")
         assert reply.message in logged(actions)
@@ -73,7 +73,7 @@ class Rig:
         return self.steering.on_joints(JointSample(self.now, self.insertion, self.rotation))
 
     def settle(self, count: int = 6) -> list[Action]:
-        """Let joint_states say several times where the needle is."""
+        """Send several joint samples of the present position."""
         actions: list[Action] = []
         for _ in range(count):
             self.now += TICK
@@ -81,17 +81,17 @@ class Rig:
         return actions
 
     def measured(self, x: float = 0.0, ahead: int = 0) -> TipMeasurement:
-        """Return a tip of where the needle is now, or is said to be `ahead` ns from now."""
+        """Return a tip of the present position, with a stamp `ahead` ns from now."""
         return TipMeasurement(self.now + ahead, "rig", np.array([x, 0.0, self.insertion]))
 
     def expose(self, tip: TipMeasurement | None = None, x: float = 0.0) -> list[Action]:
-        """One tick: joints, then the tip."""
+        """Advance by one tick: send joints, then the tip."""
         self.now += TICK
         actions = self.joints()
         return actions + self.steering.on_tip(tip or self.measured(x))
 
     def run(self, step: SendStep, part: float = 1.0, text: str = "succeeded") -> list[Action]:
-        """Carry out a part of a step and answer."""
+        """Execute a part of a step, and answer."""
         start = self.insertion, self.rotation
         for share in (0.5 * part, part):
             self.now += TICK
@@ -134,7 +134,7 @@ def where(rig: Rig) -> tuple[SteeringState, Awaiting]:
 def spied(
     rig: Rig, patch: Callable[[object, str, object], None], method: str
 ) -> list[tuple[object, ...]]:
-    """Return the list that gets the arguments of every further call of the estimator."""
+    """Return a list that collects the arguments of further calls of the estimator."""
     calls: list[tuple[object, ...]] = []
     estimator = rig.steering.control._estimator
     original = getattr(estimator, method)

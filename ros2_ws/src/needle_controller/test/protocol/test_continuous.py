@@ -1,4 +1,4 @@
-"""Continuous insertion: what path a tip leads to, and which tips are used."""
+"""Continuous insertion: paths, and the tips that are used."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from needle_controller.protocol import steering
-from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import (
+from needle_controller.protocol.actions import (
     Action,
     Awaiting,
     PublishUpdate,
     SendPath,
     SteeringState,
 )
-from needle_controller.protocol.step_watch import MOST_REFUSALS
-from needle_controller.protocol.trust import Trust
+from needle_controller.protocol.confidence import Confidence
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.motion_monitors import MAX_ABORTS_AT_REST
 
 from .rig import FREE, HELD, MOVING, TICK, Rig, logged, sent, spied, where
 
@@ -47,14 +47,14 @@ class ContinuousRig(Rig):
         super().__init__(depth=depth, way="continuous")
 
     def go_to(self, insertion: float) -> None:
-        """Go on along the path, no farther than that leads."""
+        """Advance along the path, at most to its end."""
         assert self.path is not None
         knots = np.array(self.path.points)
         self.insertion = min(insertion, knots[-1, 0])
         self.rotation = float(np.interp(self.insertion, knots[:, 0], knots[:, 1]))
 
     def go(self, distance: float) -> list[Action]:
-        """Go on, then see the tip; return what that leads to."""
+        """Advance, then expose the tip; return the actions."""
         self.go_to(self.insertion + distance)
         return self.see()
 
@@ -64,7 +64,7 @@ class ContinuousRig(Rig):
         return actions
 
     def refused(self) -> Iterator[int]:
-        """See tips whose paths are refused at once; yield how many until it gives up."""
+        """Expose tips whose paths are aborted at once; yield their number until the fault."""
         count = 0
         while self.steering.state is SteeringState.STEERING:
             count += 1
@@ -76,7 +76,7 @@ def test_the_same_tip_leads_to_the_same_path() -> None:
     assert len({path_in(ContinuousRig().see()) for _ in range(2)}) == 1
 
 
-def test_a_tip_leads_to_the_turn_of_a_step_and_a_path_beyond(
+def test_a_tip_leads_to_the_rotation_of_a_step_and_a_path_beyond(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stepwise, rig = Rig(), ContinuousRig()
@@ -87,9 +87,11 @@ def test_a_tip_leads_to_the_turn_of_a_step_and_a_path_beyond(
     assert end == pytest.approx((2 * MM, step.rotation, 2 * step.duration))
     assert path.stamp_ns == rig.steering.command_ns == rig.now
     assert where(rig) == AT_WORK
-    # In doubt it goes at half the speed.
+    # An uncertain estimate halves the speed.
     doubtful = ContinuousRig()
-    monkeypatch.setattr(steering, "trust_of", lambda *_: Trust("doubtful", is_doubtful=True))
+    monkeypatch.setattr(
+        steering, "assess_confidence", lambda *_: Confidence("doubtful", is_doubtful=True)
+    )
     assert path_in(doubtful.see()).points[1][2] == pytest.approx(2.0 * step.duration)
 
 
@@ -108,7 +110,7 @@ def test_a_tip_within_a_step_length_only_renews_the_path() -> None:
     assert updates_in(rig.go(0.0015 * MM)) == rig.steering.step == 1
 
 
-def test_the_path_of_a_needle_that_went_back_begins_where_the_needle_is() -> None:
+def test_the_path_begins_at_a_needle_that_went_back() -> None:
     rig = ContinuousRig()
     first = path_in(rig.see())
     rig.insertion = -0.2 * MM
@@ -128,7 +130,7 @@ def test_the_path_ends_at_the_depth_and_steering_there() -> None:
         rig.see()
         assert rig.path is not None
         assert rig.path.points[-1][0] <= 2.5 * MM
-    # An axis rests beside its goal: the last tip is used there, and a path leads to the very end.
+    # An axis rests beside its goal: the last tip is used there, and the path leads to the end.
     assert rig.steering.insertion == rig.insertion
     rig.go(MM)
     assert rig.steering.state is SteeringState.DONE
@@ -156,23 +158,23 @@ def test_without_hold_no_path_and_after_it_only_from_a_new_tip() -> None:
     assert path_in(rig.see()).stamp_ns == rig.now
 
 
-def test_an_answer_that_a_path_was_taken_asks_for_nothing_and_forgets_refusals() -> None:
+def test_an_accepted_path_resets_the_count_of_aborts() -> None:
     rig = ContinuousRig()
     for text in ("replaced", "succeeded"):
         for count in rig.refused():
-            if count == MOST_REFUSALS:
+            if count == MAX_ABORTS_AT_REST:
                 break
         first = path_in(rig.see())
         rig.see()
         assert rig.steering.on_result(first.stamp_ns, text) == []
         assert where(rig) == AT_WORK
-    # Of a path that was never sent nothing is believed.
+    # Answers to paths that were never sent are ignored.
     for stamp in (rig.steering.command_ns + 1, rig.steering.command_ns + TICK):
         assert rig.steering.on_result(stamp, "aborted: no") == []
     rig.steering.on_recorded_step(rig.steering.command_ns, JointSample(0, 0.0, 0.0))
 
 
-def test_refusals_in_a_row_are_a_fault_each_of_a_path_sent_when_the_last_was_known() -> None:
+def test_aborts_in_a_row_are_a_fault() -> None:
     for late in (0, 1, 3):
         rig = ContinuousRig()
         stamps = [path_in(rig.see()).stamp_ns for _ in range(late)]
@@ -182,20 +184,20 @@ def test_refusals_in_a_row_are_a_fault_each_of_a_path_sent_when_the_last_was_kno
             stamps.append(path_in(rig.see()).stamp_ns)
             rig.steering.on_result(stamps[-1 - late], "aborted: no")
             assert heard < 100
-        assert heard == 1 + (MOST_REFUSALS - 1) * (late + 1)
+        assert heard == 1 + (MAX_ABORTS_AT_REST - 1) * (late + 1)
         assert rig.steering.state is SteeringState.FAULT
         assert "without motion" in rig.steering.reason
 
 
-def test_refusals_of_all_that_a_cut_cable_held_back_count_once() -> None:
+def test_aborts_delayed_by_a_cut_cable_count_once() -> None:
     rig = ContinuousRig()
-    stamps = [path_in(rig.see()).stamp_ns for _ in range(3 * MOST_REFUSALS)]
+    stamps = [path_in(rig.see()).stamp_ns for _ in range(3 * MAX_ABORTS_AT_REST)]
     for stamp in stamps:
         rig.steering.on_result(stamp, "aborted: nobody holds to run")
     assert where(rig) == AT_WORK
 
 
-def test_paths_count_again_after_time_was_set_back_and_steering_started() -> None:
+def test_paths_are_sent_again_after_the_clock_went_back() -> None:
     rig = ContinuousRig()
     rig.now = 500 * TICK
     rig.settle()
@@ -205,16 +207,16 @@ def test_paths_count_again_after_time_was_set_back_and_steering_started() -> Non
     assert rig.steering.state is SteeringState.IDLE
     assert rig.start() == "steering"
     actions = rig.see()
-    # A needle that is out is another one: the path is its own.
+    # A needle that is out restarts the estimate, with a new path.
     assert updates_in(actions) == 1
     assert "aborted" in logged(rig.steering.on_result(path_in(actions).stamp_ns, "aborted: no"))
 
 
-def test_no_tips_is_waiting_and_a_good_one_ends_it() -> None:
+def test_the_tip_timeout_ends_with_a_good_tip() -> None:
     rig = ContinuousRig()
     rig.see()
     for second in range(10):
-        # Tips that renew the path are good ones.
+        # Tips that renew the path reset the timeout.
         assert rig.steering.on_time(float(second)) == []
         rig.see()
     rig.steering.on_time(10.0)
@@ -225,9 +227,7 @@ def test_no_tips_is_waiting_and_a_good_one_ends_it() -> None:
     assert rig.steering.reason == ""
 
 
-def test_the_estimator_is_moved_along_the_way_that_the_joints_went(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_estimator_follows_intermediate_joint_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = ContinuousRig()
     rig.see()
     way = spied(rig, monkeypatch.setattr, "advance")

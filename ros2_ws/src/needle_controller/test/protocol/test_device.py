@@ -1,11 +1,11 @@
-"""What the device answers, or does not, and retraction."""
+"""Answers of the device, missing answers, and retraction."""
 
 from __future__ import annotations
 
 import pytest
 
-from needle_controller.protocol.steering_types import Awaiting, SteeringState
-from needle_controller.protocol.step_watch import MOST_REFUSALS, MOST_UNFOLLOWED
+from needle_controller.protocol.actions import Awaiting, SteeringState
+from needle_controller.protocol.motion_monitors import MAX_ABORTS_AT_REST, MAX_UNFOLLOWED_STEPS
 
 from .rig import FREE, HELD, MOVING, TICK, Rig, device, logged, none_sent, sent, where
 
@@ -13,11 +13,11 @@ IDLE, FAULT = SteeringState.IDLE, SteeringState.FAULT
 NOTHING = Awaiting.NOTHING
 
 
-def test_a_lost_answer_ends_in_a_fault_and_moves_nothing() -> None:
+def test_a_lost_answer_is_a_fault_without_motion() -> None:
     rig = Rig()
     step = sent(rig.expose())
     timeout = rig.steering.settings.result_timeout
-    # It moves for as long as it likes; the time runs from when it stands again.
+    # The timeout starts when the motion ends.
     rig.steering.on_device(MOVING)
     for second in range(100):
         rig.settle(1)
@@ -31,14 +31,14 @@ def test_a_lost_answer_ends_in_a_fault_and_moves_nothing() -> None:
     assert rig.steering.watchdog_trips == 1
     assert rig.steering.on_result(step.stamp_ns, "succeeded") == []
     assert rig.expose() == []
-    # A person starts it again from where the needle really is.
+    # A new start continues from the actual position.
     rig.insertion = 0.0006
     rig.settle(1)
     assert rig.start() == "steering"
     assert sent(rig.expose()).insertion == pytest.approx(0.0016)
 
 
-def test_a_slow_step_of_a_device_that_never_says_moving_is_no_lost_answer() -> None:
+def test_a_slow_step_without_status_moving_is_not_a_lost_answer() -> None:
     rig = Rig()
     step = sent(rig.expose())
     for tenth in range(400):
@@ -49,7 +49,7 @@ def test_a_slow_step_of_a_device_that_never_says_moving_is_no_lost_answer() -> N
     assert rig.steering.state is SteeringState.STEERING
 
 
-def test_a_device_that_falls_silent_within_a_step_is_named_and_heard_again() -> None:
+def test_silence_of_the_device_and_its_end_are_logged() -> None:
     rig = Rig()
     for by_joints in (True, False):
         step = sent(rig.expose())
@@ -57,22 +57,22 @@ def test_a_device_that_falls_silent_within_a_step_is_named_and_heard_again() -> 
         rig.steering.on_time(0.0)
         assert rig.steering.on_time(9.9) == []
         assert "nothing heard of the device for 10 s" in logged(rig.steering.on_time(10.0))
-        assert rig.steering.patience.silence
+        assert rig.steering.watchdog.silence
         assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
         assert rig.steering.on_time(1e3) == []
         heard = rig.settle(1) if by_joints else rig.steering.on_device(MOVING)
         assert "heard again" in logged(heard)
-        assert not rig.steering.patience.silence
+        assert not rig.steering.watchdog.silence
         rig.steering.on_device(HELD)
         rig.run(step)
         rig.steering.on_time(2e3)
-    # No silence is left of a run that has ended.
+    # The silence is cleared at the end of a run.
     rig.expose()
     rig.steering.on_device(MOVING)
     rig.steering.on_time(0.0)
     rig.steering.on_time(10.0)
     rig.steering.on_stop()
-    assert not rig.steering.patience.silence
+    assert not rig.steering.watchdog.silence
 
 
 def test_a_retraction_ends_steering_until_the_needle_is_out() -> None:
@@ -85,13 +85,13 @@ def test_a_retraction_ends_steering_until_the_needle_is_out() -> None:
     assert "IDLE: needle retracted to 0.00479 m" in logged(rig.settle())
     assert where(rig) == (IDLE, NOTHING)
     assert not rig.steering.control.started
-    assert rig.steering.intake.last is None
+    assert rig.steering.tips.last is None
     rig.insertion = 0.004
     rig.settle()
     assert "retracted: draw it out first" in rig.start()
     while rig.insertion > 0.0:
         rig.insertion = max(rig.insertion - 0.0005, 0.0)
-        # Nobody is told of it again.
+        # The retraction is logged once.
         assert rig.settle(1) == []
     rig.settle()
     assert rig.start() == "steering"
@@ -119,11 +119,11 @@ def test_a_device_that_stops_ends_steering() -> None:
         assert rig.start() == "steering"
 
 
-def test_commands_that_never_move_end_in_a_fault_and_a_start_counts_anew() -> None:
+def test_commands_without_motion_are_a_fault_and_a_start_resets_the_count() -> None:
     rig = Rig()
     rig.steps(1)
     for _ in range(2):
-        for _ in range(MOST_REFUSALS):
+        for _ in range(MAX_ABORTS_AT_REST):
             assert rig.steering.state is SteeringState.STEERING
             step = sent(rig.expose())
             actions = rig.steering.on_result(step.stamp_ns, "aborted: beyond a limit")
@@ -131,17 +131,17 @@ def test_commands_that_never_move_end_in_a_fault_and_a_start_counts_anew() -> No
         assert "10 commands in a row ended without motion" in logged(actions)
         assert "beyond a limit" in logged(actions)
         assert rig.start() == "steering"
-    # One that moved a little is no refusal, and those before it are forgotten.
+    # A command with a little motion resets the count.
     for _ in range(3):
         rig.run(sent(rig.expose()), part=0.01, text="aborted: slow")
-        for _ in range(MOST_REFUSALS - 1):
+        for _ in range(MAX_ABORTS_AT_REST - 1):
             rig.steering.on_result(sent(rig.expose()).stamp_ns, "aborted: no")
         assert rig.steering.state is SteeringState.STEERING
 
 
-def test_a_person_who_lets_go_at_once_many_times_is_no_fault() -> None:
+def test_repeated_releases_are_not_a_fault() -> None:
     rig = Rig()
-    for _ in range(2 * MOST_REFUSALS):
+    for _ in range(2 * MAX_ABORTS_AT_REST):
         step = sent(rig.expose())
         rig.steering.on_result(step.stamp_ns, "aborted: hold released")
         rig.steering.on_device(FREE)
@@ -149,30 +149,30 @@ def test_a_person_who_lets_go_at_once_many_times_is_no_fault() -> None:
     assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
 
 
-def test_steps_that_the_joints_do_not_follow_are_a_fault() -> None:
+def test_unfollowed_steps_are_a_fault() -> None:
     for share in (0.0, 0.9):
         rig = Rig()
         rig.steps(3)
-        for count in range(1, MOST_UNFOLLOWED + 1):
+        for count in range(1, MAX_UNFOLLOWED_STEPS + 1):
             assert rig.steering.state is SteeringState.STEERING
             rig.run(rig.good_tips(), part=share)
             said = logged(rig.settle())
             assert "said to have succeeded" in said
-            assert ("so were 3 in a row" in said) is (count == MOST_UNFOLLOWED)
+            assert ("so were 3 in a row" in said) is (count == MAX_UNFOLLOWED_STEPS)
         assert where(rig) == (FAULT, NOTHING)
         assert rig.steering.step == 3
-        # A person has looked after it.
+        # A start resets the count.
         assert rig.start() == "steering"
         rig.run(rig.good_tips())
         assert rig.steering.step == 4
 
 
-def test_a_step_that_was_followed_forgets_those_that_were_not() -> None:
+def test_a_followed_step_resets_the_count_of_unfollowed_ones() -> None:
     rig = Rig()
-    for _ in range(MOST_UNFOLLOWED + 1):
+    for _ in range(MAX_UNFOLLOWED_STEPS + 1):
         rig.run(rig.good_tips(), part=0.5)
         rig.settle()
         assert "said to have succeeded" in rig.steering.reason
-        assert rig.steering.intake.after_ns <= rig.now - TICK
+        assert rig.steering.tips.after_ns <= rig.now - TICK
         rig.run(rig.good_tips())
     assert rig.steering.state is SteeringState.STEERING

@@ -1,10 +1,15 @@
-"""The joints of the last seconds: between samples, and what does not follow from the last."""
+"""Joint history: interpolation, and inconsistent samples."""
 
 from __future__ import annotations
 
 import math
 
-from needle_controller.protocol.joint_history import CONFIRMED_BY, Heard, JointHistory, JointSample
+from needle_controller.protocol.joint_history import (
+    CONFIRMED_BY,
+    JointHistory,
+    JointSample,
+    SampleResult,
+)
 
 TICK = 20_000_000
 SECOND = 10**9
@@ -15,11 +20,11 @@ START = 2 * HOUR
 def history(*samples: tuple[int, float, float]) -> JointHistory:
     made = JointHistory()
     for sample in samples:
-        assert made.add(JointSample(*sample)) is Heard.TAKEN
+        assert made.add(JointSample(*sample)) is SampleResult.ACCEPTED
     return made
 
 
-def test_joints_are_linear_between_samples_and_unknown_beyond_them() -> None:
+def test_joints_are_interpolated_and_unknown_outside_the_history() -> None:
     empty = JointHistory()
     assert (empty.at(5), empty.latest, empty.oldest) == (None, None, None)
     first, last = JointSample(100, 1e-5, 0.0), JointSample(400, 2e-5, 0.0)
@@ -31,13 +36,13 @@ def test_joints_are_linear_between_samples_and_unknown_beyond_them() -> None:
     assert (three.at(99), three.at(401)) == (None, None)
     assert list(three.after(200)) == [last]
     assert [sample.stamp_ns for sample in three.after(199)] == [200, 400]
-    # Stamps of a real clock lose nothing.
+    # Stamps of a real clock keep their precision.
     begin = 1_700_000_000_000_000_001
     two = history((begin, 0.0, 0.0), (begin + 2, 2e-6, 0.0))
     assert two.at(begin + 1) == JointSample(begin + 1, 1e-6, 0.0)
 
 
-def test_samples_on_a_way_are_spaced_out() -> None:
+def test_samples_between_two_others_are_spaced() -> None:
     made = history(*((k * TICK, 1e-4 * k, 0.0) for k in range(12)))
     start, end = JointSample(TICK, 1e-4, 0.0), JointSample(10 * TICK, 1e-3, 0.0)
     kept = made.between(start, end, 2.9e-4)
@@ -56,7 +61,7 @@ def test_memory_is_bounded() -> None:
     assert made.at(995) == JointSample(995, 1e-6 * 995, 0.0)
 
 
-def test_memory_is_bounded_also_where_a_new_truth_is_longer_than_it() -> None:
+def test_memory_is_bounded_after_a_jump() -> None:
     made = JointHistory(length=2)
     for start in (0, HOUR, 2 * HOUR):
         for tick in range(20):
@@ -65,67 +70,69 @@ def test_memory_is_bounded_also_where_a_new_truth_is_longer_than_it() -> None:
         assert made.latest == JointSample(start + 19 * TICK, 0.0, 0.0)
 
 
-def test_a_sample_counts_that_follows_from_the_one_before() -> None:
+def test_consistent_samples_are_accepted() -> None:
     for gap_ns, insertion, rotation, heard in (
-        # As far as a hand pushes and a motor turns in the time, and the noise of both.
-        (TICK, 1.199e-3, 0.699, Heard.TAKEN),
-        (TICK, -1.199e-3, -0.699, Heard.TAKEN),
-        (TICK, 1.201e-3, 0.0, Heard.DOUBTED),
-        (TICK, 0.0, -0.701, Heard.DOUBTED),
-        # Unseen for no longer than 40 ms.
-        (SECOND, 2.199e-3, 1.299, Heard.TAKEN),
-        (SECOND, 2.201e-3, 0.0, Heard.DOUBTED),
-        (SECOND, 0.0, 1.301, Heard.DOUBTED),
-        (SECOND + 1, 0.0, 0.0, Heard.DOUBTED),
-        (1, 0.0, 0.0, Heard.TAKEN),
-        (0, 1e-4, 0.0, Heard.REPEATED),
-        (-SECOND, 9.0, 9.0, Heard.REPEATED),
-        (-SECOND - 1, 0.0, 0.0, Heard.DOUBTED),
-        (TICK, math.nan, 0.0, Heard.DOUBTED),
-        (TICK, 0.0, math.inf, Heard.DOUBTED),
+        # Limits: the speed of a hand and of a motor, and the noise of both.
+        (TICK, 1.199e-3, 0.699, SampleResult.ACCEPTED),
+        (TICK, -1.199e-3, -0.699, SampleResult.ACCEPTED),
+        (TICK, 1.201e-3, 0.0, SampleResult.REJECTED),
+        (TICK, 0.0, -0.701, SampleResult.REJECTED),
+        # A motion between samples lasts at most 40 ms.
+        (SECOND, 2.199e-3, 1.299, SampleResult.ACCEPTED),
+        (SECOND, 2.201e-3, 0.0, SampleResult.REJECTED),
+        (SECOND, 0.0, 1.301, SampleResult.REJECTED),
+        (SECOND + 1, 0.0, 0.0, SampleResult.REJECTED),
+        (1, 0.0, 0.0, SampleResult.ACCEPTED),
+        (0, 1e-4, 0.0, SampleResult.REPEATED),
+        (-SECOND, 9.0, 9.0, SampleResult.REPEATED),
+        (-SECOND - 1, 0.0, 0.0, SampleResult.REJECTED),
+        (TICK, math.nan, 0.0, SampleResult.REJECTED),
+        (TICK, 0.0, math.inf, SampleResult.REJECTED),
     ):
         made, row = history((START, 0.05, 1.0)), (gap_ns, insertion, rotation)
         sample = JointSample(START + gap_ns, 0.05 + insertion, 1.0 + rotation)
         finite = math.isfinite(insertion + rotation)
-        # A repeated one, and one that is no number, are not even counted.
-        doubted = heard is Heard.DOUBTED and finite
+        # Repeated and non-finite samples are not counted.
+        doubted = heard is SampleResult.REJECTED and finite
         assert made.add(sample) is heard, row
-        assert (made.latest == sample) is (heard is Heard.TAKEN), row
-        assert (made.doubted, bool(made.complaint)) == (int(doubted), doubted), row
-        assert JointHistory().add(sample) is (Heard.TAKEN if finite else Heard.DOUBTED), row
+        assert (made.latest == sample) is (heard is SampleResult.ACCEPTED), row
+        assert (made.rejected, bool(made.problem)) == (int(doubted), doubted), row
+        assert JointHistory().add(sample) is (
+            SampleResult.ACCEPTED if finite else SampleResult.REJECTED
+        ), row
 
 
 SPIKES = [(TICK, 0.0, 0.0), (TICK, 0.05, 3.0), (HOUR, 0.05, 0.0), (-HOUR, 0.05, 0.0)]
 
 
-def test_a_spike_is_dropped_and_what_stays_is_the_new_truth() -> None:
+def test_a_spike_is_dropped_and_a_lasting_jump_is_accepted() -> None:
     for stamp, insertion, rotation in SPIKES:
         made = history((START, 0.05, 0.0))
         made.add(JointSample(START + stamp, insertion, rotation))
-        assert "do not follow from the last" in made.complaint
-        # One that does not follow from the spike either begins the count anew.
-        assert made.add(JointSample(START + 5 * HOUR, 1.0, 0.0)) is Heard.DOUBTED
+        assert "do not follow from the last" in made.problem
+        # A sample that is inconsistent with the spike restarts the count.
+        assert made.add(JointSample(START + 5 * HOUR, 1.0, 0.0)) is SampleResult.REJECTED
         heard = [
             made.add(JointSample(START + stamp + tick * TICK, insertion, rotation))
             for tick in range(5)
         ]
-        assert heard == [Heard.DOUBTED] * 4 + [Heard.JUMPED]
+        assert heard == [SampleResult.REJECTED] * 4 + [SampleResult.JUMPED]
         assert made.oldest == JointSample(START + stamp, insertion, rotation)
-        assert (made.complaint, made.doubted) == ("", 7)
+        assert (made.problem, made.rejected) == ("", 7)
 
 
-def test_a_complaint_says_from_where_to_where_and_in_what_time() -> None:
+def test_the_problem_names_both_positions_and_the_time() -> None:
     made = history((START, 0.05, -1.0))
     made.add(JointSample(START + TICK, 0.0625, 2.5))
     said = "joint_states do not follow from the last: 0.0625 m, 2.5 rad after 0.05 m, -1 rad"
-    assert made.complaint == f"{said}, 0.02 s later"
+    assert made.problem == f"{said}, 0.02 s later"
     made.add(JointSample(START - HOUR, 0.0625, 2.5))
-    assert made.complaint == f"{said}, -3600 s later"
+    assert made.problem == f"{said}, -3600 s later"
 
 
-def test_two_truths_in_turn_leave_the_first() -> None:
+def test_two_alternating_positions_keep_the_first() -> None:
     made = history((TICK, 0.05, 0.0))
     for tick in range(2, 40, 2):
-        assert made.add(JointSample(tick * TICK, 0.0, 0.0)) is Heard.DOUBTED
-        assert made.add(JointSample((tick + 1) * TICK, 0.05, 0.0)) is Heard.TAKEN
-        assert made.complaint == ""
+        assert made.add(JointSample(tick * TICK, 0.0, 0.0)) is SampleResult.REJECTED
+        assert made.add(JointSample((tick + 1) * TICK, 0.05, 0.0)) is SampleResult.ACCEPTED
+        assert made.problem == ""

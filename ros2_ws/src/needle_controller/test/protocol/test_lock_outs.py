@@ -1,4 +1,4 @@
-"""What is wrong for a while, or once, and how steering goes on from it."""
+"""Recovery of steering from temporary faults."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
+from needle_controller.protocol.actions import Awaiting, SteeringState
 from needle_controller.protocol.joint_history import CONFIRMED_BY, JointSample
-from needle_controller.protocol.steering_types import Awaiting, SteeringState
-from needle_controller.protocol.tip_gate import Fault, TipMeasurement
+from needle_controller.protocol.tip_checks import TipFault, TipMeasurement
 
 from .rig import MOVING, SECOND, TICK, Rig, logged, none_sent, sent, where
 
@@ -17,7 +17,7 @@ STEERING, IDLE = SteeringState.STEERING, SteeringState.IDLE
 
 
 def shown(rig: Rig, tips: list[TipMeasurement]) -> None:
-    """Show tips, right or wrong, one a tick; carry out what they lead to."""
+    """Expose tips, one per tick; execute the resulting steps."""
     for tip in tips:
         moved = TipMeasurement(rig.now + TICK, tip.frame_id, tip.position)
         actions = rig.expose(moved)
@@ -26,7 +26,7 @@ def shown(rig: Rig, tips: list[TipMeasurement]) -> None:
 
 
 @pytest.mark.parametrize("wrong", ["two bad tips", "five bad tips", "frozen camera"])
-def test_after_bad_tips_a_few_good_ones_are_enough(wrong: str) -> None:
+def test_steering_recovers_from_bad_tips(wrong: str) -> None:
     for restarted in (False, True):
         rig = Rig()
         rig.steps(20)
@@ -44,15 +44,15 @@ def test_after_bad_tips_a_few_good_ones_are_enough(wrong: str) -> None:
         rig.steps(3)
 
 
-def test_tips_that_jumped_together_count_from_the_fourth() -> None:
+def test_the_fourth_tip_after_a_jump_is_used() -> None:
     rig = Rig()
     rig.steps(10)
     for count in range(1, 4):
         assert "jumped" in logged(rig.expose(x=0.006))
-        assert rig.steering.intake.refused == {Fault.JUMP: count}
+        assert rig.steering.tips.rejected == {TipFault.JUMP: count}
     rig.run(sent(rig.expose(x=0.006)))
-    assert rig.steering.intake.refused == {Fault.JUMP: 3}
-    # One that is away from the others begins the count anew, and so does one that is not.
+    assert rig.steering.tips.rejected == {TipFault.JUMP: 3}
+    # A tip away from the others restarts the count, and so does one at the old place.
     for _ in range(2):
         for _ in range(3):
             assert none_sent(rig.expose(x=0.0))
@@ -62,7 +62,7 @@ def test_tips_that_jumped_together_count_from_the_fourth() -> None:
     assert not none_sent(rig.expose(x=0.0))
 
 
-def test_one_tip_from_the_future_holds_nothing_up() -> None:
+def test_a_tip_with_a_future_stamp_does_not_block_steering() -> None:
     for when, ahead in itertools.product(("wanted", "moving", "idle"), (0.05, 1.5, 3600.0)):
         rig = Rig()
         rig.steps(3)
@@ -80,37 +80,37 @@ def test_one_tip_from_the_future_holds_nothing_up() -> None:
             assert rig.start() == "steering"
         step = rig.good_tips()
         assert step.stamp_ns == rig.now
-        assert rig.steering.intake.after_ns <= rig.now
+        assert rig.steering.tips.after_ns <= rig.now
         if when == "wanted":
-            assert rig.steering.intake.refused == {Fault.AHEAD_OF_JOINTS: 1}
+            assert rig.steering.tips.rejected == {TipFault.AHEAD_OF_JOINTS: 1}
 
 
-def test_a_refused_tip_is_believed_to_be_of_its_stamp_up_to_a_tenth_of_a_second() -> None:
+def test_the_stamp_of_a_rejected_tip_counts_up_to_a_tenth_of_a_second_ahead() -> None:
     for ahead, believed in ((99_000_000, True), (101_000_000, False)):
         rig = Rig()
-        before = rig.steering.intake.after_ns
+        before = rig.steering.tips.after_ns
         nowhere = TipMeasurement(rig.now + ahead, "rig", np.full(3, np.nan))
         rig.steering.on_tip(nowhere)
-        assert rig.steering.intake.after_ns == (nowhere.stamp_ns if believed else before)
+        assert rig.steering.tips.after_ns == (nowhere.stamp_ns if believed else before)
 
 
-def test_of_many_tips_that_wait_the_newest_are_kept() -> None:
+def test_a_full_queue_keeps_the_newest_tips() -> None:
     rig = Rig()
     first = rig.now
     for k in range(1, 80):
         rig.steering.on_tip(rig.measured(ahead=k * TICK // 2))
-        # The same again changes nothing.
+        # A repeated tip changes nothing.
         rig.steering.on_tip(rig.measured(ahead=k * TICK // 2))
     rig.now += 39 * TICK
     step = sent(rig.joints())
     assert step.stamp_ns == first + 16 * TICK // 2
-    assert rig.steering.intake.refused.total() == 0
+    assert rig.steering.tips.rejected.total() == 0
 
 
 SPIKES = [(0, 0.01, 0.0), (0, -0.0006, 0.0), (0, 0.0006, 0.0), (0, 0.0, 2.0), (3600, 0.0, 0.0)]
 
 
-def test_a_spike_in_joint_states_stops_nothing() -> None:
+def test_a_spike_in_joint_states_does_not_stop_steering() -> None:
     for moving, spike in itertools.product((False, True), SPIKES):
         ahead, insertion, rotation = spike
         rig = Rig()
@@ -130,13 +130,13 @@ def test_a_spike_in_joint_states_stops_nothing() -> None:
         assert rig.steering.state is STEERING
 
 
-def test_a_doubt_about_joints_is_told_once() -> None:
+def test_inconsistent_joints_are_logged_once() -> None:
     rig = Rig()
     for count in range(1, 4):
         rig.now += TICK
         actions = rig.steering.on_joints(JointSample(rig.now, 0.05, 0.0))
         assert bool(actions) is (count == 1)
-    # One that is repeated does not say that the device is there.
+    # A repeated sample does not end the silence of the device.
     rig.settle()
     sent(rig.expose())
     for second in (0.0, 9.0):
@@ -145,7 +145,7 @@ def test_a_doubt_about_joints_is_told_once() -> None:
     assert "nothing heard" in logged(rig.steering.on_time(10.0))
 
 
-def test_joints_that_jumped_want_the_needle_out_unless_they_are_back() -> None:
+def test_after_a_joint_jump_the_needle_must_be_out_or_back() -> None:
     rig = Rig()
     rig.steps(15)
     deep = rig.insertion
@@ -170,7 +170,7 @@ def test_joints_that_jumped_want_the_needle_out_unless_they_are_back() -> None:
     assert rig.good_tips().insertion == pytest.approx(0.001)
 
 
-def test_a_clock_that_went_back_is_a_stop_and_a_start() -> None:
+def test_steering_stops_when_the_clock_goes_back_and_can_restart() -> None:
     rig = Rig()
     rig.now += 100 * SECOND
     rig.settle()
@@ -179,13 +179,13 @@ def test_a_clock_that_went_back_is_a_stop_and_a_start() -> None:
     rig.now -= 50 * SECOND
     assert "the clock of joint_states went -" in logged(rig.settle(CONFIRMED_BY))
     assert where(rig) == (IDLE, Awaiting.NOTHING)
-    assert rig.steering.intake.last is None
+    assert rig.steering.tips.last is None
     assert rig.start() == "steering"
     rig.run(rig.good_tips())
     assert rig.steering.step == 6
 
 
-def test_joints_that_were_silent_go_on_where_they_were() -> None:
+def test_steering_continues_after_a_gap_in_joint_states() -> None:
     for moved, goes_on in ((0.0, True), (0.00119, True), (-0.00019, True), (0.00121, False)):
         rig = Rig()
         rig.steps(5)

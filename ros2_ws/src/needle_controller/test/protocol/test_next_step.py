@@ -1,4 +1,4 @@
-"""The next step from where the needle is, how sure that is, and what was heard until then."""
+"""The next step, the confidence in the estimate, and the reception log."""
 
 from __future__ import annotations
 
@@ -8,19 +8,23 @@ import math
 import numpy as np
 import pytest
 
+from needle_controller.controller_status import ReceptionLog, received_messages
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.protocol.heard_messages import HeardMessages, heard_messages
+from needle_controller.protocol.actions import next_step
+from needle_controller.protocol.confidence import (
+    Confidence,
+    assess_confidence,
+    point_miss_probability,
+)
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.next_step import next_step
-from needle_controller.protocol.trust import Trust, point_missed, trust_of
 
 SETTINGS = SteeringSettings(depth=0.12)
 
 
-def test_a_step_goes_on_by_its_length_or_ends_at_depth_or_point() -> None:
+def test_a_step_has_its_length_or_ends_at_depth_or_point() -> None:
     rows: list[tuple[float, float | None, float | None]] = [
         (0.05, None, 0.051),
         (0.05, 0.005, 0.051),
@@ -29,7 +33,7 @@ def test_a_step_goes_on_by_its_length_or_ends_at_depth_or_point() -> None:
         (0.05, 0.99e-4, None),
         (0.05, 1e-4, None),
         (0.05, -0.01, None),
-        # The depth ends it before the point; a last step may be longer by a thousandth.
+        # The depth is before the point; the last step may be longer by a thousandth.
         (0.1195, 0.005, 0.12),
         (0.12 - 1.0009e-3, None, 0.12),
         (0.12 - 1.0011e-3, None, 0.12 - 1.1e-6),
@@ -53,58 +57,58 @@ def test_a_step_goes_on_by_its_length_or_ends_at_depth_or_point() -> None:
         assert slow == dataclasses.replace(step, duration=2.0 * step.duration)
 
 
-def test_trust_is_the_interval_of_the_covariance_the_doubts_and_the_end() -> None:
+def test_confidence_follows_from_covariance_and_miss_probability() -> None:
     estimator = HypothesisFilter(FilterSettings())
     for r1 in (-0.002, 0.002):
         estimator.reset([r1, 0.0, 0.0], np.zeros(2))
         estimate = estimator.estimate()
-        trust = trust_of(estimate)
+        trust = assess_confidence(estimate)
         half = 1.96 * math.sqrt(estimate.covariance[0, 0])
         assert trust.r1 == pytest.approx(r1, rel=1e-12)
         ends = trust.r1 - trust.low, trust.high - trust.r1
         assert ends == pytest.approx((half, half), rel=1e-4)
         assert (trust.verdict, trust.is_doubtful) == ("trusted", False)
-    there, elsewhere = trust_of(estimate, 0.049), trust_of(estimate, 0.72)
+    there, elsewhere = assess_confidence(estimate, 0.049), assess_confidence(estimate, 0.72)
     assert (there.verdict, there.is_doubtful) == ("trusted", False)
     assert elsewhere.verdict.startswith("doubtful: 72 %")
     assert elsewhere.is_doubtful
     wide = np.diag([1.1e-6, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert trust_of(dataclasses.replace(estimate, covariance=wide)).is_doubtful
-    # An estimator that does not judge itself is not judged by its end either.
-    unjudged = trust_of(dataclasses.replace(estimate, miss=None), 0.72)
+    assert assess_confidence(dataclasses.replace(estimate, covariance=wide)).is_doubtful
+    # Without a miss probability there is no verdict.
+    unjudged = assess_confidence(dataclasses.replace(estimate, miss=None), 0.72)
     assert (unjudged.verdict, unjudged.is_doubtful) == ("", False)
 
 
-def test_a_point_is_missed_as_often_as_it_is_said() -> None:
+def test_the_miss_probability_of_a_point_is_its_frequency() -> None:
     rng = np.random.default_rng(2)
     for spread in (0.0002, 0.0005, 0.0009):
         off = rng.normal(0.0, 0.0005, 3)
         root = rng.normal(0.0, spread, (3, 3))
         drawn = off + rng.normal(size=(40_000, 3)) @ root.T
         share = float(np.mean(np.linalg.norm(drawn, axis=1) > 1e-3))
-        assert float(point_missed(off, root @ root.T)) == pytest.approx(share, abs=0.03)
+        assert float(point_miss_probability(off, root @ root.T)) == pytest.approx(share, abs=0.03)
 
 
-def test_trust_in_a_line_says_the_distance_its_interval_and_the_verdict() -> None:
-    said = Trust("trusted", False, 0.001, -0.001, 0.003).summary
+def test_the_summary_contains_distance_interval_and_verdict() -> None:
+    said = Confidence("trusted", False, 0.001, -0.001, 0.003).summary
     assert said == "r1 = 0.00100 m +- 0.00200 m (95 %), trusted"
-    assert Trust(r1=0.0, low=-1.0, high=1.0).summary.endswith("(95 %)")
+    assert Confidence(r1=0.0, low=-1.0, high=1.0).summary.endswith("(95 %)")
 
 
-def test_what_was_heard_is_read_back_in_its_order_and_told_once() -> None:
-    heard = HeardMessages()
-    assert heard_messages(heard.take_text()) == []
+def test_the_reception_log_round_trips_once_in_order() -> None:
+    heard = ReceptionLog()
+    assert received_messages(heard.pop_text()) == []
     messages = [("joint_states", 1_700_000_000_000_000_000), ("needle/tip", 5), ("joint_states", 7)]
     for message in messages:
         heard.add(*message)
-    assert heard_messages(heard.take_text()) == messages
-    assert heard.take_text() == ""
-    # It is full until it is told.
+    assert received_messages(heard.pop_text()) == messages
+    assert heard.pop_text() == ""
+    # The log is full until it is published.
     for number in range(103):
         assert heard.is_full is (number >= 100)
         heard.add("joint_states", number)
-    assert len(heard_messages(heard.take_text())) == 103
+    assert len(received_messages(heard.pop_text())) == 103
     assert not heard.is_full
-    # What nobody sent so is no message.
-    found = heard_messages("joint_states soon, needle/tip -1, device/result 7, x 8 9")
+    # Malformed entries are ignored.
+    found = received_messages("joint_states soon, needle/tip -1, device/result 7, x 8 9")
     assert found == [("device/result", 7)]

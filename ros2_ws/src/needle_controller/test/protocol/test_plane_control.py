@@ -1,4 +1,4 @@
-"""One needle's estimator and law in closed loop: to a plane, to a point, past obstacles."""
+"""Estimator and law of one needle in closed loop: to a plane, to a point, past obstacles."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from needle_controller.filter import hypothesis_filter
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.planning.obstacles import Obstacle, Obstacles
-from needle_controller.planning.path_settings import PathSettings
+from needle_controller.planning.path_evaluation import PathSettings
 from needle_controller.presets.path_steering import path_planner
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
+from needle_controller.protocol.actions import next_step
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.next_step import next_step
 from needle_controller.protocol.plane_control import PlaneControl
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 
@@ -26,7 +26,7 @@ NOISE = 0.0005
 POINT, PAST = (0.004, -0.003, 0.05), (0.003, -0.004, 0.07)
 PLANE = SteeringSettings(**{**PAPER_NOISE, "tip_noise_bound": NOISE}, target_offset=0.003)
 TO_POINT = SteeringSettings(target_point=POINT, **PAPER_NOISE)
-# A sphere of 2 mm in the middle of the way.
+# A sphere of 2 mm in the middle of the path.
 TO_PAST = SteeringSettings(
     target_point=PAST,
     depth=0.15,
@@ -40,7 +40,7 @@ WALL = Obstacles(
 
 
 class Needle:
-    """An exact needle, and what steers it by tips with noise."""
+    """An exact needle, and a controller that gets noisy tips."""
 
     def __init__(
         self, settings: SteeringSettings, *, turned: float = 0.0, starts_deg: float = 15.0
@@ -67,7 +67,7 @@ class Needle:
     def steer(
         self, steps: int = 200, *, before: Callable[[int], object] = lambda _: None
     ) -> Needle:
-        """Steer on for so many steps of half a second, or to the end."""
+        """Steer for a number of steps of half a second, or to the end."""
         for k in range(steps):
             before(k)
             self.least = min(self.least, self.control.obstacles.clearance(self.tip))
@@ -107,7 +107,7 @@ def test_a_needle_is_steered_into_the_plane_however_its_base_was_turned(
 ) -> None:
     needle = Needle(dataclasses.replace(PLANE, **changes), turned=turned)  # type: ignore[arg-type]
     needle.steer(60)
-    # It unwinds on the way.
+    # The base unwinds on the way.
     assert abs(needle.joints.rotation) < needle.settings.max_winding
     assert max(needle.steer(60).track[-20:]) < 1e-3
 
@@ -120,9 +120,7 @@ def test_a_flip_turns_the_bevel_over_and_holds_the_plane() -> None:
     assert max(needle.track[69:]) < 1e-3
 
 
-def test_all_that_a_filter_runs_has_run_before_the_needle_waits_for_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_all_compiled_code_runs_at_construction(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("start_needle", "advance_needle", "correct_needle", "estimate_needle")
     ran = []
     for name in names:
@@ -137,7 +135,7 @@ def test_all_that_a_filter_runs_has_run_before_the_needle_waits_for_it(
     assert set(ran) == set(names)
 
 
-def test_a_change_of_preset_keeps_the_estimated_pose_and_steers_on() -> None:
+def test_a_change_of_preset_keeps_the_estimated_pose() -> None:
     for before, after in (("best", "paper"), ("paper", "best"), ("open_loop", "paper")):
         needle = Needle(dataclasses.replace(PLANE, preset=before)).steer(40)
         pose = needle.control._estimator.estimate()
@@ -146,26 +144,26 @@ def test_a_change_of_preset_keeps_the_estimated_pose_and_steers_on() -> None:
         np.testing.assert_allclose(kept.position, pose.position, atol=1e-9)
         assert kept.linearized[1] == pytest.approx(pose.linearized[1], abs=1e-3)
         if after != "best":
-            # s, since it cannot say on which side of +-90 deg the roll is; the mean of a new bank
-            # of hypotheses lies between them.
+            # s does not represent the side of +-90 deg of the roll; the mean of a new bank
+            # of hypotheses lies between both.
             assert kept.linearized[2] == pytest.approx(pose.linearized[2], abs=1.0)
         elif before == "paper":
             assert max(needle.steer(80).track[-20:]) < 1e-3
 
 
-def test_an_update_says_turn_miss_and_reach() -> None:
+def test_an_update_contains_turn_miss_probability_and_reach() -> None:
     needle = Needle(PLANE, turned=1.0)
     needle.steer(3)
-    # An encoder at rest may read a count less.
+    # An encoder at rest may read one count less.
     joints = JointSample(9, needle.joints.insertion - 1e-6, 1.5)
     update = needle.control.update(needle.tip, joints)
     assert update.turned == pytest.approx(0.5)
-    assert update.missed == update.estimate.miss
+    assert update.miss_probability == update.estimate.miss
     assert not update.blocked
     needle.control.target_point = np.array(POINT)
     update = needle.control.update(needle.tip, joints)
-    # It is far from there.
-    assert update.missed == pytest.approx(1.0)
+    # The tip is far from the point.
+    assert update.miss_probability == pytest.approx(1.0)
     needle.control.restart()
     assert not needle.control.started
     assert needle.control.update(needle.tip, joints).turned == 0.0
@@ -190,7 +188,7 @@ def breathing(time: float) -> Array:
     return np.asarray(np.array(POINT) + np.array([0.0, y, 2e-5 * time]))
 
 
-def test_a_point_that_moves_is_met_where_it_will_be_if_its_clock_is_known() -> None:
+def test_a_moving_point_is_reached_if_its_clock_is_known() -> None:
     ends = []
     for apart in (0.0, 1.7e9, None):
         needle = Needle(TO_POINT)
@@ -199,17 +197,17 @@ def test_a_point_that_moves_is_met_where_it_will_be_if_its_clock_is_known() -> N
             if apart is None:
                 needle.control.target_point = breathing(needle.time)
             else:
-                needle.control.see_target_point(breathing(needle.time), needle.time + apart)
+                needle.control.observe_target_point(breathing(needle.time), needle.time + apart)
 
         needle.steer(before=see)
         ends.append(needle.tip)
         if apart == 0.0:
             assert needle.off(breathing(needle.time)) < 0.0006
-    # Stamped by another clock nobody knows how old it is: it is where it was last seen.
+    # With stamps of another clock, the last observed position is used.
     np.testing.assert_array_equal(ends[1], ends[2])
 
 
-def test_the_depth_ends_it_before_the_point() -> None:
+def test_steering_ends_at_the_depth_before_the_point() -> None:
     needle = Needle(dataclasses.replace(TO_POINT, target_point=(0.0, 0.0, 0.04), depth=0.05))
     needle.control.target_point = np.array([0.0, 0.0, 0.1])
     needle.steer()
@@ -217,7 +215,7 @@ def test_the_depth_ends_it_before_the_point() -> None:
     assert not any(needle.reachable)
 
 
-def test_new_settings_keep_point_and_obstacles_unless_they_change_them_or_cannot() -> None:
+def test_new_settings_keep_point_and_obstacles_unless_they_change_them() -> None:
     control = PlaneControl(PLANE, PLANE.plane())
     assert control.target_point is None
     control.target_point, control.obstacles = np.array(POINT), WALL
@@ -229,34 +227,31 @@ def test_new_settings_keep_point_and_obstacles_unless_they_change_them_or_cannot
     assert len(control.obstacles) == 1
     control.configure(dataclasses.replace(PLANE, preset="paper"))
     assert control._points is None
-    # Every depth that a parameter may have is one of the planner.
+    # The planner accepts every depth that the parameter accepts.
     for depth in (0.0, 1e-5, 1.0):
         thick = SteeringSettings(depth=depth, needle_diameter=0.002, goal_tolerance=0.002)
         control.configure(thick)
         assert path_planner(thick).settings == PathSettings(
-            thick.max_rotation_per_length,
-            needle_radius=0.001,
-            goal_tolerance=0.002,
-            longest=depth,
+            thick.max_rotation_per_length, needle_radius=0.001, goal_tolerance=0.002, longest=depth
         )
 
 
-def test_the_needle_comes_to_the_point_past_an_obstacle() -> None:
+def test_the_needle_reaches_a_point_past_an_obstacle() -> None:
     settings = dataclasses.replace(TO_PAST, target_offset=0.004)
     needle = Needle(settings, starts_deg=10.0)
-    assert needle.control.path_obstacle(0.0) == ""
+    assert needle.control.reason_without_path(0.0) == ""
     needle.steer()
     assert not needle.blocked
     assert needle.off(PAST) < 0.001
     assert needle.least > 0.00035
-    # Without the obstacle it would have gone through it.
+    # Without the obstacle the needle would have passed through it.
     straight = Needle(dataclasses.replace(settings, obstacles=()), starts_deg=10.0)
     ball, least = needle.control.obstacles, []
     straight.steer(70, before=lambda _: least.append(ball.clearance(straight.tip)))
     assert min(least) < 0.0
 
 
-def test_a_wall_that_comes_on_the_way_stops_the_needle_before_it() -> None:
+def test_a_new_wall_stops_the_needle_before_it() -> None:
     needle = Needle(TO_PAST, starts_deg=10.0).steer(8)
     needle.control.obstacles = WALL
     needle.steer()
@@ -265,18 +260,18 @@ def test_a_wall_that_comes_on_the_way_stops_the_needle_before_it() -> None:
     assert needle.least > 0.00035
 
 
-def test_a_needle_that_is_out_is_told_why_there_is_no_path_and_from_where_there_is() -> None:
+def test_the_reason_without_path_names_an_entry_with_a_path() -> None:
     control = PlaneControl(TO_PAST, offset_plane(0.0))
     control.obstacles = Obstacles([Obstacle(PAST, PAST, 0.004)])
-    assert "the target point is -0.004 m from an obstacle" in control.path_obstacle(0.0)
+    assert "the target point is -0.004 m from an obstacle" in control.reason_without_path(0.0)
     control.obstacles = Obstacles([Obstacle((0.0, 0.0, 0.003), (0.0, 0.0, 0.003), 0.004)])
-    assert "the entry is -0.001 m from an obstacle" in control.path_obstacle(0.0)
+    assert "the entry is -0.001 m from an obstacle" in control.reason_without_path(0.0)
     # A wall that ends at y = 6 mm: from an entry farther in +y there is room beside it.
     control.obstacles = Obstacles(
         [Obstacle((-0.06, y, 0.025), (0.06, y, 0.025), 0.011) for y in (-0.045, -0.025, -0.005)]
     )
     control.target_point = np.array([0.0, 0.008, 0.1])
-    said = control.path_obstacle(0.0)
+    said = control.reason_without_path(0.0)
     assert "in place of (0, 0) there is one" in said
     x, y = (float(part) for part in said.split("entering at (")[1].split(") m")[0].split(","))
     assert y > 0.0
@@ -288,4 +283,4 @@ def test_a_needle_that_is_out_is_told_why_there_is_no_path_and_from_where_there_
             for row in control.obstacles.table
         ]
     )
-    assert control.path_obstacle(0.0) == ""
+    assert control.reason_without_path(0.0) == ""

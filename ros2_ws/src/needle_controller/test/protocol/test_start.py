@@ -1,4 +1,4 @@
-"""What it takes to start steering, and other settings on the way."""
+"""Conditions for a start, and changes of settings."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from needle_controller.model.target_plane import offset_plane
 from needle_controller.planning import entry
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.actions import Awaiting, SteeringState
 from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.steering_types import Awaiting, SteeringState
 
 from .rig import HELD, MOVING, TICK, Rig, device, logged, none_sent, sent, where
 
@@ -20,7 +20,7 @@ SETTINGS = SteeringSettings(target_offset=0.003, tip_covariance="configured")
 HOLDING = dataclasses.replace(HELD, insertion_m=0.0, rotation_rad=0.0)
 
 
-def test_start_says_which_device_it_waits_for() -> None:
+def test_start_reports_the_missing_device_state() -> None:
     bare = Steering(SETTINGS)
     assert "no device/status has come" in bare.on_start()[0].message
     bare.on_device(HELD)
@@ -38,8 +38,8 @@ def test_start_says_which_device_it_waits_for() -> None:
         assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
 
 
-def test_start_waits_for_joints_that_say_what_the_device_does() -> None:
-    """The joints lag behind the device: homing has ended there, and not here."""
+def test_start_waits_until_joints_and_device_agree() -> None:
+    """The joints lag behind the device's status after homing."""
     for insertion, rotation, agree in (
         (4.9e-5, -1.9e-2, True),
         (5.1e-5, 0.0, False),
@@ -66,7 +66,7 @@ def test_start_waits_for_joints_that_say_what_the_device_does() -> None:
     sent(rig.expose())
 
 
-def test_start_refuses_a_needle_that_is_in_or_at_the_depth_or_turned_too_far() -> None:
+def test_start_is_refused_for_an_inserted_or_rolled_needle() -> None:
     assert Rig(started=False, insertion=0.002).start() == "steering"
     assert "is 0.0021 m in and was not followed" in Rig(started=False, insertion=0.0021).start()
     for short, said in ((0.9e-6, "is at the depth 0.001 m"), (1.1e-6, "steering")):
@@ -76,16 +76,16 @@ def test_start_refuses_a_needle_that_is_in_or_at_the_depth_or_turned_too_far() -
         assert ("roll in target_plane" not in said) is started, degrees
 
 
-def test_best_starts_with_its_base_turned_however_the_last_run_left_it() -> None:
+def test_best_starts_at_any_rotation_of_the_base() -> None:
     for turned in (2.0, -8.0):
         rig = Rig(started=False, rotation=turned)
         assert rig.start() == "steering"
         assert sent(rig.expose()).rotation == pytest.approx(turned, abs=0.53)
 
 
-def test_start_and_stop_count_only_where_they_change_something() -> None:
+def test_start_and_stop_are_idempotent() -> None:
     rig = Rig(started=False)
-    # Tips move nothing while nobody has started.
+    # Tips cause no motion before a start.
     assert rig.expose() == []
     assert rig.steering.starts == 0
     assert rig.start() == "steering"
@@ -96,13 +96,13 @@ def test_start_and_stop_count_only_where_they_change_something() -> None:
         reply, _ = rig.steering.on_stop()
         assert (reply.success, reply.message) == (True, said)
         assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
-    # It goes on with what is known.
+    # Steering continues with the old estimate.
     assert rig.start() == "steering"
     assert rig.steering.reason == ""
     step = sent(rig.expose())
     assert step.insertion == pytest.approx(0.006)
     assert (rig.steering.step, rig.steering.starts) == (5, 2)
-    # A tip that waited for its joints when it was stopped is gone.
+    # A stop clears the queue of tips.
     rig.run(step)
     rig.steering.on_tip(rig.measured(ahead=TICK))
     rig.steering.on_stop()
@@ -110,24 +110,24 @@ def test_start_and_stop_count_only_where_they_change_something() -> None:
     assert none_sent(rig.settle(1))
 
 
-def test_a_needle_that_is_out_is_another_one() -> None:
+def test_a_needle_that_is_out_restarts_the_estimate() -> None:
     rig = Rig(insertion=0.0)
     rig.steps(2)
     rig.steering.on_stop()
     assert rig.start() == "steering"
     assert rig.steering.step == 0
     assert not rig.steering.control.started
-    assert rig.steering.intake.last is None
+    assert rig.steering.tips.last is None
 
 
-def test_settings_change_protocol_controller_and_plane_on_the_way() -> None:
+def test_settings_change_while_steering() -> None:
     steering = Steering(SETTINGS)
     law = steering.control._law
     steering.control.plane = offset_plane(0.005)
     shallower = dataclasses.replace(SETTINGS, depth=0.1, tip_timeout=3.0)
     steering.configure(shallower)
     assert steering.settings is shallower
-    # A given plane stays unless the offset is another.
+    # A received plane stays unless the offset changes.
     assert steering.control.plane.offset == 0.005
     steering.configure(dataclasses.replace(shallower, target_offset=0.002, preset="open_loop"))
     assert steering.control.plane.offset == 0.002
@@ -135,8 +135,8 @@ def test_settings_change_protocol_controller_and_plane_on_the_way() -> None:
     assert steering.control._law is not law
 
 
-def test_start_says_where_no_path_leads_past_obstacles(monkeypatch: pytest.MonkeyPatch) -> None:
-    # A path from another entry is looked for in planning's own tests.
+def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The search for another entry is tested with the planner.
     monkeypatch.setattr(entry, "nearest_entry", lambda *_: None)
     buried = (0.0, 0.0, 0.06, 0.0, 0.0, 0.06, 0.004)
     steering = Steering(
@@ -147,7 +147,7 @@ def test_start_says_where_no_path_leads_past_obstacles(monkeypatch: pytest.Monke
     steering.on_device(HELD)
     rig.joints()
     assert "the target point is" in rig.start()
-    # One that comes on the way stops the needle.
+    # A new obstacle stops the needle.
     steering.control.obstacles = Obstacles([Obstacle((0.05, 0.0, 0.02), (0.05, 0.0, 0.02), 0.001)])
     assert rig.start() == "steering"
     rig.steps(2)
@@ -157,5 +157,5 @@ def test_start_says_where_no_path_leads_past_obstacles(monkeypatch: pytest.Monke
         rig.run(sent(actions))
     assert "IDLE: no way on from insertion 0.0" in logged(actions)
     assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
-    said = steering.control.path_obstacle(0.0)
+    said = steering.control.reason_without_path(0.0)
     assert "no path to the target point is clear of the 3 obstacles, nor is one from" in said

@@ -1,4 +1,4 @@
-"""One step after the other."""
+"""Steps of the protocol."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import pytest
 
 from needle_controller.presets.own_parts import OwnPartError
 from needle_controller.protocol import steering
-from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import (
+from needle_controller.protocol.actions import (
     Action,
     Awaiting,
     PublishUpdate,
     SendStep,
     SteeringState,
 )
-from needle_controller.protocol.tip_gate import TipMeasurement
-from needle_controller.protocol.trust import Trust
+from needle_controller.protocol.confidence import Confidence
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.tip_checks import TipMeasurement
 
 from .rig import FREE, HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
 
 STEERING = SteeringState.STEERING
 
 
-def test_a_tip_leads_to_one_step_and_its_end_to_the_wish_for_another() -> None:
+def test_a_tip_leads_to_one_step_and_its_end_awaits_another() -> None:
     rig = Rig()
     assert where(rig) == (STEERING, Awaiting.TIP)
     assert rig.steering.command_ns == 0
@@ -33,7 +33,7 @@ def test_a_tip_leads_to_one_step_and_its_end_to_the_wish_for_another() -> None:
     step = sent(actions)
     assert step.stamp_ns == rig.now
     assert (step.insertion, step.duration) == pytest.approx((0.001, 0.5))
-    # Below the plane: the needle is turned so that it bends up, towards +x.
+    # Below the plane the needle is turned to bend towards +x.
     assert 0.0 < step.rotation <= np.deg2rad(30.0) + 1e-12
     update = next(action for action in actions if isinstance(action, PublishUpdate))
     assert update.stamp_ns == rig.steering.command_ns == rig.now
@@ -41,16 +41,16 @@ def test_a_tip_leads_to_one_step_and_its_end_to_the_wish_for_another() -> None:
     assert rig.steering.reach is update.update.reach
     assert where(rig) == (STEERING, Awaiting.RESULT)
     assert none_sent(rig.expose())
-    # Answers to other commands are not ours.
+    # Answers to other commands are ignored.
     assert rig.steering.on_result(step.stamp_ns - 1, "succeeded") == []
     assert where(rig) == (STEERING, Awaiting.RESULT)
     assert none_sent(rig.run(step))
     end = rig.now
     assert where(rig) == (STEERING, Awaiting.TIP)
-    assert (rig.steering.step, rig.steering.intake.after_ns) == (1, end)
+    assert (rig.steering.step, rig.steering.tips.after_ns) == (1, end)
     early = TipMeasurement(end - TICK // 2, "rig", np.array([0.0, 0.0, 0.0009]))
     assert rig.steering.on_tip(early) == []
-    assert rig.steering.intake.refused.total() == 0
+    assert rig.steering.tips.rejected.total() == 0
     assert sent(rig.expose()).insertion == pytest.approx(0.002)
     assert rig.steering.insertion == pytest.approx(0.001)
 
@@ -75,8 +75,8 @@ def test_without_hold_no_tip_is_used_and_after_it_a_fresh_one() -> None:
         assert none_sent(rig.expose())
         assert rig.steering.on_device(HELD) == []
         assert where(rig) == (STEERING, Awaiting.TIP)
-        assert rig.steering.intake.after_ns == rig.now
-        # A step waits for a device that still moves; a hold lost meanwhile asks anew.
+        assert rig.steering.tips.after_ns == rig.now
+        # A step waits for a moving device; a release discards it.
         rig.steering.on_device(MOVING)
         assert none_sent(rig.expose())
         assert where(rig) == (STEERING, Awaiting.DEVICE)
@@ -109,11 +109,11 @@ def test_joints_that_were_sent_before_the_answer_do_not_show_a_standstill() -> N
     assert none_sent(rig.steering.on_tip(rig.measured()))
     rig.insertion, rig.rotation = step.insertion, step.rotation
     rig.settle(1)
-    assert (rig.steering.step, rig.steering.intake.after_ns) == (1, rig.now)
+    assert (rig.steering.step, rig.steering.tips.after_ns) == (1, rig.now)
 
 
-def test_the_command_follows_from_stamps_whatever_order_the_topics_come_in() -> None:
-    """The answer, the tips and the joints of a step, each topic in its own order."""
+def test_the_command_does_not_depend_on_the_order_of_topics() -> None:
+    """Answer, tips and joints of a step arrive in any order of the topics."""
     after = set()
     for order in itertools.permutations(("answer", "tips", "before", "after")):
         if order.index("before") > order.index("after"):
@@ -141,11 +141,11 @@ def test_the_command_follows_from_stamps_whatever_order_the_topics_come_in() -> 
                     actions += rig.steering.on_joints(sample)
         after.add(sent(actions))
     (command,) = after
-    # Not one exposed before or in the motion: the first of the needle at rest.
+    # The first tip of the needle at rest, not one exposed before or during the motion.
     assert command.stamp_ns == tips[5].stamp_ns
 
 
-def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew() -> None:
+def test_motion_since_the_exposure_requires_a_new_tip() -> None:
     for moved, turned, looked_at_anew in (
         (1.01e-4, 0.0, True),
         (0.99e-4, 0.0, False),
@@ -159,7 +159,7 @@ def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew() ->
                 rig.steering.on_device(MOVING)
                 rig.expose()
             else:
-                early, last = rig.measured(ahead=TICK), rig.steering.intake.last
+                early, last = rig.measured(ahead=TICK), rig.steering.tips.last
                 rig.settle(1)
             rig.insertion += moved
             rig.rotation += turned
@@ -168,14 +168,14 @@ def test_a_needle_that_moved_by_itself_since_the_exposure_is_looked_at_anew() ->
                 actions = rig.steering.on_device(HELD)
             else:
                 actions = rig.steering.on_tip(early)
-                assert (rig.steering.intake.last is last) is looked_at_anew
+                assert (rig.steering.tips.last is last) is looked_at_anew
             assert none_sent(actions) is looked_at_anew, waiting
             if looked_at_anew:
                 assert where(rig) == (STEERING, Awaiting.TIP)
                 assert sent(rig.expose()).insertion == pytest.approx(rig.insertion + 0.001)
 
 
-def test_the_last_step_ends_at_the_depth_and_then_it_is_done() -> None:
+def test_the_last_step_ends_at_the_depth() -> None:
     rig = Rig(depth=0.0025)
     ends = []
     while rig.steering.state is STEERING:
@@ -187,19 +187,21 @@ def test_the_last_step_ends_at_the_depth_and_then_it_is_done() -> None:
     np.testing.assert_allclose(ends, [(0.001, 0.5), (0.002, 0.5), (0.0025, 0.25)])
     assert ends[-1][0] == rig.steering.insertion == 0.0025
     assert where(rig) == (SteeringState.DONE, Awaiting.NOTHING)
-    # It says how sure it is, and that the needle ends away from its plane.
+    # The reason contains the confidence: the needle ends away from the plane.
     assert "insertion 0.0025 m reached; r1 = " in rig.steering.reason
     assert "m (95 %), doubtful: " in rig.steering.reason
-    assert rig.steering.trust.is_doubtful
+    assert rig.steering.confidence.is_doubtful
     assert "at the depth" in rig.start()
 
 
-def test_in_doubt_it_goes_on_at_half_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(steering, "trust_of", lambda *_: Trust("doubtful", is_doubtful=True))
+def test_an_uncertain_estimate_halves_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        steering, "assess_confidence", lambda *_: Confidence("doubtful", is_doubtful=True)
+    )
     assert sent(Rig().expose()).duration == pytest.approx(1.0)
 
 
-def test_a_recorded_device_may_have_made_another_step() -> None:
+def test_a_recorded_step_replaces_the_sent_one() -> None:
     rig = Rig()
     rig.steering.on_recorded_step(5, JointSample(0, 0.0, 0.0))
     assert rig.steering.on_result(5, "succeeded") == []
@@ -208,12 +210,10 @@ def test_a_recorded_device_may_have_made_another_step() -> None:
     rig.steering.on_recorded_step(step.stamp_ns + 1, other)
     assert rig.steering.on_result(step.stamp_ns, "succeeded") == []
     rig.run(SendStep(step.stamp_ns + 1, other.insertion, other.rotation, 0.5))
-    assert (rig.steering.step, rig.steering.intake.after_ns) == (1, rig.now)
+    assert (rig.steering.step, rig.steering.tips.after_ns) == (1, rig.now)
 
 
-def test_an_own_part_that_fails_on_the_way_stops_the_needle(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_failing_part_of_another_package_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise OwnPartError("advance() raised RuntimeError")
 
@@ -224,7 +224,7 @@ def test_an_own_part_that_fails_on_the_way_stops_the_needle(
         (log,) = rig.expose()
     assert logged([log]) == "FAULT: advance() raised RuntimeError"
     assert where(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
-    # A tip that comes later moves nothing either.
+    # A later tip causes no motion either.
     assert none_sent(rig.expose())
     assert rig.start() == "steering"
     sent(rig.expose())

@@ -44,15 +44,16 @@ class ParameterSpec:
     texts: bool = False
 
 
-def parameter(default: Any, **spec: Any) -> Any:
-    """Declare a field of a parameter dataclass; the keywords are those of `ParameterSpec`."""
-    return dataclasses.field(default=default, metadata={_METADATA_KEY: ParameterSpec(**spec)})
+def parameter(default: Any, *spec: Any, **more: Any) -> Any:
+    """Declare a field of a parameter dataclass; the arguments are those of `ParameterSpec`."""
+    return dataclasses.field(
+        default=default, metadata={_METADATA_KEY: ParameterSpec(*spec, **more)}
+    )
 
 
 def fixed_parameter(default: Any, *spec: Any, **more: Any) -> Any:
-    """Declare a field whose value is fixed once the node runs, by the arguments of the spec."""
-    fixed = dataclasses.replace(ParameterSpec(*spec, **more), read_only=True)
-    return dataclasses.field(default=default, metadata={_METADATA_KEY: fixed})
+    """Declare a field whose value is fixed once the node runs; see `parameter`."""
+    return parameter(default, *spec, **more, read_only=True)
 
 
 def specs(parameters: Any) -> Iterator[tuple[str, ParameterSpec, Any]]:

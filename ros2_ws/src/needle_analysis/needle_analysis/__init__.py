@@ -1,1 +1,0 @@
-"""Analysis of bags: rerun, report, and the figures of a run."""

@@ -1,1 +1,0 @@
-"""Figures of a run, or of two, and the frames of its film."""

@@ -1,1 +1,0 @@
-"""The needle for programs that speak OpenIGTLink, such as 3D Slicer."""

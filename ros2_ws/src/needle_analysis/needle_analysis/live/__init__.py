@@ -1,1 +1,0 @@
-"""Picture of a needle while it is steered: no ROS."""

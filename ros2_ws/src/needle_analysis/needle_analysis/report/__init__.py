@@ -1,1 +1,0 @@
-"""A run, or two, as a page: what it says, and in which words."""

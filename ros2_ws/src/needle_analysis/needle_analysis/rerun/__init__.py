@@ -1,1 +1,0 @@
-"""A bag's inputs through today's code, beside what was recorded."""

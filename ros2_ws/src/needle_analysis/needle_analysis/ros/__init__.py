@@ -1,1 +1,0 @@
-"""The stages of `rerun`, with the nodes' own conversions."""

@@ -1,0 +1,1 @@
+"""Figures and film of a run, or of two."""

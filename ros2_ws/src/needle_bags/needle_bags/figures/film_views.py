@@ -1,0 +1,209 @@
+"""Views of the film: camera images, and drawings from the side and from above."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from collections.abc import Callable, Collection, Sequence
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from needle_bags.figures.figure_style import (
+    GOAL_BAND,
+    MM,
+    STYLE,
+    TRUTH,
+    WIDTH,
+    place,
+    png_size,
+    save,
+)
+from needle_bags.figures.film import Frame
+from needle_bags.reading.bag_images import SIDES, images_at
+from needle_bags.reading.bag_reader import Run
+from needle_bags.run.run_summary import GOAL, finite_tips, target_offset
+from needle_core.errors import UserError
+from needle_core.files.plain_yaml import load_plain
+from needle_tracker.optics.calibration import parse_calibration
+
+Floats = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
+Projection = Callable[[Floats], Floats]
+
+MAX_BYTES = 30_000
+"""Size limit of a camera image; a film of both cameras has at most 3.7 MB, 5 MB as text."""
+_LARGEST_PX = (480, 400)
+# Tried in this order.
+_QUALITIES = (75, 60, 45, 30, 15, 5, 1)
+_MAX_POINTS = 24
+_MAX_COORDINATE_PX = 1e4
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A picture for all frames, or one for each, with the needle drawn over it.
+
+    Attributes
+    ----------
+    name : str
+        Caption.
+    size : tuple of int
+        Width and height of the coordinates in `lines` [px].
+    pictures : sequence of bytes
+        A JPEG for each frame, empty if the bag has none; or one PNG for all frames.
+    lines : sequence of (n, 2) float64
+        The needle in each frame, from the entry point to the tip; empty: not drawn.
+    """
+
+    name: str
+    size: tuple[int, int]
+    pictures: Sequence[bytes]
+    lines: Sequence[Floats]
+
+    @property
+    def is_chart(self) -> bool:
+        """Whether there is one drawing for all frames."""
+        return len(self.pictures) == 1 and self.pictures[0].startswith(b"\x89PNG")
+
+
+def projections(run: Run) -> dict[str, Projection]:
+    """Return the projections of both cameras; empty without a calibration."""
+    # Compiled code, which a run without images does not need.
+    from needle_tracker.optics.refraction import stereo_views  # noqa: PLC0415
+
+    try:
+        calibration = parse_calibration(load_plain(run.calibration))
+    except (UserError, ValueError):
+        return {}
+    views = stereo_views(calibration)
+    return {side: view.project for side, view in zip(SIDES, views, strict=True)}
+
+
+def camera_views(
+    run: Run, frames: Sequence[Frame], whole: Collection[int]
+) -> tuple[list[View], dict[tuple[int, str], Image]]:
+    """Return the camera views, and some of the images in full size.
+
+    Parameters
+    ----------
+    run : Run
+        The run; its images are read.
+    frames : sequence of Frame
+        Frames of the film.
+    whole : collection of int
+        Frames whose images are returned in full size, by frame and side.
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be read.
+    """
+    pictures: dict[tuple[int, str], bytes] = {}
+    kept: dict[tuple[int, str], Image] = {}
+    sizes: dict[str, tuple[int, int]] = {}
+    stamps = np.array([frame.stamp for frame in frames], np.int64)
+    for index, side, image in images_at(run, stamps):
+        pictures[index, side] = _small_jpeg(image)
+        sizes.setdefault(side, (image.shape[1], image.shape[0]))
+        if index in whole:
+            kept[index, side] = image
+    seen_by = projections(run) if sizes else {}
+    views = [
+        View(
+            f"{side} camera",
+            sizes[side],
+            [pictures.get((index, side), b"") for index in range(len(frames))],
+            [_pixels(seen_by.get(side), frame.shaft) for frame in frames],
+        )
+        for side in SIDES
+        if side in sizes
+    ]
+    return views, kept
+
+
+def plan_views(run: Run, frames: Sequence[Frame]) -> list[View]:
+    """Return drawings of needle and target from the side and from above."""
+    names = {0: "from the side, with the wanted plane", 1: "from above"}
+    return [_plan_view(run, frames, axis, name) for axis, name in names.items()]
+
+
+def _plan_view(run: Run, frames: Sequence[Frame], axis: int, name: str) -> View:
+    plane, point = target_offset(run), _target_point(run)
+    known = [run.truth.values[:, :3], finite_tips(run).values, np.zeros((1, 3))]
+    if point is not None:
+        known.append(point[None])
+    elif axis == 0:
+        known.append(np.array([[plane - GOAL, 0.0, 0.0], [plane + GOAL, 0.0, 0.0]]))
+    places = np.concatenate(known) * MM
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 2.5))
+        place(figure, 1, top=0.12)
+        axes = figure.subplots()
+        low, high = places.min(axis=0), places.max(axis=0)
+        room = 0.06 * (high - low) + 0.2
+        axes.set_xlim(low[2] - room[2], high[2] + room[2])
+        axes.set_ylim(low[axis] - room[axis], high[axis] + room[axis])
+        if point is not None:
+            axes.plot(point[2] * MM, point[axis] * MM, "*", ms=13, color=GOAL_BAND)
+        elif axis == 0:
+            band = ((plane - GOAL) * MM, (plane + GOAL) * MM)
+            axes.axhspan(*band, color=GOAL_BAND, alpha=0.16, lw=0)
+            axes.axhline(plane * MM, color=GOAL_BAND, lw=1.3)
+        path = (run.truth if len(run.truth) else finite_tips(run)).values * MM
+        axes.plot(path[:, 2], path[:, axis], color=TRUTH, lw=0.9, ls=(0, (2, 3)))
+        axes.set(xlabel="z, insertion [mm]", ylabel=("x, up [mm]", "y, beside [mm]")[axis])
+        buffer = io.BytesIO()
+        save(figure, buffer)
+        picture = buffer.getvalue()
+        width, height = png_size(picture)
+        corners = np.array([[0.0, 0.0], [1.0, 1.0]])
+        (left, bottom), (right, top) = figure.transFigure.inverted().transform(
+            axes.transAxes.transform(corners)
+        )
+        x_range, y_range = axes.get_xlim(), axes.get_ylim()
+
+    def pixels(needle: Floats) -> Floats:
+        along = (needle[:, 2] * MM - x_range[0]) / (x_range[1] - x_range[0])
+        up = (needle[:, axis] * MM - y_range[0]) / (y_range[1] - y_range[0])
+        u = (left + along * (right - left)) * width
+        v = (1.0 - bottom - up * (top - bottom)) * height
+        return np.stack([u, v], axis=1)
+
+    lines = [_pixels(pixels, frame.needle) for frame in frames]
+    return View(name, (width, height), [picture], lines)
+
+
+def _target_point(run: Run) -> Floats | None:
+    try:
+        point = np.array([float(part) for part in run.last_status("target_point_m").split(",")])
+    except ValueError:
+        return None
+    return point if point.shape == (3,) and np.isfinite(point).all() else None
+
+
+def _pixels(project: Projection | None, needle: Floats) -> Floats:
+    """Return the pixels of a needle, thinned out, (n, 2)."""
+    if project is None or not len(needle):
+        return np.empty((0, 2))
+    chosen = np.unique(np.linspace(0, len(needle) - 1, _MAX_POINTS).round().astype(int))
+    line = np.asarray(project(needle[chosen]), np.float64)
+    return np.clip(line[np.isfinite(line).all(axis=1)], -_MAX_COORDINATE_PX, _MAX_COORDINATE_PX)
+
+
+def _small_jpeg(image: Image) -> bytes:
+    """Return an image as a JPEG of at most `_LARGEST_PX` and `MAX_BYTES`."""
+    height, width = image.shape
+    scale = min(1.0, _LARGEST_PX[0] / width, _LARGEST_PX[1] / height)
+    size = (max(round(width * scale), 1), max(round(height * scale), 1))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    data = b""
+    for quality in _QUALITIES:
+        done, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        data = bytes(encoded) if done else b""
+        if len(data) <= MAX_BYTES:
+            break
+    return data

@@ -1,0 +1,1 @@
+"""OpenIGTLink server for programs such as 3D Slicer."""

@@ -1,0 +1,1 @@
+"""Live view of the needle for ROS viewers."""

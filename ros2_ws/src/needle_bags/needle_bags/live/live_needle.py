@@ -1,0 +1,144 @@
+"""Current state of the needle, collected from the topics of the rig."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_bags.run.shaft_trail import ShaftTrail
+from needle_controller.model.target_plane import TargetPlane, offset_plane
+
+Array = NDArray[np.float64]
+
+# A requested plane is in force if its offset agrees within this [m].
+_SAME_OFFSET = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class MeasuredTip:
+    """A tip that the tracker found.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Time of exposure [ns].
+    position : ndarray, shape (3,)
+        In `rig` [m].
+    quaternion : ndarray, shape (4,)
+        x, y, z, w of the frame whose z axis is the shaft.
+    covariance : ndarray, shape (3, 3)
+        Of the position [m^2].
+    """
+
+    stamp_ns: int
+    position: Array
+    quaternion: Array
+    covariance: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class TipEstimate:
+    """The controller's estimate of the tip.
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,)
+        Of the tip [m].
+    rotation : ndarray, shape (3, 3)
+        Axes of the tip's frame as columns; the third is the heading.
+    covariance : ndarray, shape (3, 3)
+        Of the position [m^2].
+    """
+
+    position: Array
+    rotation: Array
+    covariance: Array
+
+
+class LiveNeedle:
+    """State of the needle.
+
+    Attributes
+    ----------
+    tip : MeasuredTip or None
+        The last tip that was found.
+    answered_ns : int or None
+        Exposure of the tracker's last answer, with or without a tip [ns].
+    tip_found : bool
+        Whether that answer had a tip.
+    target_point : ndarray, shape (3,), or None
+        The target point, in `rig` [m].
+    """
+
+    def __init__(self) -> None:
+        self.tip: MeasuredTip | None = None
+        self.answered_ns: int | None = None
+        self.tip_found = False
+        self.target_point: Array | None = None
+        self._estimate: TipEstimate | None = None
+        self._requested_plane: TargetPlane | None = None
+        self._offset: float | None = None
+        self._insertion = 0.0
+        self._trail = ShaftTrail()
+
+    def set_insertion(self, insertion: float) -> None:
+        """Set the insertion depth [m]."""
+        self._insertion = insertion
+
+    def add_tip(self, tip: MeasuredTip) -> None:
+        """Add a measured tip."""
+        self.tip, self.answered_ns, self.tip_found = tip, tip.stamp_ns, True
+        self._trail.add(self._insertion, tip.position)
+
+    def add_missing_tip(self, stamp_ns: int) -> None:
+        """Note that an exposure [ns] showed no tip."""
+        self.answered_ns, self.tip_found = stamp_ns, False
+
+    def set_estimate(self, estimate: TipEstimate) -> None:
+        """Set the controller's estimate, in `target_plane`."""
+        self._estimate = estimate
+
+    def request_plane(self, plane: TargetPlane) -> None:
+        """Note a requested target plane; the controller may reject it."""
+        self._requested_plane = plane
+
+    def set_targets(self, offset: float | None, point: Array | None) -> None:
+        """Set the offset of the target plane [m] and the target point that are in force."""
+        self._offset, self.target_point = offset, point
+
+    @property
+    def plane(self) -> TargetPlane | None:
+        """The target plane; None before the first controller status."""
+        if self._offset is None:
+            return None
+        requested = self._requested_plane
+        if requested is not None and abs(requested.offset - self._offset) <= _SAME_OFFSET:
+            return requested
+        return offset_plane(self._offset)
+
+    @property
+    def estimate(self) -> TipEstimate | None:
+        """The controller's estimate, in `rig`; None before the first one."""
+        plane, estimate = self.plane, self._estimate
+        if plane is None or estimate is None:
+            return None
+        rotation, origin = plane.T_rig_plane[:3, :3], plane.T_rig_plane[:3, 3]
+        return TipEstimate(
+            position=rotation @ estimate.position + origin,
+            rotation=rotation @ estimate.rotation,
+            covariance=rotation @ estimate.covariance @ rotation.T,
+        )
+
+    @property
+    def path(self) -> Array:
+        """Path of the tip in `rig` [m], shape (n, 3)."""
+        return self._trail.path
+
+    @property
+    def shaft(self) -> Array | None:
+        """Shaft in `rig`, from the entry to the tip [m], shape (n, 3); None without a tip."""
+        if self.tip is None:
+            return None
+        return self._trail.shaft(self._insertion, self.tip.position)

@@ -1,0 +1,158 @@
+"""Messages of a bag in the order of reception or of sending.
+
+The order of arrival at the recorder is not the order of arrival at the nodes: on a busy machine a
+topic can be late by tens of milliseconds, and an answer is recorded before its question. In the
+order of sending every message follows its causes. It is known for MCAP bags if the senders' clocks
+agree with the recorder's; otherwise the order of reception is used.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from needle_core.files.bag_directory import BagDirectory, SentMessage
+
+__all__ = [
+    "Reorder",
+    "SentMessage",
+    "messages_as_sent",
+    "raw_as_sent",
+    "raw_messages",
+    "read_contents",
+    "read_messages",
+]
+
+# If the fastest message of a topic has a delay outside these bounds [ns], the clocks differ.
+_MIN_DELAY, _MAX_DELAY = -1_000_000, 200_000_000
+# With fewer messages the delay may be that of the recorder.
+_MIN_MESSAGES = 20
+
+
+Reorder = Callable[[list[SentMessage]], list[tuple[int, SentMessage]]]
+"""Assigns reception times [ns] to messages in the order of sending; returns them in that order."""
+
+
+def read_contents(path: Path) -> BagDirectory:
+    """Return a closed bag: its topics, counts and metadata.
+
+    Parameters
+    ----------
+    path : Path
+        A rosbag2 directory, MCAP or SQLite.
+
+    Raises
+    ------
+    UserError
+        If there is no bag, or it is not whole.
+    """
+    with BagDirectory(path) as bag:
+        return bag
+
+
+def read_messages(path: Path, wanted: Callable[[str], bool]) -> Iterator[tuple[str, int, Any]]:
+    """Yield (topic, log time [ns], message) of the wanted topics, in order of log time.
+
+    Messages are decoded with the definitions in the bag.
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be read.
+    """
+    with BagDirectory(path) as bag:
+        store = bag.typestore()
+        for message in bag.messages(wanted):
+            yield message.topic, message.log_time, bag.deserialize(store, message)
+
+
+def raw_messages(
+    path: Path, topics: Collection[str], start: int, stop: int
+) -> Iterator[tuple[str, int, bytes]]:
+    """Yield (topic, log time [ns], serialised message) with start <= log time < stop, in order.
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be read.
+    """
+    with BagDirectory(path) as bag:
+        for message in bag.messages(topics.__contains__, start, stop):
+            yield message.topic, message.log_time, message.data
+
+
+def messages_as_sent(
+    path: Path,
+    wanted: Callable[[str], bool],
+    is_large: Callable[[str], bool],
+    reorder: Reorder | None = None,
+) -> Iterator[tuple[SentMessage, Any]]:
+    """Yield raw and decoded messages in the order of `raw_as_sent`.
+
+    `reorder` changes the order of the messages that are not large, if the senders' clocks agree.
+    """
+    with BagDirectory(path) as bag:
+        store = bag.typestore()
+        for sent in _as_sent(bag, wanted, is_large, reorder):
+            yield sent, bag.deserialize(store, sent)
+
+
+def raw_as_sent(
+    path: Path, wanted: Callable[[str], bool], is_large: Callable[[str], bool]
+) -> Iterator[SentMessage]:
+    """Yield the messages of the wanted topics in the order of sending.
+
+    Parameters
+    ----------
+    path : Path
+        The bag.
+    wanted : callable
+        Whether a topic is wanted.
+    is_large : callable
+        Whether the messages of a topic, such as images, do not fit into memory; such topics are
+        expected in order.
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be read.
+    """
+    with BagDirectory(path) as bag:
+        yield from _as_sent(bag, wanted, is_large, None)
+
+
+def _as_sent(
+    bag: BagDirectory,
+    wanted: Callable[[str], bool],
+    is_large: Callable[[str], bool],
+    reorder: Reorder | None,
+) -> Iterator[SentMessage]:
+    small = list(bag.messages(lambda name: wanted(name) and not is_large(name)))
+    streamed = bag.messages(lambda name: wanted(name) and is_large(name))
+    if not _clocks_agree(small):
+        small, streamed = list(map(_as_received, small)), map(_as_received, streamed)
+        reorder = None
+    timed = (reorder or _in_order)(small)
+    both = heapq.merge(timed, ((sent.time, sent) for sent in streamed), key=itemgetter(0))
+    yield from map(itemgetter(1), both)
+
+
+def _in_order(messages: list[SentMessage]) -> list[tuple[int, SentMessage]]:
+    ordered = sorted(messages, key=lambda sent: (sent.time, sent.log_time))
+    return [(sent.time, sent) for sent in ordered]
+
+
+def _as_received(message: SentMessage) -> SentMessage:
+    return message._replace(time=message.log_time)
+
+
+def _clocks_agree(messages: Iterable[SentMessage]) -> bool:
+    delays: dict[str, list[int]] = defaultdict(list)
+    for message in messages:
+        delays[message.topic].append(message.log_time - message.time)
+    fastest = [min(values) for values in delays.values() if len(values) >= _MIN_MESSAGES]
+    return all(_MIN_DELAY <= delay <= _MAX_DELAY for delay in fastest)

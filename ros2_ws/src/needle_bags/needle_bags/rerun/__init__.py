@@ -1,0 +1,1 @@
+"""Recorded inputs processed by the current code."""

@@ -1,0 +1,41 @@
+"""The `openigtlink` executable: the component `OpenIGTLink` as a ROS node, and its port."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+
+from needle_bags.link.link_port import LinkPort
+from needle_bags.link.openigtlink import LINK, OpenIGTLink, OpenIGTLinkParameters
+from needle_core.commands.cli import EXIT_BAD_INPUT
+from needle_core.ros.main import run_component
+
+HELP = """
+openigtlink: shows the needle to 3D Slicer and other OpenIGTLink clients, while one is connected.
+It moves nothing, nothing waits for it, and what comes in at its port is discarded.
+
+Subscribes  needle/tip_pose, needle/estimate, needle/controller_status, target_plane, joint_states
+Sends       TRANSFORM NeedleTipToRig, NeedleEstimateToRig, TargetPlaneToRig; POINT NeedleShaft,
+            NeedleTarget; STRING NeedleStatus; all in mm, in rig (docs/viewers.md)
+"""
+
+
+def main() -> int:
+    """Run the node; returns its exit code."""
+    if importlib.util.find_spec("pyigtl") is None:
+        print(
+            "error: pyigtl is not installed; docs/viewers.md says how to install it",
+            file=sys.stderr,
+        )
+        return EXIT_BAD_INPUT
+    return run_component(
+        OpenIGTLink.name,
+        OpenIGTLinkParameters,
+        lambda settings, _: OpenIGTLink(settings),
+        help_text=HELP,
+        ports=lambda settings: {LINK: LinkPort(settings)},
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Summary, events and timing of a run."""

@@ -1,0 +1,158 @@
+"""What is drawn of a needle: shaft and way, belief in `rig`, uncertainty, images in their turn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from needle_bags.live.camera_images import LatestImages, draw_needle
+from needle_bags.live.live_messages import SIGMAS, ellipsoid
+from needle_bags.live.live_needle import LiveNeedle, MeasuredTip, TipEstimate
+from needle_bags.run.shaft_trail import ShaftTrail
+from needle_controller.model.target_plane import TargetPlane
+
+RADIUS = 0.1
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def arc(insertion: float) -> NDArray[np.float64]:
+    """Where the tip of a needle on a circle is."""
+    angle = insertion / RADIUS
+    return RADIUS * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)])
+
+
+def inserted() -> ShaftTrail:
+    trail = ShaftTrail()
+    for insertion in np.arange(0.0, 0.0801, 1e-4):
+        trail.add(insertion, arc(insertion))
+    return trail
+
+
+def test_the_shaft_follows_the_path_of_the_tip() -> None:
+    shaft = inserted().shaft(0.08, arc(0.08))
+    assert shaft[0] == pytest.approx(np.zeros(3))
+    assert shaft[-1] == pytest.approx(arc(0.08))
+    assert np.linalg.norm(shaft - [RADIUS, 0.0, 0.0], axis=1) == pytest.approx(RADIUS)
+    assert np.linalg.norm(np.diff(shaft, axis=0), axis=1).sum() == pytest.approx(0.08, rel=1e-3)
+    assert 70 < len(shaft) < 90
+
+
+def test_a_withdrawn_needle_stays_on_its_path_until_it_is_out() -> None:
+    trail = inserted()
+    way = trail.path
+    trail.add(0.03, arc(0.03))
+    assert np.array_equal(trail.path, way)
+    shaft = trail.shaft(0.03, arc(0.03))
+    assert shaft[:, 2].max() == pytest.approx(arc(0.03)[2])
+    assert 25 < len(shaft) < 32
+    trail.add(0.0, arc(0.0))
+    assert len(trail.path) == 1
+    trail.add(0.002, -arc(0.002))
+    assert trail.path[-1] == pytest.approx(-arc(0.002))
+
+
+def test_the_ellipsoid_contains_95_percent() -> None:
+    rng = np.random.default_rng(5)
+    for turned in Rotation.random(4, random_state=5).as_matrix():
+        covariance = turned @ np.diag([1e-8, 4e-8, 9e-6]) @ turned.T
+        axes, lengths = ellipsoid(covariance)
+        # Else no quaternion would turn them.
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+        drawn = rng.multivariate_normal(np.zeros(3), covariance, 20_000)
+        inside = np.sum((drawn @ axes / lengths) ** 2, axis=1) <= 1.0
+        assert inside.mean() == pytest.approx(0.95, abs=0.007)
+        assert lengths.max() == pytest.approx(SIGMAS * 3e-3)
+
+
+def test_the_estimate_is_transformed_to_the_rig() -> None:
+    turned = Rotation.from_euler("xyz", [0.2, 0.1, -0.3]).as_matrix()
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = turned, [0.003, 0.001, 0.0]
+    plane = TargetPlane(transform)
+    needle: Any = LiveNeedle()
+    heading = Rotation.from_euler("y", 0.1).as_matrix()
+    covariance = np.diag([1.0, 2.0, 3.0]) * 1e-6
+    needle.set_estimate(TipEstimate(np.array([0.001, 0.0, 0.05]), heading, covariance))
+    assert [needle.estimate] == [None]
+    needle.request_plane(plane)
+    needle.set_targets(plane.offset, None)
+    belief = needle.estimate
+    assert plane.from_rig(belief.position) == pytest.approx(np.array([0.001, 0.0, 0.05]))
+    assert belief.rotation == pytest.approx(turned @ heading)
+    assert turned.T @ belief.covariance @ turned == pytest.approx(covariance)
+
+
+def test_a_rejected_plane_is_ignored() -> None:
+    needle: Any = LiveNeedle()
+    assert [needle.plane] == [None]
+    asked = np.eye(4)
+    asked[0, 3] = 0.05
+    needle.request_plane(TargetPlane(asked))
+    needle.set_targets(0.003, np.array([0.01, 0.0, 0.1]))
+    assert needle.plane.offset == pytest.approx(0.003)
+    needle.set_targets(0.05, None)
+    assert needle.plane.T_rig_plane[0, 3] == pytest.approx(0.05)
+    assert needle.target_point is None
+
+
+def test_without_a_tip_the_last_one_is_kept() -> None:
+    needle: Any = LiveNeedle()
+    assert [needle.shaft] == [None]
+    needle.set_insertion(0.02)
+    needle.add_tip(MeasuredTip(100, arc(0.02), UPRIGHT, np.eye(3)))
+    needle.add_missing_tip(200)
+    assert (needle.answered_ns, needle.tip_found) == (200, False)
+    assert needle.shaft[-1] == pytest.approx(arc(0.02))
+
+
+def blank(value: int = 0) -> NDArray[np.uint8]:
+    return np.full((120, 160), value, np.uint8)
+
+
+def test_an_image_is_shown_once_with_its_answer_or_late_without() -> None:
+    images = LatestImages()
+
+    def drawn(answered: int | None, now: float) -> tuple[int, bool] | None:
+        found = images.next(answered, now)
+        assert found is None or found[2][0, 0] == found[0]
+        return None if found is None else found[:2]
+
+    for stamp in (10, 20, 30):
+        images.add(stamp, blank(stamp))
+    assert drawn(None, 0.0) is None
+    assert drawn(20, 0.1) == (20, True)
+    assert drawn(20, 0.2) is None
+    assert drawn(10, 0.2) is None
+    assert drawn(30, 0.3) == (30, True)
+    # One that waits for its answer is not drawn without, so soon after the last.
+    images.add(40, blank(40))
+    assert drawn(30, 0.7) is None
+    assert drawn(30, 0.9) == (40, False)
+    # Without answers the newest is drawn as it is.
+    images = LatestImages()
+    images.add(10, blank(10))
+    assert drawn(None, 5.0) is None
+    images.add(20, blank(20))
+    assert drawn(None, 5.6) == (20, False)
+    assert drawn(None, 5.7) is None
+
+
+def test_shaft_and_tip_are_drawn_at_their_pixels() -> None:
+    def coloured(shaft: NDArray[np.float64]) -> NDArray[np.bool_]:
+        data = np.frombuffer(draw_needle(blank(), shaft, ""), np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        assert picture is not None
+        assert picture.shape == (120, 160, 3)
+        return np.asarray(picture.max(axis=2) > 60)
+
+    shaft = np.array([[20.0, 30.0], [100.0, 30.0], [np.nan, np.nan], [130.0, 60.0]])
+    seen = coloured(shaft)
+    assert seen[29:32, 60].any()
+    assert seen[60, 119:123].any()
+    assert not seen[80:, :].any()
+    assert not coloured(np.empty((0, 2))).any()

@@ -1,0 +1,223 @@
+"""One page for a bag, or for two; what it says is what the run was."""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+
+from needle_bags.figures.event_figure import lanes_of
+from needle_bags.figures.pair_figures import is_same_needle
+from needle_bags.reading.bag_reader import HealthEvent, Result, Run, Status, read_run
+from needle_bags.report import report
+from needle_bags.report.page import TERMS, Glossary
+from needle_bags.report.report_page import verdict_text
+from needle_bags.rerun.rerun_bag import write_rerun
+from needle_bags.run.run_summary import summarize, troubles
+from needle_bags.run.stage_timing import STAGES
+from needle_core.commands.cli import JsonValue
+
+MakeRun = Callable[..., Path]
+SECOND = 10**9
+COMMAND = "scripts/simulate --level=tip --params='a <file>.yaml'"
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures of a report, which are not rendered."""
+    figures: list[Figure] = []
+    dot = report._png(Figure(figsize=(0.1, 0.1)))
+
+    def keep(figure: Figure) -> bytes:
+        figures.append(figure)
+        return dot
+
+    monkeypatch.setattr(report, "_png", keep)
+    monkeypatch.setattr(report, "plan_views", lambda *_: [])
+    return figures
+
+
+def assert_leads_nowhere_else(page: str) -> None:
+    """No reference to another file or place, and each within the page to something there."""
+    assert not re.search(r"(src|href)=.(?!data:|#)", page)
+    assert not re.search(r"url\(|@import|//[\w-]+\.\w", re.sub(r"base64,[\w+/=]+", "", page))
+    names = re.findall(r' id="([^"]+)"', page)
+    assert len(names) == len(set(names))
+    assert set(re.findall(r'href="#([^"]+)"', page)) <= set(names)
+
+
+def test_the_report_is_one_self_contained_file(reported: tuple[Run, str]) -> None:
+    run, page = reported
+    assert_leads_nowhere_else(page)
+    # Two drawings of the film beside the figures, which are files, too.
+    figures = ("states", "path", "errors", "innovation", "timing", "events", "images")
+    assert page.count("data:image/png;base64,") == len(figures) + 2
+    for name in figures:
+        assert (run.path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    contents = re.findall(r'<li><a href="#([^"]+)">([^<]+)</a>', page)
+    assert contents == re.findall(r'<section id="([^"]+)"><h2>([^<]+)</h2>', page)
+    assert {"What the cameras saw", "Innovation and gate"} <= {title for _, title in contents}
+    rows = re.findall(r"<tr><td>([\w -]+)</td><td>[^<]*</td><td>(\d+)</td>", page)
+    assert [name for name, _ in rows] == [name for name, _ in STAGES]
+    assert all(120 <= int(count) <= 121 for _, count in rows)
+    assert "Converged" in page
+
+
+def test_texts_from_the_bag_are_escaped(
+    reported: tuple[Run, str],
+) -> None:
+    run, page = reported
+    assert "&lt;script&gt;alert(1)" in page
+    assert "<script>alert" not in page
+    section = page.partition('<section id="repeat-it">')[2]
+    assert html.unescape(section.partition("<pre>")[2].partition("</pre>")[0]) == COMMAND
+    assert f"needle_bags rerun {run.path}\n" in section
+
+
+def test_a_report_without_truth_or_command(
+    make_run: MakeRun, tmp_path: Path, drawn: list[Figure]
+) -> None:
+    bag, out, figures = (
+        make_run(truth=False, steps=20, done=False),
+        tmp_path / "out",
+        tmp_path / "figures.json",
+    )
+    assert report.main([str(bag), "--json", str(figures), "--output", str(out)]) == 0
+    page = (out / "report.html").read_text()
+    assert "No ground truth" in page
+    assert "does not say which command" in page
+    assert len(drawn) == 4
+    assert not (bag / "report.html").exists()
+    values = json.loads(figures.read_text())
+    assert (values["converged"], values["wall_s"]) == (False, None)
+
+
+def test_two_bags_are_compared(make_run: MakeRun, tmp_path: Path, drawn: list[Figure]) -> None:
+    first, second = make_run("first", steps=30), make_run("second", steps=20, done=False)
+    figures = tmp_path / "figures.json"
+    assert report.main([str(first), str(second), "--json", str(figures)]) == 0
+    page = (second / "compared_with_first.html").read_text()
+    assert len(drawn) == page.count("data:image/png;base64,") == 3
+    assert_leads_nowhere_else(page)
+    assert "Missed the plane / Not finished" in page
+    values = json.loads(figures.read_text())
+    assert values["a_steps"] == 30
+    assert values["difference_steps"] == -10
+    assert values["difference_r1_initial_mm"] == 0.0
+
+
+def test_the_report_of_a_rerun(make_run: MakeRun, tmp_path: Path, drawn: list[Figure]) -> None:
+    bag = make_run("steered", steps=20, command=COMMAND)
+    run, again = read_run(bag), tmp_path / "again"
+    write_rerun(run, again, [], {"/plane_controller": {"preset": "best"}}, "")
+    rerun = read_run(again)
+    summary = summarize(rerun)
+    assert (summary["rerun_of"], summary["steered_by"]) == ("steered", "paper")
+    assert summary["controller"] == "best"
+    words, sentence = verdict_text(summary)
+    assert words == "Rerun"
+    assert "those of steered, which paper steered" in sentence
+    assert "what best would have said" in sentence
+    # The command is that of the run in which the needle went in.
+    assert "command" not in rerun.run_info
+    third = tmp_path / "third"
+    write_rerun(rerun, third, [], {"/plane_controller": {"preset": "open_loop"}}, "")
+    assert summarize(read_run(third))["steered_by"] == "paper"
+    # Both in one page: one needle, and what each commanded, or only would have.
+    assert is_same_needle((run, rerun))
+    assert not is_same_needle((run, run))
+    assert report.main([str(bag), str(again)]) == 0
+    labels = [line.get_label() for axes in drawn[0].axes for line in axes.lines]
+    assert labels.count("A and B, truth") == 3
+    assert "A, truth" not in labels
+    assert {"A commanded", "B would have commanded"} < set(labels)
+    page = (again / "compared_with_steered.html").read_text()
+    assert "Missed the plane / Rerun" in page
+    assert "what the needle did is the same in both" in page
+
+
+def test_events_omit_the_warnings_of_the_start(
+    made_up: Run,
+) -> None:
+    begin = made_up.first_command
+    assert begin is not None
+    health = [
+        HealthEvent(begin - 3 * SECOND, "sim_rig: simulation", 1, "waiting"),
+        HealthEvent(begin - 2 * SECOND, "stereo_tracker: images", 1, "no images yet"),
+        HealthEvent(begin - SECOND, "sim_rig: simulation", 0, "running"),
+        HealthEvent(begin + SECOND, "stereo_tracker: images", 0, "ok"),
+        HealthEvent(begin + 2 * SECOND, "sim_rig: simulation", 1, "waiting again"),
+    ]
+
+    def device(seconds: float, trips: int, reason: str) -> Status:
+        values = {"state": "MOVING", "watchdog_trips": str(trips), "reason": reason}
+        return Status(begin + round(seconds * SECOND), values)
+
+    run = dataclasses.replace(
+        made_up,
+        health=health,
+        results=[Result(begin + SECOND, 0, "aborted: hold released"), *made_up.results],
+        device_status=[device(0.0, 1, "old"), device(0.5, 2, "no hold"), device(0.6, 2, "no hold")],
+    )
+    assert [(event.part, event.message) for event in troubles(run)] == [
+        ("stereo_tracker: images", "no images yet"),
+        ("device: watchdog", "no hold"),
+        ("device: step", "aborted: hold released"),
+        ("sim_rig: simulation", "waiting again"),
+    ]
+    lanes = {lane.name: lane.spans for lane in lanes_of(run)}
+    assert {"controller", "device", "aborted steps"} < set(lanes)
+    assert lanes["watchdogs"][0].begin == begin + SECOND // 2
+    (waiting,) = lanes["sim_rig: simulation"]
+    assert waiting.begin == begin + 2 * SECOND
+    (blind,) = lanes["stereo_tracker: images"]
+    assert blind.end == begin + SECOND
+    assert len(lanes["aborted steps"]) == 1
+    assert lanes["controller"][0].begin == run.controller_status[0].log_time
+
+
+def test_verdicts(make_run: MakeRun) -> None:
+    stopped = summarize(read_run(make_run("stopped", steps=60, done=False)))
+    assert verdict_text(stopped)[0] == "Not finished"
+    assert "no tip for 2 s" in verdict_text(stopped)[1]
+    run = read_run(make_run("missed", steps=60))
+    assert verdict_text(summarize(run))[0] == "Missed the plane"
+    last = run.controller_status[-1]
+
+    def told(text: str) -> dict[str, JsonValue]:
+        status = dataclasses.replace(last, values={**last.values, "target_point_m": text})
+        return summarize(dataclasses.replace(run, controller_status=[status]))
+
+    # A run to a point is judged by the point.
+    x, y, z = run.truth.values[-1, :3]
+    near = told(f"{x!s}, {y + 0.0003!s}, {z - 0.0004!s}")
+    assert near["point_error_mm"] == pytest.approx(0.5)
+    assert near["converged"] is True
+    assert "0.50 mm from the wanted point" in verdict_text(near)[1]
+    far = told(f"{x!s}, {y + 0.002!s}, {z!s}")
+    assert far["converged"] is False
+    assert verdict_text(far)[0] == "Missed the point"
+    for nothing in ("", "1, 2", "a, b, c"):
+        assert told(nothing)["point_error_mm"] is None
+
+
+def test_a_term_is_explained_at_its_first_use() -> None:
+    glossary = Glossary()
+    first = glossary.explain("The [roll] is < [turned|roll] by the [hold].")
+    assert first.count('id="term-roll"') == 1
+    assert first.count('href="#term-roll"') == 2
+    assert "&lt;" in first
+    again = glossary.explain("[roll] and [95 %]")
+    assert 'id="term-roll"' not in again
+    assert 'id="term-95"' in again
+    with pytest.raises(KeyError):
+        glossary.explain("[what nobody knows]")
+    text = "".join(path.read_text() for path in Path(report.__file__).parent.glob("static/*.html"))
+    used = {b or a for a, b in re.findall(r"\[([^\]|\[\n\"]+)(?:\|([^\]\n\"]+))?\]", text)}
+    assert set(TERMS) <= used

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from needle_bags.reading.bag_messages import SentMessage
+from needle_bags.rerun.reception_order import in_reception_order
+from needle_controller.controller_status import ReceptionLog
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+HEADER, STATUS = "std_msgs/msg/Header", "diagnostic_msgs/msg/DiagnosticStatus"
+PAIR = STORE.types["diagnostic_msgs/msg/KeyValue"]
+
+
+def sent(time: int, topic: str) -> SentMessage:
+    stamp = STORE.types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    data = bytes(STORE.serialize_cdr(STORE.types[HEADER](stamp=stamp, frame_id=""), HEADER))
+    return SentMessage(time, time, f"/rig/{topic}", HEADER, data)
+
+
+def status(time: int, *heard: tuple[str, int]) -> SentMessage:
+    """What the controller said; `("joints", 7)` is that it had heard the joints sent at 7."""
+    told = ReceptionLog()
+    for topic, sent_ns in heard:
+        told.add(topic, sent_ns)
+    values = [PAIR(key="heard", value=told.pop_text())]
+    message = STORE.types[STATUS](level=0, name="", message="", hardware_id="", values=values)
+    data = bytes(STORE.serialize_cdr(message, STATUS))
+    return SentMessage(time, time, "/rig/needle/controller_status", STATUS, data)
+
+
+J, X, S = "joints", "other", "controller_status"
+SENT = partial(map, lambda pair: sent(*pair))
+
+
+@pytest.mark.parametrize(
+    ("messages", "heard"),
+    [
+        (  # The order is that of hearing.
+            [
+                *SENT([(10, J), (11, "result"), (12, "tip"), (20, J)]),
+                *(status(30, ("tip", 12), (J, 10)), sent(40, J)),
+                status(50, (J, 20), ("result", 11), (J, 40)),
+            ],
+            [("tip", 12), (J, 10), (S, 30), (J, 20), ("result", 11), (J, 40), (S, 50)],
+        ),
+        (  # What the last status does not tell was heard after it.
+            [*SENT([(10, J), (15, J), (16, X)]), status(20, (J, 10)), sent(30, J)],
+            [(J, 10), (X, 16), (S, 20), (J, 15), (J, 30)],
+        ),
+        # Of bags that do not tell, the order is that of sending.
+        ([status(20), sent(10, J)], [(J, 10), (S, 20)]),
+        (  # What was sent before the last that was heard, and is not told, was never heard.
+            [
+                *SENT([(10, J), (11, X), (20, J)]),
+                *(status(25, (J, 20)), *SENT([(30, J), (40, J)])),
+                *(status(45, (J, 40)), sent(50, J)),
+            ],
+            [(X, 11), (J, 20), (S, 25), (J, 40), (S, 45), (J, 50)],
+        ),
+    ],
+)
+def test_the_order_is_that_of_reception(
+    messages: list[SentMessage], heard: list[tuple[str, int]]
+) -> None:
+    found = in_reception_order(list(messages), "/rig/")
+    assert [time for time, _ in found] == sorted(time for time, _ in found)
+    assert all(time >= message.time for time, message in found)
+    assert [(one.topic.rsplit("/", maxsplit=1)[-1], one.time) for _, one in found] == heard

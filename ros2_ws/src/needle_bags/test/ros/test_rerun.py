@@ -1,0 +1,350 @@
+"""`rerun`: unchanged where nothing changed, red with a gain or a sign that did, one line if bad."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from rclpy.parameter import Parameter
+from rosbags.typesys import Stores, get_typestore
+
+from needle_bags.format.bag_writer import BagCopy, standard_text, standard_topic
+from needle_bags.link import openigtlink
+from needle_bags.live import live_view
+from needle_bags.reading.bag_messages import raw_as_sent, read_contents, read_messages
+from needle_bags.reading.bag_reader import read_run
+from needle_bags.rerun.bag_pass import Output
+from needle_bags.rerun.rerun_bag import TABLE, write_rerun
+from needle_bags.ros import rerun as rerun_node
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.errors import UserError
+from needle_tracker.optics.calibration import StereoCalibration, parse_calibration
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+PICTURES = live_view.PICTURES.values()
+EVENT = "rcl_interfaces/msg/ParameterEvent"
+
+Capture = pytest.CaptureFixture[str]
+
+Shown = tuple[Path, Path, str]
+
+
+def rerun(*arguments: object) -> int:
+    return rerun_node.main([str(argument) for argument in arguments])
+
+
+def printed(*arguments: object) -> tuple[int, str]:
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        code = rerun(*arguments)
+    return code, out.getvalue()
+
+
+def changed_fields(result: Path) -> set[str]:
+    values: dict[str, Any] = json.loads(result.read_text())
+    ending = "_differing"
+    return {key.removesuffix(ending) for key, v in values.items() if key.endswith(ending) and v}
+
+
+def given(folder: Path, text: str, node: str = "plane_controller") -> Path:
+    file = folder / "given.yaml"
+    file.write_text(f"{node}: {{ros__parameters: {{{text}}}}}")
+    return file
+
+
+@pytest.fixture(scope="module")
+def untouched(regression: Path) -> tuple[int, str]:
+    """The whole of the committed bag, run again."""
+    return printed(regression)
+
+
+@pytest.fixture(scope="module")
+def mirrored(first_pictures: Path) -> tuple[int, str]:
+    """The bag up to its first pictures, run again by code that has a sign turned."""
+
+    def mirror(document: Any) -> StereoCalibration:
+        calibration = parse_calibration(document)
+        matrix = calibration.left.camera_matrix * np.array([[1, 1, 1], [1, -1, 1], [1, 1, 1]])
+        left = dataclasses.replace(calibration.left, camera_matrix=matrix)
+        return dataclasses.replace(calibration, left=left)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rerun_node, "parse_calibration", mirror)
+        return printed(first_pictures)
+
+
+@pytest.fixture(scope="module")
+def paper_bag(tmp_path_factory: pytest.TempPathFactory, eight_steps: Path) -> Path:
+    """The first steps as preset paper would have them."""
+    bag = tmp_path_factory.mktemp("rerun") / "paper"
+    assert rerun(eight_steps, "--preset", "paper", "--output", bag) == 1
+    return bag
+
+
+def test_unchanged_code_gives_unchanged_outputs(
+    untouched: tuple[int, str], regression: Path
+) -> None:
+    code, said = untouched
+    assert code == 0, f"{said}\nmeant? scripts/renew_regression_bag"
+    assert "6 image pairs through stereo_tracker, 121 tips through plane_controller" in said
+    assert "UNCHANGED" in said
+    # The table that people read in a diff belongs to the bag beside it.
+    rows = (regression / TABLE).read_text().splitlines()[1:]
+    assert len(rows) == read_contents(regression).counts["/needle/estimate"]
+
+
+def test_a_wrong_sign_in_the_projection_is_detected(mirrored: tuple[int, str]) -> None:
+    code, said = mirrored
+    assert code == 1
+    assert "needle/tip: 1 recorded but not today (at 30.0 mm" in said
+
+
+@pytest.mark.parametrize(
+    ("parameter", "field"),
+    [
+        ("curvature", "needle_control_input_u"),
+        ("target_offset", "needle_reduced_state_r1"),
+        ("step_length", "device_joint_trajectory_insertion"),
+    ],
+)
+def test_a_parameter_off_by_a_hundredth_is_detected(
+    eight_steps: Path, tmp_path: Path, parameter: str, field: str
+) -> None:
+    value = 1.01 * read_run(eight_steps).parameter("plane_controller", parameter)
+    file, result = given(tmp_path, f"{parameter}: {value}"), tmp_path / "result.json"
+    assert rerun(eight_steps, "--params", file, "--json", result) == 1
+    assert field in changed_fields(result)
+
+
+def test_a_gain_off_by_a_hundredth_is_detected(
+    paper_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    designed = SteeringSettings.gains
+
+    def off(settings: SteeringSettings) -> Any:
+        gains = designed(settings)
+        feedback = np.array(gains.feedback, copy=True)
+        feedback.flat[0] *= 1.01
+        return dataclasses.replace(gains, feedback=feedback)
+
+    monkeypatch.setattr(SteeringSettings, "gains", off)
+    result = tmp_path / "result.json"
+    assert rerun(paper_bag, "--json", result) == 1
+    assert "needle_control_input_v" in changed_fields(result)
+
+
+def test_an_exception_gives_another_exit_code_than_a_change(
+    eight_steps: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    def mistaken(*_: object) -> None:
+        raise ValueError("behind the camera")
+
+    monkeypatch.setattr("needle_bags.ros.controller_rerun.ControllerStage.process", mistaken)
+    assert rerun(eight_steps) == 3
+    assert "internal error, please report it: ValueError: behind" in capsys.readouterr().err
+
+
+def test_another_preset_is_a_run_of_its_own(eight_steps: Path, paper_bag: Path) -> None:
+    code, said = printed(paper_bag)
+    assert code == 0
+    assert "(paper)" in said
+    # Beyond the outputs it is the same bag.
+    before, after = read_contents(eight_steps), read_contents(paper_bag)
+    assert before.counts == after.counts
+    for topic in ("/joint_states", "/device/status", "/sim/tip_pose"):
+        kept = [
+            [(m.log_time, m.data) for m in raw_as_sent(bag, topic.__eq__, lambda _: False)]
+            for bag in (eight_steps, paper_bag)
+        ]
+        assert kept[0] == kept[1]
+    lines = (paper_bag / TABLE).read_text().splitlines()
+    assert len(lines) == 1 + before.counts["/needle/estimate"]
+    assert lines[0].split()[:3] == ["insertion_mm", "tip_x_mm", "tip_y_mm"]
+
+
+def test_tips_without_images_are_kept(eight_steps: Path, tmp_path: Path) -> None:
+    run, topic = read_run(eight_steps), "/needle/tip"
+    tips = [message for _, _, message in read_messages(eight_steps, topic.__eq__)]
+    tips[3].point.x = 0.5
+    output = Output("needle/tip", run.tips.received[3], int(run.tips.stamps[3]), tips[3])
+    write_rerun(run, tmp_path / "bag", [output], {}, "")
+    assert read_contents(tmp_path / "bag").counts == read_contents(eight_steps).counts
+    after = read_run(tmp_path / "bag").tips.values
+    assert np.flatnonzero((after != run.tips.values).any(axis=1)).tolist() == [3]
+
+
+@pytest.fixture(scope="module")
+def shown(first_pictures: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The bag up to its first pictures, seen by viewers; and what was said, pyigtl being there."""
+    bag = tmp_path_factory.mktemp("rerun") / "shown"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("importlib.util.find_spec", lambda _: True)
+        patch.setattr(openigtlink, "packed", lambda *_: b"needle")
+        code, said = printed(first_pictures, "--viewers", "--output", bag)
+    assert code == 0, said
+    return bag, said
+
+
+def test_viewers_show_the_recorded_needle_without_comparison(
+    shown: tuple[Path, str], first_pictures: Path
+) -> None:
+    bag, said = shown
+    before, after = read_contents(first_pictures).counts, read_contents(bag).counts
+    new = {topic.removeprefix("/"): n for topic, n in (after - before).items()}
+    assert new.keys() == {live_view.TIP, live_view.PATH, live_view.MARKERS, *PICTURES}
+    (view,) = [line for line in said.splitlines() if line.startswith("live_view: ")]
+    assert "nothing to compare, since no bag tells when it looked; sent " in view
+    for topic, count in new.items():
+        assert f"{count} {topic}" in view
+    run = read_run(first_pictures)
+    seconds = (run.joints.received[-1] - run.joints.received[0]) * 1e-9
+    # Ten times a second, and each picture once.
+    assert new[live_view.PATH] == pytest.approx(10 * seconds, abs=3)
+    assert {new[topic] for topic in PICTURES} == {before["/stereo/left/image_raw/compressed"]}
+    *_, (_, _, path) = read_messages(bag, f"/{live_view.PATH}".__eq__)
+    tip = path.poses[-1].pose.position
+    assert (tip.x, tip.y, tip.z) == tuple(run.tips.values[-1])
+    (link,) = [line for line in said.splitlines() if line.startswith("openigtlink: ")]
+    assert "nothing to compare, since ports are not recorded; sent " in link
+    assert int(link.split()[-2]) == pytest.approx(10 * seconds, abs=3)
+
+
+@pytest.fixture(scope="module")
+def shown_again(shown: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory) -> Shown:
+    """Return what a bag with the viewers' topics gives, taken through the viewers once more."""
+    folder = tmp_path_factory.mktemp("again")
+    bag, file = folder / "bag", folder / "result.json"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("importlib.util.find_spec", lambda _: None)
+        code, said = printed(shown[0], "--viewers", "--output", bag, "--json", file)
+    assert code == 0
+    return bag, file, said
+
+
+def test_recorded_viewer_topics_are_replaced(shown: tuple[Path, str], shown_again: Shown) -> None:
+    bag, file, said = shown_again
+    counts = read_contents(shown[0]).counts
+    assert json.loads(file.read_text())["live_view_path_sent"] == counts["/live_view/path"]
+    assert read_contents(bag).counts == counts
+    assert "openigtlink: left out, pyigtl is not installed" in said
+
+
+def copied(bag: Path, target: Path, custom: dict[str, str], topic: str, kind: str) -> Any:
+    """Begin a copy of a bag with other texts; return what puts a message of a new topic first."""
+    contents = read_contents(bag)
+    copy, new = BagCopy(target, "jazzy", custom), standard_topic(topic, kind)
+
+    @contextlib.contextmanager
+    def writing() -> Iterator[Callable[[bytes], None]]:
+        yield lambda data: copy.put(new, data, contents.start, contents.start)
+        for m in raw_as_sent(bag, lambda _: True, lambda _: False):
+            copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
+        copy.close()
+
+    return writing()
+
+
+def test_announced_parameters_are_sufficient(eight_steps: Path, tmp_path: Path) -> None:
+    """What ROS 2's own recorder leaves: no custom data, but /parameter_events."""
+    with copied(eight_steps, tmp_path / "bag", {}, "/parameter_events", EVENT) as put:
+        node = "/plane_controller"
+        put(event(node, read_run(eight_steps).parameters[node]))
+    assert rerun(tmp_path / "bag") == 0
+
+
+def event(node: str, parameters: dict[str, Any]) -> bytes:
+    """A node's ParameterEvent of its start, as CDR."""
+    types = STORE.types
+    kinds = {"byte": np.uint8, "bool": np.bool_, "integer": np.int64, "double": np.float64}
+
+    def value(content: Any) -> Any:
+        message = Parameter("", value=content).get_parameter_value()
+        fields = {name: getattr(message, name) for name in message.get_fields_and_field_types()}
+        for kind, numbers in kinds.items():
+            # rclpy has lists where rosbags wants arrays.
+            name = f"{kind}_array_value"
+            fields[name] = np.array(fields[name], numbers)
+        return types["rcl_interfaces/msg/ParameterValue"](**fields)
+
+    parameter = types["rcl_interfaces/msg/Parameter"]
+    new = [parameter(name, value(content)) for name, content in parameters.items()]
+    stamp = types["builtin_interfaces/msg/Time"](1, 0)
+    return bytes(STORE.serialize_cdr(types[EVENT](stamp, node, new, [], []), EVENT))
+
+
+def test_the_calibration_is_that_of_the_tracker_or_of_params(
+    eight_steps: Path, first_pictures: Path, tmp_path: Path
+) -> None:
+    """The tracker says it on a topic of its own: nobody has to tell the recorder."""
+    text = read_run(eight_steps).calibration
+    bag, kind = tmp_path / "bag", "std_msgs/msg/String"
+    with copied(
+        eight_steps, bag, {"calibration": "left: {}"}, "/stereo_tracker/calibration", kind
+    ) as put:
+        put(standard_text(text))
+    run = read_run(bag)
+    assert run.calibration == text
+    other = tmp_path / "other.yaml"
+    changed = yaml.safe_load(text)
+    changed["phantom"]["refractive_index"] += 0.01
+    other.write_text(yaml.safe_dump(changed))
+    file = given(tmp_path, f"calibration_file: {other}", "stereo_tracker")
+    seen: list[str] = []
+
+    def stop(_: object, __: object, used: str) -> None:
+        seen.append(used)
+        raise UserError("seen")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rerun_node, "_tracker", stop)
+        for arguments in ((), ("--params", file)):
+            assert rerun(first_pictures, *arguments) == 2
+    assert seen == [text, other.read_text()]
+
+
+def test_bad_input_gives_a_one_line_error(
+    eight_steps: Path, make_run: Callable[..., Path], tmp_path: Path, capsys: Capture
+) -> None:
+    table: dict[tuple[object, ...], str] = {
+        (eight_steps, "--preset", "bset"): "--preset 'bset' is not one of",
+        (eight_steps, "--json", "/nowhere/at/all.json"): "its folder must exist",
+        (eight_steps, "--params", "/nowhere.yaml"): "/nowhere.yaml",
+        (eight_steps, "--output", eight_steps): "holds a bag already",
+        (eight_steps, "--presets", "best"): "see --help",
+        (make_run(steps=3),): "give them with --params",
+    }
+    for arguments, words in table.items():
+        assert rerun(*arguments) == 2
+        said = capsys.readouterr().err
+        assert words in said
+        assert said.count("\n") == 1
+    for text, words in (
+        ("curvatur: 8.0", "has no parameter curvatur"),
+        ("curvature: -8.0", "curvature = -8"),
+        ("curvature: high", "curvature"),
+    ):
+        assert rerun(eight_steps, "--params", given(tmp_path, text)) == 2
+        # Of what the bag's nodes had and today's do not have it warns first.
+        lines = capsys.readouterr().err.splitlines()
+        (line,) = [line for line in lines if "no longer has" not in line]
+        assert words in line
+
+
+def test_parameters_reach_the_node_or_give_a_warning(
+    eight_steps: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    file = given(tmp_path, "curvature: 8.0", "/rig1/plane_controller")
+    assert rerun(eight_steps, "--params", file) == 2
+    assert "this node is /plane_controller: write '/plane_controller'" in capsys.readouterr().err
+    file = given(tmp_path, "max_depth: 0.1", "device_driver")
+    assert rerun(eight_steps, "--params", file) == 0
+    warning = f"warning: {file}: no section for /plane_controller: it has device_driver"
+    assert capsys.readouterr().err.splitlines()[0] == warning

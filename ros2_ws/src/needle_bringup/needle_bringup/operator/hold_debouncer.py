@@ -1,0 +1,87 @@
+"""Accepts a press as a hold only if it is a new one, after all buttons were released."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+from needle_bringup.operator.controls import InputLost, InputReading
+
+# A longer gap between two readings means that this process was suspended [s].
+MAX_GAP = 0.1
+
+
+class HoldKind(enum.Enum):
+    """Purpose of an accepted press."""
+
+    NOTHING = "nothing"
+    INSERT = "insert"
+    RETRACT = "retract"
+
+
+@dataclasses.dataclass(frozen=True)
+class HoldDecision:
+    """The accepted part of an input reading.
+
+    Attributes
+    ----------
+    kind : HoldKind
+        The accepted hold.
+    speed : float
+        Share of the nominal speed, 0..1.
+    stop : bool
+        Whether a stop was just requested.
+    trouble : str
+        Why there is no input; empty if there is.
+    ignored_press : bool
+        Whether a button is down that is ignored until all are released.
+    """
+
+    kind: HoldKind = HoldKind.NOTHING
+    speed: float = 0.0
+    stop: bool = False
+    trouble: str = ""
+    ignored_press: bool = False
+
+
+class HoldDebouncer:
+    """Accepts a press that starts from neutral, as long as it lasts.
+
+    After the start, a loss of the input device, a stop, two buttons at once, or a suspension of
+    this process the controls must be neutral first: a button that was down meanwhile never becomes
+    a hold by itself.
+    """
+
+    def __init__(self) -> None:
+        self._kind = HoldKind.NOTHING
+        self._armed = False
+        self._stopping = False
+        self._read_at: float | None = None
+
+    def update(self, reading: InputReading, now: float) -> HoldDecision:
+        """Return the accepted part of a reading at this steady time [s]."""
+        gap = 0.0 if self._read_at is None else now - self._read_at
+        self._read_at = now
+        if isinstance(reading, InputLost):
+            self._release()
+            self._stopping = False
+            return HoldDecision(trouble=reading.reason)
+        if gap > MAX_GAP:
+            self._release()
+        new_stop, self._stopping = reading.stop and not self._stopping, reading.stop
+        if reading.is_neutral:
+            self._kind, self._armed = HoldKind.NOTHING, True
+            return HoldDecision(speed=reading.speed)
+        if reading.stop or (reading.insert and reading.retract):
+            self._release()
+            return HoldDecision(speed=reading.speed, stop=new_stop, ignored_press=not reading.stop)
+        pressed = HoldKind.INSERT if reading.insert else HoldKind.RETRACT
+        if self._armed:
+            self._kind, self._armed = pressed, False
+        elif self._kind is not pressed:
+            self._release()
+        ignored = self._kind is HoldKind.NOTHING
+        return HoldDecision(self._kind, reading.speed, ignored_press=ignored)
+
+    def _release(self) -> None:
+        self._kind, self._armed = HoldKind.NOTHING, False

@@ -1,0 +1,132 @@
+"""Which press counts, by a rule that looks back from each moment; a joystick must go on talking."""
+
+from __future__ import annotations
+
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from needle_bringup.operator.controls import Controls, InputLost, InputReading, InputState
+from needle_bringup.operator.hold_debouncer import MAX_GAP, HoldDebouncer, HoldKind
+from needle_bringup.operator.joy_source import JOY_TIMEOUT, JoySource
+
+CYCLE = 0.02
+INSERT, RETRACT, NEUTRAL = InputState(insert=True), InputState(retract=True), InputState()
+WANTS: dict[InputReading, HoldKind] = {INSERT: HoldKind.INSERT, RETRACT: HoldKind.RETRACT}
+BOTH, STOPPED = InputState(insert=True, retract=True), InputState(insert=True, stop=True)
+READINGS = (NEUTRAL, INSERT, RETRACT, BOTH, InputState(stop=True), STOPPED, InputLost("unplugged"))
+moments = st.tuples(st.sampled_from(READINGS), st.sampled_from((CYCLE, CYCLE, CYCLE, 0.15)))
+CONTROLS = Controls(insert=0, retract=2, speed_axis=1, axis_at_zero=0.0, axis_at_full=1.0)
+
+NO_HANDS: tuple[tuple[int, list[float], list[int], str], ...] = (
+    (2, [0.0, 1.0], [1, 0, 0], "2 nodes publish"),
+    (1, [0.0, 1.0], [1, 0], "has 2 buttons, none 2"),
+    (1, [0.0], [1, 0, 0], "has 1 axes, none 1"),
+    (1, [0.0, math.nan], [1, 0, 0], "axis 1 is nan"),
+)
+
+
+def counts(seen: list[tuple[InputReading, float]]) -> HoldKind:
+    """Return what may be held at the last moment, looking back: itself alone, since neutral."""
+    last = seen[-1][0]
+    for reading, gap in reversed(seen):
+        if reading == NEUTRAL:
+            return WANTS.get(last, HoldKind.NOTHING)
+        if reading != last or last not in WANTS or gap > MAX_GAP:
+            break
+    return HoldKind.NOTHING
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(moments, min_size=1, max_size=30))
+def test_only_a_new_press_from_neutral_is_accepted(
+    seen: list[tuple[InputReading, float]],
+) -> None:
+    debouncer, now = HoldDebouncer(), 0.0
+    # Before the first look there is no gap.
+    seen[0] = (seen[0][0], 0.0)
+    for number, (reading, gap) in enumerate(seen):
+        now += gap
+        decision = debouncer.update(reading, now)
+        assert decision.kind is counts(seen[: number + 1])
+        assert bool(decision.trouble) is isinstance(reading, InputLost)
+
+
+def test_a_stop_is_requested_once_per_press_and_ends_the_hold() -> None:
+    debouncer = HoldDebouncer()
+    readings = (NEUTRAL, INSERT, STOPPED, STOPPED, INSERT, NEUTRAL, InputState(stop=True))
+    decisions = [
+        debouncer.update(reading, CYCLE * number) for number, reading in enumerate(readings)
+    ]
+    assert [one.stop for one in decisions] == [
+        False,
+        False,
+        True,
+        False,
+        False,
+        False,
+        True,
+    ]
+    assert [one.kind is HoldKind.INSERT for one in decisions] == [
+        False,
+        True,
+        *[False] * 5,
+    ]
+
+
+def test_a_stop_pressed_after_a_loss_is_requested_again() -> None:
+    debouncer = HoldDebouncer()
+    pressed = InputState(stop=True)
+    readings: list[InputReading] = [pressed, InputLost("unplugged"), pressed, pressed]
+    decisions = [
+        debouncer.update(reading, CYCLE * number) for number, reading in enumerate(readings)
+    ]
+    assert [one.stop for one in decisions] == [True, False, True, False]
+
+
+def test_a_suspended_process_requires_a_new_press() -> None:
+    debouncer = HoldDebouncer()
+    debouncer.update(NEUTRAL, 0.0)
+    for number, speed in enumerate((0.2, 0.0, 1.0), start=1):
+        decision = debouncer.update(InputState(insert=True, speed=speed), number * 0.99 * MAX_GAP)
+        assert (decision.kind, decision.speed) == (HoldKind.INSERT, speed)
+    frozen = debouncer.update(INSERT, 4.1 * MAX_GAP)
+    assert (frozen.kind, frozen.ignored_press) == (HoldKind.NOTHING, True)
+
+
+def joystick(publishers: int = 1) -> JoySource:
+    return JoySource(CONTROLS, lambda: 0.5, lambda: publishers)
+
+
+def test_the_last_message_of_a_joystick_is_used_while_recent() -> None:
+    source = joystick()
+    assert isinstance(source.read(0.0), InputLost)
+    source.receive([0.0, 1.0], [1, 0, 0], 5.0)
+    assert source.read(5.0 + 0.999 * JOY_TIMEOUT) == InputState(insert=True, speed=0.5)
+    silent = source.read(5.0 + 1.001 * JOY_TIMEOUT)
+    assert silent == InputLost("no message of the joystick for more than 0.1 s")
+    source.receive([0.0, 0.5], [0, 1, 1], 6.0)
+    assert source.read(6.0) == InputState(retract=True, speed=0.25)
+
+
+def test_an_overtaken_message_is_ignored() -> None:
+    source = joystick()
+    source.receive([0.0, 1.0], [1, 0, 0], 5.00, stamp=100.00)
+    source.receive([0.0, 1.0], [0, 0, 0], 5.05, stamp=99.98)
+    assert source.read(5.05) == InputState(insert=True, speed=0.5)
+    assert isinstance(source.read(5.00 + 1.001 * JOY_TIMEOUT), InputLost)
+    # A sender whose clock was set back is heard again after a silence, and one without at once.
+    source.receive([0.0, 1.0], [0, 0, 0], 5.11, stamp=40.00)
+    assert source.read(5.11) == InputState(speed=0.5)
+    source.receive([0.0, 1.0], [1, 0, 0], 5.13)
+    assert source.read(5.13) == InputState(insert=True, speed=0.5)
+
+
+def test_an_invalid_message_is_a_loss_of_the_joystick() -> None:
+    for publishers, axes, buttons, why in NO_HANDS:
+        source = joystick(publishers)
+        source.receive(axes, buttons, 5.0)
+        read = source.read(5.0)
+        assert isinstance(read, InputLost)
+        assert why in read.reason

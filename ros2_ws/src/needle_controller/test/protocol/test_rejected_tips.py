@@ -1,0 +1,236 @@
+"""Rejected tips, covariances, and tip timeouts."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from needle_controller.model.target_plane import plane_from_pose
+from needle_controller.protocol.actions import Action, Awaiting, SteeringState
+from needle_controller.protocol.tip_checks import TipCovariance, TipFault, TipMeasurement
+from needle_core.component import Log
+
+from .rig import HELD, MOVING, SECOND, TICK, Rig, logged, none_sent, sent, spied, where
+
+STEERING = SteeringState.STEERING
+
+
+def bad(rig: Rig, position: list[float], frame: str = "rig", ahead: int = TICK) -> TipMeasurement:
+    return TipMeasurement(rig.now + ahead, frame, np.array(position))
+
+
+def covariance_at(rig: Rig, ahead: int = 0) -> TipCovariance:
+    """Return the covariance of the tip exposed now."""
+    return TipCovariance(rig.now + ahead, "rig", np.eye(3) * 1e-8)
+
+
+def test_a_rejected_tip_causes_no_motion_and_another_is_awaited() -> None:
+    kinds = set()
+    for position, frame, fault, said in (
+        ([np.nan, 0.0, 0.0], "rig", TipFault.NOT_FINITE, "not finite"),
+        ([0.0, 0.0, 0.0], "map", TipFault.FRAME, "'map'"),
+        ([0.5, 0.2, 1.0], "rig", TipFault.TOO_FAR, "from the entry point"),
+    ):
+        rig = Rig()
+        tip = bad(rig, position, frame)
+        (log,) = rig.expose(tip)
+        assert isinstance(log, Log)
+        assert said in log.text
+        kinds.add(log.kind)
+        assert rig.steering.tips.rejected == {fault: 1}
+        assert said in rig.steering.rejection
+        assert rig.steering.reason == f"tip refused: {rig.steering.rejection}"
+        assert not rig.steering.control.started
+        assert where(rig) == (STEERING, Awaiting.TIP)
+        assert rig.steering.tips.after_ns == tip.stamp_ns
+        sent(rig.expose())
+        assert rig.steering.rejection == ""
+    # Each reason is logged separately.
+    assert len(kinds) == 3
+
+
+def test_an_implausible_tip_is_reported_even_if_none_is_awaited() -> None:
+    rig = Rig()
+    step = sent(rig.expose())
+    assert "from the entry point" in logged(rig.steering.on_tip(bad(rig, [0.1, 0.0, 1.0])))
+    assert rig.steering.on_tip(bad(rig, [0.0, 0.0, 1e-3])) == []
+    assert rig.steering.tips.rejected == {TipFault.TOO_FAR: 1}
+    rig.run(step)
+    rig.run(sent(rig.expose()))
+    rig.steering.on_stop()
+    rig.steering.on_tip(bad(rig, [0.1, 0.0, 1.0]))
+    assert rig.steering.tips.rejected == {TipFault.TOO_FAR: 2}
+    assert rig.steering.reason == "stopped"
+
+
+def test_a_stamp_that_is_old_or_far_ahead_does_not_set_the_clock() -> None:
+    rig = Rig()
+    rig.steps(1)
+    after = rig.steering.tips.after_ns
+    assert "not newer" in logged(rig.steering.on_tip(bad(rig, [0.0] * 3, ahead=TICK - rig.now)))
+    future = bad(rig, [0.0] * 3, ahead=3600 * SECOND)
+    assert "ahead of joint_states" in logged(rig.steering.on_tip(future))
+    assert rig.steering.tips.after_ns == after
+    sent(rig.expose())
+    other = Rig()
+    other.steering.tips.after_ns = 0
+    assert "older" in logged(other.steering.on_tip(TipMeasurement(1, "rig", np.zeros(3))))
+
+
+def test_queued_tips_with_too_late_stamps_are_removed() -> None:
+    rig = Rig()
+    for ahead in (1, 3, 4):
+        assert rig.steering.on_tip(rig.measured(ahead=ahead * TICK)) == []
+    # The topic keeps its order: two stamps were too late, the first was good.
+    assert rig.steering.on_tip(rig.measured(ahead=2 * TICK)) == []
+    assert rig.steering.tips.rejected == {TipFault.AHEAD_OF_JOINTS: 2}
+    rig.now += TICK
+    assert sent(rig.joints()).stamp_ns == rig.now
+
+
+def test_a_tip_timeout_ends_with_a_good_tip() -> None:
+    rig = Rig()
+    timeout = rig.steering.settings.tip_timeout
+    assert rig.steering.on_time(100.0) == []
+    assert rig.steering.on_time(100.0 + 0.99 * timeout) == []
+    assert where(rig) == (STEERING, Awaiting.TIP)
+    said = logged(rig.steering.on_time(100.0 + timeout))
+    assert said == "WAITING_FOR_TIP: no good tip for 2 s"
+    assert where(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
+    assert rig.steering.watchdog_trips == 1
+    assert rig.steering.on_time(100.0 + 3 * timeout) == []
+    rig.expose(bad(rig, [np.nan] * 3))
+    assert where(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
+    actions = rig.expose()
+    assert "STEERING: a good tip came" in logged(actions)
+    sent(actions)
+    assert where(rig) == (STEERING, Awaiting.RESULT)
+    # Stop and start also work while it waits.
+    other = Rig()
+    other.expose(bad(other, [np.nan] * 3))
+    other.steering.on_time(0.0)
+    assert "the last one was refused: tip is not finite" in logged(other.steering.on_time(2.0))
+    assert other.start() == "already steering"
+    assert other.steering.on_stop()[0].message == "stopped"
+
+
+def test_a_step_without_joint_confirmation_is_reported_after_the_tip_timeout() -> None:
+    rig = Rig()
+    rig.steering.on_result(sent(rig.expose()).stamp_ns, "succeeded")
+    rig.steering.on_time(0.0)
+    said = logged(rig.steering.on_time(2.0))
+    assert said == "WAITING_FOR_TIP: joint_states do not show the end of step 1"
+
+
+def test_time_does_not_run_while_a_person_pauses() -> None:
+    rig = Rig(held=False)
+    rig.steering.on_time(0.0)
+    assert rig.steering.on_time(1e6) == []
+    rig.steering.on_device(HELD)
+    assert rig.steering.on_time(2e6) == []
+    step = sent(rig.expose())
+    rig.steering.on_device(MOVING)
+    assert rig.steering.on_time(3e6) == []
+    rig.run(step)
+    rig.steering.on_device(HELD)
+    assert rig.steering.on_time(4e6) == []
+    assert rig.steering.state is STEERING
+
+
+def test_a_tip_without_joints_expires() -> None:
+    rig = Rig()
+    # Also in state WAITING_FOR_TIP.
+    for start in (0.0, 100.0):
+        rig.steering.on_tip(rig.measured(ahead=TICK))
+        rig.steering.on_time(start)
+        assert "no joint_states" not in logged(rig.steering.on_time(start + 1.99))
+        assert "no joint_states" in logged(rig.steering.on_time(start + 2.0))
+        rig.now += 2 * TICK
+    assert rig.steering.tips.rejected == {TipFault.NO_JOINTS: 2}
+    assert rig.steering.watchdog_trips == 3
+    sent(rig.expose())
+
+
+def test_a_tip_waits_for_its_covariance_in_any_order() -> None:
+    steps = []
+    for order in itertools.permutations(range(3)):
+        rig = Rig(tip_covariance="from_tip_pose")
+        rig.now += TICK
+        tip, covariance = rig.measured(0.0004), covariance_at(rig)
+        actions: list[Action] = []
+        for number, topic in enumerate(order):
+            assert none_sent(actions), order[:number]
+            actions += (
+                rig.joints,
+                lambda rig=rig, tip=tip: rig.steering.on_tip(tip),
+                lambda rig=rig, c=covariance: rig.steering.on_tip_pose(c),
+            )[topic]()
+        steps.append(sent(actions))
+    assert len(set(steps)) == 1
+
+
+def test_the_covariance_turns_with_the_plane(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig(tip_covariance="from_tip_pose")
+    # x of this plane is y of rig.
+    rig.steering.control.plane = plane_from_pose(
+        "rig", [0.0, 0.003, 0.0], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]
+    )
+    calls = spied(rig, monkeypatch.setattr, "correct")
+    rig.expose()
+    rig.run(sent(rig.steering.on_tip_pose(covariance_at(rig))))
+    rig.expose()
+    matrix = np.diag([1.0, 4.0, 9.0]) * 1e-8
+    matrix[0, 2] = matrix[2, 0] = 1e-8
+    sent(rig.steering.on_tip_pose(TipCovariance(rig.now, "rig", matrix)))
+    wanted = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, 9.0]]) * 1e-8
+    # measurement_std^2 is added.
+    wanted += rig.steering.settings.measurement_std**2 * np.eye(3)
+    np.testing.assert_allclose(np.asarray(calls[0][1]), wanted, atol=1e-14)
+
+
+def test_a_tip_with_a_bad_covariance_is_rejected() -> None:
+    rig = Rig(tip_covariance="from_tip_pose")
+    rig.expose()
+    actions = rig.steering.on_tip_pose(TipCovariance(rig.now, "map", np.eye(3)))
+    assert none_sent(actions)
+    assert "frame 'map'" in logged(actions)
+    assert rig.steering.tips.rejected == {TipFault.BAD_COVARIANCE: 1}
+    rig.expose()
+    sent(rig.steering.on_tip_pose(covariance_at(rig)))
+
+
+def test_a_later_covariance_shows_that_the_tips_own_is_lost() -> None:
+    rig = Rig(tip_covariance="from_tip_pose")
+    rig.expose()
+    assert rig.steering.on_tip_pose(covariance_at(rig, ahead=-TICK)) == []
+    actions = rig.steering.on_tip_pose(covariance_at(rig, ahead=TICK))
+    assert "no needle/tip_pose" in logged(actions)
+    assert "set it to configured" in logged(actions)
+    assert rig.steering.tips.rejected == {TipFault.NO_COVARIANCE: 1}
+    assert rig.steering.watchdog_trips == 0
+    assert rig.steering.tips.after_ns == rig.now
+    # The tip of the later covariance is used for the next step.
+    sent(rig.expose())
+
+
+def test_tips_without_covariances_are_reported_with_the_setting_to_change() -> None:
+    rig = Rig(tip_covariance="from_tip_pose")
+    rig.expose()
+    rig.steering.on_time(0.0)
+    assert rig.steering.on_time(1.9) == []
+    rig.steering.on_time(2.0)
+    assert rig.steering.state is SteeringState.WAITING_FOR_TIP
+    assert "set it to configured" in rig.steering.reason
+    assert rig.steering.tips.rejected == {TipFault.NO_COVARIANCE: 1}
+    # The configured covariance needs and uses no needle/tip_pose.
+    steps = []
+    for spoilt in (False, True):
+        rig = Rig()
+        for _ in range(3):
+            if spoilt:
+                rig.steering.on_tip_pose(TipCovariance(rig.now + TICK, "rig", np.zeros((3, 3))))
+            steps.append(sent(rig.expose()))
+            rig.run(steps[-1])
+    assert steps[:3] == steps[3:]
