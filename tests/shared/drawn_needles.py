@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from needle_tracker.detector.reach import Reach
+from needle_tracker.detector.search_grid import Reach
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
 

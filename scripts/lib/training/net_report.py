@@ -1,9 +1,11 @@
-"""Figures of a trained net, on samples of scenes that it was not trained on."""
+"""Figures of a trained net on samples of held-out scenes."""
 
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from collections.abc import Iterable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,31 +14,32 @@ from numpy.typing import NDArray
 
 from needle_bringup.training.samples import exposed
 from needle_bringup.training.traced_scenes import TracedScene
+from needle_tracker.detector import needle_net
 from needle_tracker.detector.needle_net import normalized
 from sample_pool import CONTEXT, SHARD, Shard, batch_of
-from training_net import NeedleNet, StoredNet
+from training_net import NeedleNet, StoredNet, export
 
 Array = NDArray[np.float64]
 
 WIDTHS_PX = (2.2, 4.0, 6.0, 9.0)
-"""Needles are told apart by width at these [px]."""
-_NEAR_PX = 4  # an end is seen where the net expects it within that
-_AROUND_PX = 8  # what belongs to one peak
-_SEEN = 0.5  # the chance that a peak is taken for an end from
-_SHAFT_PX = 15.0  # of the shaft tells its direction
-_AT_ONCE = 16
+"""Bounds of the classes of needle widths [px]."""
+_NEAR_PX = 4  # largest error of a detected end
+_AROUND_PX = 8  # radius of one peak
+_SEEN = 0.5  # expected ends of a peak that is a detection
+_SHAFT_PX = 15.0  # length of shaft that determines its direction
+_AT_ONCE = 16  # samples in a batch
 
 
 @dataclasses.dataclass(frozen=True)
 class EndError:
-    """Error of one end as the net sees it.
+    """Error of one detected end.
 
     Attributes
     ----------
     along, across : float
-        To the shaft [px].
+        Along and across the shaft [px].
     sigmas : float
-        The same as a whole, in units of what the net expects (Mahalanobis).
+        Mahalanobis distance by the spread of the peak.
     """
 
     along: float
@@ -46,7 +49,7 @@ class EndError:
 
 @dataclasses.dataclass
 class Figures:
-    """Of all samples of one kind."""
+    """Figures of all samples of one class."""
 
     samples: int = 0
     entropy: float = 0.0
@@ -57,7 +60,7 @@ class Figures:
     errors: list[EndError] = dataclasses.field(default_factory=list)
 
     def line(self) -> str:
-        """Return a line of a table."""
+        """Return a line of the table."""
         errors = self.errors or [EndError(np.nan, np.nan, np.nan)]
         along = [abs(error.along) for error in errors]
         across = [abs(error.across) for error in errors]
@@ -77,14 +80,14 @@ HEADER = (
 
 
 def discs(intensity: Array) -> Array:
-    """Return what is expected within 4 px of each pixel."""
+    """Return the expected number of ends within `_NEAR_PX` of each pixel."""
     reach = np.arange(-_NEAR_PX, _NEAR_PX + 1)
     disc = (np.hypot(*np.meshgrid(reach, reach)) <= _NEAR_PX).astype(np.float64)
     return np.asarray(cv2.filter2D(intensity, -1, disc, borderType=cv2.BORDER_CONSTANT))
 
 
 def peaks(intensity: Array) -> NDArray[np.int64]:
-    """Return where ends are seen, column and row, shape (n, 2)."""
+    """Return the detected ends, column and row, shape (n, 2)."""
     expected = discs(intensity)
     side = 2 * _AROUND_PX + 1
     highest = cv2.dilate(expected, np.ones((side, side), np.uint8))
@@ -93,16 +96,16 @@ def peaks(intensity: Array) -> NDArray[np.int64]:
 
 
 def end_error(intensity: Array, share: Array, end: Array) -> EndError | None:
-    """Return how far from its place an end was seen; None where it was not.
+    """Return the error of a detected end; None if it was not detected.
 
     Parameters
     ----------
     intensity : ndarray, shape (height, width)
-        Of ends [1/px^2].
+        Intensity of ends [1/px^2].
     share : ndarray, shape (height, width)
-        Of each pixel that is shaft.
+        Share of shaft in each pixel.
     end : ndarray, shape (2,)
-        Column and row [px].
+        True end, column and row [px].
     """
     rows, columns = np.indices(intensity.shape)
     places = np.stack([columns, rows], axis=-1)
@@ -122,7 +125,7 @@ def end_error(intensity: Array, share: Array, end: Array) -> EndError | None:
 
 
 def report(net: NeedleNet, shards: Iterable[Shard]) -> str:
-    """Return a table of what a net is worth, by width and with or without a background."""
+    """Return a table of the figures of a net, by width and with or without a background."""
     stored = StoredNet(net).eval()
     table: dict[tuple[int, bool], Figures] = {}
     for shard in shards:
@@ -167,25 +170,32 @@ def _count(figures: Figures, shaft: Array, log_intensity: Array, share: Array, e
 
 
 def report_views(net: NeedleNet, scenes: Iterable[TracedScene]) -> str:
-    """Return a table of what a net sees in whole images, without and with the empty phantom.
+    """Return a table of the ends in whole images, without and with the empty phantom.
 
     Parameters
     ----------
     net : NeedleNet
-        Which looks.
+        The net.
     scenes : iterable of TracedScene
-        That it was not trained on.
+        Held-out scenes.
     """
-    stored = StoredNet(net).eval()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "needle_net.onnx")
+        export(net, path)
+        detector = needle_net.NeedleNet(path.read_bytes())
     seen, wrong, false = np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
     for number, scene in enumerate(scenes):
         for i in range(len(scene.images)):
             for known in (False, True):
                 rng = np.random.default_rng([number, i])
                 empty = scene.images[i % 2].astype(np.float32)
-                views = exposed(rng, scene.images[i].astype(np.float32), empty if known else None)
-                intensity = _look(stored, *views)
-                found = peaks(intensity)
+                image, background = exposed(
+                    rng, scene.images[i].astype(np.float32), empty if known else None
+                )
+                _, intensity = detector.evidence(
+                    normalized(image), None if background is None else normalized(background)
+                )
+                found = peaks(intensity.astype(np.float64))
                 if i < 2:
                     false[int(known)] += [1, len(found)]
                 elif np.isfinite(scene.ends[i]).all():
@@ -200,16 +210,3 @@ def report_views(net: NeedleNet, scenes: Iterable[TracedScene]) -> str:
             f"{wrong[row] / max(ends, 1):8.2f}  {empty:9.0f} {false[row, 1] / max(empty, 1):8.2f}"
         )
     return "\n".join(lines)
-
-
-def _look(
-    stored: StoredNet, image: NDArray[np.uint8], background: NDArray[np.uint8] | None
-) -> Array:
-    """Return the intensity of ends in an image whose sides are multiples of 4 [1/px^2]."""
-    seen = np.zeros((1, 2, *image.shape), np.float32)
-    seen[0, 0] = normalized(image)
-    if background is not None:
-        seen[0, 1] = normalized(background)
-    with torch.no_grad():
-        log_intensity = stored(torch.from_numpy(seen))[1]
-    return np.asarray(np.exp(log_intensity.numpy()[0, 0].astype(np.float64)))

@@ -1,4 +1,4 @@
-"""Scenes out of a user's own recording: the tracker says where the needle was."""
+"""Training scenes from a recording of a rig, labelled by the tracker."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from needle_tracker.sources.image_files import open_pairs, read_insertions
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-_LEAST_TIPS = 10  # the path is fitted to
-_MOST_PAIRS = 60  # of each recording, so that memory holds them
-_EVERY = 5  # so many pairs, one is held out
+_LEAST_TIPS = 10  # for the fit of the path
+_MOST_PAIRS = 60  # of each recording, to limit memory
+_EVERY = 5  # one in so many pairs is held out
 _HOLE_SIGMA, _TIP_SIGMA = 0.3e-3, 0.2e-3  # of the path at the entry and of a tip about it [m]
-_PASSES, _POINTS = 5, 60  # of the fit; along a shaft that is drawn
-_SHORT = 10e-3  # of a needle whose width in the image stands for one that is not there [m]
+_PASSES, _POINTS = 5, 60  # iterations of the fit; points of a drawn shaft
+_SHORT = 10e-3  # length of the needle that gives the width in images without one [m]
 
 
 def own_scenes(folder: Path, width: float) -> tuple[TracedScene, TracedScene]:
-    """Return what to learn from in a recording, and what is held out of it.
+    """Return the training scene and the held-out scene of a recording.
 
-    A needle follows its tip, so the path of the tips that the tracker believed is where the shaft
-    was in each image; pairs between them are learned from too, believed or not.
+    The needle follows its tip, so the path of the believed tips gives the shaft in each image, also
+    in the pairs between them without a tip.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def own_scenes(folder: Path, width: float) -> tuple[TracedScene, TracedScene]:
     Raises
     ------
     UserError
-        Something is missing, or the tracker believed too few tips.
+        A missing file, or too few believed tips.
     """
     calibration = load_calibration(folder / "calibration.yaml")
     parameters = StereoTrackerParameters(needle_width=width)
@@ -79,19 +79,19 @@ def own_scenes(folder: Path, width: float) -> tuple[TracedScene, TracedScene]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OwnPair:
-    """Images of one exposure, left and right, and the insertion [m] where there is a needle."""
+    """Left and right image of one exposure, and the insertion [m] if there is a needle."""
 
     images: tuple[Image, Image]
     insertion: float | None
 
 
 class TipPath:
-    """The way that the tip took: a cubic of the insertion, through the entry.
+    """Path of the tip: a cubic of the insertion, through the entry.
 
     Parameters
     ----------
     insertions : ndarray, shape (n,)
-        Of the tips [m].
+        Insertions of the tips [m].
     tips : ndarray, shape (n, 3)
         In `rig` [m].
     """
@@ -102,7 +102,7 @@ class TipPath:
         terms, points = self._terms(s), np.vstack([tips, np.zeros(3)])
         sigmas = np.append(np.full(len(tips), _TIP_SIGMA), _HOLE_SIGMA)
         weights = 1.0 / sigmas
-        # Reweighted least squares: a tip that was wrong counts for little.
+        # Reweighted least squares: outliers have a low weight.
         for _ in range(_PASSES):
             rows = weights[:, None]
             self._cubic, *_ = np.linalg.lstsq(terms * rows, points * rows, rcond=None)
@@ -120,7 +120,7 @@ class TipPath:
 def _scene(
     rig: StereoRig, width: float, path: TipPath, empty: OwnPair, pairs: list[OwnPair]
 ) -> TracedScene:
-    """Return pairs as a scene: first the phantom without a needle."""
+    """Return a scene of pairs, the first without a needle."""
     step = -(-len(pairs) // _MOST_PAIRS)
     images, shares, ends, widths = [], [], [], []
     for pair in [empty, *pairs[::step]]:
@@ -137,12 +137,12 @@ def _scene(
 
 
 def _pairs(folder: Path, insertions: Mapping[str, float]) -> list[OwnPair]:
-    """Return the pairs of a folder that can be read.
+    """Return the readable pairs of a folder.
 
     Raises
     ------
     UserError
-        There is none.
+        No pair is readable.
     """
     found = []
     for pair in open_pairs(folder / "left", folder / "right"):

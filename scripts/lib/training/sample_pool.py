@@ -1,4 +1,4 @@
-"""Samples in files, for training to draw from: another process adds to them meanwhile."""
+"""Pool of training samples in files, to which another process adds."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from needle_tracker.detector.needle_net import normalized
 Float = NDArray[np.float32]
 
 SHARD = 128
-"""Samples in a file."""
+"""Number of samples in a file."""
 CONTEXT = 8
-"""What the net sees around a patch [px]: fewer pixels are at a border than else."""
+"""Margin around a patch that the net sees [px], so that fewer pixels are at a border."""
 KINDS = ("drawn", "traced")
-_TRACED_SHARE = 0.6  # of a batch
+_TRACED_SHARE = 0.6  # share of path-traced samples in a batch
 _OUTSIDE = BORDER - CONTEXT
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shard:
-    """The samples of one file, in arrays; a background that is not known is 0 everywhere."""
+    """Samples of one file as arrays; an unknown background is 0."""
 
     images: NDArray[np.uint8]
     backgrounds: NDArray[np.uint8]
@@ -38,18 +38,18 @@ class Shard:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Batch:
-    """Samples as the net sees them, and what is wanted of it.
+    """Inputs of the net, and the labels.
 
     Attributes
     ----------
     seen : ndarray of float32, shape (n, 2, SIZE + 2 CONTEXT, SIZE + 2 CONTEXT)
         Images and backgrounds, normalized.
     shares : ndarray of float32, shape (n, SIZE, SIZE)
-        0 to 1, the share of each pixel that is shaft.
+        Share of shaft in each pixel, 0 to 1.
     ends : ndarray of float32, shape (n, 2)
-        Column and row of the needles' ends in the patch [px]; NaN where none is.
+        Column and row of the end in each patch [px]; NaN without an end.
     widths_px : ndarray, shape (n,)
-        Of the needles [px].
+        Widths of the needles [px].
     known : ndarray of bool, shape (n,)
         Whether there is a background.
     """
@@ -62,14 +62,14 @@ class Batch:
 
 
 def write_shard(path: Path, seed: list[int], draw: Callable[[np.random.Generator], Sample]) -> None:
-    """Write a file of samples, whole or not at all.
+    """Write a file of samples, atomically.
 
     Parameters
     ----------
     path : Path
-        Where.
+        The file.
     seed : list of int
-        Keys all that is random.
+        Seed of the generator of each sample.
     draw : callable
         Returns a sample.
     """
@@ -105,26 +105,26 @@ class Pool:
         self._shards: dict[str, dict[str, Shard]] = {kind: {} for kind in KINDS}
 
     def update(self) -> int:
-        """Read what is new, forget what is gone; returns the number of samples."""
+        """Read new files, drop deleted ones; return the number of samples."""
         for kind, shards in self._shards.items():
             there = {path.name: path for path in self._folder.glob(f"{kind}-*.npz")}
             for name in shards.keys() - there.keys():
                 del shards[name]
             for name in sorted(there.keys() - shards.keys()):
-                # One that is replaced meanwhile is gone.
+                # The other process may delete the file meanwhile.
                 with contextlib.suppress(FileNotFoundError):
                     shards[name] = read_shard(there[name])
         return SHARD * sum(len(shards) for shards in self._shards.values())
 
     def batch(self, rng: np.random.Generator, count: int) -> Batch:
-        """Return samples of both kinds, turned and mirrored at random.
+        """Return samples of both kinds, rotated and mirrored at random.
 
         Parameters
         ----------
         rng : Generator
-            What chooses.
+            Generator of the choices.
         count : int
-            How many.
+            Number of samples.
         """
         traced = round(_TRACED_SHARE * count)
         kinds = [KINDS[1]] * traced + [KINDS[0]] * (count - traced)
@@ -137,16 +137,16 @@ class Pool:
 
 
 def batch_of(chosen: list[tuple[Shard, int]], turns: list[int], mirrors: list[bool]) -> Batch:
-    """Return samples as the net sees them.
+    """Return chosen samples as a batch.
 
     Parameters
     ----------
     chosen : list of tuple
-        Files and places in them.
+        Files, and indices in them.
     turns : list of int
-        Quarter turns of each.
+        Quarter turns of each sample.
     mirrors : list of bool
-        Whether each is mirrored after that.
+        Whether each sample is mirrored after that.
     """
     side = SIZE + 2 * CONTEXT
     seen = np.zeros((len(chosen), 2, side, side), np.float32)
@@ -172,7 +172,7 @@ def batch_of(chosen: list[tuple[Shard, int]], turns: list[int], mirrors: list[bo
 
 
 def _turned(end: NDArray[np.float64], turn: int, mirror: bool) -> NDArray[np.float64]:
-    """Return where a point of a patch is after it was turned and mirrored [px]."""
+    """Return a point of a patch that was rotated and mirrored [px]."""
     x, y = end
     for _ in range(turn):
         x, y = y, SIZE - 1.0 - x

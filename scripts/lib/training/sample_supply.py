@@ -1,4 +1,4 @@
-"""Files of samples: for the net to learn from, which another process writes, and to judge it."""
+"""Files of samples: training samples from a background process, and validation samples."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from needle_bringup.training.traced_scenes import TracedScene
 from sample_pool import write_shard
 
 HELD_OUT = 9
-"""Scenes whose number ends so are for validation alone."""
-_AT_ONCE = 12  # scenes that the samples of a file are cut from
+"""Scenes whose number ends with this digit are for validation only."""
+_AT_ONCE = 12  # scenes for the samples of one file
 _TRACED_PER_DRAWN = 2
 _VALIDATION = 6  # files of each kind
 _SEED_OF, _UNSEEN = {"drawn": 0, "traced": 1}, 10
@@ -26,7 +26,7 @@ _POLL = 5.0  # [s]
 
 
 def is_held_out(seed: int) -> bool:
-    """Return whether a scene is for validation alone."""
+    """Return whether a scene is for validation only."""
     return seed % 10 == HELD_OUT
 
 
@@ -37,7 +37,7 @@ def read_scene(path: Path) -> TracedScene:
 
 
 def write_scene(path: Path, scene: TracedScene) -> None:
-    """Store a scene, whole or not at all."""
+    """Write a scene, atomically."""
     new = path.with_suffix(".new")
     with new.open("wb") as file:
         np.savez(file, **{f.name: getattr(scene, f.name) for f in dataclasses.fields(scene)})
@@ -52,16 +52,16 @@ def scene_paths(folder: Path, held_out: bool) -> list[Path]:
 
 
 def supply(scenes: Path, folder: Path, most: dict[str, int]) -> None:
-    """Write files of samples for ever: first new ones, then new ones in place of the oldest.
+    """Write files of samples without end: above the limit, a new file replaces the oldest.
 
     Parameters
     ----------
     scenes : Path
-        Folder of the scenes; those that are added are used as they come.
+        Folder of the scenes, which may grow.
     folder : Path
-        Where the samples go.
+        Output folder.
     most : dict of str to int
-        So many files are kept of each kind; of drawn ones no more are drawn then.
+        Largest number of files of each kind; drawing stops there.
     """
     cv2.setNumThreads(1)
     folder.mkdir(parents=True, exist_ok=True)
@@ -81,14 +81,14 @@ def supply(scenes: Path, folder: Path, most: dict[str, int]) -> None:
 
 
 def write_validation(scenes: Path, folder: Path) -> None:
-    """Write files of samples that are not learned from, where they are not there yet.
+    """Write the missing files of validation samples.
 
     Parameters
     ----------
     scenes : Path
         Folder of the scenes.
     folder : Path
-        Where the samples go.
+        Output folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
     held_out = [read_scene(path) for path in scene_paths(scenes, held_out=True)]
@@ -103,7 +103,7 @@ def write_validation(scenes: Path, folder: Path) -> None:
 
 
 def _next(folder: Path, kind: str) -> tuple[Path, list[int]]:
-    """Return the next file of a kind, and what keys it."""
+    """Return the next file of a kind, and its seed."""
     paths = sorted(folder.glob(f"{kind}-*.npz"))
     number = int(paths[-1].stem.rpartition("-")[2]) + 1 if paths else 0
     return folder / f"{kind}-{number:05d}.npz", [_SEED_OF[kind], number]

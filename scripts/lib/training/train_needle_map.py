@@ -67,7 +67,7 @@ Scenes whose number ends in 9 are held out for the report.
 
 
 def rig_of(seed: int) -> StereoRig:
-    """Return the cameras of a scene."""
+    """Return the cameras of a scene by its seed."""
     if seed % 2 == 0:
         return load_stereo_rig(CALIBRATIONS[seed // 2 % 2])
     with tempfile.TemporaryDirectory() as folder:
@@ -77,14 +77,14 @@ def rig_of(seed: int) -> StereoRig:
 
 
 def trace_all(count: int, folder: Path) -> None:
-    """Trace scenes that are not there yet: on the bench, and in every other a box.
+    """Trace the missing scenes, in turn on the bench and in a box.
 
     Parameters
     ----------
     count : int
-        How many there are then.
+        Number of scenes.
     folder : Path
-        Where they are stored, one file each.
+        Output folder, with a file for each scene.
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{seed}.npz" for seed in range(count)]
@@ -97,16 +97,16 @@ def trace_all(count: int, folder: Path) -> None:
 
 
 def wait_for_samples(folder: Path, drawn: int, process: BaseProcess) -> None:
-    """Wait until samples of both kinds are there.
+    """Wait for samples of both kinds.
 
     Parameters
     ----------
     folder : Path
-        Where they come.
+        Folder of the samples.
     drawn : int
-        So many files of drawn ones, and of traced ones as many [1].
+        Required number of files of each kind.
     process : Process
-        What draws them.
+        Process that draws them.
     """
     with tqdm(total=2 * drawn, desc="drawing samples", unit=f"x{SHARD}") as bar:
         while bar.n < bar.total:
@@ -119,7 +119,7 @@ def wait_for_samples(folder: Path, drawn: int, process: BaseProcess) -> None:
 
 
 def read_arguments() -> argparse.Namespace:
-    """Return the command line's arguments."""
+    """Return the arguments of the command line."""
     parser = argparse.ArgumentParser(
         prog="scripts/train_needle_map",
         description=__doc__,
@@ -218,14 +218,14 @@ def main() -> int:
 
 
 def print_report(net: NeedleNet, scenes: Path, validation: Path) -> None:
-    """Say what a net is worth on scenes that it was not trained on.
+    """Print the figures of a net on held-out scenes.
 
     Parameters
     ----------
     net : NeedleNet
-        Which is judged.
+        The net.
     scenes, validation : Path
-        Folders of the scenes, and of the samples for this, which are made once.
+        Folders of the scenes and of the validation samples.
     """
     write_validation(scenes, validation)
     for kind in ("traced", "drawn"):

@@ -1,4 +1,4 @@
-"""The training itself: losses, schedule, checkpoints."""
+"""Training loop: losses, schedule, checkpoints."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ from training_net import (
 )
 
 _BATCH, _DECAY = 16, 1e-4
-_RATE, _TUNING_RATE = 3e-3, 3e-4  # largest, of a new net and of one that was trained before
+_RATE, _TUNING_RATE = 3e-3, 3e-4  # largest learning rate of a new net and of a trained one
 _WARM_UP, _FIRST_RATE, _LAST_RATE = 0.08, 0.04, 0.002  # share of the run, and of the rate
-_END_WEIGHT = 0.04  # of a nat about an end, against one about each pixel of shaft
-_LARGEST_STEP = 2.0  # of all gradients together
-_WORST, _MOST_BAD = (1.0, 30.0), 20  # losses of batches that are left out, and so many in a row
-_FULL_PRECISION = 0.9  # the last part of a run rounds no more
-_MEAN_OVER = 1000  # steps that the weights are averaged over
-_LOOK_EVERY = 200  # steps until new samples are looked for
+_END_WEIGHT = 0.04  # of the loss of ends relative to the loss of shaft
+_LARGEST_STEP = 2.0  # norm of the gradients
+_WORST, _MOST_BAD = (1.0, 30.0), 20  # losses above which a batch is skipped; consecutive skips
+_FULL_PRECISION = 0.9  # progress from which on a run does not round
+_MEAN_OVER = 1000  # steps over which the weights are averaged
+_LOOK_EVERY = 200  # steps between updates of the pool
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Length of a training, and where it is stored.
+    """Length and files of a training.
 
     Attributes
     ----------
     steps : int
-        Of the whole run.
+        Steps of the whole run.
     minutes : float
-        After so long it ends too, its rate down as after all steps [min].
+        Longest duration [min]; the learning rate falls accordingly.
     output, checkpoint : Path
-        Where the net is written, and all that `resumed` needs.
+        Files of the net and of the checkpoint.
     every : float
-        Time from one checkpoint to the next [s].
+        Period of the checkpoints [s].
     """
 
     steps: int
@@ -59,22 +59,22 @@ class Plan:
 
 @dataclasses.dataclass
 class Run:
-    """A training that can be stored and resumed.
+    """Training that can be stored and resumed.
 
     Attributes
     ----------
     net, mean_net : NeedleNet
-        What learns, and its weights averaged over the last steps: what is stored.
+        The net, and its average over the last steps, which is exported.
     optimizer : AdamW
-        Of it.
+        Optimizer of the net.
     rng : Generator
-        What chooses samples.
+        Generator for the choice of samples.
     rate : float
         Largest learning rate.
     step : int
         Steps done.
     seconds : float
-        Time they took [s].
+        Duration of the steps [s].
     """
 
     net: NeedleNet
@@ -86,7 +86,7 @@ class Run:
     seconds: float = 0.0
 
     def state(self) -> dict[str, Any]:
-        """Return all that `resumed` needs."""
+        """Return the content of a checkpoint."""
         return {
             "net": self.net.state_dict(),
             "mean_net": self.mean_net.state_dict(),
@@ -99,21 +99,21 @@ class Run:
         }
 
     def save(self, path: Path) -> None:
-        """Write a checkpoint, whole or not at all."""
+        """Write a checkpoint, atomically."""
         new = path.with_suffix(".new")
         torch.save(self.state(), new)
         new.replace(path)
 
 
 def new_run(seed: int, weights: Path | None = None) -> Run:
-    """Return a run that begins.
+    """Return a new run.
 
     Parameters
     ----------
     seed : int
-        Keys what is random.
+        Seed of the initial weights.
     weights : Path or None
-        Of a net that `export` wrote, to begin with; None: an untrained one.
+        Initial weights, from `export`; None: an untrained net.
     """
     torch.manual_seed(seed)
     if weights is None:
@@ -124,7 +124,7 @@ def new_run(seed: int, weights: Path | None = None) -> Run:
 
 
 def resumed(path: Path) -> Run:
-    """Return the run of a checkpoint."""
+    """Return the run in a checkpoint."""
     state = torch.load(path, weights_only=True)
     normalized = "middle.0.weight" in state["net"]
     run = _run(NeedleNet(normalized_layer) if normalized else NeedleNet(), state["rate"])
@@ -144,7 +144,7 @@ def _run(net: NeedleNet, rate: float) -> Run:
 
 
 def rate_share(progress: float) -> float:
-    """Return the share of the largest rate: up along a line, then down along a cosine."""
+    """Return the share of the largest rate: a linear rise, then a cosine."""
     if progress < _WARM_UP:
         return _FIRST_RATE + (1.0 - _FIRST_RATE) * progress / _WARM_UP
     left = 0.5 * (1.0 + np.cos(np.pi * min((progress - _WARM_UP) / (1.0 - _WARM_UP), 1.0)))
@@ -152,7 +152,7 @@ def rate_share(progress: float) -> float:
 
 
 def shaft_loss(logits: torch.Tensor, shares: torch.Tensor) -> torch.Tensor:
-    """Return the mean loss of a pixel's chance of being shaft; needle weighs more than floor."""
+    """Return the mean loss of the shaft probability, with a larger weight for needle pixels."""
     losses = functional.binary_cross_entropy_with_logits(logits, shares, reduction="none")
     return (losses * (1.0 + NEEDLE_WEIGHT * shares)).mean()
 
@@ -161,17 +161,17 @@ def end_loss(log_intensity: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
     """Return the mean over patches of minus the log-likelihood of their ends.
 
     Ends are a Poisson process of intensity lambda: -log L = sum(lambda) - sum_ends log(lambda).
-    Likelihood is a proper score: the spread of a peak learns to be its error, and its sum the
-    chance that an end is there.
+    Likelihood is a proper score: the net learns peaks whose spread is their error, and whose sum is
+    the probability of an end.
 
     Parameters
     ----------
     log_intensity : Tensor, shape (n, height, width)
         log(lambda) [1/px^2].
     ends : Tensor, shape (n, 2)
-        Column and row of the end in each patch [px]; NaN where none is.
+        Column and row of the end in each patch [px]; NaN without an end.
     """
-    # What is cut off still has a slope: else it would never return.
+    # Keep the gradient of clamped values, so that they can return.
     cut = log_intensity + (log_intensity.clamp(*LOG_INTENSITY) - log_intensity).detach()
     intensity = torch.exp(cut)
     total = intensity.sum()
@@ -191,7 +191,7 @@ def end_loss(log_intensity: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
 
 
 def losses(net: NeedleNet, batch: Batch, *, rounded: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the losses of shaft and end; rounded: with numbers of 16 bits, which is quicker."""
+    """Return the losses of shaft and ends; rounded: with bfloat16, which may be faster."""
     seen = torch.from_numpy(batch.seen).to(memory_format=torch.channels_last)
     with torch.autocast("cpu", torch.bfloat16, enabled=rounded):
         out = net(seen)
@@ -203,30 +203,29 @@ def losses(net: NeedleNet, batch: Batch, *, rounded: bool) -> tuple[torch.Tensor
 
 
 def rounds_quickly() -> bool:
-    """Return whether this processor is quicker with numbers of 16 bits."""
+    """Return whether bfloat16 is faster on this processor."""
     cpu = Path("/proc/cpuinfo")
     return cpu.exists() and "amx_bf16" in cpu.read_text(encoding="utf-8")
 
 
 def train(run: Run, pool: Pool, plan: Plan) -> None:
-    """Train to the end, and write net and checkpoint now and then.
+    """Train to the end of the plan, with periodic checkpoints.
 
     Parameters
     ----------
     run : Run
-        New, or resumed.
+        New or resumed run.
     pool : Pool
-        Samples.
+        Training samples.
     plan : Plan
-        How long, and where to.
+        Length and files.
 
     Raises
     ------
     RuntimeError
-        The net diverged, as it did twice in 30,000 steps before `_SMALLEST` was raised from 1e-8.
-        The last checkpoint stays, and from there it did not.
+        The net diverged; the run can be resumed from the last checkpoint.
     """
-    # More threads than that wait for each other longer than they work.
+    # For so small a net, more threads are slower.
     torch.set_num_threads(1)
     quick = rounds_quickly()
     began = saved = time.monotonic()

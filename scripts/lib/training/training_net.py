@@ -1,4 +1,4 @@
-"""The needle net: where is shaft, and where does it end."""
+"""The needle net: probability of shaft and intensity of ends."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from torch import nn
 from torch.nn import functional
 
 NEEDLE_WEIGHT = 4.0
-"""So much more than a pixel of floor counts one of needle: most pixels are floor."""
+"""Additional weight of a needle pixel: most pixels are floor."""
 LOG_INTENSITY = (-16.0, 3.0)
-"""Least and largest logarithm of the intensity of ends [1/px^2]."""
+"""Bounds of the logarithm of the intensity of ends [1/px^2]."""
 _HALF, _QUARTER, _FINE = 16, 32, 8  # channels at half, quarter and full size
 _DILATIONS = (1, 2, 4, 8, 4, 1)
-_FIRST_LOG_INTENSITY = -9.5  # of a new net: an end or so per patch
+_FIRST_LOG_INTENSITY = -9.5  # of a new net: about one end per patch
 
 
 def normalized_layer(*shape: int) -> nn.Sequential:
-    """Return a convolution whose channels are normalized over each batch, as training needs it.
+    """Return a convolution with batch normalization, for training.
 
-    Without that, what six layers add grows by ten to a hundred times, and half of the channels fall
-    silent. `folded` takes it out again.
+    Without it, the activations grow by ten to a hundred times, and half of the channels vanish.
+    `folded` removes it.
     """
     return nn.Sequential(nn.Conv2d(*shape, bias=False), nn.BatchNorm2d(shape[1]))
 
 
 class NeedleNet(nn.Module):
-    """A trunk at a quarter of the size that looks far around, and two heads at full size.
+    """Trunk at a quarter of the size with a large receptive field, and two heads at full size.
 
     Parameters
     ----------
     layer : callable
-        Returns a layer of the trunk and after it: `normalized_layer` to train from nothing, a plain
-        convolution to run. At full size normalizing takes as long as all else.
+        Returns a layer: `normalized_layer` to train a new net, a plain convolution to run. Layers
+        at full size are always plain, since their normalization doubles the duration.
     """
 
     def __init__(self, layer: Callable[..., nn.Module] = nn.Conv2d) -> None:
@@ -58,7 +58,7 @@ class NeedleNet(nn.Module):
             self.out.bias.copy_(torch.tensor([-2.0, _FIRST_LOG_INTENSITY]))
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Return two numbers for each pixel.
+        """Return the two maps of images.
 
         Parameters
         ----------
@@ -68,7 +68,7 @@ class NeedleNet(nn.Module):
         Returns
         -------
         Tensor, shape (n, 2, height, width)
-            The logit of being shaft, and the logarithm of the intensity of ends.
+            Logit of shaft, and logarithm of the intensity of ends.
         """
         half = functional.relu(self.first(image))
         seen = functional.relu(self.second(half))
@@ -83,9 +83,9 @@ class NeedleNet(nn.Module):
 
 
 def twice_as_large(image: torch.Tensor) -> torch.Tensor:
-    """Return an image of twice the size, each of whose pixels a channel of its own had.
+    """Return the pixel shuffle of an image, which has twice its size.
 
-    That is `pixel_shuffle`, which OpenCV 5 is slow at: 70 in place of 52 ms for 384x512 pixels.
+    `pixel_shuffle` itself is slow in OpenCV 5: 70 instead of 52 ms for 384x512 pixels.
     """
     count, channels, height, width = image.shape
     parts = image.reshape(count, channels // 4, 2, 2, height, width).permute(0, 1, 4, 2, 5, 3)
@@ -93,7 +93,7 @@ def twice_as_large(image: torch.Tensor) -> torch.Tensor:
 
 
 def folded(net: NeedleNet) -> NeedleNet:
-    """Return the same net of plain convolutions, each with its normalization in its weights."""
+    """Return the equivalent net of plain convolutions."""
     plain, trained = NeedleNet(), copy.deepcopy(net).eval()
     for name, layer in plain.named_modules():
         if isinstance(layer, nn.Conv2d):
@@ -105,29 +105,29 @@ def folded(net: NeedleNet) -> NeedleNet:
 
 
 class StoredNet(nn.Module):
-    """The net with chances in place of logits: what is stored."""
+    """The exported net, with probabilities instead of logits."""
 
     def __init__(self, net: NeedleNet) -> None:
         super().__init__()
         self.net = net
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the chance of shaft and the logarithm of the intensity of ends, (n, 1, h, w)."""
+        """Return probability of shaft and logarithm of the intensity of ends, (n, 1, h, w)."""
         out = self.net(image)
-        # Trained with that weight, the net takes the odds of needle for so many times too high.
+        # The weight of the loss multiplies the learned odds of needle.
         shaft = torch.sigmoid(out[:, :1] - math.log(1.0 + NEEDLE_WEIGHT))
         return shaft, torch.clamp(out[:, 1:], *LOG_INTENSITY)
 
 
 def export(net: NeedleNet, path: Path) -> None:
-    """Write a net as ONNX, whole or not at all.
+    """Write a net as ONNX, atomically.
 
     Parameters
     ----------
     net : NeedleNet
-        What to write.
+        The net.
     path : Path
-        Where; what was there is replaced.
+        Output file.
     """
     size = {2: "height", 3: "width"}
     new = path.with_suffix(".new")
@@ -147,12 +147,12 @@ def export(net: NeedleNet, path: Path) -> None:
 
 
 def load_weights(net: NeedleNet, path: Path) -> None:
-    """Give a net the weights that `export` wrote.
+    """Load weights that `export` wrote.
 
     Parameters
     ----------
     net : NeedleNet
-        Which takes them.
+        The net.
     path : Path
         ONNX file.
     """

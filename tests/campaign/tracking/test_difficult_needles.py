@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from needle_tracker.answers.tracker_parameters import default_settings
-from needle_tracker.filter.background import Image
 from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.filter.settings import TrackerSettings
+from needle_tracker.filter.settings import Image, TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera
 

@@ -14,7 +14,7 @@ from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import find_scenario
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.plant import NeedlePlant, initial_pose
-from needle_tracker.answers.swapped_images import SwapWatch
+from needle_tracker.answers.pair_answers import SwapWatch
 from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
@@ -48,9 +48,9 @@ class Looks:
         self.watch = SwapWatch(calibration, settings)
         self.ever = False
 
-    def see(self, left: np.ndarray, right: np.ndarray, insertion: float | None) -> Measurement:
+    def update(self, left: np.ndarray, right: np.ndarray, insertion: float | None) -> Measurement:
         measured = self.tracker.process(left, right, insertion)
-        self.watch.see(left, right, insertion, measured)
+        self.watch.update(left, right, insertion, measured)
         self.ever = self.ever or self.watch.suspected
         return measured
 
@@ -66,7 +66,7 @@ def test_swapped_images_are_suspected(
     looks: Looks, calibration_path: Path, scenario: str, known: bool
 ) -> None:
     for insertion, left, right in pairs(calibration_path, scenario, 1):
-        looks.see(right, left, insertion if known else None)
+        looks.update(right, left, insertion if known else None)
     assert looks.watch.suspected
 
 
@@ -78,16 +78,16 @@ def test_images_as_they_should_be_are_not(
     looks: Looks, calibration_path: Path, scenario: str, known: bool
 ) -> None:
     for insertion, left, right in pairs(calibration_path, scenario, 2, 60):
-        looks.see(left, right, insertion if known else None)
+        looks.update(left, right, insertion if known else None)
     assert not looks.ever
 
 
 def test_it_is_over_when_the_cameras_are_exchanged(looks: Looks, calibration_path: Path) -> None:
     for insertion, left, right in pairs(calibration_path, "clean", 1, 60):
         if insertion < 0.03:
-            looks.see(right, left, insertion)
+            looks.update(right, left, insertion)
         else:
             assert looks.ever
-            measured = looks.see(left, right, insertion)
+            measured = looks.update(left, right, insertion)
     assert measured.tip is not None
     assert not looks.watch.suspected

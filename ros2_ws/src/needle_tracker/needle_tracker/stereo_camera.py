@@ -1,4 +1,4 @@
-"""stereo_camera as a component: image pairs of a source, published with their calibration."""
+"""Component `stereo_camera`: publishes the image pairs of a source with their calibration."""
 
 from __future__ import annotations
 
@@ -33,20 +33,21 @@ from needle_core.diagnostics import Diagnostic, Level
 from needle_core.files.installed import find_shared_file
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration, load_calibration
-from needle_tracker.sources.pair_port import Event, PairPort
 from needle_tracker.sources.stereo_source import (
     EndOfRecording,
+    Event,
+    PairPort,
     StampedPair,
     open_source,
 )
 
 PAIRS = "pairs"
-_WINDOW = 5.0  # of the rate [s]
+_WINDOW = 5.0  # over which the rate is measured [s]
 
 
 @dataclasses.dataclass(frozen=True)
 class StereoCameraParameters:
-    """Parameters of the node; all are fixed at start."""
+    """Parameters of the node, fixed at start."""
 
     left: str = fixed_parameter(
         "", "-", "Left source: device number or /dev/..., folder of images, or video file."
@@ -74,18 +75,18 @@ class StereoCameraParameters:
         check_fields(self)
 
     def calibration(self) -> StereoCalibration:
-        """Return the cameras' calibration, the installed one by default."""
+        """Return the calibration of the cameras, the installed one by default."""
         installed = "needle_tracker", "config/calibration.yaml"
         return load_calibration(Path(self.calibration_file or find_shared_file(*installed)))
 
 
 class StereoCamera(Component):
-    """Asks for a pair at each tick, and publishes the pairs that come.
+    """Requests a pair at each tick, and publishes the received pairs.
 
     Parameters
     ----------
     settings : StereoCameraParameters
-        The node's parameters.
+        Parameters of the node.
     calibration : StereoCalibration
         The cameras.
     name : str
@@ -105,17 +106,17 @@ class StereoCamera(Component):
         self.name, self.settings = name, settings
         self._infos = {side: _camera_info(c, side) for side, c in calibration.cameras.items()}
         self._has_begun = not settings.wait_for_subscribers
-        # Whether a tick has not asked yet, and whether what was asked for has not come yet.
-        self._is_due = self._is_awaited = False
+        # A request is due since a tick; a requested pair is not received yet.
+        self._is_due = self._is_pending = False
         self._started_at = math.inf
-        # When the latest pairs were published [s].
+        # Times of publication of the latest pairs [s].
         self._times: deque[float] = deque(maxlen=round(_WINDOW * settings.rate) + 1)
         self._pairs = self._dropped = self._skew_ns = 0
         self.ports = (Port(PAIRS, self._on_pairs, self._on_change),)
         self.timers = (Timer(1.0 / settings.rate, self._tick), Timer(0.5, self._report))
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Begin, once somebody receives both images."""
+        """Begin when both images have a subscriber."""
         topics = [f"stereo/{side}/image_raw" for side in SIDES]
         self._has_begun |= all(topic in peers.subscribers for topic in topics)
         return ()
@@ -125,23 +126,23 @@ class StereoCamera(Component):
             self._started_at = at.steady
             yield Log("info", f"publishes images at {self.settings.rate:g} Hz")
         self._is_due = self._has_begun
-        yield from self._ask()
+        yield from self._request()
 
-    def _ask(self) -> Actions:
-        """Ask for the pair that is due; a camera slower than the ticks is asked again at once."""
-        if self._is_due and not self._is_awaited:
-            self._is_due, self._is_awaited = False, True
+    def _request(self) -> Actions:
+        """Request the pair that is due, as soon as the previous one was received."""
+        if self._is_due and not self._is_pending:
+            self._is_due, self._is_pending = False, True
             yield Send(PAIRS, ("next",))
 
     def _on_pairs(self, events: Sequence[Event], at: Moment) -> Actions:
         for event in events:
-            self._is_awaited = False
+            self._is_pending = False
             match event:
                 case StampedPair():
                     yield from self._publish(event, at)
                 case EndOfRecording(missing):
-                    told = f"{self._pairs} pairs, {self._dropped} unreadable"
-                    yield Log("info", f"end of the recording: {told}")
+                    counts = f"{self._pairs} pairs, {self._dropped} unreadable"
+                    yield Log("info", f"end of the recording: {counts}")
                     if missing:
                         yield Log("warning", f"the recording is not whole: {missing}")
                     yield Exit(EXIT_DONE)
@@ -149,7 +150,7 @@ class StereoCamera(Component):
                 case None:
                     self._dropped += 1
                     yield Log("warning", "a pair could not be read", kind="unreadable")
-        yield from self._ask()
+        yield from self._request()
 
     def _on_change(self, change: PortChange, at: Moment) -> Actions:
         yield Exit(EXIT_BAD_INPUT, change.lost)
@@ -165,7 +166,7 @@ class StereoCamera(Component):
             info = dataclasses.replace(self._infos[side], stamp_ns=stamp_ns)
             yield Publish(f"stereo/{side}/camera_info", info)
             height, width = pixels.shape
-            # A view, not a copy, of pixels that lie in one piece.
+            # A view of contiguous pixels, not a copy.
             data = pixels.reshape(-1).data
             image = m.Image(stamp_ns, info.frame_id, height, width, "mono8", width, data)
             yield Publish(f"stereo/{side}/image_raw", image)
@@ -203,7 +204,7 @@ def make_camera(settings: StereoCameraParameters, name: str = StereoCamera.name)
 
 
 def open_pairs(settings: StereoCameraParameters) -> PairPort:
-    """Return the port `pairs`, its source open: its images are stamped with the wall clock.
+    """Return the port `pairs` of an open source, which stamps images with the wall clock.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""stereo_tracker as a component: images and joint states in, one answer for every pair out."""
+"""Component `stereo_tracker`: images and joint states in, one answer for every pair out."""
 
 from __future__ import annotations
 
@@ -48,25 +48,25 @@ _CHECK_PERIOD = 0.05  # [s]
 
 
 class StereoTipTracker(Component):
-    """Pairs images by stamp, measures the needle's tip in each pair, and says how it goes.
+    """Measures the tip of the needle in each stereo pair, and publishes tips and diagnostics.
 
     Parameters
     ----------
     settings : StereoTrackerParameters
-        The node's parameters.
+        Parameters of the node.
     calibration : StereoCalibration
         The stereo rig.
     calibration_text : str
-        Text of its file, for whoever records.
+        Text of its file, which is published for recorders.
     name : str
         Full name of the node.
 
     Attributes
     ----------
     answers : PairAnswers
-        What answers the pairs.
+        Core of the node.
     is_annotation_wanted : bool
-        Whether anybody receives the annotated images.
+        Whether the annotated images have a subscriber.
     """
 
     name = "stereo_tracker"
@@ -82,7 +82,7 @@ class StereoTipTracker(Component):
         self.is_annotation_wanted = False
         self._cameras = calibration.cameras
         self._calibration_text = calibration_text
-        self._is_calibration_told = False
+        self._is_calibration_published = False
         self.answers = PairAnswers(
             calibration,
             settings.tracker_settings(calibration),
@@ -93,8 +93,8 @@ class StereoTipTracker(Component):
         rate = settings.annotated_rate
         self._annotated_period = 1.0 / rate if rate > 0.0 else math.inf
         self._annotated_at = -math.inf
-        # What every start begins with is not worth a warning in the log.
-        self._told = {"track": TrackState.SEARCHING.value, "images": "no images yet"}
+        # The states at every start are not logged.
+        self._reported = {"track": TrackState.SEARCHING.value, "images": "no images yet"}
         joints = Input("joint_states", m.JointState, self._on_joints, JOINT_STATES)
         self.inputs = (joints, *self._image_rows())
         self.outputs = (
@@ -106,14 +106,14 @@ class StereoTipTracker(Component):
         self.timers = (Timer(_CHECK_PERIOD, self.check),)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note whether anybody looks at the annotated images."""
+        """Record whether the annotated images have a subscriber."""
         self.is_annotation_wanted = ANNOTATED in peers.subscribers
         return ()
 
     def check(self, at: Moment) -> Actions:
-        """Answer the pairs that have waited long enough for their joint state."""
-        if not self._is_calibration_told:
-            self._is_calibration_told = True
+        """Answer the pairs that waited for their joint state until the timeout."""
+        if not self._is_calibration_published:
+            self._is_calibration_published = True
             yield Publish(CALIBRATION, m.Text(self._calibration_text))
         yield from self.publish(self.answers.ready(at.steady), at)
         yield from self._report(at)
@@ -127,8 +127,8 @@ class StereoTipTracker(Component):
             yield Publish(TIP_POSE, tip_pose_message(tip, stamp_ns))
             yield from self._annotate(answer, at)
             if answer.refused:
-                self._health.pair_refused(answer.refused, at.steady)
-            self._health.pair_done(answer.arrival, at.steady, answer.measured)
+                self._health.add_refused(answer.refused, at.steady)
+            self._health.add_pair(answer.arrival, at.steady, answer.measured)
             yield from self._report(at)
 
     # ---- inputs -------------------------------------------------------------------------------
@@ -151,7 +151,7 @@ class StereoTipTracker(Component):
         return self.publish(answers, at)
 
     def _on_image(self, side: str, message: m.Image, at: Moment) -> Actions:
-        self._health.image_came(side, at.steady)
+        self._health.add_image(side, at.steady)
         frame = frame_of(message, side, self._cameras[side])
         answers = self.answers.add_image(side, message.stamp_ns, frame, at.steady)
         return self.publish(answers, at)
@@ -162,7 +162,7 @@ class StereoTipTracker(Component):
         self.answers.add_contradiction(side, problem if in_size else "")
         return ()
 
-    # ---- what is said -------------------------------------------------------------------------
+    # ---- outputs ------------------------------------------------------------------------------
 
     def _annotate(self, answer: Answer, at: Moment) -> Actions:
         left, right = answer.pair.left.pixels, answer.pair.right.pixels
@@ -174,19 +174,19 @@ class StereoTipTracker(Component):
 
     def _report(self, at: Moment) -> Actions:
         answers, health = self.answers, self._health
-        health.note_pairing(at.steady, answers.matcher)
+        health.update_unpaired(at.steady, answers.matcher)
         health.swapped = answers.swap.suspected
-        yield from self._tell("track", health.track())
-        yield from self._tell("images", health.images(at.steady, answers.matcher))
-        yield from self._tell("joints", health.joints(answers))
+        yield from self._diagnose("track", health.track())
+        yield from self._diagnose("images", health.images(at.steady, answers.matcher))
+        yield from self._diagnose("joints", health.joints(answers))
 
-    def _tell(self, part: str, diagnostic: Diagnostic) -> Actions:
-        """Tell a part's health; log it where it turns bad, not each time it still is."""
+    def _diagnose(self, part: str, diagnostic: Diagnostic) -> Actions:
+        """Publish the diagnostics of a part; log it when it turns bad."""
         yield Diagnose(part, diagnostic)
         kind = diagnostic.message.partition(":")[0]
-        if kind != self._told.get(part) and diagnostic.level >= Level.WARN:
+        if kind != self._reported.get(part) and diagnostic.level >= Level.WARN:
             yield Log("warning", f"{part}: {diagnostic.message}")
-        self._told[part] = kind
+        self._reported[part] = kind
 
 
 def make_tracker(

@@ -28,9 +28,8 @@ from needle_core.diagnostics import Level
 from needle_core.errors import UserError
 from needle_core.runners.virtual import VirtualRunner
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.sources import pair_port
-from needle_tracker.sources.pair_port import PairPort
-from needle_tracker.sources.stereo_source import EndOfRecording, StampedPair
+from needle_tracker.sources import stereo_source
+from needle_tracker.sources.stereo_source import EndOfRecording, PairPort, StampedPair
 from needle_tracker.stereo_camera import PAIRS, StereoCamera, StereoCameraParameters
 
 ASK = Send(PAIRS, ("next",))
@@ -86,7 +85,7 @@ def test_a_pair_is_published_with_its_calibration(calibration: StereoCalibration
     np.testing.assert_allclose(info.d, camera.distortion)
 
 
-def test_stamps_lose_the_latency_and_are_one_of_a_triggered_pair(
+def test_stamps_exclude_the_latency_and_are_equal_for_a_triggered_pair(
     calibration: StereoCalibration,
 ) -> None:
     for triggered, right_ns in ((False, 7_000_000), (True, 5_000_000)):
@@ -97,7 +96,7 @@ def test_stamps_lose_the_latency_and_are_one_of_a_triggered_pair(
         assert rig.health(0.1)[2]["skew_max_ms"] == "2.00"
 
 
-def test_one_pair_at_a_time_is_asked_for(calibration: StereoCalibration) -> None:
+def test_one_pair_at_a_time_is_requested(calibration: StereoCalibration) -> None:
     """A camera slower than the ticks is asked again when it has given, not a tick later."""
     rig = Rig(calibration)
     assert not rig.asks(0.05)
@@ -107,7 +106,7 @@ def test_one_pair_at_a_time_is_asked_for(calibration: StereoCalibration) -> None
     assert rig.asks(0.15)
 
 
-def test_it_begins_once_both_images_are_received(calibration: StereoCalibration) -> None:
+def test_it_begins_when_both_images_have_subscribers(calibration: StereoCalibration) -> None:
     rig = Rig(calibration, wait_for_subscribers=True)
     left, right = ((f"stereo/{side}/image_raw", ("viewer",)) for side in ("left", "right"))
     assert rig.health(0.0)[:2] == (Level.WARN, "waiting for subscribers")
@@ -117,7 +116,7 @@ def test_it_begins_once_both_images_are_received(calibration: StereoCalibration)
     assert rig.health(0.3)[:2] == (Level.OK, "images published")
 
 
-def test_a_rate_that_is_not_reached_is_told(calibration: StereoCalibration) -> None:
+def test_a_low_rate_is_reported(calibration: StereoCalibration) -> None:
     rig = Rig(calibration, rate=10.0)
     for step in range(40):
         rig.gives(rig.pair(), 0.1 * step)
@@ -129,7 +128,7 @@ def test_a_rate_that_is_not_reached_is_told(calibration: StereoCalibration) -> N
     assert (values["pairs"], values["rate_hz"]) == ("60", "2.0")
 
 
-def test_an_unreadable_pair_is_told_and_counted(calibration: StereoCalibration) -> None:
+def test_an_unreadable_pair_is_logged_and_counted(calibration: StereoCalibration) -> None:
     rig = Rig(calibration)
     assert rig.gives(None) == [Log("warning", "a pair could not be read", kind="unreadable")]
     level, message, values = rig.health(0.1)
@@ -138,7 +137,7 @@ def test_an_unreadable_pair_is_told_and_counted(calibration: StereoCalibration) 
     assert rig.asks(0.2)
 
 
-def test_the_end_of_a_recording_says_what_it_lacked(calibration: StereoCalibration) -> None:
+def test_the_end_of_a_recording_reports_missing_frames(calibration: StereoCalibration) -> None:
     rig = Rig(calibration)
     rig.gives(None)
     rig.gives(rig.pair())
@@ -193,7 +192,7 @@ def test_a_thread_reads_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
         def shutdown(self) -> None:
             asked.clear()
 
-    monkeypatch.setattr(pair_port, "ThreadPoolExecutor", Thread)
+    monkeypatch.setattr(stereo_source, "ThreadPoolExecutor", Thread)
     source = mock.Mock()
     port, arrived = PairPort(source), list[Any]()
     port.open(arrived.append)

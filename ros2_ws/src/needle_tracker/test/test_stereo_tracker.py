@@ -46,7 +46,7 @@ class Bench:
         tracker.answers.tracker.process = (  # type: ignore[method-assign]
             lambda *pair: self.measured or process(*pair)
         )
-        tracker.answers.swap.see = lambda *_: None  # type: ignore[method-assign]
+        tracker.answers.swap.update = lambda *_: None  # type: ignore[method-assign]
 
     def do(self, actions: Actions) -> None:
         for action in actions:
@@ -109,7 +109,7 @@ def bench(make: Make) -> Bench:
     return make()
 
 
-def test_a_pair_gives_tip_and_pose_with_the_exposures_stamp(
+def test_a_pair_gives_tip_and_pose_with_the_stamp_of_the_exposure(
     bench: Bench, draw_pair: Any, make_arc: Any
 ) -> None:
     bench.measured = None
@@ -139,7 +139,7 @@ def test_a_pair_gives_tip_and_pose_with_the_exposures_stamp(
         ({"data": PIXELS.tobytes()[1:]}, "right image has 786431 bytes in rows of 1024"),
     ],
 )
-def test_bad_images_are_answered_without_a_tip_and_named(
+def test_bad_images_give_no_tip_and_are_reported(
     bench: Bench, fields: dict[str, Any], reason: str
 ) -> None:
     assert not bench.pair(10, **fields)
@@ -154,7 +154,7 @@ def test_bad_images_are_answered_without_a_tip_and_named(
     assert bench.said("images") == (Level.OK, "pairs complete")
 
 
-def test_reasons_without_end_are_told_in_a_report_of_bounded_length(bench: Bench) -> None:
+def test_the_report_of_many_reasons_is_bounded(bench: Bench) -> None:
     for number in range(50):
         assert not bench.pair(10 + number, encoding=f"{number} " + "x" * 3000)
     for part, kind in (("images", "refused: "), ("track", "no tip: ")):
@@ -166,7 +166,7 @@ def test_reasons_without_end_are_told_in_a_report_of_bounded_length(bench: Bench
         assert max(map(len, [*told, bench.health[part].message])) < 120
 
 
-def test_time_running_backwards_is_no_tip(bench: Bench) -> None:
+def test_time_running_backwards_gives_no_tip(bench: Bench) -> None:
     assert bench.pair(5 * SECOND)
     assert not bench.pair(5 * SECOND - 1000)
     assert "ran backwards" in bench.said("images")[1]
@@ -188,7 +188,7 @@ def info(camera: Camera, fields: dict[str, Any]) -> m.CameraInfo:
     return dataclasses.replace(message, k=k, roi=roi, **bins)
 
 
-def test_a_ray_falls_where_a_part_of_the_sensor_shows_it(calibration: StereoCalibration) -> None:
+def test_region_and_binning_of_camera_info_are_applied(calibration: StereoCalibration) -> None:
     K = np.array([[4000.0, 3.0, 1030.0], [0.0, 4020.0, 765.0], [0.0, 0.0, 1.0]])
     sensor = dataclasses.replace(calibration.left, width=2048, height=1536, camera_matrix=K)
     ray = np.array([0.05, -0.03, 1.0])
@@ -230,7 +230,7 @@ def test_a_camera_that_runs_at_another_resolution_gives_no_tip(
         assert bench.pair(20 + number)
 
 
-def test_images_without_a_partner_are_told(bench: Bench) -> None:
+def test_images_without_a_partner_are_reported(bench: Bench) -> None:
     bench.check()
     assert bench.said("images") == (Level.WARN, "no images yet")
     bench.image("left", 1)
@@ -246,7 +246,7 @@ def test_images_without_a_partner_are_told(bench: Bench) -> None:
     assert not bench.sent["needle/tip_pose"]
 
 
-def test_joint_states_that_tell_nothing_are_counted_and_silence_is_warned_of(bench: Bench) -> None:
+def test_useless_joint_states_are_counted_and_silence_is_a_warning(bench: Bench) -> None:
     bench.joints(1, name="rotation_joint")
     bench.joints(1, math.nan)
     bench.check()
@@ -264,7 +264,7 @@ def test_joint_states_that_tell_nothing_are_counted_and_silence_is_warned_of(ben
     assert bench.said("joints") == (Level.OK, "insertion known")
 
 
-def test_images_stamped_by_another_clock_than_joint_states_are_warned_of(bench: Bench) -> None:
+def test_images_stamped_by_another_clock_than_joint_states_are_a_warning(bench: Bench) -> None:
     bench.joints(10 * SECOND)
     for stamp, said in (
         (9 * SECOND, (Level.OK, "insertion known")),
@@ -281,7 +281,7 @@ def test_images_stamped_by_another_clock_than_joint_states_are_warned_of(bench: 
     assert bench.said("joints") == (Level.OK, "insertion known")
 
 
-def test_swapped_images_are_suspected_aloud(bench: Bench) -> None:
+def test_swapped_images_are_a_warning(bench: Bench) -> None:
     bench.measured = NOT_FOUND
     bench.tracker.answers.swap.suspected = True
     assert not bench.pair(10)
@@ -294,7 +294,7 @@ def test_swapped_images_are_suspected_aloud(bench: Bench) -> None:
     assert sum("seem to be swapped" in text for text in bench.logs) == 1
 
 
-def test_pictures_are_drawn_where_somebody_looks_and_not_for_every_pair(make: Make) -> None:
+def test_pictures_are_drawn_for_subscribers_at_a_limited_rate(make: Make) -> None:
     bench = make(annotated_rate=2.0)
     topic = "stereo_tracker/annotated_image"
     bench.pair(1)
@@ -308,7 +308,7 @@ def test_pictures_are_drawn_where_somebody_looks_and_not_for_every_pair(make: Ma
     assert bench.sent["stereo_tracker/calibration"] == [m.Text("text of the file")]
 
 
-def test_bad_parameters_are_refused_and_the_installed_calibration_is_the_default(
+def test_bad_parameters_are_rejected_and_the_installed_calibration_is_the_default(
     calibration_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value, said in (

@@ -1,4 +1,4 @@
-"""Both views side by side with what the tracker made of them, for a person to look at."""
+"""Report on a pair, in words and as a picture: what each view shows, and why there is no tip."""
 
 from __future__ import annotations
 
@@ -8,17 +8,58 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.answers.seen import missing, shows_end
 from needle_tracker.detector.end_fit import ImageEnd
-from needle_tracker.filter.measurement import Measurement
+from needle_tracker.filter.measurement import Measurement, NoTip, TrackState
 
 Image = NDArray[np.uint8]
 
+CLEAR = 0.5
+"""Expected ends, or mean probability of shaft, above which a view shows them."""
+IN_ENTRY_ZONE = "in the entry zone"
+_BY_VIEWS = {
+    (False, False): NoTip.NOTHING.value,
+    (True, False): "end seen in the left view only",
+    (False, True): "end seen in the right view only",
+    (True, True): "both views show an end but they do not meet",
+}
+HELP = {
+    _BY_VIEWS[False, False]: "light, floor, focus; swapped cameras; `check_calibration`",
+    _BY_VIEWS[True, False]: "light, floor and focus of the right view; what lies over the end",
+    _BY_VIEWS[False, True]: "light, floor and focus of the left view; what lies over the end",
+    _BY_VIEWS[True, True]: "swapped cameras; images of one exposure; `check_calibration`",
+    NoTip.UNCONFIRMED.value: (
+        "the insertion; is zero the needle's tip at the entry? move the needle"
+    ),
+    NoTip.UNCERTAIN.value: "what lies over the end; cameras farther apart",
+}
+"""Remedies for the causes that have one, as in docs/own_rig.md."""
 _SCALE = 0.5
 _GREEN, _YELLOW, _RED = (90, 230, 90), (255, 220, 60), (255, 80, 60)
 _SHAFT_PX = 40.0
-_SHIFT = 4  # sub-pixel drawing: OpenCV takes fixed-point numbers
+_SHIFT = 4  # fractional bits of coordinates for drawing
 _BAR_PX = 44
+
+
+def shows_end(end: ImageEnd | None) -> bool:
+    """Return whether a view shows the end of the needle."""
+    return end is not None and end.ends > CLEAR
+
+
+def shows_shaft(end: ImageEnd | None) -> bool:
+    """Return whether a view shows the shaft of the needle."""
+    return end is not None and end.shaft > CLEAR
+
+
+def missing(measured: Measurement) -> str:
+    """Return the reason for no tip, empty with a tip; one in the entry zone does not count."""
+    if measured.state is TrackState.ENTRY:
+        return IN_ENTRY_ZONE
+    if measured.tip is not None:
+        return ""
+    if measured.reason != NoTip.NOTHING:
+        return str(measured.reason)
+    left, right = measured.ends
+    return _BY_VIEWS[shows_end(left), shows_end(right)]
 
 
 def annotate(left: Image, right: Image, measured: Measurement) -> Image:
@@ -29,14 +70,13 @@ def annotate(left: Image, right: Image, measured: Measurement) -> Image:
     left, right : ndarray of uint8, shape (height, width)
         The pair.
     measured : Measurement
-        What the tracker answered.
+        Result of the tracker.
 
     Returns
     -------
     ndarray of uint8, shape (rows, columns, 3)
-        RGB, at half the size: left and right side by side, below each what it shows, and a line
-        of text. Green: a clear end; yellow: the shaft's line, its end unclear; red: found but not
-        believed.
+        RGB, at half size: left and right side by side, each above its description, and a line of
+        text. Green: a clear end; yellow: an unclear end; red: found but not believed.
     """
     views = [
         _view(image, end, measured.tip is not None)
@@ -53,7 +93,7 @@ def annotate(left: Image, right: Image, measured: Measurement) -> Image:
 
 
 def describe(measured: Measurement) -> str:
-    """Return one line of text: the state, the tip, and why there is none, or of one view alone."""
+    """Return one line of text: the state, and the tip or the reason for none."""
     if measured.tip is None:
         return f"{measured.state.value}: {missing(measured)}"
     place = ", ".join(
@@ -68,7 +108,7 @@ def describe(measured: Measurement) -> str:
 
 
 def describe_view(end: ImageEnd | None) -> str:
-    """Return one line of text: how surely a view shows the needle's end and its shaft."""
+    """Return one line of text: expected ends and probability of shaft in a view."""
     return "nothing found" if end is None else f"end {end.ends:.2f}, shaft {end.shaft:.2f}"
 
 
@@ -90,6 +130,6 @@ def _view(image: Image, end: ImageEnd | None, believed: bool) -> Image:
 
 
 def _fixed(points: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return points of the full image as OpenCV draws them in the small one."""
+    """Return fixed-point coordinates in the small image of points in the full one."""
     small = (points + 0.5) * _SCALE - 0.5
     return np.round(np.clip(small, -1e4, 1e4) * (1 << _SHIFT)).astype(np.int32).reshape(-1, 1, 2)

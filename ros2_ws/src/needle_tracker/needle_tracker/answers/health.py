@@ -1,4 +1,4 @@
-"""The tracker's health: counters in, diagnostics out."""
+"""Health of the tracker node: counters in, diagnostics out."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ from collections import deque
 from typing import Any
 
 from needle_core.diagnostics import Diagnostic, Level
-from needle_tracker.answers.pair_answers import PairAnswers
-from needle_tracker.answers.swapped_images import SUSPICION
+from needle_tracker.answers.pair_answers import SUSPICION, PairAnswers
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.sources.pairing import OTHER_SIDE, PairMatcher
 
-TROUBLE_SHOWN = 5.0  # a warning stays this long after what caused it [s]
-CLOCKS_DIFFER = 1_000_000_000  # pairs so long before the first joint state are no start [ns]
+TROUBLE_SHOWN = 5.0  # duration of a warning after its cause [s]
+CLOCKS_DIFFER = 1_000_000_000  # time of a pair before the first joint state that is a fault [ns]
 PARTNER_LATE = 0.5  # an image without a partner is reported after [s]
 _RATE_WINDOW = 5.0  # [s]
-_MOST_REASONS = 20  # told by name
+_MOST_REASONS = 20  # counted by name
 OTHER_REASONS = "other reasons"
 _NOTHING_YET = Measurement(None, TrackState.SEARCHING, "no images yet")
 _EXCHANGE = "exchange stereo_camera's parameters left and right, or the cables"
@@ -25,7 +24,7 @@ _EXCHANGE = "exchange stereo_camera's parameters left and right, or the cables"
 class ReasonCounts:
     """Counts of reasons: the latest by name, all others together.
 
-    Reasons quote what came from outside: there is no end of them, and each report tells them all.
+    Reasons quote received text, so their number must be limited.
     """
 
     def __init__(self) -> None:
@@ -33,33 +32,33 @@ class ReasonCounts:
         self._others = 0
 
     def add(self, reason: str) -> None:
-        """Count a reason once more."""
-        # What is named comes in the order in which it was last given.
+        """Count a reason."""
+        # The names are in the order of their latest count.
         self._named[reason] = self._named.pop(reason, 0) + 1
         if len(self._named) > _MOST_REASONS:
             self._others += self._named.pop(next(iter(self._named)))
 
     def total(self) -> int:
-        """Return how many were counted."""
+        """Return the total count."""
         return sum(self._named.values()) + self._others
 
     def items(self) -> list[tuple[str, int]]:
-        """Return reasons and counts, `OTHER_REASONS` last and only where there are some."""
+        """Return reasons and counts, `OTHER_REASONS` last if there are any."""
         return [*self._named.items(), *([(OTHER_REASONS, self._others)] if self._others else [])]
 
 
 @dataclasses.dataclass
 class Health:
-    """Counters of a node's life; times are of the steady clock, as arguments [s].
+    """Counters of the node; times are steady times, passed as arguments [s].
 
     Attributes
     ----------
     refused : ReasonCounts
-        Pairs refused before they were looked at, by reason.
+        Pairs that were not processed, by reason.
     rejected : ReasonCounts
-        Pairs that gave no believed tip, by reason.
+        Pairs without a tip, by reason.
     swapped : bool
-        Whether left and right images seem to be swapped.
+        Whether left and right images are suspected to be swapped.
     """
 
     refused: ReasonCounts = dataclasses.field(default_factory=ReasonCounts)
@@ -78,19 +77,19 @@ class Health:
     _tips: int = 0
     _measured: Measurement = _NOTHING_YET
 
-    def image_came(self, side: str, now: float) -> None:
-        """Note an image of one side."""
+    def add_image(self, side: str, now: float) -> None:
+        """Count an image of one side."""
         if not self._last_image:
             self._first_image = now
         self._last_image[side] = now
 
-    def pair_refused(self, reason: str, now: float) -> None:
-        """Note a pair that was not looked at."""
+    def add_refused(self, reason: str, now: float) -> None:
+        """Count a pair that was not processed."""
         self.refused.add(reason)
         self.last_refusal = (now, reason)
 
-    def pair_done(self, arrival: float, now: float, measured: Measurement) -> None:
-        """Note an answered pair, completed at `arrival` and answered at `now`."""
+    def add_pair(self, arrival: float, now: float, measured: Measurement) -> None:
+        """Count a pair, complete at `arrival` and answered at `now`."""
         self._done.append((now, now - arrival))
         self._measured = measured
         if measured.tip is None:
@@ -98,8 +97,8 @@ class Health:
         else:
             self._tips += 1
 
-    def note_pairing(self, now: float, matcher: PairMatcher[Any]) -> None:
-        """Note whether images were dropped for want of a partner since the last call."""
+    def update_unpaired(self, now: float, matcher: PairMatcher[Any]) -> None:
+        """Record whether images were dropped without a partner since the last call."""
         if matcher.unpaired.total() > self._unpaired:
             self._unpaired, self._last_unpaired = matcher.unpaired.total(), now
 
@@ -145,7 +144,7 @@ class Health:
         history = answers.insertions
         values = {
             "without_insertion_joint": str(self.joints_without_insertion),
-            "not_finite": str(history.refused),
+            "not_finite": str(history.rejected),
             "time_ran_backwards": str(history.restarts),
             "pairs_before_joint_states": str(answers.unanswered),
         }

@@ -1,9 +1,9 @@
-"""Images and joint states in, one answer for every stereo pair out: what the tracker's node does.
+"""Core of the tracker node: images and joint states in, one answer for every stereo pair out.
 
-An answer depends on what came, in what order, and not on when: but for `joint_timeout`, after which
-a pair no longer waits for the joint state that follows it. Times are steady, and arguments. Where
-the needle was before the first joint state is never heard: a pair exposed before it has no answer,
-whichever of both came first.
+An answer depends on the messages and their order, not on the time of their arrival, except for
+`joint_timeout`: after that, a pair no longer waits for the joint state that follows it. Times are
+steady times and passed as arguments. A pair exposed before the first joint state has no answer,
+since its insertion remains unknown.
 """
 
 from __future__ import annotations
@@ -15,20 +15,88 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.answers.swapped_images import SwapWatch
-from needle_tracker.filter.measurement import Measurement
+from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.filter.settings import TrackerSettings
+from needle_tracker.filter.settings import Image, TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.sources.insertion_history import InsertionHistory
-from needle_tracker.sources.pairing import Pair, PairMatcher
+from needle_tracker.sources.pairing import InsertionHistory, Pair, PairMatcher
 
-_NEW_RECORDING = 1_000_000_000  # [ns]: a longer step back in time begins a new recording
+SUSPICION = "left and right images seem to be swapped: the other way round they show a needle"
+_NEW_RECORDING = 1_000_000_000  # a longer step back in time begins a new recording [ns]
+# Consecutive pairs without a tip before the first check, pairs of a check, period of the checks.
+_BEFORE, _CHECKED, _PERIOD = 5, 10, 20
+_AGREEING = 4  # consecutive pairs that must show a needle when swapped
+
+
+class SwapWatch:
+    """Detector of swapped left and right images, such as from exchanged cables.
+
+    Both images of a swapped pair show the needle, but the ends do not meet, so that no tip is
+    found. Only then, and for a part of the pairs, a second tracker processes the pair swapped. Its
+    result raises a suspicion and is never published as a tip.
+
+    Parameters
+    ----------
+    calibration : StereoCalibration
+        The stereo rig.
+    settings : TrackerSettings
+        Settings of the tracker.
+
+    Attributes
+    ----------
+    suspected : bool
+        Whether the last pairs show a needle only when swapped; reset by a tip.
+    """
+
+    def __init__(self, calibration: StereoCalibration, settings: TrackerSettings) -> None:
+        left, right = calibration.left, calibration.right
+        # Swapped images of different sizes are rejected by their size.
+        self._can_check = (left.height, left.width) == (right.height, right.width)
+        self._calibration = calibration
+        self._settings = settings
+        self._swapped: NeedleTracker | None = None
+        self._missed = 0
+        self._agreeing = 0
+        self.suspected = False
+
+    def update(
+        self, left: Image, right: Image, insertion: float | None, measured: Measurement
+    ) -> None:
+        """Process a pair and its measurement.
+
+        Parameters
+        ----------
+        left, right : ndarray of uint8, shape (height, width)
+            The pair.
+        insertion : float or None
+            Insertion at the exposure [m].
+        measured : Measurement
+            Result of the tracker.
+        """
+        if measured.state is TrackState.ENTRY:
+            return
+        if measured.tip is not None:
+            self._missed = self._agreeing = 0
+            self.suspected = False
+            return
+        turn = (self._missed - _BEFORE) % _PERIOD
+        is_due = self._can_check and self._missed >= _BEFORE and turn < _CHECKED
+        self._missed += 1
+        if self.suspected or not is_due:
+            return
+        if self._swapped is None:
+            self._swapped = NeedleTracker(self._calibration, self._settings)
+        if turn == 0:
+            self._swapped.reset()
+            self._agreeing = 0
+        swapped = self._swapped.process(right, left, insertion)
+        self._agreeing = self._agreeing + 1 if swapped.tip is not None else 0
+        self.suspected = self._agreeing >= _AGREEING
 
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """An image as it came: `pixels` (shared with the message), or what is wrong with it."""
+    """A received image: `pixels` (shared with the message), or the problem with it."""
 
     pixels: NDArray[np.uint8] | None
     problem: str = ""
@@ -43,11 +111,11 @@ class Answer:
     pair : Pair of Frame
         The images.
     arrival : float
-        When the pair was complete [s], steady clock.
+        Steady time at which the pair was complete [s].
     measured : Measurement
-        What the tracker says.
+        Result of the tracker.
     refused : str
-        Why the pair was not looked at; empty where it was.
+        Reason for not processing the pair; empty if it was processed.
     """
 
     pair: Pair[Frame]
@@ -57,25 +125,25 @@ class Answer:
 
 
 class PairAnswers:
-    """Pairs images by stamp, joins the insertion at that stamp, answers the pairs in order.
+    """Pairs images by stamp, adds the insertion at that stamp, and answers the pairs in order.
 
     Parameters
     ----------
     calibration : StereoCalibration
         The stereo rig.
     tracker : TrackerSettings
-        The tracker's settings.
+        Settings of the tracker.
     pair_tolerance_ns : int or None
-        Largest difference of the stamps of a pair [ns]; None of cameras that run freely.
+        Largest difference of the stamps of a pair [ns]; None for free-running cameras.
     joint_timeout : float
-        How long a pair waits for the joint state that follows it [s], steady clock.
+        Longest wait of a pair for the joint state that follows it [s].
 
     Attributes
     ----------
     unanswered : int
         Pairs exposed before the first joint state.
     too_early : int
-        How long before it the last pair was exposed [ns]; 0 if that pair is answered.
+        Time from the exposure of the last pair to that joint state [ns]; 0 if the pair is answered.
     """
 
     def __init__(
@@ -99,26 +167,26 @@ class PairAnswers:
         self._contradictions: dict[str, str] = {}
 
     def add_image(self, side: str, stamp: int, frame: Frame, now: float) -> Iterator[Answer]:
-        """Take an image of one side, exposed at `stamp` [ns]; then as `ready`."""
+        """Add an image of one side, exposed at `stamp` [ns]; then as `ready`."""
         pair = self.matcher.add(side, stamp, frame)
         if pair is not None:
             self._queue.append((now, pair))
         return self.ready(now)
 
     def add_contradiction(self, side: str, reason: str) -> None:
-        """Refuse all pairs while a side's camera is not the calibrated one; empty: it is."""
+        """Reject all pairs while a camera is not the calibrated one; empty: accept them."""
         self._contradictions[side] = reason
 
     def add_insertion(self, stamp: int, insertion: float, now: float) -> Iterator[Answer]:
-        """Take an insertion [m] sampled at `stamp` [ns]; then as `ready`."""
+        """Add an insertion [m] sampled at `stamp` [ns]; then as `ready`."""
         self.joints_silent = False
         self.insertions.add(stamp, insertion)
         return self.ready(now)
 
     def ready(self, now: float) -> Iterator[Answer]:
-        """Yield the answers, in order, to all pairs whose insertion is settled.
+        """Yield the answers, in order, to all pairs whose insertion is final.
 
-        Each pair is looked at when its answer is asked for: the first need not wait for the rest.
+        Each pair is processed on demand, so that the first answer does not wait for the others.
         """
         while self._queue:
             arrival, pair = self._queue[0]
@@ -134,8 +202,8 @@ class PairAnswers:
             self._queue.popleft()
             answer = self._answer(arrival, pair)
             yield answer
-            # No answer waits for a suspicion.
-            self._suspect(answer)
+            # The check for swapped images must not delay the answer.
+            self._check_swap(answer)
 
     def _answer(self, arrival: float, pair: Pair[Frame]) -> Answer:
         refused = self._refusal(pair)
@@ -146,15 +214,14 @@ class PairAnswers:
             measured = self.tracker.process(left, right, self.insertions.at(pair.stamp))
         return Answer(pair, arrival, measured, refused)
 
-    def _suspect(self, answer: Answer) -> None:
-        """Look whether the images seem to be swapped."""
+    def _check_swap(self, answer: Answer) -> None:
         pair = answer.pair
         left, right = pair.left.pixels, pair.right.pixels
         if left is not None and right is not None and not answer.refused:
-            self.swap.see(left, right, self.insertions.at(pair.stamp), answer.measured)
+            self.swap.update(left, right, self.insertions.at(pair.stamp), answer.measured)
 
     def _refusal(self, pair: Pair[Frame]) -> str:
-        """Return why a pair cannot be looked at; a long step back in time begins anew."""
+        """Return the reason for rejecting a pair; a long step back in time resets the tracker."""
         last = self._last_stamp
         if last is None or pair.stamp > last:
             self._last_stamp = pair.stamp

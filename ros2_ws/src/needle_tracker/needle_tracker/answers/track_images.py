@@ -1,4 +1,4 @@
-"""`ros2 run needle_tracker track_images`: the tracker over image files, without a graph."""
+"""`ros2 run needle_tracker track_images`: the tracker on image files, without ROS nodes."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_js
 from needle_core.commands.options import CommandParser, number, output_file
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import missing_section_warning, read_sections, values_for
-from needle_tracker.answers.annotation import Image, annotate
-from needle_tracker.answers.seen import SeenCounts, missing
-from needle_tracker.answers.swapped_images import SUSPICION, SwapWatch
+from needle_tracker.answers.annotation import Image, annotate, missing
+from needle_tracker.answers.pair_answers import SUSPICION, SwapWatch
+from needle_tracker.answers.run_summary import SeenCounts, TruthComparison, read_truth
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
-from needle_tracker.answers.truth_comparison import TruthComparison, read_truth
 from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
@@ -81,9 +80,9 @@ COLUMNS = (
     *("left_end", "left_shaft", "right_end", "right_shaft", "missing"),
 )
 _NODE = "stereo_tracker"
-_NAMED = 5  # so many names are shown, the others counted
+_NAMED = 5  # names that a warning lists; it counts the others
 _JPEG_QUALITY = 90
-_NEW_RUN = 10e-3  # a jump of the insertion that no run makes between two images [m]
+_NEW_RUN = 10e-3  # change of the insertion between two images that begins a new run [m]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -115,7 +114,7 @@ def _run(words: Sequence[str]) -> int:
             unusable.append(f"{pair.name} ({problem})")
         if pair.left is not None and pair.right is not None:
             if not problem:
-                swap.see(pair.left, pair.right, insertion, measured)
+                swap.update(pair.left, pair.right, insertion, measured)
             if overlays is not None:
                 write_overlay(overlays, pair.name, annotate(pair.left, pair.right, measured))
         truth.add(pair.names, measured)
@@ -157,7 +156,7 @@ def _run(words: Sequence[str]) -> int:
 
 
 def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
-    """Return the node's parameters: its defaults, what --params says, and the needle's width."""
+    """Return the parameters of the node: defaults, --params, and the width of the needle."""
     changes: dict[str, Any] = {}
     if given.params is not None:
         sections = read_sections(Path(given.params))
@@ -177,7 +176,7 @@ def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
 def track(
     pairs: PairSequence, tracker: NeedleTracker, sizes: Sizes, insertions: Mapping[str, float]
 ) -> Iterator[tuple[NamedPair, float | None, Measurement]]:
-    """Run the tracker over a sequence of pairs; yield each with its insertion and its answer.
+    """Run the tracker on a sequence of pairs; yield each with its insertion and its result.
 
     Parameters
     ----------
@@ -186,14 +185,14 @@ def track(
     tracker : NeedleTracker
         A fresh one.
     sizes : dict of str to (int, int)
-        Width and height of the calibration's images [px].
+        Width and height of the images of the calibration [px].
     insertions : mapping
-        Insertion [m] by any of a pair's names.
+        Insertion [m] by any name of a pair.
 
     Raises
     ------
     UserError
-        The first images that can be read are not of the calibration's size.
+        The size of the first readable images differs from the calibration.
     """
     last, checked = None, False
     for pair in progress(pairs, "tracking"):
@@ -213,7 +212,7 @@ def track(
 
 
 def to_row(name: str, measured: Measurement) -> list[str]:
-    """Return a pair's line of the CSV file; a tip from the stage alone is none."""
+    """Return the CSV line of a pair; a tip from the insertion alone does not count."""
     tip, cause = measured.tip, missing(measured)
     place = [""] * 8
     if tip is not None and not cause:
@@ -228,7 +227,7 @@ def to_row(name: str, measured: Measurement) -> list[str]:
 
 
 def write_overlay(folder: Path, name: str, picture: Image) -> None:
-    """Write what was made of a pair as a picture, `annotation.annotate`'s, named as the pair.
+    """Write the annotated picture of a pair.
 
     Raises
     ------
@@ -261,7 +260,7 @@ def write_rows(path: Path, rows: Sequence[Sequence[str]]) -> None:
 
 
 def _new_folder(name: str, text: str) -> Path:
-    """Return a folder that was made, or is empty."""
+    """Create a folder, unless it exists and is empty; return its path."""
     folder = Path(text).expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,8 @@
-"""Images, joint states and tips, from and to messages."""
+"""Conversion of images, joint states and tips from and to messages."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from needle_core.messages import (
     Pose,
     PoseWithCovariance,
 )
-from needle_tracker.answers.orientation import orientation, rotation_covariance
 from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.optics.calibration import Camera, rotation_matrix
 from needle_tracker.sources.image_encodings import ENCODINGS, WANTED, bytes_per_pixel, grey_image
@@ -24,13 +24,15 @@ from needle_tracker.stereo.triangulation import SpatialTip
 
 RIG_FRAME = "rig"
 LEFT_FRAME = "left_camera_optical"
-_QUOTED = 40  # characters of a text that is not known
+ROLL_VARIANCE = math.pi**2
+"""Variance of an unknown angle [rad^2]: finite, since an infinite one means no tip."""
+_QUOTED = 40  # characters of an unknown encoding
 
 
 def frame_of(message: Any, side: str, camera: Camera) -> Frame:
-    """Return the image in a message, or why it is not one of this camera.
+    """Return the image of a message, or the reason why it is not from this camera.
 
-    The message is an `Image` of ours, of rclpy or of rosbags: they name their fields alike.
+    The message is an `Image` of needle_core, rclpy or rosbags, which have the same fields.
     """
     if message.encoding not in ENCODINGS:
         encoding = message.encoding[:_QUOTED]
@@ -50,7 +52,7 @@ def frame_of(message: Any, side: str, camera: Camera) -> Frame:
 
 
 def image_geometry(message: Any) -> tuple[int, int, NDArray[np.float64]]:
-    """Return width and height [px] and camera matrix, (3, 3), of a camera_info's images.
+    """Return width and height [px] and camera matrix, (3, 3), of the images of a camera_info.
 
     A camera_info gives `width`, `height` and `k` of the full sensor (REP 104). The images show its
     `roi` (0x0: all of it), reduced by `binning_x` and `binning_y` (0: 1).
@@ -64,12 +66,12 @@ def image_geometry(message: Any) -> tuple[int, int, NDArray[np.float64]]:
 
 
 def camera_info_problem(message: Any, side: str, camera: Camera) -> tuple[str, bool]:
-    """Return how a camera_info contradicts the calibration file, and whether in the images' size.
+    """Return how a camera_info contradicts the calibration, and whether by the size of the images.
 
-    The text is empty where it does not.
+    The text is empty if there is no contradiction.
     """
     width, height, matrix = image_geometry(message)
-    # Some drivers send zeros where they know nothing.
+    # Some drivers send zeros for an unknown size.
     if (width, height) in {(0, 0), (camera.width, camera.height)}:
         difference = float(np.abs(matrix - camera.camera_matrix).max())
         # An uncalibrated camera driver sends zeros.
@@ -83,7 +85,7 @@ def camera_info_problem(message: Any, side: str, camera: Camera) -> tuple[str, b
 
 
 def insertion_of(message: JointState) -> float | None:
-    """Return the insertion [m] in a joint state, None where it has none."""
+    """Return the insertion [m] in a joint state, if any."""
     return dict(zip(message.names, message.positions, strict=False)).get(INSERTION_JOINT)
 
 
@@ -93,7 +95,7 @@ def tip_message(tip: SpatialTip, stamp_ns: int) -> Point:
 
 
 def tip_pose_message(tip: SpatialTip | None, stamp_ns: int) -> PoseWithCovariance:
-    """Return the answer to a pair exposed at `stamp_ns`; infinite covariance without a tip."""
+    """Return the message for a pair exposed at `stamp_ns`; infinite covariance without a tip."""
     covariance = np.zeros((6, 6))
     if tip is None:
         np.fill_diagonal(covariance, np.inf)
@@ -108,14 +110,14 @@ def tip_pose_message(tip: SpatialTip | None, stamp_ns: int) -> PoseWithCovarianc
 
 
 def rotation_of(pose: Pose | PoseWithCovariance) -> NDArray[np.float64] | None:
-    """Return the axes of a pose's frame as columns, (3, 3); None where it has no orientation."""
+    """Return the rotation matrix of a pose, (3, 3); None if it has no orientation."""
     quaternion = np.array(pose.orientation)
     norm = float(np.linalg.norm(quaternion))
     return rotation_matrix(quaternion / norm) if 0.5 < norm < 2.0 else None
 
 
 def picture_message(pixels: NDArray[np.uint8], stamp_ns: int) -> Image:
-    """Return an RGB picture of what was exposed at `stamp_ns`, left view first."""
+    """Return the message of an RGB picture of a pair exposed at `stamp_ns`."""
     height, width = pixels.shape[:2]
     return Image(stamp_ns, LEFT_FRAME, height, width, "rgb8", 3 * width, pixels.tobytes())
 
@@ -123,3 +125,53 @@ def picture_message(pixels: NDArray[np.uint8], stamp_ns: int) -> Image:
 def _position(tip: SpatialTip) -> tuple[float, float, float]:
     x, y, z = (float(part) for part in tip.position)
     return (x, y, z)
+
+
+Array = NDArray[np.float64]
+
+
+def orientation(direction: Array) -> Array:
+    """Return the quaternion of the frame whose z axis is the shaft, with roll gamma = 0.
+
+    R = Rx(alpha) Ry(beta) with pitch beta = asin(d_x) and yaw alpha = atan2(-d_y, d_z): the roll,
+    which is not visible, is zero in the coordinates of [KC09].
+
+    Parameters
+    ----------
+    direction : ndarray, shape (3,)
+        Unit vector in `rig`.
+
+    Returns
+    -------
+    ndarray, shape (4,)
+        Unit quaternion x, y, z, w.
+    """
+    d_x, d_y, d_z = (float(part) for part in direction)
+    half_pitch = 0.5 * math.asin(min(max(d_x, -1.0), 1.0))
+    half_yaw = 0.5 * math.atan2(-d_y, d_z)
+    sin_a, cos_a = math.sin(half_yaw), math.cos(half_yaw)
+    sin_b, cos_b = math.sin(half_pitch), math.cos(half_pitch)
+    return np.array([sin_a * cos_b, cos_a * sin_b, sin_a * sin_b, cos_a * cos_b])
+
+
+def rotation_covariance(direction: Array, direction_covariance: Array) -> Array:
+    """Return the covariance of rotations about the fixed x, y, z axes, roll unknown.
+
+    A small rotation w turns d by w x d; the part of w across d is d x (w x d), the part along d is
+    the roll.
+
+    Parameters
+    ----------
+    direction : ndarray, shape (3,)
+        Unit vector in `rig`.
+    direction_covariance : ndarray, shape (3, 3)
+        Of the direction [-].
+
+    Returns
+    -------
+    ndarray, shape (3, 3)
+        [rad^2], with `ROLL_VARIANCE` about the shaft.
+    """
+    cross = np.cross(direction, np.eye(3), axisb=0, axisc=0)
+    across = cross @ direction_covariance @ cross.T
+    return np.asarray(across + ROLL_VARIANCE * np.outer(direction, direction))

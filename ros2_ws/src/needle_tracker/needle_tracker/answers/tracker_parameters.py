@@ -1,4 +1,4 @@
-"""The parameters of stereo_tracker, as a node and in `track_images`, and what follows from them."""
+"""Parameters of stereo_tracker, as a node and in `track_images`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
-from needle_tracker.detector.reach import Reach
+from needle_tracker.detector.search_grid import Reach
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.sources.image_files import mean_pair
@@ -15,7 +15,7 @@ from needle_tracker.sources.image_files import mean_pair
 
 @dataclasses.dataclass(frozen=True)
 class StereoTrackerParameters:
-    """Parameters of the node; all are fixed at start, so that a run is of one piece."""
+    """Parameters of the node, fixed at start."""
 
     calibration_file: str = fixed_parameter(
         "", "-", "Calibration file of the stereo rig; empty: the simulated bench's."
@@ -80,7 +80,7 @@ class StereoTrackerParameters:
     )
 
     def __post_init__(self) -> None:
-        """Check the fields, and what holds between them."""
+        """Check the fields and their relations."""
         check_fields(self)
         if self.hole_clearance >= self.max_insertion:
             raise UserError(
@@ -90,26 +90,16 @@ class StereoTrackerParameters:
 
     @property
     def pair_tolerance_ns(self) -> int | None:
-        """Largest difference of the stamps of a pair [ns]; None of cameras that run freely."""
+        """Largest difference of the stamps of a pair [ns]; None for free-running cameras."""
         return None if self.free_running else round(self.pair_tolerance * 1e9)
 
     def tracker_settings(self, calibration: StereoCalibration) -> TrackerSettings:
-        """Return the settings of the tracker behind the node.
-
-        Parameters
-        ----------
-        calibration : StereoCalibration
-            The stereo rig.
-
-        Returns
-        -------
-        TrackerSettings
-            As the parameters say.
+        """Return the settings of the tracker of a stereo rig.
 
         Raises
         ------
         UserError
-            If there are no reference images where they should be.
+            Reference images that are missing or unusable.
         """
         folder = Path(self.reference_folder)
         return TrackerSettings(
@@ -130,11 +120,5 @@ class StereoTrackerParameters:
 
 
 def default_settings(calibration: StereoCalibration) -> TrackerSettings:
-    """Return the settings for the needle of [KC09] section II (0.7 mm, 10 deg pre-bend).
-
-    Parameters
-    ----------
-    calibration : StereoCalibration
-        The stereo rig.
-    """
+    """Return the settings for the needle of [KC09] section II (0.7 mm, 10 deg pre-bend)."""
     return StereoTrackerParameters().tracker_settings(calibration)

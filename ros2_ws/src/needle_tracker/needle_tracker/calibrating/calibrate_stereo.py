@@ -1,4 +1,4 @@
-"""`ros2 run needle_tracker calibrate_stereo`: images of a ChArUco board to a calibration file."""
+"""`ros2 run needle_tracker calibrate_stereo`: calibration file from images of a ChArUco board."""
 
 from __future__ import annotations
 
@@ -11,21 +11,28 @@ from typing import Any
 
 import numpy as np
 import yaml
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
-from needle_tracker.calibrating.board_views import nothing_seen, views_in_folders
-from needle_tracker.calibrating.calibration_figures import rig_figure, save_figure
-from needle_tracker.calibrating.calibration_outliers import doubts, misfits, square_error
-from needle_tracker.calibrating.calibration_session import load_session
+from needle_tracker.calibrating.calibration_outliers import contradictions, misfits, square_error
+from needle_tracker.calibrating.calibration_session import (
+    KINDS,
+    load_session,
+    nothing_seen,
+    views_in_folders,
+)
 from needle_tracker.calibrating.charuco import CharucoBoard, write_board
 from needle_tracker.calibrating.imported_lenses import read_lenses
-from needle_tracker.calibrating.pair_consistency import PairsApartError, apart_in_words
+from needle_tracker.calibrating.pair_consistency import PairsApartError, describe_apart
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
-from needle_tracker.calibrating.rig_model import KINDS, LENS, SURFACE, unit_of
-from needle_tracker.optics.calibration import SIDES, StereoCalibration
+from needle_tracker.calibrating.rig_model import LENS, SURFACE, unit_of
+from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
+from needle_tracker.optics.compiled_projection import pack_camera, pixel_ray
+from needle_tracker.optics.window import Window
 
 _DESCRIPTION = """\
 Calibrate the stereo rig from images of a ChArUco board.
@@ -53,7 +60,14 @@ the images, and how to calibrate cameras that look through walls or from aside.
 is left) or OpenCV (intrinsics.yml extrinsics.yml) wrote them, in metres: then a board at one place
 in air, and those under the surface, suffice.
 """
-_SCALE_TOLD = 0.1  # [%]
+_COLOURS = {"left": "#1668b0", "right": "#d1701b"}
+_BOARDS = {
+    "free": ("board held freely", "#9aa0a8"),
+    "surface": ("board of known place in air", "#1b1b1b"),
+    "under": ("board under the surface", "#b03060"),
+}
+_MM = 1e3
+_SCALE_KNOWN = 0.1  # largest standard deviation of a known size of the squares [%]
 _EPILOG = """\
 writes: FILE.yaml, FILE.rig.png (cameras, surface, boards)
 
@@ -73,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def calibrate_stereo(arguments: Sequence[str]) -> int:
-    """Calibrate as the command line says, print and write the result."""
+    """Calibrate, print and write the result."""
     options = _parser().parse_args(arguments)
     if options.board is not None:
         board = CharucoBoard() if options.session is None else load_session(options.session).board
@@ -102,9 +116,9 @@ def calibrate_stereo(arguments: Sequence[str]) -> int:
             write_json(options.json, {"problem": str(error)})
         return EXIT_MISSED
     size = square_error(result)
-    problems = doubts(result, size)
-    said = [report(result, size, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
-    text = "\n".join(said)
+    problems = contradictions(result, size)
+    lines = [report(result, size, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
+    text = "\n".join(lines)
     print(text)
     save_calibration(options.output, result.calibration, text.splitlines())
     save_figure(rig_figure(result), options.output.with_suffix(".rig.png"))
@@ -117,7 +131,7 @@ def calibrate_stereo(arguments: Sequence[str]) -> int:
 
 
 def reprojection_by_kind(result: RigCalibration) -> dict[tuple[str, str], float]:
-    """Return the reprojection error by camera and kind of view, rms [px]; only kinds there are."""
+    """Return the reprojection error by camera and existing kind of view, rms [px]."""
     kinds = np.array([view.kind for view in result.model.views])
     return {
         (side, kind): result.reprojection_rms_px(side, np.flatnonzero(kinds == kind))
@@ -128,7 +142,7 @@ def reprojection_by_kind(result: RigCalibration) -> dict[tuple[str, str], float]
 
 
 def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) -> str:
-    """Return a calibration as a person reads it."""
+    """Return a calibration as text."""
     kinds = [view.kind for view in result.model.views]
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in KINDS)
     lines = [
@@ -140,7 +154,7 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
         for (side, kind), error in reprojection_by_kind(result).items()
     ]
     if result.apart:
-        lines.append(f"WARNING: {apart_in_words(result.apart)}; left out")
+        lines.append(f"WARNING: {describe_apart(result.apart)}; left out")
     lines += [f"WARNING: {text}" for view, text in misfits(result) if view.place is None]
     if "left.fx" not in result.parameters:
         pose = " and relative pose" if result.model.tied else ""
@@ -149,15 +163,15 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
         scale, unit = unit_of(name)
         value, given, sigma = (scale * v for v in (found.value, found.given, found.sigma))
         unit = unit and f" {unit}"
-        said = f"{value:.5g}{unit} +- {sigma:.2g}{unit}"
+        result_text = f"{value:.5g}{unit} +- {sigma:.2g}{unit}"
         if found.kept:
             asked = "not asked of these views"
             if math.isfinite(sigma):
                 asked = f"NOT DETERMINED by these views (+- {sigma:.2g}{unit})"
-            said = f"{asked}, kept at the given {given:g}{unit}"
-        lines.append(f"{name}: {said}")
+            result_text = f"{asked}, kept at the given {given:g}{unit}"
+        lines.append(f"{name}: {result_text}")
     error, sigma = (100.0 * value for value in size)
-    if sigma < _SCALE_TOLD:
+    if sigma < _SCALE_KNOWN:
         lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % beside the session's")
     else:
         lines.append(
@@ -179,7 +193,7 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
 
 
 def figures(result: RigCalibration, goal_mm: float) -> dict[str, JsonValue]:
-    """Return a calibration's figures, flat, for --json."""
+    """Return the figures of a calibration for --json."""
     values: dict[str, JsonValue] = {
         "views": len(result.model.views),
         "corner_sigma_px": result.fit.corner_sigma_px,
@@ -219,9 +233,9 @@ def calibration_text(calibration: StereoCalibration, comments: list[str]) -> str
     Parameters
     ----------
     calibration : StereoCalibration
-        What to write.
+        The calibration.
     comments : list of str
-        Lines to put before it.
+        Lines of the header.
     """
     surface, content = calibration.surface, dict[str, Any]()
     if surface is not None:
@@ -267,3 +281,71 @@ def save_calibration(path: Path, calibration: StereoCalibration, comments: list[
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+Array = NDArray[np.float64]
+
+
+def rig_figure(result: RigCalibration) -> Figure:
+    """Return a figure of the rig from two sides: cameras, surface, boards, frustums."""
+    figure = Figure(figsize=(9.0, 8.5), layout="constrained")
+    planes = (2, "z (insertion) [mm]"), (1, "y [mm]")
+    for axes, (axis, label) in zip(figure.subplots(1, 2), planes, strict=True):
+        axes.plot(0, 0, "k+", markersize=12, label="rig (entry point)")
+        for i, view in enumerate(result.model.views):
+            outline, (name, colour) = _MM * _outline(result, i), _BOARDS[view.kind]
+            axes.plot(outline[:, axis], outline[:, 0], color=colour, linewidth=1.5, label=name)
+        for side, camera in result.calibration.cameras.items():
+            name, colour = f"{side} camera", _COLOURS[side]
+            centre = _MM * camera.centre
+            axes.plot(centre[axis], centre[0], "o", color=colour, label=name)
+            _draw_frustum(axes, camera, axis, colour)
+            _draw_face(axes, camera.window, axis)
+        axes.set(aspect="equal", xlabel=label, ylabel="x (up) [mm]")
+        axes.grid(color="#e4e6ea")
+    # The legend has each label once; matplotlib starts missing labels with _.
+    named = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
+    shown = [line for name, line in named.items() if not str(name).startswith("_")]
+    figure.legend(handles=shown, loc="outside lower center", ncols=4, fontsize=8)
+    figure.suptitle("The rig as calibrated")
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
+    """
+    try:
+        figure.savefig(path, dpi=130)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _outline(result: RigCalibration, view: int) -> Array:
+    points = np.concatenate([result.model.views[view].corners(side).points for side in SIDES])
+    low, high = points.min(axis=0), points.max(axis=0)
+    ring = np.array([low, [high[0], low[1], 0], high, [low[0], high[1], 0], low])
+    pose = result.model.board_poses(result.fit.parameters)[view]
+    return np.asarray(ring @ pose[:3, :3].T + pose[:3, 3])
+
+
+def _draw_face(axes: Any, window: Window, axis: int) -> None:
+    """Draw the outer face of a window if it is seen edge on."""
+    along, up = window.normal[axis], window.normal[0]
+    if np.hypot(along, up) > 0.5:
+        place = (_MM * window.point[axis], _MM * window.point[0])
+        axes.axline(place, (place[0] + up, place[1] - along), color="#2e9d55", label="window")
+
+
+def _draw_frustum(axes: Any, camera: Camera, axis: int, colour: str) -> None:
+    """Draw the rays of the corners of the image, down to the window."""
+    width, height = float(camera.width), float(camera.height)
+    packed, end, direction = pack_camera(camera), np.empty(3), np.empty(3)
+    for corner in ((0.0, 0.0), (width, 0.0), (width, height), (0.0, height)):
+        pixel_ray(packed, np.array(corner), end, direction)
+        ray = _MM * np.stack([camera.centre, end])
+        axes.plot(ray[:, axis], ray[:, 0], color=colour, linewidth=0.8)

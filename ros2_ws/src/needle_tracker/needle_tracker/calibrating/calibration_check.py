@@ -1,17 +1,20 @@
-"""Finds the silent errors of a calibration by a target of known place.
+"""Check of a calibration by a target of known place.
 
-A camera that was touched, another refractive index, a lower surface: both rays still meet, and the
-tip is somewhere else. The target's corners do not come out where they are, and the pattern in which
-they miss says why.
+After a touched camera, with another refractive index or a lower surface, both rays still meet, but
+the tip is wrong. The corners of the target are then measured beside their true positions, and the
+pattern of these errors shows the cause.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_core.commands.cli import JsonValue
+from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.calibrating.calibration_start import boards_seen, checked_view
 from needle_tracker.calibrating.rig_fit import (
     LARGEST_MISFIT_PX,
@@ -23,9 +26,9 @@ from needle_tracker.calibrating.rig_fit import (
 from needle_tracker.calibrating.rig_model import (
     CAMERA_PARAMETERS,
     LENS,
-    BoardView,
     RigModel,
     camera_slice,
+    unit_of,
 )
 from needle_tracker.calibrating.tip_error import tip_error_p95, tip_shifts
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
@@ -33,25 +36,25 @@ from needle_tracker.optics.calibration import SIDES, StereoCalibration
 Array = NDArray[np.float64]
 
 CAMERAS = tuple(f"{side}_camera_turned" for side in SIDES)
-LEAST_IMPROVEMENT = 30.0  # of chi squared: no noise does that
-EXPLAINED_PX = 1.0  # a larger misfit, and the causes found explain nothing
-NOTHING_SHOWN = 1.0  # an unseen error of tips from which on a target shows nothing at all [m]
-TURN_LIMIT = np.deg2rad(0.01)  # a camera turned by more was touched, whatever it does to tips
+LEAST_IMPROVEMENT = 30.0  # of chi-squared: far above noise
+EXPLAINED_PX = 1.0  # largest misfit of an explanation by causes
+NOTHING_SHOWN = 1.0  # undetected error of tips above which a target is useless [m]
+TURN_LIMIT = np.deg2rad(0.01)  # a camera with a larger rotation was touched
 
 
 @dataclasses.dataclass(frozen=True)
 class Deviation:
-    """One thing that is not as the calibration says.
+    """A difference between rig and calibration.
 
     Attributes
     ----------
     cause : str
         One of `CheckResult.causes`.
     size, sigma : float
-        Truth minus calibration, and its standard deviation [rad, m or -]; a camera's is the
-        angle of its turn, not negative.
+        Truth minus calibration, and its standard deviation [rad, m or -]; of a camera the angle of
+        its rotation, which is not negative.
     tip_error : float
-        What it does to tips in the phantom, 95 % [m].
+        Resulting error of tips in the phantom, 95 % [m].
     """
 
     cause: str
@@ -62,26 +65,25 @@ class Deviation:
 
 @dataclasses.dataclass(frozen=True)
 class CheckResult:
-    """Verdict of a target on a calibration.
+    """Result of a check.
 
     Attributes
     ----------
     causes : tuple of str
-        What was looked for: cameras that turned (`CAMERAS`), and what the windows' parameters are
-        called (`RigModel.names`).
+        Possible causes: rotated cameras (`CAMERAS`), and the parameters of the windows
+        (`RigModel.names`).
     deviations : list of Deviation
-        What was found, the most telling first.
+        Found causes, the most significant first.
     tip_error : float
-        What all of it together does to tips in the phantom, 95 % [m]; NaN where the causes do not
-        explain what is seen.
+        Resulting error of tips in the phantom, 95 % [m]; NaN if no cause explains the views.
     unseen_tip_error : float
-        What errors this target could not show, 95 % [m].
+        Error of tips that this target cannot detect, 95 % [m].
     corner_sigma_px : float
-        What the corners miss by when everything is fitted [px].
+        Standard deviation of the corners after the fit of all causes [px].
     reprojection_px : float
-        What they miss by with the calibration as it is, rms [px].
+        Error of the corners with the calibration, rms [px].
     problems : list of str
-        Why the calibration is not shown to be good; empty where it is.
+        Reasons against the calibration; empty if it is good.
     """
 
     causes: tuple[str, ...]
@@ -94,31 +96,31 @@ class CheckResult:
 
     @property
     def ok(self) -> bool:
-        """Whether the calibration is shown to be good."""
+        """Whether the calibration is good."""
         return not self.problems
 
 
 def check(calibration: StereoCalibration, views: list[BoardView], limit: float) -> CheckResult:
-    """Compare a calibration with what is seen of a target.
+    """Compare a calibration with views of a target.
 
     Parameters
     ----------
     calibration : StereoCalibration
-        What is to be checked.
+        The calibration.
     views : list of BoardView
-        The target, at known places (or held freely in air).
+        Views of the target, at known places or held freely in air.
     limit : float
-        Largest error of tips in the phantom that is accepted, 95 % [m].
+        Largest acceptable error of tips in the phantom, 95 % [m].
 
     Returns
     -------
     CheckResult
-        What was found, and whether it is good enough.
+        The result.
 
     Raises
     ------
     UserError
-        A target that one camera does not see, or none of known place.
+        A target that one camera does not see, or without a known place.
     """
     views = [checked_view(view) for view in views]
     model = RigModel(calibration, views, boards_seen(calibration, views))
@@ -164,7 +166,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
 
 
 def _causes(model: RigModel, causes: tuple[str, ...], sigma: float) -> list[str]:
-    """Return the fewest causes that explain what is seen, the most telling first."""
+    """Return the fewest causes that explain the views, the most significant first."""
     found: list[str] = []
     cost = _fit(model, found, sigma).cost
     while len(found) < len(causes):
@@ -185,7 +187,7 @@ def _fit(model: RigModel, causes: list[str], sigma: float | None) -> RigFit:
 
 
 def _columns(model: RigModel, cause: str) -> list[int]:
-    """Return where a cause's parameters are: a camera's rotation, or one of the windows'."""
+    """Return the indices of the parameters of a cause: rotation of a camera, or of a window."""
     if cause in CAMERAS:
         start = camera_slice(SIDES[CAMERAS.index(cause)]).start + len(LENS)
         return [start, start + 1, start + 2]
@@ -209,3 +211,66 @@ def _deviation(model: RigModel, best: RigFit, cause: str) -> Deviation:
 
 def _p95(assumed: StereoCalibration, true: StereoCalibration) -> float:
     return float(np.percentile(np.linalg.norm(tip_shifts(assumed, true), axis=-1), 95.0))
+
+
+def report(result: CheckResult) -> str:
+    """Return a check as text."""
+    lines = [
+        f"corners miss by {result.reprojection_px:.3f} px rms (expected "
+        f"{math.sqrt(2.0) * result.corner_sigma_px:.3f})"
+    ]
+    lines += [f"found: {_describe(deviation)}" for deviation in result.deviations]
+    explained = math.isfinite(result.tip_error)
+    if explained and not result.deviations:
+        lines.append("found: nothing that differs from the calibration")
+    if {d.cause for d in result.deviations} >= set(CAMERAS):
+        lines.append("both cameras turned: or the target is not where the session says")
+    if explained:
+        unseen = result.unseen_tip_error
+        lines.append(
+            f"tips in the phantom, 95 %: off by {1e3 * result.tip_error:.3f} mm; with this target "
+            + (
+                f"errors below {1e3 * unseen:.3f} mm cannot be seen"
+                if unseen < NOTHING_SHOWN
+                else "other errors cannot be seen, however large"
+            )
+        )
+    lines += [f"NOT OK: {problem}" for problem in result.problems]
+    if result.ok:
+        lines.append("OK")
+    return "\n".join(lines)
+
+
+def figures(result: CheckResult) -> dict[str, JsonValue]:
+    """Return the figures of a check for --json; null for a cause that was not found."""
+    unseen = result.unseen_tip_error if result.unseen_tip_error < NOTHING_SHOWN else math.nan
+    values: dict[str, JsonValue] = {
+        "ok": result.ok,
+        "tip_error_p95_mm": 1e3 * result.tip_error,
+        "unseen_tip_error_p95_mm": 1e3 * unseen,
+        "corner_sigma_px": result.corner_sigma_px,
+        "reprojection_rms_px": result.reprojection_px,
+        "problem": "; ".join(result.problems) or None,
+    }
+    found = {deviation.cause: deviation for deviation in result.deviations}
+    for cause in result.causes:
+        scale, unit = unit_of(cause)
+        deviation = found.get(cause)
+        key = f"{cause.replace('.', '_')}{'_error' if cause not in CAMERAS else ''}"
+        key += unit and f"_{unit}"
+        values[key] = None if deviation is None else scale * deviation.size
+        values[f"sigma_{key}"] = None if deviation is None else scale * deviation.sigma
+    return values
+
+
+def _describe(deviation: Deviation) -> str:
+    scale, unit = unit_of(deviation.cause)
+    size, sigma = scale * deviation.size, scale * deviation.sigma
+    effect = f"by itself {1e3 * deviation.tip_error:.3f} mm at the tip"
+    if deviation.cause in CAMERAS:
+        side = deviation.cause.split("_")[0]
+        return f"{side} camera turned by {size:.4f} +- {sigma:.4f} deg (or moved); {effect}"
+    name = deviation.cause.replace("_", " ").replace(".", " ")
+    return (
+        f"{name} is {size:+.4f} +- {sigma:.4f}{unit and f' {unit}'} off the calibration's; {effect}"
+    )

@@ -1,8 +1,8 @@
-"""Whether the boards of a calibration contradict each other.
+"""Detection of contradictions between the boards of a calibration.
 
-A wrong size of the squares or a wrong place hardly shows in the reprojection errors: cameras, index
-and surface give way until the corners fit, and every tip is wrong by as much. It shows in how they
-had to give way.
+A wrong size of the squares or a wrong place hardly increases the reprojection errors, since the fit
+adapts cameras, index and surface, and all tips become wrong. The deviations of the fitted
+parameters reveal the contradiction.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.calibrating.pair_consistency import apart_in_words
+from needle_tracker.calibrating.calibration_session import BoardView
+from needle_tracker.calibrating.pair_consistency import describe_apart
 from needle_tracker.calibrating.rig_calibration import RigCalibration
 from needle_tracker.calibrating.rig_fit import (
     LARGEST_MISFIT_PX,
@@ -20,22 +21,22 @@ from needle_tracker.calibrating.rig_fit import (
     outlier_weights,
     place_deviations,
 )
-from needle_tracker.calibrating.rig_model import BoardView, RigModel
+from needle_tracker.calibrating.rig_model import RigModel
 from needle_tracker.optics.calibration import SIDES
 
 Array = NDArray[np.float64]
 
-LARGEST_PULL = 4.0  # standard deviations of a place: no noise does that
+LARGEST_PULL = 4.0  # standard deviations of a place
 LARGEST_SCALE_ERROR = 1e-3  # of the squares: 0.13 mm at the tip
 _RINGS = 10
 _RING_SIGMAS = 5.0  # 3.4 at most in 8 x 40 simulated sessions of lenses without a pattern
 _LEAST_PATTERN_PX = 0.02
-_LEAST_SHARE = 1e-9  # of what the size does to corners: rounding, where all of it is absorbed
-_SIZE_STEP = 1e-4  # for the derivative by the squares' size
+_LEAST_SHARE = 1e-9  # least effect of the size on the corners beyond other parameters: rounding
+_SIZE_STEP = 1e-4  # of the derivative with respect to the size of the squares
 
 
-def doubts(result: RigCalibration, size: tuple[float, float]) -> list[str]:
-    """Return in words what of the session cannot be right; empty where all goes together.
+def contradictions(result: RigCalibration, size: tuple[float, float]) -> list[str]:
+    """Return the contradictions in a session as text; empty if consistent.
 
     Parameters
     ----------
@@ -46,7 +47,7 @@ def doubts(result: RigCalibration, size: tuple[float, float]) -> list[str]:
     """
     found = [text for view, text in misfits(result) if view.place is not None]
     if any(view.place is not None for view in result.apart):
-        found.insert(0, apart_in_words(result.apart))
+        found.insert(0, describe_apart(result.apart))
     cause = "its lens has more distortion than k1, k2, k3, p1 and p2 describe"
     if "left.fx" not in result.parameters:
         cause = "the lens given with --lenses is for another camera, focus or image size"
@@ -102,10 +103,10 @@ def misfits(result: RigCalibration) -> list[tuple[BoardView, str]]:
 
 
 def ring_patterns(result: RigCalibration) -> dict[str, float]:
-    """Return the cameras whose corners miss towards or from the middle, and by how much [px].
+    """Return the cameras with a radial pattern of corner errors, and its size [px].
 
-    Noise averages out in a ring about the principal point, distortion that the lens model lacks
-    does not.
+    Noise averages out in a ring about the principal point, but missing terms of the distortion do
+    not.
 
     Parameters
     ----------
@@ -126,10 +127,10 @@ def ring_patterns(result: RigCalibration) -> dict[str, float]:
 
 
 def square_error(result: RigCalibration) -> tuple[float, float]:
-    """Return by which share the squares are larger than said, and the standard deviation.
+    """Return the relative error of the size of the squares, and its standard deviation.
 
-    One Gauss-Newton step of the size as a further parameter of the fit, all others free to follow.
-    It is told by the boards of known place: those held freely would only be nearer or farther.
+    The size is an additional parameter of the fit, in one Gauss-Newton step. Only boards of known
+    place determine it: those held freely would just be nearer or farther.
 
     Parameters
     ----------
@@ -139,7 +140,7 @@ def square_error(result: RigCalibration) -> tuple[float, float]:
     Returns
     -------
     error, sigma : float
-        True size over the given one, less 1; infinite sigma where no two places tell it.
+        True size over the given one, minus 1; infinite sigma if undetermined.
     """
     model, fitted = result.model, result.fit
     poses = model.board_poses(fitted.parameters)

@@ -1,4 +1,4 @@
-"""Inputs of a calibration: the board, and the places where it was laid."""
+"""Session of a calibration: the board, its known places, and its views in images."""
 
 from __future__ import annotations
 
@@ -22,28 +22,30 @@ from needle_tracker.optics.calibration import (
     parse_windows,
 )
 from needle_tracker.optics.window import Window, common_surface
+from needle_tracker.sources.image_files import Image, Sizes, open_pairs, progress
 
 Array = NDArray[np.float64]
 
 _LEAST_SINE = math.cos(math.radians(5.0))
 _PLACE_KEYS = ("origin", "columns", "rows", "under_surface", "sigma")
 _SURFACE_KEYS = ("surface_height", "refractive_index")
+KINDS = ("free", "surface", "under")
 _BOARD_KEYS = ("columns", "rows", "square", "marker", "dictionary", "legacy")
 
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Place where a board lay.
+    """Place of a board.
 
     Attributes
     ----------
     T_rig_board : ndarray, shape (4, 4)
-        Takes points of the board's frame to `rig` [m].
+        Transforms points of the board to `rig` [m].
     under_surface : bool
-        Whether it was in the phantom, and so seen through the windows.
+        Whether the board was in the phantom, so that light is refracted.
     sigma : float
-        Standard deviation of the place's coordinates [m]; 0: exact, it defines `rig`; infinite:
-        held freely, `T_rig_board` says nothing.
+        Standard deviation of the coordinates [m]; 0: exact, the place defines `rig`; infinite: held
+        freely, `T_rig_board` is meaningless.
     """
 
     T_rig_board: Array
@@ -52,8 +54,53 @@ class Place:
 
     @property
     def is_known(self) -> bool:
-        """Whether it says where the board lay."""
+        """Whether the position of the board is known."""
         return math.isfinite(self.sigma)
+
+
+@dataclasses.dataclass(frozen=True)
+class Corners:
+    """Corners that one camera saw: in the frame of the board [m] (n, 3), and in pixels (n, 2)."""
+
+    points: Array
+    pixels: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class BoardView:
+    """One exposure of the board by both cameras; `place` is None if it was held freely."""
+
+    name: str
+    place: Place | None
+    left: Corners
+    right: Corners
+
+    def corners(self, side: str) -> Corners:
+        """Return the corners that the camera of one side saw."""
+        return self.left if side == "left" else self.right
+
+    def without(self, side: str) -> BoardView:
+        """Return the view without the corners of one side."""
+        nothing = Corners(np.zeros((0, 3)), np.zeros((0, 2)))
+        left, right = (nothing if s == side else self.corners(s) for s in SIDES)
+        return dataclasses.replace(self, left=left, right=right)
+
+    def scaled(self, size: float) -> BoardView:
+        """Return the view of a board that is larger by a factor."""
+        left, right = (Corners(size * c.points, c.pixels) for c in (self.left, self.right))
+        return dataclasses.replace(self, left=left, right=right)
+
+    @property
+    def under_surface(self) -> bool:
+        """Whether the board was in the phantom."""
+        return self.place is not None and self.place.under_surface
+
+    @property
+    def kind(self) -> str:
+        """Kind of view in `KINDS`: held freely, at a known place in air, or in the phantom."""
+        if self.place is None:
+            return "free"
+        return "under" if self.under_surface else "surface"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,11 +110,11 @@ class Session:
     Attributes
     ----------
     board : CharucoBoard
-        The board of all images.
+        Board of all images.
     windows : pair of Window
-        Of the left and the right camera; what the images do not tell of them is kept.
+        Given windows of the left and the right camera.
     places : dict of str to Place
-        By file name without ending; `*` and `?` as in a shell.
+        By file name without suffix; `*` and `?` as in a shell.
     """
 
     board: CharucoBoard
@@ -75,12 +122,12 @@ class Session:
     places: dict[str, Place]
 
     def place_of(self, *names: str) -> Place | None:
-        """Return where the board of an image lay; None where it was held freely.
+        """Return the place of the board in an image; None if it was held freely.
 
         Parameters
         ----------
         *names : str
-            What the image may be called: file names without ending.
+            Possible names of the image: file names without suffix.
         """
         exact = [name for name in names if name in self.places]
         like = [key for key in self.places if any(fnmatch.fnmatchcase(n, key) for n in names)]
@@ -98,7 +145,7 @@ def load_session(path: Path) -> Session:
     Returns
     -------
     Session
-        What it says.
+        The session.
 
     Raises
     ------
@@ -118,12 +165,12 @@ def parse_session(content: Any) -> Session:
     Parameters
     ----------
     content : mapping
-        The file's content.
+        Content of the file.
 
     Returns
     -------
     Session
-        What it says.
+        The session.
 
     Raises
     ------
@@ -149,7 +196,7 @@ def parse_session(content: Any) -> Session:
 def _check_side(
     name: str, place: Place, board: CharucoBoard, windows: tuple[Window, Window]
 ) -> None:
-    """Refuse a board that cannot be seen, or is not wholly on the side that is said."""
+    """Reject a board that is invisible, or not wholly on the given side of the surface."""
     T = place.T_rig_board  # noqa: N806
     corners = board.corners @ T[:3, :3].T + T[:3, 3]
     for window in windows:
@@ -164,7 +211,7 @@ def _check_side(
                 f"{name} is under_surface, but reaches {-1e3 * depth.min():.1f} mm above the "
                 "surface"
             )
-    # Where each camera has a window of its own, a board in air is there before the phantom is.
+    # If each camera has its own window, a board in air may be in the place of the phantom.
     above = common_surface(*windows) is None or float(depth.max()) <= 1e-3
     if not (place.under_surface or above):
         raise UserError(
@@ -218,3 +265,97 @@ def _flag(content: dict[str, Any], name: str, key: str) -> bool:
     if not isinstance(value, bool):
         raise UserError(f"{name}.{key} = {value!r} is not true or false")
     return value
+
+
+def views_in_folders(
+    left: Path, right: Path, session: Session, *, all_places: bool = True
+) -> tuple[list[BoardView], Sizes]:
+    """Find the board in all image pairs of two folders.
+
+    Parameters
+    ----------
+    left, right : Path
+        Folders of images paired by name, or two videos (names: numbers of the frames).
+    session : Session
+        Board and places.
+    all_places : bool
+        Whether each place of the session must have an image.
+
+    Returns
+    -------
+    views : list of BoardView
+        One for each pair, in the order of the names.
+    sizes : dict of str to (int, int)
+        Width and height of the images of each side.
+
+    Raises
+    ------
+    UserError
+        Bad folders, names or files, images of different sizes, another board or none, or a place
+        of the session without an image.
+    """
+    views: list[BoardView] = []
+    sizes: Sizes = {}
+    pairs = open_pairs(left, right).refuse_unpaired()
+    for pair in progress(pairs, "finding the board"):
+        seen = []
+        for side, path, image in zip(SIDES, pair.files, (pair.left, pair.right), strict=True):
+            if image is None:
+                raise UserError(f"cannot read {path}: not an image in 8 bit")
+            size = (image.shape[1], image.shape[0])
+            if sizes.setdefault(side, size) != size:
+                raise UserError(
+                    f"{path} is {size[0]}x{size[1]}, the {side} images before it "
+                    f"are {sizes[side][0]}x{sizes[side][1]}"
+                )
+            numbers, pixels = session.board.find(image)
+            seen.append(Corners(session.board.corners[numbers], pixels))
+        names = [Path(path).stem for path in (pair.name, *pair.files)]
+        views.append(BoardView(names[0], session.place_of(*names), *seen))
+    if all(nothing_seen(view) for view in views):
+        raise _no_board(session)
+    used = [view.place for view in views]
+    for name, place in session.places.items():
+        if all_places and not any(place is one for one in used):
+            raise UserError(f"the session's places.{name} has no image in {left}")
+    return views, sizes
+
+
+def nothing_seen(view: BoardView) -> bool:
+    """Return whether neither camera saw the board."""
+    return not np.any([len(view.corners(side).points) for side in SIDES])
+
+
+def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) -> BoardView:
+    """Return the view of a board at rest, averaged over several exposures.
+
+    Parameters
+    ----------
+    name : str
+        Name of the view, by which the session gives the place of the board.
+    session : Session
+        Board and places.
+    pairs : list of dict of str to ndarray
+        Left and right images.
+    """
+    seen = []
+    for side in SIDES:
+        found: dict[int, list[Array]] = {}
+        for images in pairs:
+            for corner, pixel in zip(*session.board.find(images[side]), strict=True):
+                found.setdefault(int(corner), []).append(pixel)
+        # A corner that is missing in many exposures is unreliable.
+        kept = sorted(n for n, pixels in found.items() if 2 * len(pixels) > len(pairs))
+        pixels = np.array([np.mean(found[n], axis=0) for n in kept]).reshape(-1, 2)
+        seen.append(Corners(session.board.corners[kept], pixels))
+    view = BoardView(name, session.place_of(name), seen[0], seen[1])
+    if nothing_seen(view):
+        raise _no_board(session)
+    return view
+
+
+def _no_board(session: Session) -> UserError:
+    return UserError(
+        f"no image shows the session's board ({session.board}): are columns, rows and dictionary "
+        "those of the print, and `legacy` if OpenCV before 4.6 made it? blurred, or too small?"
+    )

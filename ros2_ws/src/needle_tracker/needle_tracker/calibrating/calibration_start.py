@@ -1,4 +1,4 @@
-"""From views of the board to a first calibration, and the refusal of sets that cannot give one."""
+"""Initial calibration from views of the board; sets that cannot determine one are rejected."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
-from needle_tracker.calibrating.rig_model import BoardView, Corners
+from needle_tracker.calibrating.calibration_session import BoardView, Corners
 from needle_tracker.optics.calibration import LEAST_BASELINE, SIDES, Camera, StereoCalibration
 from needle_tracker.optics.window import Window
 
@@ -24,24 +24,24 @@ _K1_ALONE = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2
 def checked_views(
     views: list[BoardView], surface: Window | None, least_free: int = LEAST_FREE_VIEWS
 ) -> list[BoardView]:
-    """Refuse a set of views that cannot determine the rig; return what of it counts.
+    """Return the usable part of a set of views; reject a set that cannot determine the rig.
 
-    Cameras with windows of their own may see hardly anything in common but through these: a board
-    that is held freely in air then counts for the camera that sees it.
+    Cameras with windows of their own may have little common view in air: a board that is held
+    freely then counts for each camera that sees it.
 
     Parameters
     ----------
     views : list of BoardView
-        What was seen.
+        Views of the board.
     surface : Window or None
-        What both cameras look through; None where each has a window of its own.
+        Common surface of both cameras; None if each has its own window.
     least_free : int
-        So many boards held freely are needed.
+        Least number of boards held freely.
 
     Raises
     ------
     UserError
-        Too few views or corners, a board seen by one camera only, no board of known place.
+        Too few views or corners, a board that only one camera sees, or no board of known place.
     """
     checked = [checked_view(v, alone=surface is None and v.place is None) for v in views]
     for side in SIDES:
@@ -63,7 +63,7 @@ def checked_views(
 
 
 def checked_view(view: BoardView, *, alone: bool = False) -> BoardView:
-    """Return a view without the camera that sees too little, if the other one may see it alone."""
+    """Return a view without a camera that sees too few corners, if `alone` permits that."""
     counts = {side: len(view.corners(side).points) for side in SIDES}
     few = [side for side in SIDES if counts[side] < LEAST_CORNERS]
     if few and not (alone and len(few) < len(SIDES)):
@@ -81,7 +81,7 @@ def checked_view(view: BoardView, *, alone: bool = False) -> BoardView:
 
 
 def anchor_view(views: list[BoardView], surface: Window | None) -> BoardView | None:
-    """Return the view that says where `rig` is: in air if possible, and always under a surface."""
+    """Return the view that defines `rig`: in air if possible, always so with a common surface."""
     known = [view for view in views if view.place and view.place.is_known]
     in_air = [view for view in known if not view.under_surface]
     return next(iter(in_air if surface else in_air + known), None)
@@ -90,26 +90,26 @@ def anchor_view(views: list[BoardView], surface: Window | None) -> BoardView | N
 def cameras_alone(
     views: list[BoardView], sizes: dict[str, tuple[int, int]], windows: tuple[Window, Window]
 ) -> StereoCalibration:
-    """Return each camera by itself, from the views in air (Zhang's method, OpenCV).
+    """Return the lenses of both cameras, from the views in air (Zhang's method, OpenCV).
 
     Parameters
     ----------
     views : list of BoardView
         From `checked_views`.
     sizes : dict of str to (int, int)
-        Width and height of each side's images [px].
+        Width and height of the images of each side [px].
     windows : pair of Window
         Of the left and the right camera.
 
     Returns
     -------
     StereoCalibration
-        Both lenses; how the cameras stand is left open, both are at the origin.
+        Both lenses, with unknown poses: both cameras are at the origin.
 
     Raises
     ------
     UserError
-        Views that do not determine the cameras: all parallel, or contradictory.
+        Parallel or contradictory views.
     """
     cameras = []
     for side, window in zip(SIDES, windows, strict=True):
@@ -120,35 +120,35 @@ def cameras_alone(
 
 
 def are_posed(cameras: StereoCalibration) -> bool:
-    """Return whether it is known how the cameras stand to each other."""
+    """Return whether the relative pose of the cameras is known."""
     return bool(np.linalg.norm(cameras.right.centre - cameras.left.centre) >= LEAST_BASELINE)
 
 
 def first_calibration(
     views: list[BoardView], cameras: StereoCalibration
 ) -> tuple[StereoCalibration, Array]:
-    """Return a calibration good enough to start the adjustment from.
+    """Return a calibration to start the adjustment from.
 
-    `rig` comes from a board of known place, as if there were no windows.
+    A board of known place defines `rig`; windows are ignored.
 
     Parameters
     ----------
     views : list of BoardView
         From `checked_views`.
     cameras : StereoCalibration
-        Lenses, windows, and the cameras' relative pose where that is known (`are_posed`).
+        Lenses, windows, and the relative pose of the cameras if known (`are_posed`).
 
     Returns
     -------
     calibration : StereoCalibration
-        Start values.
+        Initial values.
     boards : ndarray, shape (len(views), 4, 4)
         T_rig_board of each view.
 
     Raises
     ------
     UserError
-        A camera that comes out behind its window.
+        The pose of a camera is behind its window.
     """
     anchor = anchor_view(views, cameras.surface)
     assert anchor is not None
@@ -173,14 +173,14 @@ def first_calibration(
 
 
 def boards_seen(calibration: StereoCalibration, views: list[BoardView]) -> Array:
-    """Return T_rig_board of each view, shape (n, 4, 4): as given, else as the first camera sees it.
+    """Return T_rig_board of each view, shape (n, 4, 4): as given, else from one camera.
 
     Parameters
     ----------
     calibration : StereoCalibration
-        Windows are passed over.
+        Cameras; the windows are ignored.
     views : list of BoardView
-        Seen by one camera at least.
+        Views with at least one camera.
     """
     boards = []
     for view in views:
@@ -198,7 +198,7 @@ def _lens(corners: list[Corners], side: str, size: tuple[int, int]) -> tuple[Arr
     pixels = [c.pixels.astype(np.float32).reshape(-1, 1, 2) for c in corners]
     matrix, distortion, flags = np.eye(3), np.zeros(5), _K1_ALONE
     try:
-        # At last without images that do not fit, such as of a board in the phantom.
+        # The last round is without outliers, such as a board in the phantom.
         for _ in range(3):
             _, matrix, distortion, turns, *_, misses = cv2.calibrateCameraExtended(
                 points, pixels, size, matrix, distortion, flags=flags
@@ -222,7 +222,7 @@ def _lens(corners: list[Corners], side: str, size: tuple[int, int]) -> tuple[Arr
 
 
 def board_pose(camera: Camera, corners: Corners) -> Array:
-    """Return the board's pose in a camera's optical frame, shape (4, 4), without a window."""
+    """Return the pose of the board in the optical frame, shape (4, 4), without refraction."""
     _, rotation, translation = cv2.solvePnP(
         corners.points,
         corners.pixels,

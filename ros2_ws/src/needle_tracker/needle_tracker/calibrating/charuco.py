@@ -1,4 +1,4 @@
-"""The ChArUco board: its corners in an image, and the board to print."""
+"""ChArUco board: detection of its corners in an image, and a file to print."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _MARGIN = 0.01  # [m] of white paper on all sides
 class CharucoBoard:
     """A chessboard with ArUco markers in its white squares.
 
-    The board's frame: origin at the outer corner of the pattern's first square (top left as
-    printed, the first marker beside it), x along the columns (to the right), y along the rows
-    (down), z into the paper [m].
+    The frame of the board has its origin at the outer corner of the first square (top left as
+    printed, beside the first marker), x along the columns (to the right), y along the rows (down),
+    z into the paper [m].
 
     Attributes
     ----------
@@ -38,15 +38,15 @@ class CharucoBoard:
     square, marker : float
         Side of a square and of a marker, as measured on the printed board [m].
     dictionary : str
-        OpenCV's name of the marker dictionary.
+        Name of the marker dictionary in OpenCV.
     legacy : bool
-        Whether it was printed by OpenCV before 4.6: with an even number of rows, its first square
-        then is white.
+        Whether OpenCV before 4.6 printed it: with an even number of rows, the first square is then
+        white.
 
     Raises
     ------
     UserError
-        A board that cannot be.
+        An impossible board.
     """
 
     columns: int = 12
@@ -74,7 +74,7 @@ class CharucoBoard:
             )
 
     def __str__(self) -> str:
-        """Return what it is, for a person."""
+        """Return a description."""
         return (
             f"{self.columns} x {self.rows} squares of {1e3 * self.square:g} mm, markers "
             f"{1e3 * self.marker:g} mm, {self.dictionary}{', legacy' if self.legacy else ''}"
@@ -87,18 +87,18 @@ class CharucoBoard:
 
     @property
     def corners(self) -> Array:
-        """Inner corners in the board's frame [m], shape ((columns-1)*(rows-1), 3), by number."""
+        """Inner corners in the frame of the board [m], shape ((columns-1)*(rows-1), 3)."""
         v, u = np.mgrid[1 : self.rows, 1 : self.columns]
         flat = np.stack([u.ravel(), v.ravel(), np.zeros(u.size)], axis=-1)
         return np.asarray(self.square * flat)
 
     def black_squares(self) -> Array:
-        """Return what is printed black: squares and modules of markers.
+        """Return the black squares, and the black modules of the markers.
 
         Returns
         -------
         ndarray, shape (n, 3)
-            x and y of the corner nearest to the origin, and the side, in the board's frame [m].
+            x and y of the corner nearest to the origin, and the side, in the board frame [m].
         """
         white_first = self.legacy and self.rows % 2 == 0
         parity = np.add.outer(range(self.rows), range(self.columns)) % 2
@@ -120,7 +120,7 @@ class CharucoBoard:
         return np.concatenate(parts)
 
     def find(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.intp], Array]:
-        """Find the board's inner corners in an image.
+        """Find the inner corners of the board in an image.
 
         Parameters
         ----------
@@ -130,9 +130,9 @@ class CharucoBoard:
         Returns
         -------
         numbers : ndarray of int, shape (n,)
-            Which of `corners` were found, ascending.
+            Indices of the found `corners`, ascending.
         pixels : ndarray, shape (n, 2)
-            Where, pixel centres at integers.
+            Positions, pixel centres at integers.
         """
         parameters = cv2.aruco.CharucoParameters()
         detector = cv2.aruco.CharucoDetector(self._opencv(), parameters)
@@ -141,7 +141,7 @@ class CharucoBoard:
             return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
         # OpenCV 5 drops the axis of length 1 that 4 has.
         flat = np.asarray(pixels, dtype=np.float32).reshape(-1, 2)
-        # The window must not reach the markers, which pull the corner.
+        # The window must exclude the markers, which bias the corner.
         gap = 0.5 * (1.0 - self.marker / self.square) * min(pdist(flat), default=20.0)
         half = max(2, int(0.9 * gap))
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
@@ -167,9 +167,9 @@ def write_board(board: CharucoBoard, path: Path) -> None:
     Parameters
     ----------
     board : CharucoBoard
-        What to draw.
+        The board.
     path : Path
-        `.pdf` or `.png` (600 dpi, the size in the file).
+        `.pdf` or `.png` (600 dpi, with its size).
 
     Raises
     ------
@@ -186,7 +186,7 @@ def write_board(board: CharucoBoard, path: Path) -> None:
     )
     axes.set(xlim=(0.0, length), ylim=(height, 0.0))
     axes.axis("off")
-    # Drawn, not an image: that would be fitted to whole dots, and all of the board be larger.
+    # Vector graphics: an image would be rounded to whole dots and enlarge the board.
     black = [Rectangle((x, y), side, side) for x, y, side in board.black_squares()]
     axes.add_collection(PatchCollection(black, facecolor="black", linewidth=0.0, snap=False))
     figure.text(

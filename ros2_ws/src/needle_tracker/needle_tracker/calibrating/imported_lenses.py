@@ -1,4 +1,4 @@
-"""Lenses and relative pose of two cameras as ROS, Kalibr or OpenCV wrote them."""
+"""Import of lenses and relative pose of two cameras from files of ROS, Kalibr or OpenCV."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from needle_tracker.optics.calibration import (
     numbers,
     value_of,
 )
-from needle_tracker.optics.camera_model import distort
+from needle_tracker.optics.refraction import distort
 from needle_tracker.optics.window import Window
 
 Array = NDArray[np.float64]
 
-_RATIONAL = "rational_polynomial"  # of none, 4, 5, 8, 12 or 14 coefficients, as OpenCV has it
-_EQUIDISTANT = "equidistant"  # of 4: OpenCV's fisheye
+_RATIONAL = "rational_polynomial"  # of 0, 4, 5, 8, 12 or 14 coefficients, as in OpenCV
+_EQUIDISTANT = "equidistant"  # of 4 coefficients: fisheye of OpenCV
 _MODELS = {"plumb_bob": _RATIONAL, "radtan": _RATIONAL, "none": _RATIONAL, "fisheye": _EQUIDISTANT}
 _COUNTS = {_RATIONAL: (0, 4, 5, 8, 12, 14), _EQUIDISTANT: (4,)}
-_OPENCV_KEYS = (("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"))  # followed by 1 and 2
+_OPENCV_KEYS = (("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"))  # with suffix 1 and 2
 _CURE = (
     "calibrate with plumb_bob (Kalibr: pinhole-radtan; OpenCV: without CALIB_RATIONAL_MODEL), or "
     "run without --lenses"
 )
-_LARGEST_SKEW = 1e-3  # of a rotation's singular values: files have few digits
-_LARGEST_MISS_PX = 0.05  # of plumb_bob in place of another lens model, anywhere in the image
+_LARGEST_SKEW = 1e-3  # error of the singular values of a rotation: files have few digits
+_LARGEST_MISS_PX = 0.05  # error of plumb_bob instead of another lens model
 
 
 class _Lens(NamedTuple):
-    """A camera as a file has it; `size` is None where it has none."""
+    """Camera in a file; `size` may be missing."""
 
     path: Path
     matrix: Array
@@ -50,7 +50,7 @@ class _Lens(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """Content of one file: lenses; T_right_left; T_stereo_camera of ROS's rectification."""
+    """Content of one file: lenses; T_right_left; T_stereo_camera of the rectification of ROS."""
 
     lenses: list[_Lens]
     pose: Array | None = None
@@ -60,29 +60,29 @@ class _Found(NamedTuple):
 def read_lenses(
     paths: Sequence[Path], sizes: dict[str, tuple[int, int]], windows: tuple[Window, Window]
 ) -> StereoCalibration:
-    """Read both cameras' lenses, and their relative pose where it is there.
+    """Read the lenses of both cameras, and their relative pose if given.
 
     Parameters
     ----------
     paths : sequence of Path
-        A camera_info for left and one for right, a Kalibr chain (cam0 is left), OpenCV's intrinsics
-        and extrinsics in any order.
+        A camera_info for left and one for right, a Kalibr chain (cam0 is left), or intrinsics and
+        extrinsics of OpenCV in any order.
     sizes : dict of str to (int, int)
-        Width and height of each side's images [px].
+        Width and height of the images of each side [px].
     windows : pair of Window
         Of the left and the right camera.
 
     Returns
     -------
     StereoCalibration
-        The left camera at the origin; the right one too where no file gives the relative pose.
-        Another lens model is replaced by the plumb_bob that equals it to 0.05 px in all the image.
+        The left camera is at the origin; the right one too if no file gives the relative pose.
+        Another lens model is replaced by a plumb_bob that equals it to 0.05 px in all the image.
 
     Raises
     ------
     UserError
-        A file that cannot be read or is none of these, not two cameras, images of another size, or
-        a lens that plumb_bob cannot describe.
+        An unreadable or unknown file, not two cameras, images of another size, or a lens that
+        plumb_bob cannot describe.
     """
     if len(set(paths)) < len(paths):
         raise UserError(f"--lenses {' '.join(map(str, paths))}: a file is given twice")
@@ -154,9 +154,9 @@ def _kalibr(content: Any, path: Path) -> _Found:
 
 
 def _opencv(text: str, path: Path) -> _Found:
-    """Return what OpenCV's samples `stereo_calib` (two files) and `calibration` write.
+    """Return the content of a file of the OpenCV samples `stereo_calib` (two files), `calibration`.
 
-    Other programs name the matrices as the parameters of `stereoCalibrate`.
+    Other programs name the matrices like the parameters of `stereoCalibrate`.
     """
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -211,7 +211,7 @@ def _plumb_bob(lens: _Lens, size: tuple[int, int]) -> Array:
         )
     if model == _RATIONAL and not np.any(coefficients[5:]):
         return np.append(coefficients, np.zeros(5))[:5]
-    # Rays from the middle outwards, as far as they are in the image.
+    # Rays from the centre outwards, up to the border of the image.
     turns, slopes = np.linspace(0.0, 2.0 * np.pi, 72), np.tan(np.linspace(0.0, 1.4, 141))
     ideal = np.stack([np.outer(np.cos(turns), slopes), np.outer(np.sin(turns), slopes)], axis=-1)
     points = np.insert(ideal.reshape(-1, 1, 2), 2, 1.0, axis=-1)

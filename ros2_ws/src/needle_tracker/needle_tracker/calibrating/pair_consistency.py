@@ -1,8 +1,8 @@
-"""Views that were not taken at once: each camera alone fits them, both together do not.
+"""Detection of views whose images were not exposed at once.
 
-The right camera's pose relative to the left one is the same in every pair of images. A dropped
-frame shifts the names of one side, and cameras that run freely see a moving board at two places: in
-such a pair it comes out different, however well each image fits.
+The pose of the right camera relative to the left one is the same in every pair of images. After a
+dropped frame, which shifts the names of one side, or with a moving board before free-running
+cameras, the pose differs in such a pair, although each image fits by itself.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
-from needle_tracker.calibrating.calibration_session import Place
+from needle_tracker.calibrating.calibration_session import BoardView, Place
 from needle_tracker.calibrating.calibration_start import (
     anchor_view,
     boards_seen,
@@ -21,55 +21,50 @@ from needle_tracker.calibrating.calibration_start import (
     first_calibration,
 )
 from needle_tracker.calibrating.rig_fit import board_parameters_free, fit
-from needle_tracker.calibrating.rig_model import (
-    LENS,
-    BoardView,
-    RigModel,
-    camera_slice,
-)
+from needle_tracker.calibrating.rig_model import LENS, RigModel, camera_slice
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 
 Array = NDArray[np.float64]
 
-_MANY = 0.25  # of all views: with more of them apart, the rest is not relied on
+_MANY = 0.25  # share of inconsistent views above which all views are rejected
 _ROUNDS = 10
-# Both cameras' corners may miss by twice what one camera's do, and this: in the phantom a lens that
-# is known from boards in air alone, and a surface that may be elsewhere, come on top.
+# Tolerance of the error of both cameras beyond twice the error of one: in the phantom, the errors
+# of a lens known only from boards in air, and of the surface, are added.
 _SLACK_PX = 0.05
 _SLACK_UNDER_PX = 1.0
 
 
 class PairsApartError(UserError):
-    """Left and right images do not belong together in so many views that none is used."""
+    """Left and right images do not belong together in too many views."""
 
 
 def consistent_views(
     views: list[BoardView], cameras: StereoCalibration, least_free: int
 ) -> tuple[list[BoardView], list[BoardView], Array | None]:
-    """Take out the views whose images do not belong together.
+    """Separate the views whose images do not belong together.
 
     Parameters
     ----------
     views : list of BoardView
         From `checked_views`.
     cameras : StereoCalibration
-        Each camera's lens; how they stand does not count.
+        Lenses; the poses are ignored.
     least_free : int
         As for `checked_views`.
 
     Returns
     -------
     kept : list of BoardView
-        Those that belong together.
+        Consistent views.
     apart : list of BoardView
-        The others.
+        Other views.
     T_right_left : ndarray, shape (4, 4), or None
-        The cameras' relative pose in most views in air; None where both see none.
+        Relative pose of the cameras in most views in air; None without common views.
 
     Raises
     ------
     PairsApartError
-        More than a quarter of the views is apart, or the others cannot determine the rig.
+        Too many inconsistent views, or the others cannot determine the rig.
     """
     names, pose = _apart(views, _posed(cameras, np.eye(4)))
     kept, apart = ([v for v in views if (v.name in names) is wanted] for wanted in (False, True))
@@ -78,11 +73,11 @@ def consistent_views(
             raise UserError(f"{len(apart)} of {len(views)} views")
         return checked_views(kept, cameras.surface, least_free), apart, pose
     except UserError as error:
-        raise PairsApartError(f"{apart_in_words(apart)} ({error})") from error
+        raise PairsApartError(f"{describe_apart(apart)} ({error})") from error
 
 
-def apart_in_words(views: list[BoardView]) -> str:
-    """Return what is wrong with these views."""
+def describe_apart(views: list[BoardView]) -> str:
+    """Return the message about inconsistent views."""
     return (
         f"left and right do not show the board in the same place in "
         f"{', '.join(view.name for view in views)}, though each camera alone fits: not captured "
@@ -107,10 +102,10 @@ def _apart(views: list[BoardView], cameras: StereoCalibration) -> tuple[list[str
 
 
 def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[list[str], Array]:
-    """Return the names of the views that contradict the others, and T_right_left of these.
+    """Return the names of the views that contradict the others, and T_right_left of the others.
 
-    The others are as many as can be, and begin with the view whose relative pose comes nearest to
-    that of a quarter of all; where there is no such quarter, to that of another view.
+    The consistent set starts with the view whose relative pose is closest to that of a quarter of
+    all views, or else of one other view, and grows until it does not change.
     """
     left, right = (
         boards_seen(cameras, [view.without(other) for view in views]) for other in SIDES[::-1]
@@ -149,17 +144,17 @@ def _posed(cameras: StereoCalibration, pose: Array) -> StereoCalibration:
 
 
 def _alone(calibration: StereoCalibration, views: list[BoardView]) -> Array:
-    """Return what the corners of each view miss by in one camera alone, the larger rms [px]."""
+    """Return the error of the corners of each view in one camera alone, the larger rms [px]."""
     misses = [_misses(calibration, [view.without(side) for view in views]) for side in SIDES]
     return np.asarray(np.max(misses, axis=0))
 
 
 def _misses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
-    """Return what the corners of each view miss by at the board's best place, rms [px]."""
+    """Return the error of the corners of each view at the best place of the board, rms [px]."""
     model = RigModel(calibration, views, boards_seen(calibration, views))
     free = board_parameters_free(model)
     if any(view.under_surface for view in views):
-        # One flat board does not tell the surface's height from it.
+        # With one flat board, index and height of the surface are indistinguishable.
         free[model.names.index("refractive_index")] = True
     squares = np.sum(fit(model, model.start, free).residuals.reshape(-1, 2) ** 2, axis=-1)
     of_view = np.concatenate([model.view_of[side] for side in SIDES])

@@ -1,6 +1,6 @@
-"""Calibration of the whole rig: bundle adjustment that invents nothing.
+"""Calibration of the whole rig by bundle adjustment.
 
-What the views do not determine well enough is kept at its given value, and said.
+A parameter that the views do not determine well enough keeps its given value, which is reported.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
+from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.calibrating.calibration_start import (
     LEAST_FREE_VIEWS,
     are_posed,
@@ -25,7 +26,6 @@ from needle_tracker.calibrating.rig_model import (
     CAMERA_PARAMETERS,
     LENS,
     POSE,
-    BoardView,
     RigModel,
     camera_slice,
 )
@@ -35,8 +35,8 @@ from needle_tracker.optics.window import Window, common_surface
 
 Array = NDArray[np.float64]
 
-# A standard deviation above these, and the parameter is kept at its given value: about 0.04 mm of
-# depth for the surface's, about a pixel at the image's corner for the lens's (f = 16 mm).
+# Largest standard deviations of determined parameters: about 0.04 mm of depth for the surface,
+# about a pixel in the corner of the image for the lens (f = 16 mm).
 LIMITS = {
     "refractive_index": 0.003,
     "surface_height": 0.15e-3,
@@ -46,17 +46,17 @@ LIMITS = {
     "p2": 0.003,
     "k3": 0.05,
 }
-_FIRST_SIGMA_PX = 10.0  # of corners, while cameras and boards come near
-_FOCAL_LIMIT = 0.005  # of the focal length, and of the image's width for the principal point
-# Of the image's width: boards on a surface hold the cameras that look through it, a small one in a
-# box does less; there a shifted principal point and a turned camera are much alike, and harmless.
+_FIRST_SIGMA_PX = 10.0  # of corners in the first fit of the poses
+_FOCAL_LIMIT = 0.005  # of the focal length, and of the image width for the principal point
+# Of the image width: in a box with a small board, a shifted principal point and a rotated camera
+# are nearly equivalent, and harmless.
 _OWN_WINDOWS_CENTRE_LIMIT = 0.01
-_LARGEST_TURN = 0.2  # between a given relative pose and that of the views [rad]
+_LARGEST_TURN = 0.2  # largest angle between a given relative pose and that of the views [rad]
 
 
 @dataclasses.dataclass(frozen=True)
 class Determined:
-    """Result for one parameter: `sigma` is what the views gave, `value` what is used."""
+    """Result for one parameter: `sigma` is that of the views, `value` is the one in use."""
 
     value: float
     sigma: float
@@ -71,17 +71,17 @@ class RigCalibration:
     Attributes
     ----------
     calibration : StereoCalibration
-        The result.
+        Calibration.
     fit : RigFit
         Parameters, covariance, residuals.
     model : RigModel
-        What was fitted.
+        Fitted model.
     parameters : dict of str to Determined
-        By name: `left.fx` ... `right.k3`, and the windows' (`RigModel.names`).
+        By name: `left.fx` ... `right.k3`, and those of the windows (`RigModel.names`).
     tip_error_p95 : float
-        Expected 95 % error of a tip in the phantom from this calibration alone [m].
+        Expected 95 % error of tips in the phantom from this calibration alone [m].
     apart : list of BoardView
-        Views that were left out: left and right do not belong together.
+        Rejected views, whose images do not belong together.
     """
 
     calibration: StereoCalibration
@@ -128,7 +128,7 @@ def calibrate(
     sizes : dict of str to (int, int)
         Width and height of each side's images [px].
     windows : pair of Window
-        Of the left and the right camera, as given; what the views do not tell of them is kept.
+        Given windows of the left and the right camera.
     lenses : StereoCalibration, optional
         Cameras whose lenses are kept, and their relative pose if they are not in one place.
 
@@ -152,12 +152,12 @@ def calibrate(
     start, boards = first_calibration(views, cameras)
     model = RigModel(start, views, boards, tied=tied)
     names = list(model.names)
-    # What parameters are kept at: the windows as given, a lens without distortion.
+    # Values of undetermined parameters: windows as given, a lens without distortion.
     given = model.start[: model.shared].copy()
     given[[name.split(".")[-1] in LENS[4:] for name in names]] = 0.0
     free = board_parameters_free(model)
-    # The start ignores what refracts: where no board of known place in air holds the cameras, they
-    # and the boards first have to come near.
+    # The initial values ignore refraction: without a board of known place in air, fit the poses of
+    # cameras and boards first.
     poses = free.copy()
     poses[: model.shared] = [name.split(".")[-1] in POSE for name in names]
     poses[camera_slice("right")] &= not tied
@@ -198,7 +198,7 @@ def calibrate(
 
 
 def _check_relative_pose(given: Array, seen: Array) -> None:
-    """Refuse a relative pose in another unit, or of other cameras, than the views show."""
+    """Reject a given relative pose that contradicts the views."""
     lengths = np.linalg.norm([given[:3, 3], seen[:3, 3]], axis=-1)
     turn = np.abs(given[:3, :3] - seen[:3, :3]).max()
     aside = np.abs(given[:3, 3] / lengths[0] - seen[:3, 3] / lengths[1]).max()
@@ -212,9 +212,9 @@ def _check_relative_pose(given: Array, seen: Array) -> None:
 
 
 def _least_determined(names: list[str], result: RigFit) -> int | None:
-    """Return the free parameter that is farthest above its limit, None where there is none."""
+    """Return the free parameter that is farthest above its limit, if any."""
     limits = np.array([LIMITS.get(name.split(".")[-1], np.inf) for name in names])
-    # Of a fixed parameter the standard deviation is 0.
+    # The standard deviation of a fixed parameter is 0.
     ratios = result.sigma[: len(names)] / limits
     worst = int(ratios.argmax())
     return worst if ratios[worst] > 1.0 else None

@@ -1,4 +1,4 @@
-"""Least squares on the rig model: robust, with what the data did and did not determine."""
+"""Robust least squares on the rig model, with the covariance of the parameters."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Mask = NDArray[np.bool_]
 
 LEAST_CORNER_SIGMA_PX = 0.02
 LARGEST_MISFIT_PX = 0.1  # about 0.05 mm of depth
-_OUTLIER = 3.0  # in standard deviations: beyond, a residual counts linearly
+_OUTLIER = 3.0  # standard deviations above which the cost of a residual is linear
 _LEAST_EIGENVALUE = 1e-14
 _ITERATIONS = 40
-_LEAST_CHANGE = 1e-4  # of the cost: parameters then stand still within 1 % of their sigma
+_LEAST_CHANGE = 1e-4  # of the cost: parameters then change by less than 1 % of their sigma
 _LARGEST_DAMPING = 1e6
 
 
@@ -29,15 +29,15 @@ class RigFit:
     Attributes
     ----------
     parameters : ndarray, shape (p,)
-        The whole vector, fixed ones included.
+        All parameters, including fixed ones.
     free : ndarray of bool, shape (p,)
-        Which were fitted.
+        Fitted parameters.
     covariance : ndarray, shape (p, p)
-        Of the parameters; 0 for fixed ones.
+        Covariance of the parameters; 0 for fixed ones.
     residuals : ndarray, shape (2 * corners,)
-        Seen minus fitted [px].
+        Measured minus fitted pixels [px].
     corner_sigma_px : float
-        Standard deviation of a corner's coordinate that the residuals show [px].
+        Standard deviation of the coordinate of a corner, from the residuals [px].
     cost : float
         Half the sum of squares of residuals and priors over their standard deviations.
     """
@@ -56,7 +56,7 @@ class RigFit:
 
 
 def board_parameters_free(model: RigModel) -> Mask:
-    """Return which boards' parameters are unknown: all but those of exactly known places."""
+    """Return the mask of unknown board parameters: all but those of exact places."""
     free = np.zeros(len(model.start), dtype=bool)
     for number, view in enumerate(model.views):
         if view.place is None or view.place.sigma > 0.0:
@@ -66,20 +66,20 @@ def board_parameters_free(model: RigModel) -> Mask:
 
 
 def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None = None) -> RigFit:
-    """Fit the free parameters to what was seen.
+    """Fit the free parameters to the views.
 
-    Boards of known place, and windows, are held to what is given by its standard deviation.
+    Known places and windows are priors with their standard deviations.
 
     Parameters
     ----------
     model : RigModel
-        With the views.
+        Model with the views.
     start : ndarray, shape (p,)
-        Where to start.
+        Initial parameters.
     free : ndarray of bool, shape (p,)
-        What to fit.
+        Parameters to fit.
     corner_sigma_px : float, optional
-        Standard deviation of a corner's coordinate [px]; by default from the residuals.
+        Standard deviation of the coordinate of a corner [px]; by default from the residuals.
 
     Returns
     -------
@@ -102,12 +102,12 @@ def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None
 
 
 def outlier_weights(whitened: Array) -> Array:
-    """Return how much each residual counts, by its size in standard deviations (soft L1)."""
+    """Return the weights of residuals in standard deviations (soft L1)."""
     return np.asarray(1.0 / np.sqrt(1.0 + (whitened / _OUTLIER) ** 2))
 
 
 def given_rows(model: RigModel, free: Mask) -> Array:
-    """Return the rows that known places and windows add to the whitened Jacobian, (n, free)."""
+    """Return the rows of the priors in the whitened Jacobian, (n, free)."""
     rows, sigmas = _priors(model, free)
     result = np.zeros((len(rows), int(np.count_nonzero(free))))
     result[np.arange(len(rows)), np.searchsorted(np.flatnonzero(free), rows)] = 1.0 / sigmas
@@ -115,20 +115,20 @@ def given_rows(model: RigModel, free: Mask) -> Array:
 
 
 def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, float]]:
-    """Return how far boards came out from their places, where those have a standard deviation.
+    """Return the deviations of boards from places with a standard deviation.
 
     Parameters
     ----------
     model : RigModel
-        What was fitted.
+        Fitted model.
     result : RigFit
-        Its fit.
+        Result of the fit.
 
     Returns
     -------
     list of (str, float, float)
-        Name of the view; distance of the board's middle from where it should be [m]; the largest
-        of its six parameters in standard deviations.
+        Name of the view; deviation of the centre of the board [m]; the largest deviation of its six
+        parameters in standard deviations.
     """
     rows, sigmas = _place_priors(model, result.free)
     numbers = (rows.reshape(-1, 6)[:, 0] - model.shared) // 6
@@ -146,17 +146,17 @@ def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, 
 
 
 def misfit_px(model: RigModel, result: RigFit) -> float:
-    """Return what corners miss by beyond their noise, rms of a coordinate [px]: a wrong model.
+    """Return the error of corners beyond their noise, rms of a coordinate [px]: a wrong model.
 
-    The noise is what a polynomial of degree 4 in the board's coordinates leaves: it follows
-    perspective, lens and refraction to a few thousandths of a pixel.
+    The noise is the residual of a polynomial of degree 4 in the coordinates of the board, which
+    fits perspective, lens and refraction to a few thousandths of a pixel.
 
     Parameters
     ----------
     model : RigModel
-        What was fitted.
+        Fitted model.
     result : RigFit
-        Its fit.
+        Result of the fit.
     """
     total, spare = 0.0, 0
     for seen in (view.corners(side) for view in model.views for side in SIDES):
@@ -179,9 +179,9 @@ def _minimise(
 ) -> tuple[Array, Array, float]:
     """Return parameters, normal matrix at them, and cost.
 
-    Levenberg-Marquardt on the normal equations, each row weighted down where it is an outlier
-    (soft L1). scipy's `least_squares` takes a singular value decomposition of the whole Jacobian
-    (8,000 x 150) in every step, and a minute instead of seconds.
+    Levenberg-Marquardt on the normal equations, with a low weight for outliers (soft L1). scipy's
+    `least_squares` takes a minute instead of seconds, since it decomposes the whole Jacobian
+    (8,000 x 150) in every step.
     """
     rows, place_sigma = priors
     prior_columns = np.searchsorted(np.flatnonzero(free), rows)
@@ -228,7 +228,7 @@ def _solve(normal: Array, gradient: Array, damping: float) -> Array:
 
 
 def _priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:
-    """Return the parameters that what is given holds, and how tightly."""
+    """Return the indices of the parameters with priors, and the standard deviations."""
     rows, sigmas = _place_priors(model, free)
     held = np.array([WINDOW.get(name.split(".")[-1], 0.0) for name in model.names])
     window_rows = np.flatnonzero((held > 0.0) & free[: model.shared])
@@ -236,7 +236,7 @@ def _priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:
 
 
 def _place_priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:
-    """Return the board parameters that a known place holds, and how tightly [rad or m]."""
+    """Return the indices of the parameters of known places, and their sigmas [rad or m]."""
     rows: list[int] = []
     sigmas: list[float] = []
     for number, view in enumerate(model.views):
@@ -245,7 +245,7 @@ def _place_priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]
         first = model.shared + 6 * number
         if not free[first]:
             continue
-        # The place is known by coordinates of its edges: so well is its rotation known.
+        # The rotation follows from the coordinates of the edges.
         reach = max(float(np.ptp(view.left.points[:, :2], axis=0).max()), 1e-3)
         rows += range(first, first + 6)
         sigmas += [view.place.sigma * 2.0 / reach] * 3 + [view.place.sigma] * 3
@@ -253,7 +253,7 @@ def _place_priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]
 
 
 def _spread(residuals: Array, free: Mask, priors: tuple[NDArray[np.intp], Array]) -> float:
-    """Return the standard deviation that residuals of a fit show, outliers left out."""
+    """Return the standard deviation of the residuals of a fit, without outliers."""
     if not residuals.size:
         return 0.0
     rough = 1.4826 * float(np.median(np.abs(residuals)))
@@ -263,7 +263,7 @@ def _spread(residuals: Array, free: Mask, priors: tuple[NDArray[np.intp], Array]
 
 
 def _inverse_normal(normal: Array) -> Array:
-    """Return the inverse, with huge but finite variances for what is not determined."""
+    """Return the inverse, with large but finite variances for undetermined parameters."""
     scale = _scale(normal)
     values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
     values = np.maximum(values, _LEAST_EIGENVALUE)

@@ -1,16 +1,16 @@
-"""The whole rig as one function: from cameras, surface and boards to every corner's pixel.
+"""Model of the whole rig: pixels of all corners as a function of cameras, surface and boards.
 
-What calibration and its check have in common. Parameters are one vector:
+Calibration and its check share this model. Its parameters are one vector:
 
     left: fx fy cx cy k1 k2 p1 p2 k3, rotation (3), translation (3); right: likewise;
-    the windows'; for each view of the board: rotation (3), translation (3).
+    windows; for each view of the board: rotation (3), translation (3).
 
-The windows' are refractive index and surface height where both cameras look through one level
-surface, else of each window how far it is moved along its normal and how it is tilted about two
-axes across that; layers and indices are then as given.
+The parameters of the windows are refractive index and height of a common surface, else for each
+window its offset along the normal and its tilts about two axes across that; layers and indices are
+then as given.
 
-Rotations and translations are increments on the transforms that the model starts from. A camera
-turns about its own centre, T_optical_rig = [exp(rotation) | translation] T0; a board about its
+Rotations and translations are increments on the initial transforms. A camera rotates about its own
+centre, T_optical_rig = [exp(rotation) | translation] T0; a board about its
 first corner, T_rig_board = [exp(rotation) R0 | t0 + translation].
 """
 
@@ -23,10 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from needle_tracker.calibrating.calibration_session import Place
+from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
-from needle_tracker.optics.camera_model import project_optical
-from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.optics.refraction import RefractedCamera, project_optical
 from needle_tracker.optics.window import Window, surface_from_above
 
 Array = NDArray[np.float64]
@@ -35,69 +34,22 @@ Mask = NDArray[np.bool_]
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
 SURFACE = ("refractive_index", "surface_height")
-# A window of its own is given to a ruler and a level; its standard deviations [m, rad]. What light
-# passes shows where its faces are no better, but for effects that hardly move tips.
+# Standard deviations of a given window, as measured with a ruler and a level [m, rad].
 WINDOW = {"window_offset": 2e-3, "window_tilt_1": 0.02, "window_tilt_2": 0.02}
 _CAMERA = len(LENS) + len(POSE)
 CAMERA_PARAMETERS = 2 * _CAMERA
-KINDS = ("free", "surface", "under")
-# Central differences; the model is smooth, so that these are good to 1e-6 relative.
+# Steps of the central differences, whose relative error is about 1e-6.
 _STEPS = {"f": 0.1, "c": 0.1, "k": 1e-4, "p": 1e-4, "r": 1e-5, "t": 1e-5, "s": 1e-5, "w": 1e-5}
 
 
-@dataclasses.dataclass(frozen=True)
-class Corners:
-    """The board's corners that one camera saw: in the board's frame [m] (n, 3), pixels (n, 2)."""
-
-    points: Array
-    pixels: Array
-
-
-@dataclasses.dataclass(frozen=True)
-class BoardView:
-    """One exposure of the board by both cameras; `place` is None where it was held freely."""
-
-    name: str
-    place: Place | None
-    left: Corners
-    right: Corners
-
-    def corners(self, side: str) -> Corners:
-        """Return what the camera of one side saw."""
-        return self.left if side == "left" else self.right
-
-    def without(self, side: str) -> BoardView:
-        """Return the view as if the camera of one side had seen nothing."""
-        nothing = Corners(np.zeros((0, 3)), np.zeros((0, 2)))
-        left, right = (nothing if s == side else self.corners(s) for s in SIDES)
-        return dataclasses.replace(self, left=left, right=right)
-
-    def scaled(self, size: float) -> BoardView:
-        """Return the view as if the board's squares were larger by a factor."""
-        left, right = (Corners(size * c.points, c.pixels) for c in (self.left, self.right))
-        return dataclasses.replace(self, left=left, right=right)
-
-    @property
-    def under_surface(self) -> bool:
-        """Whether the board was in the phantom, and so seen through the windows."""
-        return self.place is not None and self.place.under_surface
-
-    @property
-    def kind(self) -> str:
-        """One of `KINDS`: held freely, at a known place in air, or in the phantom."""
-        if self.place is None:
-            return "free"
-        return "under" if self.under_surface else "surface"
-
-
 def camera_slice(side: str) -> slice:
-    """Return where a camera's parameters are in the vector."""
+    """Return the slice of the parameters of a camera."""
     start = SIDES.index(side) * _CAMERA
     return slice(start, start + _CAMERA)
 
 
 def unit_of(name: str) -> tuple[float, str]:
-    """Return the factor to a person's unit of a parameter or a camera's turn, and that unit."""
+    """Return the factor to the display unit of a parameter or a rotation, and that unit."""
     if "tilt" in name or "turned" in name:
         return math.degrees(1.0), "deg"
     return (1e3, "mm") if name.endswith(("surface_height", "window_offset")) else (1.0, "")
@@ -109,23 +61,23 @@ class RigModel:
     Parameters
     ----------
     start : StereoCalibration
-        Cameras and windows that the parameters start from.
+        Initial cameras and windows.
     views : list of BoardView
-        What was seen.
+        Views of the board.
     boards : ndarray, shape (len(views), 4, 4)
-        T_rig_board of each view that the parameters start from.
+        Initial T_rig_board of each view.
     tied : bool
-        Whether the right camera follows the left one, at the pose relative to it that both start
-        with; its own rotation and translation then change nothing.
+        Whether the relative pose of the cameras is fixed; rotation and translation of the right
+        camera are then unused.
 
     Attributes
     ----------
     names : tuple of str
-        Of the parameters that all views share, `left.fx` and so on; they come first.
+        Names of the parameters that all views share, such as `left.fx`; they come first.
     shared : int
-        How many these are.
+        Number of shared parameters.
     start : ndarray, shape (p,)
-        The parameters that it starts from.
+        Initial parameters.
     """
 
     def __init__(
@@ -162,7 +114,7 @@ class RigModel:
         self._steps = np.array([_STEPS[name.split(".")[-1][0]] for name in names])
 
     def calibration(self, parameters: Array) -> StereoCalibration:
-        """Return the calibration that a parameter vector stands for."""
+        """Return the calibration of a parameter vector."""
         left, right = (self._camera(parameters, side) for side in SIDES)
         return StereoCalibration(left, right)
 
@@ -175,12 +127,12 @@ class RigModel:
         return poses
 
     def residuals(self, parameters: Array) -> Array:
-        """Return seen minus expected pixels, left then right, shape (2 * corners,) [px]."""
+        """Return measured minus expected pixels, left then right, shape (2 * corners,) [px]."""
         seen = [(self.pixels[s] - self.project(parameters, s)).ravel() for s in SIDES]
         return np.concatenate(seen)
 
     def project(self, parameters: Array, side: str) -> Array:
-        """Return where one camera should see its corners, shape (n, 2) [px]."""
+        """Return the expected pixels of the corners of one camera, shape (n, 2) [px]."""
         camera, under = self._camera(parameters, side), self._under[side]
         boards, transform = self.board_poses(parameters)[self.view_of[side]], camera.T_optical_rig
         corners = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side])
@@ -196,9 +148,9 @@ class RigModel:
         Parameters
         ----------
         parameters : ndarray, shape (p,)
-            Where.
+            Point of the derivatives.
         free : ndarray of bool, shape (p,)
-            Which parameters.
+            Parameters to vary.
         """
         count = {side: 2 * len(self.pixels[side]) for side in SIDES}
         result = np.zeros((sum(count.values()), len(parameters)))
@@ -210,7 +162,7 @@ class RigModel:
                 if free[column]:
                     slopes = self._slopes(parameters, side, np.array([column]))
                     result[rows, column] = -slopes.ravel()
-            # One board's pose moves that board's corners only: all boards are moved at once.
+            # The pose of a board affects only its own corners: vary all boards at once.
             of_boards = np.arange(self.shared, len(parameters)).reshape(-1, 6)
             lines = first + np.arange(count[side]).reshape(-1, 2)
             for columns in of_boards[:, : 6 * bool(np.any(free[self.shared :]))].T:
@@ -219,14 +171,14 @@ class RigModel:
         return result[:, free]
 
     def _slopes(self, parameters: Array, side: str, columns: NDArray[np.intp]) -> Array:
-        """Return d(pixel)/d(parameters) of some that are moved together, shape (n, 2)."""
+        """Return d(pixel)/d(parameters) for parameters that vary together, shape (n, 2)."""
         step = np.zeros_like(parameters)
         step[columns] = self._steps[columns]
         above, below = (self.project(parameters + s * step, side) for s in (1.0, -1.0))
         return np.asarray((above - below) / (2.0 * self._steps[columns[0]]))
 
     def _transform(self, parameters: Array, side: str) -> Array:
-        """Return T_optical_rig: turned about the camera's own centre, then shifted."""
+        """Return T_optical_rig: rotated about the centre of the camera, then translated."""
         start = self._start[side].T_optical_rig
         if self.tied and side == "right":
             left = self._start["left"].T_optical_rig

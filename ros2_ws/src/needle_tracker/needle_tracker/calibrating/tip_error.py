@@ -1,7 +1,7 @@
-"""Effect of a calibration's error on a tip in the phantom.
+"""Effect of the error of a calibration on tips in the phantom.
 
-The two rays of a wrong calibration still meet, somewhere else: nothing but this computation, or a
-target of known place, shows it.
+The two rays of a wrong calibration still meet, but elsewhere: only this computation, or a target of
+known place, reveals the error.
 """
 
 from __future__ import annotations
@@ -10,16 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
-from needle_tracker.calibrating.calibration_session import Place
-from needle_tracker.calibrating.rig_model import BoardView, Corners, RigModel
+from needle_tracker.calibrating.calibration_session import BoardView, Corners, Place
+from needle_tracker.calibrating.rig_model import RigModel
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.optics.refraction import stereo_views
 from needle_tracker.stereo.triangulation import midpoint
 
 Array = NDArray[np.float64]
 
-# Where the needle goes, in `rig` [m]: to both sides of its axis, and along it; and so far it keeps
-# behind the windows.
+# Region of the needle in `rig` [m]: across z, along z, and behind the windows.
 HALF_HEIGHT, HALF_WIDTH = 0.0155, 0.015
 INSERTIONS = (0.005, 0.120)
 LEAST_DEPTH = 1e-3
@@ -30,19 +29,19 @@ _SEED = 0
 def needle_points(
     calibration: StereoCalibration, counts: tuple[int, int, int] = (4, 3, 5)
 ) -> Array:
-    """Return a grid of points where the needle goes, shape (n, 3), in `rig` [m].
+    """Return a grid of points in the region of the needle, shape (n, 3), in `rig` [m].
 
     Parameters
     ----------
     calibration : StereoCalibration
-        The points are behind both of its windows.
+        The points are behind both windows.
     counts : tuple of int
-        Points along x, y and z; fewer where some would be outside.
+        Points along x, y and z, before those outside are removed.
 
     Raises
     ------
     UserError
-        No place about the needle's axis is behind both windows.
+        No point is behind both windows.
     """
     axes = (
         np.linspace(HALF_HEIGHT, -HALF_HEIGHT, counts[0]),
@@ -58,14 +57,14 @@ def needle_points(
 
 
 def tip_shifts(assumed: StereoCalibration, true: StereoCalibration) -> Array:
-    """Return by how much tips are seen beside their place, shape (n, 3), in `rig` [m].
+    """Return the errors of tips, shape (n, 3), in `rig` [m].
 
     Parameters
     ----------
     assumed : StereoCalibration
-        What tips are triangulated with.
+        Calibration of the triangulation.
     true : StereoCalibration
-        What the rig really is.
+        True calibration.
     """
     points = needle_points(true)
     left, right = (view.project(points) for view in stereo_views(true))
@@ -73,14 +72,14 @@ def tip_shifts(assumed: StereoCalibration, true: StereoCalibration) -> Array:
 
 
 def measured_points(assumed: StereoCalibration, left: Array, right: Array) -> Array:
-    """Return the points in `rig` [m], shape (n, 3), that a calibration takes pixels for.
+    """Return the points of pairs of pixels by a calibration, shape (n, 3), in `rig` [m].
 
     Parameters
     ----------
     assumed : StereoCalibration
-        What they are triangulated with.
+        Calibration of the triangulation.
     left, right : ndarray, shape (n, 2)
-        The pixels at which each camera sees them.
+        Pixels of the two cameras.
     """
     views = stereo_views(assumed)
     return np.stack([midpoint(views, pair) for pair in zip(left, right, strict=True)])
@@ -89,16 +88,16 @@ def measured_points(assumed: StereoCalibration, left: Array, right: Array) -> Ar
 def tip_error_p95(
     calibration: StereoCalibration, covariance: Array, *, tied: bool = False
 ) -> float:
-    """Return the 95 % error of tips that a calibration's uncertainty causes [m].
+    """Return the 95 % error of tips from the uncertainty of a calibration [m].
 
     Parameters
     ----------
     calibration : StereoCalibration
         The calibration.
     covariance : ndarray, shape (s, s)
-        Of the parameters that all views share (`RigModel.names`).
+        Covariance of the parameters that all views share (`RigModel.names`).
     tied : bool
-        Whether the right camera follows the left one.
+        Whether the relative pose of the cameras is fixed.
     """
     generator = np.random.default_rng(_SEED)
     values, vectors = np.linalg.eigh(covariance)
@@ -111,7 +110,7 @@ def tip_error_p95(
 def _tip_slopes(calibration: StereoCalibration, *, tied: bool) -> Array:
     """Return d(tip)/d(shared parameters), shape (points, 3, s).
 
-    The pixels stay: J_tip d(tip) + J_parameters d(parameters) = 0, in the least squares sense.
+    The pixels are constant: J_tip d(tip) + J_parameters d(parameters) = 0, by least squares.
     """
     points = needle_points(calibration)
     nowhere = Corners(points, np.zeros((len(points), 2)))
@@ -119,7 +118,7 @@ def _tip_slopes(calibration: StereoCalibration, *, tied: bool) -> Array:
     model = RigModel(calibration, [view], np.eye(4)[None], tied=tied)
     free = np.zeros(len(model.start), dtype=bool)
     free[: model.shared] = True
-    # Residuals are seen minus expected: the sign turns twice.
+    # Residuals are measured minus expected: the sign changes twice.
     by_parameter = model.jacobian(model.start, free).reshape(2, len(points), 2, -1)
     cameras = stereo_views(calibration)
     slopes = []

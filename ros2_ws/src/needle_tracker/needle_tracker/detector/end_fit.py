@@ -1,4 +1,4 @@
-"""Fit the shaft's line and its end to the network's maps, about where the end is expected."""
+"""Fit of the line and the end of the shaft to the maps of the network, about an expected end."""
 
 # Compiled functions take plain numbers, one by one; numba's floor and ceil are floats.
 # ruff: noqa: PLR0917, RUF046
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,29 +17,53 @@ from needle_core.compiled import compiled, inlined
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-LINE_WIDTHS = 8.0
-"""Shaft behind the end that the line is fitted to [needle widths]: short enough to be straight."""
-ASIDE_WIDTHS = 2.0
-"""Beside the line, map that is read [needle widths]."""
-_MIN_LINE_WIDTHS = 2.0  # a shorter line has no direction [needle widths]
-_SLOPES, _MAX_SLOPE = 7, 0.15  # directions tried about the expected one [-, tangent]
-_PASSES = 2  # of the line's fit; each centres the window anew
-# What light and blur leave in line and end beyond what the maps say [needle widths]: from errors in
-# path-traced pairs. What a bevel does to the end of both views alike is `FilterSettings.end_sigma`.
-_LINE_SYSTEMATIC = _END_SYSTEMATIC = 0.1
-_ONE_SIGMA = 0.5 * (1.0 + math.erf(math.sqrt(0.5)))  # of a normal distribution, share below it
-_AROUND_WIDTHS = 3.0  # to both sides, ends that may be one that a bevel blurs [needle widths]
-_FLAT_SHARE = 0.05  # probability that the map of ends says nothing about the end
+
+class EndFitSettings(NamedTuple):
+    """Numbers of the fit; lengths are in needle widths.
+
+    Attributes
+    ----------
+    line_widths : float
+        Shaft behind the end that the line is fitted to: short enough to be straight at the largest
+        curvature of a needle.
+    least_line_widths : float
+        A shorter line has no direction.
+    aside_widths : float
+        Margin of the map on both sides of the line.
+    largest_slope : float
+        Tangent of the largest angle between the fitted line and the expected direction.
+    systematic_widths : float
+        Standard deviation of line and end beyond that of the maps, caused by light and blur: from
+        the errors in path-traced pairs. An error that both views share is
+        `FilterSettings.end_sigma`.
+    around_widths : float
+        Half the length within which ends belong to one end that a bevel blurs.
+    hidden_end : float
+        Probability that the network does not show an end that is there.
+    """
+
+    line_widths: float = 8.0
+    least_line_widths: float = 2.0
+    aside_widths: float = 2.0
+    largest_slope: float = 0.15
+    systematic_widths: float = 0.1
+    around_widths: float = 3.0
+    hidden_end: float = 0.05
+
+
+FIT = EndFitSettings()
+_PASSES = 2  # of the line's fit; the second centres the window on the result of the first
+_ONE_SIGMA = 0.5 * (1.0 + math.erf(math.sqrt(0.5)))  # share of a normal distribution below it
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImageEnd:
-    """The needle's end as one camera sees it.
+    """End of the needle in the image of one camera.
 
     Attributes
     ----------
     point : ndarray, shape (2,)
-        The end of the shaft's axis [px].
+        End of the axis of the shaft [px].
     direction : ndarray, shape (2,)
         Unit vector along the shaft, towards the end.
     sigma_across, sigma_along : float
@@ -76,53 +101,51 @@ def fit_end(
     Parameters
     ----------
     shaft, ends : ndarray of float32, shape (height, width)
-        The network's maps of a window.
+        Maps of a window.
     point, direction : ndarray, shape (2,)
         Expected end in the window [px], and unit vector along the shaft towards it.
     behind : float
         Length of shaft behind the end [px].
     along, across : float
-        How far from the point the end may be, along and across the direction [px].
+        Largest distance of the end from the point, along and across the direction [px].
     width : float
-        Of the needle [px].
+        Width of the needle [px].
 
     Returns
     -------
     ImageEnd or None
         None if the maps show no shaft there.
     """
-    back = min(behind, LINE_WIDTHS * width)
-    if back < _MIN_LINE_WIDTHS * width:
+    back = min(behind, FIT.line_widths * width)
+    if back < FIT.least_line_widths * width:
         return None
-    result = np.zeros(8)
-    found = _fit(
-        shaft,
-        ends,
-        np.ascontiguousarray(point, np.float64),
-        np.ascontiguousarray(direction, np.float64),
-        back,
-        along,
-        across,
-        width,
-        result,
-    )
-    if not found:
-        return None
-    u, v, d_u, d_v, sigma_across, sigma_along, sigma_angle, certainty = result.tolist()
-    end = np.array([u, v])
+    point = np.ascontiguousarray(point, np.float64)
+    direction = np.ascontiguousarray(direction, np.float64)
+    offset, slope = _best_line(shaft, point, direction, back, across, width)
+    end, spread = 0.0, along
+    sigma_across = sigma_angle = certainty = 0.0
+    for _ in range(_PASSES):
+        length, offset, slope, sigma_across, sigma_angle, certainty = _fit_line(
+            shaft, point, direction, offset, slope, end, back, width
+        )
+        if length < FIT.least_line_widths * width:
+            return None
+        end, spread = _end_on_line(ends, point, direction, offset, slope, along, width)
+    norm, across_direction = math.hypot(1.0, slope), np.array([-direction[1], direction[0]])
+    fitted = point + end * direction + (offset + slope * end) * across_direction
     return ImageEnd(
-        end,
-        np.array([d_u, d_v]),
-        math.hypot(sigma_across, _LINE_SYSTEMATIC * width),
-        math.hypot(sigma_along, _END_SYSTEMATIC * width),
-        math.hypot(sigma_angle, _LINE_SYSTEMATIC / LINE_WIDTHS),
-        _ends_about(ends, end, width),
+        fitted,
+        (direction + slope * across_direction) / norm,
+        math.hypot(sigma_across, FIT.systematic_widths * width),
+        math.hypot(spread * norm, FIT.systematic_widths * width),
+        math.hypot(sigma_angle, FIT.systematic_widths / FIT.line_widths),
+        _ends_about(ends, fitted, width),
         certainty,
     )
 
 
 def _ends_about(ends: Map, point: Array, width: float) -> float:
-    """Return the expected number of ends within a needle's width of a point."""
+    """Return the expected number of ends within the width of a needle of a point."""
     half = max(int(math.ceil(width)), 2)
     column, row = np.rint(point).astype(int)
     rows = slice(max(row - half, 0), max(row + half + 1, 0))
@@ -132,7 +155,7 @@ def _ends_about(ends: Map, point: Array, width: float) -> float:
 
 @inlined
 def _at(image: Map, x: float, y: float) -> float:
-    """Return a map at a place, by linear interpolation; 0 outside."""
+    """Return the value of a map by bilinear interpolation; 0 outside."""
     column, row = int(math.floor(x)), int(math.floor(y))
     if column < 0 or row < 0 or column + 1 >= image.shape[1] or row + 1 >= image.shape[0]:
         return 0.0
@@ -151,54 +174,23 @@ def _on_line(image: Map, point: Array, direction: Array, along: float, across: f
 
 
 @compiled
-def _fit(
-    shaft: Map,
-    ends: Map,
-    point: Array,
-    direction: Array,
-    back: float,
-    along: float,
-    across: float,
-    width: float,
-    result: Array,
-) -> bool:
-    """Write end (u, v), direction (u, v), sigmas across, along, of the angle, and the certainty."""
-    offset, slope = _best_line(shaft, point, direction, back, across, width)
-    end = 0.0
-    line = np.empty(6)
-    spread = along
-    for _ in range(_PASSES):
-        _fit_line(shaft, point, direction, offset, slope, end, back, width, line)
-        if line[0] < _MIN_LINE_WIDTHS * width:
-            return False
-        offset, slope = line[1], line[2]
-        end, spread = _end_on_line(ends, point, direction, offset, slope, along, width)
-    norm = math.sqrt(1.0 + slope * slope)
-    beside = offset + slope * end
-    result[0] = point[0] + end * direction[0] - beside * direction[1]
-    result[1] = point[1] + end * direction[1] + beside * direction[0]
-    result[2] = (direction[0] - slope * direction[1]) / norm
-    result[3] = (direction[1] + slope * direction[0]) / norm
-    result[4], result[5], result[6], result[7] = line[3], spread * norm, line[4], line[5]
-    return True
-
-
-@compiled
 def _best_line(
     shaft: Map, point: Array, direction: Array, back: float, across: float, width: float
 ) -> tuple[float, float]:
-    """Return offset [px] and slope of the line that the most shaft lies on."""
+    """Return offset [px] and slope of the line with the largest sum of shaft probability."""
     best, offset, slope = -1.0, 0.0, 0.0
     pitch = 0.5 * width
     steps = int(math.ceil(across / pitch))
+    # From one slope to the next, the far end of the line moves by at most the pitch.
+    slopes = int(math.ceil(FIT.largest_slope * back / pitch))
     for j in range(-steps, steps + 1):
-        for k in range(_SLOPES):
-            lean = _MAX_SLOPE * (2.0 * k / (_SLOPES - 1) - 1.0)
+        for k in range(-slopes, slopes + 1):
+            lean = FIT.largest_slope * k / slopes
             total = 0.0
             s = -back
             while s <= 0.0:
                 total += _on_line(shaft, point, direction, s, j * pitch + lean * s)
-                s += 0.5 * width
+                s += pitch
             if total > best:
                 best, offset, slope = total, j * pitch, lean
     return offset, slope
@@ -214,12 +206,11 @@ def _fit_line(
     end: float,
     back: float,
     width: float,
-    line: Array,
-) -> None:
-    """Fit a line to the middles of the shaft, by weighted least squares.
+) -> tuple[float, float, float, float, float, float]:
+    """Fit a line to the centre of the shaft, by weighted least squares.
 
-    Writes the shaft's length [px], offset and slope, their standard deviations at the end, and the
-    mean probability along the line.
+    Return the length of the shaft [px], offset and slope, their standard deviations at the end, and
+    the mean probability along the line.
     """
     count = int(back)
     places, middles, weights = np.empty(count), np.empty(count), np.empty(count)
@@ -242,23 +233,23 @@ def _fit_line(
             breadth += weights[i] * (second / mass - (moment / mass) ** 2)
         certainty += _on_line(shaft, point, direction, s, centre)
     total = weights.sum()
-    line[0], line[5] = total, certainty / count
+    certainty /= count
     if total < 2.0:
-        return
+        return total, offset, slope, 0.0, 0.0, certainty
     mean = (weights * places).sum() / total
     middle = (weights * middles).sum() / total
-    spread = max((weights * (places - mean) ** 2).sum() / total, 1e-9)
+    spread = (weights * (places - mean) ** 2).sum() / total
     lean = (weights * (places - mean) * (middles - middle)).sum() / (total * spread)
     residuals = middles - middle - lean * (places - mean)
     variance = (weights * residuals * residuals).sum() / total
-    # What disturbs the middles does so over about a needle's width.
+    # Disturbances of the centre are correlated over about the width of the needle.
     independent = max(total / width - 2.0, 1.0)
-    line[1], line[2] = middle - lean * mean, lean
-    # The variance of one shaft's probability across it is width^2 / 12, of blurred edges a little
-    # more. What is broader may be two, such as a needle beside its shadow.
-    doubt = max(breadth / total - width * width / 6.0, 0.0)
-    line[3] = math.sqrt(doubt + variance / independent * (1.0 + (end - mean) ** 2 / spread))
-    line[4] = math.sqrt(variance / independent / spread)
+    # The variance of the probability across one shaft is width^2 / 12, with blurred edges up to
+    # twice that. A broader distribution may be two lines, such as a needle beside its shadow.
+    doubt = max(breadth / total - 2.0 * width * width / 12.0, 0.0)
+    sigma = math.sqrt(doubt + variance / independent * (1.0 + (end - mean) ** 2 / spread))
+    sigma_angle = math.sqrt(variance / independent / spread)
+    return total, middle - lean * mean, lean, sigma, sigma_angle, certainty
 
 
 @compiled
@@ -271,10 +262,10 @@ def _end_on_line(
     along: float,
     width: float,
 ) -> tuple[float, float]:
-    """Return the median of the end's place along the line, and its standard deviation [px].
+    """Return the median of the position of the end along the line, and its standard deviation [px].
 
-    The network's intensity, summed across the line, is the density of the end's place. A small
-    share is spread over the whole window, so that a map without an end says that it knows nothing.
+    The intensity of ends, summed across the line, is the density of the position. The share
+    `hidden_end` is uniform over the window, so that a map without an end gives a wide spread.
     """
     count = 2 * int(along) + 1
     density = np.empty(count)
@@ -289,9 +280,11 @@ def _end_on_line(
         density[i] = total
     _keep_about_the_most(density, width)
     known = density.sum()
-    flat = max(_FLAT_SHARE, 1.0 - known) if known < _FLAT_SHARE else _FLAT_SHARE
+    flat = max(FIT.hidden_end, 1.0 - known) if known < FIT.hidden_end else FIT.hidden_end
     for i in range(count):
-        density[i] = (density[i] / max(known, _FLAT_SHARE)) * (1.0 - _FLAT_SHARE) + flat / count
+        density[i] = (density[i] / max(known, FIT.hidden_end)) * (
+            1.0 - FIT.hidden_end
+        ) + flat / count
     density /= density.sum()
     early, late = _quantile(density, 1.0 - _ONE_SIGMA), _quantile(density, _ONE_SIGMA)
     return _quantile(density, 0.5) - along, 0.5 * (late - early)
@@ -299,11 +292,11 @@ def _end_on_line(
 
 @compiled
 def _keep_about_the_most(density: Array, width: float) -> None:
-    """Set the density to 0 but for a part of it that holds the most.
+    """Set the density to 0 outside the interval that holds the most of it.
 
-    A wide window may show other ends, too, and what is between two is none.
+    A wide window may show two ends, and their median would be at neither.
     """
-    count = 2 * int(_AROUND_WIDTHS * width) + 1
+    count = 2 * int(FIT.around_widths * width) + 1
     if len(density) <= count:
         return
     total = most = density[:count].sum()
@@ -318,10 +311,10 @@ def _keep_about_the_most(density: Array, width: float) -> None:
 
 @compiled
 def _quantile(density: Array, level: float) -> float:
-    """Return the place below which a share of the density lies, in samples."""
+    """Return the quantile of a density, in samples."""
     below = 0.0
     for i in range(len(density)):
-        # The density of a sample is that of the pixel about it.
+        # A sample is the density of the pixel about it.
         if level <= below + density[i]:
             place: float = i - 0.5 + (level - below) / density[i]
             return place

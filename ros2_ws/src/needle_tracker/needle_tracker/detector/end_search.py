@@ -1,8 +1,8 @@
-"""Search one camera's maps for ends that a shaft joins to the entry, by dynamic programming.
+"""Search of the maps of one camera for ends that a shaft connects to the entry.
 
-The needle runs outwards from the entry, so each row of the polar search grid holds one cell of it.
-A path's score is the log-likelihood ratio of its cells, shaft against floor, plus that of an end
-where it stops.
+The needle runs outwards from the entry, so it has one cell in each row of the polar search grid.
+The score of a path is the log-likelihood ratio of its cells, shaft against floor, plus that of an
+end in its last cell; dynamic programming maximizes it.
 """
 
 # Compiled functions take plain numbers, one by one.
@@ -17,39 +17,62 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_core.compiled import compiled, inlined
+from needle_tracker.detector.end_fit import FIT
 from needle_tracker.detector.search_grid import SearchGrid
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Cells = NDArray[np.int64]
 
-CANDIDATES = 10
-"""Ends per view that are looked at more closely."""
-_ROW_WEIGHT = 0.25  # neighbouring rows say much the same: they count for a quarter
-_LOG_RATIO = 2.0  # of one row, at most
-# Shares of the training's pixels that are shaft, and ends in the window about a cell: the network's
-# probabilities over these are likelihood ratios.
-_SHAFT_PRIOR, _ENDS_PRIOR = 0.04, 1.5e-3
-_LATE_START = -4.0  # score of a path that begins away from the entry
-_SURE = 6.0  # most of a path: a longer shaft is no surer, or long lines would hide short needles
-_HIDDEN_END = 0.05  # likelihood ratio of an end that the network does not see
-_MAX_SLOPE = 1.0  # sideways per outwards: 45 deg from the radius, pre-bend included
-_APART = 0.8e-3  # between two ends of one view [m]
-_DIRECTION_ROWS = 8  # rows that give a path's direction at its end
+
+@dataclasses.dataclass(frozen=True)
+class SearchSettings:
+    """Numbers of the search for paths; scores are natural logarithms of likelihood ratios.
+
+    Attributes
+    ----------
+    candidates : int
+        Ends of each view that are examined further.
+    smooth_rows : int
+        Rows over which the steps of the cells average out.
+    shaft_prior, ends_prior : float
+        Share of shaft among the pixels of the training, and ends in the window of a cell: the
+        network's probabilities over these are likelihood ratios.
+    row_weight : float
+        Weight of a row, since neighbouring rows are correlated.
+    row_limit : float
+        Largest size of the score of one row.
+    late_start : float
+        Score of a path that begins away from the entry.
+    path_limit : float
+        Largest score of a shaft, so that a long line does not hide a short needle.
+    """
+
+    candidates: int = 10
+    smooth_rows: int = 7
+    shaft_prior: float = 0.04
+    ends_prior: float = 1.5e-3
+    row_weight: float = 0.25
+    row_limit: float = 2.0
+    late_start: float = -4.0
+    path_limit: float = 6.0
+
+
+SEARCH = SearchSettings()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ShaftPath:
-    """A path from the entry to what may be the needle's end, in one image.
+    """Path in one image from the entry to a candidate for the end of the needle.
 
     Attributes
     ----------
     pixels : ndarray, shape (n, 2)
-        From the entry outwards, the end last, good to about a cell of the grid [px].
+        From the entry outwards, the end last, to the resolution of the grid [px].
     score : float
         Log-likelihood ratio of shaft and end.
     shaft : float
-        Mean probability of shaft along it.
+        Mean probability of shaft along the path.
     """
 
     pixels: Array
@@ -64,37 +87,41 @@ class ShaftPath:
     @property
     def direction(self) -> Array:
         """Return the unit vector towards the end, shape (2,)."""
-        ahead = self.pixels[-1] - self.pixels[max(len(self.pixels) - 1 - _DIRECTION_ROWS, 0)]
-        return np.asarray(ahead / max(float(np.linalg.norm(ahead)), 1e-9))
+        ahead = self.pixels[-1] - self.pixels[max(len(self.pixels) - 1 - SEARCH.smooth_rows, 0)]
+        return np.asarray(ahead / np.linalg.norm(ahead))
 
 
 def find_paths(
     grid: SearchGrid, shaft: Map, ends: Map, first_end: int, last_end: int
 ) -> list[ShaftPath]:
-    """Return the paths with the largest scores, the best first, their ends apart.
+    """Return the paths with the largest scores and distinct ends, the best first.
 
     Parameters
     ----------
     grid : SearchGrid
-        The camera's grid.
+        Grid of the camera.
     shaft, ends : ndarray of float32, shape (rows, columns)
-        The network's maps at the cells of the grid's first rows.
+        Maps at the cells of the first rows of the grid.
     first_end, last_end : int
         First and last row in which a path may end.
     """
     rows = min(last_end + 1, len(shaft))
+    reachable = grid.reachable[:rows]
     pitch = grid.distances[:rows] * grid.angle_pitch
-    steps = np.maximum(1, np.ceil(_MAX_SLOPE * grid.row_pitch / pitch)).astype(np.int64)
-    apart = np.ceil(_APART / pitch).astype(np.int64)
+    # A path leaves the radius by at most 45 deg, the pre-bend included.
+    steps = np.maximum(1, np.ceil(grid.row_pitch / pitch)).astype(np.int64)
+    # Ends within two rows are one.
+    apart = np.ceil(2.0 * grid.row_pitch / pitch).astype(np.int64)
+    shaft_scores, end_scores = _scores(shaft[:rows], ends[:rows], reachable)
     cells, lengths, scores = _best_paths(
-        shaft[:rows],
-        ends[:rows],
-        grid.reachable[:rows],
+        shaft_scores,
+        end_scores,
         steps,
         apart,
-        math.ceil(_APART / grid.row_pitch),
         max(first_end, 1),
-        CANDIDATES,
+        SEARCH.candidates,
+        SEARCH.late_start,
+        SEARCH.path_limit,
     )
     found = []
     for columns, length, score in zip(cells, lengths, scores, strict=True):
@@ -105,30 +132,40 @@ def find_paths(
     return found
 
 
+def _scores(shaft: Map, ends: Map, reachable: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return the log-likelihood ratios of shaft in each cell, and of an end in it.
+
+    A cell outside the image has no shaft score and no end.
+    """
+    chance, prior = shaft.astype(np.float64), SEARCH.shaft_prior
+    with np.errstate(divide="ignore"):
+        ratio = np.log(chance / (1.0 - chance)) - math.log(prior / (1.0 - prior))
+    limited = SEARCH.row_weight * np.clip(ratio, -SEARCH.row_limit, SEARCH.row_limit)
+    end = np.log(ends.astype(np.float64) / SEARCH.ends_prior + FIT.hidden_end)
+    return np.where(reachable, limited, 0.0), np.where(reachable, end, -np.inf)
+
+
 @compiled
 def _best_paths(
-    shaft: Map,
-    ends: Map,
-    reachable: NDArray[np.bool_],
+    shaft_scores: Array,
+    end_scores: Array,
     steps: Cells,
     apart: Cells,
-    rows_apart: int,
     first_end: int,
     count: int,
+    late_start: float,
+    path_limit: float,
 ) -> tuple[Cells, Cells, Array]:
     """Return each path's columns, its number of rows (0: no path) and its score."""
-    rows, columns = shaft.shape
-    total = _accumulated(shaft, reachable, steps)
-    score = np.full((rows, columns), -np.inf)
-    for i in range(first_end, rows):
-        for j in range(columns):
-            if reachable[i, j]:
-                score[i, j] = total[i, j] + math.log(ends[i, j] / _ENDS_PRIOR + _HIDDEN_END)
-    # An end is better than all places about it, those farther along its own shaft among them.
+    rows, columns = shaft_scores.shape
+    total = _accumulated(shaft_scores, steps, late_start, path_limit)
+    score = total + end_scores
+    score[:first_end] = -np.inf
+    # A candidate is the best place about it, also along its own shaft.
     peaks = np.full((rows, columns), -np.inf)
     for i in range(first_end, rows):
         for j in range(columns):
-            if score[i, j] > 0.0 and _is_peak(score, i, j, rows_apart, apart[i]):
+            if score[i, j] > 0.0 and _is_peak(score, i, j, apart[i]):
                 peaks[i, j] = score[i, j]
     cells = np.zeros((count, rows), np.int64)
     lengths = np.zeros(count, np.int64)
@@ -144,36 +181,30 @@ def _best_paths(
 
 
 @compiled
-def _accumulated(shaft: Map, reachable: NDArray[np.bool_], steps: Cells) -> Array:
-    """Return the largest log-likelihood ratio of all paths to each cell.
+def _accumulated(scores: Array, steps: Cells, late_start: float, path_limit: float) -> Array:
+    """Return the largest score of all paths to each cell.
 
-    total[i, j] = min(ratio(shaft[i, j]) + max(total[i - 1, j - step ... j + step], late), sure)
+    total[i, j] = min(score[i, j] + max(total[i - 1, j - step ... j + step], late), limit)
     """
-    rows, columns = shaft.shape
+    rows, columns = scores.shape
     total = np.zeros((rows, columns))
-    prior = math.log(_SHAFT_PRIOR / (1.0 - _SHAFT_PRIOR))
     for i in range(rows):
         for j in range(columns):
             if i:
-                total[i, j] = _LATE_START
+                total[i, j] = late_start
                 for k in range(max(j - steps[i], 0), min(j + steps[i] + 1, columns)):
                     total[i, j] = max(total[i, j], total[i - 1, k])
-            # A cell outside the image says nothing.
-            if reachable[i, j]:
-                chance = min(max(shaft[i, j], 1e-3), 1.0 - 1e-3)
-                ratio = math.log(chance / (1.0 - chance)) - prior
-                total[i, j] += _ROW_WEIGHT * min(max(ratio, -_LOG_RATIO), _LOG_RATIO)
-                total[i, j] = min(total[i, j], _SURE)
+            total[i, j] = min(total[i, j] + scores[i, j], path_limit)
     return total
 
 
 @compiled
 def _read_back(total: Array, steps: Cells, end: int, column: int, cells: Cells) -> None:
-    """Write the columns of the path that ends in a cell."""
+    """Write the columns of the path to a cell."""
     columns = total.shape[1]
     cells[end] = column
     for i in range(end, 0, -1):
-        # Of equals the straightest.
+        # Among equal totals, choose the straightest path.
         chosen, largest = column, total[i - 1, column]
         for away in range(1, steps[i] + 1):
             for k in (column - away, column + away):
@@ -184,11 +215,11 @@ def _read_back(total: Array, steps: Cells, end: int, column: int, cells: Cells) 
 
 
 @inlined
-def _is_peak(score: Array, row: int, column: int, rows_apart: int, apart: int) -> bool:
-    """Return whether no score about a cell is above its own; of equals the first is the peak."""
+def _is_peak(score: Array, row: int, column: int, apart: int) -> bool:
+    """Return whether a cell has the largest score about it; among equals, the first."""
     rows, columns = score.shape
     own = score[row, column]
-    for i in range(max(row - rows_apart, 0), min(row + rows_apart + 1, rows)):
+    for i in range(max(row - 2, 0), min(row + 2 + 1, rows)):
         for j in range(max(column - apart, 0), min(column + apart + 1, columns)):
             first = i < row or (i == row and j < column)
             if score[i, j] > own or (first and score[i, j] == own):

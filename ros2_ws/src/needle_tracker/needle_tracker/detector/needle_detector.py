@@ -1,4 +1,4 @@
-"""One camera's images: search them for the needle, or fit its end where it is expected."""
+"""Detector of the needle in the images of one camera: search, or fit of an expected end."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.detector.end_fit import ASIDE_WIDTHS, LINE_WIDTHS, ImageEnd, fit_end
+from needle_tracker.detector.end_fit import FIT, ImageEnd, fit_end
 from needle_tracker.detector.end_search import ShaftPath, find_paths
 from needle_tracker.detector.needle_net import (
     MARGIN_PX,
@@ -21,26 +21,46 @@ from needle_tracker.detector.needle_net import (
     NeedleNet,
     normalized,
 )
-from needle_tracker.detector.reach import Reach
-from needle_tracker.detector.search_grid import SearchGrid, make_search_grid
+from needle_tracker.detector.search_grid import Reach, SearchGrid, make_search_grid
 from needle_tracker.optics.refraction import RefractedCamera
 
 Array = NDArray[np.float64]
 Pixels = TypeVar("Pixels", NDArray[np.float32], NDArray[np.float64])
 
-_COARSE_WIDTH_PX = 4.4
-"""Needles at least so wide are searched at half size: there they are 2.2 px, the least trained."""
-_FULL_SIZE_REACH = 20e-3
-"""From the entry, all is searched at full size, which shows more of a short needle [m]."""
-_STRIPS = 3  # boxes that an image is searched in
-_END_BLUR_PX = 5  # side of the square that ends are summed over at a cell of the search grid
-_NEAR_WIDTHS = 5.0  # about a path, in which shaft and ends are looked for at full size [widths]
-_LEAST_ENDS = 0.05  # expected in a window from which on it is a candidate
-_AHEAD_WIDTHS = 4.0  # seen beyond the expected end: the network must see what follows
+
+@dataclasses.dataclass(frozen=True)
+class DetectorSettings:
+    """Numbers of the detector.
+
+    Attributes
+    ----------
+    coarse_width_px : float
+        Width from which on a needle is searched for at half size [px]: there it is 2.2 px wide, the
+        least width of the training.
+    full_size_reach : float
+        Distance from the entry up to which the search is at full size, which shows more of a short
+        needle [m].
+    strips : int
+        Boxes that cover the reachable part of an image; with more, the network evaluates fewer
+        pixels outside it.
+    end_window_px : int
+        Side of the square over which the ends about a cell are summed [px].
+    near_widths : float
+        Half the size of the region about a path that is examined at full size [needle widths].
+    """
+
+    coarse_width_px: float = 4.4
+    full_size_reach: float = 20e-3
+    strips: int = 3
+    end_window_px: int = 5
+    near_widths: float = 5.0
+
+
+DETECTOR = DetectorSettings()
 
 
 class NeedleDetector:
-    """The needle in one camera's images.
+    """Detector of the needle in the images of one camera.
 
     Parameters
     ----------
@@ -49,9 +69,9 @@ class NeedleDetector:
     needle_width : float
         Diameter of the needle, good to 30 % [m].
     reach : Reach
-        What the needle can do.
+        Physical reach of the needle.
     hole_clearance : float
-        Radius about the entry that is not searched [m].
+        Radius about the entry that is excluded from the search [m].
     net : NeedleNet
         The network.
 
@@ -76,27 +96,27 @@ class NeedleDetector:
         self.width_px = needle_width * self._px_per_m
         self._shrink = 1 if self.width_px <= MAX_WIDTH_PX else 2
         self._search_shrink = self._shrink
-        if self.width_px >= _COARSE_WIDTH_PX * self._shrink:
+        if self.width_px >= DETECTOR.coarse_width_px * self._shrink:
             self._search_shrink *= 2
-        self._grid: SearchGrid = make_search_grid(view, reach, first_distance=hole_clearance)
+        self._grid: SearchGrid = make_search_grid(view, reach, hole_clearance)
         self._entry = view.project(np.zeros(3))
         self._clear_px = hole_clearance * self._px_per_m
         self._backgrounds: dict[int, Map] = {}
         self._shrunk: dict[int, Image] = {}
 
     def set_background(self, image: Image | None) -> None:
-        """Take the view with less needle in it than any other, None to forget it."""
+        """Use an image as the background; None: the background is unknown."""
         self._backgrounds = {}
         if image is not None:
             for shrink in {self._shrink, self._search_shrink}:
-                self._backgrounds[shrink] = normalized(_smaller(image, shrink))
+                self._backgrounds[shrink] = normalized(_resized(image, shrink))
 
-    def see(self, image: Image) -> None:
-        """Take the image that the next calls are about."""
+    def set_image(self, image: Image) -> None:
+        """Use an image for the next calls."""
         self._shrunk = {1: image}
 
     def search(self, least: float, most: float) -> list[ShaftPath]:
-        """Return paths to what may be the needle's end, the best first.
+        """Return paths to candidates for the end of the needle, the best first.
 
         Parameters
         ----------
@@ -106,7 +126,7 @@ class NeedleDetector:
         grid = self._grid
         first, last = grid.row_of(least), grid.row_of(most)
         reachable = grid.reachable[: last + 1]
-        near = np.arange(last + 1)[:, None] < grid.row_of(_FULL_SIZE_REACH)
+        near = np.arange(last + 1)[:, None] < grid.row_of(DETECTOR.full_size_reach)
         maps = [
             self._sampled(reachable & part, shrink)
             for part, shrink in ((near, self._shrink), (~near, self._search_shrink))
@@ -118,10 +138,10 @@ class NeedleDetector:
         return find_paths(grid, shaft, ends, first, last)
 
     def trace(self, path: ShaftPath, end: ImageEnd) -> ShaftPath:
-        """Return the path to an end as the image at full size shows it, near one that was found."""
+        """Return the path to an end at full size, near a path that `search` found."""
         grid, rows = self._grid, len(path.pixels)
         off = np.linalg.norm(grid.pixels[:rows] - path.pixels[:, None], axis=-1)
-        near = grid.reachable[:rows] & (off < _NEAR_WIDTHS * self.width_px)
+        near = grid.reachable[:rows] & (off < DETECTOR.near_widths * self.width_px)
         if not near.any():
             return path
         shaft, ends = self._sampled(near, self._shrink)
@@ -134,7 +154,7 @@ class NeedleDetector:
         return found[0] if found else path
 
     def _sampled(self, cells: NDArray[np.bool_], shrink: int) -> tuple[Map, Map]:
-        """Return the maps at cells of the grid's first rows, 0 at all others."""
+        """Return the maps at cells of the first rows of the grid, 0 at all others."""
         places = _shrunk_px(self._grid.pixels[: len(cells)], np.float32(shrink))
         height, width = self._at(shrink).shape
         shaft, ends = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
@@ -143,8 +163,8 @@ class NeedleDetector:
             rows, columns = seen_shaft.shape
             shaft[y0 : y0 + rows, x0 : x0 + columns] = seen_shaft
             ends[y0 : y0 + rows, x0 : x0 + columns] = seen_ends
-        ends = cv2.boxFilter(ends, -1, (_END_BLUR_PX, _END_BLUR_PX), normalize=False)
-        # Cells may be farther apart than a thin needle is wide.
+        ends = cv2.boxFilter(ends, -1, (DETECTOR.end_window_px,) * 2, normalize=False)
+        # The pitch of the cells may exceed the width of a thin needle.
         shaft = cv2.dilate(shaft, np.ones((3, 3), np.uint8))
         sampled = [
             np.where(cells, cv2.remap(each, places[..., 0], places[..., 1], cv2.INTER_LINEAR), 0.0)
@@ -153,26 +173,28 @@ class NeedleDetector:
         return sampled[0], sampled[1]
 
     def ends_near(self, path: ShaftPath, *, hidden: bool) -> list[ImageEnd]:
-        """Return the ends that the image at full size shows about the end of a path.
+        """Return the ends at full size about the end of a path.
 
-        What half the size shows as one may be two, such as a needle beside its shadow.
+        Two lines, such as a needle and its shadow, may be one at half size.
 
         Parameters
         ----------
         path : ShaftPath
             From `search`.
         hidden : bool
-            Whether a shaft's line without an end will do where no end is seen.
+            Whether to return the line of the shaft alone if no end is found.
         """
         shrink, width = self._shrink, self.width_px
-        half = _NEAR_WIDTHS * width
-        box = self._box(path.end, path.direction, (-LINE_WIDTHS * width - half, half), half)
+        half = DETECTOR.near_widths * width
+        box = self._box(path.end, path.direction, (-FIT.line_widths * width - half, half), half)
         if box is None:
             return []
         shaft, ends, corner = self._evidence(shrink, box)
         size = 2 * round(width / shrink) + 1
         mass = cv2.boxFilter(ends, -1, (size, size), normalize=False)
-        peaks = (mass >= cv2.dilate(mass, np.ones((size, size), np.uint8))) & (mass > _LEAST_ENDS)
+        peaks = (mass >= cv2.dilate(mass, np.ones((size, size), np.uint8))) & (
+            mass > FIT.hidden_end
+        )
         found = []
         for row, column in np.argwhere(peaks):
             place = np.array([column, row], np.float64)
@@ -183,7 +205,7 @@ class NeedleDetector:
             if end is not None:
                 found.append(end)
         if hidden and not found:
-            # The end is hidden: the shaft's line still says where it is, across.
+            # The end is hidden, but the shaft determines its position across.
             place = _shrunk_px(path.end, shrink) - corner
             end = self._fitted((shaft, ends, corner), place, path.direction, half, 0.5 * width)
             found = [] if end is None else [end]
@@ -192,22 +214,24 @@ class NeedleDetector:
     def fit(
         self, point: Array, direction: Array, *, along: float, across: float
     ) -> ImageEnd | None:
-        """Fit line and end about where they are expected.
+        """Fit line and end about an expected end.
 
         Parameters
         ----------
         point, direction : ndarray, shape (2,)
             Expected end [px], and unit vector along the shaft towards it.
         along, across : float
-            How far from the point the end may be, along and across the direction [px].
+            Largest distance of the end from the point, along and across the direction [px].
 
         Returns
         -------
         ImageEnd or None
-            None if no shaft is seen there.
+            None if the maps show no shaft.
         """
         shrink, width = self._shrink, self.width_px
-        back, ahead = LINE_WIDTHS * width + along, along + _AHEAD_WIDTHS * width
+        # The network needs context beyond the end: half as much as behind it.
+        line = FIT.line_widths * width
+        back, ahead = line + along, 0.5 * line + along
         box = self._box(point, direction, (-back, ahead), across)
         if box is None:
             return None
@@ -223,7 +247,7 @@ class NeedleDetector:
         along: float,
         across: float,
     ) -> ImageEnd | None:
-        """Fit line and end in maps, about a place in them; return them in the whole image."""
+        """Fit line and end about a pixel of the maps; the result is in pixels of the image."""
         shaft, ends, corner = maps
         shrink, width = self._shrink, self.width_px
         point = _full_px(place + corner, shrink)
@@ -239,22 +263,19 @@ class NeedleDetector:
         )
         if found is None:
             return None
-        return ImageEnd(
-            _full_px(found.point + corner, shrink),
-            found.direction,
-            found.sigma_across * shrink,
-            found.sigma_along * shrink,
-            found.sigma_angle,
-            found.ends,
-            found.shaft,
+        return dataclasses.replace(
+            found,
+            point=_full_px(found.point + corner, shrink),
+            sigma_across=found.sigma_across * shrink,
+            sigma_along=found.sigma_along * shrink,
         )
 
     def _box(
         self, point: Array, direction: Array, along: tuple[float, float], across: float
     ) -> tuple[int, ...] | None:
-        """Return the box that holds a strip, in the image as the network sees it; None outside."""
+        """Return the box around a strip, in the shrunk image; None outside the image."""
         corners = np.array(along)[:, None] * direction + point
-        beside = across + ASIDE_WIDTHS * self.width_px
+        beside = across + FIT.aside_widths * self.width_px
         low, high = corners.min(axis=0) - beside, corners.max(axis=0) + beside
         height, width = self._shape
         if not np.isfinite(low + high).all() or (high < 0).any() or (low > (width, height)).any():
@@ -270,11 +291,11 @@ class NeedleDetector:
 
     def _at(self, shrink: int) -> Image:
         if shrink not in self._shrunk:
-            self._shrunk[shrink] = _smaller(self._shrunk[1], shrink)
+            self._shrunk[shrink] = _resized(self._shrunk[1], shrink)
         return self._shrunk[shrink]
 
     def _evidence(self, shrink: int, box: tuple[int, ...]) -> tuple[Map, Map, tuple[int, int]]:
-        """Return the maps of a box (columns and rows, first and after the last), and its corner."""
+        """Return the maps of a box (first column and row, end column and row), and its corner."""
         image = self._at(shrink)
         height, width = image.shape
         x0, y0 = max(box[0] - MARGIN_PX, 0), max(box[1] - MARGIN_PX, 0)
@@ -287,14 +308,14 @@ class NeedleDetector:
 
 
 def _strips(places: Map) -> list[tuple[int, ...]]:
-    """Return boxes that hold places, shape (n, 2).
+    """Return boxes that cover pixels, shape (n, 2).
 
-    They are strips across the longer side, each as wide as the places in it need, since a needle's
-    reach is a cone.
+    The boxes are strips across the longer side, each as wide as its pixels, since the reach of a
+    needle is a cone.
     """
     low, high = places.min(axis=0), places.max(axis=0)
     axis = int((high - low).argmax())
-    edges = np.linspace(low[axis], high[axis], _STRIPS + 1)
+    edges = np.linspace(low[axis], high[axis], DETECTOR.strips + 1)
     boxes: list[tuple[int, ...]] = []
     for begin, end in itertools.pairwise(edges):
         inside = places[(places[:, axis] >= begin) & (places[:, axis] <= end)]
@@ -305,9 +326,9 @@ def _strips(places: Map) -> list[tuple[int, ...]]:
 
 
 def _shrunk_px(pixels: Pixels, shrink: float) -> Pixels:
-    """Return where pixels are in an image made smaller.
+    """Return the coordinates of pixels in the shrunk image.
 
-    Pixel i of an image at half size covers the pixels 2 i and 2 i + 1.
+    Pixel i at half size covers the pixels 2 i and 2 i + 1.
     """
     half = pixels.dtype.type(0.5)
     shrunk: Pixels = (pixels + half) / shrink - half
@@ -315,11 +336,11 @@ def _shrunk_px(pixels: Pixels, shrink: float) -> Pixels:
 
 
 def _full_px(pixels: Array, shrink: float) -> Array:
-    """Return where pixels of an image made smaller are in the image itself."""
+    """Return the coordinates in the image of pixels of the shrunk image."""
     return np.asarray((pixels + 0.5) * shrink - 0.5)
 
 
-def _smaller(image: Image, shrink: int) -> Image:
+def _resized(image: Image, shrink: int) -> Image:
     if shrink == 1:
         return image
     size = (image.shape[1] // shrink, image.shape[0] // shrink)

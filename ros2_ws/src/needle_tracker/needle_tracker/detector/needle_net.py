@@ -1,8 +1,8 @@
-"""The network that sees needles: per pixel the probability of shaft, and the intensity of ends.
+"""Neural network that maps an image to the probability of shaft and the intensity of ends.
 
-The weights (`needle_net.onnx`) come from `scripts/train_needle_map`. The network knows needles of
-2 to 9 px. It sees brightness against the surroundings, so light and floor matter little, and beside
-the image the background: the same view with less needle in it.
+`scripts/train_needle_map` trains the weights (`needle_net.onnx`) on needles of 2 to 9 px. The input
+is brightness relative to the surroundings, so that light and floor matter little, and as a second
+channel the background: the same view with less needle in it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ Image = NDArray[np.uint8]
 Map = NDArray[np.float32]
 
 MAX_WIDTH_PX = 7.0
-"""Wider needles are shown at half size [px]; the network was trained with up to 9 px."""
+"""A wider needle is halved in size [px]; the network was trained with up to 9 px."""
 MARGIN_PX = 20
-"""Pixels around a window that the network sees beside it: half the surroundings."""
-_SURROUNDINGS_PX = 41  # side of the square that brightness is judged against, as in training
-_DARK_NOISE, _CLIP = 2.0, 4.0  # grey levels and standard deviations, as in training
+"""Context around a window that the network is shown [px]: half the surroundings."""
+_SURROUNDINGS_PX = 2 * MARGIN_PX + 1  # side of the square of the local mean, as in training
+_DARK_NOISE, _CLIP = 2.0, 4.0  # [grey levels], [standard deviations], as in training
 _MULTIPLE = 4  # the network halves its input twice
 
 
 def normalized(image: Image) -> Map:
-    """Return brightness against the surroundings, in units of how much that varies there.
+    """Return brightness relative to the local mean, in local standard deviations.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def normalized(image: Image) -> Map:
     size = (_SURROUNDINGS_PX, _SURROUNDINGS_PX)
     values = image.astype(np.float32)
     values -= cv2.blur(values, size, borderType=cv2.BORDER_REFLECT)
-    # Rounding leaves the mean of squares a little below zero on flat images.
+    # Rounding can make the variance of a flat image negative.
     variance = np.maximum(cv2.blur(values * values, size, borderType=cv2.BORDER_REFLECT), 0.0)
     return np.asarray(
         np.clip(values / (np.sqrt(variance) + _DARK_NOISE), -_CLIP, _CLIP), np.float32
@@ -47,14 +47,21 @@ def normalized(image: Image) -> Map:
 
 
 class NeedleNet:
-    """The network, ready to run on one thread."""
+    """The trained network, run by OpenCV.
 
-    def __init__(self) -> None:
-        content = (files("needle_tracker") / "detector" / "needle_net.onnx").read_bytes()
-        self._net = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
+    Parameters
+    ----------
+    weights : bytes or None
+        Content of an ONNX file; None: the installed weights.
+    """
+
+    def __init__(self, weights: bytes | None = None) -> None:
+        if weights is None:
+            weights = (files("needle_tracker") / "detector" / "needle_net.onnx").read_bytes()
+        self._net = cv2.dnn.readNetFromONNX(np.frombuffer(weights, np.uint8))
 
     def evidence(self, image: Map, background: Map | None) -> tuple[Map, Map]:
-        """Return what the network sees.
+        """Return the network's maps of an image.
 
         Parameters
         ----------
@@ -66,10 +73,9 @@ class NeedleNet:
         Returns
         -------
         shaft : ndarray of float32, shape (height, width)
-            Probability that a pixel is needle.
+            Probability that a pixel shows the shaft.
         ends : ndarray of float32, shape (height, width)
-            Expected number of needle ends in each pixel; the sum over an area is the expected
-            number of ends there.
+            Expected number of needle ends in each pixel, which may be summed over an area.
         """
         height, width = image.shape
         padded = np.zeros((1, 2, _padded(height), _padded(width)), np.float32)

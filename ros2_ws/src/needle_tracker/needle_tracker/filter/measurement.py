@@ -1,4 +1,4 @@
-"""The tracker's answer to a pair of images."""
+"""Result of the tracker for a pair of images."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ Array = NDArray[np.float64]
 
 
 class TrackState(enum.Enum):
-    """The tracker's knowledge of the needle."""
+    """State of the believed track."""
 
-    SEARCHING = "SEARCHING"  # nothing is known: the whole reachable region is searched
-    CONFIRMING = "CONFIRMING"  # something like a needle, not believed yet
+    SEARCHING = "SEARCHING"  # no track: the whole reachable region is searched
+    CONFIRMING = "CONFIRMING"  # tracks, none of them believed yet
     TRACKING = "TRACKING"
-    LOST = "LOST"  # was tracked and is not seen
-    ENTRY = "ENTRY"  # short, and not seen: the tip follows from the insertion
+    LOST = "LOST"  # believed before, and not seen
+    ENTRY = "ENTRY"  # short and not seen: the tip follows from the insertion
 
 
 class NoTip(str, enum.Enum):
-    """A reason, as a person reads it."""
+    """Reason for a pair without a tip."""
 
     def __str__(self) -> str:
         """Return the text."""
@@ -44,17 +44,17 @@ class Measurement:
     Attributes
     ----------
     tip : SpatialTip or None
-        The believed tip; None where there is none.
+        Believed tip, if any.
     state : TrackState
         State of the track after this pair.
     reason : str
-        Why there is no tip; empty where there is one.
+        Reason for no tip; empty with a tip.
     ends : pair of (ImageEnd or None)
-        What was found in the left and the right image, believed or not.
+        End found in the left and the right image, believed or not.
     probability : float
-        Of the best track to be the needle, 0 to 1.
+        Probability that the best track is the needle.
     stage : pair of float
-        The stage's zero [m] and scale error [-], as estimated.
+        Zero [m] and scale error [-] of the stage, as estimated.
     """
 
     tip: SpatialTip | None

@@ -1,9 +1,9 @@
-"""One thing that may be the needle: where it is, and how likely it is the needle after all.
+"""Track of one thing that may be the needle: its state, and the odds that it is the needle.
 
-It is the needle, and moves as the stage does, or along its heading where the insertion is unknown.
-Or it is another thing (an old track, a scratch, a screw), which stays where it is or ends elsewhere
-by chance. Or it is the needle's shadow, which moves with the needle in another place. Or there is
-no end at all.
+The tip of the needle advances along its heading by the way of the stage, or by an unknown way if
+the insertion is unknown; the heading turns by at most the curvature of the needle. The zero and the
+scale of the stage are part of the state, so that a stage that is read 1 mm off does not move the
+tip. Anything else (an old track, a scratch, a screw) stands still, or its end moves by chance.
 """
 
 from __future__ import annotations
@@ -14,49 +14,167 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.filter.needle_motion import (
-    HEADING,
-    POSITION,
-    SCALE,
-    ZERO,
-    NeedleMotion,
-    gaussian,
-)
 from needle_tracker.filter.settings import FilterSettings, TrackerSettings
-from needle_tracker.stereo.sighting import GATE, Sighting
+from needle_tracker.stereo.sighting import PAIRING, Sighting
 from needle_tracker.stereo.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
 
-_LENGTH_SIGMA = 0.4e-3  # of a shaft's length as both views show it [m], from path-traced pairs
-_ASIDE_SIGMAS = 2.5  # the widest reach, in standard deviations of where needles go
-_SHADOW = 3.0  # log-odds of a needle against its own shadow or mirror image
-_JUMPS = 0.1  # probability that what is no needle ends elsewhere in the next pair
-_ACROSS = 1.0 / (2.0 * math.pi * (0.3e-3) ** 2)  # density of a chance end across the needle [1/m^2]
+POSITION, HEADING, ZERO, SCALE = slice(0, 3), slice(3, 6), 6, 7
+"""Indices of the state: tip [m] and heading in `rig`, zero [m] and scale error [-] of the stage."""
+SIZE = 8
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NeedleMotion:
+    """Gaussian state of tip, heading and stage.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (8,)
+        Tip, heading, zero and scale error.
+    covariance : ndarray, shape (8, 8)
+        Covariance of the state.
+    """
+
+    mean: Array
+    covariance: Array
+
+    @staticmethod
+    def begin(tip: SpatialTip, settings: TrackerSettings) -> NeedleMotion:
+        """Return the state after a first sighting.
+
+        The heading of the path is that of the visible end, with half the lean as its uncertainty.
+        """
+        mean = np.zeros(SIZE)
+        mean[POSITION], mean[HEADING] = tip.position, tip.direction
+        covariance = np.zeros((SIZE, SIZE))
+        covariance[POSITION, POSITION] = tip.covariance
+        lean = (0.5 * settings.tip_lean) ** 2 * _across(tip.direction)
+        covariance[HEADING, HEADING] = tip.direction_covariance + lean
+        covariance[ZERO, ZERO] = settings.stage_zero_sigma**2
+        covariance[SCALE, SCALE] = settings.stage_scale_sigma**2
+        return NeedleMotion(mean, covariance)
+
+    def advanced(self, way: float, curvature: float, settings: FilterSettings) -> NeedleMotion:
+        """Return the state after a way of the base of the needle.
+
+        p_{k+1} = p_k + (1 + scale) way h_k,  h_{k+1} = h_k + turn across h_k
+
+        Parameters
+        ----------
+        way : float
+            Way of the base, negative for a retraction [m].
+        curvature : float
+            Largest curvature of the path [1/m].
+        settings : FilterSettings
+            Noise of the motion.
+        """
+        heading = self.mean[HEADING] / np.linalg.norm(self.mean[HEADING])
+        mean, transition = self.mean.copy(), np.eye(SIZE)
+        gone = (1.0 + mean[SCALE]) * way
+        mean[POSITION] += gone * heading
+        mean[HEADING] = heading
+        transition[POSITION, HEADING] = gone * np.eye(3)
+        transition[POSITION, SCALE] = way * heading
+        turn = curvature * way
+        noise = np.zeros((SIZE, SIZE))
+        noise[POSITION, POSITION] = (
+            (settings.slip_sigma * way) ** 2 * np.outer(heading, heading)
+            + (0.5 * turn * way) ** 2 * _across(heading)
+            + settings.drift_sigma**2 * np.eye(3)
+        )
+        noise[HEADING, HEADING] = turn**2 * _across(heading)
+        return NeedleMotion(mean, transition @ self.covariance @ transition.T + noise)
+
+    def spread(self, way_sigma: float) -> Array:
+        """Return the covariance of the tip after a further, unknown way of zero mean [m^2].
+
+        Cov(p + w h) = Cov(p) + sigma_w^2 (h h^T + Cov(h))
+        """
+        heading = self.mean[HEADING]
+        ways = np.outer(heading, heading) + self.covariance[HEADING, HEADING]
+        return np.asarray(self.covariance[POSITION, POSITION] + way_sigma**2 * ways)
+
+    def surprise(self, tip: SpatialTip) -> tuple[float, float]:
+        """Return the squared distance of a sighting over both covariances, and its log-density."""
+        return gaussian(
+            tip.position - self.mean[POSITION],
+            self.covariance[POSITION, POSITION] + tip.covariance,
+        )
+
+    def corrected(self, rows: Array, residuals: Array, variances: Array) -> NeedleMotion:
+        """Return the state after independent linear measurements (Kalman's equations).
+
+        Parameters
+        ----------
+        rows : ndarray, shape (n, 8)
+            Derivatives of the measurements by the state.
+        residuals, variances : ndarray, shape (n,)
+            Measured minus expected values, and the variances of the measurements.
+        """
+        spread = self.covariance @ rows.T
+        gain = np.linalg.solve(rows @ spread + np.diag(variances), spread.T).T
+        mean = self.mean + gain @ residuals
+        # The Joseph form keeps the covariance symmetric and positive.
+        left = np.eye(SIZE) - gain @ rows
+        covariance = left @ self.covariance @ left.T + (gain * variances) @ gain.T
+        return NeedleMotion(mean, covariance)
+
+    def seen(self, tip: SpatialTip) -> NeedleMotion:
+        """Return the state after a sighting of the tip."""
+        values, axes = np.linalg.eigh(tip.covariance)
+        rows = np.zeros((3, SIZE))
+        rows[:, POSITION] = axes.T
+        return self.corrected(rows, axes.T @ (tip.position - self.mean[POSITION]), values)
+
+    def measured(self, length: float, insertion: float, sigma: float) -> NeedleMotion:
+        """Return the state after the length of the shaft was compared with the insertion.
+
+        length = (1 + scale) insertion + zero; a tip that is farther ahead makes the shaft longer.
+        """
+        rows = np.zeros((1, SIZE))
+        rows[0, POSITION] = -self.mean[HEADING]
+        rows[0, ZERO], rows[0, SCALE] = 1.0, insertion
+        expected = self.mean[ZERO] + (1.0 + self.mean[SCALE]) * insertion
+        return self.corrected(rows, np.array([length - expected]), np.array([sigma**2]))
+
+
+def gaussian(off: Array, covariance: Array) -> tuple[float, float]:
+    """Return the squared distance over the covariance, and the log-density."""
+    square = float(off @ np.linalg.solve(covariance, off))
+    _, log_determinant = np.linalg.slogdet(2.0 * math.pi * covariance)
+    return square, -0.5 * (square + float(log_determinant))
+
+
+def _across(unit: Array) -> Array:
+    return np.asarray(np.eye(3) - np.outer(unit, unit))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NeedleTrack:
-    """A thing that may be the needle.
+    """Track of one thing that may be the needle.
 
     Attributes
     ----------
     motion : NeedleMotion
-        Where it is, if it is the needle.
+        State if it is the needle.
     place, place_covariance : ndarray, shape (3,) and (3, 3)
-        Where it stands, if it is not [m].
+        Position if it stands still [m].
     end_log_odds : float
-        That there is an end.
+        Log-odds that it is an end.
     place_log_odds : float
-        That the needle ends here, by the stage and by how far aside that is.
+        Log-odds that the needle ends here, from the stage and the distance aside.
     motion_log_odds : float
-        That it moves as the needle does, and does not stand.
+        Log-odds that it moves as the needle does, and does not stand still.
     insertion : float or None
-        At the last pair [m].
+        Insertion of the last pair [m].
+    way : float or None
+        Way of the stage since the last sighting [m]; None if the insertion is unknown.
     way_sigma : float
-        Standard deviation of the way since the pair before [m]; 0 where the stage tells it.
+        Standard deviation of the way since the previous pair [m]; 0 if the insertion is known.
     misses : int
-        Pairs in a row without a sighting.
+        Consecutive pairs without a sighting.
     """
 
     motion: NeedleMotion
@@ -66,6 +184,7 @@ class NeedleTrack:
     place_log_odds: float
     motion_log_odds: float
     insertion: float | None
+    way: float | None = 0.0
     way_sigma: float = 0.0
     misses: int = 0
 
@@ -73,26 +192,28 @@ class NeedleTrack:
     def begin(
         sighting: Sighting, insertion: float | None, settings: TrackerSettings
     ) -> NeedleTrack:
-        """Return the track of something seen for the first time."""
-        tip = sighting.tip
+        """Return the track of a first sighting."""
+        tip, numbers = sighting.tip, settings.filter
         motion = NeedleMotion.begin(tip, settings)
         if insertion is not None and sighting.length is not None:
-            motion = motion.measured(sighting.length, insertion, _LENGTH_SIGMA)
-        end = settings.filter.prior_log_odds + sighting.evidence
+            motion = motion.measured(sighting.length, insertion, numbers.length_sigma)
+        end = numbers.prior_log_odds + sighting.evidence
         place = place_log_odds(sighting, insertion, settings)
         return NeedleTrack(
             motion, tip.position, tip.covariance, end, place, 0.0, insertion
         )._bounded(settings)
 
     def predicted(self, insertion: float | None, settings: TrackerSettings) -> NeedleTrack:
-        """Return the track at the next pair, before it is looked at."""
+        """Return the track at the next pair, before a sighting in it."""
         numbers, curvature = settings.filter, settings.reach.curvature
-        way, way_sigma = 0.0, numbers.free_step * math.sqrt(self.misses + 1.0)
+        step, way, way_sigma = 0.0, None, numbers.free_step * math.sqrt(self.misses + 1.0)
         if insertion is not None and self.insertion is not None:
-            way, way_sigma = insertion - self.insertion, 0.0
+            step, way_sigma = insertion - self.insertion, 0.0
+            way = None if self.way is None else self.way + step
         return dataclasses.replace(
             self,
-            motion=self.motion.advanced(way, curvature, numbers),
+            motion=self.motion.advanced(step, curvature, numbers),
+            way=way,
             way_sigma=way_sigma,
             place_covariance=self.place_covariance + numbers.drift_sigma**2 * np.eye(3),
             insertion=insertion,
@@ -101,7 +222,7 @@ class NeedleTrack:
     def surprise(self, tip: SpatialTip, settings: TrackerSettings) -> float:
         """Return the squared distance over the covariance of a sighting that may be this track's.
 
-        As the needle's, a way that is unknown included, or as that of what stands: the lesser.
+        The smaller of the distances from the needle, with an unknown way, and from the place.
         """
         as_needle, _ = self._motion_to(tip, settings).surprise(tip)
         as_needle += self._ways(tip) ** 2
@@ -109,84 +230,91 @@ class NeedleTrack:
         return min(as_needle, as_other)
 
     def fits(self, tip: SpatialTip, settings: TrackerSettings) -> bool:
-        """Return whether a sighting can be this track's."""
-        return self.surprise(tip, settings) < GATE
+        """Return whether a sighting may be this track's."""
+        return self.surprise(tip, settings) < PAIRING.gate
 
     def seen(self, sighting: Sighting, settings: TrackerSettings) -> NeedleTrack:
         """Return the predicted track after a sighting that `fits`."""
         numbers, tip = settings.filter, sighting.tip
         motion = self._motion_to(tip, settings)
         _, stood = gaussian(tip.position - self.place, self.place_covariance + tip.covariance)
-        gain = self._log_density(tip, motion, stood, numbers) - _log_sum(
-            math.log(1.0 - _JUMPS) + stood,
-            math.log(_JUMPS * numbers.jump_density * _ACROSS),
+        gain = self._log_density(tip, motion, stood) - _log_sum(
+            stood, math.log(numbers.chance_density)
         )
         place, covariance = _merged(self.place, self.place_covariance, tip)
+        way = math.dist(tip.position, self.place) if self.way is None else abs(self.way)
+        independent = min(way / numbers.evidence_length, 1.0)
+        # The end after a gap may be that of another thing, such as the shadow of the needle.
+        before = self.motion_log_odds
+        before = max(before - numbers.miss_cost * self.misses, min(before, 0.0))
         return dataclasses.replace(
             self,
             motion=motion.seen(tip),
             place=place,
             place_covariance=covariance,
-            end_log_odds=self.end_log_odds + numbers.repeat_weight * sighting.evidence,
-            # What once ended where the needle cannot is not the needle.
+            end_log_odds=self.end_log_odds + independent * sighting.evidence,
+            # A thing that ended where the needle cannot is not the needle.
             place_log_odds=min(
                 self.place_log_odds, place_log_odds(sighting, self.insertion, settings)
             ),
-            motion_log_odds=self.motion_log_odds + gain,
+            motion_log_odds=before + gain,
+            way=0.0,
             misses=0,
         )._bounded(settings)
 
     def _motion_to(self, tip: SpatialTip, settings: TrackerSettings) -> NeedleMotion:
-        """Return the motion up to a sighting: by the stage, or by as far as the sighting says."""
+        """Return the state at a sighting: an unknown way is that to the sighting."""
         if self.way_sigma == 0.0:
             return self.motion
         way = self._ways(tip) * self.way_sigma
         return self.motion.advanced(way, settings.reach.curvature, settings.filter)
 
     def _ways(self, tip: SpatialTip) -> float:
-        """Return the way to a sighting, in standard deviations; 0 where the stage tells it."""
+        """Return the way to a sighting in standard deviations; 0 if the insertion is known."""
         if self.way_sigma == 0.0:
             return 0.0
         ahead = tip.position - self.motion.mean[POSITION]
         return float(ahead @ self.motion.mean[HEADING]) / self.way_sigma
 
-    def _log_density(
-        self, tip: SpatialTip, motion: NeedleMotion, stood: float, numbers: FilterSettings
-    ) -> float:
+    def _log_density(self, tip: SpatialTip, motion: NeedleMotion, stood: float) -> float:
         """Return the log-density of a sighting if this is the needle [1/m^3]."""
         _, moved = motion.surprise(tip)
         if self.way_sigma == 0.0:
             return moved
-        # The way was fitted: along the heading its own density counts, not that of the sighting.
+        # The way is that to the sighting: along the heading, use the density of the way.
         heading = motion.mean[HEADING]
         total = motion.covariance[POSITION, POSITION] + tip.covariance
         along = math.sqrt(float(heading @ total @ heading))
         moved += math.log(along / self.way_sigma) - 0.5 * self._ways(tip) ** 2
-        rest = numbers.rest_probability
-        return _log_sum(math.log(1.0 - rest) + moved, math.log(rest) + stood)
+        # Rest and motion are equally probable.
+        return _log_sum(moved, stood) + math.log(0.5)
 
     def missed(self) -> NeedleTrack:
-        """Return the predicted track after a pair that does not show it."""
+        """Return the predicted track after a pair without a sighting."""
         return dataclasses.replace(self, misses=self.misses + 1)
 
-    @property
-    def log_odds(self) -> float:
+    def log_odds(self, settings: TrackerSettings) -> float:
         """Return the log-odds that this is the needle.
 
-        Else it is another thing's end or none at all, and neither goes where the needle does; or it
-        is the needle's shadow or mirror image, which does so in another place.
+        The alternatives are the end of another thing, which does not move as the needle does; no
+        end at all; and the shadow or the mirror image of the needle, which moves so elsewhere. With
+        the insertion, a line without an end is fitted where the stage predicts the end, so that its
+        motion is no evidence.
 
-        P(else) / P(needle) = ((1 + e^-end) e^-motion + e^-shadow) e^-place
+        P(else) / P(needle) = (e^-motion + e^-end [e^-motion] + e^-shadow) e^-place
         """
-        others = _log_sum(0.0, -self.end_log_odds) - self.motion_log_odds
-        return self.place_log_odds - _log_sum(others, -_SHADOW)
+        no_end = -self.end_log_odds
+        if self.insertion is None:
+            no_end -= self.motion_log_odds
+        others = _log_sum(-self.motion_log_odds, no_end)
+        return self.place_log_odds - _log_sum(others, -settings.filter.shadow_log_odds)
 
     def rank(self, settings: TrackerSettings) -> float:
-        """Return the log-odds against other tracks: one that is not seen loses with each pair."""
-        return self.log_odds - settings.filter.miss_cost * self.misses
+        """Return the log-odds against other tracks, which fall with each miss."""
+        return self.log_odds(settings) - settings.filter.miss_cost * self.misses
 
     def _bounded(self, settings: TrackerSettings) -> NeedleTrack:
-        """Return the track with log-odds within bounds: no evidence is beyond doubt."""
+        """Return the track with bounded log-odds."""
         bound = settings.filter.max_log_odds
         return dataclasses.replace(
             self,
@@ -196,48 +324,39 @@ class NeedleTrack:
 
     @property
     def tip(self) -> tuple[Array, Array]:
-        """Return the tip [m] and its covariance [m^2], a way that is unknown included."""
+        """Tip [m] and its covariance [m^2], including an unknown way."""
         return self.motion.mean[POSITION], self.motion.spread(self.way_sigma)
 
     @property
     def stage(self) -> tuple[float, float]:
-        """Return the stage's zero [m] and scale error [-], as estimated."""
+        """Zero [m] and scale error [-] of the stage, as estimated."""
         return float(self.motion.mean[ZERO]), float(self.motion.mean[SCALE])
 
 
 def place_log_odds(sighting: Sighting, insertion: float | None, settings: TrackerSettings) -> float:
-    """Return the log-odds that the needle ends in a place, and not something else.
+    """Return the log-odds that it is the needle that ends in a place.
 
-    A needle that ends far aside has bent outwards all the way, so its tangent at the tip passes the
-    entry on the other side; a shadow beside it runs parallel. And a needle is as long as the stage
-    says, where other things end at any distance. An end that is followed by the stage says nothing
-    new of it: infinite.
+    The needle is as long as the insertion, while other things end at any distance. An end that
+    follows the stage is no further evidence: infinite. Without the insertion all places are alike.
     """
-    if insertion is not None and sighting.length is None:
+    if insertion is None:
+        return 0.0
+    if sighting.length is None:
         return math.inf
-    position, ahead = sighting.tip.position, sighting.tip.direction
-    distance = float(np.linalg.norm(position))
-    widest = distance * math.sin(float(settings.reach.chord_angle(np.array(distance))))
-    outwards = position[:2] / max(float(np.linalg.norm(position[:2])), 1e-9)
-    # Where the tangent passes the entry, outwards.
-    passes = float((position[:2] - position[2] / max(ahead[2], 0.1) * ahead[:2]) @ outwards)
-    aside = _ASIDE_SIGMAS * max(passes, 0.0) / widest
-    log_odds = -0.5 * aside * aside
-    if insertion is not None and sighting.length is not None:
-        sigma = math.hypot(
-            settings.stage_zero_sigma, settings.stage_scale_sigma * insertion, _LENGTH_SIGMA
-        )
-        off = (sighting.length - insertion) / sigma
-        density = math.exp(-0.5 * off * off) / (math.sqrt(2.0 * math.pi) * sigma)
-        log_odds += math.log(max(density * settings.reach.length, 1e-9))
-    return log_odds
+    sigma = math.hypot(
+        settings.stage_zero_sigma,
+        settings.stage_scale_sigma * insertion,
+        settings.filter.length_sigma,
+    )
+    off = (sighting.length - insertion) / sigma
+    return math.log(settings.reach.length / (math.sqrt(2.0 * math.pi) * sigma)) - 0.5 * off * off
 
 
 def _merged(place: Array, covariance: Array, tip: SpatialTip) -> tuple[Array, Array]:
-    """Return the mean of two places by their covariances; a place far off is the new one."""
+    """Return the mean of two positions by their covariances; a position far off replaces it."""
     total = covariance + tip.covariance
     off = tip.position - place
-    if float(off @ np.linalg.solve(total, off)) > GATE:
+    if float(off @ np.linalg.solve(total, off)) > PAIRING.gate:
         return tip.position, tip.covariance
     gain = np.linalg.solve(total, covariance).T
     return place + gain @ off, covariance - gain @ covariance
@@ -245,3 +364,16 @@ def _merged(place: Array, covariance: Array, tip: SpatialTip) -> tuple[Array, Ar
 
 def _log_sum(one: float, other: float) -> float:
     return float(np.logaddexp(one, other))
+
+
+def tip_at_entry(insertion: float, settings: TrackerSettings) -> SpatialTip:
+    """Return the tip of a short needle that is not seen: on the z axis of `rig`."""
+    reach = settings.reach
+    sideways = math.hypot(reach.hole_tolerance, insertion * math.sin(reach.entry_angle))
+    along = math.hypot(reach.hole_tolerance, insertion * (1.0 - math.cos(reach.entry_angle)))
+    return SpatialTip(
+        np.array([0.0, 0.0, insertion]),
+        np.diag([sideways**2, sideways**2, along**2]),
+        np.array([0.0, 0.0, 1.0]),
+        np.diag([reach.entry_angle**2, reach.entry_angle**2, 0.0]),
+    )

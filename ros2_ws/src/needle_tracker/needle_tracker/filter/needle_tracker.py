@@ -1,7 +1,7 @@
-"""Stereo pair in, tip out: look where tracks are expected, search where they are not, believe one.
+"""Tracker of the needle's tip: a stereo pair in, the believed tip out.
 
-The answer depends on the images and insertions given so far and on nothing else: no time, no
-randomness, one thread.
+Tracks are looked for where they are expected; if that fails, both images are searched. The result
+depends only on the images and insertions so far: no time, no randomness, one thread.
 """
 
 from __future__ import annotations
@@ -14,62 +14,116 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.detector.end_fit import ImageEnd
-from needle_tracker.detector.needle_detector import NeedleDetector
+from needle_tracker.detector.needle_detector import DETECTOR, NeedleDetector
 from needle_tracker.detector.needle_net import NeedleNet
-from needle_tracker.filter.background import Background, Image, Pair
 from needle_tracker.filter.measurement import Measurement, NoTip, TrackState
-from needle_tracker.filter.needle_motion import HEADING
-from needle_tracker.filter.needle_track import NeedleTrack
-from needle_tracker.filter.settings import TrackerSettings
+from needle_tracker.filter.needle_track import HEADING, NeedleTrack, tip_at_entry
+from needle_tracker.filter.settings import Image, Pair, TrackerSettings
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.optics.refraction import stereo_views
-from needle_tracker.stereo.sighting import SIGMAS, Ends, Sighting, StereoSearch, evidence
+from needle_tracker.stereo.sighting import PAIRING, Ends, Sighting, StereoSearch, evidence
 from needle_tracker.stereo.triangulation import SpatialTip, triangulate
 
 Array = NDArray[np.float64]
 
-_TRACKS = 4  # things followed at once
-_LEAST_GATE_PX = 4.0  # half the size of the window that an end is looked for in
-_MOST_FOLLOWED = 8e-3  # an end known worse than that is searched for [m]
-_LEAST_NEW_WIDTHS = 3.0  # of needle, since a background that is of use [needle widths]
-_GLANCE = (32, 24)  # size that views are compared at from pair to pair [px]
-_CHANGE = 0.2  # of most of a view's brightness: more than flicker, less than a lamp
-_DRAWN_LENGTH, _DRAWN_POINTS = 0.04, 20  # of the needle to warm up on [m]
-_DARK = 10  # brightest grey level of an image that shows nothing
+
+@dataclasses.dataclass(frozen=True)
+class FollowingSettings:
+    """Numbers of the tracker around its filter.
+
+    Attributes
+    ----------
+    tracks : int
+        Largest number of tracks.
+    least_gate_px : float
+        Least half size of the window in which an end is expected [px].
+    least_new_widths : float
+        Length of needle that must be new since a pair for it to be the background [needle widths].
+    glance_shrink : int
+        Factor of size at which a view is compared with the previous one.
+    change : float
+        Relative change of the brightness of most of a view: more than flicker, less than a lamp.
+    dark : int
+        Brightest grey level of a black image.
+    """
+
+    tracks: int = 4
+    least_gate_px: float = 4.0
+    least_new_widths: float = 3.0
+    glance_shrink: int = 32
+    change: float = 0.2
+    dark: int = 10
+
+
+FOLLOWING = FollowingSettings()
+
+
+class Background:
+    """The pair with the least needle so far: by the insertion, else the first one.
+
+    Parameters
+    ----------
+    reference : pair of ndarray of uint8, shape (height, width), or None
+        Left and right image of the phantom without needle, to begin with.
+    least_new : float
+        Length of needle that must be new since a pair for it to be the background [m].
+    """
+
+    def __init__(self, reference: Pair | None, least_new: float) -> None:
+        self._pair: Pair | None = None
+        self._insertion: float | None = None
+        self._least_new = least_new
+        if reference is not None:
+            self.update(reference, 0.0)
+
+    def update(self, pair: Pair, insertion: float | None) -> Pair | None:
+        """Return the background of a pair with an insertion [m] or None; None if there is none."""
+        before = math.inf if self._insertion is None else self._insertion
+        less = insertion is not None and insertion <= max(before, 0.0)
+        if self._pair is None or less:
+            self._insertion = insertion
+            # The driver of a camera may reuse the array.
+            self._pair = pair[0].copy(), pair[1].copy()
+            return None
+        if insertion is not None and insertion - before < self._least_new:
+            return None
+        return self._pair
 
 
 class NeedleTracker:
-    """Tracks the tip through a sequence of stereo pairs.
+    """Tracker of the tip through a sequence of stereo pairs.
 
     Parameters
     ----------
     calibration : StereoCalibration
         The stereo rig.
     settings : TrackerSettings
-        What else is known.
+        Needle, stage and filter.
     """
 
     def __init__(self, calibration: StereoCalibration, settings: TrackerSettings) -> None:
-        # Results must not depend on how many cores there are.
+        # Results must not depend on the number of cores.
         cv2.setNumThreads(1)
         self.settings = settings
         self.views = stereo_views(calibration)
         self._shapes = tuple((c.height, c.width) for c in (calibration.left, calibration.right))
-        net = NeedleNet()
+        net, clearance = NeedleNet(), settings.hole_clearance
         left, right = (
-            NeedleDetector(
-                view, settings.needle_width, settings.reach, settings.hole_clearance, net
-            )
+            NeedleDetector(view, settings.needle_width, settings.reach, clearance, net)
             for view in self.views
         )
         self._detectors = (left, right)
         self._search = StereoSearch(
-            self.views, self._detectors, settings.reach, settings.windows, settings.tip_lean
+            self.views,
+            self._detectors,
+            settings.reach,
+            settings.windows,
+            settings.tip_lean,
+            settings.entry_zone,
         )
-        self._least_new = _LEAST_NEW_WIDTHS * settings.needle_width
-        self._background = Background(settings.reference, self._least_new)
+        self._background = self._new_background(settings.reference)
         self._views_before: tuple[Array, ...] | None = None
-        self._shown: Pair | None = None
+        self._current_background: Pair | None = None
         self.reset()
 
     @property
@@ -79,34 +133,33 @@ class NeedleTracker:
         return left.width_px, right.width_px
 
     def warm_up(self) -> None:
-        """Compile, or load, all that is compiled: the first pair must not wait for it.
+        """Compile, or load, all compiled functions: the first pair must not wait for that.
 
-        The tracker looks at a needle that it draws itself, and forgets it.
+        The tracker processes a drawn needle, and forgets it.
         """
-        background = self._background
-        self._background = Background(None, self._least_new)
-        line = np.zeros((_DRAWN_POINTS, 3))
-        line[:, 2] = np.linspace(0.0, _DRAWN_LENGTH, _DRAWN_POINTS)
+        background, self._background = self._background, self._new_background(None)
+        length = 2.0 * DETECTOR.full_size_reach
+        line = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, length]])
         images = []
         for view, width, shape in zip(self.views, self.needle_widths_px, self._shapes, strict=True):
             image = np.full(shape, 200, np.uint8)
             corners = np.round(np.nan_to_num(view.project(line))).astype(np.int32)
-            cv2.polylines(image, [corners], False, 60, max(round(width), 1))
+            cv2.polylines(image, [corners], False, 0, max(round(width), 1))
             images.append(image)
-        # Found, then followed.
+        # The needle is found in the first pair, and followed in the second one.
         for _ in range(2):
-            self.process(images[0], images[1], _DRAWN_LENGTH)
+            self.process(images[0], images[1], length)
         self.reset()
         self._background, self._views_before = background, None
         self._use_background(None)
 
     def reset(self) -> None:
-        """Forget the needle, not what stands behind it."""
+        """Forget the needle, but keep the background."""
         self._tracks: list[NeedleTrack] = []
         self._believed = False
 
     def skip(self, reason: str) -> Measurement:
-        """Answer a pair that cannot be looked at; it counts as one without a tip."""
+        """Return the measurement of a pair that cannot be processed: a miss of all tracks."""
         self._tracks = [track.missed() for track in self._tracks]
         return self._answer(None, reason)
 
@@ -118,7 +171,7 @@ class NeedleTracker:
         left, right : ndarray of uint8, shape (height, width)
             Images of one exposure, of the calibration's size.
         insertion : float or None
-            Length of needle beyond the entry point at the exposure [m], None where unknown.
+            Length of needle beyond the entry point at the exposure [m]; None if unknown.
 
         Returns
         -------
@@ -128,12 +181,12 @@ class NeedleTracker:
         Raises
         ------
         ValueError
-            An image of another size than the calibration's.
+            The size of an image differs from the calibration.
         """
         pair = np.ascontiguousarray(left), np.ascontiguousarray(right)
         self._check(pair)
         for side, image in zip(SIDES, pair, strict=True):
-            if int(image[::8, ::8].max()) < _DARK:
+            if int(image[::8, ::8].max()) < FOLLOWING.dark:
                 return self.skip(f"{side} image is black")
         measured = self._measure(pair, insertion)
         if measured.tip is None and insertion is not None and insertion < self.settings.entry_zone:
@@ -142,19 +195,18 @@ class NeedleTracker:
         return measured
 
     def _measure(self, pair: Pair, insertion: float | None) -> Measurement:
-        """Measure the tip as the images show it."""
+        """Measure the tip in the images."""
         changed = self._view_changed(pair)
         if changed:
-            # What stands behind the needle is no longer known.
-            self._background = Background(None, self._least_new)
-        background = self._background.see(pair, insertion)
-        if background is not self._shown:
+            self._background = self._new_background(None)
+        background = self._background.update(pair, insertion)
+        if background is not self._current_background:
             self._use_background(background)
         if insertion is not None and insertion < self.settings.hole_clearance:
             self.reset()
             return self._answer(None, NoTip.NOTHING)
         for detector, image in zip(self._detectors, pair, strict=True):
-            detector.see(image)
+            detector.set_image(image)
         settings = self.settings
         self._tracks = [track.predicted(insertion, settings) for track in self._tracks]
         best = self._best()
@@ -168,30 +220,32 @@ class NeedleTracker:
                 return self._answer(sighting, "")
             self._tracks = predicted
         if changed:
-            # A lamp was switched or a camera bumped: much is new, and little of it the needle.
+            # A lamp was switched or a camera was bumped: most new lines are not the needle.
             self._tracks = [track.missed() for track in self._tracks]
             return self._answer(None, NoTip.CHANGED)
         found, ends = self._look_everywhere(insertion)
         return self._answer(found, "", ends)
 
     def _view_changed(self, pair: Pair) -> bool:
-        """Return whether most of a view differs from the last pair's by more than its light."""
-        before = self._views_before
+        """Return whether the brightness of most of a view changed since the previous pair."""
+        before, shrink = self._views_before, FOLLOWING.glance_shrink
         self._views_before = tuple(
-            cv2.resize(image, _GLANCE, interpolation=cv2.INTER_AREA).astype(np.float64)
-            for image in pair
+            cv2.resize(
+                image, (width // shrink, height // shrink), interpolation=cv2.INTER_AREA
+            ).astype(np.float64)
+            for image, (height, width) in zip(pair, self._shapes, strict=True)
         )
         return before is not None and any(
-            float(np.median(np.abs(now - then))) > _CHANGE * float(np.median(then))
+            float(np.median(np.abs(now - then))) > FOLLOWING.change * float(np.median(then))
             for now, then in zip(self._views_before, before, strict=True)
         )
 
     def _look_everywhere(self, insertion: float | None) -> tuple[Sighting | None, Ends]:
-        """Search both images; return the best track's sighting, and what each view shows alone."""
+        """Search both images; return the best sighting and the best end of each view."""
         settings = self.settings
         least, most = settings.hole_clearance, settings.reach.length
         if insertion is not None:
-            margin = SIGMAS * math.hypot(
+            margin = PAIRING.sigmas * math.hypot(
                 settings.stage_zero_sigma, settings.stage_scale_sigma * insertion
             )
             least = max(least, settings.reach.shortest_chord(insertion) - margin)
@@ -208,27 +262,29 @@ class NeedleTracker:
         tracks += [(NeedleTrack.begin(each, insertion, settings), each) for each in left]
         kept = [pair for pair in tracks if pair[0].misses < settings.filter.forgotten_after]
         kept.sort(key=lambda pair: -pair[0].rank(settings))
-        self._tracks = [track for track, _ in kept[:_TRACKS]]
+        self._tracks = [track for track, _ in kept[: FOLLOWING.tracks]]
         return kept[0][1] if kept else None, ends
 
     def _follow(self, track: NeedleTrack) -> Sighting | None:
-        """Look for the end where a track has it."""
+        """Return the sighting of a track at its predicted tip; None if the fit fails."""
         position, covariance = track.tip
-        if float(np.linalg.eigvalsh(covariance)[-1]) > _MOST_FOLLOWED**2:
+        if float(np.linalg.eigvalsh(covariance)[-1]) > (2.0 * self.settings.filter.free_step) ** 2:
             return None
         heading = track.motion.mean[HEADING]
         ends = []
         for view, detector in zip(self.views, self._detectors, strict=True):
             point, jacobian = view.project(position), view.jacobian(position)
             ahead = jacobian @ heading
-            direction = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+            direction = ahead / np.linalg.norm(ahead)
             spread = jacobian @ covariance @ jacobian.T
             across = np.array([-direction[1], direction[0]])
             end = detector.fit(
                 point,
                 direction,
-                along=_LEAST_GATE_PX + SIGMAS * math.sqrt(direction @ spread @ direction),
-                across=_LEAST_GATE_PX + SIGMAS * math.sqrt(across @ spread @ across),
+                along=FOLLOWING.least_gate_px
+                + PAIRING.sigmas * math.sqrt(direction @ spread @ direction),
+                across=FOLLOWING.least_gate_px
+                + PAIRING.sigmas * math.sqrt(across @ spread @ across),
             )
             if end is None:
                 return None
@@ -250,7 +306,7 @@ class NeedleTracker:
         numbers = self.settings.filter
         probability = self._probability(best)
         accepted = probability > numbers.accepted
-        self._believed = accepted or (self._believed and best.log_odds > 0.0)
+        self._believed = accepted or (self._believed and best.log_odds(self.settings) > 0.0)
         state = TrackState.TRACKING if self._believed else TrackState.CONFIRMING
         if self._believed and best.misses >= numbers.lost_after:
             state = TrackState.LOST
@@ -262,15 +318,15 @@ class NeedleTracker:
         elif not accepted:
             reason = NoTip.UNCONFIRMED
         else:
-            tip = self._told(sighting.tip)
+            tip = self._published(sighting.tip)
             reason = NoTip.UNCERTAIN if tip is None else ""
         return Measurement(tip, state, reason, ends, probability, best.stage)
 
-    def _told(self, tip: SpatialTip) -> SpatialTip | None:
-        """Return what is told of a believed needle, None if these two views leave it open.
+    def _published(self, tip: SpatialTip) -> SpatialTip | None:
+        """Return the tip of a believed needle to be published; None if it is too uncertain.
 
-        What a bevel and its light hide, and a shadow beside the shaft, last from pair to pair: they
-        cancel in motion, and pairs are not merged, since nothing averages out.
+        Errors by a bevel, its light or a shadow beside the shaft persist from pair to pair: they
+        cancel in motion, and pairs are not averaged.
         """
         numbers = self.settings.filter
         if float(np.linalg.eigvalsh(tip.covariance)[-1]) > numbers.max_sigma**2:
@@ -286,8 +342,11 @@ class NeedleTracker:
         odds = [math.exp(each.rank(self.settings)) for each in self._tracks]
         return math.exp(track.rank(self.settings)) / (1.0 + sum(odds))
 
+    def _new_background(self, reference: Pair | None) -> Background:
+        return Background(reference, FOLLOWING.least_new_widths * self.settings.needle_width)
+
     def _use_background(self, pair: Pair | None) -> None:
-        self._shown = pair
+        self._current_background = pair
         for detector, image in zip(self._detectors, pair or (None, None), strict=True):
             detector.set_background(image)
 
@@ -295,16 +354,3 @@ class NeedleTracker:
         for side, image, shape in zip(SIDES, pair, self._shapes, strict=True):
             if image.shape != shape or image.dtype != np.uint8:
                 raise ValueError(f"{side} image is {image.dtype}{image.shape}, wants uint8{shape}")
-
-
-def tip_at_entry(insertion: float, settings: TrackerSettings) -> SpatialTip:
-    """Return the tip of a short needle that is not seen: on the z axis of `rig`."""
-    reach = settings.reach
-    sideways = math.hypot(reach.hole_tolerance, insertion * math.sin(reach.entry_angle))
-    along = math.hypot(reach.hole_tolerance, insertion * (1.0 - math.cos(reach.entry_angle)))
-    return SpatialTip(
-        np.array([0.0, 0.0, insertion]),
-        np.diag([sideways**2, sideways**2, along**2]),
-        np.array([0.0, 0.0, 1.0]),
-        np.diag([reach.entry_angle**2, reach.entry_angle**2, 0.0]),
-    )

@@ -1,4 +1,4 @@
-"""Settings of the tracker beside the calibration, and the numbers of its filter."""
+"""Settings of the tracker besides the calibration, and the numbers of its filter."""
 
 from __future__ import annotations
 
@@ -7,86 +7,97 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.detector.reach import Reach
+from needle_tracker.detector.search_grid import Reach
 from needle_tracker.optics.window import Window
 
 Image = NDArray[np.uint8]
+Pair = tuple[Image, Image]
+"""Left and right image."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FilterSettings:
-    """Numbers of the filter over time.
+    """Numbers of the filter over time; odds are natural logarithms.
 
     Attributes
     ----------
     slip_sigma : float
-        Of the way the tip goes per way of the base: needle and gel give [-].
+        Standard deviation of the way of the tip over the way of the base [-]: needle and gel give.
     drift_sigma : float
-        Of the tip between two pairs at rest [m].
+        Standard deviation of the motion of the tip between two pairs at rest [m].
     free_step : float
-        Way between two pairs where the insertion is unknown [m], standard deviation.
-    rest_probability : float
-        That the needle rests between two pairs where the insertion is unknown.
-    jump_density : float
-        Probability per metre that what is no needle ends elsewhere in the next pair [1/m].
+        Standard deviation of the way between two pairs if the insertion is unknown [m].
+    chance_density : float
+        Density of the next end of something that is not the needle, if it ends elsewhere in the
+        next pair [1/m^3]: once per metre along the needle, within 0.3 mm across.
+    shadow_log_odds : float
+        A needle against its own shadow or mirror image.
+    length_sigma : float
+        Standard deviation of the length of the shaft [m], from path-traced pairs.
     prior_log_odds : float
-        Of a pair of ends that meet to be an end, before the network is asked: from 231 sightings in
-        path-traced pairs (logistic regression, which gave the evidence a weight of 1).
-    repeat_weight : float
-        Share of a look's evidence that is new, since looks in a row show much the same.
+        Two ends that meet are an end, before the network is evaluated: from 231 sightings in
+        path-traced pairs (logistic regression, with a weight of 1 for the evidence).
+    evidence_length : float
+        Way of the tip over which the images become independent [m]: the same picture again is no
+        further evidence.
     miss_cost : float
-        Log-odds that a track loses by a pair that does not show it.
+        Log-odds that a track loses in a pair that does not show it.
     max_log_odds : float
-        Largest size of a track's log-odds: no evidence is beyond doubt.
+        Largest size of the log-odds of a track.
     accepted : float
-        Probability from which on a track is believed.
+        Probability from which on a track is the needle.
     end_sigma : float
-        Of the needle's end along it, alike in both views and from pair to pair: what a bevel and
-        its light hide [needle widths], from errors in path-traced pairs.
+        Standard deviation of the end along the needle that both views and all pairs share, since a
+        bevel and its light hide a part [needle widths]: from errors in path-traced pairs.
     max_sigma : float
-        A tip known worse than that in any direction is not told [m].
-    lost_after, forgotten_after : int
-        Pairs in a row without a sighting until a track is lost, and forgotten.
+        Largest standard deviation of a published tip, in any direction [m].
+    lost_after : int
+        Consecutive pairs without a sighting after which a track is lost.
     """
 
     slip_sigma: float = 0.05
     drift_sigma: float = 0.02e-3
     free_step: float = 4.0e-3
-    rest_probability: float = 0.5
-    jump_density: float = 10.0
+    chance_density: float = 1.8e6
+    shadow_log_odds: float = 3.0
+    length_sigma: float = 0.4e-3
     prior_log_odds: float = -1.0
-    repeat_weight: float = 0.1
+    evidence_length: float = 10e-3
     miss_cost: float = 0.5
     max_log_odds: float = 8.0
     accepted: float = 0.85
     end_sigma: float = 0.3
     max_sigma: float = 0.8e-3
     lost_after: int = 10
-    forgotten_after: int = 30
+
+    @property
+    def forgotten_after(self) -> float:
+        """Consecutive misses that outweigh any evidence: then the track is dropped."""
+        return 2.0 * self.max_log_odds / self.miss_cost
 
 
 @dataclasses.dataclass(frozen=True)
 class TrackerSettings:
-    """Everything that the tracker is told beside the calibration.
+    """Settings of the tracker besides the calibration.
 
     Attributes
     ----------
     reach : Reach
-        What the needle can do.
+        Physical reach of the needle.
     windows : tuple of Window
-        What the cameras look through.
+        Windows of the cameras.
     needle_width : float
-        Diameter of the needle, good to 30 % [m].
+        Diameter of the needle, to within 30 % [m].
     tip_lean : float
-        Largest angle between the visible end and the needle's path (pre-bend) [rad].
+        Largest angle between the visible end and the path of the needle (pre-bend) [rad].
     entry_zone : float
         Insertion below which the tip of a needle that is not seen follows from the insertion [m].
     hole_clearance : float
-        Radius around the entry that is not looked at [m].
+        Radius around the entry that is excluded from the search [m].
     stage_zero_sigma : float
         Standard deviation of the insertion at which the tip is at the entry [m].
     stage_scale_sigma : float
-        Standard deviation of the insertion's scale [-].
+        Standard deviation of the scale of the insertion [-].
     filter : FilterSettings
         Numbers of the filter.
     reference : pair of ndarray of uint8, shape (height, width), or None
@@ -102,4 +113,4 @@ class TrackerSettings:
     stage_zero_sigma: float
     stage_scale_sigma: float
     filter: FilterSettings = dataclasses.field(default_factory=FilterSettings)
-    reference: tuple[Image, Image] | None = dataclasses.field(default=None, compare=False)
+    reference: Pair | None = dataclasses.field(default=None, compare=False)

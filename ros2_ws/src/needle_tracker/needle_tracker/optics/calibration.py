@@ -1,4 +1,4 @@
-"""The calibration file of the stereo rig: read, checked, typed."""
+"""Calibration file of the stereo rig: reading and checks."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_tracker.optics.window import Layer, Window, common_surface, surface_from_above
 
 SIDES = ("left", "right")
-LEAST_BASELINE = 1e-3  # between the cameras [m]
+LEAST_BASELINE = 1e-3  # distance between the cameras [m]
 _DISTORTION_MODEL = "plumb_bob"
 _INDICES = (1.0, 3.0)
-_THICKEST = 0.5  # of a layer [m]
-_LEAST_ASIDE = 0.3  # of a window's normal across the needle's axis
+_THICKEST = 0.5  # largest thickness of a layer [m]
+_LEAST_ASIDE = 0.3  # component of the normal of a window across the needle [-]
 
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """One calibrated pinhole camera, and what it looks through.
+    """A calibrated pinhole camera and its window.
 
     Attributes
     ----------
@@ -35,11 +35,11 @@ class Camera:
     camera_matrix : ndarray, shape (3, 3)
         fx, fy, cx, cy [px].
     distortion : ndarray, shape (5,)
-        plumb_bob's k1, k2, p1, p2, k3 [-].
+        k1, k2, p1, p2, k3 of plumb_bob [-].
     T_optical_rig : ndarray, shape (4, 4)
-        Takes points of `rig` to the camera's optical frame [m].
+        Transforms points of `rig` to the optical frame of the camera [m].
     window : Window
-        Where its view enters the body that the needle is in.
+        Surface through which the camera sees the body with the needle.
     """
 
     width: int
@@ -58,7 +58,7 @@ class Camera:
 
 @dataclasses.dataclass(frozen=True)
 class StereoCalibration:
-    """Both cameras, each with the window that it looks through."""
+    """Both cameras, each with its window."""
 
     left: Camera
     right: Camera
@@ -70,12 +70,12 @@ class StereoCalibration:
 
     @property
     def sizes(self) -> dict[str, tuple[int, int]]:
-        """Width and height of each side's images [px]."""
+        """Width and height of the images of each side [px]."""
         return {side: (camera.width, camera.height) for side, camera in self.cameras.items()}
 
     @property
     def surface(self) -> Window | None:
-        """The level surface that both look through from above; None for windows of their own."""
+        """Level surface that both cameras share; None for windows of their own."""
         return common_surface(self.left.window, self.right.window)
 
 
@@ -96,14 +96,13 @@ def load_calibration(path: Path) -> StereoCalibration:
     Raises
     ------
     UserError
-        Unreadable, not YAML, or a value missing, not finite, of the wrong size or out of bounds;
-        the message says which.
+        Unreadable, not YAML, or a value missing, not finite, of the wrong size or out of bounds.
     """
     return calibration_from(read_calibration(path), path)
 
 
 def calibration_from(text: str, path: Path) -> StereoCalibration:
-    """Return what the text of a calibration file says; raises as `load_calibration`."""
+    """Return the calibration in the text of a file; raises as `load_calibration`."""
     try:
         return parse_calibration(load_yaml(text))
     except (UserError, ValueError) as error:
@@ -111,17 +110,7 @@ def calibration_from(text: str, path: Path) -> StereoCalibration:
 
 
 def parse_calibration(content: Any) -> StereoCalibration:
-    """Check the content of a calibration file.
-
-    Parameters
-    ----------
-    content : mapping
-        The file's content.
-
-    Returns
-    -------
-    StereoCalibration
-        With rotations normalised.
+    """Return the calibration in the content of a file, rotations normalised.
 
     Raises
     ------
@@ -145,12 +134,12 @@ def parse_calibration(content: Any) -> StereoCalibration:
 
 
 def parse_windows(content: Any) -> tuple[Window, Window]:
-    """Return the left and the right camera's window: its own, or the phantom's one surface.
+    """Return the windows of both cameras: their own, or the surface of the phantom.
 
     Parameters
     ----------
     content : mapping
-        A file's content: `phantom`, or `left` and `right` with a `window` each.
+        Content of a file: `phantom`, or `left` and `right` with a `window` each.
 
     Raises
     ------
@@ -226,7 +215,7 @@ def _camera(content: Any, side: str, window: Window) -> Camera:
 
 
 def check_camera_matrix(name: str, matrix: NDArray[np.float64]) -> None:
-    """Refuse a camera matrix, (3, 3), with skew or without focal lengths."""
+    """Reject a camera matrix, (3, 3), with skew or without focal lengths."""
     if not (matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0):
         raise UserError(f"{name}: focal lengths {matrix[0, 0]:g}, {matrix[1, 1]:g} px not positive")
     if np.any(matrix[[0, 1, 2, 2], [1, 0, 0, 1]] != 0.0) or matrix[2, 2] != 1.0:
@@ -246,7 +235,7 @@ def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def value_of(content: Any, *keys: str) -> Any:
-    """Return what stands under a path of keys; a `UserError` names the path where it is missing."""
+    """Return the value under a path of keys; a missing one raises a `UserError` with the path."""
     value = content
     for key in keys:
         if not isinstance(value, dict) or key not in value:
@@ -256,7 +245,7 @@ def value_of(content: Any, *keys: str) -> Any:
 
 
 def number(content: Any, *keys: str) -> float:
-    """Return the finite number under a path of keys; a `UserError` names it where it is none."""
+    """Return the number under a path of keys; raises a `UserError` unless it is finite."""
     value = value_of(content, *keys)
     if not _is_number(value) or not math.isfinite(value):
         raise UserError(f"{'.'.join(keys)} = {value!r} is not a finite number")
@@ -266,7 +255,7 @@ def number(content: Any, *keys: str) -> float:
 def numbers(content: Any, count: int | None, *keys: str) -> NDArray[np.float64]:
     """Return the list of finite numbers under a path of keys, shape (count,); None: any count.
 
-    Rows of a matrix are joined. A `UserError` names the list where it is none.
+    Rows of a matrix are joined. Anything else raises a `UserError`.
     """
     value, name = value_of(content, *keys), ".".join(keys)
     if isinstance(value, list):
@@ -285,7 +274,7 @@ def _is_number(value: Any) -> bool:
 
 
 def size_of(content: Any, *keys: str) -> int:
-    """Return the side of an image under a path of keys [px]; a `UserError` where it is none."""
+    """Return the size of an image under a path of keys [px]; raises a `UserError` unless valid."""
     value = value_of(content, *keys)
     if not isinstance(value, int) or isinstance(value, bool) or not 16 <= value <= 16384:
         raise UserError(f"{'.'.join(keys)} = {value!r} is not a size in [16, 16384] px")

@@ -1,6 +1,6 @@
-"""Points through the refracting window into one camera, and back: for loops.
+"""Projection through the refracting window, and rays of pixels: compiled, for loops.
 
-`refraction` has the same projection for arrays of any shape; the tests hold the two together.
+`refraction` has the same projection for arrays of any shape; tests compare the two.
 """
 
 # Compiled functions take plain numbers, one by one.
@@ -20,18 +20,31 @@ Array = NDArray[np.float64]
 
 _ITERATIONS = 40
 _UNDISTORT_ITERATIONS = 12
-_UNDISTORTED = 1e-9  # what is inverted so well is, at unit focal length
-_JACOBIAN_STEP = 1e-5  # [m]
+_UNDISTORTED = 1e-9  # error of a converged inversion of the distortion, at unit focal length
+_JACOBIAN_STEP = 1e-5  # of the central differences [m]: their relative error is about 1e-8
+_LAYERS = 29  # index of the first layer in a packed camera: thickness and refractive index
 
 
-_LAYERS = 29  # from here on, thickness and index of each layer
+@inlined
+def cross(one: Array, other: Array, result: Array) -> None:
+    """Write the cross product of two vectors, shape (3,)."""
+    result[0] = one[1] * other[2] - one[2] * other[1]
+    result[1] = one[2] * other[0] - one[0] * other[2]
+    result[2] = one[0] * other[1] - one[1] * other[0]
+
+
+@inlined
+def dot(one: Array, other: Array) -> float:
+    """Return the scalar product of two vectors, shape (3,)."""
+    product: float = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+    return product
 
 
 def pack_camera(camera: Camera) -> Array:
-    """Return all that projection needs, as the array that `project_point` takes."""
+    """Return the parameters of the projection as one array, for `project_point`."""
     window = camera.window
     height = float(window.height(camera.centre))
-    # The point of the outer face next to the camera.
+    # Point of the outer face next to the camera.
     foot = window.point + (camera.centre - window.point - height * window.normal)
     return np.concatenate(
         [
@@ -49,7 +62,7 @@ def pack_camera(camera: Camera) -> Array:
 
 @inlined
 def _crossing(camera: Array, distance: float, depth: float) -> float:
-    """Return how far from the camera's foot, along the window, light crosses the outer face [m].
+    """Return the distance from the foot of the camera at which light crosses the outer face [m].
 
     Snell's law in the plane of incidence, rho the wanted distance, s = rho / sqrt(rho^2 + h^2)
     the sine in air: a layer takes the light t s / sqrt(n_i^2 - s^2) farther, and in the last
@@ -61,11 +74,11 @@ def _crossing(camera: Array, distance: float, depth: float) -> float:
     camera : ndarray
         From `pack_camera`.
     distance : float
-        D: of the point from the camera's foot, along the window [m].
+        D: distance of the point from the foot of the camera, along the window [m].
     depth : float
-        Of the point behind the outer face [m].
+        Depth of the point behind the outer face [m].
     """
-    # The last medium is the one that the point is in.
+    # The point is in the last medium.
     index, end = camera[25], len(camera)
     shallower = 0.0
     for i in range(_LAYERS, len(camera), 2):
@@ -111,7 +124,7 @@ def _crossing(camera: Array, distance: float, depth: float) -> float:
 def _seen(
     camera: Array, point_x: float, point_y: float, point_z: float
 ) -> tuple[float, float, float]:
-    """Return where a point is seen on the outer face, in the optical frame [m]."""
+    """Return the point of the outer face at which a point appears, in the optical frame [m]."""
     offset_x, offset_y, offset_z = point_x - camera[12], point_y - camera[13], point_z - camera[14]
     depth = -(camera[26] * offset_x + camera[27] * offset_y + camera[28] * offset_z)
     if depth > 0.0:
@@ -132,16 +145,16 @@ def _seen(
 
 @compiled
 def see_through(camera: Array, points: Array, seen: Array) -> None:
-    """Write where points are seen on the outer face, whatever the lens.
+    """Write the points of the outer face at which points appear.
 
     Parameters
     ----------
     camera : ndarray
         From `pack_camera`.
     points : ndarray, shape (n, 3)
-        In `rig` [m]; those before the window are seen straight.
+        In `rig` [m]; those before the window are not refracted.
     seen : ndarray, shape (n, 3)
-        Takes the result, in the optical frame [m].
+        Output, in the optical frame [m].
     """
     for i in range(len(points)):
         seen[i, 0], seen[i, 1], seen[i, 2] = _seen(camera, points[i, 0], points[i, 1], points[i, 2])
@@ -158,7 +171,7 @@ def project_point(camera: Array, point: Array, pixel: Array) -> None:
     point : ndarray, shape (3,)
         In `rig` [m].
     pixel : ndarray, shape (2,)
-        Takes the result; NaN behind the camera.
+        Output; NaN behind the camera.
     """
     x, y, z = _seen(camera, point[0], point[1], point[2])
     if z <= 0.0:
@@ -177,7 +190,7 @@ def project_point(camera: Array, point: Array, pixel: Array) -> None:
 def _refracted(
     camera: Array, along_x: float, along_y: float, along_z: float, index: float, direction: Array
 ) -> float:
-    """Write the unit vector into a medium of an index; return its part along the normal."""
+    """Write the unit vector in a medium of an index; return its component along the normal."""
     x, y, z = along_x / index, along_y / index, along_z / index
     steep = math.sqrt(1.0 - x * x - y * y - z * z)
     direction[0] = x - steep * camera[26]
@@ -188,7 +201,7 @@ def _refracted(
 
 @compiled
 def pixel_ray(camera: Array, pixel: Array, origin: Array, direction: Array) -> None:
-    """Write the refracted ray that a pixel looks along.
+    """Write the refracted ray of a pixel.
 
     Parameters
     ----------
@@ -197,8 +210,8 @@ def pixel_ray(camera: Array, pixel: Array, origin: Array, direction: Array) -> N
     pixel : ndarray, shape (2,)
         Pixel coordinates.
     origin, direction : ndarray, shape (3,)
-        Take the point of the window's inner face in `rig` [m] and the unit vector into the body;
-        NaN for a pixel that does not look at the window, or where the distortion has no inverse.
+        Output: the point of the inner face of the window in `rig` [m] and the unit vector into the
+        body; NaN if the pixel does not see the window or the distortion has no inverse.
     """
     k1, k2, p1, p2, k3 = camera[19], camera[20], camera[21], camera[22], camera[23]
     seen_x = (pixel[0] - camera[17]) / camera[15]
@@ -229,7 +242,7 @@ def pixel_ray(camera: Array, pixel: Array, origin: Array, direction: Array) -> N
         origin[:] = np.nan
         direction[:] = np.nan
         return
-    # The part along the window; Snell's law: it shrinks by the index, in each medium anew.
+    # Snell's law: the component along the window, divided by the index of each medium.
     along_x = air_x + inwards * camera[26]
     along_y = air_y + inwards * camera[27]
     along_z = air_z + inwards * camera[28]
@@ -256,82 +269,3 @@ def point_jacobian(camera: Array, point: Array, jacobian: Array) -> None:
         project_point(camera, moved, behind)
         moved[axis] = point[axis]
         jacobian[:, axis] = (ahead - behind) / (2.0 * _JACOBIAN_STEP)
-
-
-@compiled
-def solve_position(
-    cameras: tuple[Array, Array],
-    points: Array,
-    axes: Array,
-    sigmas: Array,
-    position: Array,
-    iterations: int,
-) -> tuple[int, Array, Array, Array]:
-    """Fit a position to two image points, each known across and along its shaft.
-
-    Parameters
-    ----------
-    cameras : pair of ndarray
-        From `pack_camera`.
-    points : ndarray, shape (2, 2)
-        Image points [px].
-    axes : ndarray, shape (2, 2, 2)
-        Per camera the unit vectors across and along the shaft.
-    sigmas : ndarray, shape (4,)
-        Standard deviations: left across, left along, right across, right along [px].
-    position : ndarray, shape (3,)
-        Where to start; takes the result [m].
-    iterations : int
-        Most steps.
-
-    Returns
-    -------
-    converged : int
-        1 if so.
-    normal : ndarray, shape (3, 3)
-        Normal matrix: the inverse of the covariance.
-    residual : ndarray, shape (4,)
-        In the order of `sigmas` [px].
-    jacobians : ndarray, shape (2, 2, 3)
-        Of both cameras at the position [px/m].
-    """
-    jacobians = np.empty((2, 2, 3))
-    rows = np.empty((4, 3))
-    residual = np.empty(4)
-    normal = np.zeros((3, 3))
-    pixel = np.empty(2)
-    for _ in range(iterations):
-        for i in range(2):
-            project_point(cameras[i], position, pixel)
-            point_jacobian(cameras[i], position, jacobians[i])
-            off = points[i] - pixel
-            for k in range(2):
-                across, along = axes[i, k, 0], axes[i, k, 1]
-                residual[2 * i + k] = across * off[0] + along * off[1]
-                rows[2 * i + k] = across * jacobians[i, 0] + along * jacobians[i, 1]
-        normal[:] = 0.0
-        right = np.zeros(3)
-        for k in range(4):
-            weighted = 1.0 / (sigmas[k] * sigmas[k]) * rows[k]
-            right += weighted * residual[k]
-            normal += np.outer(weighted, rows[k])
-        # Scaled by its diagonal, the determinant says how well the position is determined.
-        product = normal[0, 0] * normal[1, 1] * normal[2, 2]
-        c00 = normal[1, 1] * normal[2, 2] - normal[1, 2] * normal[2, 1]
-        c01 = normal[0, 2] * normal[2, 1] - normal[0, 1] * normal[2, 2]
-        c02 = normal[0, 1] * normal[1, 2] - normal[0, 2] * normal[1, 1]
-        det = normal[0, 0] * c00 + normal[1, 0] * c01 + normal[2, 0] * c02
-        if not (product > 0.0 and det > 1e-10 * product):
-            return 0, normal, residual, jacobians
-        c11 = normal[0, 0] * normal[2, 2] - normal[0, 2] * normal[2, 0]
-        c12 = normal[0, 2] * normal[1, 0] - normal[0, 0] * normal[1, 2]
-        c22 = normal[0, 0] * normal[1, 1] - normal[0, 1] * normal[1, 0]
-        step = np.empty(3)
-        step[0] = c00 * right[0] + c01 * right[1] + c02 * right[2]
-        step[1] = c01 * right[0] + c11 * right[1] + c12 * right[2]
-        step[2] = c02 * right[0] + c12 * right[1] + c22 * right[2]
-        step /= det
-        position += step
-        if np.abs(step).max() < 1e-10:
-            return 1, normal, residual, jacobians
-    return 0, normal, residual, jacobians

@@ -1,8 +1,8 @@
-"""A camera that looks through its window: Snell's law, both ways.
+"""Camera behind its refracting window: projection of points by Snell's law.
 
 The window is a stack of plane-parallel media: air with the camera, layers such as a wall of
-acrylic, then the body with the needle. A ray from the camera and its continuations lie in one plane
-with the window's normal, so that both directions reduce to that plane.
+acrylic, then the body with the needle. A ray from the camera and its continuations are in one plane
+with the normal of the window, so that refraction is a problem in that plane.
 """
 
 from __future__ import annotations
@@ -11,12 +11,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.optics.calibration import Camera, StereoCalibration
-from needle_tracker.optics.camera_model import project_optical
-from needle_tracker.optics.compiled_projection import pack_camera, see_through
+from needle_tracker.optics.compiled_projection import pack_camera, point_jacobian, see_through
 
 Array = NDArray[np.float64]
 
-_JACOBIAN_STEP = 1e-5  # [m]: central differences are then good to about 1e-8 relative
+
+def distort(points: Array, distortion: Array) -> Array:
+    """Apply plumb_bob distortion (Brown's model, as in OpenCV and CameraInfo).
+
+    Parameters
+    ----------
+    points : ndarray, shape (..., 2)
+        Ideal image points at unit focal length [-].
+    distortion : ndarray, shape (5,)
+        k1, k2, p1, p2, k3.
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Distorted points at unit focal length [-].
+    """
+    k1, k2, p1, p2, k3 = distortion
+    x, y = points[..., 0], points[..., 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def project_optical(camera: Camera, points: Array) -> Array:
+    """Project points of the optical frame to pixels.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    points : ndarray, shape (..., 3)
+        In the camera's optical frame [m].
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Pixel coordinates (u right, v down, pixel centres at integers); NaN behind the camera.
+    """
+    depth = np.where(points[..., 2] > 0.0, points[..., 2], np.nan)
+    distorted = distort(points[..., :2] / depth[..., None], camera.distortion)
+    matrix = camera.camera_matrix
+    return distorted * matrix[[0, 1], [0, 1]] + matrix[:2, 2]
 
 
 class RefractedCamera:
@@ -33,11 +79,11 @@ class RefractedCamera:
         self.packed = pack_camera(camera)
 
     def __eq__(self, other: object) -> bool:
-        """Return whether both have the same image of everything."""
+        """Return whether both cameras project all points alike."""
         return isinstance(other, RefractedCamera) and self._identity == other._identity
 
     def __hash__(self) -> int:
-        """Return what is equal for equal cameras."""
+        """Return the hash of size and parameters."""
         return hash(self._identity)
 
     @property
@@ -48,18 +94,18 @@ class RefractedCamera:
     def sideways(self) -> Array:
         """Unit vector in `rig`, shape (3,), across the needle's axis and the window's normal.
 
-        With the axis, z, it spans the plane through the needle's way that faces this camera.
+        With z it spans the plane through the needle that faces this camera.
         """
         sideways = np.cross([0.0, 0.0, 1.0], self.camera.window.normal)
         return np.asarray(sideways / np.linalg.norm(sideways))
 
     def project(self, points: Array) -> Array:
-        """Return the pixels at which points are seen.
+        """Return the pixels of points.
 
         Parameters
         ----------
         points : ndarray, shape (..., 3)
-            Points in `rig` [m]; before the window they are seen straight.
+            Points in `rig` [m]; those before the window are not refracted.
 
         Returns
         -------
@@ -69,12 +115,12 @@ class RefractedCamera:
         return project_optical(self.camera, self.seen_through(points))
 
     def seen_through(self, points: Array) -> Array:
-        """Return where points are seen on the outer face, in the optical frame: whatever the lens.
+        """Return the points of the outer face at which points appear, in the optical frame.
 
         Parameters
         ----------
         points : ndarray, shape (..., 3)
-            Points in `rig` [m]; those before the window are seen straight.
+            Points in `rig` [m]; those before the window are not refracted.
 
         Returns
         -------
@@ -88,9 +134,9 @@ class RefractedCamera:
 
     def jacobian(self, point: Array) -> Array:
         """Return d(pixel)/d(point) [px/m], shape (2, 3), at one point in `rig` [m]."""
-        steps = _JACOBIAN_STEP * np.concatenate([np.eye(3), -np.eye(3)])
-        pixels = self.project(point + steps)
-        return np.asarray((pixels[:3] - pixels[3:]).T / (2.0 * _JACOBIAN_STEP))
+        jacobian = np.empty((2, 3))
+        point_jacobian(self.packed, np.asarray(point, dtype=np.float64), jacobian)
+        return jacobian
 
 
 def stereo_views(calibration: StereoCalibration) -> tuple[RefractedCamera, RefractedCamera]:

@@ -1,4 +1,4 @@
-"""The window that a camera looks through: a flat face, the layers behind it, and the body."""
+"""Window of a camera: a flat face, the layers behind it, and the body."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Layer:
     Attributes
     ----------
     thickness : float
-        Along the window's normal [m].
+        Along the normal of the window [m].
     refractive_index : float
-        Against air [-], at least 1.
+        Relative to air [-], at least 1.
     """
 
     thickness: float
@@ -28,18 +28,18 @@ class Layer:
 
 @dataclasses.dataclass(frozen=True)
 class Window:
-    """Surface at which light goes from air into the body that the needle is in.
+    """Surface at which light enters the body with the needle.
 
     Attributes
     ----------
     point : ndarray, shape (3,)
-        Any point of the outer face, where air ends, in `rig` [m].
+        Any point of the outer face in `rig` [m].
     normal : ndarray, shape (3,)
-        Of the faces: a unit vector in `rig`, towards the camera.
+        Unit vector in `rig`, across the faces and towards the camera.
     layers : tuple of Layer
         From the outer face inwards; none for a body with a free surface.
     inside : float
-        Refractive index of the body against air [-], at least 1.
+        Refractive index of the body relative to air [-], at least 1.
     """
 
     point: Array
@@ -49,11 +49,11 @@ class Window:
 
     @property
     def thickness(self) -> float:
-        """Of all layers together [m]."""
+        """Thickness of all layers together [m]."""
         return sum(layer.thickness for layer in self.layers)
 
     def height(self, points: Array) -> Array:
-        """Return how far points are before the outer face, towards the camera.
+        """Return the height of points above the outer face, towards the camera.
 
         Parameters
         ----------
@@ -68,7 +68,7 @@ class Window:
         return np.asarray((points - self.point) @ self.normal)
 
     def depth(self, points: Array) -> Array:
-        """Return how deep points are in the body, behind all layers.
+        """Return the depth of points in the body, behind all layers.
 
         Parameters
         ----------
@@ -84,7 +84,7 @@ class Window:
 
 
 def common_surface(left: Window, right: Window) -> Window | None:
-    """Return the level, free surface that two windows are; None where they are anything else."""
+    """Return the level, free surface that two windows share, if any."""
     for window in (left, right):
         if window.layers or not np.array_equal(window.normal, [1.0, 0.0, 0.0]):
             return None
@@ -98,9 +98,9 @@ def surface_from_above(surface_height: float, refractive_index: float) -> Window
     Parameters
     ----------
     surface_height : float
-        Its x in `rig` [m].
+        x of the surface in `rig` [m].
     refractive_index : float
-        Of the body against air [-].
+        Refractive index of the body relative to air [-].
     """
     return Window(
         np.array([surface_height, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), (), refractive_index

@@ -1,4 +1,4 @@
-"""`ros2 run needle_tracker check_calibration`: whether the calibration is still the rig's."""
+"""`ros2 run needle_tracker check_calibration`: check that a calibration still fits the rig."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 import time
 from argparse import Namespace
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import rclpy
@@ -16,21 +17,48 @@ from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Image
 
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
+from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
 from needle_core.message_types import to_nanoseconds
 from needle_core.process.discovery import restrict_discovery
 from needle_core.process.shared_memory import remove_incomplete_ports
 from needle_core.ros.base_node import IMAGES_BEST_EFFORT, WholeNode
+from needle_core.settings.bounds import check_bounds
 from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.answers.tracker_messages import frame_of
-from needle_tracker.calibrating.board_views import averaged_view, views_in_folders
-from needle_tracker.calibrating.calibration_check import check
-from needle_tracker.calibrating.calibration_session import Session, load_session
-from needle_tracker.calibrating.check_options import figures, parse, report
-from needle_tracker.calibrating.rig_model import BoardView
+from needle_tracker.calibrating.calibration_check import check, figures, report
+from needle_tracker.calibrating.calibration_session import (
+    BoardView,
+    Session,
+    averaged_view,
+    load_session,
+    views_in_folders,
+)
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.sources.image_files import size_problem
 from needle_tracker.sources.pairing import PairMatcher
+
+_DESCRIPTION = """\
+Check a stereo calibration with a ChArUco board of known place: a camera turned by 0.02 deg, an
+index off by 0.01 or another surface height are silent (both rays still meet) and cost 0.1 to
+0.7 mm. Prints what differs, by how much and what it does to tips.
+
+The session file is that of calibrate_stereo (see there): board and places. For a check lay the
+board flat on the surface and, tilted, at a known place under it, and give each place the `sigma`
+that it is really known to. A place given wrong looks like both cameras turned.
+
+Recorded images: --left and --right, folders paired by name; an image whose name is no place of the
+session is taken for a board held freely in air, which says little. Live: --live NAME takes pairs
+from stereo/{left,right}/image_raw; the board stands still at the session's place NAME.
+"""
+_EPILOG = """\
+examples:
+  ros2 run needle_tracker check_calibration --calibration rig.yaml --session S.yaml --left L --right R
+  ros2 run needle_tracker check_calibration --calibration rig.yaml --session S.yaml --live under_wedge
+
+exit codes: 0 OK; 1 NOT OK, or this target cannot show it; 2 bad input, no images or no board;
+130 interrupted
+"""  # noqa: E501 - command lines stay whole
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,8 +67,48 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(lambda: check_calibration(parse(remove_ros_args(words)[1:]), words))
 
 
+def parse(arguments: Sequence[str]) -> Namespace:
+    """Return the options of a command line, without the name of the program; `limit` is in metres.
+
+    Raises
+    ------
+    UserError
+        Contradictory options, or a number out of bounds.
+    """
+    given = _parser().parse_args(arguments)
+    if (given.live is None) != (given.left is not None and given.right is not None):
+        raise UserError("wants either --left and --right, or --live; see --help")
+    if given.live is not None and (given.left is not None or given.right is not None):
+        raise UserError("--live takes its images from topics: no --left, no --right")
+    for name, lower, upper, unit in (
+        ("count", 1, 1000, "pairs"),
+        ("timeout", 0.1, 3600.0, "s"),
+        ("pair_tolerance", 0.0, 0.1, "s"),
+        ("limit_mm", 0.001, 10.0, "mm"),
+    ):
+        check_bounds(f"--{name.replace('_', '-')}", getattr(given, name), lower, upper, unit)
+    given.limit = 1e-3 * given.limit_mm
+    return given
+
+
+def _parser() -> CommandParser:
+    parser = CommandParser("check_calibration", _DESCRIPTION, _EPILOG)
+    add = parser.add_argument
+    add("--calibration", type=Path, required=True, metavar="FILE", help="what is checked")
+    add("--session", type=Path, required=True, metavar="FILE", help="board and places (YAML)")
+    add("--left", type=Path, metavar="DIR", help="images of the left camera")
+    add("--right", type=Path, metavar="DIR", help="images of the right camera")
+    add("--live", metavar="NAME", help="take images from topics, the board at this place")
+    add("--count", type=int, default=10, metavar="N", help="pairs to take live (10)")
+    add("--timeout", type=float, default=10.0, metavar="S", help="wait for them so long (10 s)")
+    add("--pair-tolerance", type=float, default=0.0, metavar="S", help="of left and right (0 s)")
+    add("--limit-mm", type=float, default=0.15, metavar="MM", help="accepted tip error (0.15)")
+    add("--json", type=Path, metavar="FILE", help="also write the figures as flat JSON")
+    return parser
+
+
 def check_calibration(options: Namespace, words: list[str]) -> int:
-    """Check as asked, print and write the result."""
+    """Check the calibration, print and write the result."""
     calibration, session = load_calibration(options.calibration), load_session(options.session)
     if options.left is not None and options.right is not None:
         views, sizes = views_in_folders(options.left, options.right, session, all_places=False)
@@ -77,7 +145,7 @@ def _live_view(
 
 
 class _Capture(WholeNode):
-    """Takes a number of image pairs from the topics."""
+    """Node that receives a number of image pairs."""
 
     def __init__(
         self, context: Context, calibration: StereoCalibration, options: Namespace
@@ -102,7 +170,7 @@ class _Capture(WholeNode):
         Raises
         ------
         UserError
-            Images that are not of the calibrated cameras, or too few in the given time.
+            Images of other cameras, or too few before the timeout.
         """
         executor = SingleThreadedExecutor(context=self.context)
         executor.add_node(self)

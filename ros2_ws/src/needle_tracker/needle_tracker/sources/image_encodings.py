@@ -1,4 +1,4 @@
-"""Grey images from what cameras send: grey, colour, YUV 4:2:2 or a Bayer pattern, 8 bits each.
+"""Conversion of camera images to grey: grey, colour, YUV 4:2:2 or a Bayer pattern, 8 bits each.
 
 The names are those of sensor_msgs/image_encodings.
 """
@@ -18,9 +18,9 @@ _COLOUR = {
     "bgra8": (4, cv2.COLOR_BGRA2GRAY),
     "rgba8": (4, cv2.COLOR_RGBA2GRAY),
 }
-# Brightness is every other byte, from this one on.
+# Brightness is every other byte, starting at this one.
 _YUV = {"yuyv": 0, "yuv422_yuy2": 0, "uyvy": 1, "yuv422": 1}
-# OpenCV names a pattern by its second row's second and third pixel.
+# OpenCV names a pattern by the second and third pixel of its second row.
 _BAYER = {
     "bayer_rggb8": cv2.COLOR_BayerBG2GRAY,
     "bayer_bggr8": cv2.COLOR_BayerRG2GRAY,
@@ -28,9 +28,9 @@ _BAYER = {
     "bayer_grbg8": cv2.COLOR_BayerGB2GRAY,
 }
 ENCODINGS = (*_GREY, *_COLOUR, *_YUV, *_BAYER)
-"""Those that are read."""
+"""Supported encodings."""
 WANTED = "8 bits, such as mono8 or bgr8"
-"""The same in short, for a person."""
+"""Supported encodings, in short."""
 
 
 def bytes_per_pixel(encoding: str) -> int:
@@ -46,16 +46,16 @@ def grey_image(rows: NDArray[np.uint8], width: int, encoding: str) -> Image:
     Parameters
     ----------
     rows : ndarray of uint8, shape (height, step)
-        The image's bytes, row by row; what follows the pixels of a row is left out.
+        Bytes of the image, row by row; padding after the pixels of a row is ignored.
     width : int
-        Of the image [px].
+        Width of the image [px].
     encoding : str
         One of `ENCODINGS`.
 
     Returns
     -------
     ndarray of uint8, shape (height, width)
-        Of a grey image the same memory.
+        Shares the memory of a grey image.
     """
     pixels = rows[:, : width * bytes_per_pixel(encoding)]
     if encoding in _COLOUR:

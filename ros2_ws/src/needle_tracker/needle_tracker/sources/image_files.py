@@ -1,4 +1,4 @@
-"""Image files paired by name, or two videos frame by frame, as one sequence of named pairs."""
+"""Sequences of named pairs from files: images paired by name, or two videos frame by frame."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from needle_core.errors import UserError
 
 Image = NDArray[np.uint8]
 Sizes = dict[str, tuple[int, int]]
-"""Width and height of each side's images [px]."""
+"""Width and height of the images of each side [px]."""
 
 _SUFFIXES = frozenset(
     (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".pnm", ".ppm", ".tif", ".tiff", ".webp", ".jp2")
 )
-# How the file names of two cameras differ: in the left one's a pattern, in the right one's a text.
+# Differences between the names of a left and a right file: a pattern, and its replacement.
 _CAMERA_NUMBER = "(?:(?<=cam)|(?<=cam[-_])|(?<=camera)|(?<=camera[-_]))%d(?!\\d)"
 _WORDS = (("left", "right"), (_CAMERA_NUMBER % 0, "1"), (_CAMERA_NUMBER % 1, "2"), ("l", "r"))
 _SEPARATORS = "-_. "
@@ -34,13 +34,13 @@ _SIDES = ("left", "right")
 
 @dataclasses.dataclass(frozen=True)
 class NamedPair:
-    """The images of one name; None for one that cannot be read.
+    """The two images of one name; None for an unreadable image.
 
     Attributes
     ----------
     name : str
-        File name, without `left` or `right` where the files differ by that; for videos the frame's
-        number, from 000000 on.
+        File name, without `left` or `right` if the files differ by that; for videos the number of
+        the frame, from 000000 on.
     left, right : ndarray of uint8, shape (height, width), or None
         Grey images.
     files : pair of Path
@@ -59,11 +59,11 @@ class NamedPair:
         return tuple(dict.fromkeys(name for path in paths for name in (path.name, path.stem)))
 
     def number_in(self, numbers: Mapping[str, float]) -> float | None:
-        """Return the number that a CSV has for one of its names; None where it has none."""
+        """Return the number under one of its names, if any."""
         return next((numbers[name] for name in self.names if name in numbers), None)
 
     def problem(self, sizes: Sizes) -> str:
-        """Return which image cannot be used, for it is not of these sizes; empty where both can."""
+        """Return the problem with an image, such as another size; empty if both are usable."""
         for (side, wanted), image in zip(sizes.items(), (self.left, self.right), strict=True):
             if image is None:
                 return f"{side} image is unreadable or not of 8 bit"
@@ -73,7 +73,7 @@ class NamedPair:
 
 
 def size_problem(side: str, size: tuple[int, ...], wanted: tuple[int, int]) -> str:
-    """Return that a side's images are not of the calibration's size, in words; empty if they are.
+    """Return a message if the size of an image differs from the calibration, else an empty text.
 
     Sizes are width and height [px].
     """
@@ -84,17 +84,16 @@ def size_problem(side: str, size: tuple[int, ...], wanted: tuple[int, int]) -> s
 
 @dataclasses.dataclass
 class PairSequence:
-    """Pairs in the order of their names, read one by one.
+    """Pairs in the order of their names, read on demand.
 
     Attributes
     ----------
     names : list of str
-        Of the pairs, in order (numbers in a name count as numbers). Of videos: as many as the
-        containers promise.
+        Names of the pairs, in natural order; for videos as many as the containers declare.
     unpaired : list of str
-        Names, with their side, that have no partner; of videos known at the end.
+        Names without a partner, with their side; for videos known at the end.
     cut_off : int
-        Pairs that the videos' containers promised and their data did not give; known at the end.
+        Number of pairs that the containers declare and the data lack; known at the end.
     """
 
     names: list[str]
@@ -105,14 +104,14 @@ class PairSequence:
     cut_off: int = 0
 
     def refuse_unpaired(self) -> PairSequence:
-        """Return the sequence itself; a `UserError` where an image has no partner."""
+        """Return the sequence itself; raises a `UserError` if an image has no partner."""
         if self.unpaired:
             raise UserError(f"images without a partner ({len(self.unpaired)}): {self.unpaired[0]}")
         return self
 
     @property
     def missing(self) -> str:
-        """Frames that the videos lacked, in words, known at the end; empty where all is there."""
+        """Missing frames of the videos, as text, known at the end; empty if complete."""
         parts = []
         if self.unpaired:
             parts.append(f"{len(self.unpaired)} frames without a partner")
@@ -201,7 +200,7 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
 
 
 def progress(pairs: PairSequence, what: str) -> Iterator[NamedPair]:
-    """Yield the pairs; a bar on a terminal says how far it is."""
+    """Yield the pairs, with a progress bar on a terminal."""
     hidden = not sys.stderr.isatty()
     yield from tqdm(
         pairs, what, len(pairs.names), unit="pair", delay=1.0, leave=False, disable=hidden
@@ -209,14 +208,14 @@ def progress(pairs: PairSequence, what: str) -> Iterator[NamedPair]:
 
 
 def mean_pair(left: Path, right: Path, sizes: Sizes) -> tuple[Image, Image]:
-    """Return the mean of all pairs of two folders or videos, which has less noise.
+    """Return the mean of all pairs of two folders or videos, to reduce noise.
 
     Parameters
     ----------
     left, right : Path
-        As of `open_pairs`.
+        As for `open_pairs`.
     sizes : dict of str to (int, int)
-        Width and height that each side's images must have [px].
+        Required width and height of the images of each side [px].
 
     Raises
     ------
@@ -234,7 +233,7 @@ def mean_pair(left: Path, right: Path, sizes: Sizes) -> tuple[Image, Image]:
 
 
 def _pair(left: set[str], right: set[str], *, one_folder: bool) -> list[tuple[str, str, str]]:
-    """Return name, left and right file of each pair: equal names, else such as sides differ by."""
+    """Return name, left and right file of each pair: of equal names, else by `_WORDS`."""
     equal = set() if one_folder else left & right
     pairs = [(name, name, name) for name in equal]
     unused = right - equal
@@ -248,7 +247,7 @@ def _pair(left: set[str], right: set[str], *, one_folder: bool) -> list[tuple[st
 
 
 def _partners(name: str) -> Iterator[tuple[str, str]]:
-    """Yield what the right camera's file of this name could be called, and what both share."""
+    """Yield possible names of the right file for a left one, and the name that both share."""
     stem, suffix = Path(name).stem, Path(name).suffix
     for left, right in _WORDS:
         for match in re.finditer(left, stem, re.IGNORECASE):
@@ -271,7 +270,7 @@ def read_insertions(path: Path) -> Mapping[str, float]:
     Returns
     -------
     mapping
-        Name to insertion [m]; names without a value are left out.
+        Name to insertion [m], without names that have no value.
 
     Raises
     ------
@@ -290,22 +289,21 @@ def read_numbers(
     Parameters
     ----------
     option : str
-        For messages: the option that the file was given with.
+        Option of the file, for messages.
     path : Path
         The file.
     columns : tuple of str
-        Besides `name`; others are passed over.
+        Columns besides `name`; others are ignored.
 
     Returns
     -------
     dict
-        Name to the columns' numbers, None where all of these fields are empty.
+        Name to the numbers of the columns; None if all of these fields are empty.
 
     Raises
     ------
     UserError
-        Unreadable, a column missing, a value that is not a finite number, or a name given twice;
-        the message says in which line.
+        Unreadable, a column missing, a value that is not a finite number, or a duplicate name.
     """
     found: dict[str, list[float] | None] = {}
     try:
@@ -341,7 +339,7 @@ def _number(text: str, where: str, column: str) -> float:
 
 
 def _image_folder(folder: Path) -> Path:
-    """Return where a folder's images are: in it, or in its `data` (as EuRoC and Kalibr lay it)."""
+    """Return the folder of the images: the folder itself or its `data`, as in EuRoC and Kalibr."""
     inner = folder / "data"
     has_images = any(path.suffix.lower() in _SUFFIXES for path in folder.iterdir())
     return inner if inner.is_dir() and not has_images else folder
@@ -359,20 +357,20 @@ def _images_in(side: str, folder: Path) -> set[str]:
 
 
 def _natural(name: str) -> tuple[list[tuple[int, str]], str]:
-    """Return a key by which frame_9 comes before frame_10."""
+    """Return a key that sorts frame_9 before frame_10."""
     parts = re.split(r"(\d+)", name)
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], name
 
 
 def _read(path: Path) -> Image | None:
-    """Return a file's grey image, None where it is not one of 8 bit."""
+    """Return the grey image of a file; None unless it has 8 bits."""
     try:
         data = np.fromfile(path, np.uint8)
     except OSError:
         return None
     if not data.size:
         return None
-    # Without ANYDEPTH OpenCV would quietly make 8 bit of 16.
+    # Without ANYDEPTH OpenCV would silently convert 16 bits to 8.
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         return _grey(cv2.imdecode(data, flags))

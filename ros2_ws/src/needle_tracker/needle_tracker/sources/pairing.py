@@ -1,17 +1,19 @@
-"""Left and right images of one exposure, brought together by their stamps."""
+"""Matching by stamps: left and right images of one exposure, and the insertion at it."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import statistics
 from collections import Counter, OrderedDict, deque
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
-_WAITING_LIMIT = 3
-_SKEWS = 100  # the latest pairs, whose stamps' difference is told
-_PERIODS, _FEWEST_PERIODS = 15, 3  # the latest, and those without which none is known
+_WAITING_LIMIT = 3  # images of one side without a partner
+_SKEWS = 100  # latest pairs whose differences of stamps are reported
+_PERIODS = 15  # latest periods of the cameras, of which the median is used
+_KEPT = 2000  # samples: 40 s at 50 Hz
 OTHER_SIDE = {"left": "right", "right": "left"}
 
 
@@ -25,22 +27,22 @@ class Pair(Generic[T]):
 
 
 class PairMatcher(Generic[T]):
-    """Pairs images by stamp; never the latest with the latest.
+    """Pairs images by stamp, never just the latest with the latest.
 
-    An image waits for its partner until a later pair is complete, or too many of its side wait.
+    An image waits for its partner until a later pair is complete or too many images wait.
 
     Parameters
     ----------
     tolerance : int or None
         Largest difference of the stamps of a pair [ns]; 0 for cameras on one trigger. None for
-        cameras that run freely: half the time from one image of a camera to its next.
+        free-running cameras: half the measured period of the cameras.
 
     Attributes
     ----------
     pairs : int
-        Pairs made.
+        Number of pairs.
     unpaired : Counter of str
-        Images of each side that were dropped without a partner.
+        Number of images of each side that were dropped without a partner.
     """
 
     def __init__(self, tolerance: int | None) -> None:
@@ -56,16 +58,15 @@ class PairMatcher(Generic[T]):
         """Largest difference of the stamps of a pair, as given or measured [ns]."""
         if self._tolerance is not None:
             return self._tolerance
-        known = len(self._periods) >= _FEWEST_PERIODS
-        return round(statistics.median(self._periods) / 2.0) if known else 0
+        return round(statistics.median(self._periods) / 2.0) if self._periods else 0
 
     @property
     def skew(self) -> tuple[float, int] | None:
-        """Median and largest difference of the stamps of the latest pairs [ns]; None without."""
+        """Median and largest difference of the stamps of the latest pairs [ns], if any."""
         return (statistics.median(self._skews), max(self._skews)) if self._skews else None
 
     def add(self, side: str, stamp: int, image: T) -> Pair[T] | None:
-        """Take an image; return the pair that it completes, None where its partner is missing.
+        """Add an image; return the pair that it completes, if any.
 
         Parameters
         ----------
@@ -105,7 +106,7 @@ class PairMatcher(Generic[T]):
         return Pair(partner, other_image, image)
 
     def waiting(self, side: str) -> list[int]:
-        """Return the stamps [ns] of a side's images that wait for their partner."""
+        """Return the stamps [ns] of the images of a side that wait for their partner."""
         return list(self._waiting[side])
 
     def _drop_older(self, side: str, stamp: int) -> None:
@@ -113,3 +114,68 @@ class PairMatcher(Generic[T]):
         for old in [other for other in waiting if other < stamp]:
             del waiting[old]
             self.unpaired[side] += 1
+
+
+class InsertionHistory:
+    """Insertions by stamp, for interpolation.
+
+    Attributes
+    ----------
+    rejected : int
+        Number of samples that were not finite.
+    restarts : int
+        Number of times that the stamps ran backwards.
+    """
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[int, float]] = deque(maxlen=_KEPT)
+        self._first = 0
+        self.rejected = 0
+        self.restarts = 0
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def add(self, stamp: int, insertion: float) -> None:
+        """Add a sample.
+
+        Parameters
+        ----------
+        stamp : int
+            Time of sampling [ns]. A step backwards restarts the history.
+        insertion : float
+            Insertion [m]; only finite values are used.
+        """
+        if not math.isfinite(insertion):
+            self.rejected += 1
+            return
+        if self._samples and stamp < self._samples[-1][0]:
+            self._samples.clear()
+            self.restarts += 1
+        elif self._samples and stamp == self._samples[-1][0]:
+            self._samples.pop()
+        if not self._samples:
+            self._first = stamp
+        self._samples.append((stamp, insertion))
+
+    def time_before(self, stamp: int) -> int:
+        """Return the time from `stamp` to the first sample ever [ns]; 0 if that was before."""
+        return max(0, self._first - stamp) if self._samples else 0
+
+    def is_bracketed(self, stamp: int) -> bool:
+        """Return whether there is a sample at or after `stamp` [ns], so that `at` is final."""
+        return bool(self._samples) and self._samples[-1][0] >= stamp
+
+    def at(self, stamp: int) -> float | None:
+        """Return the interpolated insertion [m] at `stamp` [ns]; None outside the samples."""
+        after: tuple[int, float] | None = None
+        for sample in reversed(self._samples):
+            if sample[0] == stamp:
+                return sample[1]
+            if sample[0] < stamp:
+                if after is None:
+                    return None
+                share = (stamp - sample[0]) / (after[0] - sample[0])
+                return sample[1] + share * (after[1] - sample[1])
+            after = sample
+        return None

@@ -1,25 +1,26 @@
-"""Sources of image pairs: two cameras, two folders or two video files."""
+"""Sources of image pairs: two cameras, two folders or two video files; and their port."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
 
+from needle_core.component import Batch, PortChange
 from needle_core.errors import UserError
 from needle_tracker.sources.image_files import Image, Sizes, open_pairs, size_problem
 
-# A camera that gives nothing for so many tries in a row is gone.
-LOST_AFTER = 20
+LOST_AFTER = 20  # consecutive failed reads of the cameras
 
 
 @dataclasses.dataclass(frozen=True)
 class StampedPair:
-    """A pair of grey images and when each was taken [ns of the clock given]."""
+    """A pair of grey images and their stamps [ns of the given clock]."""
 
     left: Image
     right: Image
@@ -29,36 +30,20 @@ class StampedPair:
 
 @dataclasses.dataclass(frozen=True)
 class EndOfRecording:
-    """A recording has no further pair.
+    """End of a recording.
 
     Attributes
     ----------
     missing : str
-        Frames that it lacked; empty where nothing is missing.
+        Missing frames, as text; empty if the recording is complete.
     """
 
     missing: str = ""
 
 
-class StereoSource(Protocol):
-    """Gives one pair after the other."""
-
-    def next(self) -> StampedPair | EndOfRecording | None:
-        """Return the next pair; None where this one could not be read.
-
-        Raises
-        ------
-        UserError
-            A source that is gone, or images of another size.
-        """
-
-    def close(self) -> None:
-        """Let go of devices and files."""
-
-
 def open_source(
     names: tuple[str, str], sizes: Sizes, rate: float, clock: Callable[[], int], *, loop: bool
-) -> StereoSource:
+) -> CameraPair | RecordedPairs:
     """Open cameras or a recording.
 
     Parameters
@@ -66,24 +51,24 @@ def open_source(
     names : pair of str
         Left and right: device number or `/dev/...`, folder, or video file.
     sizes : dict of str to (int, int)
-        Width and height that each side's images must have [px].
+        Required width and height of the images of each side [px].
     rate : float
-        Pairs a second that cameras are asked for.
+        Pairs per second that are requested from cameras.
     clock : callable
-        Returns the time [ns] that images are stamped with.
+        Returns the time for the stamps [ns].
     loop : bool
-        Whether a recording begins again at its end.
+        Whether a recording restarts at its end.
 
     Raises
     ------
     UserError
-        Something is missing, cannot be opened, or is not of the calibration's size.
+        A source is missing, cannot be opened, or has another size than the calibration.
     """
     for side, name in zip(sizes, names, strict=True):
         if not name:
             raise UserError(f"{side} is empty: a device number, /dev/videoN, a folder or a video")
     left, right = names
-    # A camera is a number, or below /dev/.
+    # A camera is a number or a path below /dev/.
     are_cameras = {name.isdecimal() or name.startswith("/dev/") for name in names}
     if len(are_cameras) > 1:
         raise UserError(
@@ -97,17 +82,17 @@ def open_source(
 
 
 class CameraPair:
-    """Two cameras through OpenCV.
+    """Two cameras, read by OpenCV.
 
-    Both are grabbed, one right after the other, and only then decoded: decoding takes milliseconds
-    and would come between the two exposures. Each image's stamp is the clock right after its grab.
+    Both images are grabbed before the first is decoded: decoding takes milliseconds, which would
+    separate the two exposures. The stamp of an image is the time right after its grab.
 
     Parameters
     ----------
     names, sizes, rate, clock
         As of `open_source`.
     open_capture : callable
-        Opens a device by its name; OpenCV's by default.
+        Opens a device by its name; by default that of OpenCV.
     """
 
     def __init__(
@@ -134,13 +119,19 @@ class CameraPair:
                 (cv2.CAP_PROP_FRAME_WIDTH, sizes[side][0]),
                 (cv2.CAP_PROP_FRAME_HEIGHT, sizes[side][1]),
                 (cv2.CAP_PROP_FPS, rate),
-                # An old frame from a queue would be stamped as a new one.
+                # An old frame from a queue would get a new stamp.
                 (cv2.CAP_PROP_BUFFERSIZE, 1),
             ):
                 capture.set(key, value)
 
     def next(self) -> StampedPair | None:
-        """Return the next pair; None where a camera gave none."""
+        """Return the next pair; None if a camera failed.
+
+        Raises
+        ------
+        UserError
+            Cameras that were disconnected, or images of another size.
+        """
         stamps, grabbed = {}, True
         for side, capture in self._captures.items():
             grabbed = bool(capture.grab()) and grabbed
@@ -158,7 +149,7 @@ class CameraPair:
         return StampedPair(left, right, stamps["left"], stamps["right"])
 
     def close(self) -> None:
-        """Let go of the cameras."""
+        """Close the cameras."""
         for capture in self._captures.values():
             capture.release()
 
@@ -173,7 +164,7 @@ class CameraPair:
 class RecordedPairs:
     """Two folders of images, or two videos, one pair after the other.
 
-    Both images of a pair carry one stamp: the clock when the pair is asked for.
+    Both images of a pair have one stamp: the time of the request.
 
     Parameters
     ----------
@@ -186,22 +177,28 @@ class RecordedPairs:
     ) -> None:
         self._clock, self._sizes, self._loop = clock, sizes, loop
         self._pairs = open_pairs(Path(names[0]), Path(names[1])).refuse_unpaired()
-        # A recording of another size is refused before anything is published.
+        # Reject a recording of another size before its first pair is published.
         next(self._read())
         self._events = self._read()
 
     def next(self) -> StampedPair | EndOfRecording | None:
-        """Return the next pair; None where one of its images cannot be read."""
+        """Return the next pair; None if one of its images cannot be read.
+
+        Raises
+        ------
+        UserError
+            Images of another size.
+        """
         return next(self._events)
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         self._events = iter(())
 
     def _read(self) -> Iterator[StampedPair | EndOfRecording | None]:
-        goes_on = True
-        while goes_on:
-            goes_on = False
+        repeat = True
+        while repeat:
+            repeat = False
             for pair in self._pairs:
                 stamp = self._clock()
                 if pair.left is None or pair.right is None:
@@ -209,18 +206,57 @@ class RecordedPairs:
                     continue
                 if problem := pair.problem(self._sizes):
                     raise UserError(f"{pair.name}: {problem}")
-                goes_on = self._loop
+                repeat = self._loop
                 yield StampedPair(pair.left, pair.right, stamp, stamp)
         while True:
             yield EndOfRecording(self._pairs.missing)
 
 
 def _open_device(name: str) -> cv2.VideoCapture:
-    # What goes wrong is said by us, in one line; OpenCV's own lines are for its developers.
+    # Failures are reported in one line; silence the messages of OpenCV.
     opencv = cast(Any, cv2)
-    # OpenCV 5 has moved it.
+    # OpenCV 5 moved the function.
     logging = opencv if hasattr(opencv, "setLogLevel") else opencv.utils.logging
     logging.setLogLevel(0)
     if name.isdecimal():
         return cv2.VideoCapture(int(name), cv2.CAP_V4L2)
     return cv2.VideoCapture(name, cv2.CAP_V4L2)
+
+
+Event = StampedPair | EndOfRecording | None
+"""Result of a read of a source."""
+
+
+class PairPort:
+    """Port of a source: a thread reads the next pair on each request.
+
+    Parameters
+    ----------
+    source : CameraPair or RecordedPairs
+        An open source, closed with the port.
+    """
+
+    def __init__(self, source: CameraPair | RecordedPairs) -> None:
+        self._source = source
+        self._reader = ThreadPoolExecutor(1, "pairs")
+
+    def open(self, arrive: Callable[[Batch | PortChange], None]) -> None:
+        """Set the callback for results, which the thread calls."""
+        self._arrive = arrive
+
+    def send(self, batch: tuple[Any, ...]) -> None:
+        """Request the next pair."""
+        self._reader.submit(self._source.next).add_done_callback(self._on_read)
+
+    def close(self) -> None:
+        """Close the source, after the current read."""
+        self._reader.shutdown()
+        self._source.close()
+
+    def _on_read(self, read: Future[Event]) -> None:
+        error = read.exception()
+        if isinstance(error, UserError):
+            self._arrive(PortChange(str(error)))
+        else:
+            # Any other error is raised in the node and ends it.
+            self._arrive(lambda: (read.result(),))

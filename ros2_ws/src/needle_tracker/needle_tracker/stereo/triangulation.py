@@ -1,8 +1,8 @@
-"""Triangulate the ends of both views: tight across the needle, loose along it.
+"""Triangulation of the ends in both views: tight across the needle, loose along it.
 
-Each view tells the end to a few hundredths of a pixel across the shaft, from its line, and to a
-pixel or so along it. Least squares weights both accordingly, so that an end that is poorly seen
-hardly touches the depth.
+A view determines the end to a few hundredths of a pixel across the shaft, from its line, and to
+about a pixel along it. Least squares weights both accordingly, so that an end that is poorly seen
+hardly affects the depth.
 """
 
 from __future__ import annotations
@@ -15,24 +15,30 @@ from numpy.typing import NDArray
 
 from needle_core.compiled import compiled
 from needle_tracker.detector.end_fit import ImageEnd
-from needle_tracker.optics.compiled_projection import pixel_ray, solve_position
+from needle_tracker.optics.compiled_projection import (
+    cross,
+    dot,
+    pixel_ray,
+    point_jacobian,
+    project_point,
+)
 from needle_tracker.optics.refraction import RefractedCamera
-from needle_tracker.optics.vectors import cross, dot
 
 Array = NDArray[np.float64]
 
 _ITERATIONS = 12
-_LEAST_SINE = 1e-3  # of the angle between the planes in which the two views see the shaft
+_ROUNDING = 1e-10  # step of a converged position [m]; scaled determinant of a singular matrix
+_LEAST_SINE = 1e-3  # of the angle between the two planes through a camera and the shaft
 
 
 @dataclasses.dataclass(frozen=True)
 class SpatialTip:
-    """The tip in `rig`.
+    """Measured tip, in `rig`.
 
     Attributes
     ----------
     position : ndarray, shape (3,)
-        The visible end [m].
+        Visible end [m].
     covariance : ndarray, shape (3, 3)
         Of the position [m^2].
     direction : ndarray, shape (3,)
@@ -70,7 +76,7 @@ def midpoint(views: tuple[RefractedCamera, RefractedCamera], tips: tuple[Array, 
     pixel_ray(views[1].packed, np.asarray(tips[1], dtype=np.float64), q, b)
     cosine = float(a @ b)
     denominator = 1.0 - cosine * cosine
-    if not denominator > 1e-9:
+    if not denominator > 0.0:
         return np.full(3, np.nan)
     between = q - p
     along_a = float(between @ a - cosine * (between @ b)) / denominator
@@ -81,7 +87,7 @@ def midpoint(views: tuple[RefractedCamera, RefractedCamera], tips: tuple[Array, 
 def triangulate(
     views: tuple[RefractedCamera, RefractedCamera], ends: tuple[ImageEnd, ImageEnd]
 ) -> SpatialTip | None:
-    """Return the tip that fits both images best.
+    """Return the least-squares tip of both images.
 
     Gauss-Newton on the four image residuals (across and along the shaft, per camera), each over its
     standard deviation; the covariance is the inverse of the normal matrix.
@@ -91,12 +97,12 @@ def triangulate(
     views : pair of RefractedCamera
         Left and right.
     ends : pair of ImageEnd
-        The needle's end in the left and right image.
+        End of the needle in the left and the right image.
 
     Returns
     -------
     SpatialTip or None
-        None where the two views do not determine a point.
+        None if the two views do not determine a point.
     """
     position = midpoint(views, (ends[0].point, ends[1].point))
     if not np.all(np.isfinite(position)):
@@ -105,64 +111,107 @@ def triangulate(
         [[[-end.direction[1], end.direction[0]], end.direction] for end in ends]
     )  # rows: across, along
     sigmas = np.array([s for end in ends for s in (end.sigma_across, end.sigma_along)])
-    position = np.array(position)
-    converged, normal, residual, jacobians = solve_position(
+    converged, normal, residual, jacobians = _solve_position(
         (views[0].packed, views[1].packed),
         np.stack([end.point for end in ends]),
         axes,
         sigmas,
         position,
-        _ITERATIONS,
     )
     if not converged:
         return None
-    direction, direction_covariance = np.empty(3), np.empty((3, 3))
+    direction, direction_covariance = np.empty(3), np.zeros((3, 3))
     sigma_angles = np.array([end.sigma_angle for end in ends])
     if not _shaft_direction(jacobians, axes, sigma_angles, direction, direction_covariance):
         return None
     if direction_covariance.trace() > 1.0:
         return None
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-    misfit = float(np.sum((residual / sigmas) ** 2))
+    misfit = float(np.sum(residual**2))
     return SpatialTip(position, covariance, direction, direction_covariance, misfit)
+
+
+@compiled
+def _solve_position(
+    cameras: tuple[Array, Array], points: Array, axes: Array, sigmas: Array, position: Array
+) -> tuple[bool, Array, Array, Array]:
+    """Fit a position to two image points, each known across and along its shaft.
+
+    Parameters
+    ----------
+    cameras : pair of ndarray
+        From `pack_camera`.
+    points : ndarray, shape (2, 2)
+        Image points [px].
+    axes : ndarray, shape (2, 2, 2)
+        Per camera the unit vectors across and along the shaft.
+    sigmas : ndarray, shape (4,)
+        Standard deviations: left across, left along, right across, right along [px].
+    position : ndarray, shape (3,)
+        Initial value, and output [m].
+
+    Returns
+    -------
+    converged : bool
+        Whether the iteration converged.
+    normal : ndarray, shape (3, 3)
+        Normal matrix: the inverse of the covariance.
+    residual : ndarray, shape (4,)
+        Residuals over `sigmas`.
+    jacobians : ndarray, shape (2, 2, 3)
+        Of both cameras at the position [px/m].
+    """
+    jacobians, rows, residual = np.empty((2, 2, 3)), np.empty((4, 3)), np.empty(4)
+    normal, pixel = np.zeros((3, 3)), np.empty(2)
+    for _ in range(_ITERATIONS):
+        for i in range(2):
+            project_point(cameras[i], position, pixel)
+            point_jacobian(cameras[i], position, jacobians[i])
+            off = points[i] - pixel
+            for k in range(2):
+                across, along = axes[i, k] / sigmas[2 * i + k]
+                residual[2 * i + k] = across * off[0] + along * off[1]
+                rows[2 * i + k] = across * jacobians[i, 0] + along * jacobians[i, 1]
+        normal = rows.T @ rows
+        # Scaled by its diagonal, the determinant shows how well the position is determined.
+        product = normal[0, 0] * normal[1, 1] * normal[2, 2]
+        # A NaN, of a point behind a camera, must not reach det().
+        if not 0.0 < product < math.inf:
+            return False, normal, residual, jacobians
+        if not np.linalg.det(normal) > _ROUNDING * product:
+            return False, normal, residual, jacobians
+        step = np.linalg.solve(normal, rows.T @ residual)
+        position += step
+        if np.abs(step).max() < _ROUNDING:
+            return True, normal, residual, jacobians
+    return False, normal, residual, jacobians
 
 
 @compiled
 def _shaft_direction(
     jacobians: Array, axes: Array, sigma_angles: Array, direction: Array, covariance: Array
 ) -> bool:
-    """Write the shaft's direction in `rig`, and its covariance; return whether the views tell it.
+    """Write the direction of the shaft in `rig`, and add its covariance; False if undetermined.
 
-    Seen through a camera's Jacobian J, the direction d runs along the image line: n . J d = 0 with
-    n across the line. So d is across both J^T n: the intersection of two planes.
+    Seen through the Jacobian J of a camera, the direction d runs along the image line: n . J d = 0
+    with n across the line. So d is across both J^T n: the intersection of two planes.
     """
-    normals, alongs = np.empty((2, 3)), np.empty((2, 3))
+    normals, alongs, turned = np.empty((2, 3)), np.empty((2, 3)), np.empty(3)
     for i in range(2):
-        for k in range(3):
-            normals[i, k] = axes[i, 0, 0] * jacobians[i, 0, k] + axes[i, 0, 1] * jacobians[i, 1, k]
-            alongs[i, k] = axes[i, 1, 0] * jacobians[i, 0, k] + axes[i, 1, 1] * jacobians[i, 1, k]
+        normals[i] = axes[i, 0, 0] * jacobians[i, 0] + axes[i, 0, 1] * jacobians[i, 1]
+        alongs[i] = axes[i, 1, 0] * jacobians[i, 0] + axes[i, 1, 1] * jacobians[i, 1]
     cross(normals[0], normals[1], direction)
     length = math.sqrt(dot(direction, direction))
     product = math.sqrt(dot(normals[0], normals[0]) * dot(normals[1], normals[1]))
     if not length > _LEAST_SINE * product:
         return False
-    # Towards the tip in the left image; then it must be so in the right one.
-    sign = -1.0 if dot(alongs[0], direction) < 0.0 else 1.0
-    for k in range(3):
-        direction[k] *= sign / length
+    # The direction must be towards the tip in both images.
+    direction /= -length if dot(alongs[0], direction) < 0.0 else length
     if dot(alongs[1], direction) <= 0.0:
         return False
-    # Turning an image line by da moves its n by -da t (t along): dn = -da J^T t.
-    turned = np.empty(3)
-    covariance[:] = 0.0
+    # A rotation of an image line by da changes its n by -da t (t along): dn = -da J^T t.
     for i in range(2):
         cross(alongs[i], normals[1 - i], turned)
-        away = dot(direction, turned)
-        for a in range(3):
-            for b in range(3):
-                covariance[a, b] += (
-                    (sigma_angles[i] / length) ** 2
-                    * (turned[a] - away * direction[a])
-                    * (turned[b] - away * direction[b])
-                )
+        turned -= dot(direction, turned) * direction
+        covariance += (sigma_angles[i] / length) ** 2 * np.outer(turned, turned)
     return True

@@ -14,7 +14,7 @@ from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
 
 
-def test_tip_and_state_are_drawn_where_they_are(
+def test_tip_and_state_are_drawn_at_their_pixels(
     calibration: StereoCalibration,
     settings: TrackerSettings,
     draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from needle_tracker.answers.orientation import ROLL_VARIANCE, orientation, rotation_covariance
+from needle_tracker.answers.tracker_messages import ROLL_VARIANCE, orientation, rotation_covariance
 
 
 def directions() -> np.ndarray:

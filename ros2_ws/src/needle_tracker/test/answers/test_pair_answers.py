@@ -53,11 +53,11 @@ def answering(
     answers = PairAnswers(calibration, settings, pair_tolerance_ns=None, joint_timeout=TIMEOUT)
     bench = Answering(answers)
     monkeypatch.setattr(bench.answers.tracker, "process", bench.process)
-    monkeypatch.setattr(bench.answers.swap, "see", lambda *_: None)
+    monkeypatch.setattr(bench.answers.swap, "update", lambda *_: None)
     return bench
 
 
-def test_an_answer_is_out_before_what_it_does_not_need(
+def test_an_answer_is_sent_before_the_check_for_swapped_images(
     answering: Answering, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []
@@ -65,7 +65,7 @@ def test_an_answer_is_out_before_what_it_does_not_need(
     def note(what: str) -> Callable[..., None]:
         return lambda *_: done.append(what)
 
-    monkeypatch.setattr(answering.answers.swap, "see", note("suspected"))
+    monkeypatch.setattr(answering.answers.swap, "update", note("suspected"))
     for stamp in (1, 2):
         list(answering.answers.add_image("left", stamp, FRAME, 0.0))
         list(answering.answers.add_image("right", stamp, FRAME, 0.0))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from code_lines import ROOT
-from needle_tracker.answers.annotation import annotate, describe_view
-from needle_tracker.answers.seen import HELP, SeenCounts, missing
+from needle_tracker.answers.annotation import HELP, annotate, describe_view, missing
+from needle_tracker.answers.run_summary import SeenCounts
 from needle_tracker.answers.track_images import COLUMNS, to_row
 from needle_tracker.detector.end_fit import ImageEnd
 from needle_tracker.filter.measurement import Measurement, NoTip, TrackState
@@ -31,7 +31,7 @@ def nothing(left: ImageEnd | None, right: ImageEnd | None) -> Measurement:
         (END, END, "both views show an end but they do not meet"),
     ],
 )
-def test_what_is_missing_is_told_by_view(
+def test_the_reason_for_no_tip_depends_on_the_views(
     left: ImageEnd | None, right: ImageEnd | None, cause: str
 ) -> None:
     measured = nothing(left, right)
@@ -43,7 +43,7 @@ def test_what_is_missing_is_told_by_view(
     assert (row["right_end"], row["right_shaft"]) == seen[right]
 
 
-def test_counts_are_of_all_pairs_that_were_looked_at() -> None:
+def test_counts_include_all_processed_pairs() -> None:
     counts = SeenCounts()
     for measured in (
         *[nothing(END, HIDDEN)] * 3,
@@ -67,7 +67,7 @@ def test_help_is_that_of_the_page() -> None:
     assert HELP.items() <= helps.items()
 
 
-def test_pictures_say_what_each_view_shows() -> None:
+def test_pictures_describe_each_view() -> None:
     grey = np.full((480, 640), 128, np.uint8)
     assert (describe_view(None), describe_view(END)) == ("nothing found", "end 0.93, shaft 0.98")
     below = annotate(grey, grey, nothing(END, None))[240:262]

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_tracker.answers import swapped_images
-from needle_tracker.answers.swapped_images import SwapWatch
+from needle_tracker.answers import pair_answers
+from needle_tracker.answers.pair_answers import SwapWatch
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
@@ -38,7 +38,7 @@ class Other:
 @pytest.fixture
 def other(monkeypatch: pytest.MonkeyPatch) -> Other:
     other = Other()
-    monkeypatch.setattr(swapped_images, "NeedleTracker", lambda *_: other)
+    monkeypatch.setattr(pair_answers, "NeedleTracker", lambda *_: other)
     return other
 
 
@@ -49,10 +49,10 @@ def watch(calibration: StereoCalibration, settings: TrackerSettings) -> SwapWatc
 
 def misses(watch: SwapWatch, pairs: int) -> None:
     for _ in range(pairs):
-        watch.see(LEFT, RIGHT, None, MISSED)
+        watch.update(LEFT, RIGHT, None, MISSED)
 
 
-def test_four_in_a_row_after_five_missed_are_a_suspicion_until_a_tip(
+def test_four_agreeing_pairs_after_five_misses_raise_a_suspicion_until_a_tip(
     watch: SwapWatch, other: Other
 ) -> None:
     entry: Any = Measurement(None, TrackState.ENTRY, "")
@@ -61,12 +61,12 @@ def test_four_in_a_row_after_five_missed_are_a_suspicion_until_a_tip(
     seen = ((MISSED, 8), (MISSED, 1), (MISSED, 5), (entry, 1), (found, 1), (MISSED, 5))
     for measured, pairs in seen:
         for _ in range(pairs):
-            watch.see(LEFT, RIGHT, None, measured)
+            watch.update(LEFT, RIGHT, None, measured)
         looks.append((other.looks, watch.suspected))
     assert looks == [(3, False), (4, True), (4, True), (4, True), (4, False), (4, False)]
 
 
-def test_where_the_other_way_round_shows_none_half_of_the_pairs_are_looked_at(
+def test_half_of_the_pairs_are_checked_while_swapped_pairs_show_no_needle(
     watch: SwapWatch, other: Other
 ) -> None:
     other.finds = False

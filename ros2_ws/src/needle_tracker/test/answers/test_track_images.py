@@ -106,7 +106,7 @@ def track(folder: Path, calibration_path: Path) -> Callable[..., tuple[int, list
 Track = Callable[..., tuple[int, list[dict[str, str]]]]
 
 
-def test_every_pair_has_its_line_and_what_cannot_be_used_is_named(
+def test_every_pair_has_a_line_and_unusable_images_are_named(
     track: Track, folder: Path, capsys: Out
 ) -> None:
     (folder / "left" / "image_51.png").write_bytes(b"no image")
@@ -139,7 +139,7 @@ def test_every_pair_has_its_line_and_what_cannot_be_used_is_named(
     assert len(Scripted.resets) == 1
 
 
-def test_parameters_of_the_node_count_here_too(track: Track, folder: Path, capsys: Out) -> None:
+def test_parameters_of_the_node_apply(track: Track, folder: Path, capsys: Out) -> None:
     params = folder / "rig.yaml"
     params.write_text(
         "stereo_tracker: {ros__parameters: {stage_zero_sigma: 0.002, needle_width: 0.001}}"
@@ -172,7 +172,7 @@ TRUTH = "name,x_m,y_m,z_m\n"
 NODE = "stereo_tracker: {ros__parameters: {%s}}"
 
 
-def test_what_cannot_be_used_is_one_line(track: Track, folder: Path, capsys: Out) -> None:
+def test_unusable_input_is_reported_in_one_line(track: Track, folder: Path, capsys: Out) -> None:
     given = folder / "given.txt"
     for option, text, says in (
         ("--params", NODE % "needle_widht: 0.001", "needle_widht"),
@@ -202,7 +202,7 @@ def test_what_cannot_be_used_is_one_line(track: Track, folder: Path, capsys: Out
         assert any(one in error for one in says.split("|")), error
 
 
-def test_wrong_options_are_one_line(track: Track, folder: Path, capsys: Out) -> None:
+def test_wrong_options_are_reported_in_one_line(track: Track, folder: Path, capsys: Out) -> None:
     for words in (["--needle-width-mm", "seven"], ["--unknown"], ["--overlay", str(folder)]):
         code, rows = track(*words)
         assert (code, rows, capsys.readouterr().err.count("\n")) == (2, [], 1)
@@ -213,7 +213,7 @@ def test_wrong_options_are_one_line(track: Track, folder: Path, capsys: Out) -> 
     assert "image is 640x480, the calibration is for 1024x768" in capsys.readouterr().err
 
 
-def test_videos_serve_too(track: Track, folder: Path) -> None:
+def test_videos_are_read(track: Track, folder: Path) -> None:
     # Without loss; a codec that every OpenCV has.
     path, codec = folder / "both.avi", cv2.VideoWriter.fourcc(*"FFV1")
     video = cv2.VideoWriter(str(path), codec, 10.0, (1024, 768), False)
@@ -226,7 +226,7 @@ def test_videos_serve_too(track: Track, folder: Path) -> None:
     assert [float(row["z_m"]) for row in rows] == pytest.approx([0.050, 0.051], abs=2e-3)
 
 
-def test_tips_are_held_against_the_truth(track: Track, folder: Path, capsys: Out) -> None:
+def test_tips_are_compared_with_the_truth(track: Track, folder: Path, capsys: Out) -> None:
     # 50 is right, 51 is 1 mm off, there is no needle in 3 and 52, and 60 is not told.
     lines = ["image_50.png,0,0,0.05", "image_51.png,0,0,0.052", "image_52.png,,,", "image_3.png,,,"]
     for side in ("left", "right"):
@@ -248,7 +248,7 @@ def test_tips_are_held_against_the_truth(track: Track, folder: Path, capsys: Out
     assert json.loads((folder / "o.json").read_text())["missed"] == 1
 
 
-def test_what_was_found_is_drawn(track: Track, folder: Path) -> None:
+def test_overlays_are_drawn(track: Track, folder: Path) -> None:
     (folder / "left" / "image_51.png").write_bytes(b"no image")
     assert track("--overlay", str(folder / "seen"))[0] == 0
     assert sorted(path.stem for path in (folder / "seen").iterdir()) == [
@@ -266,7 +266,7 @@ def test_swapped_folders_are_suspected(
         def __init__(self, *_: Any) -> None:
             pass
 
-        def see(self, *_: Any) -> None:
+        def update(self, *_: Any) -> None:
             pass
 
     monkeypatch.setattr(track_images, "SwapWatch", Suspects)

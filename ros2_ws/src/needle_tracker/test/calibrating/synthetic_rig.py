@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
-from needle_tracker.calibrating.calibration_session import Place
+from needle_tracker.calibrating.calibration_session import BoardView, Corners, Place
 from needle_tracker.calibrating.charuco import CharucoBoard
-from needle_tracker.calibrating.rig_model import BoardView, Corners
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.optics.window import Layer, Window, surface_from_above
 

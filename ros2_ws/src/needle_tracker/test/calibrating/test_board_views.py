@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 
 from needle_core.errors import UserError
-from needle_tracker.calibrating.board_views import averaged_view, views_in_folders
-from needle_tracker.calibrating.calibration_session import Place, Session
+from needle_tracker.calibrating.calibration_session import (
+    Place,
+    Session,
+    averaged_view,
+    views_in_folders,
+)
 from needle_tracker.calibrating.charuco import CharucoBoard
 from needle_tracker.optics.calibration import SIDES
 
@@ -79,7 +83,7 @@ def another_board(folder: Path) -> None:
         (another_board, "no image shows the session's board .* `legacy`"),
     ],
 )
-def test_folders_that_are_no_session_are_refused(
+def test_unsuitable_folders_are_rejected(
     folder: Path, spoil: Callable[[Path], object], says: str
 ) -> None:
     spoil(folder)
@@ -87,7 +91,7 @@ def test_folders_that_are_no_session_are_refused(
         views_in_folders(folder / "left", folder / "right", SESSION)
 
 
-def test_a_board_that_stood_still_is_the_mean_of_its_exposures() -> None:
+def test_a_board_at_rest_is_averaged_over_its_exposures() -> None:
     moved = np.roll(IMAGE, 1, axis=1)
     hidden = IMAGE.copy()
     hidden[:, 84:] = 255

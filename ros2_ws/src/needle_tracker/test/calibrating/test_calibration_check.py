@@ -10,11 +10,9 @@ import pytest
 
 from needle_core.errors import UserError
 from needle_sim.camera.stereo_rig import StereoRig
-from needle_tracker.calibrating.calibration_check import check
-from needle_tracker.calibrating.calibration_session import Place
-from needle_tracker.calibrating.check_options import figures, report
+from needle_tracker.calibrating.calibration_check import check, figures, report
+from needle_tracker.calibrating.calibration_session import BoardView, Place
 from needle_tracker.calibrating.rig_calibration import RigCalibration
-from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
 
 from .synthetic_rig import (
@@ -94,7 +92,7 @@ def test_another_surface_or_index_is_found(
     assert f"{cause.replace('_', ' ')} is {'+' if off > 0 else '-'}" in report(found)
 
 
-def test_a_target_that_cannot_show_it_is_never_ok(
+def test_a_target_that_cannot_detect_errors_is_never_ok(
     calibration: StereoCalibration, rig: StereoRig
 ) -> None:
     rng = np.random.default_rng(1)
@@ -108,7 +106,7 @@ def test_a_target_that_cannot_show_it_is_never_ok(
     assert any("cannot show errors of tips below 0.0" in problem for problem in found.problems)
 
 
-def test_other_cameras_or_lenses_are_no_turned_camera(
+def test_other_cameras_or_lenses_are_not_reported_as_a_turned_camera(
     calibration: StereoCalibration, rig: StereoRig
 ) -> None:
     exchanged = [dataclasses.replace(v, left=v.right, right=v.left) for v in target(rig)]

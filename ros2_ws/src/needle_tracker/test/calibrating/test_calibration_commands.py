@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from needle_core.errors import UserError
 from needle_tracker.calibrating import calibrate_stereo as calibrating
 from needle_tracker.calibrating.calibrate_stereo import main as calibrate_stereo
-from needle_tracker.calibrating.calibration_figures import rig_figure, save_figure
+from needle_tracker.calibrating.calibrate_stereo import rig_figure, save_figure
+from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.calibrating.pair_consistency import PairsApartError
 from needle_tracker.calibrating.rig_calibration import RigCalibration
-from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.ros import check_calibration as checking
 from needle_tracker.ros.check_calibration import main as check_calibration
@@ -61,7 +61,7 @@ def one_line(out: Out) -> str:
     return captured.err
 
 
-def test_a_calibration_is_written_that_its_check_accepts(
+def test_a_written_calibration_passes_its_check(
     seen: dict[str, list[BoardView]], arguments: list[str], tmp_path: Path, capsys: Out
 ) -> None:
     output, figures = tmp_path / "rig.yaml", tmp_path / "figures.json"
@@ -98,7 +98,7 @@ def test_a_calibration_is_written_that_its_check_accepts(
     assert values["left_camera_turned_deg"] is None
 
 
-def test_what_is_doubted_is_told_in_words_figures_and_exit_code(
+def test_contradictions_are_in_text_json_and_exit_code(
     seen: dict[str, list[BoardView]],
     arguments: list[str],
     tmp_path: Path,
@@ -111,7 +111,7 @@ def test_what_is_doubted_is_told_in_words_figures_and_exit_code(
     assert "100 %" in capsys.readouterr().out
     assert calibrate_stereo([*words, "--goal-mm", "0.001"]) == 1
     assert "NOT within 0.001 mm" in capsys.readouterr().out
-    monkeypatch.setattr(calibrating, "doubts", lambda *_: ["does its place hold"])
+    monkeypatch.setattr(calibrating, "contradictions", lambda *_: ["does its place hold"])
     assert calibrate_stereo(words) == 1
     assert "NOT OK: does its place hold" in capsys.readouterr().out
     assert json.loads(figures.read_text())["problem"] == "does its place hold"
@@ -127,7 +127,7 @@ def test_what_is_doubted_is_told_in_words_figures_and_exit_code(
     assert not output.exists()
 
 
-def test_bad_arguments_are_one_line_and_exit_2(
+def test_bad_arguments_are_reported_in_one_line_with_exit_2(
     seen: dict[str, list[BoardView]],
     arguments: list[str],
     tmp_path: Path,

@@ -36,7 +36,7 @@ def box_content(**places: Any) -> dict[str, Any]:
     return said
 
 
-def test_a_session_written_is_the_session_read(tmp_path: Path) -> None:
+def test_a_session_is_read(tmp_path: Path) -> None:
     path = tmp_path / "session.yaml"
     path.write_text(yaml.safe_dump(session_content(**{n: entry(p) for n, p in PLACES.items()})))
     read = load_session(path)
@@ -50,7 +50,7 @@ def test_a_session_written_is_the_session_read(tmp_path: Path) -> None:
     assert read.place_of("free_1") is None
 
 
-def test_a_session_says_windows_and_what_is_held_in_the_box() -> None:
+def test_a_session_has_windows_and_boards_in_the_box() -> None:
     places = {"stand": entry(STANDS), "box_*": {"under_surface": True}}
     session = parse_session(box_content(**places))
     for window, given in zip(session.windows, GIVEN_BOX, strict=True):
@@ -98,7 +98,7 @@ def test_a_wrong_place_is_named() -> None:
             parse_session(box_content(a=place | {"under_surface": True}))
 
 
-def test_a_file_that_is_no_session_is_refused(tmp_path: Path) -> None:
+def test_a_file_without_a_session_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "session.yaml"
     with pytest.raises(UserError, match="cannot be read: No such file"):
         load_session(path)

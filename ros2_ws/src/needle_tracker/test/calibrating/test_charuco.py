@@ -33,7 +33,7 @@ def test_corners_are_found_where_they_are_drawn() -> None:
     np.testing.assert_allclose(pixels, expected[numbers], atol=0.5)
 
 
-def test_a_board_that_cannot_be_is_refused() -> None:
+def test_an_impossible_board_is_rejected() -> None:
     wrong: dict[str, Any]
     for wrong, says in (
         ({"columns": 2}, "board.columns"),

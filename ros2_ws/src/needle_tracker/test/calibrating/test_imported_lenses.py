@@ -14,10 +14,10 @@ import yaml
 from needle_core.errors import UserError
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_tracker.calibrating.calibrate_stereo import figures, report
-from needle_tracker.calibrating.calibration_outliers import doubts, square_error
+from needle_tracker.calibrating.calibration_outliers import contradictions, square_error
+from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.calibrating.imported_lenses import read_lenses
 from needle_tracker.calibrating.rig_calibration import calibrate
-from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 
 from .synthetic_rig import GIVEN, PLACES, SIZES, take
@@ -104,9 +104,7 @@ def read(*paths: Path) -> StereoCalibration:
     return read_lenses(paths, SIZES, GIVEN)
 
 
-def test_each_format_gives_the_pair_that_was_written(
-    tmp_path: Path, calibration: StereoCalibration
-) -> None:
+def test_each_format_is_read_back(tmp_path: Path, calibration: StereoCalibration) -> None:
     matrices, lenses, pose = pair(calibration)
     for tool, paths in all_formats(tmp_path, calibration).items():
         found = read(*paths)
@@ -120,7 +118,7 @@ def test_each_format_gives_the_pair_that_was_written(
             load_calibration(paths[-1])
 
 
-def test_a_file_for_each_camera_of_opencv_leaves_their_pose_open(
+def test_single_camera_files_of_opencv_have_no_relative_pose(
     tmp_path: Path, calibration: StereoCalibration
 ) -> None:
     paths = []
@@ -158,7 +156,7 @@ def test_another_model_of_a_narrow_lens_becomes_plumb_bob(
         np.testing.assert_allclose(same.reshape(-1, 2), true.reshape(-1, 2), atol=0.05)
 
 
-def test_a_chain_that_cannot_be_used_says_why(
+def test_an_unusable_chain_is_rejected_with_the_reason(
     tmp_path: Path, calibration: StereoCalibration
 ) -> None:
     fisheye = {"distortion_model": "equidistant", "distortion_coeffs": [-0.02, 0.01, -0.008, 0.002]}
@@ -184,7 +182,7 @@ def test_a_chain_that_cannot_be_used_says_why(
             read(written(tmp_path / "chain.yaml", chain))
 
 
-def test_files_that_are_not_two_cameras_are_refused(
+def test_files_that_are_not_two_cameras_are_rejected(
     tmp_path: Path, calibration: StereoCalibration
 ) -> None:
     ros_files, chain, split, *_ = all_formats(tmp_path, calibration).values()
@@ -201,7 +199,7 @@ def test_files_that_are_not_two_cameras_are_refused(
             read(*paths)
 
 
-def test_with_given_lenses_boards_at_known_places_give_the_rest(
+def test_with_given_lenses_boards_at_known_places_suffice(
     calibration: StereoCalibration, views: list[BoardView], tmp_path: Path
 ) -> None:
     found = [view for view in views[6:] if view.name != "surface_b"]
@@ -219,7 +217,7 @@ def test_with_given_lenses_boards_at_known_places_give_the_rest(
     assert "left_fx_px" not in figures(result, 0.06)
 
 
-def test_lenses_of_other_cameras_or_in_another_unit_are_the_reason_told(
+def test_lenses_of_other_cameras_or_in_another_unit_are_rejected(
     rig: StereoRig, calibration: StereoCalibration, views: list[BoardView], tmp_path: Path
 ) -> None:
     far, swapped, longer = (kalibr(calibration) for _ in range(3))
@@ -235,6 +233,6 @@ def test_lenses_of_other_cameras_or_in_another_unit_are_the_reason_told(
     given = read(written(tmp_path / "chain.yaml", longer))
     places = {name: place for name, place in PLACES.items() if name != "surface_b"}
     result = calibrate(take(rig, free=0, places=places), SIZES, GIVEN, given)
-    said = doubts(result, square_error(result))
+    said = contradictions(result, square_error(result))
     assert any("another camera, focus or image size" in text for text in said)
     assert not any("more distortion" in text for text in said)

@@ -12,10 +12,11 @@ import pytest
 from needle_core.errors import UserError
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_tracker.calibrating.calibrate_stereo import save_calibration
-from needle_tracker.calibrating.calibration_outliers import doubts, square_error
+from needle_tracker.calibrating.calibration_outliers import contradictions, square_error
+from needle_tracker.calibrating.calibration_session import BoardView, Corners
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_fit import fit
-from needle_tracker.calibrating.rig_model import LENS, BoardView, Corners, RigModel, camera_slice
+from needle_tracker.calibrating.rig_model import LENS, RigModel, camera_slice
 from needle_tracker.calibrating.tip_error import (
     measured_points,
     needle_points,
@@ -49,7 +50,7 @@ def tip_error(rig: StereoRig, calibration: StereoCalibration) -> float:
 
 
 @RIGS
-def test_tips_are_right_to_60_micrometres_and_it_says_so(
+def test_tips_are_accurate_to_60_micrometres_as_reported(
     request: pytest.FixtureRequest, rigs: str, found: str
 ) -> None:
     result: RigCalibration = request.getfixturevalue(found)
@@ -62,11 +63,13 @@ def test_tips_are_right_to_60_micrometres_and_it_says_so(
         assert result.reprojection_rms_px(side) == pytest.approx(math.sqrt(2) * NOISE_PX, rel=0.15)
     error, sigma = square_error(result)
     assert abs(error) < 4.0 * sigma
-    assert doubts(result, (error, sigma)) == []
+    assert contradictions(result, (error, sigma)) == []
     assert result.apart == []
 
 
-def test_each_parameter_comes_out_within_its_sigma(rig: StereoRig, result: RigCalibration) -> None:
+def test_each_parameter_is_estimated_within_its_sigma(
+    rig: StereoRig, result: RigCalibration
+) -> None:
     truth = {"refractive_index": rig.left.window.indices[0], "surface_height": 0.0175}
     for side in SIDES:
         camera = getattr(rig, side)
@@ -80,7 +83,7 @@ def test_each_parameter_comes_out_within_its_sigma(rig: StereoRig, result: RigCa
     assert result.parameters["left.k3"].kept
 
 
-def test_windows_come_out_as_they_are_as_far_as_they_show(
+def test_windows_are_estimated_as_far_as_the_views_determine_them(
     box_rig: StereoRig, box_result: RigCalibration
 ) -> None:
     for side, given in zip(SIDES, GIVEN_BOX, strict=True):
@@ -96,7 +99,7 @@ def test_windows_come_out_as_they_are_as_far_as_they_show(
         assert (window.layers, window.inside) == (given.layers, given.inside)
 
 
-def test_what_the_views_do_not_tell_is_kept_as_given(
+def test_undetermined_parameters_keep_their_given_values(
     rig: StereoRig, calibration: StereoCalibration
 ) -> None:
     # One flat board does not tell the index from the height.
@@ -111,7 +114,7 @@ def test_what_the_views_do_not_tell_is_kept_as_given(
     assert index.value == pytest.approx(1.3, abs=0.003)
 
 
-def test_outliers_do_not_bend_it(rig: StereoRig, result: RigCalibration) -> None:
+def test_outliers_have_little_effect(rig: StereoRig, result: RigCalibration) -> None:
     views = list(result.model.views)
     for i in range(0, len(views), 3):
         pixels = views[i].left.pixels.copy()
@@ -128,7 +131,7 @@ def test_outliers_do_not_bend_it(rig: StereoRig, result: RigCalibration) -> None
 
 
 @pytest.mark.parametrize("kind", ["surface", "box"])
-def test_the_jacobian_is_that_of_the_residuals(
+def test_the_jacobian_agrees_with_finite_differences(
     calibration: StereoCalibration,
     box_path: Path,
     views: list[BoardView],
@@ -154,7 +157,7 @@ def test_the_jacobian_is_that_of_the_residuals(
 
 
 @RIGS
-def test_the_file_written_is_the_calibration_read(
+def test_a_written_calibration_is_read_back(
     request: pytest.FixtureRequest, rigs: str, found: str, tmp_path: Path
 ) -> None:
     written = request.getfixturevalue(found).calibration
@@ -179,7 +182,7 @@ def without(views: list[BoardView], number: int, side: str, corners: int) -> lis
     return [*views[:number], spoilt, *views[number + 1 :]]
 
 
-def test_sets_that_cannot_determine_the_rig_are_refused(
+def test_sets_that_cannot_determine_the_rig_are_rejected(
     rig: StereoRig,
     calibration: StereoCalibration,
     views: list[BoardView],
@@ -230,5 +233,5 @@ def test_the_lens_of_a_webcam_is_fitted_with_k3(rig: StereoRig) -> None:
         found = result.parameters[f"{side}.k3"]
         assert not found.kept
         assert abs(found.value - 0.05) < 4.0 * found.sigma < 0.08
-    assert doubts(result, square_error(result)) == []
+    assert contradictions(result, square_error(result)) == []
     assert tip_error(webcams, result.calibration) < 0.07e-3

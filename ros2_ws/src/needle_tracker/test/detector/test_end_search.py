@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_tracker.detector.end_search import CANDIDATES, find_paths
+from needle_tracker.detector.end_search import SEARCH, find_paths
 from needle_tracker.detector.search_grid import SearchGrid, make_search_grid
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.refraction import RefractedCamera
@@ -18,7 +18,7 @@ def grid(views: tuple[RefractedCamera, RefractedCamera], calibration: object) ->
     from drawn_needles import tracker_settings  # noqa: PLC0415
 
     settings: TrackerSettings = tracker_settings(calibration)  # type: ignore[arg-type]
-    return make_search_grid(views[0], settings.reach, first_distance=settings.hole_clearance)
+    return make_search_grid(views[0], settings.reach, settings.hole_clearance)
 
 
 def drawn(
@@ -54,10 +54,10 @@ def test_a_gap_is_bridged_and_an_end_before_it_is_another_candidate(grid: Search
     rows = [len(path.pixels) - 1 for path in paths]
     assert rows[0] == END_ROW
     assert 80 in rows
-    assert len(paths) <= CANDIDATES
+    assert len(paths) <= SEARCH.candidates
 
 
-def test_ends_only_in_the_rows_that_are_asked_for(grid: SearchGrid) -> None:
+def test_ends_are_only_in_the_given_rows(grid: SearchGrid) -> None:
     maps = drawn(grid, middle(grid), END_ROW)
     for path in find_paths(grid, *maps, 130, 150):
         assert 130 <= len(path.pixels) - 1 <= 150

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_tracker.filter.background import Background, Pair
+from needle_tracker.filter.needle_tracker import Background
+from needle_tracker.filter.settings import Pair
 
 LEAST_NEW = 2e-3
 
@@ -16,7 +17,7 @@ def pair(level: int) -> Pair:
 
 def shown(background: Background, insertions: list[float | None]) -> list[int | None]:
     """Return which of the pairs is the background of each."""
-    pairs = [background.see(pair(i), insertion) for i, insertion in enumerate(insertions)]
+    pairs = [background.update(pair(i), insertion) for i, insertion in enumerate(insertions)]
     return [None if each is None else int(each[0][0, 0]) for each in pairs]
 
 
@@ -43,10 +44,10 @@ def test_a_reference_holds_until_the_needle_is_outside() -> None:
     assert shown(background, [None, 0.04, 0.0, 0.05]) == [100, 100, None, 2]
 
 
-def test_an_image_that_its_owner_changes_later_does_not_change_it() -> None:
+def test_the_background_is_a_copy() -> None:
     images = pair(7)
     background = Background(images, LEAST_NEW)
     images[0][:] = 99
-    kept = background.see(pair(1), None)
+    kept = background.update(pair(1), None)
     assert kept is not None
     assert kept[0][0, 0] == 7

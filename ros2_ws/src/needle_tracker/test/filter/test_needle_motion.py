@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from needle_tracker.filter.needle_motion import (
+from needle_tracker.filter.needle_track import (
     HEADING,
     POSITION,
     SCALE,
@@ -31,7 +31,7 @@ def motion(settings: TrackerSettings) -> NeedleMotion:
     return NeedleMotion.begin(sighting(np.array([0.001, 0.002, 0.05])), settings)
 
 
-def test_the_needle_goes_its_heading_by_the_stages_way(
+def test_the_needle_advances_along_its_heading_by_the_way_of_the_stage(
     motion: NeedleMotion, settings: TrackerSettings
 ) -> None:
     after = motion.advanced(2e-3, settings.reach.curvature, settings.filter)
@@ -43,7 +43,7 @@ def test_the_needle_goes_its_heading_by_the_stages_way(
     assert np.linalg.eigvalsh(back.covariance)[0] > 0.0
 
 
-def test_the_spread_after_a_way_is_that_of_simulated_needles(
+def test_the_covariance_after_a_way_agrees_with_simulated_needles(
     motion: NeedleMotion, settings: TrackerSettings
 ) -> None:
     rng, way = np.random.default_rng(0), 5e-3
@@ -67,7 +67,7 @@ def test_an_unknown_way_spreads_the_tip_along_the_heading_and_beside_it(
     np.testing.assert_allclose(motion.spread(sigma), np.cov(ends.T), atol=3e-7)
 
 
-def test_corrections_one_by_one_are_one_batch(motion: NeedleMotion) -> None:
+def test_sequential_corrections_equal_one_batch(motion: NeedleMotion) -> None:
     rng = np.random.default_rng(1)
     rows, residuals = rng.normal(size=(6, SIZE)), 1e-3 * rng.normal(size=6)
     variances = rng.uniform(0.5, 2.0, 6) * 1e-6
@@ -81,7 +81,7 @@ def test_corrections_one_by_one_are_one_batch(motion: NeedleMotion) -> None:
     np.testing.assert_allclose(after.covariance, np.linalg.inv(information), atol=1e-12)
 
 
-def test_a_stage_that_is_off_is_found_out_and_does_not_move_the_tip(
+def test_an_error_of_the_stage_is_estimated_and_does_not_move_the_tip(
     motion: NeedleMotion, settings: TrackerSettings
 ) -> None:
     """Zero 1 mm off, scale 1 %: 60 mm of insertion, a sighting and a length for each mm."""
@@ -100,7 +100,7 @@ def test_a_stage_that_is_off_is_found_out_and_does_not_move_the_tip(
     assert total == pytest.approx(zero + scale * 0.08, abs=0.3e-3)
 
 
-def test_the_density_is_the_normal_distributions() -> None:
+def test_the_density_is_that_of_a_normal_distribution() -> None:
     covariance = np.diag([1.0, 4.0, 0.25])
     square, log_density = gaussian(np.array([1.0, 2.0, 0.5]), covariance)
     assert square == pytest.approx(3.0)

@@ -1,4 +1,4 @@
-"""Needle or anything else: what sightings in a row say."""
+"""Odds of a track after consecutive sightings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def sighting(z: float, evidence: float = 4.0) -> Sighting:
 def after(
     settings: TrackerSettings, places: list[float], insertions: list[float | None]
 ) -> NeedleTrack:
-    """Return the track of something seen at these places [m]."""
+    """Return the track after sightings at these distances from the entry [m]."""
     track = NeedleTrack.begin(sighting(places[0]), insertions[0], settings)
     for place, insertion in zip(places[1:], insertions[1:], strict=True):
         track = track.predicted(insertion, settings)
@@ -39,37 +39,55 @@ def after(
 
 
 def test_an_end_at_the_insertion_is_the_needle_at_once(settings: TrackerSettings) -> None:
-    accepted = ACCEPTED
-    assert after(settings, [0.05], [0.05]).log_odds > accepted
-    assert after(settings, [0.05], [0.056]).log_odds < 0.0
+    assert after(settings, [0.05], [0.05]).log_odds(settings) > ACCEPTED
+    assert after(settings, [0.05], [0.056]).log_odds(settings) < 0.0
     # A stage 1 mm off does not hide the needle.
-    assert after(settings, [0.05], [0.051]).log_odds > accepted
+    assert after(settings, [0.05], [0.051]).log_odds(settings) > ACCEPTED
 
 
-def test_what_stands_while_the_stage_moves_is_no_needle(settings: TrackerSettings) -> None:
+def test_a_thing_at_rest_while_the_stage_moves_is_no_needle(settings: TrackerSettings) -> None:
     insertions = [0.049 + 5e-4 * n for n in range(8)]
-    assert after(settings, [0.05] * 8, list(insertions)).log_odds < 0.0
+    assert after(settings, [0.05] * 8, list(insertions)).log_odds(settings) < 0.0
     moving = after(settings, [0.001 + i for i in insertions], list(insertions))
-    assert moving.log_odds > ACCEPTED
+    assert moving.log_odds(settings) > ACCEPTED
 
 
-def test_without_the_insertion_what_has_moved_is_the_needle(settings: TrackerSettings) -> None:
+def test_without_the_insertion_a_moving_thing_is_the_needle(settings: TrackerSettings) -> None:
     nothing: list[float | None] = [None] * 10
     resting = after(settings, [0.05] * 10, nothing)
-    assert resting.log_odds < ACCEPTED
+    assert resting.log_odds(settings) < ACCEPTED
     moving = after(settings, [0.05 + 1e-3 * n for n in range(4)], nothing[:4])
-    assert moving.log_odds > ACCEPTED
+    assert moving.log_odds(settings) > ACCEPTED
 
 
-def test_a_miss_costs_rank_and_no_belief(settings: TrackerSettings) -> None:
+def test_a_miss_reduces_the_rank_and_not_the_odds(settings: TrackerSettings) -> None:
     before = after(settings, [0.05], [0.05])
     missed = before.predicted(0.051, settings).missed()
-    assert missed.log_odds == before.log_odds
+    assert missed.log_odds(settings) == before.log_odds(settings)
     assert missed.rank(settings) == before.rank(settings) - settings.filter.miss_cost
     assert missed.misses == 1
 
 
-def test_the_stage_is_told_as_it_is(settings: TrackerSettings) -> None:
+@pytest.mark.parametrize("insertion", [0.05, None])
+def test_the_same_picture_again_is_no_further_evidence(
+    settings: TrackerSettings, insertion: float | None
+) -> None:
+    once = after(settings, [0.05], [insertion])
+    often = after(settings, [0.05] * 20, [insertion] * 20)
+    assert often.end_log_odds == pytest.approx(once.end_log_odds, abs=0.01)
+    assert often.motion_log_odds < 0.1
+
+
+def test_after_a_gap_the_needle_must_move_again(settings: TrackerSettings) -> None:
+    insertions = [0.05 + 1e-3 * n for n in range(20)]
+    track = before = after(settings, insertions, list(insertions))
+    for n in range(20):
+        track = track.predicted(insertions[-1] + 1e-3 * n, settings).missed()
+    again = track.seen(sighting(insertions[-1] + 19e-3), settings)
+    assert again.motion_log_odds < before.motion_log_odds
+
+
+def test_the_zero_of_the_stage_is_estimated(settings: TrackerSettings) -> None:
     track = after(
         settings, [0.0508 + 1e-3 * n for n in range(20)], [0.05 + 1e-3 * n for n in range(20)]
     )

@@ -23,7 +23,7 @@ def path(calibration_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["calibration.yaml", "calibration_top_and_side.yaml"])
-def test_simulation_and_tracker_see_the_same(calibration_path: Path, name: str) -> None:
+def test_simulation_and_tracker_project_alike(calibration_path: Path, name: str) -> None:
     path = calibration_path.with_name(name)
     rig = load_stereo_rig(path)
     # In the gel, in the acrylic, and before it.
@@ -35,7 +35,7 @@ def test_simulation_and_tracker_see_the_same(calibration_path: Path, name: str) 
 
 
 @pytest.mark.parametrize(("scenario", "most"), [("clean", 0.2e-3), ("clutter", 0.3e-3)])
-def test_tips_are_found_where_they_are(path: Path, scenario: str, most: float) -> None:
+def test_tips_are_accurate(path: Path, scenario: str, most: float) -> None:
     calibration = load_calibration(path)
     tracker = NeedleTracker(calibration, default_settings(calibration))
     errors = []

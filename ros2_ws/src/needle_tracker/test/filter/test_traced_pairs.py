@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from needle_tracker.answers.tracker_parameters import default_settings
-from needle_tracker.filter.background import Image
 from needle_tracker.filter.needle_tracker import NeedleTracker
+from needle_tracker.filter.settings import Image
 from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
 from needle_tracker.stereo.triangulation import SpatialTip
 
@@ -71,7 +71,7 @@ def tracked(
 
 
 @pytest.mark.parametrize("name", ["steel_on_dark", "steel_on_brushed_metal"])
-def test_a_steel_needle_is_found_and_mostly_no_surer_than_it_is_known(
+def test_a_steel_needle_is_found_with_a_realistic_covariance(
     calibration: StereoCalibration, name: str
 ) -> None:
     squares = []
@@ -84,7 +84,7 @@ def test_a_steel_needle_is_found_and_mostly_no_surer_than_it_is_known(
 
 
 @pytest.mark.parametrize("empty", [False, True])
-def test_a_needle_along_a_line_of_paper_is_not_taken_to_be_where_the_line_is(
+def test_a_line_of_paper_along_the_needle_does_not_bias_the_tip(
     calibration: StereoCalibration, empty: bool
 ) -> None:
     for tip, truth in tracked(calibration, "steel_on_graph_paper", empty=empty):

@@ -40,7 +40,7 @@ def test_rotations_agree_with_scipy_and_are_normalised(content: Any) -> None:
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-14)
 
 
-def test_the_one_surface_is_both_windows(content: Any) -> None:
+def test_a_common_surface_is_the_window_of_both_cameras(content: Any) -> None:
     calibration = parse_calibration(content)
     for camera in (calibration.left, calibration.right):
         assert camera.window.point.tolist() == [0.0175, 0.0, 0.0]
@@ -60,7 +60,7 @@ def test_the_one_surface_is_both_windows(content: Any) -> None:
     assert (surface.point[0], surface.inside) == (0.0175, 1.3)
 
 
-def test_windows_are_read_as_they_stand(own_windows: Any) -> None:
+def test_windows_are_read(own_windows: Any) -> None:
     calibration = parse_calibration(own_windows)
     assert calibration.surface is None
     window = calibration.right.window

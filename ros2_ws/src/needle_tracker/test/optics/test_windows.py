@@ -19,12 +19,10 @@ import pytest
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
-from needle_tracker.detector.reach import Reach
-from needle_tracker.detector.search_grid import make_search_grid
+from needle_tracker.detector.search_grid import Reach, make_search_grid
 from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
-from needle_tracker.optics.camera_model import project_optical
 from needle_tracker.optics.compiled_projection import pixel_ray, project_point
-from needle_tracker.optics.refraction import RefractedCamera, stereo_views
+from needle_tracker.optics.refraction import RefractedCamera, project_optical, stereo_views
 from needle_tracker.optics.window import Layer, Window
 
 Array = np.ndarray
@@ -103,7 +101,7 @@ def aquacal() -> Any:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_pixels_and_rays_are_those_of_aquacal(aquacal: Any, seed: int) -> None:
+def test_pixels_and_rays_agree_with_aquacal(aquacal: Any, seed: int) -> None:
     # Its world has z down into the water: x = rig y, y = -rig z, z = -rig x.
     turn = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
     view, points = random_view(seed, 0, np.eye(3))
@@ -185,7 +183,9 @@ def test_a_ray_leads_back_to_the_point_by_snells_law(view: RefractedCamera, poin
 
 
 @VIEWS
-def test_the_compiled_model_is_the_same(view: RefractedCamera, points: Array) -> None:
+def test_the_compiled_projection_agrees_with_the_array_projection(
+    view: RefractedCamera, points: Array
+) -> None:
     # Deep, in the layers, and before the window.
     window, depths = view.camera.window, np.linspace(-0.03, 0.05, len(points))
     everywhere = points + (window.depth(points) - depths)[:, None] * window.normal
@@ -193,7 +193,7 @@ def test_the_compiled_model_is_the_same(view: RefractedCamera, points: Array) ->
     np.testing.assert_allclose(compiled_pixels(view, everywhere), pixels, rtol=0.0, atol=1e-9)
 
 
-def test_what_has_no_ray_or_pixel_is_nan() -> None:
+def test_missing_rays_and_pixels_are_nan() -> None:
     view, _ = random_view(0, 0)
     camera = view.camera
     # Strong barrel distortion: no ideal point is seen that far out.
@@ -215,7 +215,7 @@ def test_what_has_no_ray_or_pixel_is_nan() -> None:
 
 
 @pytest.mark.parametrize("layers", [0, 3])
-def test_what_is_seen_does_not_jump_at_a_face(layers: int) -> None:
+def test_projection_is_continuous_at_a_face(layers: int) -> None:
     view, points = random_view(7, layers)
     window = view.camera.window
     for depth in np.cumsum([0.0, *(layer.thickness for layer in window.layers)]):
@@ -228,7 +228,7 @@ def test_what_is_seen_does_not_jump_at_a_face(layers: int) -> None:
     np.testing.assert_allclose(view.project(before), straight(view.camera, before), atol=1e-9)
 
 
-def test_layers_of_the_bodys_index_or_of_air_are_none() -> None:
+def test_layers_with_the_index_of_body_or_air_have_no_effect() -> None:
     view, points = random_view(0, 0)
     window = view.camera.window
     deep = points - 0.01 * window.normal
@@ -250,10 +250,10 @@ def test_lens_and_slopes_agree_with_opencv_and_finite_differences(
     np.testing.assert_allclose(seen, straight(calibration.left, point[None])[0], atol=1e-9)
 
 
-def test_each_view_of_a_box_searches_where_needles_go(calibration_path: Path) -> None:
+def test_each_view_of_a_box_searches_the_reach_of_the_needle(calibration_path: Path) -> None:
     rig = load_calibration(calibration_path.with_name("calibration_top_and_side.yaml"))
     for number, view in enumerate(stereo_views(rig)):
-        grid = make_search_grid(view, REACH, first_distance=2e-3)
+        grid = make_search_grid(view, REACH, 2e-3)
         assert grid.reachable[:, len(grid.angles) // 2].mean() > 0.9
         assert abs(view.sideways[1 - number]) > 0.999
         # A needle that bends towards this camera lies on the grid's middle, one aside does not.

@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from needle_tracker.sources.insertion_history import InsertionHistory
-from needle_tracker.sources.pairing import PairMatcher
+from needle_tracker.sources.pairing import InsertionHistory, PairMatcher
 
 
 def test_equal_stamps_pair_in_any_order_of_arrival() -> None:
@@ -23,7 +22,7 @@ def test_equal_stamps_pair_in_any_order_of_arrival() -> None:
     assert (matcher.pairs, matcher.unpaired.total()) == (2, 0)
 
 
-def test_latest_is_never_paired_with_latest_and_what_is_passed_over_is_counted() -> None:
+def test_latest_is_never_paired_with_latest_and_dropped_images_are_counted() -> None:
     matcher: PairMatcher[str] = PairMatcher(0)
     matcher.add("left", 10, "l10")
     assert matcher.add("right", 20, "r20") is None
@@ -49,7 +48,7 @@ def test_tolerance_is_kept_and_the_nearest_wins() -> None:
     assert matcher.unpaired["left"] == 1
 
 
-def test_free_running_cameras_pair_within_half_a_frame_and_the_skew_is_told() -> None:
+def test_free_running_cameras_pair_within_half_a_frame_and_the_skew_is_reported() -> None:
     matcher: PairMatcher[str] = PairMatcher(None)
     period, late, pairs = 33_000, 12_000, []
     for number in range(40):
@@ -82,7 +81,7 @@ def test_insertion_is_interpolated_at_the_exposure() -> None:
     # Of two at one moment the later counts; one that is not finite does not.
     history.add(200, 0.030)
     history.add(210, math.nan)
-    assert (history.at(200), history.refused, history.is_bracketed(205)) == (0.030, 1, False)
+    assert (history.at(200), history.rejected, history.is_bracketed(205)) == (0.030, 1, False)
     history.add(50, 0.002)
     assert (history.restarts, history.at(100), history.at(50)) == (1, None, 0.002)
     assert (history.time_before(49), history.time_before(50)) == (1, 0)

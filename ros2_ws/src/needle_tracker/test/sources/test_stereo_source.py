@@ -14,8 +14,8 @@ from needle_tracker.sources.stereo_source import (
     LOST_AFTER,
     CameraPair,
     EndOfRecording,
+    RecordedPairs,
     StampedPair,
-    StereoSource,
     open_source,
 )
 
@@ -58,7 +58,7 @@ class FakeCapture:
         self.opened = False
 
 
-def opened(left: object, right: object, *, loop: bool = False) -> StereoSource:
+def opened(left: object, right: object, *, loop: bool = False) -> CameraPair | RecordedPairs:
     return open_source((str(left), str(right)), SIZES, 100.0, Clock(), loop=loop)
 
 
@@ -76,7 +76,7 @@ def write_pairs(folder: Path, count: int, size: tuple[int, int] = (64, 48)) -> t
     return folder / "left", folder / "right"
 
 
-def levels_of(source: StereoSource, most: int = 99) -> tuple[list[int], str]:
+def levels_of(source: CameraPair | RecordedPairs, most: int = 99) -> tuple[list[int], str]:
     """Return a grey level of each left image, 0 for what cannot be read, and what was lacking."""
     levels: list[int] = []
     while len(levels) < most and not isinstance(event := source.next(), EndOfRecording):
@@ -96,7 +96,7 @@ def test_both_cameras_are_grabbed_before_either_is_decoded() -> None:
     assert not any(capture.opened for capture in captures.values())
 
 
-def test_a_camera_that_gives_nothing_is_gone_after_a_while() -> None:
+def test_a_failing_camera_is_lost_after_some_reads() -> None:
     source, captures = cameras([])
     captures["2"].good = False
     for _ in range(1, LOST_AFTER):
@@ -111,7 +111,7 @@ def test_a_camera_that_gives_nothing_is_gone_after_a_while() -> None:
         cameras([], 80)[0].next()
 
 
-def test_folders_come_in_order_and_end_or_begin_again(tmp_path: Path) -> None:
+def test_folders_are_read_in_order_and_end_or_restart(tmp_path: Path) -> None:
     left, right = write_pairs(tmp_path, 3)
     pair = opened(left, right).next()
     assert isinstance(pair, StampedPair)
@@ -138,7 +138,7 @@ def write_video(path: Path, count: int) -> Path:
     return path
 
 
-def test_a_video_that_is_longer_or_cut_off_is_said(tmp_path: Path) -> None:
+def test_a_longer_or_cut_off_video_is_reported(tmp_path: Path) -> None:
     left, right = write_video(tmp_path / "left.avi", 6), write_video(tmp_path / "right.avi", 4)
     levels, missing = levels_of(opened(left, right))
     np.testing.assert_allclose(levels, [0, 40, 80, 120], atol=3)
@@ -151,7 +151,7 @@ def test_a_video_that_is_longer_or_cut_off_is_said(tmp_path: Path) -> None:
     assert f"{6 - len(levels)} of 6 pairs cannot be read" in missing
 
 
-def test_sources_that_are_wrong_are_refused(tmp_path: Path) -> None:
+def test_wrong_sources_are_rejected(tmp_path: Path) -> None:
     left, right = write_pairs(tmp_path / "good", 2)
     other = write_pairs(tmp_path / "large", 2, (80, 60))[0]
     (tmp_path / "empty").mkdir()

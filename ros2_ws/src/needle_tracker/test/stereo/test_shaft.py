@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from needle_tracker.detector.end_search import ShaftPath
 from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.refraction import RefractedCamera
-from needle_tracker.stereo.shaft import is_reachable, shaft_length, shaft_points
+from needle_tracker.stereo.sighting import is_reachable, shaft_length, shaft_points
 
 Views = tuple[RefractedCamera, RefractedCamera]
 LENGTH = 70e-3
@@ -34,7 +34,7 @@ def distance_to(points: np.ndarray, curve: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("roll", [0.0, 0.7, 1.6, 3.0, -1.2])
 @pytest.mark.parametrize("curvature", [2.0, 7.0])
-def test_the_shaft_is_where_it_was_seen(views: Views, curvature: float, roll: float) -> None:
+def test_shaft_points_are_on_the_shaft(views: Views, curvature: float, roll: float) -> None:
     points = arc(curvature, roll)
     # The right path starts elsewhere and has other points.
     paths = (seen(views[0], points), seen(views[1], arc(curvature, roll, start=5e-3, count=171)))
@@ -47,7 +47,7 @@ def test_the_shaft_is_where_it_was_seen(views: Views, curvature: float, roll: fl
 
 
 @pytest.mark.parametrize("roll", [0.0, 1.6])
-def test_cells_make_steps_the_shaft_does_not(views: Views, roll: float) -> None:
+def test_the_steps_of_the_cells_are_smoothed(views: Views, roll: float) -> None:
     points = arc(4.0, roll)
     rng = np.random.default_rng(0)
     paths = tuple(
@@ -59,7 +59,7 @@ def test_cells_make_steps_the_shaft_does_not(views: Views, roll: float) -> None:
     assert distance_to(found, arc(4.0, roll, count=20_001)).max() < 1e-3
 
 
-def test_a_needle_is_reachable_and_as_long_as_it_is(
+def test_a_needle_is_reachable_and_its_length_is_right(
     views: Views, settings: TrackerSettings
 ) -> None:
     points = arc(5.0, 1.0)
@@ -76,7 +76,7 @@ def test_a_shadow_on_the_floor_is_not_reachable(views: Views, settings: TrackerS
     assert not is_reachable(found, settings.reach)
 
 
-def test_a_line_along_the_baseline_says_nothing(views: Views) -> None:
+def test_a_line_along_the_baseline_has_no_shaft_points(views: Views) -> None:
     y = np.linspace(-20e-3, 20e-3, 130)
     line = np.stack([0.0 * y, y, np.full_like(y, 62.5e-3)], axis=1)
     # Every ray of one image meets all of the other's there, and a hair's breadth says where.

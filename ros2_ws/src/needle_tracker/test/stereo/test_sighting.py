@@ -47,6 +47,7 @@ def search(views: Views, settings: TrackerSettings) -> Callable[..., StereoSearc
             settings.reach,
             settings.windows,
             settings.tip_lean,
+            settings.entry_zone,
         )
 
     return make
@@ -57,7 +58,7 @@ def needle(make_arc: MakeArc) -> np.ndarray:
     return np.asarray(make_arc(0.06, 6.0, 0.7))
 
 
-def test_what_only_one_view_shows_is_told(
+def test_the_end_in_only_one_view_is_reported(
     search: Callable[..., StereoSearch], needle: np.ndarray
 ) -> None:
     sightings, (left, right) = search([needle], []).search(3e-3, 0.15)
@@ -76,7 +77,7 @@ def test_one_needle_in_both_views_is_one_sighting(
     assert sighting.evidence > 4.0
 
 
-def test_a_line_in_one_view_only_is_none(
+def test_a_line_in_only_one_view_is_no_sighting(
     search: Callable[..., StereoSearch], needle: np.ndarray, make_arc: MakeArc
 ) -> None:
     line = make_arc(0.09, 3.0, -1.5)
@@ -86,27 +87,27 @@ def test_a_line_in_one_view_only_is_none(
     np.testing.assert_allclose(found[0].tip.position, needle[-1], atol=0.05e-3)
 
 
-def test_a_shadow_on_the_floor_is_none(
+def test_a_shadow_on_the_floor_is_no_sighting(
     search: Callable[..., StereoSearch], needle: np.ndarray
 ) -> None:
     shadow = needle * [0.0, 1.0, 1.0] - [0.02, 0.0, 0.0]
     assert search([shadow], [shadow]).search(3e-3, 0.15)[0] == []
 
 
-def test_a_line_whose_tangent_misses_the_entry_is_none(
+def test_a_line_whose_tangent_misses_the_entry_is_no_sighting(
     search: Callable[..., StereoSearch], needle: np.ndarray
 ) -> None:
     beside = needle + np.array([0.0, 0.017, 0.0])
     assert search([beside], [beside]).search(3e-3, 0.15)[0] == []
 
 
-def test_only_ends_at_the_distances_that_are_asked_for(
+def test_sightings_are_only_at_the_given_distances(
     search: Callable[..., StereoSearch], needle: np.ndarray
 ) -> None:
     assert search([needle], [needle]).search(0.07, 0.08)[0] == []
 
 
-def test_evidence_is_the_sum_of_what_the_views_say(views: Views, needle: np.ndarray) -> None:
+def test_evidence_is_the_sum_over_the_views(views: Views, needle: np.ndarray) -> None:
     left, right = (
         SeenLines(view, [needle]).ends_near(
             ShaftPath(view.project(needle), 1.0, 1.0), hidden=False

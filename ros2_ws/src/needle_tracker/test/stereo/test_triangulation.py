@@ -35,7 +35,7 @@ def test_exact_images_give_the_exact_tip(views: Views) -> None:
     np.testing.assert_allclose(midpoint(views, (left.point, right.point)), TIP, atol=1e-11)
 
 
-def test_it_does_not_matter_which_camera_comes_first(views: Views) -> None:
+def test_the_order_of_the_cameras_does_not_matter(views: Views) -> None:
     left, right = seen(views)
     tip = triangulate((views[1], views[0]), (right, left))
     assert tip is not None
@@ -43,7 +43,7 @@ def test_it_does_not_matter_which_camera_comes_first(views: Views) -> None:
     np.testing.assert_allclose(tip.position, TIP, atol=1e-11)
 
 
-def test_shafts_that_run_opposite_ways_are_not_one_needle(views: Views) -> None:
+def test_shafts_in_opposite_directions_are_not_one_needle(views: Views) -> None:
     left, right = seen(views)
     for one, other in ((left, turned(right)), (turned(left), right)):
         assert triangulate(views, (one, other)) is None
@@ -94,7 +94,7 @@ def test_covariances_fit_the_errors(views: Views) -> None:
     assert np.std(np.array(errors)[:, 0]) < 0.6 * np.std(np.array(plain)[:, 0])
 
 
-def test_the_directions_covariance_is_what_turning_the_lines_does(views: Views) -> None:
+def test_the_covariance_of_the_direction_agrees_with_finite_differences(views: Views) -> None:
     sigmas, turn = (1e-3, 6e-3), 1e-4
     exact = [
         dataclasses.replace(tip, sigma_angle=sigma)

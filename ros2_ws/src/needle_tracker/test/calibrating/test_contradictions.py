@@ -9,10 +9,14 @@ import pytest
 
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_tracker.calibrating.calibrate_stereo import report
-from needle_tracker.calibrating.calibration_outliers import doubts, ring_patterns, square_error
+from needle_tracker.calibrating.calibration_outliers import (
+    contradictions,
+    ring_patterns,
+    square_error,
+)
+from needle_tracker.calibrating.calibration_session import BoardView, Corners
 from needle_tracker.calibrating.pair_consistency import PairsApartError, consistent_views
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
-from needle_tracker.calibrating.rig_model import BoardView, Corners
 from needle_tracker.optics.calibration import StereoCalibration
 
 from .synthetic_rig import GIVEN, PLACES, SIZES, free_pose, lenses_of, take, view_of
@@ -37,17 +41,17 @@ def test_wrong_squares_are_found_by_their_size(
     result = calibrate(said_larger(views[4:], 0.003), SIZES, GIVEN, lenses_of(calibration))
     error, sigma = square_error(result)
     assert error == pytest.approx(-0.003, abs=max(4.0 * sigma, 3e-4))
-    assert "smaller than the session says" in doubts(result, (error, sigma))[0]
+    assert "smaller than the session says" in contradictions(result, (error, sigma))[0]
 
 
-def test_one_place_does_not_tell_the_size_of_the_squares(
+def test_one_place_does_not_determine_the_size_of_the_squares(
     views: list[BoardView], calibration: StereoCalibration
 ) -> None:
     found = said_larger(views[2:7], 0.01)
     result = calibrate(found, SIZES, GIVEN, lenses_of(calibration))
     size = square_error(result)
     assert not size[1] < 0.1
-    assert doubts(result, size) == []
+    assert contradictions(result, size) == []
     assert "size of the squares: not told by these views" in report(result, size, 0.06)
 
 
@@ -70,7 +74,7 @@ def test_a_wrong_place_is_found(
     wrong = dataclasses.replace(views[number], place=dataclasses.replace(place, T_rig_board=pose))
     found = [*views[5:number], wrong, *views[number + 1 :]]
     result = calibrate(found, SIZES, GIVEN, lenses_of(calibration))
-    assert any(says in one for one in doubts(result, square_error(result)))
+    assert any(says in one for one in contradictions(result, square_error(result)))
 
 
 def test_a_lens_that_plumb_bob_does_not_describe_is_not_ok(result: RigCalibration) -> None:
@@ -80,7 +84,7 @@ def test_a_lens_that_plumb_bob_does_not_describe_is_not_ok(result: RigCalibratio
     residuals[-out.size :] += (0.05 * np.sin(away / 50.0) * out / away).ravel()
     bent = dataclasses.replace(result, fit=dataclasses.replace(result.fit, residuals=residuals))
     assert 0.03 < ring_patterns(bent)["right"] < 0.06
-    (said,) = doubts(bent, (0.0, np.inf))
+    (said,) = contradictions(bent, (0.0, np.inf))
     assert "right camera: corners miss by up to 0.0" in said
     assert "in a pattern of rings: its lens has more" in said
 
@@ -123,7 +127,7 @@ def moved(rig: StereoRig, views: list[BoardView], numbers: set[int]) -> list[Boa
         ({7: 8}, set(), ["under_deep"]),
     ],
 )
-def test_few_pairs_not_taken_at_once_are_left_out(
+def test_few_inconsistent_pairs_are_left_out(
     rig: StereoRig,
     many: list[BoardView],
     calibration: StereoCalibration,
@@ -141,7 +145,7 @@ def test_few_pairs_not_taken_at_once_are_left_out(
 
 
 @pytest.mark.parametrize("count", [FREE, 3])
-def test_many_pairs_not_taken_at_once_are_the_reason_told(
+def test_many_inconsistent_pairs_are_rejected(
     rig: StereoRig, many: list[BoardView], calibration: StereoCalibration, count: int
 ) -> None:
     views = moved(rig, many, set(range(count)))[: FREE + 2]
@@ -149,8 +153,8 @@ def test_many_pairs_not_taken_at_once_are_the_reason_told(
         consistent_views(views, calibration, 3)
 
 
-def test_a_place_that_only_one_image_shows_is_not_ok(result: RigCalibration) -> None:
+def test_a_place_in_only_one_image_is_not_ok(result: RigCalibration) -> None:
     place = next(view for view in result.model.views if view.name == "surface_a")
     apart = dataclasses.replace(result, apart=[place])
-    assert "in surface_a, though" in doubts(apart, (0.0, np.inf))[0]
+    assert "in surface_a, though" in contradictions(apart, (0.0, np.inf))[0]
     assert "WARNING: left and right do not show" in report(apart, (0.0, np.inf), 0.06)

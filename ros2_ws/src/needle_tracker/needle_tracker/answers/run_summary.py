@@ -1,8 +1,10 @@
-"""Errors of tips against the truth, in mm and in sigmas."""
+"""Summary of a run over image files: what the views showed, and errors against the truth."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,22 +12,65 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_core.commands.cli import JsonValue
+from needle_tracker.answers.annotation import HELP, IN_ENTRY_ZONE, missing, shows_end, shows_shaft
 from needle_tracker.filter.measurement import Measurement, TrackState
+from needle_tracker.optics.calibration import SIDES
 from needle_tracker.sources.image_files import read_numbers
 
 Array = npt.NDArray[np.float64]
 
 _INSIDE_95 = 7.814728
-"""Square of a normal error of three axes, in sigmas, that 95 % stay within."""
+"""95 % quantile of chi-squared with three degrees of freedom."""
+
+
+@dataclasses.dataclass
+class SeenCounts:
+    """Counts of ends and shafts that were seen, except in the entry zone."""
+
+    pairs: int = 0
+    ends: Counter[str] = dataclasses.field(default_factory=Counter)
+    shafts: Counter[str] = dataclasses.field(default_factory=Counter)
+    missing: Counter[str] = dataclasses.field(default_factory=Counter)
+
+    def add(self, measured: Measurement) -> None:
+        """Count the result of a pair."""
+        cause = missing(measured)
+        if cause:
+            self.missing[cause] += 1
+        if cause == IN_ENTRY_ZONE:
+            return
+        self.pairs += 1
+        for side, end in zip(SIDES, measured.ends, strict=True):
+            self.ends[side] += shows_end(end)
+            self.shafts[side] += shows_shaft(end)
+
+    def describe(self) -> str:
+        """Return the counts as text, and the remedy for the most frequent cause."""
+        lines = [
+            f"  {side:5}: end seen in {self.ends[side]} of {self.pairs} pairs, "
+            f"shaft in {self.shafts[side]}"
+            for side in SIDES
+        ]
+        lines += [f"  no tip {n:6d} x  {cause}" for cause, n in self.missing.most_common()]
+        for cause, _ in self.missing.most_common():
+            if cause in HELP:
+                lines.append(f"  most often `{cause}`, helps: {HELP[cause]} (docs/own_rig.md)")
+                break
+        return "\n".join(lines)
+
+    def figures(self) -> dict[str, JsonValue]:
+        """Return the counts by the keys of `track_images --json`."""
+        seen = {f"{side}_end_seen": self.ends[side] for side in SIDES}
+        return {**seen, **{f"{side}_shaft_seen": self.shafts[side] for side in SIDES}}
 
 
 class TruthComparison:
-    """Compares tips with where the needle's end really was, pair by pair.
+    """Comparison of tips with the true end of the needle, pair by pair.
 
     Parameters
     ----------
     tips : mapping of str to (ndarray, shape (3,), or None)
-        True tip in `rig` [m] by name; None where the images show no needle.
+        True tip in `rig` [m] by name; None if the images show no needle.
     """
 
     def __init__(self, tips: Mapping[str, Array | None]) -> None:
@@ -35,7 +80,7 @@ class TruthComparison:
         self._missed = self._false = self._untold = 0
 
     def add(self, names: Sequence[str], measured: Measurement) -> None:
-        """Take what a pair of any of these names gave; a tip from the stage alone is none."""
+        """Add the result of a pair by any of its names; a tip in the entry zone does not count."""
         key = next((name for name in names if name in self._tips), None)
         if key is None:
             self._untold += 1
@@ -52,7 +97,7 @@ class TruthComparison:
         self._squares.append(float(error @ np.linalg.solve(tip.covariance, error)))
 
     def figures(self) -> dict[str, JsonValue]:
-        """Return the figures, by the names of `track_images --json`; NaN where nothing tells."""
+        """Return the figures by the keys of `track_images --json`; NaN if unknown."""
         errors = np.array(self._errors or [np.full(3, np.nan)])
         squares = np.array(self._squares or [np.nan])
         size = 1e3 * np.linalg.norm(errors, axis=1)
@@ -71,7 +116,7 @@ class TruthComparison:
         }
 
     def describe(self) -> str:
-        """Return the figures as a person reads them."""
+        """Return the figures as text."""
         seen = self.figures()
         lines = [
             f"against the truth: {seen['compared']} tips, {seen['missed']} needles without a tip, "
@@ -95,17 +140,17 @@ def read_truth(path: Path) -> dict[str, Array | None]:
     Parameters
     ----------
     path : Path
-        The file, such as `render_images` writes; other columns are passed over.
+        The file, as from `render_images`; other columns are ignored.
 
     Returns
     -------
     dict
-        Name to the tip in `rig` [m], None where the fields are empty: no needle.
+        Name to the tip in `rig` [m]; None if the fields are empty: no needle.
 
     Raises
     ------
     UserError
-            As `image_files.read_numbers`.
+        As `image_files.read_numbers`.
     """
     read = read_numbers("--truth", path, ("x_m", "y_m", "z_m"))
     return {name: None if tip is None else np.array(tip) for name, tip in read.items()}
