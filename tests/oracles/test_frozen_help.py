@@ -1,7 +1,8 @@
 """`--help` of every command and script is the frozen text in `help/`.
 
-After an intended change, `PYTHONPATH=scripts/lib python tests/oracles/test_frozen_help.py` renews
-the texts; review them with `git diff`.
+After an intended change, renew the texts and review them with `git diff`:
+
+    PYTHONPATH=scripts/lib:tests:tests/shared python tests/oracles/test_frozen_help.py
 """
 
 from __future__ import annotations
