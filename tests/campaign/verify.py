@@ -57,9 +57,7 @@ def _verify(arguments: Sequence[str]) -> int:
     parser.add_argument(
         "steps", nargs="*", metavar="STEP", help=f"{', '.join(STEPS)} (default: all)"
     )
-    parser.add_argument(
-        "--only", action="append", metavar="NAME", help="run only this check; may be repeated"
-    )
+    parser.add_argument("--only", action="append", metavar="NAME", help="only this check")
     parser.add_argument("--list", action="store_true", help="list the checks and exit")
     parser.add_argument("--keep", metavar="DIR", help="keep the bags in this new folder")
     parser.add_argument("--json", metavar="FILE", help="also write the results as flat JSON")

@@ -88,9 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _bench(arguments: Sequence[str]) -> int:
     parser = CommandParser("bench", DESCRIPTION, EPILOG)
     parser.add_argument("--json", metavar="FILE", help="also write the figures as flat JSON")
-    parser.add_argument(
-        "--only", metavar="WORD", help="measure only rows whose name contains this text"
-    )
+    parser.add_argument("--only", metavar="WORD", help="only rows whose name contains this")
     given = parser.parse_args(arguments)
     file = output_file("--json", given.json)
     benches = {name: bench for name, bench in BENCHES.items() if (given.only or "") in name}

@@ -124,9 +124,7 @@ def read_arguments() -> argparse.Namespace:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "--steps", type=int, default=24000, metavar="N", help="training steps; default: 24000"
-    )
+    parser.add_argument("--steps", type=int, default=24000, metavar="N", help="default: 24000")
     parser.add_argument(
         "--minutes",
         type=float,
@@ -134,9 +132,7 @@ def read_arguments() -> argparse.Namespace:
         help="maximum duration of the training [min]; "
         f"default: {_MINUTES:.0f}, with --own {_OWN_MINUTES:.0f}",
     )
-    parser.add_argument(
-        "--scenes", type=int, default=140, metavar="N", help="traced scenes; default: 140"
-    )
+    parser.add_argument("--scenes", type=int, default=140, metavar="N", help="default: 140")
     parser.add_argument(
         "--drawn",
         type=int,
@@ -168,15 +164,9 @@ def read_arguments() -> argparse.Namespace:
         action="store_true",
         help="only evaluate the network from which --resume would continue",
     )
+    parser.add_argument("--own", type=Path, metavar="FOLDER", help="train on your own recording")
     parser.add_argument(
-        "--own", type=Path, metavar="FOLDER", help="train with a recording of your own rig"
-    )
-    parser.add_argument(
-        "--needle-width-mm",
-        type=float,
-        default=0.7,
-        metavar="W",
-        help="diameter of the needle with --own [mm]; default: 0.7",
+        "--needle-width-mm", type=float, default=0.7, metavar="W", help="with --own; default: 0.7"
     )
     given = parser.parse_args()
     own = given.own is not None

@@ -244,19 +244,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(words: Sequence[str]) -> int:
     parser = CommandParser("estimator_table", "Compare estimators under all disturbances.", "")
     add = parser.add_argument
-    add(
-        "--needles",
-        default="10000",
-        metavar="N",
-        help="needles per row, a multiple of 1000 (10000)",
-    )
+    add("--needles", default="10000", metavar="N", help="of each row (10000)")
     add("--only", default="", metavar="KEYS", help="rows, separated by commas (default: all)")
-    add(
-        "--estimators",
-        default=",".join(ESTIMATORS),
-        metavar="NAMES",
-        help="separated by commas (default: all)",
-    )
+    add("--estimators", default=",".join(ESTIMATORS), metavar="NAMES", help="names (default: all)")
     add("--before", type=Path, metavar="FILE", help="earlier --json; adds its best as `before`")
     add("--json", metavar="FILE", help="write all figures as JSON")
     add("--table", metavar="FILE", help="write the table as Markdown")

@@ -279,12 +279,7 @@ def _run(words: Sequence[str]) -> int:
         ("--pitch-deg", "1", "P", "bound of the pitch at the entry"),
         ("--roll-deg", "10", "R", "bound of the roll at the entry"),
         ("--told-deg", "2", "S", "standard deviation of the pitch that the controller assumes"),
-        (
-            "--noise-mm",
-            "1",
-            "A",
-            "maximum error of each measured coordinate, known to the controller",
-        ),
+        ("--noise-mm", "1", "A", "maximum error of each coordinate, known to the controller"),
     )
     parser = study_parser("obstacle_study", "Steer needles around generated obstacles.", options)
     parser.add_argument("--rrt", action="store_true", help="use the published RRT planner")

@@ -162,14 +162,8 @@ def _traced(calibration: Path, scene: TracedScene) -> dict[str, NDArray[np.gener
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draw the set, or one half of it; returns the exit code."""
     parser = CommandParser("traced_set", str(__doc__), "")
-    parser.add_argument(
-        "folder", metavar="DIR", help="folder of the set; existing sequences are kept"
-    )
-    parser.add_argument(
-        "--held-back",
-        action="store_true",
-        help="draw only the half that is held back for `scripts/verify C`",
-    )
+    parser.add_argument("folder", metavar="DIR", help="folder; existing sequences are kept")
+    parser.add_argument("--held-back", action="store_true", help="only the half that is held back")
     given = parser.parse_args(arguments)
     wanted = scenes(HELD_BACK) + ([] if given.held_back else scenes(LOOKED_AT))
 

@@ -17,9 +17,7 @@ class ConsoleParameters:
     port: int = fixed_parameter(8080, "-", "Port of the page.", 1, 65535)
     hold_port: int = fixed_parameter(8081, "-", "Port of the hold.", 1, 65535)
     hold_real_rig: bool = fixed_parameter(
-        False,
-        "-",
-        "Allow pages on the rig's own machine to hold a real rig; other machines never may.",
+        False, "-", "Allow pages on the rig's own machine to hold a real rig; others never may."
     )
     hosts: tuple[str, ...] = fixed_parameter(
         ("",),
@@ -28,9 +26,7 @@ class ConsoleParameters:
         texts=True,
     )
     calibration_file: str = fixed_parameter(
-        "",
-        "-",
-        "Calibration file of the cameras, to draw the needle; empty: that of needle_tracker.",
+        "", "-", "Calibration of the cameras, to draw the needle; empty: needle_tracker's."
     )
 
     def __post_init__(self) -> None:

@@ -95,36 +95,22 @@ def _axis(
             counts_per_unit, f"counts/{unit}", "Position counts per unit of the axis.", 1.0, 1e12
         ),
         "counts_per_turn": fixed_parameter(
-            0.0,
-            "counts",
-            "Counts per turn, for a drive in rpm; 0: as the drive reports (0x608F).",
-            0.0,
-            1e9,
+            0.0, "counts", "Counts per turn of a drive in rpm; 0: as it reports (0x608F).", 0.0, 1e9
         ),
         "reverse": fixed_parameter(False, "-", "The drive counts in the opposite direction."),
-        "acceleration": fixed_parameter(
-            acceleration, ramp, "Acceleration during homing.", 1e-4, 1e4
-        ),
+        "acceleration": fixed_parameter(acceleration, ramp, "Ramp of homing.", 1e-4, 1e4),
         "quick_stop_deceleration": fixed_parameter(
             quick_stop, ramp, "Deceleration of a quick stop.", 1e-4, 1e4
         ),
         "homing_method": fixed_parameter(
-            homing_method,
-            "-",
-            "CiA 402 homing method; 17, 18: limit switch; 37: current position.",
-            1,
-            37,
+            homing_method, "-", "CiA 402 method: 17, 18 limit switch; 37 current position.", 1, 37
         ),
         "following_error": limit_parameter(f"{axis}_following_error"),
         "following_error_time": fixed_parameter(
             0.05, "s", "Time for which the drive tolerates a larger following error.", 0.001, 10.0
         ),
         "max_torque": fixed_parameter(
-            0.0,
-            "-",
-            "Maximum torque relative to the rated torque; 0: the drive's own setting.",
-            0.0,
-            5.0,
+            0.0, "-", "Maximum share of the rated torque; 0: the drive's setting.", 0.0, 5.0
         ),
         "tolerance": fixed_parameter(
             tolerance, unit, "Position tolerance at the target.", 1e-7, 1.0

@@ -52,9 +52,7 @@ class DriveEmulatorParameters:
     rpm: bool = fixed_parameter(
         False, "-", "Both drives use rpm for speeds and rpm/s for ramps, and report it (0x60A9)."
     )
-    boot_time: float = fixed_parameter(
-        0.5, "s", "Time from power-up to the boot-up message.", 0.0, 60.0
-    )
+    boot_time: float = fixed_parameter(0.5, "s", "From power-up to the boot-up message.", 0.0, 60.0)
     insertion_node_id: int = fixed_parameter(
         1, "-", "CANopen node id of the stepper drive.", 1, _LAST_NODE
     )

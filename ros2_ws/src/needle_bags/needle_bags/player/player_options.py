@@ -101,30 +101,10 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
         parser.add_argument(name, default="", metavar="REGEX", help=text)
 
     parser.add_argument("bag", type=Path, metavar="BAG", help="directory of the bag, or a file")
-    parser.add_argument(
-        "--rate",
-        type=float,
-        default=1.0,
-        metavar="R",
-        help="playback speed relative to the recording",
-    )
-    parser.add_argument(
-        "--start",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="start this long after the first message [s]",
-    )
-    parser.add_argument(
-        "--end",
-        type=float,
-        default=math.inf,
-        metavar="S",
-        help="end this long after the first message [s]",
-    )
-    parser.add_argument(
-        "--topics", nargs="+", default=[], metavar="T", help="play only these topics"
-    )
+    parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="speed factor")
+    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="start time [s]")
+    parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="end time [s]")
+    parser.add_argument("--topics", nargs="+", default=[], metavar="T", help="only these topics")
     add_regex("--regex", "play topics whose name matches, and those of --topics")
     add_regex("--exclude-regex", "do not play topics whose name matches, except those of --topics")
     parser.add_argument(

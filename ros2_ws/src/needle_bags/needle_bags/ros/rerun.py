@@ -199,12 +199,7 @@ def _parser() -> CommandParser:
             metavar="NAME",
             help=f"{kind} of another package (docs/own_controllers.md); '': the preset's",
         )
-    add(
-        "--params",
-        type=Path,
-        metavar="FILE",
-        help="ROS parameter file that overrides recorded parameters",
-    )
+    add("--params", type=Path, metavar="FILE", help="ROS parameter file that overrides the bag's")
     add(
         "--output",
         type=Path,

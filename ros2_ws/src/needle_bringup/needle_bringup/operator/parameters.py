@@ -36,9 +36,7 @@ class OperatorParameters:
     retract_key: int = fixed_parameter(
         _NONE, "-", "Key or button held to retract; -1: none.", _NONE, _LAST_KEY
     )
-    stop_key: int = fixed_parameter(
-        _NONE, "-", "Key or button pressed to stop; -1: none.", _NONE, _LAST_KEY
-    )
+    stop_key: int = fixed_parameter(_NONE, "-", "Pressed to stop; -1: none.", _NONE, _LAST_KEY)
     speed_axis: int = fixed_parameter(
         _NONE,
         "-",

@@ -38,9 +38,7 @@ def _paper(arguments: Sequence[str]) -> int:
     parser = CommandParser("paper", DESCRIPTION, EPILOG)
     parser.add_argument("--quick", action="store_true", help="fewer trials and runs")
     parser.add_argument("--out", metavar="DIR", help=f"output folder (default: {OUT}/)")
-    parser.add_argument(
-        "--runs", metavar="DIR", help="store bags and studies here, and reuse existing ones"
-    )
+    parser.add_argument("--runs", metavar="DIR", help="keep and reuse bags and studies here")
     parser.add_argument(
         "--seed", default="1", metavar="N", help="seed of all random numbers (default: 1)"
     )

@@ -299,9 +299,7 @@ def _parser() -> CommandParser:
         help="add a component of your own (docs/own_controllers.md); may be repeated",
     )
     add("--bag", metavar="DIR", help="new folder for the run (default: time-stamped, in bags/)")
-    add(
-        "--params", metavar="FILE", help="ROS parameter file that overrides the rig's configuration"
-    )
+    add("--params", metavar="FILE", help="ROS parameter file that overrides the configuration")
     add(
         "--seed",
         default="1",

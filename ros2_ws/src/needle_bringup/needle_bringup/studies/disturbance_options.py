@@ -32,12 +32,7 @@ def add_disturbance_options(parser: CommandParser) -> None:
         ("--delay", "0", "N", "delay of a measurement, in steps, known to the controller"),
         ("--untold-delay", "0", "N", "delay of a measurement, in steps, unknown to the controller"),
         ("--kappa-scale", "1", "S", "true curvature relative to the assumed one"),
-        (
-            "--kappa-patches",
-            "0",
-            "F",
-            "maximum relative error of the curvature, drawn anew every 20 mm",
-        ),
+        ("--kappa-patches", "0", "F", "maximum relative error of the curvature, new every 20 mm"),
         (
             "--push",
             "0",

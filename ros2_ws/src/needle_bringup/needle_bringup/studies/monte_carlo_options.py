@@ -213,12 +213,7 @@ def _parser() -> CommandParser:
             "steer N needles to points instead of the plane: each from a random start within the "
             "bounds to its own random point, 60 to 120 mm ahead",
         ),
-        (
-            "--rotation-deg",
-            "1e6",
-            "B",
-            "maximum total rotation of each base on the way to its point [deg]",
-        ),
+        ("--rotation-deg", "1e6", "B", "maximum total rotation of each base to its point [deg]"),
         (
             "--target-drift-mm-per-s",
             "0",

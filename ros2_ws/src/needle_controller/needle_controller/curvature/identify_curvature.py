@@ -93,18 +93,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     add("source", type=Path, metavar="BAG_OR_CSV", help="a bag's directory, or a CSV of tips")
     add("--insertion", type=Path, metavar="FILE", help="CSV name,insertion_m for a CSV of tips")
     add("--json", type=Path, metavar="FILE", help="also write the result as flat JSON")
-    add(
-        "--from-mm",
-        default="0",
-        metavar="D",
-        help="ignore tips at a smaller insertion [mm] (default: 0)",
-    )
-    add(
-        "--until-mm",
-        default="inf",
-        metavar="D",
-        help="ignore tips at a larger insertion [mm] (default: all)",
-    )
+    add("--from-mm", default="0", metavar="D", help="ignore smaller insertions [mm] (default: 0)")
+    add("--until-mm", default="inf", metavar="D", help="ignore larger ones [mm] (default: all)")
     add(
         "--entry-std-mm",
         default="0.5",

@@ -60,16 +60,9 @@ class SteeringSettings:
         "Estimator of another package (entry point group needle_controller.estimators; "
         "docs/own_controllers.md); empty: the preset's.",
     )
-    law: str = fixed_parameter(
-        "",
-        "-",
-        "Control law of another package (group needle_controller.laws); empty: the preset's.",
-    )
+    law: str = fixed_parameter("", "-", "Control law, likewise (group needle_controller.laws).")
     planner: str = fixed_parameter(
-        "",
-        "-",
-        "Planner of paths to a point, of another package (group needle_controller.planners); "
-        "empty: the preset's.",
+        "", "-", "Planner of paths to a point, likewise (group needle_controller.planners)."
     )
     seed: int = fixed_parameter(
         0, "-", "Seed of an estimator of another package; presets use none.", 0, 2**31 - 1
@@ -167,11 +160,7 @@ class SteeringSettings:
         600.0,
     )
     tip_margin: float = parameter(
-        0.004,
-        "m",
-        "Accepted distance of a measured tip from the reachable positions of the needle.",
-        0.0,
-        0.1,
+        0.004, "m", "Accepted distance of a measured tip from the needle's reach.", 0.0, 0.1
     )
     needle_out_insertion: float = parameter(
         0.002, "m", "Up to this insertion the needle counts as out of the phantom.", 0.0, 0.01

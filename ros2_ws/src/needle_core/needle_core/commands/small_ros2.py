@@ -25,8 +25,8 @@ usage: ros2 run PACKAGE EXECUTABLE [arguments]
        ros2 param get NODE NAME | set NODE NAME VALUE
 
 A small substitute for the ros2 command line, which PyPI does not have. It runs the nodes and tools
-of this project and accesses a running graph; see also `ros2 topic pub --help` and so on. For other
-commands (bag, launch, ...) install ROS 2 Jazzy, source it and run scripts/setup again.
+of this project and accesses a running graph; `ros2 topic pub --help` shows its options. For
+everything else (bag, launch, ...) install ROS 2 Jazzy, source it and run scripts/setup again.
 """
 _MODULE = ".executables"
 T = TypeVar("T")

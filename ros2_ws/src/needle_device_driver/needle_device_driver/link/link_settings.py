@@ -32,11 +32,7 @@ class LinkSettings:
         500_000, "bit/s", "Bitrate of the CAN bus; slcan only.", 10_000, 1_000_000
     )
     tty_baudrate: int = fixed_parameter(
-        115_200,
-        "bit/s",
-        "Baud rate of the serial port; slcan only, USB adapters ignore it.",
-        9600,
-        4_000_000,
+        115_200, "bit/s", "Of the serial port; slcan only, USB adapters ignore it.", 9600, 4_000_000
     )
     host: str = fixed_parameter("localhost", "-", "Host of the socketcand server.")
     port: int = fixed_parameter(29536, "-", "Port of the socketcand server.", 1, 65535)

@@ -213,20 +213,11 @@ def _parser() -> CommandParser:
     add = parser.add_argument
     add("--output", required=True, metavar="DIR", help="new or empty folder")
     add("--renderer", default="quick", metavar="R", help="quick or path_traced (default: quick)")
-    add("--scenario", metavar="NAME", help="scenario of quick, see below (default: clean)")
-    add(
-        "--appearance",
-        metavar="NAME",
-        help="appearance of path_traced, see below (default: random)",
-    )
+    add("--scenario", metavar="NAME", help="for quick, see below (default: clean)")
+    add("--appearance", metavar="NAME", help="for path_traced, see below (default: random)")
     add("--frames", metavar="N", help="number of pairs (default: up to the depth)")
     add("--seed", default="0", metavar="N", help="seed of path and images (default: 0)")
-    add(
-        "--start-mm",
-        default="0",
-        metavar="D",
-        help="insertion of the first frame [mm] (default: 0)",
-    )
+    add("--start-mm", default="0", metavar="D", help="insertion at the first frame (default: 0)")
     add("--depth-mm", default="120", metavar="D", help="final insertion [mm] (default: 120)")
     add("--step-mm", default="1", metavar="S", help="insertion between frames [mm] (default: 1)")
     add(
@@ -235,21 +226,9 @@ def _parser() -> CommandParser:
         metavar="K",
         help=f"curvature of the needle's path [1/m] (default: {CURVATURE:.3f})",
     )
-    add(
-        "--noise",
-        metavar="SIGMA",
-        help="sensor noise of quick [grey levels] (default: the scenario's)",
-    )
-    add(
-        "--calibration",
-        metavar="FILE",
-        help="calibration of the cameras (default: needle_tracker's)",
-    )
-    add(
-        "--box",
-        action="store_true",
-        help="use two webcams in front of an acrylic box, drawn from the seed",
-    )
+    add("--noise", metavar="SIGMA", help="noise of quick [grey levels] (default: the scenario's)")
+    add("--calibration", metavar="FILE", help="of the cameras (default: needle_tracker's)")
+    add("--box", action="store_true", help="two webcams and an acrylic box, drawn from the seed")
     add("--json", metavar="FILE", help="also write a summary as flat JSON")
     return parser
 

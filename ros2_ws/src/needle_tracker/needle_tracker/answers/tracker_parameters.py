@@ -27,16 +27,10 @@ class StereoTrackerParameters:
         "recording; empty: use the pairs before each insertion.",
     )
     reliable_images: bool = fixed_parameter(
-        True,
-        "-",
-        "Reliable subscription to images, for simulation; false: best effort, for hardware.",
+        True, "-", "Subscribe to images reliably (simulation); false: best effort (hardware)."
     )
     pair_tolerance: float = fixed_parameter(
-        0.0,
-        "s",
-        "Maximum difference between the stamps of the left and right image of a pair.",
-        0.0,
-        0.1,
+        0.0, "s", "Maximum difference of the stamps of a pair's images.", 0.0, 0.1
     )
     free_running: bool = fixed_parameter(
         False,
@@ -79,18 +73,10 @@ class StereoTrackerParameters:
         0.01, "-", "Standard deviation of the insertion's scale.", 1e-4, 0.1
     )
     tip_lean: float = fixed_parameter(
-        0.21,
-        "rad",
-        "Maximum angle between the visible end and the needle's path (pre-bend).",
-        0.0,
-        0.8,
+        0.21, "rad", "Maximum angle between visible end and path (pre-bend).", 0.0, 0.8
     )
     annotated_rate: float = fixed_parameter(
-        2.0,
-        "Hz",
-        "Maximum rate of annotated images, sent only to subscribers; 0: none.",
-        0.0,
-        100.0,
+        2.0, "Hz", "Maximum rate of annotated images, if subscribed to; 0: none.", 0.0, 100.0
     )
 
     def __post_init__(self) -> None:

@@ -100,20 +100,8 @@ def _parser() -> CommandParser:
     add("--right", type=Path, metavar="DIR", help="images of the right camera")
     add("--live", metavar="NAME", help="use images from topics, the board at this place")
     add("--count", type=int, default=10, metavar="N", help="number of live pairs (10)")
-    add(
-        "--timeout",
-        type=float,
-        default=10.0,
-        metavar="S",
-        help="maximum wait for live pairs (10 s)",
-    )
-    add(
-        "--pair-tolerance",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="of the stamps of a live pair (0 s)",
-    )
+    add("--timeout", type=float, default=10.0, metavar="S", help="wait for live pairs (10 s)")
+    add("--pair-tolerance", type=float, default=0.0, metavar="S", help="of left and right (0 s)")
     add("--limit-mm", type=float, default=0.15, metavar="MM", help="accepted tip error (0.15)")
     add("--json", type=Path, metavar="FILE", help="also write the figures as flat JSON")
     return parser
