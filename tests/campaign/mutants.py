@@ -29,11 +29,11 @@ WANTED = 0.9
 OF_TYPES = "core/ReplaceBinaryOperator_BitOr"
 
 DESCRIPTION = f"""\
-Change the code at random places, one at a time, and say which changes no test notices.
+Change the code at random places, one at a time, and list the changes that no test detects.
 
-The driver's supervisor, axes and CiA 402, and the controller's protocol, in clones of what is
-committed. A mutant counts as noticed when a test fails, or does not end. Exit code 1 below
-{WANTED:.0%}. Needs cosmic-ray: python -m pip install cosmic-ray==8.7.0
+Mutates the driver's supervisor, axes and CiA 402 code and the controller's protocol, in clones of
+the last commit. A mutant counts as detected if a test fails or does not end. Exit code 1 below
+{WANTED:.0%}. Requires cosmic-ray: python -m pip install cosmic-ray==8.7.0
 """
 
 
@@ -80,10 +80,10 @@ TARGETS = (
 def main() -> int:
     """Run the command line; returns the exit code."""
     parser = CommandParser("mutants", DESCRIPTION, "")
-    parser.add_argument("--sample", type=int, default=400, help="how many mutants")
-    parser.add_argument("--seed", type=int, default=1, help="which ones")
-    parser.add_argument("--cores", type=int, default=2, help="how many at a time")
-    parser.add_argument("--timeout", type=float, default=180.0, help="of the tests [s]")
+    parser.add_argument("--sample", type=int, default=400, help="number of mutants")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the sample")
+    parser.add_argument("--cores", type=int, default=2, help="number of parallel runs")
+    parser.add_argument("--timeout", type=float, default=180.0, help="timeout of the tests [s]")
 
     def run() -> int:
         given = parser.parse_args()

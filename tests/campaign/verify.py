@@ -35,15 +35,15 @@ STEPS: Mapping[str, tuple[Check, ...]] = {
 }
 
 DESCRIPTION = """\
-Run what each step of the project must show, at full size, and print wanted beside seen.
+Run the full-size checks of each step of the project; print expected and measured values.
 """
 EPILOG = """\
 examples:
-  scripts/verify A                 everything of step A
+  scripts/verify A                 all checks of step A
   scripts/verify A --only camera --only same_seed
-  scripts/verify --list            the names of all checks
+  scripts/verify --list            names of all checks
 
-exit codes: 0 all as wanted, 1 something falls short, 2 bad input, 130 interrupted.
+exit codes: 0 all checks passed; 1 a check failed; 2 invalid input; 130 interrupted
 """
 
 
@@ -54,11 +54,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _verify(arguments: Sequence[str]) -> int:
     parser = CommandParser("verify", DESCRIPTION, EPILOG)
-    parser.add_argument("steps", nargs="*", metavar="STEP", help=f"{', '.join(STEPS)}; all if none")
+    parser.add_argument(
+        "steps", nargs="*", metavar="STEP", help=f"{', '.join(STEPS)} (default: all)"
+    )
     parser.add_argument("--only", action="append", metavar="NAME", help="only this check")
-    parser.add_argument("--list", action="store_true", help="say what there is to check")
-    parser.add_argument("--keep", metavar="DIR", help="new folder that keeps the bags")
-    parser.add_argument("--json", metavar="FILE", help="write the findings as a flat JSON object")
+    parser.add_argument("--list", action="store_true", help="list the checks and exit")
+    parser.add_argument("--keep", metavar="DIR", help="keep the bags in this new folder")
+    parser.add_argument("--json", metavar="FILE", help="also write the results as flat JSON")
     given = parser.parse_args(arguments)
     checks = _chosen(given.steps or list(STEPS), given.only)
     if given.list:

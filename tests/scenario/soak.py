@@ -1,13 +1,13 @@
-"""Run the whole rig many times in simulated time, under random faults, and check its invariants.
+"""Run the whole rig many times in simulated time under random faults, and check its invariants.
 
-Each run has all nodes of the rig in one process, on one clock and one seed: driver with emulated
-drives, controller, operator, a person, and up to six faults (nodes killed, stopped, slow; topics,
-services and bus lossy, late, silent; drives, cameras, clocks and people that fail). The same seed
-gives the same run. The schedule of a run that violates an invariant is shortened, and kept as a
-file with --failures. What is interrupted says how far it came.
+Each run has all nodes of the rig in one process, with one clock and one seed: driver with emulated
+drives, controller, operator, a simulated person, and up to six faults (nodes killed, stopped or
+slow; topics, services and bus lossy, late or silent; failures of drives, cameras, clocks and the
+person). The same seed gives the same run. If a run violates an invariant, its schedule of faults is
+shortened, and written to a file with --failures. An interrupted soak prints its progress.
 
-With --processes, runs of real processes follow, in real time, one after the other: nodes are killed
-and stopped while a simulated needle is inserted. They need an otherwise idle machine.
+With --processes, runs of real processes follow in real time: nodes are killed and stopped during
+the insertion of a simulated needle. They need an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ EXAMPLES = """\
 examples:
   scripts/soak --runs 300                300 runs
   scripts/soak --runs 1 --seed 4711      repeat the run of one seed
-  scripts/soak --runs 300 --processes 3  then three of real processes, some 25 s each
+  scripts/soak --runs 300 --processes 3  then three runs of real processes, about 25 s each
   scripts/soak --runs 10000 --scheduler tcp://10.0.0.5:8786
-  scripts/soak --schedule FILE           replay a schedule that an earlier run kept
+  scripts/soak --schedule FILE           replay a schedule of --failures
 
-exit codes: 0 no invariant violated, 1 at least one violated, 2 bad input, 130 interrupted.
+exit codes: 0 no invariant violated; 1 at least one violated; 2 invalid input; 130 interrupted
 """
 
 
@@ -60,17 +60,17 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     cluster = (
-        "do the runs on the Dask cluster of this scheduler, such as tcp://10.0.0.5:8786, to the "
-        "same results (docs/several_computers.md)"
+        "run on the Dask cluster of this scheduler, such as tcp://10.0.0.5:8786, with the same "
+        "results (docs/several_computers.md)"
     )
     for name, kind, default, metavar, told in (
         ("--runs", int, 300, "N", "number of runs (300)"),
         ("--processes", int, 0, "N", "number of runs of real processes (0)"),
         ("--seed", int, 1, "S", "seed of the first run (1)"),
-        ("--schedule", Path, None, "FILE", "replay the seed and faults in this file"),
-        ("--failures", Path, None, "DIR", "keep schedules that violate here"),
+        ("--schedule", Path, None, "FILE", "replay the seed and the faults of this file"),
+        ("--failures", Path, None, "DIR", "write schedules of violations into this folder"),
         ("--scheduler", str, "", "ADDRESS", cluster),
-        ("--json", Path, None, "FILE", "write the figures as JSON"),
+        ("--json", Path, None, "FILE", "also write the figures as flat JSON"),
     ):
         parser.add_argument(name, type=kind, default=default, metavar=metavar, help=told)
     return parser.parse_args(arguments)

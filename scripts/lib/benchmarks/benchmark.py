@@ -34,20 +34,20 @@ from needle_sim.studies.needles import NeedleBatch
 from needle_sim.studies.study import GRIDS, StartBounds, StudySettings, run_study
 
 DESCRIPTION = """\
-Measure what is fast enough and what is not, each figure beside a reference in the same run: the
-machine's own speed falls out of the ratio.
+Measure speed and memory, each figure with a reference from the same run: their ratio is independent
+of the machine's speed.
 """
 EPILOG = """\
 references:
-  plain Python     the same loop, needle by needle, with numbers and `math` (few needles, scaled)
+  plain Python     the same loop per needle with numbers and `math` (few needles, scaled)
   python-control   the same loop as interconnected systems of python-control (fewer, scaled); its
-                   time of one update holds the needle's simulation, too
+                   time per update includes the simulation of the needle
   rosbags Writer   the same messages into an MCAP bag; the disk alone: their bytes into one file;
-                   all with what the disk needs to take them (fsync)
-  a frame          the time from one exposure to the next, 30 a second
-  one at a time    the same code as the study's, in a loop over needles (few needles, scaled)
+                   both including fsync
+  a frame          period of the exposures at 30 Hz
+  one at a time    the code of the study in a loop over needles (few needles, scaled)
 
-exit codes: 0 measured, 2 bad input, 130 interrupted.
+exit codes: 0 done; 2 invalid input; 130 interrupted
 """
 TIP_NOISE = 0.001
 STEPS = 120
@@ -87,8 +87,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _bench(arguments: Sequence[str]) -> int:
     parser = CommandParser("bench", DESCRIPTION, EPILOG)
-    parser.add_argument("--json", metavar="FILE", help="write the figures as one flat JSON object")
-    parser.add_argument("--only", metavar="WORD", help="only rows whose name has this in it")
+    parser.add_argument("--json", metavar="FILE", help="also write the figures as flat JSON")
+    parser.add_argument("--only", metavar="WORD", help="only rows whose name contains this")
     given = parser.parse_args(arguments)
     file = output_file("--json", given.json)
     benches = {name: bench for name, bench in BENCHES.items() if (given.only or "") in name}

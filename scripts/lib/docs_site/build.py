@@ -14,14 +14,15 @@ from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
 
 HELP = """\
-Write the documents as a site: this checkout's README, docs and packages' READMEs,
-and a reference made from the code as it is: nodes, topics, services, parameters, diagnostics,
-command lines, libraries. It is read from the disk or any web server, without a network.
+Build the documentation site: README, docs, READMEs of the packages, and a reference generated from
+the code (nodes, topics, services, parameters, diagnostics, command lines, libraries). The site can
+be read from the disk or a web server, without a network.
 """
 EPILOG = """\
-exit codes: 0 done; 1 a link leads nowhere, a page is in no section of docs/README.md, or Sphinx
-warns of something else; 2 bad arguments, or something is missing; 130 interrupted. The first call
-installs Sphinx.
+The first call installs Sphinx.
+
+exit codes: 0 done; 1 a link is broken, a page is missing in docs/README.md, or another warning of
+Sphinx; 2 invalid arguments or missing input; 130 interrupted
 """
 OUT = "site"
 _HERE = Path(__file__).parent
@@ -63,7 +64,7 @@ def main() -> int:
 def _docs() -> int:
     parser = CommandParser("docs", HELP, EPILOG)
     parser.add_argument(
-        "--out", metavar="DIR", default=str(ROOT / OUT), help=f"where to write (default: {OUT}/)"
+        "--out", metavar="DIR", default=str(ROOT / OUT), help=f"output folder (default: {OUT}/)"
     )
     out = Path(parser.parse_args().out).expanduser()
     if out.exists() and not out.is_dir():

@@ -42,7 +42,7 @@ def help_of_module(module: str, name: str) -> str:
 
 
 def help_of_script(name: str) -> str:
-    """Return what a script prints on `--help`; one that is Python is not set up for that anew."""
+    """Return what a script prints on `--help`; Python scripts run in this process."""
     text = (SCRIPTS / name).read_text("utf-8")
     module = re.search(r'^run python -m (\S+) "\$@"$', text, re.MULTILINE)
     if module:
@@ -50,9 +50,16 @@ def help_of_script(name: str) -> str:
     file = re.search(r'^run python "\$here/lib/(\S+)\.py" "\$@"$', text, re.MULTILINE)
     if file:
         extras = {extra: mock.MagicMock() for extra in ("onnx", "torch", "torch.nn")}
-        path = [str((SCRIPTS / "lib" / file[1]).parent), *sys.path]
-        with mock.patch.object(sys, "path", path), mock.patch.dict(sys.modules, extras):
-            return help_of_module(file[1].rpartition("/")[2], name)
+        folder = str((SCRIPTS / "lib" / file[1]).parent)
+        path = mock.patch.object(sys, "path", [folder, *sys.path])
+        with path, mock.patch.dict(sys.modules, extras):
+            text = help_of_module(file[1].rpartition("/")[2], name)
+            imported = dict(sys.modules)
+        # patch.dict removes all new modules; only those with the replaced extras must go.
+        for key, value in imported.items():
+            if key not in extras and not str(getattr(value, "__file__", "")).startswith(folder):
+                sys.modules.setdefault(key, value)
+        return text
     done = subprocess.run(
         [SCRIPTS / name, "--help"], capture_output=True, text=True, check=True, timeout=60
     )

@@ -1,15 +1,14 @@
-"""Train the net that sees needles: which pixels are shaft, and where the shaft ends.
+"""Train the network that detects needles: pixels of the shaft, and the end of the shaft.
 
-Scenes are path-traced at random, then samples are cut from them and others are drawn, and the net
-learns from both. Everything is kept in the folder of the run: called again with --resume, it goes
-on where it was ended, be it by a signal. On two cores it takes some two hours: half an hour for 140
-scenes, then the training.
+The network learns from samples of randomly path-traced scenes and from drawn samples. The folder of
+the run keeps everything: --resume continues an ended or interrupted training. On two cores it takes
+about two hours: half an hour for 140 scenes, then the training.
 
-With --own the net goes on learning from a recording of your own rig: FOLDER has calibration.yaml,
-empty/left and empty/right (an insertion without a needle), needle/left, needle/right and
-needle/insertion.csv (one with; files as for track_images). The path of the tips that the tracker
-believes says where the shaft was, also in the pairs between them. A fifth of the pairs is held out,
-and the report says what the net sees there before and after.
+With --own the training continues with a recording of your own rig: FOLDER has calibration.yaml,
+empty/left and empty/right (an insertion without needle), needle/left, needle/right and
+needle/insertion.csv (an insertion with needle; files as for track_images). The path of the tips
+that the tracker accepts gives the position of the shaft, also in the pairs between them. A fifth of
+the pairs is held out; the report compares the network on them before and after.
 """
 
 from __future__ import annotations
@@ -49,20 +48,19 @@ _POLL = 5.0  # [s]
 _OWN, _OWN_HELD_OUT = "0.npz", "9.npz"
 _EXAMPLES = """examples:
   scripts/train_needle_map
-      all of it, from nothing; the weights replace the tracker's at the end and every 3 minutes
-      on the way there
+      train from scratch; replaces the tracker's weights every 3 minutes and at the end
   scripts/train_needle_map --resume
-      what was ended, from its last checkpoint on
+      continue from the last checkpoint
   scripts/train_needle_map --scenes 12 --drawn 10 --steps 2000 --folder /tmp/try \\
           --output /tmp/try/needle_net.onnx
-      a first try, of half an hour or so; the tracker's weights stay
+      a first trial of about half an hour, which keeps the tracker's weights
   scripts/train_needle_map --own recordings/monday --needle-width-mm 1.3
-      what is seen on a rig of one's own, better; half an hour
+      improve the detection on your own rig; half an hour
   scripts/train_needle_map --report --folder /tmp/try --output /tmp/try/needle_net.onnx
-      what that net is worth on scenes that it was not trained on
+      evaluate a network on scenes that were not used for training
 
-What comes out depends a little on the machine: another run gives another net, about as good.
-Scenes whose number ends in 9 are held out for the report.
+The result depends slightly on the machine: another run gives a different network of similar
+quality. Scenes whose number ends in 9 are held out for the report.
 """
 
 
@@ -131,7 +129,7 @@ def read_arguments() -> argparse.Namespace:
         "--minutes",
         type=float,
         metavar="M",
-        help="the training ends after that, fewer steps or not; "
+        help="maximum duration of the training [min]; "
         f"default: {_MINUTES:.0f}, with --own {_OWN_MINUTES:.0f}",
     )
     parser.add_argument("--scenes", type=int, default=140, metavar="N", help="default: 140")
@@ -140,33 +138,33 @@ def read_arguments() -> argparse.Namespace:
         type=int,
         default=150,
         metavar="N",
-        help=f"files of {SHARD} samples that are drawn, and kept of traced ones; default: 150",
+        help=f"files of {SHARD} samples, each of drawn and of traced ones; default: 150",
     )
     parser.add_argument(
         "--folder",
         type=Path,
         metavar="DIR",
-        help="scenes and samples, which are made once; 8 GB; default: .training/run, "
-        "with --own .training/own",
+        help="folder for scenes and samples, made only once (8 GB); default: .training/run, with "
+        "--own .training/own",
     )
     parser.add_argument(
         "--output",
         type=Path,
         default=WEIGHTS,
         metavar="FILE.onnx",
-        help="default: the tracker's; the checkpoint lies in the folder",
+        help="file for the weights; default: the tracker's; the checkpoint is in the folder",
     )
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="go on from the last checkpoint in the folder; if there is none, from --output",
+        help="continue from the last checkpoint in the folder, or else from --output",
     )
     parser.add_argument(
         "--report",
         action="store_true",
-        help="only say what the net is worth that --resume would begin with",
+        help="only evaluate the network from which --resume would continue",
     )
-    parser.add_argument("--own", type=Path, metavar="FOLDER", help="learn from a recording")
+    parser.add_argument("--own", type=Path, metavar="FOLDER", help="train on your own recording")
     parser.add_argument(
         "--needle-width-mm", type=float, default=0.7, metavar="W", help="with --own; default: 0.7"
     )

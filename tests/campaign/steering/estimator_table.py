@@ -242,14 +242,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: Sequence[str]) -> int:
-    parser = CommandParser("estimator_table", "Compare estimators under every trouble.", "")
+    parser = CommandParser("estimator_table", "Compare estimators under all disturbances.", "")
     add = parser.add_argument
-    add("--needles", default="10000", metavar="N", help="of each row, in thousands (10000)")
+    add("--needles", default="10000", metavar="N", help="of each row (10000)")
     add("--only", default="", metavar="KEYS", help="rows, separated by commas (default: all)")
-    add("--estimators", default=",".join(ESTIMATORS), metavar="NAMES", help="which (default: all)")
-    add("--before", type=Path, metavar="FILE", help="JSON of before; adds its best as `before`")
-    add("--json", metavar="FILE", help="write all figures")
-    add("--table", metavar="FILE", help="write the markdown")
+    add("--estimators", default=",".join(ESTIMATORS), metavar="NAMES", help="names (default: all)")
+    add("--before", type=Path, metavar="FILE", help="earlier --json; adds its best as `before`")
+    add("--json", metavar="FILE", help="write all figures as JSON")
+    add("--table", metavar="FILE", help="write the table as Markdown")
     given = parser.parse_args(words)
     needles = whole_number("--needles", given.needles, _STARTS, 1_000_000)
     json_file, table_file = output_file("--json", given.json), output_file("--table", given.table)

@@ -274,15 +274,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     options = (
-        ("--scenes", "1000", "N", "how many"),
-        ("--seed", "1", "N", "seed of all randomness"),
-        ("--pitch-deg", "1", "P", "bound of the needles' pitch at their entries"),
-        ("--roll-deg", "10", "R", "bound of their roll"),
-        ("--told-deg", "2", "S", "standard deviation of the pitch that the controller is told"),
-        ("--noise-mm", "1", "A", "largest error of each coordinate of a measured tip, as is told"),
+        ("--scenes", "1000", "N", "number of scenes"),
+        ("--seed", "1", "N", "seed of all random numbers"),
+        ("--pitch-deg", "1", "P", "bound of the pitch at the entry"),
+        ("--roll-deg", "10", "R", "bound of the roll at the entry"),
+        ("--told-deg", "2", "S", "standard deviation of the pitch that the controller assumes"),
+        ("--noise-mm", "1", "A", "maximum error of each coordinate, known to the controller"),
     )
-    parser = study_parser("obstacle_study", "Steer needles past generated obstacles.", options)
-    parser.add_argument("--rrt", action="store_true", help="steer by the published RRT planner")
+    parser = study_parser("obstacle_study", "Steer needles around generated obstacles.", options)
+    parser.add_argument("--rrt", action="store_true", help="use the published RRT planner")
     given = parser.parse_args(words)
     path = output_file("--json", given.json)
     seen = study(
@@ -307,7 +307,7 @@ def study_parser(
         parser.add_argument(
             option, default=default, metavar=metavar, help=f"{text} (default: {default})"
         )
-    parser.add_argument("--json", metavar="FILE", help="write the figures there too")
+    parser.add_argument("--json", metavar="FILE", help="also write the figures as flat JSON")
     return parser
 
 

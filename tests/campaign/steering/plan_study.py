@@ -127,12 +127,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     options = (
-        ("--scenes", "300", "N", "how many"),
-        ("--seed", "909", "N", "seed of all randomness"),
-        ("--radius-mm", "135.6", "R", "least radius of a path"),
-        ("--tolerance-mm", "1", "A", "distance by which a path may pass the target"),
+        ("--scenes", "300", "N", "number of scenes"),
+        ("--seed", "909", "N", "seed of all random numbers"),
+        ("--radius-mm", "135.6", "R", "minimum radius of a path"),
+        ("--tolerance-mm", "1", "A", "accepted distance of a path from its target"),
     )
-    given = study_parser("plan_study", "Plan past generated obstacles.", options).parse_args(words)
+    given = study_parser(
+        "plan_study", "Plan paths around generated obstacles.", options
+    ).parse_args(words)
     path = output_file("--json", given.json)
     seen = study(
         whole_number("--scenes", given.scenes, 1, 100_000),

@@ -1,7 +1,7 @@
-"""`python -m campaign.tracking.traced_set`: draws the path-traced pairs of step C.
+"""`python -m campaign.tracking.traced_set`: renders the path-traced pairs of `scripts/verify C`.
 
-Half of the set is for building on; the other half is for `scripts/verify C` and for nobody's eyes.
-A sequence that was drawn stays in the checkout's .traced, so that what was interrupted goes on.
+One half of the set is for development; the other half is held back for `scripts/verify C`. Existing
+sequences are kept, so that an interrupted run can be continued.
 """
 
 from __future__ import annotations
@@ -162,8 +162,8 @@ def _traced(calibration: Path, scene: TracedScene) -> dict[str, NDArray[np.gener
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draw the set, or one half of it; returns the exit code."""
     parser = CommandParser("traced_set", str(__doc__), "")
-    parser.add_argument("folder", metavar="DIR", help="takes it; what is there stays")
-    parser.add_argument("--held-back", action="store_true", help="only what nobody looks at")
+    parser.add_argument("folder", metavar="DIR", help="folder; existing sequences are kept")
+    parser.add_argument("--held-back", action="store_true", help="only the half that is held back")
     given = parser.parse_args(arguments)
     wanted = scenes(HELD_BACK) + ([] if given.held_back else scenes(LOOKED_AT))
 

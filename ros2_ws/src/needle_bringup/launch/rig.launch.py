@@ -1,11 +1,11 @@
-"""The nodes that run beside a rig's own cameras and drives; for ROS 2 Jazzy with `ros2 launch`.
+"""Nodes of a real rig, without its cameras; for ROS 2 Jazzy with `ros2 launch`.
 
     ros2 launch needle_bringup rig.launch.py calibration:=FILE drives:=FILE bag:=DIR
 
-Starts tracker, controller and recorder, and the driver where `drives` names its configuration
-(docs/hardware.md). The cameras and the person's hold (`ros2 run needle_bringup operator`) come from
-elsewhere: nothing in here moves a needle by itself. A file that is missing ends the launch before a
-node starts, and a node that ends ends the others.
+Starts tracker and controller, the recorder if `bag` is given, and the driver if `drives` is given
+(docs/hardware.md). Start the cameras and the hold-to-run switch (`ros2 run needle_bringup
+operator`) separately: no node of this launch moves a needle without the hold. A missing file ends
+the launch before a node starts; if a node exits, the others end.
 """
 
 from launch import LaunchDescription
@@ -18,9 +18,9 @@ def generate_launch_description() -> LaunchDescription:
     """Return the graph beside a rig."""
     calibration = str(find_shared_file("needle_tracker", "config/calibration.yaml"))
     arguments = {
-        "calibration": (calibration, "the stereo calibration"),
-        "drives": ("", "the drives' parameter file; empty: none"),
-        "bag": ("", "new bag; empty: none"),
+        "calibration": (calibration, "calibration file of the stereo rig"),
+        "drives": ("", "parameter file of the drives; empty: no driver"),
+        "bag": ("", "new bag; empty: no recording"),
         "params": ("", "parameter file for any node; empty: none"),
     }
     return describe(arguments, nodes_beside_rig)

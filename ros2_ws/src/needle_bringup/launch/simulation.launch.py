@@ -1,10 +1,9 @@
-"""The simulated rig: sim_rig, tracker and controller; for ROS 2 Jazzy with `ros2 launch`.
+"""Simulated rig: sim_rig, tracker and controller; for ROS 2 Jazzy with `ros2 launch`.
 
     ros2 launch needle_bringup simulation.launch.py level:=tip simulated_operator:=true
 
-`scripts/simulate` does the same without `launch`, and reports. Without
-`simulated_operator:=true` the needle moves when somebody else sends device/hold. The launch ends
-with the operator, and with any other node.
+`scripts/simulate` does the same without `launch`, and writes a report. Without
+`simulated_operator:=true` another node must publish device/hold. The launch ends when a node exits.
 """
 
 from launch import LaunchDescription
@@ -16,12 +15,12 @@ from needle_bringup.simulation.simulate_options import CONTROLLERS, LEVELS
 def generate_launch_description() -> LaunchDescription:
     """Return the graph of a simulated run."""
     arguments = {
-        "level": ("camera", "what is simulated"),
-        "seed": ("1", "seed of all noise"),
-        "controller": ("best", "how the needle is turned"),
-        "simulated_operator": ("false", "let the stand-in keep the hold"),
-        "bag": ("", "new bag; empty: none"),
-        "can": ("/tmp/needle_can", "level drive: where the emulated CAN adapter appears"),
+        "level": ("camera", "what is simulated: tips, images, or images and drives"),
+        "seed": ("1", "seed of all random numbers"),
+        "controller": ("best", "preset that rotates the needle"),
+        "simulated_operator": ("false", "press the hold automatically"),
+        "bag": ("", "new bag; empty: no recording"),
+        "can": ("/tmp/needle_can", "level drive: path of the emulated CAN adapter"),
         "params": ("", "parameter file for any node; empty: none"),
     }
     choices = {"level": LEVELS, "controller": CONTROLLERS, "simulated_operator": ("true", "false")}

@@ -13,20 +13,20 @@ from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 class ConsoleParameters:
     """Parameters of the console, fixed at start."""
 
-    address: str = fixed_parameter("127.0.0.1", "-", "Address of page and hold.")
+    address: str = fixed_parameter("127.0.0.1", "-", "Address that page and hold listen on.")
     port: int = fixed_parameter(8080, "-", "Port of the page.", 1, 65535)
     hold_port: int = fixed_parameter(8081, "-", "Port of the hold.", 1, 65535)
     hold_real_rig: bool = fixed_parameter(
-        False, "-", "Pages on the rig's own machine may hold a real rig, too; others never."
+        False, "-", "Allow pages on the rig's own machine to hold a real rig; others never may."
     )
     hosts: tuple[str, ...] = fixed_parameter(
         ("",),
         "-",
-        "Names and addresses by which browsers reach this machine; empty: the address.",
+        "Names and addresses of this machine in browsers; empty: `address`.",
         texts=True,
     )
     calibration_file: str = fixed_parameter(
-        "", "-", "Calibration of the cameras, to draw the needle in; empty: needle_tracker's own."
+        "", "-", "Calibration of the cameras, to draw the needle; empty: needle_tracker's."
     )
 
     def __post_init__(self) -> None:

@@ -23,19 +23,19 @@ class DriverParameters(SafetyLimits, LinkSettings):
     """Parameters of device_driver other than those of one drive."""
 
     connect_timeout: float = fixed_parameter(
-        10.0, "s", "Longest wait for adapter and drives at start.", 0.0, 3600.0
+        10.0, "s", "Maximum wait for adapter and drives at start.", 0.0, 3600.0
     )
     insertion_drive: str = fixed_parameter(
         "motor",
         "-",
         "motor; or hand: a person pushes the needle, the insertion drive only measures its "
-        "position, and the rotation follows.",
+        "position, and the rotation follows it.",
         choices=("motor", "hand"),
     )
     watchdog: float = fixed_parameter(
         0.1,
         "s",
-        "A drive stops after this time without the computer's heartbeat.",
+        "A drive stops if it receives no heartbeat of the computer for this time.",
         0.05,
         LONGEST_WATCHDOG,
     )
@@ -92,23 +92,25 @@ def _axis(
     fields = {
         "node_id": fixed_parameter(node_id, "-", "CANopen node id of the drive.", 1, 126),
         "counts_per_unit": fixed_parameter(
-            counts_per_unit, f"counts/{unit}", "Position counts of the drive.", 1.0, 1e12
+            counts_per_unit, f"counts/{unit}", "Position counts per unit of the axis.", 1.0, 1e12
         ),
         "counts_per_turn": fixed_parameter(
             0.0, "counts", "Counts per turn of a drive in rpm; 0: as it reports (0x608F).", 0.0, 1e9
         ),
-        "reverse": fixed_parameter(False, "-", "Whether the drive counts in reverse."),
+        "reverse": fixed_parameter(False, "-", "The drive counts in the opposite direction."),
         "acceleration": fixed_parameter(acceleration, ramp, "Ramp of homing.", 1e-4, 1e4),
-        "quick_stop_deceleration": fixed_parameter(quick_stop, ramp, "Ramp of a stop.", 1e-4, 1e4),
+        "quick_stop_deceleration": fixed_parameter(
+            quick_stop, ramp, "Deceleration of a quick stop.", 1e-4, 1e4
+        ),
         "homing_method": fixed_parameter(
-            homing_method, "-", "CiA 402 method: 17, 18 limit switch; 37 where it stands.", 1, 37
+            homing_method, "-", "CiA 402 method: 17, 18 limit switch; 37 current position.", 1, 37
         ),
         "following_error": limit_parameter(f"{axis}_following_error"),
         "following_error_time": fixed_parameter(
-            0.05, "s", "Time for which the drive tolerates more.", 0.001, 10.0
+            0.05, "s", "Time for which the drive tolerates a larger following error.", 0.001, 10.0
         ),
         "max_torque": fixed_parameter(
-            0.0, "-", "Share of rated torque; 0: the drive's own setting.", 0.0, 5.0
+            0.0, "-", "Maximum share of the rated torque; 0: the drive's setting.", 0.0, 5.0
         ),
         "tolerance": fixed_parameter(
             tolerance, unit, "Position tolerance at the target.", 1e-7, 1.0

@@ -41,43 +41,47 @@ class DriveEmulatorParameters:
     """Parameters of drive_emulator, fixed at the start."""
 
     pty: str = fixed_parameter(
-        "", "-", "Link to the serial port that appears; empty: the port's own name is logged."
+        "", "-", "Symbolic link to the pseudo-terminal; empty: only its own name is logged."
     )
     limit_action: str = fixed_parameter(
         LimitAction.CLAMP.value,
         "-",
-        "What a drive does with a target beyond 0x607D once it is homed.",
+        "Reaction of a homed drive to a target beyond its software limits (0x607D).",
         choices=tuple(action.value for action in LimitAction),
     )
     rpm: bool = fixed_parameter(
-        False, "-", "Both drives take speeds in rpm and ramps in rpm/s, and say so (0x60A9)."
+        False, "-", "Both drives use rpm for speeds and rpm/s for ramps, and report it (0x60A9)."
     )
     boot_time: float = fixed_parameter(0.5, "s", "From power-up to the boot-up message.", 0.0, 60.0)
-    insertion_node_id: int = fixed_parameter(1, "-", "Of the stepper drive.", 1, _LAST_NODE)
+    insertion_node_id: int = fixed_parameter(
+        1, "-", "CANopen node id of the stepper drive.", 1, _LAST_NODE
+    )
     insertion_counts_per_unit: float = fixed_parameter(
-        2.0e7, "1/m", "Position counts of the insertion axis.", 1.0, 1e12
+        2.0e7, "1/m", "Position counts per metre of the insertion axis.", 1.0, 1e12
     )
     insertion_max_speed: float = fixed_parameter(
-        0.01, "m/s", "Fastest that the insertion motor can go.", 1e-6, 1.0
+        0.01, "m/s", "Maximum speed of the insertion motor.", 1e-6, 1.0
     )
     insertion_lag: float = fixed_parameter(
-        0.0, "s", "Time constant with which the insertion motor follows its drive.", 0.0, 1.0
+        0.0, "s", "Time constant of the insertion motor.", 0.0, 1.0
     )
     insertion_start: float = fixed_parameter(
-        0.0, "m", "Where the insertion axis stands at power-up, from its home switch.", -0.003, 1.0
+        0.0, "m", "Position of the insertion axis at power-up, from its home switch.", -0.003, 1.0
     )
     insertion_travel: float = fixed_parameter(
-        0.25, "m", "From the home switch to the other limit switch.", 0.001, 2.0
+        0.25, "m", "Distance from the home switch to the other limit switch.", 0.001, 2.0
     )
-    rotation_node_id: int = fixed_parameter(2, "-", "Of the servo drive.", 1, _LAST_NODE)
+    rotation_node_id: int = fixed_parameter(
+        2, "-", "CANopen node id of the servo drive.", 1, _LAST_NODE
+    )
     rotation_counts_per_unit: float = fixed_parameter(
-        COUNTS_PER_RADIAN, "1/rad", "Position counts of the rotation axis.", 1.0, 1e12
+        COUNTS_PER_RADIAN, "1/rad", "Position counts per radian of the rotation axis.", 1.0, 1e12
     )
     rotation_max_speed: float = fixed_parameter(
-        20.0, "rad/s", "Fastest that the rotation motor can go.", 1e-3, 1e4
+        20.0, "rad/s", "Maximum speed of the rotation motor.", 1e-3, 1e4
     )
     rotation_lag: float = fixed_parameter(
-        0.005, "s", "Time constant with which the rotation motor follows its drive.", 0.0, 1.0
+        0.005, "s", "Time constant of the rotation motor.", 0.0, 1.0
     )
 
     def __post_init__(self) -> None:

@@ -24,32 +24,32 @@ class SimRigParameters:
     level: str = fixed_parameter(
         "camera",
         "-",
-        "tip: measured tips; camera: images; drive: images and emulated drives.",
+        "tip: measured tips; camera: stereo images; drive: stereo images and emulated drives.",
         choices=LEVELS,
     )
     seed: int = fixed_parameter(
-        0, "-", "Keys all chance; the same seed gives the same run.", 0, 2**31 - 1
+        0, "-", "Seed of all random numbers; the same seed gives the same run.", 0, 2**31 - 1
     )
     curvature: float = fixed_parameter(
         1.0 / 0.122, "1/m", "Curvature of the needle's path in this tissue.", 0.0, 100.0
     )
     needle_diameter: float = fixed_parameter(
-        NeedleShape.diameter, "m", "Diameter of the needle that the cameras see.", 0.2e-3, 3e-3
+        NeedleShape.diameter, "m", "Diameter of the needle in the images.", 0.2e-3, 3e-3
     )
     pre_bend: float = fixed_parameter(
         NeedleShape.bend_angle,
         "rad",
-        "Angle between its shaft and its pre-bent end; 0: straight.",
+        "Angle between the shaft and the pre-bent end; 0: straight needle.",
         0.0,
         0.5,
     )
     pre_bend_distance: float = fixed_parameter(
-        NeedleShape.bend_distance, "m", "From that bend to the tip.", 1e-3, 0.05
+        NeedleShape.bend_distance, "m", "Distance from the bend to the tip.", 1e-3, 0.05
     )
     pre_bend_lean: float = fixed_parameter(
         NeedleShape.lean,
         "rad",
-        "Angle between its end and the heading, less than pre_bend: the rest is the shaft's.",
+        "Angle of the pre-bent end to the heading, below pre_bend; the shaft takes the rest.",
         0.0,
         0.5,
     )
@@ -60,29 +60,29 @@ class SimRigParameters:
         0.0, "rad", "Roll of the bevel at the entry point.", -math.pi, math.pi
     )
     tip_noise: float = fixed_parameter(
-        0.001, "m", "Level tip: largest error of each measured coordinate, uniform.", 0.0, 0.1
+        0.001, "m", "Level tip: maximum error of each measured coordinate (uniform).", 0.0, 0.1
     )
     torsion_play: float = fixed_parameter(
-        0.0, "rad", "Dead band between base and tip angle, either way.", 0.0, math.pi
+        0.0, "rad", "Dead band between base and tip angle, in either direction.", 0.0, math.pi
     )
     torsion_lag: float = fixed_parameter(
-        0.0, "m", "First-order lag of the tip's angle in inserted length.", 0.0, 1.0
+        0.0, "m", "First-order lag of the tip angle, as inserted length.", 0.0, 1.0
     )
     camera_rate: float = fixed_parameter(
         10.0,
         "Hz",
-        "Exposures per second while a tip is awaited or the needle goes in continuously.",
+        "Exposure rate while the controller waits for a tip or inserts continuously.",
         0.1,
         50.0,
     )
     calibration_file: str = fixed_parameter(
-        "", "-", "Calibration of the simulated cameras; empty: needle_tracker's own."
+        "", "-", "Calibration file of the simulated cameras; empty: that of needle_tracker."
     )
     scenario: str = fixed_parameter(
-        CLEAN.name, "-", "What troubles the cameras.", choices=tuple(SCENARIOS)
+        CLEAN.name, "-", "Disturbances of the images.", choices=tuple(SCENARIOS)
     )
     images: str = fixed_parameter(
-        "", "-", "New folder for every image, calibration, insertions and truth; empty: none."
+        "", "-", "New folder for all images, calibration, insertions and true tips; empty: none."
     )
     max_depth: float = limit_parameter("max_depth")
     max_step_length: float = limit_parameter("max_step_length")

@@ -50,24 +50,22 @@ class StereoCameraParameters:
     """Parameters of the node, fixed at start."""
 
     left: str = fixed_parameter(
-        "", "-", "Left source: device number or /dev/..., folder of images, or video file."
+        "", "-", "Left source: device number, /dev/..., folder of images, or video file."
     )
-    right: str = fixed_parameter("", "-", "Right source, of the same kind.")
+    right: str = fixed_parameter("", "-", "Right source, of the same kind as the left.")
     calibration_file: str = fixed_parameter(
         "", "-", "Calibration file of the stereo rig; empty: the simulated bench's."
     )
-    rate: float = fixed_parameter(20.0, "Hz", "Image pairs a second.", 0.1, 1000.0)
-    loop: bool = fixed_parameter(
-        False, "-", "Begin a recording again at its end, instead of ending with it."
-    )
+    rate: float = fixed_parameter(20.0, "Hz", "Rate of image pairs.", 0.1, 1000.0)
+    loop: bool = fixed_parameter(False, "-", "Repeat a recording, instead of exiting at its end.")
     latency: float = fixed_parameter(
-        0.0, "s", "Time from exposure to grab, taken off the stamp (cameras only).", 0.0, 1.0
+        0.0, "s", "Time from exposure to grab, subtracted from the stamp (cameras only).", 0.0, 1.0
     )
     triggered: bool = fixed_parameter(
-        False, "-", "One trigger line exposes both cameras: both images get the left's stamp."
+        False, "-", "One trigger exposes both cameras: both images get the left image's stamp."
     )
     wait_for_subscribers: bool = fixed_parameter(
-        False, "-", "Begin when somebody subscribes to both images (for recordings)."
+        False, "-", "Start when both image topics have a subscriber (for recordings)."
     )
 
     def __post_init__(self) -> None:

@@ -32,10 +32,10 @@ class OpenIGTLinkParameters:
     """Parameters of openigtlink."""
 
     address: str = fixed_parameter(
-        "127.0.0.1", "-", "Address to listen on; beyond loopback that whole network can connect."
+        "127.0.0.1", "-", "Address to listen on; beyond loopback, its whole network can connect."
     )
     port: int = fixed_parameter(18944, "-", "Port that Slicer connects to; 0: any.", 0, 65535)
-    rate: float = fixed_parameter(10.0, "Hz", "How often all messages are sent.", 0.5, 30.0)
+    rate: float = fixed_parameter(10.0, "Hz", "Rate of all messages.", 0.5, 30.0)
 
     def __post_init__(self) -> None:
         """Check the fields; raises UserError as `check_fields`."""

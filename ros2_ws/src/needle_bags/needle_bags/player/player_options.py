@@ -14,18 +14,17 @@ from needle_core.files.bag_directory import BagDirectory
 from needle_core.settings.bounds import check_bounds
 
 _DESCRIPTION = """\
-Plays a bag: sends its messages again, in their order and at their distances, with the quality of
-service that they were recorded with. Late subscribers get the last message of topics that were
-transient local.
+Play a bag: publish its messages with their recorded order, timing and quality of service. Late
+subscribers receive the last message of a transient-local topic.
 
-It never speaks to a rig. Commands (device/joint_trajectory), holds (device/hold), emergency stops
-(device/estop), targets (target_plane, target_point, obstacles) and /parameter_events are played
-under /replay only. Beside a living rig (something publishes device/status) everything is; a rig
-that comes up later ends the playing.
+A rig never receives these messages. Commands (device/joint_trajectory), holds (device/hold),
+emergency stops (device/estop), targets (target_plane, target_point, obstacles) and
+/parameter_events are always published under /replay. If a rig is running (device/status has a
+publisher), all topics are; if a rig starts later, the playback ends.
 """
 _EPILOG = """\
-While it plays, in a terminal: the space bar pauses and goes on, up and down play a tenth faster
-and slower, right and left go five seconds on and back. From anywhere:
+Keys during playback: space pauses and resumes, up and down change the rate by 10 %, right and left
+jump by 5 s. From another terminal:
   ros2 service call /player/pause std_srvs/srv/SetBool "{data: true}"
   ros2 param set /player rate 0.5
   ros2 param set /player seek 12.5       (seconds after the bag's first message)
@@ -37,9 +36,10 @@ examples:
   ros2 run needle_bags player bags/my_run --regex '^/needle/' --exclude-regex pose
   ros2 run needle_bags player bags/my_run --remap needle/tip:=old/tip
 
-A recorded /clock is played like any topic; --clock makes one from the time of recording instead.
-Exit codes: 0 done, or ended by Ctrl-C; 1 a rig came up; 2 bad arguments, or a bag that cannot be
-played.
+A recorded /clock is played like any topic; with --clock, the recording time is published instead.
+
+exit codes: 0 done or ended by Ctrl-C; 1 a rig started; 2 invalid arguments, or a bag that cannot be
+played
 """
 MIN_RATE = 0.001
 MAX_RATE = 1000.0
@@ -100,25 +100,25 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
     def add_regex(name: str, text: str) -> None:
         parser.add_argument(name, default="", metavar="REGEX", help=text)
 
-    parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory, or a file")
-    parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast")
-    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="begin here [s]")
-    parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="end here [s]")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="directory of the bag, or a file")
+    parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="speed factor")
+    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="start time [s]")
+    parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="end time [s]")
     parser.add_argument("--topics", nargs="+", default=[], metavar="T", help="only these topics")
-    add_regex("--regex", "topics in whose name this is found (and those of --topics)")
-    add_regex("--exclude-regex", "not those in whose name this is found, but for --topics")
+    add_regex("--regex", "play topics whose name matches, and those of --topics")
+    add_regex("--exclude-regex", "do not play topics whose name matches, except those of --topics")
     parser.add_argument(
-        "--remap", nargs="+", default=[], metavar="A:=B", help="play topic A under the name B"
+        "--remap", nargs="+", default=[], metavar="A:=B", help="publish topic A under the name B"
     )
-    parser.add_argument("--loop", action="store_true", help="begin again at the end, until Ctrl-C")
-    parser.add_argument("--paused", action="store_true", help="begin paused")
+    parser.add_argument("--loop", action="store_true", help="repeat until Ctrl-C")
+    parser.add_argument("--paused", action="store_true", help="start paused")
     parser.add_argument(
         "--clock",
         nargs="?",
         type=float,
         const=40.0,
         metavar="HZ",
-        help="publish /clock from the time of recording (40 Hz) in place of a recorded one",
+        help="publish the recording time on /clock, at 40 Hz or HZ, instead of a recorded one",
     )
     given = parser.parse_args(arguments)
     return PlayerOptions(

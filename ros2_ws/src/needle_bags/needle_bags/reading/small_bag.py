@@ -23,9 +23,9 @@ from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
 
 _DESCRIPTION = """
-Copies a bag without what a rerun does not need, and with the images of a few exposures only,
-compressed. What the tracker says of compressed images is not quite what was recorded: let `rerun
-SMALL_BAG --output DIR` put today's answers in. scripts/renew_regression_bag does all of it.
+Copy only what a rerun needs from a bag, with the compressed images of a few exposures. The tips of
+compressed images differ slightly from the recorded ones: `rerun SMALL_BAG --output DIR` replaces
+them with new ones. scripts/renew_regression_bag runs both commands.
 """
 # Consecutive exposures, which the tracker follows, and distant ones, where it has to search [m].
 DEPTHS = (30e-3, 31e-3, 32e-3, 75e-3, 76e-3, 110e-3)

@@ -11,14 +11,14 @@ from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_js
 from needle_core.commands.options import CommandParser, output_file
 
 _DESCRIPTION = """
-Makes a bag whole again whose recording was cut off (by a crash, kill -9, a power cut or a full
-disk) or that is damaged. It keeps everything before the first damage, and says how many seconds of
-the recording follow it, if metadata.yaml tells. A bag of several files ends at the damage, too.
+Complete a bag that is damaged, or whose recording was interrupted (by a crash, kill -9, a power
+failure or a full disk). Everything before the first damage is kept, also in a bag of several files;
+if metadata.yaml has the duration, the lost seconds are printed.
 
-The bag's files are those that metadata.yaml names, or else <stem>_<n>.mcap of one stem. `recover`
-names other files in the folder and leaves them as they are. The previous files stay as FILE.damaged
-until you delete them, so there must be room for a copy. A bag that is whole is left as it is. A
-single .mcap file is made whole by itself.
+The files of the bag are those of metadata.yaml, or else <stem>_<n>.mcap of one stem; other files in
+the directory are listed and not changed. The previous files remain as FILE.damaged until you delete
+them, so the disk needs space for a copy. A complete bag is not changed. A single .mcap file is
+completed without the other files of its directory.
 """
 _EXAMPLES = """
 examples:
@@ -26,18 +26,17 @@ examples:
   ros2 run needle_bags recover bags/my_run --json recovery.json
   ros2 run needle_bags recover downloads/monday.mcap
 
-exit codes: 0 the bag is whole now (also if something was lost); 2 there is no bag, it
-is still being recorded, nothing comes before the damage, or the disk refuses the changes; 130
-interrupted (run it again)
+exit codes: 0 the bag is complete, perhaps with lost data; 2 there is no bag, it is still being
+recorded, nothing precedes the damage, or it cannot be written; 130 interrupted (run it again)
 """
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     parser = CommandParser("recover", _DESCRIPTION, _EXAMPLES)
-    parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory, or a file")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="directory of the bag, or a file")
     parser.add_argument(
-        "--json", type=Path, metavar="FILE", help="also write what was done as flat JSON"
+        "--json", type=Path, metavar="FILE", help="also write a summary as flat JSON"
     )
 
     def command() -> int:

@@ -32,17 +32,16 @@ from needle_core.files.file_access import replace_file
 PAGE = "report.html"
 
 _DESCRIPTION = """
-Shows how a recorded run went: did the tip reach the wanted plane, how far off was it on the way,
-what did the cameras see, how long did each stage take, what went wrong when. Everything comes from
-the bag.
+Report on a recorded run: whether the tip reached the target plane, its error on the way, the camera
+images, the duration of each stage, and the faults.
 
-Writes into the bag's directory (or --output): report.html, one file of 6 MB at most with a film of
-the insertion and all figures, which opens in any browser without a network, and prints; and the
-figures as PNG files. With two bags: one page that compares them, compared_with_<A>.html, into the
-second bag's directory (or --output).
+Writes report.html and its figures as PNG files into the bag's directory (or --output). report.html
+is one file of at most 6 MB with a film of the insertion and all figures; it needs no network and
+can be printed. With two bags, writes a page that compares them, compared_with_<A>.html, into the
+directory of the second bag (or --output).
 
-A single .mcap file is read alone, whatever else is in its folder; its report goes into the folder
-<file>_report beside it.
+A single .mcap file is read without the other files of its directory; its report is written into
+<file>_report next to it.
 """
 _EXAMPLES = """
 examples:
@@ -51,7 +50,7 @@ examples:
   ros2 run needle_bags report bags/paper_run bags/best_run
   ros2 run needle_bags report downloads/monday.mcap
 
-exit codes: 0 done; 2 a bag is missing, broken, unfinished, or not of a needle run
+exit codes: 0 done; 2 a bag is missing, damaged, incomplete, or not of a needle run
 """
 
 
@@ -167,17 +166,17 @@ def figures_of(run: Run, timings: Sequence[StageTiming]) -> dict[str, Figure | N
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     parser = CommandParser("report", _DESCRIPTION, _EXAMPLES)
-    parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory, or a file")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="directory of the bag, or a file")
     parser.add_argument(
-        "other", type=Path, nargs="?", metavar="OTHER_BAG", help="compare BAG with this one"
+        "other", type=Path, nargs="?", metavar="OTHER_BAG", help="compare BAG with this bag"
     )
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="also write the figures of the run as flat JSON"
     )
     parser.add_argument(
-        "--namespace", metavar="NS", help="of the rig to show, where a bag holds several"
+        "--namespace", metavar="NS", help="namespace of the rig, if the bag has several"
     )
-    parser.add_argument("--output", type=Path, metavar="DIR", help="write here instead")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="write into this directory")
     return run_command(lambda: _report(parser.parse_args(arguments)))
 
 

@@ -33,15 +33,15 @@ class Tolerance:
     reason: str
 
 
-LENGTH = Tolerance("m", 1e-7, 1e-6, "below a hundredth of the error of a tip")
+LENGTH = Tolerance("m", 1e-7, 1e-6, "less than a hundredth of a tip's error")
 ANGLE = Tolerance("rad", 1e-6, 1e-6, "a hundredth of an encoder count of the rotation")
-QUATERNION = Tolerance("-", 1e-6, 0.0, "as an angle, halved")
-RATIO = Tolerance("-", 1e-6, 1e-6, "as an angle: sines of angles")
-CURVATURE = Tolerance("1/m", 1e-5, 1e-6, "turns a heading by 1e-6 rad in 120 mm")
+QUATERNION = Tolerance("-", 1e-6, 0.0, "half an angle")
+RATIO = Tolerance("-", 1e-6, 1e-6, "sines of angles")
+CURVATURE = Tolerance("1/m", 1e-5, 1e-6, "changes a heading by 1e-6 rad in 120 mm")
 ROTATION_RATE = Tolerance("rad/m", 1e-3, 1e-6, "1e-6 rad in a step of 1 mm")
 VIRTUAL_INPUT = Tolerance("1/m^2", 1e-3, 1e-5, "follows from the rotation per length")
-DURATION = Tolerance("s", 1e-9, 1e-6, "a nanosecond is the message's own resolution")
-COVARIANCE = Tolerance("of sigmas", 0.0, 1e-3, "nobody knows a variance to a thousandth")
+DURATION = Tolerance("s", 1e-9, 1e-6, "resolution of the message: a nanosecond")
+COVARIANCE = Tolerance("of sigmas", 0.0, 1e-3, "no variance is known to a thousandth")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,14 +9,14 @@ from needle_bags.live.live_view import LiveView, LiveViewParameters
 from needle_core.ros.main import run_component
 
 HELP = """
-live_view: shows the needle to RViz, Foxglove and the like while it is steered. Each of its topics
-is sent only while somebody subscribes to it; it moves nothing, and nothing waits for it.
+live_view: publishes the needle for RViz, Foxglove and other viewers during steering. It publishes
+a topic only while it has a subscriber, commands no motion, and never delays another node.
 
 Subscribes  needle/tip_pose, needle/estimate, needle/controller_status, target_plane, joint_states,
-            stereo_tracker/calibration; stereo/{left,right}/image_raw (while its view is wanted)
+            stereo_tracker/calibration; stereo/{left,right}/image_raw (only to publish its view)
 Publishes   ~/tip, ~/path, ~/markers (shaft, tip, estimate, 95 % ellipsoid, plane, target point),
-            ~/left/compressed, ~/right/compressed (JPEG, shaft and tip drawn in); /tf, /tf_static
-            where tf2_msgs is installed
+            ~/left/compressed, ~/right/compressed (JPEG with shaft and tip); /tf, /tf_static (if
+            tf2_msgs is installed)
 """
 
 

@@ -11,8 +11,8 @@ from needle_core.commands.cli import EXIT_BAD_INPUT
 from needle_core.ros.main import run_component
 
 HELP = """
-openigtlink: shows the needle to 3D Slicer and other OpenIGTLink clients, while one is connected.
-It moves nothing, nothing waits for it, and what comes in at its port is discarded.
+openigtlink: sends the needle to 3D Slicer and other OpenIGTLink clients. It commands no motion,
+never delays another node, and discards all data that it receives from clients.
 
 Subscribes  needle/tip_pose, needle/estimate, needle/controller_status, target_plane, joint_states
 Sends       TRANSFORM NeedleTipToRig, NeedleEstimateToRig, TargetPlaneToRig; POINT NeedleShaft,

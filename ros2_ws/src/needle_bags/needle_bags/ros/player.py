@@ -71,7 +71,7 @@ class PlayerParameters:
         upper=MAX_RATE,
     )
     seek: float = parameter(
-        0.0, unit="s", description="Jump to this time after the first message.", lower=0.0
+        0.0, unit="s", description="Jump to this time after the bag's first message.", lower=0.0
     )
 
     def __post_init__(self) -> None:

@@ -37,26 +37,24 @@ from needle_core.ros.parameters import NodeParameters
 HELP = """
 recorder: records every topic of the graph into a bag (a rosbag2 directory with MCAP data).
 
-Topics that appear later are recorded too, images included; annotated images are left out
-(`exclude_regex`). The bag also contains the message definitions, all nodes' parameters and their
-changes, versions and commit. Ctrl-C ends the recording and completes the bag. Data are written ten
-times a second: after a crash, kill -9 or a full disk, `ros2 run needle_bags recover BAG` completes
-the bag.
+Also records images and topics that appear later, but not annotated images (`exclude_regex`). The
+bag contains message definitions, the parameters of all nodes and their changes, versions and
+commit. Ctrl-C ends the recording and completes the bag. Data are written ten times a second; after
+a crash, kill -9 or a full disk, `ros2 run needle_bags recover BAG` completes the bag.
 
   ros2 run needle_bags recorder --ros-args -p bag:=bags/my_run
   ros2 run needle_bags recorder --ros-args -p topics:='[/needle/tip, /joint_states]'
   ros2 run needle_bags recorder --ros-args -p snapshot_seconds:=20.0
 
-With `snapshot_seconds` the last seconds are kept in memory, and written only on a call of the
-service ~/snapshot (std_srvs/Trigger) or a second after a device/status reports FAULT or ESTOPPED.
-All snapshots go into the same bag; a message is written once.
+With `snapshot_seconds` the last seconds stay in memory. They are written on a call of the service
+~/snapshot (std_srvs/Trigger), and a second after device/status reports FAULT or ESTOPPED. All
+snapshots are in the same bag; each message is written once.
 
-Subscribes to every topic of the graph; publishes /diagnostics: a warning when messages are lost,
-a message cannot be decoded (it is recorded anyway) or the disk is nearly full. When only `reserve`
-is free, the recording ends and the bag is completed; the node goes on reporting this, and the rest
-of the graph continues.
-Exit codes: 0 the bag is whole; 1 the disk refused data or was full; 2 bad parameters, or the bag
-cannot be created.
+/diagnostics has a warning if messages are lost, if a message cannot be decoded (it is recorded
+anyway), and if the disk is nearly full. When only `reserve` is free, the recording ends and the bag
+is completed; the node continues to report this.
+Exit codes: 0 the bag is complete; 1 the disk was full or a write failed; 2 invalid parameters, or
+the bag cannot be created
 """
 
 GRAPH_PERIOD = 0.1

@@ -16,27 +16,29 @@ from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 class RecorderParameters:
     """Parameters of the recorder."""
 
-    bag: str = fixed_parameter("", "-", "The bag's directory; empty: a new time-stamped one here.")
-    topics: tuple[str, ...] = fixed_parameter(
-        (), "-", "Names of topics to record; with neither these nor a regex: all.", texts=True
+    bag: str = fixed_parameter(
+        "", "-", "Directory of the bag; empty: a new time-stamped one in the working directory."
     )
-    regex: str = fixed_parameter("", "-", "Also record topics whose name this expression matches.")
+    topics: tuple[str, ...] = fixed_parameter(
+        (), "-", "Topics to record; with neither topics nor a regex, all topics.", texts=True
+    )
+    regex: str = fixed_parameter("", "-", "Also record topics whose name matches this expression.")
     exclude_regex: str = fixed_parameter(
         "/annotated_image$|/live_view/",
         "-",
-        "Do not record topics whose name this expression matches, unless `topics` names them.",
+        "Do not record topics whose name matches this expression, unless `topics` has them.",
     )
     snapshot_seconds: float = fixed_parameter(
         0.0,
         "s",
-        "Keep this time in memory and write it only on request or on a fault; 0: write all.",
+        "Keep the messages of this time, write them on request or on a fault; 0: write all.",
         0.0,
         3600.0,
     )
     snapshot_size: int = fixed_parameter(
         500_000_000,
         "B",
-        "Memory for it; images may fill it earlier.",
+        "Maximum memory of the snapshot; with images it may be shorter than snapshot_seconds.",
         1_000_000,
         2**40,
     )
@@ -46,24 +48,24 @@ class RecorderParameters:
         "File to store in the bag as calibration.yaml; a tracker publishes its own.",
     )
     run_info: str = fixed_parameter(
-        "", "-", "Text about the run to keep in the bag: YAML `key: value` lines or JSON."
+        "", "-", "Text about the run to store in the bag: YAML `key: value` lines or JSON."
     )
     max_file_size: int = fixed_parameter(
         4_000_000_000,
         "B",
-        "Bytes of messages in one data file; 0: no limit.",
+        "Maximum bytes of messages per data file; 0: no limit.",
         lower=0,
     )
     compression: str = fixed_parameter(
         "none",
         "-",
-        "Compression of the data; zstd takes a third of a core for noisy images.",
+        "Compression of the data; zstd needs a third of a core for noisy images.",
         choices=COMPRESSIONS,
     )
     reserve: int = fixed_parameter(
         RESERVE,
         "B",
-        "Free space at which the recording ends; at most a tenth of the disk.",
+        "Free disk space at which the recording ends; at most a tenth of the disk.",
         lower=0,
     )
 

@@ -48,32 +48,34 @@ from needle_tracker.optics.calibration import parse_calibration
 from needle_tracker.stereo_tracker import CALIBRATION, TIP_POSE, StereoTipTracker
 
 DESCRIPTION = """\
-Run a bag again, without a graph and without waiting: its images through today's tracker, its tips
-through today's estimator, law and step protocol, with the parameters and the calibration that were
-recorded. Compare every output with the recorded one, field by field, and say what changed where.
+Process a bag with the current code, offline: its images with the tracker, its tips with the
+estimator, law and step protocol, with the recorded parameters and calibration. Compares every
+output with the recorded one, field by field, and prints the differences.
 
-The needle does what it did: joints, tips and the device's answers are the recorded ones.
+Joints, tips and answers of the device remain the recorded ones: the needle follows its recorded
+path.
 
-With --viewers, live_view and openigtlink see the recorded needle as well. No bag tells when they
-looked, and ports are not recorded: what they send is counted, not compared; --output writes topics.
+With --viewers, live_view and openigtlink process the recorded needle as well. Their messages are
+counted, not compared, because a bag has neither their timing nor data of ports; --output writes
+their topics.
 """
 EPILOG = f"""\
 examples:
   ros2 run needle_bags rerun bags/my_run
-      does today's code still do the same?
+      check that the current code gives the recorded results
   ros2 run needle_bags rerun bags/my_run --preset best
-      what would `best` have seen here, and how would it have turned the needle?
+      estimates and commands of the controller `best` for the recorded tips
   ros2 run needle_bags rerun bags/my_run --params other.yaml --output bags/again
   ros2 run needle_bags report bags/my_run bags/again
-      other parameters, and both in one report
+      compare with other parameters, in one report
   ros2 run needle_bags rerun bags/my_run --viewers --output bags/shown
-      a bag for Foxglove, with markers, and images that have shaft and tip drawn in
+      a bag for Foxglove, with markers, and images with shaft and tip
 
 tolerances: a value may differ by absolute + relative x recorded
 {tolerance_table()}
 
-exit codes: 0 nothing changed, 1 something did, 2 bad input or something missing, 3 today's code
-broke, 130 interrupted.
+exit codes: 0 no difference; 1 differences; 2 invalid or missing input; 3 the current code failed;
+130 interrupted
 """
 FILE = "calibration_file"
 TRACKER, CONTROLLER = "stereo_tracker", "plane_controller"
@@ -189,28 +191,28 @@ def _run(words: Sequence[str]) -> int:
 def _parser() -> CommandParser:
     parser = CommandParser("rerun", DESCRIPTION, EPILOG)
     add = parser.add_argument
-    add("bag", type=Path, metavar="BAG", help="the bag's directory, or a file")
-    add("--preset", metavar="|".join(PRESETS), help="another controller than the recorded one")
+    add("bag", type=Path, metavar="BAG", help="directory of the bag, or a file")
+    add("--preset", metavar="|".join(PRESETS), help="controller in place of the recorded one")
     for kind in GROUPS:
         add(
             f"--{kind}",
             metavar="NAME",
-            help=f"another {kind}, of another package (docs/own_controllers.md); '': the preset's",
+            help=f"{kind} of another package (docs/own_controllers.md); '': the preset's",
         )
-    add("--params", type=Path, metavar="FILE", help="ROS parameter file on top of the recorded")
+    add("--params", type=Path, metavar="FILE", help="ROS parameter file that overrides the bag's")
     add(
         "--output",
         type=Path,
         metavar="NEW_BAG",
-        help="write a copy of the bag with today's outputs in place of the recorded ones",
+        help="write a copy of the bag with the new outputs in place of the recorded ones",
     )
     add(
         "--viewers",
         action="store_true",
-        help="show the recorded needle to live_view and openigtlink, too; count what they send",
+        help="also run live_view and openigtlink, and count their messages",
     )
-    add("--namespace", metavar="NS", help="of the rig to run again, where the bag holds several")
-    add("--json", type=Path, metavar="FILE", help="write the result as one flat JSON object")
+    add("--namespace", metavar="NS", help="namespace of the rig, if the bag has several")
+    add("--json", type=Path, metavar="FILE", help="also write the result as flat JSON")
     return parser
 
 

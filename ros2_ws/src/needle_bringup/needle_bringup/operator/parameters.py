@@ -20,42 +20,42 @@ class OperatorParameters:
     source: str = fixed_parameter(
         PEDAL,
         "-",
-        "Input: a pedal or key or a joystick, by their event device; or the topic joy.",
+        "Input: event device of a pedal (or key) or of a joystick; or the topic joy.",
         choices=(PEDAL, JOYSTICK, JOY),
     )
     device: str = fixed_parameter(
-        "", "-", "Event device of the pedal or joystick, preferably a name in /dev/input/by-id."
+        "", "-", "Event device of the pedal or joystick, preferably from /dev/input/by-id."
     )
     key: int = fixed_parameter(
         _NONE,
         "-",
-        "Held to insert: code of a key or button, as evtest shows it; of joy its index.",
+        "Key or button held to insert: its code as shown by evtest, or its index in joy.",
         _NONE,
         _LAST_KEY,
     )
     retract_key: int = fixed_parameter(
-        _NONE, "-", "Held to withdraw the needle; -1: none.", _NONE, _LAST_KEY
+        _NONE, "-", "Key or button held to retract; -1: none.", _NONE, _LAST_KEY
     )
     stop_key: int = fixed_parameter(_NONE, "-", "Pressed to stop; -1: none.", _NONE, _LAST_KEY)
     speed_axis: int = fixed_parameter(
         _NONE,
         "-",
-        "Axis of a joystick, or index of joy's, that sets the speed; -1: none.",
+        "Joystick axis, or axis index in joy, that sets the speed; -1: none.",
         _NONE,
         _LAST_AXIS,
     )
     axis_at_zero: float = fixed_parameter(
-        -1.0, "-", "What the axis reads at speed 0, of -1 to 1.", -1.0, 1.0
+        -1.0, "-", "Reading of the axis at zero speed, from -1 to 1.", -1.0, 1.0
     )
     axis_at_full: float = fixed_parameter(
-        1.0, "-", "What the axis reads at full speed, of -1 to 1.", -1.0, 1.0
+        1.0, "-", "Reading of the axis at full speed, from -1 to 1.", -1.0, 1.0
     )
     speed_scale: float = parameter(
         1.0,
         unit="-",
         lower=0.0,
         upper=1.0,
-        description="Share of the nominal speed, with speed_axis that of its full end.",
+        description="Speed relative to the nominal speed; with speed_axis, at the full reading.",
     )
 
     def __post_init__(self) -> None:

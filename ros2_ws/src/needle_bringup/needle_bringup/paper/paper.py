@@ -15,17 +15,17 @@ PAGE = "paper.md"
 IMAGES = "images"
 OUT = "bags/paper"
 DESCRIPTION = """\
-Run every figure and number of [KC09] section IV and write them beside the paper's values: paper.md
-and its figures under images/. Trials go through the whole node graph, studies through monte_carlo.
+Reproduce all figures and numbers of [KC09] section IV, and write them next to the paper's values:
+paper.md, with its figures in images/. Trials run the complete rig, studies run monte_carlo.
 """
 EPILOG = """\
 examples:
-  scripts/paper                    all of it, into bags/paper/ (about ten minutes)
-  scripts/paper --out docs         the same, into the page that goes with this checkout
+  scripts/paper                    everything, into bags/paper/ (about ten minutes)
+  scripts/paper --out docs         renew the page in docs/
   scripts/paper --quick --out /tmp/paper
-      three trials in place of nine, 1,000 runs in place of 10,000
+      three trials instead of nine, 1,000 runs instead of 10,000
 
-exit codes: 0 done, 2 bad input or something missing, 130 interrupted.
+exit codes: 0 done; 2 invalid or missing input; 130 interrupted
 """
 
 
@@ -37,10 +37,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _paper(arguments: Sequence[str]) -> int:
     parser = CommandParser("paper", DESCRIPTION, EPILOG)
     parser.add_argument("--quick", action="store_true", help="fewer trials and runs")
-    parser.add_argument("--out", metavar="DIR", help=f"where to write (default: {OUT}/)")
-    parser.add_argument("--runs", metavar="DIR", help="keep bags and studies there and use them")
-    parser.add_argument("--seed", default="1", metavar="N", help="seed of all noise (default: 1)")
-    parser.add_argument("--json", metavar="FILE", help="write the figures as a flat JSON object")
+    parser.add_argument("--out", metavar="DIR", help=f"output folder (default: {OUT}/)")
+    parser.add_argument("--runs", metavar="DIR", help="keep and reuse bags and studies here")
+    parser.add_argument(
+        "--seed", default="1", metavar="N", help="seed of all random numbers (default: 1)"
+    )
+    parser.add_argument("--json", metavar="FILE", help="also write the figures as flat JSON")
     given = parser.parse_args(arguments)
     if not given.seed.isdecimal() or int(given.seed) >= 2**31 - 100:
         raise UserError(f"--seed {given.seed!r} is not a whole number of at most 31 bits")

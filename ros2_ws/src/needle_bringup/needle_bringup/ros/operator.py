@@ -14,14 +14,14 @@ from needle_core.component import Batch, PortChange, RealPort
 from needle_core.ros.main import run_component
 
 HELP = """\
-operator: hold-to-run switch of the needle: a foot pedal, a key, a joystick.
+operator: hold-to-run switch of the needle: a foot pedal, a key or a joystick.
 
-A pedal, key or joystick by its event device (source pedal or joystick, device, key), or a
-joystick on a topic of sensor_msgs/Joy (source joy), published at 20 Hz or more. The needle is
-inserted, or withdrawn with retract_key, while the button is held; it stops when the button is
-released, or the device is unplugged, silent or frozen. A button that is down at the start or after
-a loss is ignored until all are released and it is pressed again. Before a withdrawal, a steering
-plane_controller is stopped.
+Reads an event device (source pedal or joystick; parameters device and key), or a joystick from a
+topic of type sensor_msgs/Joy (source joy) with 20 Hz or more. While the button is held, the needle
+is inserted, or retracted with retract_key. It stops when the button is released, or when the device
+is unplugged, silent or frozen. A button that is pressed at the start or after a loss is ignored
+until all are released and it is pressed again. Before a retraction, a steering plane_controller is
+stopped.
 
 Publishes   device/hold
 Subscribes  joy (source joy), device/status

@@ -18,19 +18,20 @@ from needle_core.commands.cli import EXIT_INTERRUPTED
 from needle_core.ros.main import run_component
 
 HELP = """\
-simulated_operator: presses the hold-to-run switch of a simulated rig in place of a person.
+simulated_operator: operates the hold-to-run switch of a simulated rig.
 
-Confirms that the needle is out, homes, enables, starts the controller, then presses the hold until
-the controller is DONE or in FAULT; releases and disables at the end, also on Ctrl-C. Shows the
-progress. It acts only if there is a single device that reports in device/status that it is
-simulated: on a real rig a person holds the switch. Unanswered calls are repeated after 1 s, home
-and start only if the statuses do not show that they were accepted.
+Confirms that the needle is out, homes, enables, starts the controller, and presses the hold until
+the controller is DONE or in FAULT; then, and on Ctrl-C, it releases the hold and disables the
+device. Shows the progress. It acts only if exactly one device reports in device/status that it is
+simulated: on a real rig a person holds the switch. It repeats an unanswered call after 1 s; home
+and start only if the status does not show that they were accepted.
 
 Publishes   device/hold
 Subscribes  needle/controller_status, device/status
 Calls       device/confirm_needle_out, device/home, device/enable, plane_controller/start
-Exit code   0 when the depth was reached, 1 when it was not, 2 when the rig did not get ready or for
-            bad parameters, 130 when interrupted
+
+Exit codes: 0 depth reached; 1 depth not reached; 2 the rig did not get ready, or a parameter is
+invalid; 130 interrupted
 """
 
 

@@ -52,27 +52,27 @@ class SimulatedOperatorParameters:
         unit="-",
         lower=0.0,
         upper=1.0,
-        description="Share of the commanded speed during the hold.",
+        description="Speed during the hold, relative to the commanded speed.",
     )
     hold_rate: float = fixed_parameter(
-        20.0, "Hz", "Rate of device/hold; the device wants 10 Hz or more.", 10.0, 100.0
+        20.0, "Hz", "Rate of device/hold; the device requires at least 10 Hz.", 10.0, 100.0
     )
     wait_timeout: float = fixed_parameter(
         90.0,
         "s",
-        "Time limit for the rig to get ready, and for each service to answer.",
+        "Maximum wait for the rig to get ready, and for each service to answer.",
         0.1,
         3600.0,
     )
     stall_timeout: float = fixed_parameter(
         30.0,
         "s",
-        "The hold is released when the needle has not advanced for this time.",
+        "Release the hold after this time without an advance of the needle.",
         0.1,
         3600.0,
     )
     wait_for_recorder: bool = fixed_parameter(
-        False, "-", "Start only when the recorder has the parameters of all nodes."
+        False, "-", "Wait until the recorder has the parameters of all nodes."
     )
 
     def __post_init__(self) -> None:

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Steer a simulated needle by hand, in a browser, in real time.
 
-Runs sim_rig, plane_controller (at level drive also drive_emulator and device_driver) and the
-console in one process, cameras and stereo_tracker in a second one, and prints the address to open.
-With --graph each is a ROS node of this shell's domain, with live_view for RViz and Foxglove.
-Nothing moves before you have pressed the buttons in their order; Ctrl-C ends all.
+Runs sim_rig, plane_controller, the console and, at level drive, drive_emulator and device_driver in
+one process, cameras and stereo_tracker in a second one, and prints the address to open. With
+--graph they are ROS nodes in this shell's domain, together with live_view for RViz and Foxglove.
+Nothing moves until you press the buttons in their order; Ctrl-C ends everything.
 """
 
 EPILOG = """\
@@ -40,23 +40,26 @@ examples:
   scripts/console --level drive --port 9000
       the device driver moves two emulated CANopen drives; page and hold on ports 9000 and 9001
   scripts/console --graph
-      ROS nodes, to look at with `ros2 topic echo`, RViz or Foxglove as well
+      ROS nodes, also for `ros2 topic echo`, RViz and Foxglove
 
-exit codes: 130 ended by Ctrl-C, 1 a part of the rig ended before, 2 bad input or something missing.
+exit codes: 130 ended by Ctrl-C; 1 a component exited; 2 invalid or missing input
 """
 
 # Options with the same meaning as those of `simulate`.
 _SHARED = {
-    "--level": ("tip|camera|drive", "what is simulated (default: camera)"),
-    "--controller": ("paper|best|open_loop", "how the needle is turned (default: best)"),
+    "--level": (
+        "tip|camera|drive",
+        "what is simulated: tips, images, or images and drives (default: camera)",
+    ),
+    "--controller": ("paper|best|open_loop", "preset that rotates the needle (default: best)"),
     "--insertion": (
         "continuous|stepwise",
-        "without a stop, or 1 mm at a time (default: continuous)",
+        "without stops, or in steps of 1 mm (default: continuous)",
     ),
-    "--initial": ("X_MM,PITCH_DEG,ROLL_DEG", "where the needle starts (default: -3,2,15)"),
-    "--noise-mm": ("A", "level tip: how far off a measured tip may be (default: 1.0)"),
-    "--depth-mm": ("D", "how far to insert (default: 120)"),
-    "--seed": ("N", "seed of all noise (default: 1)"),
+    "--initial": ("X_MM,PITCH_DEG,ROLL_DEG", "initial pose of the needle (default: -3,2,15)"),
+    "--noise-mm": ("A", "level tip: maximum error of each coordinate [mm] (default: 1.0)"),
+    "--depth-mm": ("D", "final insertion [mm] (default: 120)"),
+    "--seed": ("N", "seed of all random numbers (default: 1)"),
 }
 # The hold uses the port after that of the page.
 _DEFAULT_PORT, _LAST_PORT = "8080", 65534
@@ -105,7 +108,7 @@ def parse_console(arguments: Sequence[str]) -> ConsoleOptions:
         "--port",
         default=_DEFAULT_PORT,
         metavar="N",
-        help=f"port of the page; the hold takes the next (default: {_DEFAULT_PORT})",
+        help=f"port of the page; the hold uses the next one (default: {_DEFAULT_PORT})",
     )
     parser.add_argument("--graph", action="store_true", help="run ROS nodes, for RViz and Foxglove")
     for option, (metavar, text) in _SHARED.items():

@@ -19,47 +19,45 @@ from needle_core.commands.options import (
 from needle_core.errors import UserError
 
 DESCRIPTION = """\
-Steer a simulated needle into a plane with the real node graph, record it, and report how it went.
+Steer a simulated needle into a plane with the rig's components, record the run and report on it.
 
 sim_rig, stereo_tracker, plane_controller, simulated_operator and, at level drive, drive_emulator
-and device_driver run in this process, on a virtual clock: the same seed gives the same bag, byte
-for byte. With --graph they and recorder are ROS nodes in processes of their own.
+and device_driver run in one process on a virtual clock: the same seed gives the same bag, byte for
+byte. With --graph they and the recorder are ROS nodes in separate processes.
 
-It shows how far the needle is in, and leaves a folder that holds the bag (open it with rosbags,
-mcap, Foxglove, PlotJuggler or `ros2 bag`), report.html with its figures, summary.json, the
-parameters and, of ROS nodes, their logs.
+Shows the progress, and writes a folder with the bag (for rosbags, mcap, Foxglove, PlotJuggler or
+`ros2 bag`), report.html with its figures, summary.json, the parameters and, with --graph, the logs.
 """
 
 EPILOG = """\
 examples:
   scripts/simulate
-      camera images, controller best, start 3 mm beside the plane, 120 mm deep
+      camera images, controller best, start 3 mm from the plane, 120 mm deep
   scripts/simulate --level tip --seed 7
-      no images: the tip is measured with the paper's +-1 mm noise; quicker
+      no images: tips with the noise of the paper, +-1 mm; faster
   scripts/simulate --level drive
       camera images, and the device driver moves two emulated CANopen drives
   scripts/simulate --controller open_loop --level tip --noise-mm 0
-      no steering: where the needle goes by itself (14.6 mm beside the plane; exit code 1)
+      no steering: the needle ends 14.6 mm from the plane (exit code 1)
   scripts/simulate --initial=5,-4,30 --depth-mm 80 --bag bags/my_run
-      another start: 5 mm above the plane, pitched 4 deg down, rolled by 30 deg
+      start 5 mm above the plane, pitched down by 4 deg, rolled by 30 deg
   scripts/simulate --target 10,-5,100
-      to a point 100 mm deep, 10 mm above the entry and 5 mm beside it
+      to a point 100 mm deep, 10 mm above the entry and 5 mm to its side
   scripts/simulate --target 4,-6,100 --obstacles obstacles.yaml
-      round spheres and capsules, such as
+      around spheres and capsules, such as
         frame: rig
         spheres: [{center: [0.002, -0.003, 0.055], radius: 0.003}]
         capsules: [{start: [-0.02, 0.006, 0.07], end: [0.02, 0.006, 0.07], radius: 0.003}]
   scripts/simulate --curvature 4 --diameter-mm 1 --pre-bend-deg 6
-      another needle, which simulation, tracker and controller are told of alike; a contradiction
-      between --params and other nodes is warned of
+      another needle, in simulation, tracker and controller; contradictory --params cause a warning
   scripts/simulate --level tip --estimator particle_filter
       with an estimator of another package (docs/own_controllers.md)
   scripts/simulate --params my_rig.yaml
-      with a ROS parameter file on top of the rig's configuration, such as
+      with a ROS parameter file that overrides the rig's configuration, such as
         plane_controller: {ros__parameters: {max_rotation_per_length: 300.0}}
 
-exit codes: 0 converged (within 1 mm of plane or point at the end), 1 ran but missed, 2 bad input or
-something missing, 130 interrupted.
+exit codes: 0 converged (final tip within 1 mm of the plane or point); 1 not converged; 2 invalid or
+missing input; 130 interrupted
 """
 
 LEVELS = ("tip", "camera", "drive")
@@ -208,46 +206,45 @@ def _parser() -> CommandParser:
         "--level",
         default="camera",
         metavar="tip|camera|drive",
-        help="what is simulated: only "
-        "the tip's measurement, the stereo images of it, or also the drives that the device driver "
-        "moves over a CAN bus (default: camera)",
+        help="what is simulated: the measured tips; the stereo images; or the images and the "
+        "drives, which the device driver moves over a CAN bus (default: camera)",
     )
     add(
         "--controller",
         default="best",
         metavar="paper|best|open_loop",
-        help="how the needle is turned: as in the paper, by the best controller known here, or not "
-        "at all (default: best)",
+        help="preset that rotates the needle: the paper's, this project's best, or none (default: "
+        "best)",
     )
     add_own_part_options(add, "--target")
     add(
         "--insertion",
         default="stepwise",
         metavar="|".join(INSERTIONS),
-        help="whether the needle rests after each step until its tip was seen, or goes on while a "
-        "person holds (default: stepwise)",
+        help="rest after each step until the tip is measured, or advance throughout the hold "
+        "(default: stepwise)",
     )
     add(
         "--initial",
         default="-3,2,15",
         metavar="X_MM,PITCH_DEG,ROLL_DEG",
-        help="where the needle starts, seen from the wanted plane (default: -3,2,15)",
+        help="initial pose of the needle relative to the target plane (default: -3,2,15)",
     )
     add(
         "--noise-mm",
         metavar="A",
-        help="level tip: the measured tip is off by up to A mm in each direction (default: 1.0)",
+        help="level tip: maximum error of each measured coordinate [mm] (default: 1.0)",
     )
     add(
         "--depth-mm",
         metavar="D",
-        help=f"how far to insert (default: {DEPTH_MM}); with --target at most "
-        f"(default: {LARGEST_DEPTH_MM:g})",
+        help=f"final insertion [mm] (default: {DEPTH_MM}); with --target the maximum (default: "
+        f"{LARGEST_DEPTH_MM:g})",
     )
     add(
         "--target",
         metavar="X_MM,Y_MM,Z_MM",
-        help="steer to this point in place of the plane: X up, Z along the insertion, from the "
+        help="steer to this point instead of the plane: X up, Z along the insertion, from the "
         "entry point",
     )
     add(
@@ -258,59 +255,58 @@ def _parser() -> CommandParser:
     add(
         "--curvature",
         metavar="K",
-        help="needle: curvature of its path in the tissue [1/m], in all nodes (default: 8.197, a "
+        help="curvature of the needle's path in the tissue [1/m], in all nodes (default: 8.197, a "
         "radius of 122 mm)",
     )
     add(
         "--diameter-mm",
         metavar="D",
-        help="needle: diameter, in all nodes (default: 0.7)",
+        help="diameter of the needle [mm], in all nodes (default: 0.7)",
     )
     add(
         "--pre-bend-deg",
         metavar="A",
-        help="needle: angle between its shaft and its last 9 mm, in all nodes; 0: straight "
+        help="angle between the needle's shaft and its last 9 mm [deg], in all nodes; 0: straight "
         "(default: 10)",
     )
     add(
         "--play-deg",
         default="0",
         metavar="D",
-        help="tissue: base and tip angle differ by up to D deg before the tip follows (default: 0)",
+        help="tissue: dead band between base and tip angle, +-D [deg] (default: 0)",
     )
     add(
         "--lag-mm",
         default="0",
         metavar="L",
-        help="tissue: the tip's angle follows the base's with this length constant (default: 0)",
+        help="tissue: first-order lag of the tip angle, as inserted length [mm] (default: 0)",
     )
     add(
         "--real-time-factor",
         metavar="F",
-        help="1: as slow as the real rig; 0: as fast as the computer allows, repeatable "
-        "(default: 0)",
+        help="speed relative to real time; 0: as fast as possible, repeatable (default: 0)",
     )
     add(
         "--graph",
         action="store_true",
-        help="each component as a ROS node in a process of its own, over DDS, in real time",
+        help="run each component as a ROS node in its own process, over DDS, in real time",
     )
     add(
         "--component",
         action="append",
         default=[],
         metavar="MODULE:NAME",
-        help="a component of your own beside the rig's (docs/own_controllers.md); may be repeated",
+        help="add a component of your own (docs/own_controllers.md); may be repeated",
     )
     add("--bag", metavar="DIR", help="new folder for the run (default: time-stamped, in bags/)")
-    add("--params", metavar="FILE", help="ROS parameter file on top of the rig's configuration")
+    add("--params", metavar="FILE", help="ROS parameter file that overrides the configuration")
     add(
         "--seed",
         default="1",
         metavar="N",
-        help="seed of all noise: same seed, same run (default: 1)",
+        help="seed of all random numbers; the same seed gives the same run (default: 1)",
     )
-    add("--json", metavar="FILE", help="write the result there too, as one flat JSON object")
+    add("--json", metavar="FILE", help="also write the result as flat JSON")
     return parser
 
 
@@ -382,14 +378,14 @@ def existing_file(given_by: str, text: str) -> Path:
 def add_own_part_options(add: Callable[..., Any], points: str) -> None:
     """Add `--estimator`, `--law` and `--planner`; `points` is the option that planners require."""
     for option, what in (
-        ("--estimator", "an estimator"),
-        ("--law", "a control law"),
-        ("--planner", f"with {points}: a planner"),
+        ("--estimator", "estimator"),
+        ("--law", "control law"),
+        ("--planner", f"with {points}: planner"),
     ):
         add(
             option,
             default="",
             metavar="NAME",
-            help=f"{what} of another package in place of the controller's own, by the name of its "
-            "entry point (docs/own_controllers.md)",
+            help=f"{what} of another package, by the name of its entry point "
+            "(docs/own_controllers.md)",
         )

@@ -22,63 +22,63 @@ def add_disturbance_options(parser: CommandParser) -> None:
             "--noise-mm",
             _NOISE_MM,
             "A",
-            "error of each coordinate of a measured tip: of uniform noise the largest, of normal "
-            "noise the standard deviation",
+            "error of each coordinate of a measured tip [mm]: maximum of uniform noise, standard "
+            "deviation of normal noise",
         ),
-        ("--noise-shape", "uniform", "|".join(_SHAPES), "how that noise is distributed"),
-        ("--outliers", "0", "F", "share of measurements off in a random direction"),
-        ("--outlier-mm", "5,10", "LO,HI", "how far those are off, uniform in between"),
-        ("--found", "1", "F", "share of the exposures in which the tip is found"),
-        ("--delay", "0", "N", "steps that a measurement comes late, as the controller is told"),
-        ("--untold-delay", "0", "N", "steps that it comes late, as if it were new"),
-        ("--kappa-scale", "1", "S", "the needle's curvature, in terms of what is assumed"),
-        ("--kappa-patches", "0", "F", "curvature off by up to this share, anew every 20 mm"),
+        ("--noise-shape", "uniform", "|".join(_SHAPES), "distribution of that noise"),
+        ("--outliers", "0", "F", "share of tips with an additional error in a random direction"),
+        ("--outlier-mm", "5,10", "LO,HI", "range of that error [mm], uniform"),
+        ("--found", "1", "F", "share of exposures in which the tip is found"),
+        ("--delay", "0", "N", "delay of a measurement, in steps, known to the controller"),
+        ("--untold-delay", "0", "N", "delay of a measurement, in steps, unknown to the controller"),
+        ("--kappa-scale", "1", "S", "true curvature relative to the assumed one"),
+        ("--kappa-patches", "0", "F", "maximum relative error of the curvature, new every 20 mm"),
         (
             "--push",
             "0",
             "K",
-            "curvature [1/m] by which the tissue bends the path aside, in a direction fixed in "
-            "space and drawn for each needle",
+            "additional curvature of the path by the tissue [1/m], in a fixed random direction "
+            "per needle",
         ),
         ("--rotation-gain", "1", "G", "share of the base's rotation that reaches the tip"),
         (
             "--roll-walk",
             "0",
             "D",
-            "by how much the tip turns about its axis by itself: standard deviation [deg] over 1 "
-            "mm, growing with the square root of the insertion",
+            "random rotation of the tip about its axis: standard deviation over 1 mm [deg]; it "
+            "grows with the square root of the insertion",
         ),
-        ("--play-deg", "0", "D", "dead band between base and tip angle, +-"),
-        ("--lag-mm", "0", "L", "length over which the tip's angle follows the base's"),
-        ("--slip", "0", "F", "share by which the stage moves farther than the needle goes in"),
-        ("--bump-mm", "0", "D", "how far the phantom, with the needle, is moved at half the depth"),
+        ("--play-deg", "0", "D", "dead band between base and tip angle, +-D [deg]"),
+        ("--lag-mm", "0", "L", "first-order lag of the tip angle, as inserted length [mm]"),
+        ("--slip", "0", "F", "slip: the stage moves farther than the needle by this share"),
+        ("--bump-mm", "0", "D", "displacement of phantom and needle at half the depth [mm]"),
     )
     for name, default, metavar, text in numbers:
         add(name, default=default, metavar=metavar, help=f"{text} (default: {default})")
     add(
         "--correlated",
         metavar="R",
-        help="in place of that noise: normal errors of the same variance as uniform ones within "
-        "--noise-mm (0.577 mm of 1 mm), each with correlation R to the one before, in [0, 0.999]",
+        help="instead of that noise: normal errors with the variance of uniform ones within "
+        "--noise-mm (0.577 mm for 1 mm), and correlation R in [0, 0.999] to the previous error",
     )
     add(
         "--student",
         metavar="DOF,SCALE_MM",
-        help="in place of that noise: errors with Student's t distribution of DOF degrees of "
+        help="instead of that noise: errors with Student's t distribution with DOF degrees of "
         "freedom, times SCALE_MM",
     )
     add(
         "--bias-walk",
         metavar="A",
-        help="in place of that noise: a bias of each measured coordinate that walks within +-A mm, "
-        "up or down by A/10 from one exposure to the next, and uniform noise within +-0.3 A. A "
-        "camera that is worse than specified: --claimed-mm 0.03 --bias-walk 0.3",
+        help="instead of that noise: a bias of each measured coordinate within +-A mm, which "
+        "changes by +-A/10 between exposures, and uniform noise within +-0.3 A. For a camera that "
+        "is worse than specified: --claimed-mm 0.03 --bias-walk 0.3",
     )
     add(
         "--layer",
         metavar="S,FROM_MM",
-        help="tissue in which the needle's curvature is S times as large, from the first step on "
-        "that begins at FROM_MM or deeper",
+        help="tissue layer with S times the curvature, from the first step that begins at FROM_MM "
+        "or deeper",
     )
 
 

@@ -23,52 +23,47 @@ from needle_sim.studies.disturbances import Disturbances
 from needle_sim.studies.study import GRIDS, StartBounds
 
 DESCRIPTION = """\
-Steer many simulated needles to the plane x = 0 and say how many get there.
+Steer many simulated needles to the plane x = 0, and count those that converge.
 
-The default is the study of [KC09]: 10 x 10 x 10 starts (x, pitch, roll up to the given bounds, roll
-centred on 0), each 10 times with other noise, 120 mm deep, +-1 mm noise on each coordinate of the
-tip. What is judged is the true tip. The first tip is measured before the needle moves, every other
-after a step of --step-mm, the last one after the last. Disturbances act on the plant alone; the
-controller is told of none, but of --delay. Of the noise it believes what --claimed-mm says.
+The default is the study of [KC09]: 10 x 10 x 10 starts (x, pitch and roll up to the given bounds,
+roll centred on 0), 10 runs each with different noise, 120 mm deep, +-1 mm noise on each coordinate
+of the tip. A tip is measured before the first step and after every step of --step-mm; the figures
+use the true tip. Disturbances affect only the plant: the controller knows --delay, and assumes the
+noise of --claimed-mm.
 """
 
 EPILOG = """\
-figures (--json FILE has all of them, flat; null where there is none):
-  converged_at_end    share of runs within +-1 mm of the plane at the end
+figures (all in --json FILE, null if not applicable):
+  converged_at_end    share of runs that end within +-1 mm of the plane
   converged_last_20   share within +-1 mm after each of the last 20 steps
-  rms, p95, max       of the distance over the last 20 steps of all runs
+  rms, p95, max       distance from the plane over the last 20 steps of all runs
   settle              insertion of the last entry into +-1 mm, of the runs that end inside
-  rotation_mean       how much the base turns, either way, summed over a run
-  wall_s, cpu_s       time of the study, by the clock and on the processor (threads of numpy
-                      that wait count too: OPENBLAS_NUM_THREADS=1 keeps them out)
-  diverged            share that ends outside, farther off than its start, and still moving away
-  inside_N_sigma      share of x and of pitch (the mean of both shares), over the last 20 steps of
-                      all runs, within N of the estimate's own standard deviations from the truth;
-                      null for paper and open_loop, whose estimate makes no use of them;
-                      x_inside_3_sigma is that of x alone
-  doubtful_at_end     share of runs that give more than 5 % at the end to being more than 1 mm off
-  trusted_far_off     how many end more than 5 mm off and do not say so
-with --targets, in place of all that speaks of the plane:
-  rms_point           of the tip's distance from its point at the end (p95, max likewise)
-  within_1_mm_point   share that ends within 1 mm of it; a point counts as one that can be reached
-                      where the arc from the true start to it takes at most 0.6 of the curvature
+  rotation_mean       mean over the runs of the total rotation of the base, in both directions
+  wall_s, cpu_s       elapsed and processor time of the study (waiting threads of numpy count too,
+                      unless OPENBLAS_NUM_THREADS=1)
+  diverged            share that ends outside, farther away than its start, and still moving away
+  inside_N_sigma      share of x and pitch (mean of both shares) within N of the estimate's standard
+                      deviations from the true value, over the last 20 steps of all runs; null for
+                      paper and open_loop, which do not use them; x_inside_3_sigma is for x alone
+  doubtful_at_end     share whose final estimate has a probability above 5 % of an error above 1 mm
+  trusted_far_off     number of runs that end more than 5 mm away and are not doubtful
+with --targets, instead of those for the plane:
+  rms_point           final distance of the tip from its point (p95 and max likewise)
+  within_1_mm_point   share that ends within 1 mm of its point; a point counts as reachable if the
+                      arc to it from the true start needs at most 0.6 of the curvature
 
 examples:
-  ros2 run needle_sim monte_carlo --controller paper
   ros2 run needle_sim monte_carlo --controller paper --grid cell --json paper.json
   ros2 run needle_sim monte_carlo --controller open_loop --initial=-3,2,15 --draws 1
-  ros2 run needle_sim monte_carlo --controller paper --kappa-scale 0.8 --csv runs.csv
   ros2 run needle_sim monte_carlo --noise-mm 0.58 --noise-shape normal
-  ros2 run needle_sim monte_carlo --targets 2000 --csv points.csv
-  ros2 run needle_sim monte_carlo --targets 2000 --rotation-deg 800
+  ros2 run needle_sim monte_carlo --outliers 0.05 --outlier-mm 2,3.5 --slip 0.02 --bump-mm 2
+  ros2 run needle_sim monte_carlo --targets 2000 --rotation-deg 800 --csv points.csv
   ros2 run needle_sim monte_carlo --targets 2000 --target-drift-mm-per-s 0.03 --target-breath-mm 3
   ros2 run needle_sim monte_carlo --targets 2000 --controller sliding_mode
-  ros2 run needle_sim monte_carlo --targets 2000 --controller rrt
   ros2 run needle_sim monte_carlo --estimator particle_filter --draws 1
-  ros2 run needle_sim monte_carlo --outliers 0.05 --outlier-mm 2,3.5 --slip 0.02 --bump-mm 2
   ros2 run needle_sim monte_carlo --draws 1000 --scheduler tcp://10.0.0.5:8786 --csv runs.csv
 
-exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
+exit codes: 0 done; 2 invalid or missing input; 130 interrupted
 """
 
 _DEPTH_MM, _DEPTH_OF_POINTS_MM = "120", "150"
@@ -180,65 +175,64 @@ def _parser() -> CommandParser:
         "--controller",
         default="best",
         metavar="NAME",
-        help="best, paper or open_loop; with --targets best, or the published sliding_mode or rrt "
-        "with best's estimator (default: best)",
+        help="best, paper or open_loop; with --targets best, or one of the published laws "
+        "sliding_mode and rrt with the estimator of best (default: best)",
     )
     add_own_part_options(add, "--targets")
     add(
         "--grid",
         default="endpoint",
         metavar="endpoint|cell|random",
-        help="starts on the bounds too, in the middles of cells, or anywhere (default: endpoint)",
+        help="starts up to the bounds, at the centres of cells, or random (default: endpoint)",
     )
     numbers = (
-        ("--draws", "10", "N", "runs from each start"),
-        ("--claimed-mm", "1", "C", "largest error that the controller is told, whatever it is"),
+        ("--draws", "10", "N", "runs per start"),
+        ("--claimed-mm", "1", "C", "maximum tip error that the controller assumes [mm]"),
         (
             "--sigma-scale",
             "1",
             "S",
-            "other than 1: each tip is given with a covariance in place of a bound, the standard "
-            "deviations of uniform noise within --claimed-mm, S times too small",
+            "other than 1: each tip has a covariance instead of a bound, that of uniform noise "
+            "within --claimed-mm with standard deviations S times too small",
         ),
-        ("--x-mm", "3", "X", "bound of the starts' distance from the plane"),
-        ("--pitch-deg", "10", "P", "bound of the starts' pitch"),
-        ("--roll-deg", "30", "R", "bound of the starts' roll"),
-        ("--flips", "0", "N", "times the bevel is flipped, evenly spaced, mirrored"),
+        ("--x-mm", "3", "X", "bound of the initial distance from the plane [mm]"),
+        ("--pitch-deg", "10", "P", "bound of the initial pitch [deg]"),
+        ("--roll-deg", "30", "R", "bound of the initial roll [deg]"),
+        ("--flips", "0", "N", "number of flips of the bevel, at equal distances, mirrored"),
         (
             "--turn-delay-mm",
             "0",
             "D",
-            "insertion from a measurement until the base turns by it: of a needle that goes in "
-            "continuously its speed times the answer's latency; not with --targets",
+            "insertion between a measurement and its rotation [mm]: speed x latency in continuous "
+            "insertion; not with --targets",
         ),
         (
             "--targets",
             "0",
             "N",
-            "steer N needles to points in place of the plane: each from a random start within the "
-            "bounds to a random point of its own, 60 to 120 mm ahead",
+            "steer N needles to points instead of the plane: each from a random start within the "
+            "bounds to its own random point, 60 to 120 mm ahead",
         ),
-        ("--rotation-deg", "1e6", "B", "most that each base may turn on the way to its point"),
+        ("--rotation-deg", "1e6", "B", "maximum total rotation of each base to its point [deg]"),
         (
             "--target-drift-mm-per-s",
             "0",
             "V",
-            "how fast each point drifts in a direction of its own while the needle goes in at 2 "
-            "mm/s",
+            "drift speed of each point in its own direction [mm/s], if inserted at 2 mm/s",
         ),
         (
             "--target-breath-mm",
             "0",
             "A",
-            "how far each point moves to and fro, 0.2 times a second, in another direction",
+            "amplitude of each point's oscillation at 0.2 Hz in another direction [mm]",
         ),
         (
             "--step-mm",
             "1",
             "L",
-            "insertion from one exposure to the next, as the controller is told",
+            "insertion between exposures [mm], known to the controller",
         ),
-        ("--seed", "1", "N", "seed of all randomness: same seed, same figures"),
+        ("--seed", "1", "N", "seed of all random numbers; the same seed gives the same figures"),
     )
     for name, default, metavar, text in numbers:
         add(name, default=default, metavar=metavar, help=f"{text} (default: {default})")
@@ -246,26 +240,26 @@ def _parser() -> CommandParser:
     add(
         "--depth-mm",
         metavar="D",
-        help=f"how far to insert, at most where there are targets (default: {_DEPTH_MM}; with "
+        help=f"final insertion [mm], the maximum with --targets (default: {_DEPTH_MM}; with "
         f"--targets {_DEPTH_OF_POINTS_MM})",
     )
     add(
         "--initial",
         metavar="X_MM,PITCH_DEG,ROLL_DEG",
-        help="all runs from this one start instead of a grid",
+        help="start all runs from this pose instead of a grid",
     )
     add(
         "--scheduler",
         default="",
         metavar="ADDRESS",
-        help="steer the needles on the Dask cluster of this scheduler, such as "
-        "tcp://10.0.0.5:8786, to the same figures (docs/several_computers.md)",
+        help="run on the Dask cluster of this scheduler, such as tcp://10.0.0.5:8786, with the "
+        "same figures (docs/several_computers.md)",
     )
-    add("--json", metavar="FILE", help="write the figures as one flat JSON object")
+    add("--json", metavar="FILE", help="also write the figures as flat JSON")
     add(
         "--csv",
         metavar="FILE",
-        help="one line for each run: what it was run with, and what became of it",
+        help="write a line per run: its options, start and results",
     )
     return parser
 

@@ -11,11 +11,11 @@ from needle_core.commands.cli import EXIT_BAD_INPUT
 from needle_core.ros.main import run_component
 
 HELP = """\
-console: serves a page that shows the state of the rig and has a hold to steer the needle.
+console: serves a web page with the state of the rig and a hold button to steer the needle.
 
-Publishes   device/hold (always; pressed only while a person holds), target_plane, target_point
+Publishes   device/hold (always; pressed only while the button is held), target_plane, target_point
 Subscribes  device/status, needle/controller_status, joint_states, needle/tip_pose, needle/estimate,
-            target_plane, /diagnostics, and while a page is open stereo/{left,right}/image_raw
+            target_plane, /diagnostics; stereo/{left,right}/image_raw (while a page is open)
 Calls       device/{confirm_needle_out,home,enable,stop,retract,reset},
             plane_controller/{start,stop}
 """

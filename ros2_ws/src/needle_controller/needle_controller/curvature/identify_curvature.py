@@ -30,45 +30,46 @@ from needle_core.commands.options import CommandParser, number, output_file
 from needle_core.errors import UserError
 
 DESCRIPTION = """\
-Find the curvature of the needle's path in a tissue, from an insertion without rotation.
+Identify the curvature of the needle's path in a tissue, from an insertion without rotation.
 
-Such a needle follows a circle; its radius 1/kappa is what plane_controller's parameter `curvature`
-(kappa, 1/m) comes from. The most likely arc is fitted to the measured tips, and its radius printed
-in mm with the interval that holds it with 95 % probability. Tips far from the arc do not count.
+The needle then follows a circle; the curvature kappa of that circle is plane_controller's parameter
+`curvature` [1/m]. The command fits the most likely arc to the measured tips and prints its radius
+1/kappa [mm] with its 95 % interval. Tips far from the arc are ignored as outliers.
 """
 
 EPILOG = """\
-what to measure:
-  Push the needle in without turning it, 60 mm or more, a tip every mm. At +-1 mm of noise 60 mm of
-  arc give 1/kappa = 122 mm to about 6 % (one standard deviation), 120 mm to 1 %. On the rig:
-  plane_controller with `preset: open_loop` inserts without turning; record a bag of it.
+measurement:
+  Insert the needle without rotation by 60 mm or more, and measure a tip every mm. With +-1 mm of
+  noise, an arc of 60 mm gives 1/kappa = 122 mm within about 6 % (one standard deviation), an arc of
+  120 mm within 1 %. On the rig, record a bag of plane_controller with `preset: open_loop`.
 
 input:
-  a bag: the directory of a rosbag2 bag with needle/tip and joint_states
-  a CSV: columns x_m, y_m, z_m; with insertion_m the lengths are used, but for how far the needle
-  goes in for each mm of the stage, which the tips tell; without it each tip is taken to the nearest
-  point of the arc. `ros2 run needle_tracker track_images` writes such a file: rows
-  with valid 0 are left out, --insertion takes the same CSV (name,insertion_m) as there.
-  A column rotation_rad, if there is one, is checked like a bag's rotation joint. Without it tips
-  are refused that leave their arc in order, one after the other, by more than 0.05 mm (or 2.5 times
-  --repeating-error-mm) and more than chance explains. That shows a turn half-way from 20 deg on at
-  stereo_tracker's noise, from 30 deg on at +-1 mm over 120 mm; at +-1 mm over 60 mm hardly any.
+  bag: directory of a rosbag2 bag with needle/tip and joint_states
+  CSV: columns x_m, y_m, z_m, as in the output of `ros2 run needle_tracker track_images`; rows with
+      valid 0 are ignored.
+      insertion_m (or --insertion, the same file as for track_images) gives the length of the arc at
+      each tip, up to the slip between stage and needle, which is estimated from the tips. Without
+      it each tip belongs to the nearest point of the arc.
+      rotation_rad is checked like the rotation joint of a bag. Without it the tips are rejected if
+      successive tips leave the arc by more than 0.05 mm (or 2.5 times --repeating-error-mm) and by
+      more than their noise explains. This detects a rotation half-way of 20 deg or more at the
+      noise of stereo_tracker, of 30 deg at +-1 mm over 120 mm, and hardly any at +-1 mm over 60 mm.
 
 examples:
   ros2 run needle_controller identify_curvature bags/insertion
   ros2 run needle_controller identify_curvature tips.csv --insertion insertion.csv --json kappa.json
   ros2 run needle_controller identify_curvature bags/steered --until-mm 40
-      only what was inserted before the base began to turn
+      only the insertion before the first rotation
   ros2 run needle_controller identify_curvature tips.csv --forecast-mm 98
-      where the tip will be at 98 mm, from tips of the first 50 mm, say; for tissue whose curvature
-      varies by 0.4 1/m from place to place
+      predict the tip at 98 mm, for example from tips of the first 50 mm, in tissue whose curvature
+      varies by 0.4 1/m
   ros2 run needle_controller identify_curvature tips.csv --entry-std-mm inf --heading-std-deg inf
-      nothing is known of the entry but the tips
+      with an unknown entry pose
   ros2 run needle_controller identify_curvature bags/insertion --from-mm 5
-      without the first tips of stereo_tracker: before it sees the needle it says where it must be
+      without the first tips of stereo_tracker, which follow from the insertion, not from images
 
-exit codes: 0 done, 1 the tips cannot tell the path from a straight line, 2 bad input (turned on the
-way, too short, not finite, ...), 130 interrupted.
+exit codes: 0 done; 1 the path cannot be distinguished from a straight line; 2 invalid input (the
+base rotated, the insertion is too short, a value is not finite, ...); 130 interrupted
 """
 
 
@@ -91,39 +92,40 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     add = parser.add_argument
     add("source", type=Path, metavar="BAG_OR_CSV", help="a bag's directory, or a CSV of tips")
     add("--insertion", type=Path, metavar="FILE", help="CSV name,insertion_m for a CSV of tips")
-    add("--json", type=Path, metavar="FILE", help="write the result to FILE as well")
-    add("--from-mm", default="0", metavar="D", help="leave out what is less deep (default: 0)")
-    add("--until-mm", default="inf", metavar="D", help="leave out what is deeper (default: all)")
+    add("--json", type=Path, metavar="FILE", help="also write the result as flat JSON")
+    add("--from-mm", default="0", metavar="D", help="ignore smaller insertions [mm] (default: 0)")
+    add("--until-mm", default="inf", metavar="D", help="ignore larger ones [mm] (default: all)")
     add(
         "--entry-std-mm",
         default="0.5",
         metavar="S",
-        help="how well it is known that the needle enters at rig's origin at insertion 0, "
-        "standard deviation; inf: not at all (default: 0.5)",
+        help="standard deviation of the entry point from rig's origin at insertion 0 [mm]; inf: "
+        "unknown (default: 0.5)",
     )
     add(
         "--heading-std-deg",
         default="5",
         metavar="S",
-        help="how well it is known that it enters along rig's z axis; inf: not at all (default: 5)",
+        help="standard deviation of the heading at the entry from rig's z axis [deg]; inf: unknown "
+        "(default: 5)",
     )
     add(
         "--repeating-error-mm",
         default="0.02",
         metavar="E",
-        help="what all tips may be off together, as by a calibration's error: more tips do not "
-        "make it smaller (default: 0.02)",
+        help="error common to all tips [mm], such as that of the calibration: more tips do not "
+        "reduce it (default: 0.02)",
     )
     add(
         "--rotation-tolerance-deg",
         default="1",
         metavar="R",
-        help="what the base may turn on the way (default: 1)",
+        help="accepted rotation of the base during the insertion [deg] (default: 1)",
     )
     add(
         "--forecast-mm",
         metavar="D",
-        help="say where the tip of the needle will be at this insertion, if it is not turned",
+        help="predict the tip at this insertion [mm], without rotation",
     )
     options = parser.parse_args(arguments)
     options.json = output_file("--json", options.json)

@@ -50,70 +50,70 @@ class SteeringSettings:
     preset: str = parameter(
         "best",
         "-",
-        "best = hypothesis filter and roll law, paper = observer and law of [KC09], "
-        "open_loop = no rotation.",
+        "best: hypothesis filter and roll law; paper: observer and law of [KC09]; open_loop: no "
+        "rotation.",
         choices=PRESETS,
     )
     estimator: str = fixed_parameter(
         "",
         "-",
-        "Name of an estimator of another package, in place of the preset's (entry points "
-        "needle_controller.estimators; docs/own_controllers.md); empty = the preset's.",
+        "Estimator of another package (entry point group needle_controller.estimators; "
+        "docs/own_controllers.md); empty: the preset's.",
     )
-    law: str = fixed_parameter("", "-", "Likewise of a control law (needle_controller.laws).")
+    law: str = fixed_parameter("", "-", "Control law, likewise (group needle_controller.laws).")
     planner: str = fixed_parameter(
-        "", "-", "Likewise of a planner of ways to a point (needle_controller.planners)."
+        "", "-", "Planner of paths to a point, likewise (group needle_controller.planners)."
     )
     seed: int = fixed_parameter(
-        0, "-", "Of what chance another package's estimator uses; ours use none.", 0, 2**31 - 1
+        0, "-", "Seed of an estimator of another package; presets use none.", 0, 2**31 - 1
     )
     curvature: float = parameter(
         1.0 / 0.122, "1/m", "Curvature of the needle's path in the tissue.", 0.1, 100.0
     )
     needle_diameter: float = fixed_parameter(
-        0.0007, "m", "Diameter of the needle, which is led past obstacles.", 0.2e-3, 3e-3
+        0.0007, "m", "Diameter of the needle, for the distance to obstacles.", 0.2e-3, 3e-3
     )
     goal_tolerance: float = parameter(
-        0.001, "m", "Distance by which a path past obstacles may pass its target point.", 0.0, 0.01
+        0.001, "m", "Accepted distance of a path around obstacles from its target point.", 0.0, 0.01
     )
     target_offset: float = parameter(
-        0.0, "m", "x of the wanted plane in rig, until a target_plane is given.", -0.1, 0.1
+        0.0, "m", "x of the target plane in rig, until a target_plane is received.", -0.1, 0.1
     )
     target_point: tuple[float, ...] = parameter(
         (),
         "m",
-        "x, y, z in rig of the point to steer to in place of the plane, until a "
-        "target_point or target_plane is given; empty = the plane. Not with flip_depths, and with "
-        "presets that estimate the whole pose only.",
+        "x, y, z in rig of the target point, until a target_point or target_plane is received; "
+        "empty: steer to the plane. Not with flip_depths; only with presets that estimate the "
+        "whole pose.",
         -1.0,
         1.0,
     )
     obstacles: tuple[float, ...] = parameter(
         (),
         "m",
-        "What the needle must not touch on its way to a point, until obstacles are "
-        "given: of each the x, y, z in rig of both ends of its axis, and its radius.",
+        "Obstacles on the way to a point, until obstacles are received: 7 numbers each, x, y, z in "
+        "rig of both ends of the axis, and the radius.",
         -1.0,
         1.0,
     )
     depth: float = parameter(
-        0.12, "m", "Insertion at which steering is done; of a point, at the latest.", 0.0, 1.0
+        0.12, "m", "Insertion at which steering ends; to a point: the maximum.", 0.0, 1.0
     )
     step_length: float = parameter(
-        0.001, "m", "Insertion of one step; the last one ends at the depth.", 1e-4, 0.01
+        0.001, "m", "Insertion per step; the last step ends at the depth.", 1e-4, 0.01
     )
     insertion: str = fixed_parameter(
         "stepwise",
         "-",
-        "stepwise = the needle rests after each step until its tip was seen; continuous = it goes "
-        "on while held: the path ahead is sent anew with every tip.",
+        "stepwise: the needle rests after each step until its tip is measured; continuous: it "
+        "advances during the hold, and every tip updates the path ahead.",
         choices=INSERTIONS,
     )
     horizon: float = parameter(
         0.002,
         "m",
-        "Continuous insertion: how far beyond the newest tip the path leads, and the "
-        "needle at most; the device's max_step_length or less.",
+        "Continuous insertion: length of the path beyond the newest tip, and so the maximum "
+        "advance; at most the device's max_step_length.",
         2e-4,
         0.005,
     )
@@ -121,73 +121,72 @@ class SteeringSettings:
     max_rotation_per_length: float = parameter(
         math.radians(30.0) / 0.001,
         "rad/m",
-        "Most the base is turned per inserted length.",
+        "Maximum rotation of the base per inserted length.",
         0.0,
         1000.0,
     )
     max_winding: float = parameter(
         6.0 * math.pi,
         "rad",
-        "The roll law keeps rotation_joint within +- this: beyond, it turns the other "
-        "way round. (The law of [KC09] never winds up.)",
+        "The roll law keeps rotation_joint within +- this value: it then turns the other way. (The "
+        "law of [KC09] never winds up.)",
         2.0 * math.pi,
         1000.0,
     )
     rotation_budget: float = parameter(
         1e6,
         "rad",
-        "Most the base turns, either way, from the first tip to a point: with less it "
-        "turns more seldom, and corrects less. Not past obstacles.",
+        "Maximum total rotation of the base, in both directions, on the way to a point; a lower "
+        "value means fewer corrections. Not used with obstacles.",
         0.0,
         1e6,
     )
     tip_timeout: float = parameter(
-        2.0, "s", "Time without a good tip (steady clock) until WAITING_FOR_TIP.", 0.01, 60.0
+        2.0, "s", "Time without a valid tip until WAITING_FOR_TIP (monotonic clock).", 0.01, 60.0
     )
     tip_covariance: str = parameter(
         "from_tip_pose",
         "-",
-        "from_tip_pose = a tip has the covariance of the needle/tip_pose with its "
-        "stamp plus measurement_std squared, and is refused without one; configured = every tip "
-        "has the noise of tip_noise: for a source of needle/tip alone.",
+        "from_tip_pose: the covariance of the needle/tip_pose with the tip's stamp, plus "
+        "measurement_std squared; a tip without one is rejected. configured: the noise of "
+        "tip_noise, for a source that only publishes needle/tip.",
         choices=TIP_COVARIANCES,
     )
     result_timeout: float = parameter(
         10.0,
         "s",
-        "Time without device/result (steady clock) until FAULT, the device at rest.",
+        "Time without device/result until FAULT, while the device is at rest (monotonic clock).",
         0.1,
         600.0,
     )
     tip_margin: float = parameter(
-        0.004, "m", "What noise may add to a tip's distance from where the needle can be.", 0.0, 0.1
+        0.004, "m", "Accepted distance of a measured tip from the needle's reach.", 0.0, 0.1
     )
     needle_out_insertion: float = parameter(
-        0.002, "m", "Insertion up to which the needle counts as out.", 0.0, 0.01
+        0.002, "m", "Up to this insertion the needle counts as out of the phantom.", 0.0, 0.01
     )
     retraction_tolerance: float = parameter(
-        0.0002, "m", "Backward motion that counts as a retraction.", 1e-6, 0.01
+        0.0002, "m", "Minimum backward motion that counts as a retraction.", 1e-6, 0.01
     )
     tip_noise: str = parameter(
         "normal",
         "-",
-        "Where tip_covariance is configured: a coordinate is off by up to "
-        "tip_noise_bound (bounded, used as such by best), or "
-        "with standard deviation measurement_std (normal).",
+        "Noise of each coordinate if tip_covariance is configured. bounded: errors up to "
+        "tip_noise_bound (best uses this bound); normal: standard deviation measurement_std.",
         choices=TIP_NOISES,
     )
     tip_noise_bound: float = parameter(
         0.001,
         "m",
-        "Largest error of one measured tip coordinate, where tip_noise is bounded.",
+        "Maximum error of a measured tip coordinate if tip_noise is bounded.",
         1e-6,
         0.1,
     )
     flip_depths: tuple[float, ...] = parameter(
         (),
         "m",
-        "Insertions at which the bevel is flipped within the plane, increasing; not "
-        "with presets paper and open_loop.",
+        "Insertions at which the bevel is flipped within the plane, in increasing order; not with "
+        "presets paper and open_loop.",
         0.0,
         1.0,
     )
@@ -198,52 +197,52 @@ class SteeringSettings:
     process_noise: tuple[float, ...] = parameter(
         (5.0e-7, 0.13, 24.0),
         "m, 1/m, 1/m^3",
-        "Variance per metre of white noise on the derivatives of s, for the observer.",
+        "Observer: variance per metre of white noise on the derivatives of s1, s2, s3.",
         0.0,
     )
     measurement_std: float = parameter(
         1e-4,
         "m",
-        "Standard deviation of one measured tip coordinate; with tip_covariance "
-        "from_tip_pose of what its covariance leaves out.",
+        "Standard deviation of a measured tip coordinate; with tip_covariance from_tip_pose, of "
+        "the errors that its covariance does not contain.",
         1e-7,
         0.1,
     )
     saturation_margin: float = parameter(
-        0.11, "-", "The estimate is kept within s2^2 + (s3/curvature)^2 <= 1 - this.", 1e-6, 0.9
+        0.11, "-", "Limits the estimate to s2^2 + (s3/curvature)^2 <= 1 - this value.", 1e-6, 0.9
     )
     demand_margin: float = parameter(
         0.26,
         "-",
-        "The state the law demands is kept within s2^2 + (s3/curvature)^2 <= 1 - this.",
+        "Limits the demanded state to s2^2 + (s3/curvature)^2 <= 1 - this value.",
         1e-6,
         0.9,
     )
     entry_angle_std: float = parameter(
         math.radians(8.0),
         "rad",
-        "How well pitch and yaw at the entry are known, for preset best and for paths.",
+        "Standard deviation of pitch and yaw at the entry, for preset best and for paths.",
         1e-3,
         math.pi,
     )
     initial_yaw_std: float = parameter(
         math.radians(10.0),
         "rad",
-        "How well the yaw at the entry is known (covariance only).",
+        "Standard deviation of the yaw at the entry (only for the covariance).",
         0.0,
         math.pi,
     )
     initial_pitch_std: float = parameter(
         math.radians(10.0),
         "rad",
-        "How well the pitch at the entry is known (covariance only).",
+        "Standard deviation of the pitch at the entry (only for the covariance).",
         0.0,
         math.pi,
     )
     initial_roll_std: float = parameter(
         math.radians(30.0),
         "rad",
-        "How well the roll at the entry is known (covariance only).",
+        "Standard deviation of the roll at the entry (only for the covariance).",
         0.0,
         math.pi,
     )

@@ -9,8 +9,8 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.ros.main import run_component
 
 HELP = """
-plane_controller: steers the needle into the target plane, or to the target point, one insertion
-step per measured tip.
+plane_controller: steers the needle into the target plane or to the target point, with one insertion
+step, or one new path if it inserts continuously, per measured tip.
 
 Subscribes  needle/tip, needle/tip_pose (its covariance), target_plane, target_point, obstacles,
             joint_states, device/result, device/status

@@ -24,8 +24,8 @@ usage: ros2 run PACKAGE EXECUTABLE [arguments]
        ros2 service call SERVICE TYPE [YAML]
        ros2 param get NODE NAME | set NODE NAME VALUE
 
-This is a small stand-in: PyPI has no ros2 command line. It runs the nodes and tools of this
-project and speaks to a running graph; `ros2 topic pub --help` and the like say more. For
+A small substitute for the ros2 command line, which PyPI does not have. It runs the nodes and tools
+of this project and accesses a running graph; `ros2 topic pub --help` shows its options. For
 everything else (bag, launch, ...) install ROS 2 Jazzy, source it and run scripts/setup again.
 """
 _MODULE = ".executables"

@@ -269,7 +269,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--timeout", type=float, default=float("inf"), metavar="N", help="exit after N seconds")
     add = command("topic", "pub", pub, "topic_name", "message_type")
     add("values", nargs="?", default="{}", help="YAML; `now` is the time of sending")
-    add("-r", "--rate", type=float, default=1.0, metavar="N", help="[Hz]")
+    add("-r", "--rate", type=float, default=1.0, metavar="N", help="rate [Hz]")
     add("-p", "--print", type=int, default=1, metavar="N", help="print every N-th message")
     add("-1", "--once", action="store_true")
     add("-t", "--times", type=int, default=0, metavar="N")

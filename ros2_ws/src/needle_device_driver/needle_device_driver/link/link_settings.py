@@ -21,15 +21,15 @@ class LinkSettings:
     link: str = fixed_parameter(
         "slcan",
         "-",
-        "slcan: serial adapter or pseudo-terminal; socketcan: Linux CAN interface; socketcand: one "
-        "over TCP; virtual: inside one process.",
+        "slcan: serial adapter or pseudo-terminal; socketcan: Linux CAN interface; socketcand: CAN "
+        "interface over TCP; virtual: inside one process.",
         choices=("slcan", "socketcan", "socketcand", "virtual"),
     )
     channel: str = fixed_parameter(
-        "/dev/ttyACM0", "-", "Device file (slcan) or name of the interface."
+        "/dev/ttyACM0", "-", "Device file (slcan) or name of the CAN interface."
     )
     bitrate: int = fixed_parameter(
-        500_000, "bit/s", "Of the CAN bus; slcan only.", 10_000, 1_000_000
+        500_000, "bit/s", "Bitrate of the CAN bus; slcan only.", 10_000, 1_000_000
     )
     tty_baudrate: int = fixed_parameter(
         115_200, "bit/s", "Of the serial port; slcan only, USB adapters ignore it.", 9600, 4_000_000

@@ -14,19 +14,20 @@ from needle_device_driver.link.can_port import CanPort
 from needle_device_driver.parameters import DeviceDriverParameters, DriverParameters
 
 HELP = """\
-device_driver: moves the needle's stepper stage and rotation servo, CiA 402 drives on a CAN bus.
+device_driver: moves the insertion stepper and the rotation servo, CiA 402 drives on a CAN bus.
 
 Publishes   joint_states (50 Hz), device/status, device/result
 Subscribes  device/joint_trajectory, device/hold, device/estop
 Services    device/{home,retract,stop,reset}, device/{enable,confirm_needle_out}
 
-Nothing moves at start. To move: device/confirm_needle_out true, device/home, device/enable true,
-then press the hold and send steps. docs/hardware.md: wiring, adapters, bringing up new drives;
-docs/safety.md: every rule that stops or refuses a motion.
+The node waits for adapter and drives (`connect_timeout`); nothing moves at start. To move the
+needle, call device/confirm_needle_out with true, device/home and device/enable with true, then hold
+the switch and send steps. Ctrl-C stops both axes and disables the drives.
 
-It waits up to `connect_timeout` for adapter and drives. Ctrl-C stops the axes and switches them
-off.
-Exit code   0 when ended, 2 when the adapter or a drive is missing, or for bad parameters
+docs/hardware.md: wiring, adapters, commissioning of drives
+docs/safety.md:   all rules that stop or reject a motion
+
+Exit codes: 0 ended by a signal; 2 the adapter or a drive is missing, or a parameter is invalid
 """
 
 # Longer than a node takes to discover its peers on the same machine [s].

@@ -16,7 +16,7 @@ HARD_HOLD_TIMEOUT_CAP = 0.5
 # Longest step: 5 mm at 0.01 mm/s, plus a margin [s].
 HARD_STEP_TIME_CAP = 600.0
 _SMALLEST = 1e-5
-_FOLLOWING = "Largest distance from the set-point."
+_FOLLOWING = "Maximum distance from the set-point."
 _TOLERANCE = "Position tolerance at the target."
 
 
@@ -58,50 +58,50 @@ class SafetyLimits:
         Longest time for that after the last set-point [s].
     """
 
-    max_depth: float = fixed_parameter(0.2, "m", "Deepest insertion.", 0.001, 0.5)
+    max_depth: float = fixed_parameter(0.2, "m", "Maximum insertion depth.", 0.001, 0.5)
     max_step_length: float = fixed_parameter(
-        0.002, "m", "Longest insertion of one command.", _SMALLEST, HARD_STEP_LENGTH_CAP
+        0.002, "m", "Maximum insertion per command.", _SMALLEST, HARD_STEP_LENGTH_CAP
     )
     max_speed: float = fixed_parameter(
-        HARD_SPEED_CAP, "m/s", "Fastest insertion of a command.", _SMALLEST, HARD_SPEED_CAP
+        HARD_SPEED_CAP, "m/s", "Maximum insertion speed of a command.", _SMALLEST, HARD_SPEED_CAP
     )
     max_rotation_step: float = fixed_parameter(
-        1.2, "rad", "Largest rotation of one command.", 0.01, 2 * math.pi
+        1.2, "rad", "Maximum rotation per command.", 0.01, 2 * math.pi
     )
     max_rotation_rate: float = fixed_parameter(
-        math.pi, "rad/s", "Fastest rotation of a command.", 0.01, 20.0
+        math.pi, "rad/s", "Maximum rotation rate of a command.", 0.01, 20.0
     )
     max_turns: float = fixed_parameter(
-        10.0, "turns", "Largest rotation either way from home.", 0.1, 1000.0
+        10.0, "turns", "Maximum rotation from home, in either direction.", 0.1, 1000.0
     )
     hold_timeout: float = fixed_parameter(
         0.25,
         "s",
-        "Lifetime of a hold message after its arrival, steady clock.",
+        "Time after its arrival for which a hold message is valid (monotonic clock).",
         0.05,
         HARD_HOLD_TIMEOUT_CAP,
     )
     tip_age_limit: float = fixed_parameter(
-        2.0, "s", "A command is refused if the tip behind it is older, steady clock.", 0.05, 60.0
+        2.0, "s", "Maximum age of the tip that a command is based on (monotonic clock).", 0.05, 60.0
     )
     reply_age_limit: float = fixed_parameter(
-        0.1, "s", "A drive that is silent for longer has failed.", 0.05, 0.5
+        0.1, "s", "A drive that sends nothing for this long has failed.", 0.05, 0.5
     )
     retraction_speed: float = fixed_parameter(
-        0.002, "m/s", "Speed of a retraction.", _SMALLEST, HARD_SPEED_CAP
+        0.002, "m/s", "Retraction speed.", _SMALLEST, HARD_SPEED_CAP
     )
     homing_speed: float = fixed_parameter(
-        0.002, "m/s", "Speed towards the insertion switch.", _SMALLEST, HARD_SPEED_CAP
+        0.002, "m/s", "Homing speed of the insertion axis.", _SMALLEST, HARD_SPEED_CAP
     )
     homing_rotation_rate: float = fixed_parameter(
-        1.0, "rad/s", "Speed towards the rotation switch.", 0.01, 20.0
+        1.0, "rad/s", "Homing speed of the rotation axis.", 0.01, 20.0
     )
     insertion_following_error: float = fixed_parameter(0.0005, "m", _FOLLOWING, 1e-6, 10.0)
     rotation_following_error: float = fixed_parameter(0.1, "rad", _FOLLOWING, 1e-6, 10.0)
     insertion_tolerance: float = fixed_parameter(1e-6, "m", _TOLERANCE, 1e-7, 1.0)
     rotation_tolerance: float = fixed_parameter(1e-4, "rad", _TOLERANCE, 1e-7, 1.0)
     settling_time: float = fixed_parameter(
-        1.0, "s", "Longest time to the target after the last set-point.", 0.1, 10.0
+        1.0, "s", "Maximum time to reach the target after the last set-point.", 0.1, 10.0
     )
 
     def __post_init__(self) -> None:

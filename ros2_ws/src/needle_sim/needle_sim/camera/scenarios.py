@@ -246,10 +246,10 @@ class Scenario:
         check_bounds("noise", self.noise, 0.0, 50.0, "grey levels")
 
 
-CLEAN = Scenario("clean", "a clear phantom in good light")
+CLEAN = Scenario("clean", "clear phantom in good light")
 _CLUTTER = Scenario(
     "clutter",
-    "bubbles, glints on surface and needle, uneven light that drifts, more noise",
+    "bubbles, glints on surface and needle, uneven drifting light, more noise",
     noise=4.0,
     bubbles=Bubbles(70, 0.00015, 0.0012),
     glints=Glints(22, 2, 4, 0.005, 150.0),
@@ -257,7 +257,7 @@ _CLUTTER = Scenario(
 )
 _HEAVY_CLUTTER = Scenario(
     "heavy_clutter",
-    "more and bigger of these, glints over the needle, its shadow on the floor, a cable that moves",
+    "more and larger clutter, glints over the needle, its shadow on the floor, a moving cable",
     noise=5.0,
     bubbles=Bubbles(170, 0.00015, 0.0022),
     glints=Glints(40, 5, 7, 0.007, 240.0, flicker=0.4),
@@ -272,18 +272,18 @@ _ALL = (
     dataclasses.replace(
         _HEAVY_CLUTTER,
         name="occlusion",
-        summary="heavy clutter; hands pass over, one camera or both are blocked for a while",
+        summary="heavy clutter; hands pass, one or both cameras are blocked for a while",
         occlusion=Occlusion(),
     ),
     dataclasses.replace(
         _HEAVY_CLUTTER,
         name="absent",
-        summary="heavy clutter without a needle, whatever the stage does",
+        summary="heavy clutter without a needle, also while the stage moves",
         needle=False,
     ),
     Scenario(
         "defocus",
-        "cameras focused above the phantom: the deeper, the more blurred",
+        "cameras focused above the phantom: blur increases with depth",
         noise=4.0,
         bubbles=Bubbles(45, 0.0002, 0.0015),
         lighting=Lighting(0.04, 0.1, 0.03),
@@ -291,20 +291,20 @@ _ALL = (
     ),
     Scenario(
         "steel",
-        "a bare needle that mirrors a lamp along part of its shaft, dark where it bends away",
+        "bare needle that mirrors a lamp along part of its shaft, dark where it bends away",
         metal=MetalShaft(),
         lighting=Lighting(0.04, 0.1, 0.03),
     ),
     Scenario(
         "steel_on_graph_paper",
-        "the same over ruled paper that lies askew",
+        "bare needle over ruled paper at an angle",
         metal=MetalShaft(),
         lighting=Lighting(0.04, 0.1, 0.03),
         paper=GraphPaper(),
     ),
     Scenario(
         "hard_shadow",
-        "a small lamp: the needle's shadow is as dark and whole as the needle, close beside it",
+        "small lamp: the needle's shadow is as dark and continuous as the needle, close beside it",
         lighting=Lighting(0.04, 0.1, 0.03),
         shadow=FloorShadow(0.027, 0.75, 0.3, 0.003),
     ),

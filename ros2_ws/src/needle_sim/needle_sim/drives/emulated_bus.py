@@ -141,13 +141,13 @@ def bus_health(bus: EmulatedBus) -> Diagnostic:
 
 
 COMMANDS = """\
-cut_bus             frames get lost both ways; the adapter stays
-unplug              the adapter disappears
-stall AXIS          the motor is blocked
-reboot AXIS         the drive loses its power for a moment
-emcy AXIS CODE      the drive has a fault of that error code, such as 0x5530
-hang AXIS           the drive's processor hangs: silent, the motor ends at its set-point
-restore             end of cut_bus, unplug, stall and hang; AXIS is insertion or rotation"""
+cut_bus             lose all frames in both directions; the adapter stays connected
+unplug              remove the adapter
+stall AXIS          block the motor
+reboot AXIS         interrupt the drive's power
+emcy AXIS CODE      put the drive into a fault with this error code, such as 0x5530
+hang AXIS           hang the drive's processor: it is silent, the motor ends at its set-point
+restore             end cut_bus, unplug, stall and hang; AXIS is insertion or rotation"""
 
 
 class PlugCommand(enum.Enum):

@@ -153,7 +153,7 @@ class NamedAppearance:
 RANDOM = "random"
 
 APPEARANCES = {
-    RANDOM: NamedAppearance("everything is drawn by the seed"),
+    RANDOM: NamedAppearance("all properties drawn from the seed"),
     "drawn_on_grey": NamedAppearance(
         "drawn steel under two softboxes", "drawn", "softboxes", "grey"
     ),
@@ -184,7 +184,7 @@ APPEARANCES = {
         "drawn steel, screws and cables behind", "drawn", None, "clutter"
     ),
     "absent": NamedAppearance(
-        "no needle: bubbles, lint, print; all drawn by the seed", needle=False
+        "no needle: bubbles, lint, print; all drawn from the seed", needle=False
     ),
 }
 """Name to fixed properties."""

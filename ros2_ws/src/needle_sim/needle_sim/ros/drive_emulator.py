@@ -19,20 +19,20 @@ from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator, Dri
 from needle_sim.drives.emulated_bus import COMMANDS, PlugCommand
 
 HELP = f"""\
-drive_emulator: a stepper (insertion) and a servo (rotation) as CiA 402 drives on one CAN bus.
+drive_emulator: emulates a stepper (insertion) and a servo (rotation), CiA 402 drives on a CAN bus.
 
-Whatever drives them reaches the bus as through a serial adapter (slcan) at a pseudo-terminal. The
-drives know profile position, homing (methods 17, 18, 35, 37) and cyclic synchronous position mode,
-software limits, following error, emergencies, heartbeats both ways.
+A pseudo-terminal acts as serial adapter (slcan) to the bus. The drives support profile position,
+homing (methods 17, 18, 35, 37) and cyclic synchronous position mode, software limits, following
+errors, emergency messages, and heartbeats in both directions.
 
-By hand, beside a driver:
+To run it with a driver:
     ros2 run needle_sim drive_emulator --ros-args -p pty:=/tmp/can
     ros2 run needle_device_driver device_driver --ros-args -p link:=slcan -p channel:=/tmp/can
 
-Faults on command: type a line into this program's terminal, or write it to its input.
+To inject a fault, type a line into this program's terminal or write it to its standard input:
 {"".join(f"    {line}" + chr(10) for line in COMMANDS.splitlines())}
-Publishes   sim/drive_positions: where the motors really are, from the home switch's edge, whatever
-            the drives count; 50 Hz
+Publishes   sim/drive_positions (50 Hz): true positions of the motors, from the edge of the home
+            switch, independent of the drives' counters
 """
 
 _WAKE_UP_PERIOD = 0.2

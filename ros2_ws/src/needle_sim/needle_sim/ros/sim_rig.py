@@ -12,13 +12,13 @@ from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
 
 HELP = """\
-sim_rig: stands in for the rig, so that every other node runs as on the real one.
+sim_rig: simulates the rig; every other node runs as on the real rig.
 
-Publishes   sim/tip_pose (the truth);
+Publishes   sim/tip_pose (the true tip);
             levels tip and camera: joint_states, device/status, device/result;
             level tip: needle/tip, needle/tip_pose;
             levels camera and drive: stereo/{left,right}/{image_raw,camera_info};
-            level drive: device/estop, when the tip leaves the phantom
+            level drive: device/estop, if the tip leaves the phantom
 Subscribes  needle/controller_status;
             levels tip and camera: device/joint_trajectory, device/hold, device/estop;
             level drive: sim/drive_positions, which moves the needle

@@ -35,28 +35,27 @@ from needle_sim.sequences.boxes import draw_box
 RENDERERS = ("quick", "path_traced")
 
 DESCRIPTION = """\
-Render the stereo images of a needle that goes into a phantom on a random, steered-like path.
+Render stereo images of a needle during its insertion into a phantom, on a random steered path.
 
-The folder gets left/NNNNNN.png, right/NNNNNN.png, calibration.yaml, insertion.csv (name,
-insertion_m) and truth.csv: the tip, pitch and yaw of heading and of the visible shaft's end, and
-the share of the last 10 mm that each camera sees. Fields are empty where there is no needle. The
-first frame is at insertion 0, or at --start-mm; where the depth is reached, the stage rests.
+Writes left/NNNNNN.png, right/NNNNNN.png, calibration.yaml, insertion.csv (name, insertion_m) and
+truth.csv: the tip, pitch and yaw of the heading and of the visible end of the shaft, and the share
+of the last 10 mm that each camera sees; fields are empty without a needle. The first frame is at
+insertion 0 or --start-mm; the stage stops at the depth.
 
-Renderer quick draws a line of the needle's width with a scenario's troubles. Renderer path_traced
-follows the light in a scene of metal, lamps and floor, which an appearance names; truth.csv then
-has the bevel, too. It needs an extra that is not installed by default (docs/dependencies.md).
+Renderer quick draws a line as wide as the needle, with the disturbances of a scenario. Renderer
+path_traced traces the light in a scene of metal, lamps and floor, given by an appearance; truth.csv
+then also contains the bevel. It requires an optional extra (docs/dependencies.md).
 """
 
 EPILOG = """\
 examples:
   ros2 run needle_sim render_images --output /tmp/clutter --scenario clutter
-  ros2 run needle_sim render_images --output /tmp/empty --scenario absent --frames 720 --step-mm 0.2
   ros2 run needle_sim render_images --output /tmp/traced --renderer path_traced --seed 7 \\
       --start-mm 54 --depth-mm 60
-  ros2 run needle_sim render_images --output /tmp/box --renderer path_traced --box --seed 7 \
+  ros2 run needle_sim render_images --output /tmp/box --renderer path_traced --box --seed 7 \\
       --appearance drawn_before_clutter --start-mm 54 --depth-mm 60
 
-exit codes: 0 done, 2 bad input or something missing, 130 interrupted.
+exit codes: 0 done; 2 invalid input or a missing file or package; 130 interrupted
 """
 
 
@@ -214,23 +213,23 @@ def _parser() -> CommandParser:
     add = parser.add_argument
     add("--output", required=True, metavar="DIR", help="new or empty folder")
     add("--renderer", default="quick", metavar="R", help="quick or path_traced (default: quick)")
-    add("--scenario", metavar="NAME", help="of quick, see below (default: clean)")
-    add("--appearance", metavar="NAME", help="of path_traced, see below (default: random)")
-    add("--frames", metavar="N", help="how many pairs (default: to the depth)")
-    add("--seed", default="0", metavar="N", help="keys path and images (default: 0)")
-    add("--start-mm", default="0", metavar="D", help="insertion of the first frame (default: 0)")
-    add("--depth-mm", default="120", metavar="D", help="where the stage stops (default: 120)")
-    add("--step-mm", default="1", metavar="S", help="insertion between frames (default: 1)")
+    add("--scenario", metavar="NAME", help="for quick, see below (default: clean)")
+    add("--appearance", metavar="NAME", help="for path_traced, see below (default: random)")
+    add("--frames", metavar="N", help="number of pairs (default: up to the depth)")
+    add("--seed", default="0", metavar="N", help="seed of path and images (default: 0)")
+    add("--start-mm", default="0", metavar="D", help="insertion at the first frame (default: 0)")
+    add("--depth-mm", default="120", metavar="D", help="final insertion [mm] (default: 120)")
+    add("--step-mm", default="1", metavar="S", help="insertion between frames [mm] (default: 1)")
     add(
         "--curvature",
         default=repr(CURVATURE),
         metavar="K",
-        help=f"of the needle's path [1/m] (default: {CURVATURE:.3f})",
+        help=f"curvature of the needle's path [1/m] (default: {CURVATURE:.3f})",
     )
-    add("--noise", metavar="SIGMA", help="of quick's sensor [grey levels] (default: scenario's)")
-    add("--calibration", metavar="FILE", help="of the cameras (default: needle_tracker's own)")
-    add("--box", action="store_true", help="draw two webcams before an acrylic box, by the seed")
-    add("--json", metavar="FILE", help="write what was done as one flat JSON object")
+    add("--noise", metavar="SIGMA", help="noise of quick [grey levels] (default: the scenario's)")
+    add("--calibration", metavar="FILE", help="of the cameras (default: needle_tracker's)")
+    add("--box", action="store_true", help="two webcams and an acrylic box, drawn from the seed")
+    add("--json", metavar="FILE", help="also write a summary as flat JSON")
     return parser
 
 

@@ -36,27 +36,29 @@ from needle_tracker.sources.image_files import (
 )
 
 DESCRIPTION = """\
-Measure the needle's tip in stereo images, paired by file name and taken in the order of their names
-(numbers count as numbers), or in two videos frame by frame (names are 000000, 000001, ...). Names
-are equal or differ in left and right, l and r, cam0 and cam1 (left-0001.png, right-0001.png: 0001).
+Measure the needle's tip in stereo images or in two videos.
+
+Images are paired by file name and processed in the order of their names (numbers sort as numbers).
+The names of a pair are equal, or differ in left and right, l and r, or cam0 and cam1: left-0001.png
+and right-0001.png are pair 0001. Frames of a video are named 000000, 000001, ...
 """
 EPILOG = """\
-The output is a CSV file, one line for each pair:
+The output is a CSV file with a line per pair:
   name            file name without left or right (video: number of the frame)
-  valid           1 with a tip, 0 without; then the tip's fields are empty
-  x_m y_m z_m     the tip in rig: x up, z along the insertion, from the needle's entry point
-  sigma_*_m       its standard deviations
+  valid           1 with a tip, 0 without; the tip's fields are then empty
+  x_m y_m z_m     tip in rig: x up, z along the insertion, origin at the needle's entry point
+  sigma_*_m       standard deviations of the tip
   pitch_rad yaw_rad   of the shaft at its visible end: asin(d_x) and atan2(-d_y, d_z)
-  left_end right_end  how many needle ends the network expects there, about 1 where the end is seen
-  left_shaft right_shaft  mean probability of shaft behind it; empty where nothing was found
-  missing         why there is no tip; docs/own_rig.md says what helps
---insertion helps: one look at the needle is then enough. A needle shorter than 8 mm (entry_zone) is
-seen or not: nothing is wrong with images that do not show it.
-The stage's zero and scale may be off (stage_zero_sigma, stage_scale_sigma); both are estimated and
-printed.
-Without --insertion tips come from the images alone: the needle is believed when its end has moved
-as a needle does. One at rest is not told from an old track.
---params takes the parameters of the node stereo_tracker, of which those for topics change nothing.
+  left_end right_end  expected number of needle ends at the tip, about 1 for a visible end
+  left_shaft right_shaft  mean probability of shaft behind it; empty if nothing was found
+  missing         why there is no tip; docs/own_rig.md gives remedies
+
+With --insertion a single pair is enough for a tip. The stage's zero and scale may be wrong
+(stage_zero_sigma, stage_scale_sigma): both are estimated and printed. Below an insertion of 8 mm
+(entry_zone) the needle does not have to be visible.
+Without --insertion a needle is accepted only after its end has moved like a needle: at rest it
+cannot be distinguished from an old needle track.
+--params has the parameters of the node stereo_tracker; those for topics have no effect.
 
 examples:
   ros2 run needle_tracker track_images --calibration rig.yaml --left left --right right \\
@@ -64,15 +66,15 @@ examples:
   ros2 run needle_tracker track_images --calibration out/calibration.yaml --left out/left \\
       --right out/right --insertion out/insertion.csv --output tips.csv \\
       --truth out/truth.csv --overlay out/seen
-      of a folder out of render_images: how far off the tips are, and pictures of what was found
+      errors of the tips, and annotated images, for a folder `out` of render_images
 
-With --truth, --json has (null without):
-  compared missed tips_without_needle without_truth   how many
-  error_rms_mm error_p95_mm error_max_mm              in 3D; error_x_rms_mm, ... by axis
-  error_sigmas      root mean square of the errors in claimed standard deviations: 1 is as claimed
-  inside_95         share within the ellipsoids that should hold 95 %
+Figures in --json that require --truth, else null:
+  compared missed tips_without_needle without_truth   numbers of pairs
+  error_rms_mm error_p95_mm error_max_mm              in 3D; error_x_rms_mm, ... per axis
+  error_sigmas      root mean square of error / standard deviation; ideally 1
+  inside_95         share of the tips inside their 95 % ellipsoids
 
-exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
+exit codes: 0 done; 2 invalid input or a missing file; 130 interrupted
 """
 COLUMNS = (
     *("name", "valid", "x_m", "y_m", "z_m"),
@@ -286,23 +288,23 @@ def _parser() -> CommandParser:
     add("--calibration", required=True, metavar="FILE", help="calibration file of the stereo rig")
     add("--left", required=True, metavar="DIR", help="folder of the left images, or a video")
     add("--right", required=True, metavar="DIR", help="folder of the right images, or a video")
-    add("--insertion", metavar="FILE", help="CSV with name,insertion_m")
-    add("--output", required=True, metavar="FILE.csv", help="where the tips go")
+    add("--insertion", metavar="FILE", help="CSV name,insertion_m")
+    add("--output", required=True, metavar="FILE.csv", help="file for the tips")
     add(
         "--overlay",
         metavar="DIR",
-        help="new folder for pictures of each pair: the shaft's end green (yellow: its line alone, "
-        "red: not believed), and how surely each view shows end and shaft",
+        help="new folder for an annotated image of each pair: the shaft's end in green (yellow: "
+        "only its line, red: rejected), with the confidence of end and shaft in each view",
     )
     add(
         "--truth",
         metavar="FILE",
-        help="CSV with name,x_m,y_m,z_m of the true tips, empty where there is no needle "
-        "(render_images writes one): prints errors in mm and in claimed standard deviations",
+        help="CSV name,x_m,y_m,z_m of the true tips, empty without a needle (written by "
+        "render_images): print the errors in mm and in standard deviations",
     )
     add("--params", metavar="FILE", help="ROS parameter file with stereo_tracker's parameters")
-    add("--needle-width-mm", metavar="W", help="diameter of the needle (default: 0.7)")
-    add("--json", metavar="FILE", help="write the counts as one flat JSON object")
+    add("--needle-width-mm", metavar="W", help="diameter of the needle [mm] (default: 0.7)")
+    add("--json", metavar="FILE", help="also write the figures as flat JSON")
     return parser
 
 

@@ -23,60 +23,60 @@ class StereoTrackerParameters:
     reference_folder: str = fixed_parameter(
         "",
         "-",
-        "Folder with left/ and right/: images of the phantom without needle, from just before the "
-        "recording; empty: taken from the pairs before each insertion.",
+        "Folder with left/ and right/, images of the phantom without needle from just before the "
+        "recording; empty: use the pairs before each insertion.",
     )
     reliable_images: bool = fixed_parameter(
-        True, "-", "Take images reliably, for simulation; false: best effort, for hardware."
+        True, "-", "Subscribe to images reliably (simulation); false: best effort (hardware)."
     )
     pair_tolerance: float = fixed_parameter(
-        0.0, "s", "Largest difference of the stamps of a pair's left and right image.", 0.0, 0.1
+        0.0, "s", "Maximum difference of the stamps of a pair's images.", 0.0, 0.1
     )
     free_running: bool = fixed_parameter(
         False,
         "-",
-        "Each camera runs by itself: images pair up to half a frame apart, as their stamps say, "
-        "and pair_tolerance does not count.",
+        "The cameras are not synchronized: pair images whose stamps differ by up to half a frame, "
+        "and ignore pair_tolerance.",
     )
     joint_timeout: float = fixed_parameter(
-        1.0, "s", "Longest wait of a pair for the joint state that follows it.", 0.0, 60.0
+        1.0, "s", "Maximum wait of a pair for the joint state after it.", 0.0, 60.0
     )
     needle_width: float = fixed_parameter(
-        0.7e-3, "m", "Diameter of the needle, good to 30 %.", 0.2e-3, 3e-3
+        0.7e-3, "m", "Diameter of the needle, within 30 %.", 0.2e-3, 3e-3
     )
     entry_zone: float = fixed_parameter(
         8e-3,
         "m",
-        "Insertion below which the tip of a needle that is not seen follows from the insertion.",
+        "Below this insertion, the tip of an invisible needle is computed from the insertion.",
         0.0,
         0.05,
     )
     hole_clearance: float = fixed_parameter(
-        2.0e-3, "m", "Radius about the entry point that is not looked at (hole, rim).", 0.5e-3, 0.02
+        2.0e-3, "m", "Radius around the entry point that is not searched (hole, rim).", 0.5e-3, 0.02
     )
     hole_tolerance: float = fixed_parameter(
-        0.5e-3, "m", "How far from the entry point the needle may pass.", 0.01e-3, 5e-3
+        0.5e-3, "m", "Maximum distance of the needle from the entry point.", 0.01e-3, 5e-3
     )
     entry_angle: float = fixed_parameter(
-        0.1745, "rad", "Largest angle of the needle to rig's z at the entry.", 0.0, 0.7
+        0.1745, "rad", "Maximum angle between needle and rig's z axis at the entry.", 0.0, 0.7
     )
     max_curvature: float = fixed_parameter(
-        9.0, "1/m", "Largest curvature of the needle's path.", 0.1, 50.0
+        9.0, "1/m", "Maximum curvature of the needle's path.", 0.1, 50.0
     )
     max_insertion: float = fixed_parameter(
-        0.15, "m", "Longest insertion; nothing is looked for farther from the entry.", 0.01, 1.0
+        0.15, "m", "Maximum insertion; the search ends at this distance from the entry.", 0.01, 1.0
     )
     stage_zero_sigma: float = fixed_parameter(
-        0.5e-3, "m", "Standard deviation of the stage's zero at the entry.", 0.01e-3, 5e-3
+        0.5e-3, "m", "Standard deviation of the stage's zero from the entry.", 0.01e-3, 5e-3
     )
     stage_scale_sigma: float = fixed_parameter(
         0.01, "-", "Standard deviation of the insertion's scale.", 1e-4, 0.1
     )
     tip_lean: float = fixed_parameter(
-        0.21, "rad", "Largest angle between visible end and needle's path (pre-bend).", 0.0, 0.8
+        0.21, "rad", "Maximum angle between visible end and path (pre-bend).", 0.0, 0.8
     )
     annotated_rate: float = fixed_parameter(
-        2.0, "Hz", "Most annotated images a second, while someone subscribes; 0: none.", 0.0, 100.0
+        2.0, "Hz", "Maximum rate of annotated images, if subscribed to; 0: none.", 0.0, 100.0
     )
 
     def __post_init__(self) -> None:

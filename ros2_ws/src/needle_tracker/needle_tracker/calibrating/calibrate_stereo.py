@@ -37,13 +37,13 @@ from needle_tracker.optics.window import Window
 _DESCRIPTION = """\
 Calibrate the stereo rig from images of a ChArUco board.
 
-LEFT and RIGHT hold the images of each camera. Paired are equal names, and names that differ in
-left and right, l and r, or cam0 and cam1 (then LEFT and RIGHT may be one folder). The session file
-says what the board is and where it lay, in metres in the frame `rig` (x up, z along the insertion,
+The folders --left and --right have the images of the cameras. The names of a pair are equal, or
+differ in left and right, l and r, or cam0 and cam1 (both folders may then be the same). The session
+file describes the board and its places, in metres in the frame `rig` (x up, z along the insertion,
 origin at the needle's entry point):
 
   board: {columns: 12, rows: 9, square: 0.010, marker: 0.0075, dictionary: DICT_5X5_100}
-  phantom: {surface_height: 0.0175, refractive_index: 1.33}      # kept where not determined
+  phantom: {surface_height: 0.0175, refractive_index: 1.33}      # used if not determined
   places:                                                        # by file name, * and ? allowed
     surface_near: {origin: [0.0185, -0.045, 0.0025]}
     surface_far: {origin: [0.0185, -0.045, 0.0125]}
@@ -51,14 +51,14 @@ origin at the needle's entry point):
                   under_surface: true, sigma: 2.0e-5}
 
 `origin` is the outer corner of the pattern's first square, top left as printed; `columns` and
-`rows` are the directions in which these count (default [0, 0, 1] and [0, 1, 0]); `sigma` is how
-well the place is known. An image whose name has no place is a board held freely in air: 6 at
-least, 20 are better, tilted by 15 to 45 deg in all directions. docs/calibration.md says how to take
-the images, and how to calibrate cameras that look through walls or from aside.
+`rows` are the directions of increasing columns and rows (default [0, 0, 1] and [0, 1, 0]); `sigma`
+is the standard deviation of the place. Images without a place show the board held freely in air:
+at least 6, better 20, tilted by 15 to 45 deg in all directions. docs/calibration.md explains how to
+take the images, and how to calibrate cameras that look through walls or from the side.
 
---lenses keeps lenses and relative pose as ROS (LEFT.yaml RIGHT.yaml), Kalibr (camchain.yaml; cam0
-is left) or OpenCV (intrinsics.yml extrinsics.yml) wrote them, in metres: then a board at one place
-in air, and those under the surface, suffice.
+--lenses keeps the lenses and the relative pose of a calibration by ROS (LEFT.yaml RIGHT.yaml),
+Kalibr (camchain.yaml; cam0 is left) or OpenCV (intrinsics.yml extrinsics.yml), in metres: one place
+in air and the places under the surface are then enough.
 """
 _COLOURS = {"left": "#1668b0", "right": "#d1701b"}
 _BOARDS = {
@@ -75,9 +75,9 @@ examples:
   ros2 run needle_tracker calibrate_stereo --board board.pdf
   ros2 run needle_tracker calibrate_stereo --left L --right R --session S.yaml --output rig.yaml
 
-exit codes: 0 done; 1 calibrated and written, but NOT OK, or tips are not expected within --goal-mm;
-1, and nothing written, where many pairs were not taken at once; 2 bad input or a set of views that
-cannot determine the rig (nothing written); 130 interrupted
+exit codes: 0 done; 1 NOT OK or a tip error above --goal-mm (the calibration is written), or many
+pairs not taken simultaneously (nothing is written); 2 invalid input, or the views do not determine
+the rig (nothing is written); 130 interrupted
 """
 
 
@@ -219,11 +219,11 @@ def _parser() -> CommandParser:
     add("--left", type=Path, metavar="DIR", help="images of the left camera")
     add("--right", type=Path, metavar="DIR", help="images of the right camera")
     add("--session", type=Path, metavar="FILE", help="board, windows and places (YAML)")
-    add("--output", type=Path, metavar="FILE.yaml", help="the calibration file to write")
+    add("--output", type=Path, metavar="FILE.yaml", help="calibration file to write")
     add("--lenses", type=Path, nargs="+", metavar="FILE", help="keep these lenses (see above)")
-    add("--goal-mm", type=float, default=0.06, metavar="MM", help="wanted tip error (0.06)")
+    add("--goal-mm", type=float, default=0.06, metavar="MM", help="required tip error (0.06)")
     add("--json", type=Path, metavar="FILE", help="also write the figures as flat JSON")
-    add("--board", type=Path, metavar="FILE.pdf|.png", help="write a board to print and end")
+    add("--board", type=Path, metavar="FILE.pdf|.png", help="write a board for printing, and exit")
     return parser
 
 

@@ -39,24 +39,24 @@ from needle_tracker.sources.image_files import size_problem
 from needle_tracker.sources.pairing import PairMatcher
 
 _DESCRIPTION = """\
-Check a stereo calibration with a ChArUco board of known place: a camera turned by 0.02 deg, an
-index off by 0.01 or another surface height are silent (both rays still meet) and cost 0.1 to
-0.7 mm. Prints what differs, by how much and what it does to tips.
+Check a stereo calibration with a ChArUco board at known places. A camera rotated by 0.02 deg, a
+refractive index off by 0.01 or a changed surface height cause tip errors of 0.1 to 0.7 mm without
+warning, because both rays still meet. Prints each deviation and the resulting tip error.
 
-The session file is that of calibrate_stereo (see there): board and places. For a check lay the
-board flat on the surface and, tilted, at a known place under it, and give each place the `sigma`
-that it is really known to. A place given wrong looks like both cameras turned.
+The session file is that of calibrate_stereo (see its --help). Place the board flat on the surface
+and, tilted, at a known place under it; give each place its true standard deviation `sigma`. A wrong
+place looks like a rotation of both cameras.
 
-Recorded images: --left and --right, folders paired by name; an image whose name is no place of the
-session is taken for a board held freely in air, which says little. Live: --live NAME takes pairs
-from stereo/{left,right}/image_raw; the board stands still at the session's place NAME.
+Recorded images: --left and --right, paired by name. An image without a place in the session counts
+as a board held freely in air, which shows little. Live: --live NAME uses pairs of
+stereo/{left,right}/image_raw, with the board at rest at the session's place NAME.
 """
 _EPILOG = """\
 examples:
   ros2 run needle_tracker check_calibration --calibration rig.yaml --session S.yaml --left L --right R
   ros2 run needle_tracker check_calibration --calibration rig.yaml --session S.yaml --live under_wedge
 
-exit codes: 0 OK; 1 NOT OK, or this target cannot show it; 2 bad input, no images or no board;
+exit codes: 0 OK; 1 NOT OK, or this target cannot show it; 2 invalid input, no images or no board;
 130 interrupted
 """  # noqa: E501 - command lines stay whole
 
@@ -94,13 +94,13 @@ def parse(arguments: Sequence[str]) -> Namespace:
 def _parser() -> CommandParser:
     parser = CommandParser("check_calibration", _DESCRIPTION, _EPILOG)
     add = parser.add_argument
-    add("--calibration", type=Path, required=True, metavar="FILE", help="what is checked")
+    add("--calibration", type=Path, required=True, metavar="FILE", help="calibration to check")
     add("--session", type=Path, required=True, metavar="FILE", help="board and places (YAML)")
     add("--left", type=Path, metavar="DIR", help="images of the left camera")
     add("--right", type=Path, metavar="DIR", help="images of the right camera")
-    add("--live", metavar="NAME", help="take images from topics, the board at this place")
-    add("--count", type=int, default=10, metavar="N", help="pairs to take live (10)")
-    add("--timeout", type=float, default=10.0, metavar="S", help="wait for them so long (10 s)")
+    add("--live", metavar="NAME", help="use images from topics, the board at this place")
+    add("--count", type=int, default=10, metavar="N", help="number of live pairs (10)")
+    add("--timeout", type=float, default=10.0, metavar="S", help="wait for live pairs (10 s)")
     add("--pair-tolerance", type=float, default=0.0, metavar="S", help="of left and right (0 s)")
     add("--limit-mm", type=float, default=0.15, metavar="MM", help="accepted tip error (0.15)")
     add("--json", type=Path, metavar="FILE", help="also write the figures as flat JSON")

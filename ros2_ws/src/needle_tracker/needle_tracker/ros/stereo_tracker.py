@@ -9,12 +9,12 @@ from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.stereo_tracker import make_tracker
 
 HELP = """
-stereo_tracker: where the needle's tip is, from stereo images through the phantom's surface.
+stereo_tracker: measures the needle's tip in stereo images through the phantom's surface.
 
-Subscribes: stereo/{left,right}/image_raw, stereo/{left,right}/camera_info, joint_states.
-Publishes: needle/tip (only where a tip was found), needle/tip_pose (one for every image pair; an
-infinite covariance says that no tip was found), /diagnostics, ~/calibration (the text of the file
-in use, latched), ~/annotated_image (while someone subscribes).
+Subscribes  stereo/{left,right}/image_raw, stereo/{left,right}/camera_info, joint_states
+Publishes   needle/tip (only if a tip was found), needle/tip_pose (one per image pair; an infinite
+            covariance means that no tip was found), /diagnostics, ~/calibration (text of the
+            calibration file, latched), ~/annotated_image (only while it has a subscriber)
 """
 
 
