@@ -14,6 +14,7 @@ import multiprocessing
 import os
 import re
 import signal
+import time
 from collections.abc import Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -22,8 +23,8 @@ import pytest
 
 import compile_ahead
 from cpu_budget import CpuBudget
-from left_processes import end_left_processes
 from needle_bringup.studies import monte_carlo
+from needle_bringup.workplace import processes_with
 from needle_core.process.ros_domain import reserve_domain_id
 
 SHARDS = os.cpu_count() or 1
@@ -33,6 +34,9 @@ ALONE = ("tests/smoke/", "tests/campaign/")
 WHOLE = 1000
 """With more tests than this, a run is one of all."""
 _INDEX_BYTES = 4
+# Environment variable by which processes of this run are found.
+_RUN_MARK = "NEEDLE_TEST_RUN"
+_EXIT_GRACE = 2.0  # time that a signalled process has to exit [s]
 _reserved = contextlib.ExitStack()
 _budget = CpuBudget()
 
@@ -75,10 +79,28 @@ def pytest_runtestloop(session: pytest.Session) -> object:
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Fail the session when processes are left, and end them."""
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
-    for line in end_left_processes():
+    for line in _kill_leftover_processes():
         session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
         if reporter is not None:
             reporter.write_line(f"FAILED process left behind: {line}", red=True)
+
+
+def _kill_leftover_processes() -> list[str]:
+    """Kill processes that tests started and left; return a line for each."""
+    run = os.environ.get(_RUN_MARK, "")
+    if not run:
+        return []
+    end = time.monotonic() + _EXIT_GRACE
+    while True:
+        # A zombie has no command.
+        found = [one for one in processes_with(_RUN_MARK, run) if one[0] != os.getpid() and one[1]]
+        if not found or time.monotonic() > end:
+            break
+        time.sleep(0.05)
+    for process, _ in found:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
+    return [f"{process} {command}" for process, command in found]
 
 
 def _warm_up() -> None:

@@ -9,12 +9,11 @@ from typing import Any
 from needle_core import messages as m
 from needle_device_driver.supervisor.limits import SafetyLimits
 from scenario import faults as of
-from scenario.course import Course, told_by_moments
+from scenario.course import Course, told_by_moments, watch_moments
 from scenario.fault_orders import LATEST_MESSAGE, SLOWEST_HANDLER, FaultOrders
 from scenario.faults import Fault, Kind, draw_schedule, strange_topic
 from scenario.judging.invariants import RELEASE_BOUND, Violation, Watch
-from scenario.judging.set_point_frames import SetPointFrames
-from scenario.moments import watch_moments
+from scenario.judging.limit_witness import SetPointFrames
 from scenario.parts.bench import Motors
 from scenario.parts.person import OUT, Wish
 from scenario.rig import SECOND, SoakRig

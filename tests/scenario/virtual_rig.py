@@ -160,10 +160,10 @@ class VirtualRig:
         self.hand = Hand(steers=not others)
         self.drives = DriveEmulator(DriveEmulatorParameters(**(drives or {})))
         self.bus = self.drives.bus
-        self._driver = DeviceDriverParameters(
+        parameters = DeviceDriverParameters(
             link="virtual", channel=CAN, retraction_speed=FASTEST, **(driver or {})
         )
-        parts = [self.drives, DeviceDriver(self._driver), *others, self.hand]
+        parts = [self.drives, DeviceDriver(parameters), *others, self.hand]
         self.runner = VirtualRunner(parts, seed, faults=faults)
 
     @property
@@ -171,10 +171,6 @@ class VirtualRig:
         """True place of the motors now [m], [rad]."""
         axes = self.bus.axes(self.runner.now)
         return axes["insertion"].position, axes["rotation"].position
-
-    def start_driver(self) -> None:
-        """Start the driver anew, after it was killed."""
-        self.runner.start(DeviceDriver(self._driver))
 
     def home(self) -> None:
         """Home both axes, the needle being out, and enable them."""

@@ -8,9 +8,11 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
@@ -47,11 +49,22 @@ from needle_core.ros import base_node
 from needle_core.ros.component_node import ComponentNode
 from needle_core.ros.main import run_component
 from needle_core.settings.parameter_fields import check_fields, parameter
-from own_context import own_context
 
 PATIENCE = 60.0  # [s]
 LONGEST = 1000
 NO_TYPE = 11
+
+
+@contextmanager
+def own_context() -> Iterator[Context]:
+    """Yield a ROS context with a domain of its own."""
+    with reserve_domain_id() as domain:
+        context = Context()
+        rclpy.init(context=context, domain_id=domain)
+        try:
+            yield context
+        finally:
+            context.try_shutdown()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,10 +6,9 @@ import re
 from typing import Any
 
 from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx import addnodes
 from sphinx.application import Sphinx
-
-from docs_site.mathml import add_mathml
 
 project = "Needle steering"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
@@ -63,8 +62,18 @@ def _link_names(app: Sphinx, page: nodes.document) -> None:
             link += literal
 
 
+def _inline_math(writer: Any, node: nodes.math) -> None:
+    writer.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def _displayed_math(writer: Any, node: nodes.math_block) -> None:
+    writer.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
 def setup(app: Sphinx) -> None:
-    """Add what Sphinx itself lacks."""
+    """Register the hooks, and a renderer that writes equations as MathML."""
     app.connect("autodoc-process-docstring", _escape, priority=_BEFORE_NAPOLEON)
     app.connect("doctree-read", _link_names)
-    add_mathml(app)
+    app.add_html_math_renderer("mathml", (_inline_math, None), (_displayed_math, None))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -21,13 +20,7 @@ from campaign.checks.control_studies import (
     judge,
     run,
 )
-from needle_bringup.studies.pure_insertions import (
-    RADIUS,
-    curvature_errors,
-    pure_insertions,
-)
-from needle_bringup.workplace import ran
-from needle_core.files.installed import find_executable
+from needle_bringup.studies.pure_insertions import curvature_errors
 
 INSERTIONS = 3000
 
@@ -73,21 +66,6 @@ def curvature(bench: Workbench) -> Iterator[Finding]:
         "bias <= 0.5 %, spread <= 6.5 %",
         f"bias {off.bias:+.2%}, spread {off.spread:.2%} (a circle: kappa {off.circle_bias:+.0%})",
         abs(off.bias) <= 0.005 and off.spread <= 0.065,
-    )
-    tips, insertion = pure_insertions(1, np.random.default_rng(61))
-    file, result = bench.folder / "insertion.csv", bench.folder / "insertion.json"
-    rows = np.column_stack([insertion, tips[0]])
-    np.savetxt(file, rows, delimiter=",", header="insertion_m,x_m,y_m,z_m", comments="")
-    command = find_executable("needle_controller", "identify_curvature")
-    ran([command, str(file), "--json", str(result)])
-    found = json.loads(result.read_text("utf-8"))
-    low, high = found["radius_low_mm"], found["radius_high_mm"]
-    yield Finding(
-        "curvature_command",
-        "identify_curvature on a CSV of one of them",
-        f"a 95 % interval that holds {RADIUS * 1e3:.0f} mm",
-        f"{found['radius_mm']:.1f} mm, {low:.1f} to {high:.1f} mm",
-        low <= RADIUS * 1e3 <= high,
     )
 
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from campaign.checking import Check, Finding, Workbench
 from campaign.tracking.traced_set import HELD_BACK, RIGS, drawn, scenes
-from campaign.tracking.traced_study import Told, TracedAnswer, traced_looks
+from campaign.tracking.traced_study import VARIATIONS, Told, TracedAnswer, traced_looks
 from campaign.tracking.tracker_study import WRONG
-from campaign.tracking.variations import VARIATIONS
 from needle_bringup.workplace import checkout
 
 _LEAST = {Told.EMPTY_PHANTOM: 0.97, Told.INSERTION: 0.97, Told.NOTHING: 0.92}

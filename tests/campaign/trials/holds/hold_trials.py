@@ -31,7 +31,7 @@ KINDS = ("pedal_unplugged", "joy_silent", "operator_frozen", CABLE)
 DELAY, LOSS = 0.005, 0.01
 """Of all that passes the cable."""
 OPERATOR = "operator"
-_OPERATOR_MODULE = "campaign.trials.holds.piped_operator"
+_OPERATOR_MODULE = "campaign.trials.holds.piped_pedal"
 _SPEED, _DEPTH_MM = 0.005, 190.0
 _DEEP = 0.17  # from here on the next trial has a rig of its own [m]
 _JOY_PERIOD = 0.02

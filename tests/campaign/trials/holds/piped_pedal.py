@@ -1,4 +1,7 @@
-"""A foot pedal without hardware: its events come through a named pipe. No ROS in here."""
+"""A foot pedal without hardware: its events come through a named pipe.
+
+`python -m campaign.trials.holds.piped_pedal` runs the operator with this pedal.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import contextlib
 import errno
 import os
 import struct
+import sys
 from pathlib import Path
 
 KEY = 48
@@ -94,3 +98,10 @@ class PipeDevice:
     def close(self) -> None:
         """Let go of the pipe."""
         os.close(self._pipe)
+
+
+if __name__ == "__main__":
+    # The trial itself uses the pedal without the operator's imports.
+    from needle_bringup.ros import operator
+
+    sys.exit(operator.main(PipeDevice))
