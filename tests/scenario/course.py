@@ -120,7 +120,7 @@ def watch_moments(rig: SoakRig, meet: Callable[[Moment], None]) -> None:
 
         rig.watch(topic, see)
 
-    def see_hold(node: str, message: Any) -> None:
+    def observe_hold(node: str, message: Any) -> None:
         if node != rig.hand_node:
             return
         pressed = heard.get(node, False)
@@ -130,7 +130,7 @@ def watch_moments(rig: SoakRig, meet: Callable[[Moment], None]) -> None:
 
     watch_status("device/status", _DEVICE)
     watch_status("needle/controller_status", _CONTROLLER)
-    rig.watch("device/hold", see_hold)
+    rig.watch("device/hold", observe_hold)
     rig.watch("device/joint_trajectory", lambda *_: meet(Moment.COMMAND))
     rig.adapter_opened.append(lambda: meet(Moment.ADAPTER_OPENED))
     meet(Moment.START)

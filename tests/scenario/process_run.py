@@ -27,7 +27,7 @@ from needle_core.status_messages import DeviceStatus
 from needle_device_driver.device import HOLDS
 from needle_device_driver.supervisor.limits import SafetyLimits
 from scenario.faults import Fault, Kind
-from scenario.judging.invariants import RELEASE_BOUND, Watch
+from scenario.monitors.invariants import RELEASE_BOUND, InvariantMonitor
 from scenario.parts.person import OUT
 from scenario.rig_run import RunResult
 
@@ -44,23 +44,23 @@ _START, _DRAW_OUT, _STILL = 120.0, 60.0, 1.0
 _WITHOUT_SYNC = 0.1
 
 
-class Witness(RigHand):
+class ProcessMonitor(RigHand):
     """Hears holds, status and motors, and judges them; draws the needle out when it is asked to.
 
-    Times are those at which a message was sent, so that a witness who is late judges no other. It
+    Times are those at which a message was sent, so that a monitor who is late judges no other. It
     judges motion from the first word of the person on: DDS may let it hear that later than the
     driver does.
 
     Attributes
     ----------
-    watch : Watch
+    watch : InvariantMonitor
         What it judges with.
     """
 
     def __init__(self) -> None:
-        self.watch = Watch(SafetyLimits(), _RELEASE_BOUND)
+        self.watch = InvariantMonitor(SafetyLimits(), _RELEASE_BOUND)
         self._begun = time.time()
-        self._hears_person = False
+        self._received_hold = False
         super().__init__("sim/drive_positions")
         # Whose press it is that moves the needle.
         self._holder = PERSON
@@ -105,14 +105,14 @@ class Witness(RigHand):
     def _on_hold(self, message: Joy, info: dict[str, int]) -> None:
         hold = from_ros(HoldState, message)
         if hold.source == self._holder:
-            self._hears_person = True
+            self._received_hold = True
             pressed, at = hold.pressed, self._sent_at(info)
-            self.watch.see_hand(at, holds=pressed)
+            self.watch.observe_hand(at, holds=pressed)
             if pressed:
-                self.watch.see_hold(at)
+                self.watch.observe_hold(at)
 
     def _on_command(self, message: JointTrajectory) -> None:
-        self.watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
+        self.watch.observe_command([(at.positions[0], at.positions[1]) for at in message.points])
 
     def _on_places(self, message: JointState, info: dict[str, int]) -> None:
         before = self.places[-1].time if self.places else 0.0
@@ -120,16 +120,16 @@ class Witness(RigHand):
         at = self.places[-1]
         moved_at = at.time - self._begun
         if at.time - before > _WITHOUT_SYNC:
-            self.watch.see_drives_go_on(moved_at)
-        if self._hears_person:
-            self.watch.see_motors(moved_at, at.insertion, at.rotation)
+            self.watch.observe_drives_go_on(moved_at)
+        if self._received_hold:
+            self.watch.observe_motors(moved_at, at.insertion, at.rotation)
 
     def _sent_at(self, info: dict[str, int]) -> float:
         return info["source_timestamp"] * 1e-9 - self._begun
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         super()._on_status(message)
-        self.watch.see_device(self.now, DeviceStatus.parse(values_of(message)))
+        self.watch.observe_device(self.now, DeviceStatus.parse(values_of(message)))
 
 
 def processes_schedule_of(seed: int) -> list[Fault]:
@@ -169,48 +169,48 @@ def run_processes(seed: int, folder: Path, faults: Sequence[Fault] | None = None
     with (
         reserve_domain_id() as domain,
         ros(domain),
-        closing(Witness()) as witness,
+        closing(ProcessMonitor()) as monitor,
         closing(TrialProcesses(folder, domain, graph_in_real_time(seed))) as graph,
     ):
-        _insert(witness, graph, happened)
-        violations = tuple(witness.watch.violations)
-        return RunResult(seed, happened, violations, happened, witness.now, of_processes=True)
+        _insert(monitor, graph, happened)
+        violations = tuple(monitor.watch.violations)
+        return RunResult(seed, happened, violations, happened, monitor.now, of_processes=True)
 
 
-def _insert(witness: Witness, graph: TrialProcesses, faults: Sequence[Fault]) -> None:
-    witness.until(lambda: witness.insertion > _DEEP_ENOUGH, "steering", _START)
-    begun = witness.now
+def _insert(monitor: ProcessMonitor, graph: TrialProcesses, faults: Sequence[Fault]) -> None:
+    monitor.until(lambda: monitor.insertion > _DEEP_ENOUGH, "steering", _START)
+    begun = monitor.now
     events: list[tuple[float, Callable[[], None]]] = []
     for fault in faults:
         for at, happen in ((fault.at, _begin), (fault.at + fault.lasts, _end)):
-            events.append((begun + at, partial(happen, witness, graph, fault)))
+            events.append((begun + at, partial(happen, monitor, graph, fault)))
     for at, act in sorted(events, key=lambda event: event[0]):
-        witness.pause(max(at - witness.now, 0.0))
+        monitor.pause(max(at - monitor.now, 0.0))
         act()
-    witness.pause(_STILL)
+    monitor.pause(_STILL)
     # From here on there is one person, and it wants the needle out.
     graph.end(PERSON)
     try:
-        witness.draw_out()
+        monitor.draw_out()
     except UserError as error:
-        witness.watch.violate("the_way_goes_on", witness.now, str(error))
+        monitor.watch.violate("the_way_goes_on", monitor.now, str(error))
 
 
-def _begin(witness: Witness, graph: TrialProcesses, fault: Fault) -> None:
+def _begin(monitor: ProcessMonitor, graph: TrialProcesses, fault: Fault) -> None:
     if graph.nodes[fault.part].exit_code is not None:
         return
     if fault.part == "device_driver":
-        witness.watch.see_driver(witness.now, speaks=False)
+        monitor.watch.observe_driver(monitor.now, speaks=False)
     if fault.kind is Kind.OFF:
         graph.kill(fault.part)
     else:
         graph.signal(fault.part, signal.SIGSTOP)
 
 
-def _end(witness: Witness, graph: TrialProcesses, fault: Fault) -> None:
+def _end(monitor: ProcessMonitor, graph: TrialProcesses, fault: Fault) -> None:
     if graph.nodes[fault.part].exit_code is not None:
         graph.begin(fault.part)
     else:
         graph.signal(fault.part, signal.SIGCONT)
     if fault.part == "device_driver":
-        witness.watch.see_driver(witness.now, speaks=True)
+        monitor.watch.observe_driver(monitor.now, speaks=True)

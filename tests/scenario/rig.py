@@ -97,7 +97,7 @@ class SoakRig:
         The controller's.
     watchers : dict of str to list of Watcher
         By topic, who is called with the sender and the message of each publication.
-    hears_hold : callable
+    on_hold_received : callable
         Called with each hold as the driver takes it, and when [s].
     frames_sent, adapter_opened : list of callable
         Called with each batch of frames that the driver sends, and when it sends its first.
@@ -112,7 +112,7 @@ class SoakRig:
     def __init__(self, seed: int, depth: float | None = None, *, at_page: bool = False) -> None:
         self.faults = LinkFaults()
         self.watchers: dict[str, list[Watcher]] = {}
-        self.hears_hold: Callable[[HoldState, float], None] = lambda *_: None
+        self.on_hold_received: Callable[[HoldState, float], None] = lambda *_: None
         self.frames_sent: list[Callable[[Any], None]] = []
         self.adapter_opened: list[Callable[[], None]] = []
         self._adapter_is_open = False
@@ -212,11 +212,11 @@ class SoakRig:
         self.disk = Disk()
         self.start(RECORDER)
 
-    def losses(self, *, judges_killed: bool) -> list[str]:
+    def losses(self, *, check_killed: bool) -> list[str]:
         """End the recording; return what the bags lack."""
         losses: list[str] = []
         for recorder in self.recorders:
-            losses += recorder.losses(judges_killed=judges_killed)
+            losses += recorder.losses(check_killed=check_killed)
         if self.disk is not None:
             self.disk.close()
         return losses
@@ -257,7 +257,7 @@ class SoakRig:
         return driver
 
     def _take_hold(self, handler: Any, message: HoldState, at: Any) -> Any:
-        self.hears_hold(message, at.steady)
+        self.on_hold_received(message, at.steady)
         return handler(message, at)
 
     def _make_page(self) -> Page:

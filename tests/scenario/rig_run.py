@@ -12,8 +12,8 @@ from scenario import faults as of
 from scenario.course import Course, told_by_moments, watch_moments
 from scenario.fault_orders import LATEST_MESSAGE, SLOWEST_HANDLER, FaultOrders
 from scenario.faults import Fault, Kind, draw_schedule, strange_topic
-from scenario.judging.invariants import RELEASE_BOUND, Violation, Watch
-from scenario.judging.limit_witness import SetPointFrames
+from scenario.monitors.invariants import RELEASE_BOUND, InvariantMonitor, Violation
+from scenario.monitors.limit_monitor import SetPointFrames
 from scenario.parts.bench import Motors
 from scenario.parts.person import OUT, Wish
 from scenario.rig import SECOND, SoakRig
@@ -114,7 +114,7 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
         rig.run(_LOOK)
     if not _has_left(rig):
         watch.violate("the_way_goes_on", rig.now, _state_of(rig))
-    losses = rig.losses(judges_killed=len(of_recording) == 1)
+    losses = rig.losses(check_killed=len(of_recording) == 1)
     if losses:
         watch.violate("nothing_recorded_is_lost", rig.now, "; ".join(losses))
     for error in rig.crashes:
@@ -128,7 +128,7 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     )  # fmt: skip
 
 
-def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
+def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
     """Return what watches over a rig from now on."""
     # A hold counts from its arrival: what is late on its way outlives the hand by as much.
     late = sum(
@@ -140,51 +140,51 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
     late += 0.15 if rig.hand_node == of.CONSOLE else 0.0
     slow = (f.size for f in faults if f.part == "device_driver" and f.kind is Kind.SLOW)
     slowness = max(slow, default=0.0) * SLOWEST_HANDLER
-    watch = Watch(SafetyLimits(), RELEASE_BOUND + late, slowness)
+    watch = InvariantMonitor(SafetyLimits(), RELEASE_BOUND + late, slowness)
     strange = {strange_topic(fault) for fault in faults}
     joints_spoilt = _JOINTS in strange or any(fault.part in _TAKE_JOINTS for fault in faults)
 
-    def see_motors(now: float, at: Motors) -> None:
+    def observe_motors(now: float, at: Motors) -> None:
         rig.digest.update(_rounded((at.insertion, at.rotation)))
-        watch.see_hand(now, holds=rig.hand_presses)
-        watch.see_driver(now, speaks=rig.runner.is_responsive("device_driver"))
-        watch.see_motors(now, at.insertion, at.rotation)
+        watch.observe_hand(now, holds=rig.hand_presses)
+        watch.observe_driver(now, speaks=rig.runner.is_responsive("device_driver"))
+        watch.observe_motors(now, at.insertion, at.rotation)
         if rig.recorders:
-            watch.see_waiting(now, rig.recorders[-1].recording.bytes_waiting)
+            watch.observe_waiting(now, rig.recorders[-1].recording.bytes_waiting)
 
-    def see_command(_: str, message: m.Trajectory) -> None:
+    def observe_command(_: str, message: m.Trajectory) -> None:
         for point in message.points:
             rig.digest.update(_rounded(point.positions))
-        watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
+        watch.observe_command([(at.positions[0], at.positions[1]) for at in message.points])
 
-    def see_hold(node: str, message: m.HoldState) -> None:
+    def observe_hold(node: str, message: m.HoldState) -> None:
         if node == of.CONSOLE:
             # It may have been pressed since the last tick.
-            watch.see_hand(rig.now, holds=rig.hand_presses)
-            watch.see_page_hold(rig.now, pressed=message.pressed)
+            watch.observe_hand(rig.now, holds=rig.hand_presses)
+            watch.observe_page_hold(rig.now, pressed=message.pressed)
         if message.pressed:
-            (watch.see_hold if node == rig.hand_node else watch.see_other_hold)(rig.now)
+            (watch.observe_hold if node == rig.hand_node else watch.observe_other_hold)(rig.now)
 
     def hear(message: m.HoldState, now: float) -> None:
         pressed = message.pressed and 0.0 <= message.speed_scale <= 1.0
-        watch.witness.hear(now, message.source, pressed=pressed, lifetime=message.lifetime)
+        watch.hold_monitor.receive(now, message.source, pressed=pressed, lifetime=message.lifetime)
 
-    rig.bench.watchers.append(see_motors)
+    rig.bench.watchers.append(observe_motors)
     _watch_set_points(rig, watch)
-    rig.watch("device/status", lambda _, message: watch.see_device(rig.now, message))
+    rig.watch("device/status", lambda _, message: watch.observe_device(rig.now, message))
     rig.watch(
         "needle/controller_status",
-        lambda _, message: watch.see_belief(rig.now, message, joints_heard=not joints_spoilt),
+        lambda _, message: watch.observe_belief(rig.now, message, joints_heard=not joints_spoilt),
     )
-    rig.watch("device/joint_trajectory", see_command)
-    rig.watch("device/estop", lambda _, said: watch.see_estop(rig.now, pressed=said.pressed))
-    rig.watch("device/hold", see_hold)
+    rig.watch("device/joint_trajectory", observe_command)
+    rig.watch("device/estop", lambda _, said: watch.observe_estop(rig.now, pressed=said.pressed))
+    rig.watch("device/hold", observe_hold)
     if _HOLD in strange or any(fault.part == of.SECOND_PERSON for fault in faults):
-        rig.hears_hold = hear
+        rig.on_hold_received = hear
     return watch
 
 
-def _watch_set_points(rig: SoakRig, watch: Watch) -> None:
+def _watch_set_points(rig: SoakRig, watch: InvariantMonitor) -> None:
     """Let the watch see all set-points that the driver sends."""
     settings = [rig.drives.bus.drives[axis].settings for axis in ("insertion", "rotation")]
     axes = {its.node_id: axis for axis, its in enumerate(settings)}
@@ -194,7 +194,7 @@ def _watch_set_points(rig: SoakRig, watch: Watch) -> None:
         for frame in batch:
             if (set_point := frames.take(frame.identifier, frame.data)) is not None:
                 node, place = set_point
-                watch.see_set_point(rig.now, axes[node], place)
+                watch.observe_set_point(rig.now, axes[node], place)
 
     rig.frames_sent.append(see)
 

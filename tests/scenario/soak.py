@@ -28,8 +28,8 @@ from needle_core.commands.cli import (
 )
 from needle_core.errors import UserError
 from scenario.faults import Fault, read_schedule, write_schedule
-from scenario.judging.invariants import Violation
 from scenario.many_runs import Tally, results_here, results_of_cluster
+from scenario.monitors.invariants import Violation
 from scenario.process_run import results_of_processes
 from scenario.rig_run import RunResult, run
 from scenario.shrinking import shrink

@@ -34,10 +34,10 @@ AT_REST = (1e-6, 1e-4)
 """What motors at rest may still move [m], [rad]: counts of their encoders."""
 
 
-class Witness(Component):
+class LogCollector(Component):
     """Keeps what is logged."""
 
-    name = "witness"
+    name = "log"
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -99,8 +99,8 @@ class Scene(VirtualRig):
         self.bus_says: list[CanFrame] = []
         self.heartbeats = 0
         super().__init__(1, driver=driver, drives=drives, faults=(self._see_frames,))
-        self._witness = Witness()
-        self.runner.start(self._witness)
+        self._log = LogCollector()
+        self.runner.start(self._log)
 
     def _see_frames(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
         if link.topic == CAN:
@@ -176,7 +176,7 @@ class Scene(VirtualRig):
 
     def named(self, rule: Rule) -> bool:
         """Return whether a rule was named in the log."""
-        return any(f"[{rule.value}]" in line for line in self._witness.lines)
+        return any(f"[{rule.value}]" in line for line in self._log.lines)
 
     def rests(self, seconds: float = 0.3) -> bool:
         """Return whether no motor moves for some time."""

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 from needle_device_driver.supervisor.limits import SafetyLimits
-from scenario.judging.bag_witness import WAITING_LIMIT
-from scenario.judging.hold_witness import HoldWitness
-from scenario.judging.limit_witness import LimitWitness
+from scenario.monitors.bag_monitor import WAITING_LIMIT
+from scenario.monitors.hold_monitor import HoldMonitor
+from scenario.monitors.limit_monitor import LimitMonitor
 
 # A motor that goes no farther in a tick rests [m], [rad].
 _REST_INSERTION, _REST_ROTATION = 2e-7, 5e-4
@@ -62,7 +62,7 @@ class Violation:
     text: str
 
 
-class Watch:
+class InvariantMonitor:
     """Watches one run. Times are seconds from its start.
 
     Parameters
@@ -78,7 +78,7 @@ class Watch:
     ----------
     violations : list of Violation
         The first of each kind.
-    witness : HoldWitness
+    hold_monitor : HoldMonitor
         Of the holds that reach the device; it is asked where it hears any.
     """
 
@@ -87,8 +87,8 @@ class Watch:
     ) -> None:
         self._release_bound = release_bound
         self.violations: list[Violation] = []
-        self.witness = HoldWitness()
-        self._limits = LimitWitness(bounds, late)
+        self.hold_monitor = HoldMonitor()
+        self._limits = LimitMonitor(bounds, late)
         self._before: tuple[float, float, float] | None = None
         self._pressed_until = self._told_until = self._other_until = -1.0
         self._pressed_since = self._other_since = -1.0
@@ -114,7 +114,7 @@ class Watch:
 
     # ---- what happens ---------------------------------------------------------------------------
 
-    def see_hand(self, at: float, *, holds: bool) -> None:
+    def observe_hand(self, at: float, *, holds: bool) -> None:
         """Take whether the hand presses what could move the needle."""
         if holds and not self._holds:
             self._pressed_since = at
@@ -122,11 +122,11 @@ class Watch:
             self._pressed_until = at
         self._holds = holds
 
-    def see_hold(self, at: float) -> None:
+    def observe_hold(self, at: float) -> None:
         """Take a message by which the hand's own node says that it presses."""
         self._told_until = at
 
-    def see_page_hold(self, at: float, *, pressed: bool) -> None:
+    def observe_page_hold(self, at: float, *, pressed: bool) -> None:
         """Take whether the console says that the hand, at its page, presses."""
         idle = at - self._pressed_until
         if pressed and idle > PAGE_LIFETIME:
@@ -141,13 +141,13 @@ class Watch:
             self._page_ended = at
         self._page_holds = pressed
 
-    def see_other_hold(self, at: float) -> None:
+    def observe_other_hold(self, at: float) -> None:
         """Take that somebody else pressed: from outside that is a hold like any other."""
         if at - self._other_until > self._release_bound:
             self._other_since = at + DISCOVERED_WITHIN
         self._other_until = at
 
-    def see_device(self, at: float, status: DeviceStatus) -> None:
+    def observe_device(self, at: float, status: DeviceStatus) -> None:
         """Take a device/status as it is published."""
         state, before = status.state, self._status.state
         if state in ("FAULT", "ESTOPPED") and not status.fault:
@@ -162,9 +162,9 @@ class Watch:
                 # The rotation is homed where it stands.
                 self._zero = self._before[2]
         self._status, self._status_at = status, at
-        self.witness.see_owner(at, status.hold_owner)
+        self.hold_monitor.observe_owner(at, status.hold_owner)
 
-    def see_command(self, points: Sequence[tuple[float, float]]) -> None:
+    def observe_command(self, points: Sequence[tuple[float, float]]) -> None:
         """Take a command for the joints, whoever sent it: insertion [m] and rotation [rad]."""
         if self._before is not None:
             _, insertion, rotation = self._before
@@ -172,33 +172,33 @@ class Watch:
             ahead = [point for point in points if point[0] > insertion] or points[-1:]
             self._commands.append(((insertion, rotation - self._zero), *ahead))
 
-    def see_driver(self, at: float, *, speaks: bool) -> None:
+    def observe_driver(self, at: float, *, speaks: bool) -> None:
         """Take whether the driver runs and hears its drives: else it cannot know better."""
         if not speaks and self._silent_since is None:
-            self.witness.lose_device(at)
+            self.hold_monitor.lose_device(at)
         self._silent_since = None if speaks else self._silent_since or at
         if not speaks:
-            self.witness.forget()
+            self.hold_monitor.forget()
             # Who starts anew has not heard it; it starts disabled.
             self._estop_since = None
 
-    def see_estop(self, at: float, *, pressed: bool) -> None:
+    def observe_estop(self, at: float, *, pressed: bool) -> None:
         """Take what is said of the emergency stop."""
         self._estop_since = (self._estop_since or at) if pressed else None
 
-    def see_set_point(self, at: float, axis: int, place: float | None) -> None:
-        """Take what is sent to a drive; see `LimitWitness.see_set_point`."""
-        for text in self._limits.see_set_point(at, axis, place):
+    def observe_set_point(self, at: float, axis: int, place: float | None) -> None:
+        """Take what is sent to a drive; see `LimitMonitor.observe_set_point`."""
+        for text in self._limits.observe_set_point(at, axis, place):
             self.violate("none_beyond_limits", at, text)
 
-    def see_drives_go_on(self, at: float) -> None:
+    def observe_drives_go_on(self, at: float) -> None:
         """Take that the drives' own time stood still until now: what was under way ends by it."""
         self._ends_until = at + WATCHDOG_BOUND
 
-    def see_motors(self, at: float, insertion: float, rotation: float) -> None:
+    def observe_motors(self, at: float, insertion: float, rotation: float) -> None:
         """Take where the motors really are."""
         before, self._before = self._before, (at, insertion, rotation)
-        for text in self._limits.see_motors(at, insertion, rotation):
+        for text in self._limits.observe_motors(at, insertion, rotation):
             self.violate("none_beyond_limits", at, text)
         if before is None:
             return
@@ -217,17 +217,17 @@ class Watch:
         begins, self._moving_since = self._moving_since is None, self._moving_since or at
         if self._is_homing or at <= self._homing_until:
             return
-        self._judge_hold(at, begins=begins)
-        self._judge_status(at)
+        self._check_hold(at, begins=begins)
+        self._check_status(at)
         if along > _REST_INSERTION:
-            self._judge_way(at, insertion, rotation)
+            self._check_path(at, insertion, rotation)
 
-    def see_waiting(self, at: float, waiting: int) -> None:
+    def observe_waiting(self, at: float, waiting: int) -> None:
         """Take how much waits for the recorder's disk [B]."""
         if waiting > _WAITING:
             self.violate("queues_are_bounded", at, f"{waiting} bytes wait, at most {_WAITING}")
 
-    def see_belief(self, at: float, status: ControllerStatus, *, joints_heard: bool) -> None:
+    def observe_belief(self, at: float, status: ControllerStatus, *, joints_heard: bool) -> None:
         """Take a needle/controller_status as it is published, while joints reach the controller."""
         # Before its first step it has nothing but the needle's place of before.
         steers = status.state == "STEERING" and status.step != 0
@@ -245,7 +245,7 @@ class Watch:
     def _is_homing(self) -> bool:
         return self._status.activity == "homing"
 
-    def _judge_hold(self, at: float, *, begins: bool) -> None:
+    def _check_hold(self, at: float, *, begins: bool) -> None:
         estop = self._estop_since
         if estop is not None and at - estop > self._release_bound:
             self.violate("estop_stops", at, f"motion {at - estop:.3f} s after an emergency stop")
@@ -254,7 +254,7 @@ class Watch:
         if idle > self._release_bound and at > self._ends_until:
             said = f"motion {idle:.3f} s after the last moment in which anybody held and said so"
             self.violate("no_motion_without_hold", at, said)
-        by_others = self.witness.idle(at) if self.witness.hears else 0.0
+        by_others = self.hold_monitor.idle(at) if self.hold_monitor.has_received else 0.0
         if by_others > RELEASE_BOUND and at > self._ends_until:
             said = f"motion {by_others:.3f} s after the last press of an owner reached the device"
             self.violate("no_motion_by_another", at, said)
@@ -263,7 +263,7 @@ class Watch:
             said = f"motion by a press of {since:.3f} s; the device became ready at {ready:.3f} s"
             self.violate("no_motion_by_itself", at, said)
 
-    def _judge_way(self, at: float, insertion: float, rotation: float) -> None:
+    def _check_path(self, at: float, insertion: float, rotation: float) -> None:
         """Judge a motion inwards: nobody but a command moves the needle there, and as it says."""
         off = [
             abs(rotation - self._zero - _rotation_at(insertion, command))
@@ -278,7 +278,7 @@ class Watch:
             said = f"{where} it is {min(off):.2f} rad from the nearest command"
             self.violate("turns_as_commanded", at, said)
 
-    def _judge_status(self, at: float) -> None:
+    def _check_status(self, at: float) -> None:
         state = self._status.state
         if state not in ("HOLDING", "DISABLED") or self._silent_since is not None:
             return

@@ -19,7 +19,7 @@ class _Press:
     spent: bool = False
 
 
-class HoldWitness:
+class HoldMonitor:
     """Hears every hold that reaches the device, and what that says of the owner.
 
     Hold to run has one owner, until it is let go; a press beside it takes a release and a new press
@@ -34,11 +34,11 @@ class HoldWitness:
     """
 
     def __init__(self) -> None:
-        self.hears = False
+        self.has_received = False
         self._presses: dict[str, _Press] = {}
         self._ended = -math.inf
 
-    def hear(self, at: float, sender: str, *, pressed: bool, lifetime: float) -> None:
+    def receive(self, at: float, sender: str, *, pressed: bool, lifetime: float) -> None:
         """Take a message as the device does.
 
         Parameters
@@ -52,7 +52,7 @@ class HoldWitness:
         lifetime : float
             How long it counts by its own word [s].
         """
-        self.hears = True
+        self.has_received = True
         self._end_lapsed(at)
         if not pressed:
             if sender in self._presses:
@@ -61,7 +61,7 @@ class HoldWitness:
         until = at + min(lifetime, _HOLD_AGE)
         self._presses.setdefault(sender, _Press(until)).until = until
 
-    def see_owner(self, at: float, owner: str) -> None:
+    def observe_owner(self, at: float, owner: str) -> None:
         """Take whose hold counts by the device's own word; empty: nobody's."""
         self._end_lapsed(at)
         for sender, press in self._presses.items():

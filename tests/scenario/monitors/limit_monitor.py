@@ -62,7 +62,7 @@ class SetPointFrames:
         return node, counts / self._counts_per_unit[node]
 
 
-class Pace:
+class SpeedBudget:
     """Judges a way by the time that it took, over all spans of it at once.
 
     Parameters
@@ -108,15 +108,15 @@ class _Axis:
     scale: float
     speed: float
     behind: float
-    set_points: Pace
-    motor: Pace
+    set_points: SpeedBudget
+    motor: SpeedBudget
 
     def said(self, way: float, most: float) -> str:
         """Return a way beside its bound."""
         return f"{way * self.scale:.4g} {self.unit} (at most {most * self.scale:.4g})"
 
 
-class LimitWitness:
+class LimitMonitor:
     """Says what is beyond the limits.
 
     Parameters
@@ -134,14 +134,14 @@ class LimitWitness:
 
         def axis(name: str, unit: str, scale: float, speed: float, behind: float) -> _Axis:
             behind += _SET_POINTS_BEHIND * _SET_POINT_PERIOD * speed
-            return _Axis(name, unit, scale, speed, behind, Pace(speed), Pace(speed))
+            return _Axis(name, unit, scale, speed, behind, SpeedBudget(speed), SpeedBudget(speed))
 
         self._axes = (
             axis("insertion", "mm", 1e3, bounds.max_speed, bounds.insertion_following_error),
             axis("rotation", "rad", 1.0, bounds.max_rotation_rate, bounds.rotation_following_error),
         )
 
-    def see_set_point(self, at: float, axis: int, place: float | None) -> Iterator[str]:
+    def observe_set_point(self, at: float, axis: int, place: float | None) -> Iterator[str]:
         """Take what is sent to a drive, whatever a bus makes of it.
 
         Parameters
@@ -166,7 +166,7 @@ class LimitWitness:
         if ahead > bound:
             yield f"set-points of {its.name} {its.said(ahead, bound)} ahead of its speed limit"
 
-    def see_motors(self, at: float, insertion: float, rotation: float) -> Iterator[str]:
+    def observe_motors(self, at: float, insertion: float, rotation: float) -> Iterator[str]:
         """Take where the motors really are; yields what is beyond the limits.
 
         Parameters

@@ -21,7 +21,7 @@ WAITING_LIMIT = 400_000
 _WRITTEN_OUT = 0.3
 
 
-class BagWitness:
+class BagMonitor:
     """Takes note of every message that one recorder takes.
 
     Parameters
