@@ -136,7 +136,7 @@ def watch_moments(rig: SoakRig, meet: Callable[[Moment], None]) -> None:
     meet(Moment.START)
 
 
-def told_by_moments(course: Course) -> list[Fault]:
+def relative_to_moments(course: Course) -> list[Fault]:
     """Return the faults that happened, each told by the last moment that it met.
 
     So a change that shifts what a run does shifts its faults with it.

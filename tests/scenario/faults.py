@@ -62,15 +62,15 @@ CONSOLE, PAGE, PAGE_LINE = "console", "page", "page line"
 RECORDER, DISK = "recorder", "disk"
 """Where one of them goes wrong a recorder is there, with a disk of its own."""
 DRIVES = ("insertion drive", "rotation drive")
-STRANGER = "stranger on "
+ROGUE = "stranger on "
 """Begins the name of a part where a foreign node publishes or calls what is not its own."""
-STRANGE_TOPICS = (
+ROGUE_TOPICS = (
     "/device/hold", "/device/joint_trajectory", "/device/estop", "/joint_states", "/needle/tip",
     "/target_plane",
 )  # fmt: skip
 FLOOD = "flood"
 """A stranger that publishes 5,000 times a second what is not its own; `size` draws the topic."""
-_STRANGE_SERVICES = (*SERVICES, "/device/stop", "/plane_controller/stop", "/device/enable off")
+_ROGUE_SERVICES = (*SERVICES, "/device/stop", "/plane_controller/stop", "/device/enable off")
 
 _DRAWN_TOGETHER: dict[str, tuple[Kind, ...]] = {
     **dict.fromkeys(PROCESSES, (Kind.OFF, Kind.STUCK, Kind.SLOW)),
@@ -83,8 +83,8 @@ _DRAWN_TOGETHER: dict[str, tuple[Kind, ...]] = {
     CLOCK: (Kind.WRONG, Kind.SLOW),
     PERSON: (Kind.WRONG, Kind.STUCK, Kind.INTERMITTENT, Kind.OFF),
     PARAMETERS: (Kind.WRONG, Kind.GARBAGE),
-    **{STRANGER + name: (Kind.WRONG, Kind.GARBAGE) for name in STRANGE_TOPICS},
-    **{STRANGER + name: (Kind.WRONG,) for name in _STRANGE_SERVICES},
+    **{ROGUE + name: (Kind.WRONG, Kind.GARBAGE) for name in ROGUE_TOPICS},
+    **{ROGUE + name: (Kind.WRONG,) for name in _ROGUE_SERVICES},
 }
 _DRAWN_ALONE: dict[str, tuple[Kind, ...]] = {
     SECOND_PERSON: (Kind.STUCK, Kind.WRONG, Kind.INTERMITTENT, Kind.OFF),
@@ -144,12 +144,12 @@ class Fault:
         return f"{what}, {when}, for {self.lasts:.3f} s"
 
 
-def strange_topic(fault: Fault) -> str:
+def rogue_topic(fault: Fault) -> str:
     """Return the topic on which a fault lets a stranger publish; empty: on none."""
     if fault.part == FLOOD:
-        return STRANGE_TOPICS[int(fault.size * len(STRANGE_TOPICS))]
-    name = fault.part.removeprefix(STRANGER)
-    return name if name in STRANGE_TOPICS and name != fault.part else ""
+        return ROGUE_TOPICS[int(fault.size * len(ROGUE_TOPICS))]
+    name = fault.part.removeprefix(ROGUE)
+    return name if name in ROGUE_TOPICS and name != fault.part else ""
 
 
 def draw_schedule(seed: int) -> list[Fault]:

@@ -47,7 +47,7 @@ class Tally:
         """Count a run."""
         self._runs += not result.of_processes
         self._processes += result.of_processes
-        self._faults += len(result.told_by_moments)
+        self._faults += len(result.relative_to_moments)
         self._simulated += result.simulated
         self.violations += bool(result.violations)
 

@@ -9,9 +9,9 @@ from typing import Any
 from needle_core import messages as m
 from needle_device_driver.supervisor.limits import SafetyLimits
 from scenario import faults as of
-from scenario.course import Course, told_by_moments, watch_moments
-from scenario.fault_orders import LATEST_MESSAGE, SLOWEST_HANDLER, FaultOrders
-from scenario.faults import Fault, Kind, draw_schedule, strange_topic
+from scenario.course import Course, relative_to_moments, watch_moments
+from scenario.fault_injector import LATEST_MESSAGE, SLOWEST_HANDLER, FaultInjector
+from scenario.faults import Fault, Kind, draw_schedule, rogue_topic
 from scenario.monitors.invariants import RELEASE_BOUND, InvariantMonitor, Violation
 from scenario.monitors.limit_monitor import SetPointFrames
 from scenario.parts.bench import Motors
@@ -49,7 +49,7 @@ class RunResult:
         What happened to it.
     violations : tuple of Violation
         Invariants that did not hold.
-    told_by_moments : tuple of Fault
+    relative_to_moments : tuple of Fault
         Those faults that happened, each told by the last moment that it met; of real processes as
         they were drawn.
     simulated : float
@@ -68,7 +68,7 @@ class RunResult:
     seed: int
     faults: tuple[Fault, ...]
     violations: tuple[Violation, ...]
-    told_by_moments: tuple[Fault, ...]
+    relative_to_moments: tuple[Fault, ...]
     simulated: float
     of_processes: bool = False
     digest: str = ""
@@ -101,7 +101,7 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     if of_recording:
         rig.record()
     watch = _watched(rig, faults)
-    course = Course(rig.runner.timeline, faults, FaultOrders(rig).begin)
+    course = Course(rig.runner.timeline, faults, FaultInjector(rig).begin)
     watch_moments(rig, course.meet)
     # What has not come when the needle is out again never comes.
     while rig.now < _FAULTS_OVER and (course.is_under_way or (course.waits and not _has_left(rig))):
@@ -123,7 +123,7 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
         off = f"the tip went to {rig.bench.deepest_tip[0] * 1e3:.2f} mm from the plane"
         watch.violate("undisturbed_converges", rig.now, f"{off}; {_state_of(rig)}")
     return RunResult(
-        seed, tuple(faults), tuple(watch.violations), tuple(told_by_moments(course)), rig.now,
+        seed, tuple(faults), tuple(watch.violations), tuple(relative_to_moments(course)), rig.now,
         digest=rig.digest.hexdigest(), inserted=rig.person.done, log=tuple(rig.log),
     )  # fmt: skip
 
@@ -141,7 +141,7 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
     slow = (f.size for f in faults if f.part == "device_driver" and f.kind is Kind.SLOW)
     slowness = max(slow, default=0.0) * SLOWEST_HANDLER
     watch = InvariantMonitor(SafetyLimits(), RELEASE_BOUND + late, slowness)
-    strange = {strange_topic(fault) for fault in faults}
+    strange = {rogue_topic(fault) for fault in faults}
     joints_spoilt = _JOINTS in strange or any(fault.part in _TAKE_JOINTS for fault in faults)
 
     def observe_motors(now: float, at: Motors) -> None:

@@ -137,7 +137,7 @@ def _tell(result: RunResult, folder: Path | None) -> None:
     _print_violations(f"seed {result.seed}", result.violations)
     keep(result.faults)
     kept = shrink(result.faults, still)
-    told = list(run(result.seed, kept).told_by_moments)
+    told = list(run(result.seed, kept).relative_to_moments)
     if still(told):
         kept = told
     _print_faults(kept)

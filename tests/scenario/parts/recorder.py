@@ -165,7 +165,7 @@ class RecorderStandIn(Component):
         self._killed_at: float | None = None
         self._refused_at: float | None = None
         self._bag = _Bag(disk, disk.next_bag())
-        self._witness = BagMonitor(self._bag.directory)
+        self._monitor = BagMonitor(self._bag.directory)
         workers: list[_Jobs] = []
 
         def make_worker(do: RunJob, end: Job) -> _Jobs:
@@ -199,7 +199,7 @@ class RecorderStandIn(Component):
             Whether the bag of a killed one counts: nothing else kept it from writing.
         """
         if self._killed_at is not None:
-            return self._witness.losses_of_killed(self._killed_at) if check_killed else []
+            return self._monitor.losses_of_killed(self._killed_at) if check_killed else []
         self.recording.close()
         if not self.recording.is_whole:
             if self._refused_at is None:
@@ -207,13 +207,13 @@ class RecorderStandIn(Component):
             if self._refused_at is None:
                 return [f"{self._bag.directory} is not whole: {self.recording.error}"]
             # A disk that refused data leaves what a kill leaves.
-            return self._witness.losses_of_killed(self._refused_at) if check_killed else []
-        return self._witness.losses_of_ended()
+            return self._monitor.losses_of_killed(self._refused_at) if check_killed else []
+        return self._monitor.losses_of_ended()
 
     def _hear(self, topic: str, message: Any, at: Moment) -> Actions:
         self._now = at.steady
         self._count += 1
-        self._witness.take(at.steady, topic)
+        self._monitor.take(at.steady, topic)
         data = repr(message).encode()
         self.recording.append(Received(topic, data, at.stamp_ns, at.sent_ns, self._count))
         return ()

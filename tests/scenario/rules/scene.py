@@ -37,7 +37,7 @@ AT_REST = (1e-6, 1e-4)
 class LogCollector(Component):
     """Keeps what is logged."""
 
-    name = "log"
+    name = "log_collector"
 
     def __init__(self) -> None:
         self.lines: list[str] = []

@@ -9,7 +9,7 @@ from typing import Any
 
 from needle_core import component as c
 from needle_core import messages as m
-from scenario.faults import FLOOD, Fault, Kind, strange_topic
+from scenario.faults import FLOOD, Fault, Kind, rogue_topic
 from scenario.parts.bench import Bench
 
 _PERIOD = 0.05
@@ -18,7 +18,7 @@ _FLOOD_PERIOD, _AT_ONCE = 0.001, 5
 _JOINTS = (m.INSERTION_JOINT, m.ROTATION_JOINT)
 
 
-class Stranger(c.Component):
+class RoguePublisher(c.Component):
     """Publishes on one topic from its start on.
 
     Parameters
@@ -37,7 +37,7 @@ class Stranger(c.Component):
         self.name = name
         self._garbage = fault.kind is Kind.GARBAGE
         self._bench, self._chance = bench, chance
-        self._topic = strange_topic(fault).removeprefix("/")
+        self._topic = rogue_topic(fault).removeprefix("/")
         rows: dict[str, tuple[type[Any], Any, Callable[[int], Any]]] = {
             "device/hold": (m.HoldState, c.BEST_EFFORT, self._hold),
             "device/joint_trajectory": (m.Trajectory, c.RELIABLE, self._trajectory),

@@ -19,7 +19,7 @@ from scenario.course import Undo
 from scenario.faults import Fault, Kind
 from scenario.link_faults import LinkFault
 from scenario.parts.bench import Sight
-from scenario.parts.stranger import Stranger
+from scenario.parts.rogue_publisher import RoguePublisher
 from scenario.rig import SECOND_JOYSTICK, SECOND_OPERATOR, SoakRig
 
 _LINKS = (*faults.TOPICS, *faults.SERVICES, faults.BUS, faults.PAGE_LINE)
@@ -48,7 +48,7 @@ def _nothing() -> None:
     """Do nothing: the fault was over at once."""
 
 
-class FaultOrders:
+class FaultInjector:
     """Lets faults begin and end.
 
     Parameters
@@ -60,33 +60,33 @@ class FaultOrders:
     def __init__(self, rig: SoakRig) -> None:
         self._rig = rig
         self._timeline = rig.runner.timeline
-        self._strangers = itertools.count(1)
-        self._spoilers: dict[str, Callable[[Fault], Undo]] = {
+        self._rogues = itertools.count(1)
+        self._injectors: dict[str, Callable[[Fault], Undo]] = {
             **dict.fromkeys(
-                (*faults.PROCESSES, faults.CONSOLE, faults.RECORDER), self._spoil_process
+                (*faults.PROCESSES, faults.CONSOLE, faults.RECORDER), self._inject_process_fault
             ),
-            faults.DISK: self._spoil_disk,
-            **dict.fromkeys(_LINKS, self._spoil_link),
-            **dict.fromkeys(faults.DRIVES, self._spoil_drive),
+            faults.DISK: self._inject_disk_fault,
+            **dict.fromkeys(_LINKS, self._inject_link_fault),
+            **dict.fromkeys(faults.DRIVES, self._inject_drive_fault),
             faults.ADAPTER: self._unplug,
-            faults.PAGE: self._spoil_page,
-            faults.CAMERAS: self._spoil_cameras,
-            faults.CLOCK: self._spoil_clock,
-            faults.PERSON: self._confuse_person,
-            faults.SECOND_PERSON: self._let_second_person_in,
+            faults.PAGE: self._inject_page_fault,
+            faults.CAMERAS: self._inject_camera_fault,
+            faults.CLOCK: self._inject_clock_fault,
+            faults.PERSON: self._inject_operator_error,
+            faults.SECOND_PERSON: self._inject_second_operator,
             faults.PARAMETERS: self._change_parameters,
         }
 
     def begin(self, fault: Fault) -> Undo:
         """Let a fault begin; returns what ends it."""
-        return self._spoilers.get(fault.part, self._let_stranger_act)(fault)
+        return self._injectors.get(fault.part, self._inject_rogue_publisher)(fault)
 
     def _chance_of(self, fault: Fault) -> random.Random:
         return self._timeline.stream(f"fault of {fault.part}")
 
     # ---- parts ----------------------------------------------------------------------------------
 
-    def _spoil_process(self, fault: Fault) -> Undo:
+    def _inject_process_fault(self, fault: Fault) -> Undo:
         rig, names = self._rig, self._rig.processes_of(fault.part)
         if fault.kind is Kind.OFF:
             for name in names:
@@ -108,19 +108,19 @@ class FaultOrders:
         self._rig.unplug()
         return self._rig.plug_in
 
-    def _spoil_page(self, fault: Fault) -> Undo:
+    def _inject_page_fault(self, fault: Fault) -> Undo:
         rig = self._rig
         if fault.kind is Kind.OFF:
             if rig.runner.runs(faults.PAGE):
                 rig.runner.stop(faults.PAGE)
             return partial(rig.start, faults.PAGE)
         if fault.kind is Kind.STUCK:
-            return self._spoil_process(fault)
+            return self._inject_process_fault(fault)
         doing = "sends_garbage" if fault.kind is Kind.GARBAGE else "repeats"
         setattr(rig.page, doing, True)
         return lambda: setattr(rig.page, doing, False)
 
-    def _spoil_link(self, fault: Fault) -> Undo:
+    def _inject_link_fault(self, fault: Fault) -> Undo:
         late = fault.size * (_LATEST_FRAME if fault.part == faults.BUS else LATEST_MESSAGE)
         spoil = partial(LinkFault, self._timeline.now + fault.lasts)
         spoilt = {
@@ -133,7 +133,7 @@ class FaultOrders:
         self._rig.faults.begin(fault.part, spoilt)
         return partial(self._rig.faults.end, fault.part)
 
-    def _spoil_drive(self, fault: Fault) -> Undo:
+    def _inject_drive_fault(self, fault: Fault) -> Undo:
         axis, now = fault.part.partition(" ")[0], self._timeline.now
         bus = self._rig.drives.bus
         drive = bus.drives[axis]
@@ -155,12 +155,12 @@ class FaultOrders:
                 return go_on
         return _nothing
 
-    def _spoil_cameras(self, fault: Fault) -> Undo:
+    def _inject_camera_fault(self, fault: Fault) -> Undo:
         self._rig.tracker.sight = _SIGHTS[fault.kind]
         # The tracker may be another by then.
         return lambda: setattr(self._rig.tracker, "sight", Sight.CLEAR)
 
-    def _spoil_clock(self, fault: Fault) -> Undo:
+    def _inject_clock_fault(self, fault: Fault) -> Undo:
         timeline = self._timeline
         if fault.kind is Kind.WRONG:
             before = timeline.clock_offset_ns
@@ -170,10 +170,10 @@ class FaultOrders:
         def drift() -> None:
             timeline.clock_offset_ns -= round(fault.size * _DRIFT_NS)
 
-        self._again_and_again(fault, drift, lambda: _DRIFT_PERIOD)
+        self._repeat(fault, drift, lambda: _DRIFT_PERIOD)
         return _nothing
 
-    def _confuse_person(self, fault: Fault) -> Undo:
+    def _inject_operator_error(self, fault: Fault) -> Undo:
         person, hand = self._rig.person, self._rig.hand
         person.absent = True
 
@@ -183,7 +183,7 @@ class FaultOrders:
         if fault.kind is Kind.OFF:
             hand.insert = hand.retract = hand.stop = False
         elif fault.kind is Kind.INTERMITTENT:
-            self._again_and_again(fault, tremble)
+            self._repeat(fault, tremble)
         elif fault.kind is Kind.WRONG:
             hand.insert, hand.retract = fault.size < 0.6, fault.size > 0.4
             hand.stop = fault.size > 0.9
@@ -193,11 +193,11 @@ class FaultOrders:
 
         return end
 
-    def _spoil_disk(self, fault: Fault) -> Undo:
+    def _inject_disk_fault(self, fault: Fault) -> Undo:
         assert self._rig.disk is not None, "who records nothing has no disk"
         return self._rig.disk.spoil(fault)
 
-    def _let_second_person_in(self, fault: Fault) -> Undo:
+    def _inject_second_operator(self, fault: Fault) -> Undo:
         rig, hand, chance = self._rig, self._rig.second_hand, self._chance_of(fault)
 
         def let_go() -> None:
@@ -207,14 +207,14 @@ class FaultOrders:
             hand.insert, hand.retract = chance.choice(_WAVERING)
 
         if fault.kind is Kind.INTERMITTENT:
-            self._again_and_again(fault, waver)
+            self._repeat(fault, waver)
             return let_go
         hand.insert, hand.retract = fault.kind is not Kind.WRONG, fault.kind is Kind.WRONG
         if fault.kind is not Kind.OFF:
             return let_go
         return partial(rig.kill, SECOND_JOYSTICK if fault.size < 0.5 else SECOND_OPERATOR)
 
-    def _again_and_again(
+    def _repeat(
         self, fault: Fault, act: Callable[[], None], pause: Callable[[], float] | None = None
     ) -> None:
         """Act now, and after each pause while a fault lasts."""
@@ -254,15 +254,15 @@ class FaultOrders:
 
     # ---- strangers ------------------------------------------------------------------------------
 
-    def _let_stranger_act(self, fault: Fault) -> Undo:
+    def _inject_rogue_publisher(self, fault: Fault) -> Undo:
         rig = self._rig
-        if not faults.strange_topic(fault):
-            name = fault.part.removeprefix(faults.STRANGER).removeprefix("/")
+        if not faults.rogue_topic(fault):
+            name = fault.part.removeprefix(faults.ROGUE).removeprefix("/")
             on = True if name in _SWITCHED_ON else None
             if name.endswith(" off"):
                 name, on = name.removesuffix(" off"), False
             rig.person.asides.append(Call(name, on))
             return _nothing
-        name = f"stranger_{next(self._strangers)}"
-        rig.runner.start(Stranger(name, fault, rig.bench, self._chance_of(fault)))
+        name = f"stranger_{next(self._rogues)}"
+        rig.runner.start(RoguePublisher(name, fault, rig.bench, self._chance_of(fault)))
         return partial(rig.runner.stop, name)
