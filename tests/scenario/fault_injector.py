@@ -261,7 +261,7 @@ class FaultInjector:
             on = True if name in _SWITCHED_ON else None
             if name.endswith(" off"):
                 name, on = name.removesuffix(" off"), False
-            rig.person.asides.append(Call(name, on))
+            rig.person.extra_actions.append(Call(name, on))
             return _nothing
         name = f"stranger_{next(self._rogues)}"
         rig.runner.start(RoguePublisher(name, fault, rig.bench, self._chance_of(fault)))

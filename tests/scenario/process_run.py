@@ -28,7 +28,7 @@ from needle_device_driver.device import HOLDS
 from needle_device_driver.supervisor.limits import SafetyLimits
 from scenario.faults import Fault, Kind
 from scenario.monitors.invariants import RELEASE_BOUND, InvariantMonitor
-from scenario.parts.person import OUT
+from scenario.parts.operator_model import OUT
 from scenario.rig_run import RunResult
 
 PERSON = "simulated_operator"

@@ -30,13 +30,13 @@ from scenario.link_faults import LinkFaults
 from scenario.parts.bench import ANSWER, TIP_NOISE, Bench, TrackerStandIn
 from scenario.parts.hold_server import HoldServer
 from scenario.parts.page import Page
-from scenario.parts.person import (
+from scenario.parts.operator_model import (
     INSERT,
     RETRACT,
     STOP,
-    Hand,
+    JoystickButtons,
     Joystick,
-    Person,
+    OperatorModel,
 )
 from scenario.parts.recorder import Disk, RecorderStandIn
 
@@ -83,9 +83,9 @@ class SoakRig:
         The needle.
     drives : DriveEmulator
         What moves it.
-    hand, second_hand : Hand
+    hand, second_hand : JoystickButtons
         The person's, and that of a second one.
-    person : Person
+    person : OperatorModel
         Who uses them.
     hand_node : str
         Name of the node by which the person holds.
@@ -127,8 +127,8 @@ class SoakRig:
                 **dict.fromkeys((*names, *SECOND), uniform(*_COMPUTE)),
                 "stereo_tracker": uniform(*ANSWER),
             },
-            faults=(self._meet_faults,),
-            taps=(self._see_published,),
+            faults=(self._apply_faults,),
+            taps=(self._tap_published,),
         )
         timeline = self.runner.timeline
         timeline.clock_offset_ns = _CLOCK_NS
@@ -140,11 +140,11 @@ class SoakRig:
             nominal_speed=0.005,
             tip_noise_bound=TIP_NOISE,
         )
-        self.hand, self.second_hand = Hand(), Hand()
+        self.hand, self.second_hand = JoystickButtons(), JoystickButtons()
         self.drives = DriveEmulator(DriveEmulatorParameters(boot_time=0.1))
         self.bench = Bench(self.drives.bus, timeline.stream("needle"))
         self.hand_node = CONSOLE if at_page else "operator"
-        self.person = Person(self.hand, lambda: self.bench.motors.insertion, self.hand_node)
+        self.person = OperatorModel(self.hand, lambda: self.bench.motors.insertion, self.hand_node)
         self.page: Page | None = None
         self.disk: Disk | None = None
         self.recorders: list[RecorderStandIn] = []
@@ -154,7 +154,7 @@ class SoakRig:
             "plane_controller": lambda: PlaneController(self.steering),
             "operator": lambda: Operator(_operator_settings()),
             "stereo_tracker": self._make_tracker,
-            "joy_node": lambda: Joystick(Hand() if at_page else self.hand),
+            "joy_node": lambda: Joystick(JoystickButtons() if at_page else self.hand),
             CONSOLE: lambda: Console(ConsoleParameters()),
             HoldServer.name: HoldServer,
             PAGE: self._make_page,
@@ -237,9 +237,9 @@ class SoakRig:
             if self.runner.run(end - self.now):
                 for name, ended in tuple(self.runner.exits.items()):
                     del self.runner.exits[name]
-                    self._see_exit(name, ended.text)
+                    self._on_exit(name, ended.text)
 
-    def _see_exit(self, name: str, why: str) -> None:
+    def _on_exit(self, name: str, why: str) -> None:
         if why.startswith(_INTERNAL):
             self.crashes.append(f"{name}: {why}")
         if name in self._makers and name != PAGE:
@@ -262,7 +262,7 @@ class SoakRig:
 
     def _make_page(self) -> Page:
         self.page = Page(lambda: self.hand.button, self.runner.timeline.stream("page"))
-        self.person.sees_lost_press = self.page.asks_for_a_new_press
+        self.person.shows_lost_press = self.page.asks_for_a_new_press
         return self.page
 
     def _make_recorder(self) -> RecorderStandIn:
@@ -279,20 +279,20 @@ class SoakRig:
 
     # ---- what is seen ---------------------------------------------------------------------------
 
-    def _see_published(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
+    def _tap_published(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
         topic = output.topic
         self.digest.update(f"{stamp_ns} {sender} {topic}\n".encode())
         for watcher in self.watchers.get(topic, ()):
             watcher(sender, message)
         if output is LOG:
-            self._see_log(message)
+            self._on_log(message)
 
-    def _see_log(self, line: LogLine) -> None:
+    def _on_log(self, line: LogLine) -> None:
         self.log.append(f"{self.now:9.3f} {line.source}: {line.severity}: {line.text}")
         if line.text.startswith(_INTERNAL):
             self.crashes.append(f"{line.source}: {line.text}")
 
-    def _meet_faults(self, link: Link, message: Any, now: float, rng: Any) -> Arrivals | None:
+    def _apply_faults(self, link: Link, message: Any, now: float, rng: Any) -> Arrivals | None:
         if link.topic == CAN and link.sender == "device_driver":
             for see in () if self._adapter_is_open else self.adapter_opened:
                 see()

@@ -15,7 +15,7 @@ from scenario.faults import Fault, Kind, draw_schedule, rogue_topic
 from scenario.monitors.invariants import RELEASE_BOUND, InvariantMonitor, Violation
 from scenario.monitors.limit_monitor import SetPointFrames
 from scenario.parts.bench import Motors
-from scenario.parts.person import OUT, Wish
+from scenario.parts.operator_model import OUT, OperatorGoal
 from scenario.rig import SECOND, SoakRig
 
 # So long moments are waited for whose faults shall follow them [s].
@@ -109,8 +109,8 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     course.give_up()
     calm = rig.now
     while rig.now < calm + _GO_ON + _DRAW_OUT and not _has_left(rig):
-        if rig.now > calm + _GO_ON and rig.person.wish is Wish.INSERT:
-            rig.person.wish = Wish.DRAW_OUT
+        if rig.now > calm + _GO_ON and rig.person.goal is OperatorGoal.INSERT:
+            rig.person.goal = OperatorGoal.WITHDRAW
         rig.run(_LOOK)
     if not _has_left(rig):
         watch.violate("the_way_goes_on", rig.now, _state_of(rig))
@@ -205,7 +205,7 @@ def _rounded(place: Sequence[float]) -> bytes:
 
 
 def _has_left(rig: SoakRig) -> bool:
-    return rig.person.wish is Wish.LEAVE and rig.bench.motors.insertion < OUT
+    return rig.person.goal is OperatorGoal.LEAVE and rig.bench.motors.insertion < OUT
 
 
 def _state_of(rig: SoakRig) -> str:
