@@ -15,7 +15,7 @@ from needle_core.component import Call
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import from_values
 from scenario import faults
-from scenario.course import Undo
+from scenario.schedule_runner import Undo
 from scenario.faults import Fault, Kind
 from scenario.link_faults import LinkFault
 from scenario.parts.bench import Sight

@@ -9,7 +9,7 @@ from typing import Any
 from needle_core import messages as m
 from needle_device_driver.supervisor.limits import SafetyLimits
 from scenario import faults as of
-from scenario.course import Course, relative_to_moments, watch_moments
+from scenario.schedule_runner import ScheduleRunner, relative_to_moments, watch_moments
 from scenario.fault_injector import LATEST_MESSAGE, SLOWEST_HANDLER, FaultInjector
 from scenario.faults import Fault, Kind, draw_schedule, rogue_topic
 from scenario.monitors.invariants import RELEASE_BOUND, InvariantMonitor, Violation
@@ -101,12 +101,12 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     if of_recording:
         rig.record()
     watch = _watched(rig, faults)
-    course = Course(rig.runner.timeline, faults, FaultInjector(rig).begin)
-    watch_moments(rig, course.meet)
+    schedule = ScheduleRunner(rig.runner.timeline, faults, FaultInjector(rig).begin)
+    watch_moments(rig, schedule.reach)
     # What has not come when the needle is out again never comes.
-    while rig.now < _FAULTS_OVER and (course.is_under_way or (course.waits and not _has_left(rig))):
+    while rig.now < _FAULTS_OVER and (schedule.has_active or (schedule.has_pending and not _has_left(rig))):
         rig.run(_LOOK)
-    course.give_up()
+    schedule.cancel_pending()
     calm = rig.now
     while rig.now < calm + _GO_ON + _DRAW_OUT and not _has_left(rig):
         if rig.now > calm + _GO_ON and rig.person.goal is OperatorGoal.INSERT:
@@ -123,7 +123,7 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
         off = f"the tip went to {rig.bench.deepest_tip[0] * 1e3:.2f} mm from the plane"
         watch.violate("undisturbed_converges", rig.now, f"{off}; {_state_of(rig)}")
     return RunResult(
-        seed, tuple(faults), tuple(watch.violations), tuple(relative_to_moments(course)), rig.now,
+        seed, tuple(faults), tuple(watch.violations), tuple(relative_to_moments(schedule)), rig.now,
         digest=rig.digest.hexdigest(), inserted=rig.person.done, log=tuple(rig.log),
     )  # fmt: skip
 

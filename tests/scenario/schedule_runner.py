@@ -1,4 +1,4 @@
-"""The course of a schedule: each fault begins by what it meets, and ends after its time."""
+"""The schedule of a schedule: each fault begins by what it meets, and ends after its time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CONTROLLER = {("state", "STEERING"): Moment.STEERING, ("state", "DONE"): Moment
 
 
 @dataclasses.dataclass(frozen=True)
-class Meeting:
+class ReachedMoment:
     """A moment that came.
 
     Attributes
@@ -42,7 +42,7 @@ class Meeting:
     at: float
 
 
-class Course:
+class ScheduleRunner:
     """Lets the faults of a schedule begin and end.
 
     Parameters
@@ -56,7 +56,7 @@ class Course:
 
     Attributes
     ----------
-    met : list of Meeting
+    reached : list of ReachedMoment
         All moments that came, in their order.
     begun : list of tuple of Fault and float
         Faults that happened, and when they began [s].
@@ -70,30 +70,30 @@ class Course:
         self._waiting = list(faults)
         self._under_way = 0
         self._count: Counter[Moment] = Counter()
-        self.met: list[Meeting] = []
+        self.reached: list[ReachedMoment] = []
         self.begun: list[tuple[Fault, float]] = []
 
     @property
-    def is_under_way(self) -> bool:
+    def has_active(self) -> bool:
         """Whether a fault lasts, or its moment has come."""
         return self._under_way > 0
 
     @property
-    def waits(self) -> bool:
+    def has_pending(self) -> bool:
         """Whether the moment of a fault has not come yet."""
         return bool(self._waiting)
 
-    def meet(self, moment: Moment) -> None:
+    def reach(self, moment: Moment) -> None:
         """Take note that a moment has come."""
         self._count[moment] += 1
         this = moment, self._count[moment]
-        self.met.append(Meeting(*this, self._timeline.now))
+        self.reached.append(ReachedMoment(*this, self._timeline.now))
         for fault in [one for one in self._waiting if (one.after, one.nth) == this]:
             self._waiting.remove(fault)
             self._under_way += 1
             self._timeline.call_after(fault.at, partial(self._happen, fault))
 
-    def give_up(self) -> None:
+    def cancel_pending(self) -> None:
         """Wait for no moment any more."""
         self._waiting.clear()
 
@@ -106,8 +106,8 @@ class Course:
         self._under_way -= 1
 
 
-def watch_moments(rig: SoakRig, meet: Callable[[Moment], None]) -> None:
-    """Call `meet` with each moment of a rig as it comes, the start at once."""
+def watch_moments(rig: SoakRig, reach: Callable[[Moment], None]) -> None:
+    """Call `reach` with each moment of a rig as it comes, the start at once."""
     heard: dict[str, Any] = {}
 
     def watch_status(topic: str, moments: dict[tuple[str, str], Moment]) -> None:
@@ -116,7 +116,7 @@ def watch_moments(rig: SoakRig, meet: Callable[[Moment], None]) -> None:
             heard[topic] = message
             for (key, value), moment in moments.items():
                 if getattr(message, key) == value != getattr(before, key, ""):
-                    meet(moment)
+                    reach(moment)
 
         rig.watch(topic, see)
 
@@ -126,23 +126,23 @@ def watch_moments(rig: SoakRig, meet: Callable[[Moment], None]) -> None:
         pressed = heard.get(node, False)
         heard[node] = message.pressed
         if message.pressed != pressed:
-            meet(Moment.PRESSED if message.pressed else Moment.RELEASED)
+            reach(Moment.PRESSED if message.pressed else Moment.RELEASED)
 
     watch_status("device/status", _DEVICE)
     watch_status("needle/controller_status", _CONTROLLER)
     rig.watch("device/hold", observe_hold)
-    rig.watch("device/joint_trajectory", lambda *_: meet(Moment.COMMAND))
-    rig.adapter_opened.append(lambda: meet(Moment.ADAPTER_OPENED))
-    meet(Moment.START)
+    rig.watch("device/joint_trajectory", lambda *_: reach(Moment.COMMAND))
+    rig.adapter_opened.append(lambda: reach(Moment.ADAPTER_OPENED))
+    reach(Moment.START)
 
 
-def relative_to_moments(course: Course) -> list[Fault]:
+def relative_to_moments(schedule: ScheduleRunner) -> list[Fault]:
     """Return the faults that happened, each told by the last moment that it met.
 
     So a change that shifts what a run does shifts its faults with it.
     """
     told = []
-    for fault, begun in course.begun:
-        last = [one for one in course.met if one.at <= begun][-1]
+    for fault, begun in schedule.begun:
+        last = [one for one in schedule.reached if one.at <= begun][-1]
         told.append(dataclasses.replace(fault, after=last.moment, nth=last.nth, at=begun - last.at))
     return told
