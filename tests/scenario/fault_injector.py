@@ -18,7 +18,7 @@ from scenario import faults
 from scenario.schedule_runner import Undo
 from scenario.faults import Fault, Kind
 from scenario.link_faults import LinkFault
-from scenario.parts.bench import Sight
+from scenario.parts.bench import CameraState
 from scenario.parts.rogue_publisher import RoguePublisher
 from scenario.rig import SECOND_JOYSTICK, SECOND_OPERATOR, SoakRig
 
@@ -34,12 +34,12 @@ _DRIFT_NS, _DRIFT_PERIOD = 2_000_000, 0.02
 _TREMBLING = (0.03, 0.3)
 _WAVERING = ((True, False), (False, False), (False, True), (True, True))
 _MOTION_ERROR = 0x5530
-_SIGHTS = {
-    Kind.OFF: Sight.BLACK,
-    Kind.STUCK: Sight.FROZEN,
-    Kind.WRONG: Sight.WRONG,
-    Kind.SLOW: Sight.LATE,
-    Kind.GARBAGE: Sight.WRONG,
+_CAMERA_STATES = {
+    Kind.OFF: CameraState.BLACK,
+    Kind.STUCK: CameraState.FROZEN,
+    Kind.WRONG: CameraState.WRONG,
+    Kind.SLOW: CameraState.LATE,
+    Kind.GARBAGE: CameraState.WRONG,
 }
 _SWITCHED_ON = ("device/enable", "device/confirm_needle_out")
 
@@ -156,9 +156,9 @@ class FaultInjector:
         return _nothing
 
     def _inject_camera_fault(self, fault: Fault) -> Undo:
-        self._rig.tracker.sight = _SIGHTS[fault.kind]
+        self._rig.tracker.camera_state = _CAMERA_STATES[fault.kind]
         # The tracker may be another by then.
-        return lambda: setattr(self._rig.tracker, "sight", Sight.CLEAR)
+        return lambda: setattr(self._rig.tracker, "camera_state", CameraState.CLEAR)
 
     def _inject_clock_fault(self, fault: Fault) -> Undo:
         timeline = self._timeline

@@ -28,7 +28,7 @@ from needle_sim.drive_emulator import DriveEmulator, DriveEmulatorParameters
 from scenario.faults import CONSOLE, PAGE, RECORDER
 from scenario.link_faults import LinkFaults
 from scenario.parts.bench import ANSWER, TIP_NOISE, Bench, TrackerStandIn
-from scenario.parts.hold_server import HoldServer
+from scenario.parts.hold_server import VirtualHoldServer
 from scenario.parts.page import Page
 from scenario.parts.operator_model import (
     INSERT,
@@ -45,7 +45,7 @@ SECOND_OPERATOR, SECOND_JOYSTICK = "second_operator", "second_joy_node"
 SECOND = (SECOND_JOYSTICK, SECOND_OPERATOR)
 """Of a second person."""
 _SECOND_JOY = "second_joy"
-_CONSOLE = (CONSOLE, HoldServer.name)
+_CONSOLE = (CONSOLE, VirtualHoldServer.name)
 # Whose topics are recorded.
 _RECORDED = ("device_driver", "plane_controller", "operator", "joy_node")
 _DEPTHS = (0.003, 0.008)
@@ -156,7 +156,7 @@ class SoakRig:
             "stereo_tracker": self._make_tracker,
             "joy_node": lambda: Joystick(JoystickButtons() if at_page else self.hand),
             CONSOLE: lambda: Console(ConsoleParameters()),
-            HoldServer.name: HoldServer,
+            VirtualHoldServer.name: VirtualHoldServer,
             PAGE: self._make_page,
             RECORDER: self._make_recorder,
             SECOND_OPERATOR: lambda: Operator(_operator_settings(), SECOND_OPERATOR, _SECOND_JOY),
@@ -198,7 +198,7 @@ class SoakRig:
         """Kill a node as SIGKILL does."""
         if self.runner.runs(name):
             self.runner.kill(name)
-            if name == HoldServer.name and self.page is not None:
+            if name == VirtualHoldServer.name and self.page is not None:
                 self.page.cut()
             if name == RECORDER:
                 self.recorders[-1].cut(self.now)

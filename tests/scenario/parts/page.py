@@ -24,7 +24,7 @@ CONNECT = "connect"
 
 
 @dataclasses.dataclass(frozen=True)
-class Said:
+class PageMessage:
     """A word on the line between page and console.
 
     Attributes
@@ -77,14 +77,14 @@ class Page(Component):
         self._count = 0
         self._press: _Press | None = None
         self._lost = False
-        self._heard_at = -_SILENCE
+        self._received_at = -_SILENCE
         self._under_finger = finger()
-        self.ports = (Port(PAGE_LINE, self._take),)
+        self.ports = (Port(PAGE_LINE, self._handle_batch),)
         self.timers = (Timer(_LOOK, self._look),)
 
     def asks_for_a_new_press(self, now: float) -> bool:
         """Tell whether it shows that the finger holds nothing: the press is lost, or the link."""
-        return self._lost or now - self._heard_at > _SILENCE
+        return self._lost or now - self._received_at > _SILENCE
 
     def cut(self) -> None:
         """Let the connection end, as the kernel does for a server that is gone."""
@@ -92,37 +92,37 @@ class Page(Component):
 
     def on_stop(self, at: Moment) -> Actions:
         """Go away: the connection ends."""
-        yield Send(PAGE_LINE, (Said(self._connection),))
+        yield Send(PAGE_LINE, (PageMessage(self._connection),))
         yield Exit(0)
 
     # ---- the connection -------------------------------------------------------------------------
 
-    def _take(self, batch: Sequence[Said], at: Moment) -> Actions:
+    def _handle_batch(self, batch: Sequence[PageMessage], at: Moment) -> Actions:
         # The finger comes first, as in a browser that stood still.
-        yield from self._see_finger()
-        for said in batch:
-            if said.connection != self._connection:
+        yield from self._update_finger()
+        for message in batch:
+            if message.connection != self._connection:
                 continue
-            if said.text is None:
+            if message.text is None:
                 self._lose_connection(at.steady)
             else:
-                yield from self._hear(json.loads(said.text), at)
+                yield from self._handle_message(json.loads(message.text), at)
 
     def _lose_connection(self, now: float) -> None:
         self._drop()
         self._count, self._is_cut = 0, False
         self._retry_at = now + _RETRY
 
-    def _hear(self, told: dict[str, object], at: Moment) -> Actions:
+    def _handle_message(self, told: dict[str, object], at: Moment) -> Actions:
         self._retry_at = math.inf
         self._count = int(str(told["count"]))
-        self._heard_at = at.steady
+        self._received_at = at.steady
         # Once lost, a press is over, whatever the finger does.
         if self._press and int(str(told["heard"])) > self._press.after and not told["held"]:
             self._drop()
-        yield from self._tell()
+        yield from self._publish_state()
 
-    def _tell(self) -> Actions:
+    def _publish_state(self) -> Actions:
         if not self._count:
             return
         message = {
@@ -136,12 +136,12 @@ class Page(Component):
         yield self._send(text)
 
     def _send(self, text: str) -> Action:
-        return Send(PAGE_LINE, (Said(self._connection, text),))
+        return Send(PAGE_LINE, (PageMessage(self._connection, text),))
 
     # ---- the finger -----------------------------------------------------------------------------
 
     def _look(self, at: Moment) -> Actions:
-        yield from self._see_finger()
+        yield from self._update_finger()
         if self._is_cut:
             self._lose_connection(at.steady)
         if at.steady >= self._retry_at:
@@ -153,13 +153,13 @@ class Page(Component):
         if self.repeats and self._sent:
             yield self._send(self._chance.choice(self._sent))
 
-    def _see_finger(self) -> Actions:
+    def _update_finger(self) -> Actions:
         before, self._under_finger = self._under_finger, self._finger()
         if self._under_finger == before:
             return
         if self._press:
             self._press = None
-            yield from self._tell()
+            yield from self._publish_state()
         self._lost = False
         if self._under_finger and not before:
             # The next count is answered with it.
