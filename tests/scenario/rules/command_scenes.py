@@ -18,9 +18,9 @@ def hold_to_run() -> None:
     assert scene.refuses(Rule.HOLD_TO_RUN)
     scene.press()
     scene.step()
-    assert not scene.rests(0.1)
+    assert not scene.is_at_rest(0.1)
     scene.release()
-    assert scene.rests()
+    assert scene.is_at_rest()
 
 
 def hold_age() -> None:
@@ -28,8 +28,8 @@ def hold_age() -> None:
     scene = Scene()
     scene.moving()
     scene.silence(0.5)
-    assert scene.named(Rule.HOLD_AGE)
-    assert scene.rests(0.5)
+    assert scene.is_logged(Rule.HOLD_AGE)
+    assert scene.is_at_rest(0.5)
 
 
 def hold_new_press() -> None:
@@ -48,10 +48,10 @@ def hold_one_owner() -> None:
     """A second hand does not count beside the first, nor when that lets go."""
     scene = Scene()
     scene.ready()
-    other = scene.let_in(HOLD)
+    other = scene.start_node(HOLD)
     for count, pressed in enumerate((False, True), 1):
-        scene.told(other, Publish(HOLD.topic, m.HoldState("other", "", count, pressed, 1.0, 0.1)))
-    assert scene.named(Rule.HOLD_ONE_OWNER)
+        scene.act(other, Publish(HOLD.topic, m.HoldState("other", "", count, pressed, 1.0, 0.1)))
+    assert scene.is_logged(Rule.HOLD_ONE_OWNER)
     assert scene.hand.status.hold_owner == "hand"
 
 
@@ -59,10 +59,10 @@ def hold_in_order() -> None:
     """An old press of the hand that comes again does not count."""
     scene = Scene()
     scene.ready()
-    other = scene.let_in(HOLD)
+    other = scene.start_node(HOLD)
     old = m.HoldState(scene.hand.name, scene.hand.session._session, 1, False, 0.0, 0.1)
-    scene.told(other, Publish(HOLD.topic, old))
-    assert scene.named(Rule.HOLD_IN_ORDER)
+    scene.act(other, Publish(HOLD.topic, old))
+    assert scene.is_logged(Rule.HOLD_IN_ORDER)
     assert scene.hand.status.holds_ignored > 0
     assert scene.hand.status.hold_owner == "hand"
 
@@ -73,7 +73,7 @@ def speed_scale() -> None:
     scene.moving()
     scene.hand.held = Held(True, math.nan)
     scene.runner.run(0.1)
-    assert scene.rests()
+    assert scene.is_at_rest()
     assert scene.hand.status.hold_owner == ""
 
 
@@ -81,7 +81,7 @@ def one_device() -> None:
     """Where another device speaks nothing moves."""
     scene = Scene()
     scene.moving()
-    scene.let_in(STATUS)
+    scene.start_node(STATUS)
     assert scene.fails(Rule.ONE_DEVICE)
 
 
@@ -89,14 +89,14 @@ def no_motion_by_itself() -> None:
     """Enabling moves nothing, whatever was under way before and is pressed still."""
     scene = Scene()
     scene.home()
-    assert scene.rests()
+    assert scene.is_at_rest()
     scene.press()
     scene.step()
     scene.call("device/enable", False)
     scene.runner.run(0.1)
-    assert scene.rests()
+    assert scene.is_at_rest()
     scene.call("device/enable", True)
-    assert scene.rests(1.0)
+    assert scene.is_at_rest(1.0)
 
 
 def command_state() -> None:
@@ -104,7 +104,7 @@ def command_state() -> None:
     scene = Scene()
     first = scene.moving()
     second = scene.step(0.001, 0.1, 0.5)
-    assert scene.named(Rule.COMMAND_STATE)
+    assert scene.is_logged(Rule.COMMAND_STATE)
     scene.until(lambda: first in scene.hand.results, "the first step")
     assert scene.hand.results[first] == "succeeded"
     assert scene.hand.results[second].startswith("aborted")
@@ -114,7 +114,7 @@ def command_one_publisher() -> None:
     """With two who command nobody is obeyed."""
     scene = Scene()
     scene.ready()
-    scene.let_in(COMMANDS)
+    scene.start_node(COMMANDS)
     scene.step()
     assert scene.refuses(Rule.COMMAND_ONE_PUBLISHER)
 
@@ -251,7 +251,7 @@ def retraction() -> None:
     scene.call("device/retract")
     scene.runner.run(0.1)
     scene.release()
-    assert scene.rests()
+    assert scene.is_at_rest()
     assert 0.0 < scene.place[0] < deep
     scene.press()
     scene.call("device/retract")
@@ -266,7 +266,7 @@ def homing_needle_out() -> None:
     scene.until(lambda: scene.state == "DISABLED", "the driver")
     scene.hand.answers.clear()
     scene.hand.actions.append(Call("device/home"))
-    assert scene.rests(1.0)
+    assert scene.is_at_rest(1.0)
     assert [answer.success for answer in scene.hand.answers] == [False]
 
 

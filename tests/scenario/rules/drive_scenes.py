@@ -66,12 +66,12 @@ def estop_latches() -> None:
     """An emergency stop ends the motion; taking it back moves nothing."""
     scene = Scene()
     scene.moving()
-    other = scene.let_in(ESTOP)
-    scene.told(other, Publish(ESTOP.topic, m.EmergencyStop(True)))
-    assert scene.rests()
-    assert scene.named(Rule.ESTOP_LATCHES)
-    scene.told(other, Publish(ESTOP.topic, m.EmergencyStop(False)))
-    assert scene.rests()
+    other = scene.start_node(ESTOP)
+    scene.act(other, Publish(ESTOP.topic, m.EmergencyStop(True)))
+    assert scene.is_at_rest()
+    assert scene.is_logged(Rule.ESTOP_LATCHES)
+    scene.act(other, Publish(ESTOP.topic, m.EmergencyStop(False)))
+    assert scene.is_at_rest()
     assert scene.state == "ESTOPPED"
 
 
@@ -142,7 +142,7 @@ def one_master() -> None:
     """Somebody else's SYNC is a fault."""
     scene = Scene()
     scene.moving()
-    scene.bus_says = [CanFrame(SYNC)]
+    scene.extra_frames = [CanFrame(SYNC)]
     assert scene.fails(Rule.ONE_MASTER)
 
 
@@ -181,7 +181,7 @@ def quick_stop() -> None:
     scene.moving()
     scene.release()
     assert states(scene) == [PowerState.QUICK_STOP_ACTIVE] * 2
-    assert scene.rests()
+    assert scene.is_at_rest()
 
 
 def software_limits() -> None:

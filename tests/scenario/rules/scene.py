@@ -48,7 +48,7 @@ class LogCollector(Component):
         return ()
 
 
-class Other(Component):
+class SecondNode(Component):
     """A second node that sends what is not its own.
 
     Parameters
@@ -85,7 +85,7 @@ class Scene(VirtualRig):
 
     Attributes
     ----------
-    bus_says : list of CanFrame
+    extra_frames : list of CanFrame
         What somebody else puts on the bus, in the drives' next batch.
     heartbeats : int
         The computer's, so far.
@@ -96,18 +96,18 @@ class Scene(VirtualRig):
         driver: Mapping[str, Any] | None = None,
         drives: Mapping[str, Any] | None = None,
     ) -> None:
-        self.bus_says: list[CanFrame] = []
+        self.extra_frames: list[CanFrame] = []
         self.heartbeats = 0
-        super().__init__(1, driver=driver, drives=drives, faults=(self._see_frames,))
+        super().__init__(1, driver=driver, drives=drives, faults=(self._tap_frames,))
         self._log = LogCollector()
         self.runner.start(self._log)
 
-    def _see_frames(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
+    def _tap_frames(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
         if link.topic == CAN:
             if link.sender == DRIVER:
                 self.heartbeats += sum(frame.identifier == HEARTBEAT for frame in message)
             else:
-                message, self.bus_says = (*message, *self.bus_says), []
+                message, self.extra_frames = (*message, *self.extra_frames), []
         return (Arrival(0.0, message),)
 
     # ---- what is done -------------------------------------------------------------------------
@@ -150,14 +150,14 @@ class Scene(VirtualRig):
         self.until(lambda: self.place[0] > begin + 0.0005, "a step under way")
         return stamp
 
-    def let_in(self, *outputs: Output) -> Other:
+    def start_node(self, *outputs: Output) -> SecondNode:
         """Start another node, and let the rest see it."""
-        other = Other(*outputs)
+        other = SecondNode(*outputs)
         self.runner.start(other)
         self.runner.run(0.3)
         return other
 
-    def told(self, other: Other, *actions: Action) -> None:
+    def act(self, other: SecondNode, *actions: Action) -> None:
         """Let the other node act, and time go by."""
         other.actions += actions
         self.runner.run(0.1)
@@ -174,11 +174,11 @@ class Scene(VirtualRig):
         """What the device says of itself."""
         return self.hand.status.state
 
-    def named(self, rule: Rule) -> bool:
+    def is_logged(self, rule: Rule) -> bool:
         """Return whether a rule was named in the log."""
         return any(f"[{rule.value}]" in line for line in self._log.lines)
 
-    def rests(self, seconds: float = 0.3) -> bool:
+    def is_at_rest(self, seconds: float = 0.3) -> bool:
         """Return whether no motor moves for some time."""
         before = self.place
         self.runner.run(seconds)
@@ -190,12 +190,12 @@ class Scene(VirtualRig):
 
     def refuses(self, rule: Rule) -> bool:
         """Return whether the last command was refused for a rule, and nothing moves."""
-        return self.rests() and self.named(rule) and self.state != "MOVING"
+        return self.is_at_rest() and self.is_logged(rule) and self.state != "MOVING"
 
     def fails(self, rule: Rule) -> bool:
         """Return whether the device is in FAULT for a rule, and nothing moves."""
         self.runner.run(0.3)
-        return self.rests() and self.named(rule) and self.state == "FAULT"
+        return self.is_at_rest() and self.is_logged(rule) and self.state == "FAULT"
 
 
-__all__ = ["AXES", "COMMANDS", "DRIVER", "ESTOP", "HOLD", "STATUS", "Held", "Other", "Scene"]
+__all__ = ["AXES", "COMMANDS", "DRIVER", "ESTOP", "HOLD", "STATUS", "Held", "SecondNode", "Scene"]
