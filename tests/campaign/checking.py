@@ -171,7 +171,7 @@ def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:
     return found
 
 
-def unreadable(bag: Path) -> str:
+def bag_read_error(bag: Path) -> str:
     """Return why a bag does not open with rosbags and mcap; an empty text if it does."""
     try:
         with Reader(bag) as reader:

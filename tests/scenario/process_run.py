@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState, Joy
 from trajectory_msgs.msg import JointTrajectory
 
-from campaign.trials.rig_hand import RigHand, ros
+from campaign.trials.ros_rig_client import RosRigClient, ros
 from campaign.trials.trial_processes import TrialProcesses, graph_in_real_time
 from needle_core.convert import from_ros
 from needle_core.errors import UserError
@@ -44,7 +44,7 @@ _START, _DRAW_OUT, _STILL = 120.0, 60.0, 1.0
 _WITHOUT_SYNC = 0.1
 
 
-class ProcessMonitor(RigHand):
+class ProcessMonitor(RosRigClient):
     """Hears holds, status and motors, and judges them; draws the needle out when it is asked to.
 
     Times are those at which a message was sent, so that a monitor who is late judges no other. It

@@ -56,7 +56,7 @@ class Held(NamedTuple):
     push: float = 0.0
 
 
-class Hand(Component):
+class VirtualRigClient(Component):
     """Holds, sends what it is told to, and keeps what it hears.
 
     Parameters
@@ -157,7 +157,7 @@ class VirtualRig:
         drives: Mapping[str, Any] | None = None,
         faults: Sequence[Fault] = (),
     ) -> None:
-        self.hand = Hand(steers=not others)
+        self.hand = VirtualRigClient(steers=not others)
         self.drives = DriveEmulator(DriveEmulatorParameters(**(drives or {})))
         self.bus = self.drives.bus
         parameters = DeviceDriverParameters(

@@ -27,7 +27,7 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_srvs.srv import Trigger
 
 import needle_tracker
-from campaign.trials.rig_hand import CONTROLLER_START, RigHand
+from campaign.trials.ros_rig_client import CONTROLLER_START, RosRigClient
 from campaign.trials.steered_needle import FRAME_RATE, OFFSET, steer
 from campaign.trials.trial_processes import TrialProcesses
 from figure_rows import Row
@@ -169,7 +169,7 @@ def _free_ports() -> dict[str, object]:
         return {"port": page.getsockname()[1], "hold_port": hold.getsockname()[1]}
 
 
-class LatencyRig(RigHand):
+class LatencyRig(RosRigClient):
     """Cameras and operator: publishes the image drawn nearest to the insertion, and holds.
 
     Parameters
@@ -227,7 +227,7 @@ class LatencyRig(RigHand):
             if time.monotonic() > end:
                 raise UserError(f"timed out after {_TIMEOUT:g} s: {what}; device: {self.status}")
             wait = self._due - time.monotonic()
-            self.look(max(wait, 0.0))
+            self.spin(max(wait, 0.0))
             if time.monotonic() >= self._due:
                 self._publish_pair()
                 # A late camera does not catch up.

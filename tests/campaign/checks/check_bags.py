@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 
-from campaign.checking import Check, Finding, Workbench, unreadable
+from campaign.checking import Check, Finding, Workbench, bag_read_error
 from campaign.trials.recording_trials import record_and_kill, record_full_rate
 from campaign.trials.signal_trials import signal_trials
 
@@ -40,7 +40,7 @@ def full_rate(bench: Workbench) -> Iterator[Finding]:
         f"{seen['grew']:+.1f} MB, {seen['memory']:.0f} MB at the end",
         seen["grew"] <= MEMORY_GROWTH_MB,
     )
-    why = unreadable(bench.folder / "full_rate")
+    why = bag_read_error(bench.folder / "full_rate")
     yield Finding("full_rate_readers", "rosbags and mcap", "read all", why or "read all", not why)
 
 

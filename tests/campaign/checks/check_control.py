@@ -13,11 +13,11 @@ from campaign.checks.control_studies import (
     FIGURE_3,
     PAPER,
     POINTS,
-    TOLD_WRONG,
+    MISINFORMED,
     TROUBLE,
     WANDERING,
     Study,
-    judge,
+    compare_figures,
     run,
 )
 from needle_bringup.studies.pure_insertions import curvature_errors
@@ -42,7 +42,7 @@ def best(bench: Workbench) -> Iterator[Finding]:
 
 def trouble(bench: Workbench) -> Iterator[Finding]:
     """Study preset best under each trouble, of which it is told nothing."""
-    return _studied(TROUBLE + TOLD_WRONG + WANDERING, bench)
+    return _studied(TROUBLE + MISINFORMED + WANDERING, bench)
 
 
 def points(bench: Workbench) -> Iterator[Finding]:
@@ -54,7 +54,7 @@ def points(bench: Workbench) -> Iterator[Finding]:
 
 def _studied(studies: Iterable[Study], bench: Workbench) -> Iterator[Finding]:
     for study in studies:
-        yield from judge(study, run(study, bench.folder))
+        yield from compare_figures(study, run(study, bench.folder))
 
 
 def curvature(bench: Workbench) -> Iterator[Finding]:

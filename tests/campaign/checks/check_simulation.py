@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
-from campaign.checking import Check, Finding, Workbench, payloads, unreadable
+from campaign.checking import Check, Finding, Workbench, payloads, bag_read_error
 
 SAME_TOPICS = ("/needle/tip", "/device/joint_trajectory", "/device/result", "/sim/tip_pose")
 # Options of simulate -> what the error over the last 20 mm may be [mm RMS].
@@ -30,7 +30,7 @@ def camera(bench: Workbench) -> Iterator[Finding]:
     passed = run.summary.get("converged") is True and abs(r1 or 9.0) <= 1.0
     yield Finding("camera_converged", "level camera: converged, |r1|", wanted, seen, passed)
     yield Finding("camera_wall", "its time", "< 40 s", f"{run.wall:.1f} s", run.wall < 40.0)
-    why = unreadable(run.bag)
+    why = bag_read_error(run.bag)
     yield Finding("camera_bag", "its bag", "opens with rosbags and mcap", why or "opens", not why)
     kinds = ("report.html", "summary.json", "parameters.yaml", "*.png")
     missing = ", ".join(kind for kind in kinds if not any(run.bag.glob(kind)))

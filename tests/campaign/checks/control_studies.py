@@ -91,7 +91,7 @@ TROUBLE = tuple(
     )
 )
 _KNOWN = {"inside_2_sigma": 0.93, "inside_3_sigma": 0.99}
-TOLD_WRONG = tuple(
+MISINFORMED = tuple(
     Study(key, "best", options, {AT_END: least, **_KNOWN}, {TRUSTED_FAR_OFF: 0.0})
     for key, options, least in (
         ("normal_noise", NORMAL, 0.999),
@@ -138,7 +138,7 @@ _COMPARED = (
 )
 COMPARED = {
     BEST.key: BEST,
-    **{study.key: study for study in TROUBLE + TOLD_WRONG if study.key in _COMPARED},
+    **{study.key: study for study in TROUBLE + MISINFORMED if study.key in _COMPARED},
     **{study.key: study for study in WANDERING},
 }
 """Rows of the table of estimators, by key."""
@@ -181,7 +181,7 @@ def run(study: Study, folder: Path) -> Figures:
     return dict(json.loads(file.read_text(encoding="utf-8")))
 
 
-def judge(study: Study, figures: Figures) -> Iterator[Finding]:
+def compare_figures(study: Study, figures: Figures) -> Iterator[Finding]:
     """Compare a study's figures with what they must be."""
     bounds = [(*bound, True) for bound in study.at_least.items()]
     for key, bound, is_least in (*bounds, *((*bound, False) for bound in study.at_most.items())):

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from campaign.steering.obstacle_scenes import ObstacleScene, clearance, make_scene
-from campaign.steering.path_judge import way_after
+from campaign.steering.path_search import find_path
 from needle_bringup.studies.study_laws import rrt_law
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.target_motion import TargetMotion
@@ -63,7 +63,7 @@ class SceneOutcome:
     Attributes
     ----------
     bare, solvable, roomy : bool
-        Whether the judge finds a way with all, 90 % or 85 % of the curvature, 0.35, 0.75 or 1.25 mm
+        Whether the solvability finds a way with all, 90 % or 85 % of the curvature, 0.35, 0.75 or 1.25 mm
         clear of everything.
     taken, stopped : bool
         Whether the controller set out, and whether it saw no way on.
@@ -82,10 +82,10 @@ class SceneOutcome:
     least: float = math.inf
 
 
-def judge(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcome:
+def solvability(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcome:
     """Return whether a scene can be solved, of a needle that has not set out."""
     bare, solvable, roomy = (
-        way_after(
+        find_path(
             scene.target,
             scene.obstacles,
             share * CURVATURE,
@@ -102,7 +102,7 @@ def judge(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcome:
 
 def steer(
     scene: ObstacleScene,
-    judged: SceneOutcome,
+    solved: SceneOutcome,
     settings: SteeringSettings,
     rng: np.random.Generator,
     times: list[float],
@@ -113,7 +113,7 @@ def steer(
 
     Parameters
     ----------
-    scene, judged : ObstacleScene, SceneOutcome
+    scene, solved : ObstacleScene, SceneOutcome
         The scene, and what is known of it.
     settings : SteeringSettings
         The controller's; its `tip_noise_bound` is the largest error of a measured coordinate, too.
@@ -126,7 +126,7 @@ def steer(
     """
     drive = _reference(scene, settings) if rrt else _best(scene, settings)
     if drive is None:
-        return judged
+        return solved
     plant = NeedlePlant(initial_pose(scene.pitch, scene.roll), curvature=CURVATURE)
     noise = settings.tip_noise_bound
     joints, least = JointSample(0, 0.0, 0.0), math.inf
@@ -141,7 +141,7 @@ def steer(
         if step is None:
             miss = float(np.linalg.norm(_tip(plant) - scene.target))
             return dataclasses.replace(
-                judged, taken=True, stopped=command is None, miss=miss, least=least
+                solved, taken=True, stopped=command is None, miss=miss, least=least
             )
         length, turn = step.insertion - joints.insertion, step.rotation - joints.rotation
         for _ in range(_SUBSTEPS):
@@ -227,7 +227,7 @@ def study(
             seed, n, curvature=CURVATURE, pitch_bound=pitch_bound, roll_bound=roll_bound
         )
         rng = np.random.default_rng([seed, n, 1])
-        outcomes.append(steer(scene, judge(scene, settings), settings, rng, times, rrt=rrt))
+        outcomes.append(steer(scene, solvability(scene, settings), settings, rng, times, rrt=rrt))
     return figures(outcomes, times)
 
 
@@ -242,7 +242,7 @@ def figures(outcomes: Sequence[SceneOutcome], times: Sequence[float]) -> dict[st
 
     solvable = [one for one in outcomes if one.solvable]
     roomy = [one for one in outcomes if one.roomy]
-    # The judge misses some ways: where a needle was led there, there is one.
+    # The solvability misses some ways: where a needle was led there, there is one.
     unsolvable = [
         one
         for one in outcomes
@@ -294,7 +294,7 @@ def _run(words: Sequence[str]) -> int:
         entry_angle_std=math.radians(number("--told-deg", given.told_deg, 0.1, 45.0, "deg")),
         noise=number("--noise-mm", given.noise_mm, 0.01, 10.0, "mm") * 1e-3,
     )
-    tell(LABELS, seen, path)
+    print_figures(LABELS, seen, path)
     return EXIT_DONE
 
 
@@ -311,7 +311,7 @@ def study_parser(
     return parser
 
 
-def tell(labels: Mapping[str, str], seen: Mapping[str, float | None], path: Path | None) -> None:
+def print_figures(labels: Mapping[str, str], seen: Mapping[str, float | None], path: Path | None) -> None:
     """Print a study's figures, and write them where --json says."""
     for name, label in labels.items():
         value = seen[name]

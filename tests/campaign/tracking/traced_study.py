@@ -34,9 +34,9 @@ class Variation:
     name : str
         As a person reads it.
     width : float
-        Needle width that is told, over the true one.
+        Needle width that is known, over the true one.
     zero : float
-        Added to the insertion that is told [m].
+        Added to the insertion that is known [m].
     seen : callable
         Image and generator of noise in, image out.
     """
@@ -67,8 +67,8 @@ def _dim(image: Image, _: np.random.Generator) -> Image:
 
 AS_TRACED = Variation("as traced")
 VARIATIONS = (
-    Variation("width told 0.7 times", width=0.7),
-    Variation("width told 1.3 times", width=1.3),
+    Variation("width known 0.7 times", width=0.7),
+    Variation("width known 1.3 times", width=1.3),
     Variation("stage 1 mm too long", zero=1e-3),
     Variation("stage 1 mm too short", zero=-1e-3),
     Variation("blur of 1 px", seen=_blurred(1.0)),
@@ -79,7 +79,7 @@ VARIATIONS = (
 )
 
 
-class Told(enum.Enum):
+class KnownInput(enum.Enum):
     """The tracker's knowledge beside the pairs of a sequence."""
 
     NOTHING = "without"
@@ -88,15 +88,15 @@ class Told(enum.Enum):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class TracedAnswer:
+class TrackedPair:
     """The tracker's answer to a path-traced pair.
 
     Attributes
     ----------
     scene : TracedScene
         What it showed.
-    told : Told
-        What the tracker was told.
+    known : KnownInput
+        What the tracker was known.
     tip : SpatialTip or None
         What it believed.
     truth : ndarray, shape (3,), or None
@@ -104,7 +104,7 @@ class TracedAnswer:
     """
 
     scene: TracedScene
-    told: Told
+    known: KnownInput
     tip: SpatialTip | None
     truth: NDArray[np.float64] | None
 
@@ -126,9 +126,9 @@ class TracedAnswer:
         return np.asarray(self.tip.position - self.truth)
 
 
-def traced_looks(
-    sequence: DrawnSequence, told: Told, variation: Variation = AS_TRACED
-) -> Iterator[TracedAnswer]:
+def tracked_pairs(
+    sequence: DrawnSequence, known: KnownInput, variation: Variation = AS_TRACED
+) -> Iterator[TrackedPair]:
     """Yield what is said of a sequence's pairs.
 
     Of a needle the first `SETTLED` pairs are shown and not yielded, nor are pairs that have not all
@@ -138,8 +138,8 @@ def traced_looks(
     ----------
     sequence : DrawnSequence
         The pairs.
-    told : Told
-        What the tracker is told.
+    known : KnownInput
+        What the tracker is known.
     variation : Variation
         What is otherwise than the tracker expects.
     """
@@ -151,14 +151,14 @@ def traced_looks(
         dataclasses.replace(
             default_settings(stereo),
             needle_width=variation.width * sequence.scene.look.diameter,
-            reference=(left, right) if told is Told.EMPTY_PHANTOM else None,
+            reference=(left, right) if known is KnownInput.EMPTY_PHANTOM else None,
         ),
     )
     for number, pair in enumerate(sequence.pairs):
         left, right = (variation.seen(image, rng) for image in pair)
         insertion = float(sequence.insertions[number]) + variation.zero
-        tip = tracker.process(left, right, None if told is Told.NOTHING else insertion).tip
+        tip = tracker.process(left, right, None if known is KnownInput.NOTHING else insertion).tip
         if not sequence.scene.look.needle:
-            yield TracedAnswer(sequence.scene, told, tip, None)
+            yield TrackedPair(sequence.scene, known, tip, None)
         elif number >= SETTLED and sequence.seen[number].min() >= 1.0:
-            yield TracedAnswer(sequence.scene, told, tip, sequence.tips[number])
+            yield TrackedPair(sequence.scene, known, tip, sequence.tips[number])

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from rosbags.rosbag2 import Reader
 
-from campaign.checking import busy, unreadable
+from campaign.checking import busy, bag_read_error
 from needle_bags.reading.bag_messages import read_contents
 from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag
@@ -106,7 +106,7 @@ def record_and_kill(folder: Path, moments: int, *words: str) -> Iterator[tuple[s
             recording.kill()
             recording.wait(10.0)
         recover_bag(bag)
-        if why := unreadable(bag):
+        if why := bag_read_error(bag):
             yield why, 0.0, 0
             continue
         # A best-effort topic may lose what is sent before the recorder is known to it, no more.

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from campaign.checking import busy, unreadable
+from campaign.checking import busy, bag_read_error
 from campaign.trials.trial_processes import TrialProcesses
 from needle_bringup.simulation.node_graph import NodeProcess
 from needle_bringup.simulation.rig_configuration import command_line_parameters
@@ -102,7 +102,7 @@ def _trial(
         for node in nodes:
             wrong = _wrong(node)
             if node.name == "recorder" and bag.exists():
-                wrong = wrong or unreadable(bag)
+                wrong = wrong or bag_read_error(bag)
             yield Ended(node.name, f"{kind} at {moment:.1f} s", ends.get(node.name, _HANGS), wrong)
 
 

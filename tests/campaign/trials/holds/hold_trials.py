@@ -17,7 +17,7 @@ from sensor_msgs.msg import Joy
 
 from campaign.trials.holds.computers import enter_network, two_computers
 from campaign.trials.holds.piped_pedal import KEY, PipedPedal
-from campaign.trials.rig_hand import CONTROLLER_START, RigHand, ros
+from campaign.trials.ros_rig_client import CONTROLLER_START, RosRigClient, ros
 from campaign.trials.trial_processes import TrialProcesses, without_recorder
 from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_core.errors import UserError
@@ -89,12 +89,12 @@ def hold_trials(kind: str, count: int, seed: int = 1) -> list[dict[str, Any]]:
             before = dict.fromkeys((OPERATOR, "plane_controller"), persons)
             parameters = _parameters(rng.randrange(1000))
             with (
-                closing(RigHand(holds=False)) as hand,
+                closing(RosRigClient(holds=False)) as hand,
                 closing(TrialProcesses(place, domain, parameters, before)) as graph,
                 _held(kind, place, graph, hand, cable) as source,
             ):
                 hand.prepare()
-                hand.insist(CONTROLLER_START)
+                hand.call_until_success(CONTROLLER_START)
                 while len(outcomes) < count and hand.insertion < _DEEP:
                     outcomes.append(_lose(hand, source, rng, *_LASTS.get(kind, _LASTS_ELSE)))
                     graph.check()
@@ -106,7 +106,7 @@ def _held(
     kind: str,
     folder: Path,
     graph: TrialProcesses,
-    hand: RigHand,
+    hand: RosRigClient,
     cable: tuple[Callable[[], None], ...],
 ) -> Iterator[Source]:
     """Start an operator, and give what its person holds."""
@@ -134,7 +134,7 @@ def _held(
 
 
 def _lose(
-    hand: RigHand, source: Source, rng: random.Random, shortest: float, longest: float
+    hand: RosRigClient, source: Source, rng: random.Random, shortest: float, longest: float
 ) -> dict[str, Any]:
     """Hold, lose the source at a random moment, get it back as it was, and watch."""
     again = _hold_anew(hand, source)
@@ -146,15 +146,15 @@ def _lose(
     source.come_back()
     hand.pause(_BACK)
     return {
-        "moving": hand.way(lost - RECENT, lost) > 0.0,
+        "moving": hand.travelled_distance(lost - RECENT, lost) > 0.0,
         "last_motion_ms": (hand.last_motion(lost, back) - lost) * 1e3,
-        "distance_mm": hand.way(lost, back) * 1e3,
-        "resumed_mm": hand.way(back) * 1e3,
+        "distance_mm": hand.travelled_distance(lost, back) * 1e3,
+        "resumed_mm": hand.travelled_distance(back) * 1e3,
         "again_s": again,
     }
 
 
-def _hold_anew(hand: RigHand, source: Source) -> float:
+def _hold_anew(hand: RosRigClient, source: Source) -> float:
     """Press anew until the needle moves, and return how long that took [s].
 
     What was lost must be there and neutral first; raises UserError if it never moves.
@@ -167,7 +167,7 @@ def _hold_anew(hand: RigHand, source: Source) -> float:
         source.press(True)
         again = time.monotonic() + _AGAIN
         while time.monotonic() < again:
-            hand.look(0.005)
+            hand.spin(0.005)
             if hand.insertion > at + _UNDER_WAY:
                 return time.monotonic() - begin
     raise UserError(f"the held needle does not move; device: {hand.status}")

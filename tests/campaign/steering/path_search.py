@@ -24,7 +24,7 @@ _LONGEST = 0.2
 
 
 @compiled
-def way_after(
+def find_path(
     target: FloatArray,
     obstacles: FloatArray,
     curvature: float,

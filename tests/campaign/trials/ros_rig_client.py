@@ -52,15 +52,15 @@ def ros(domain: int) -> Iterator[None]:
         rclpy.try_shutdown()
 
 
-class Place(NamedTuple):
-    """Place of the motors at the system time at which it was said [s], [m], [rad]."""
+class MotorPosition(NamedTuple):
+    """MotorPosition of the motors at the system time at which it was said [s], [m], [rad]."""
 
     time: float
     insertion: float
     rotation: float
 
 
-class RigHand(WholeNode):
+class RosRigClient(WholeNode):
     """A node whose callbacks run where a trial waits for something.
 
     Parameters
@@ -72,7 +72,7 @@ class RigHand(WholeNode):
 
     Attributes
     ----------
-    places : list of Place
+    places : list of MotorPosition
         As they were said.
     status, controller : dict of str to str
         What device and controller said last.
@@ -82,7 +82,7 @@ class RigHand(WholeNode):
 
     def __init__(self, places_from: str = "joint_states", *, holds: bool = True) -> None:
         super().__init__("hand")
-        self.places: list[Place] = []
+        self.places: list[MotorPosition] = []
         self.status: dict[str, str] = {}
         self.controller: dict[str, str] = {}
         self.pressed = False
@@ -110,7 +110,7 @@ class RigHand(WholeNode):
 
     # ---- waiting ------------------------------------------------------------------------------
 
-    def look(self, timeout: float = 0.0) -> None:
+    def spin(self, timeout: float = 0.0) -> None:
         """Take one message, waiting for it at most `timeout` [s]."""
         self._executor.spin_once(timeout_sec=timeout)
 
@@ -127,13 +127,13 @@ class RigHand(WholeNode):
             if time.monotonic() > deadline:
                 told = f"device: {self.status}, controller: {self.controller.get('state')}"
                 raise UserError(f"waited {patience:g} s in vain: {what}; {told}")
-            self.look(0.01)
+            self.spin(0.01)
 
     def pause(self, seconds: float) -> None:
         """Listen for so long."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self.look(0.005)
+            self.spin(0.005)
 
     def close(self) -> None:
         """Let go of everything."""
@@ -151,17 +151,17 @@ class RigHand(WholeNode):
         self.until(future.done, f"an answer from {name}")
         return bool(future.result().success)
 
-    def insist(self, name: str, data: bool | None = None) -> None:
+    def call_until_success(self, name: str, data: bool | None = None) -> None:
         """Call a service until it agrees; raises as `until`."""
         self.until(lambda: self.call(name, data), f"{name} agrees")
 
     def prepare(self) -> None:
         """Home both axes, the needle being out, and enable them; raises as `until`."""
-        self.insist("device/confirm_needle_out", True)
-        self.insist("device/home")
+        self.call_until_success("device/confirm_needle_out", True)
+        self.call_until_success("device/home")
         off_at_home = {"homed": "true", "state": "DISABLED"}.items()
         self.until(lambda: off_at_home <= self.status.items(), "homed")
-        self.insist("device/enable", True)
+        self.call_until_success("device/enable", True)
 
     def send_hold(self) -> None:
         """Say what the hold is."""
@@ -179,11 +179,11 @@ class RigHand(WholeNode):
         """Return when the needle moved last of a time [s]; its beginning where it did not."""
         return max((at.time for at, _ in self._motions(begin, end)), default=begin)
 
-    def way(self, begin: float, end: float = math.inf) -> float:
+    def travelled_distance(self, begin: float, end: float = math.inf) -> float:
         """Return how far the needle moved in a time, to and fro [m]."""
         return sum(way for _, way in self._motions(begin, end))
 
-    def _motions(self, begin: float, end: float) -> Iterator[tuple[Place, float]]:
+    def _motions(self, begin: float, end: float) -> Iterator[tuple[MotorPosition, float]]:
         """Yield each place of a time that is another than that before, and how far from it."""
         for before, after in itertools.pairwise(self.places):
             way = abs(after.insertion - before.insertion)
@@ -193,7 +193,7 @@ class RigHand(WholeNode):
     def _on_places(self, message: JointState, info: dict[str, int]) -> None:
         at = dict(zip(message.name, message.position, strict=True))
         sent = info["source_timestamp"] * 1e-9
-        self.places.append(Place(sent, at["insertion_joint"], at["rotation_joint"]))
+        self.places.append(MotorPosition(sent, at["insertion_joint"], at["rotation_joint"]))
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         self.status = values_of(message)
