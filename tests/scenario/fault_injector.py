@@ -15,12 +15,12 @@ from needle_core.component import Call
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import from_values
 from scenario import faults
-from scenario.schedule_runner import Undo
 from scenario.faults import Fault, Kind
 from scenario.link_faults import LinkFault
 from scenario.parts.bench import CameraState
 from scenario.parts.rogue_publisher import RoguePublisher
 from scenario.rig import SECOND_JOYSTICK, SECOND_OPERATOR, SoakRig
+from scenario.schedule_runner import Undo
 
 _LINKS = (*faults.TOPICS, *faults.SERVICES, faults.BUS, faults.PAGE_LINE)
 SLOWEST_HANDLER = 0.05

@@ -29,15 +29,15 @@ from scenario.faults import CONSOLE, PAGE, RECORDER
 from scenario.link_faults import LinkFaults
 from scenario.parts.bench import ANSWER, TIP_NOISE, Bench, TrackerStandIn
 from scenario.parts.hold_server import VirtualHoldServer
-from scenario.parts.page import Page
 from scenario.parts.operator_model import (
     INSERT,
     RETRACT,
     STOP,
-    JoystickButtons,
     Joystick,
+    JoystickButtons,
     OperatorModel,
 )
+from scenario.parts.page import Page
 from scenario.parts.recorder import Disk, RecorderStandIn
 
 NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node")

@@ -9,7 +9,6 @@ from typing import Any
 from needle_core import messages as m
 from needle_device_driver.supervisor.limits import SafetyLimits
 from scenario import faults as of
-from scenario.schedule_runner import ScheduleRunner, relative_to_moments, watch_moments
 from scenario.fault_injector import LATEST_MESSAGE, SLOWEST_HANDLER, FaultInjector
 from scenario.faults import Fault, Kind, draw_schedule, rogue_topic
 from scenario.monitors.invariants import RELEASE_BOUND, InvariantMonitor, Violation
@@ -17,6 +16,7 @@ from scenario.monitors.limit_monitor import SetPointFrames
 from scenario.parts.bench import Motors
 from scenario.parts.operator_model import OUT, OperatorGoal
 from scenario.rig import SECOND, SoakRig
+from scenario.schedule_runner import ScheduleRunner, relative_to_moments, watch_moments
 
 # So long moments are waited for whose faults shall follow them [s].
 _FAULTS_OVER = 30.0
@@ -104,7 +104,9 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     schedule = ScheduleRunner(rig.runner.timeline, faults, FaultInjector(rig).begin)
     watch_moments(rig, schedule.reach)
     # What has not come when the needle is out again never comes.
-    while rig.now < _FAULTS_OVER and (schedule.has_active or (schedule.has_pending and not _has_left(rig))):
+    while rig.now < _FAULTS_OVER and (
+        schedule.has_active or (schedule.has_pending and not _has_left(rig))
+    ):
         rig.run(_LOOK)
     schedule.cancel_pending()
     calm = rig.now

@@ -11,9 +11,9 @@ from campaign.checking import Check, Finding, Workbench
 from campaign.checks.control_studies import (
     BEST,
     FIGURE_3,
+    MISINFORMED,
     PAPER,
     POINTS,
-    MISINFORMED,
     TROUBLE,
     WANDERING,
     Study,

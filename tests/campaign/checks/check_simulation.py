@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
-from campaign.checking import Check, Finding, Workbench, payloads, bag_read_error
+from campaign.checking import Check, Finding, Workbench, bag_read_error, payloads
 
 SAME_TOPICS = ("/needle/tip", "/device/joint_trajectory", "/device/result", "/sim/tip_pose")
 # Options of simulate -> what the error over the last 20 mm may be [mm RMS].

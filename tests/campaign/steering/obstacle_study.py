@@ -63,8 +63,8 @@ class SceneOutcome:
     Attributes
     ----------
     bare, solvable, roomy : bool
-        Whether the solvability finds a way with all, 90 % or 85 % of the curvature, 0.35, 0.75 or 1.25 mm
-        clear of everything.
+        Whether the search finds a path with all, 90 % or 85 % of the curvature, 0.35, 0.75 or
+        1.25 mm clear of everything.
     taken, stopped : bool
         Whether the controller set out, and whether it saw no way on.
     miss : float
@@ -311,7 +311,9 @@ def study_parser(
     return parser
 
 
-def print_figures(labels: Mapping[str, str], seen: Mapping[str, float | None], path: Path | None) -> None:
+def print_figures(
+    labels: Mapping[str, str], seen: Mapping[str, float | None], path: Path | None
+) -> None:
     """Print a study's figures, and write them where --json says."""
     for name, label in labels.items():
         value = seen[name]

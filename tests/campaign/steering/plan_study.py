@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from campaign.steering.obstacle_scenes import ObstacleScene, make_scene
-from campaign.steering.obstacle_study import CURVATURE, study_parser, print_figures
+from campaign.steering.obstacle_study import CURVATURE, print_figures, study_parser
 from needle_controller.planning.entry import entry_state
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_evaluation import PathSettings

@@ -13,8 +13,8 @@ from campaign.steering.obstacle_study import (
     CURVATURE,
     DEPTH,
     SceneOutcome,
-    solvability,
     main,
+    solvability,
 )
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 
@@ -56,7 +56,7 @@ def test_some_scenes_have_no_contact(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "needles that touched an obstacle" in capsys.readouterr().out
     seen = json.loads(path.read_text(encoding="utf-8"))
     assert seen["contacts"] == 0
-    # A path through one of ten was not found by the solvability, and the noise led the needle off it.
+    # Tolerated: the search misses the path through one of ten.
     assert seen["unsolvable_refused"] >= 0.9
     assert seen["solvable"] > 4
     # One of seven may miss: over hundreds of scenes 7 % do.

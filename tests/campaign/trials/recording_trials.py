@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from rosbags.rosbag2 import Reader
 
-from campaign.checking import busy, bag_read_error
+from campaign.checking import bag_read_error, busy
 from needle_bags.reading.bag_messages import read_contents
 from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag

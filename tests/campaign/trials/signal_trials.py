@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from campaign.checking import busy, bag_read_error
+from campaign.checking import bag_read_error, busy
 from campaign.trials.trial_processes import TrialProcesses
 from needle_bringup.simulation.node_graph import NodeProcess
 from needle_bringup.simulation.rig_configuration import command_line_parameters

@@ -122,7 +122,9 @@ class OperatorModel(c.Component):
         self._changed_at = 0.0
         self.inputs = (
             c.Input("device/status", DeviceStatus, self._on_device_status, c.LATCHED),
-            c.Input("needle/controller_status", ControllerStatus, self._on_controller_status, c.LATCHED),
+            c.Input(
+                "needle/controller_status", ControllerStatus, self._on_controller_status, c.LATCHED
+            ),
         )
         self.outputs = (c.Output("device/estop", m.EmergencyStop),)
         self.timers = (c.Timer(_PERIOD, self._act),)

@@ -198,4 +198,4 @@ class Scene(VirtualRig):
         return self.is_at_rest() and self.is_logged(rule) and self.state == "FAULT"
 
 
-__all__ = ["AXES", "COMMANDS", "DRIVER", "ESTOP", "HOLD", "STATUS", "Held", "SecondNode", "Scene"]
+__all__ = ["AXES", "COMMANDS", "DRIVER", "ESTOP", "HOLD", "STATUS", "Held", "Scene", "SecondNode"]
