@@ -1,4 +1,4 @@
-"""Effects of each fault of the vocabulary on the rig, at its begin and at its end."""
+"""Injects the faults of the vocabulary into the rig, and removes them."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from scenario.schedule_runner import Undo
 
 _LINKS = (*faults.TOPICS, *faults.SERVICES, faults.BUS, faults.PAGE_LINE)
 SLOWEST_HANDLER = 0.05
-"""What the slowest of nodes takes for each handler [s]."""
+"""Largest added time of a handler of a slow node [s]."""
 LATEST_MESSAGE = 1.0
-"""What the worst of faults delays a message by [s]."""
+"""Largest delay of a message by a fault [s]."""
 _LATEST_FRAME = 0.1
 _JUMP_NS = 20_000_000_000
 _DRIFT_NS, _DRIFT_PERIOD = 2_000_000, 0.02
-# Seconds between two changes of mind of a hand that trembles.
-_TREMBLING = (0.03, 0.3)
-_WAVERING = ((True, False), (False, False), (False, True), (True, True))
+# Time between two changes of an unsteady hand [s].
+_TREMOR_PERIOD = (0.03, 0.3)
+_HAND_STATES = ((True, False), (False, False), (False, True), (True, True))
 _MOTION_ERROR = 0x5530
 _CAMERA_STATES = {
     Kind.OFF: CameraState.BLACK,
@@ -45,16 +45,16 @@ _SWITCHED_ON = ("device/enable", "device/confirm_needle_out")
 
 
 def _nothing() -> None:
-    """Do nothing: the fault was over at once."""
+    """No-op end of a fault without duration."""
 
 
 class FaultInjector:
-    """Lets faults begin and end.
+    """Begins and ends faults.
 
     Parameters
     ----------
     rig : SoakRig
-        What they happen to.
+        The rig.
     """
 
     def __init__(self, rig: SoakRig) -> None:
@@ -78,7 +78,7 @@ class FaultInjector:
         }
 
     def begin(self, fault: Fault) -> Undo:
-        """Let a fault begin; returns what ends it."""
+        """Begin a fault; return the function that ends it."""
         return self._injectors.get(fault.part, self._inject_rogue_publisher)(fault)
 
     def _chance_of(self, fault: Fault) -> random.Random:
@@ -122,15 +122,15 @@ class FaultInjector:
 
     def _inject_link_fault(self, fault: Fault) -> Undo:
         late = fault.size * (_LATEST_FRAME if fault.part == faults.BUS else LATEST_MESSAGE)
-        spoil = partial(LinkFault, self._timeline.now + fault.lasts)
-        spoilt = {
-            Kind.OFF: spoil(loss=1.0),
-            Kind.INTERMITTENT: spoil(loss=fault.size),
-            Kind.SLOW: spoil(late=late),
-            Kind.REORDERED: spoil(late=late, reorders=True),
-            Kind.DUPLICATED: spoil(late=late, duplicates=0.5, reorders=True),
+        fault_until_end = partial(LinkFault, self._timeline.now + fault.lasts)
+        fault_on_link = {
+            Kind.OFF: fault_until_end(loss=1.0),
+            Kind.INTERMITTENT: fault_until_end(loss=fault.size),
+            Kind.SLOW: fault_until_end(late=late),
+            Kind.REORDERED: fault_until_end(late=late, reorders=True),
+            Kind.DUPLICATED: fault_until_end(late=late, duplicates=0.5, reorders=True),
         }[fault.kind]
-        self._rig.faults.begin(fault.part, spoilt)
+        self._rig.faults.begin(fault.part, fault_on_link)
         return partial(self._rig.faults.end, fault.part)
 
     def _inject_drive_fault(self, fault: Fault) -> Undo:
@@ -157,7 +157,7 @@ class FaultInjector:
 
     def _inject_camera_fault(self, fault: Fault) -> Undo:
         self._rig.tracker.camera_state = _CAMERA_STATES[fault.kind]
-        # The tracker may be another by then.
+        # The tracker may have been restarted by then.
         return lambda: setattr(self._rig.tracker, "camera_state", CameraState.CLEAR)
 
     def _inject_clock_fault(self, fault: Fault) -> Undo:
@@ -177,13 +177,13 @@ class FaultInjector:
         person, hand = self._rig.person, self._rig.hand
         person.absent = True
 
-        def tremble() -> None:
+        def toggle() -> None:
             hand.insert = not hand.insert
 
         if fault.kind is Kind.OFF:
             hand.insert = hand.retract = hand.stop = False
         elif fault.kind is Kind.INTERMITTENT:
-            self._repeat(fault, tremble)
+            self._repeat(fault, toggle)
         elif fault.kind is Kind.WRONG:
             hand.insert, hand.retract = fault.size < 0.6, fault.size > 0.4
             hand.stop = fault.size > 0.9
@@ -194,36 +194,36 @@ class FaultInjector:
         return end
 
     def _inject_disk_fault(self, fault: Fault) -> Undo:
-        assert self._rig.disk is not None, "who records nothing has no disk"
+        assert self._rig.disk is not None, "the rig has no recorder"
         return self._rig.disk.spoil(fault)
 
     def _inject_second_operator(self, fault: Fault) -> Undo:
         rig, hand, chance = self._rig, self._rig.second_hand, self._chance_of(fault)
 
-        def let_go() -> None:
+        def release() -> None:
             hand.insert = hand.retract = False
 
-        def waver() -> None:
-            hand.insert, hand.retract = chance.choice(_WAVERING)
+        def change_hand() -> None:
+            hand.insert, hand.retract = chance.choice(_HAND_STATES)
 
         if fault.kind is Kind.INTERMITTENT:
-            self._repeat(fault, waver)
-            return let_go
+            self._repeat(fault, change_hand)
+            return release
         hand.insert, hand.retract = fault.kind is not Kind.WRONG, fault.kind is Kind.WRONG
         if fault.kind is not Kind.OFF:
-            return let_go
+            return release
         return partial(rig.kill, SECOND_JOYSTICK if fault.size < 0.5 else SECOND_OPERATOR)
 
     def _repeat(
         self, fault: Fault, act: Callable[[], None], pause: Callable[[], float] | None = None
     ) -> None:
-        """Act now, and after each pause while a fault lasts."""
+        """Act now, and after each pause during a fault."""
         end, chance = self._timeline.now + fault.lasts, self._chance_of(fault)
 
         def go_on() -> None:
             if self._timeline.now < end:
                 act()
-                seconds = pause() if pause else chance.uniform(*_TREMBLING)
+                seconds = pause() if pause else chance.uniform(*_TREMOR_PERIOD)
                 self._timeline.call_after(seconds, go_on)
 
         go_on()
@@ -252,7 +252,7 @@ class FaultInjector:
         change_to(changed)
         return partial(change_to, rig.steering)
 
-    # ---- strangers ------------------------------------------------------------------------------
+    # ---- rogue publishers -----------------------------------------------------------------------
 
     def _inject_rogue_publisher(self, fault: Fault) -> Undo:
         rig = self._rig

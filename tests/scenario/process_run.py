@@ -1,4 +1,4 @@
-"""One run of the rig as real processes: some are killed or stopped, and judged from outside."""
+"""One run of the rig as real processes, some of which are killed or stopped."""
 
 from __future__ import annotations
 
@@ -33,28 +33,27 @@ from scenario.rig_run import RunResult
 
 PERSON = "simulated_operator"
 PARTS = ("device_driver", "plane_controller", "stereo_tracker", PERSON)
-# The stand-in does not promise to speak often, as the operator of a person does (0.1 s): its hold
-# lives for the driver's own 0.25 s.
+# Messages of the simulated operator do not have the lifetime of 0.1 s that those of the operator
+# node have: its hold lasts for the driver's own 0.25 s.
 _RELEASE_BOUND = RELEASE_BOUND - 0.1 + 0.25
 _MOST = 3
 _LATEST, _SHORTEST, _LONGEST = 3.0, 0.05, 3.0
 _DEEP_ENOUGH = 0.002
 _START, _DRAW_OUT, _STILL = 120.0, 60.0, 1.0
-# The emulated drives move on with each SYNC, and say so: without a driver they stand still [s].
+# Gap after which the emulated drives stood still: they publish with each SYNC of the driver [s].
 _WITHOUT_SYNC = 0.1
 
 
 class ProcessMonitor(RosRigClient):
-    """Hears holds, status and motors, and judges them; draws the needle out when it is asked to.
+    """Checks holds, status and motors; withdraws the needle on request.
 
-    Times are those at which a message was sent, so that a monitor who is late judges no other. It
-    judges motion from the first word of the person on: DDS may let it hear that later than the
-    driver does.
+    Times are source time stamps, so that its own lateness has no effect. It checks motion from the
+    first hold on, because DDS may deliver that later to it than to the driver.
 
     Attributes
     ----------
     watch : InvariantMonitor
-        What it judges with.
+        The invariants.
     """
 
     def __init__(self) -> None:
@@ -62,7 +61,7 @@ class ProcessMonitor(RosRigClient):
         self._begun = time.time()
         self._received_hold = False
         super().__init__("sim/drive_positions")
-        # Whose press it is that moves the needle.
+        # Source whose press moves the needle.
         self._holder = PERSON
         self.create_subscription(Joy, "device/hold", self._on_hold, to_qos(HOLDS))
         self.create_subscription(
@@ -71,16 +70,16 @@ class ProcessMonitor(RosRigClient):
 
     @property
     def now(self) -> float:
-        """System time since it began [s]."""
+        """System time since the start of the run [s]."""
         return time.time() - self._begun
 
     def draw_out(self) -> None:
-        """Mend what a person can mend, then hold until the needle is out.
+        """Reset and enable the device, then hold until the needle is out.
 
         Raises
         ------
         UserError
-            If it does not come out.
+            If the needle does not come out.
         """
         self._holder = self.get_name()
         end = self.now + _DRAW_OUT
@@ -94,7 +93,7 @@ class ProcessMonitor(RosRigClient):
             elif state == "DISABLED":
                 self.call("device/enable", True)
             elif self.status.get("hold_owner") != self.get_name():
-                # A hold that does not count has to be let go of first.
+                # A hold that does not count must be released first.
                 self.pressed = not self.pressed
             elif activity != "retraction":
                 self.call("device/retract")
@@ -133,7 +132,7 @@ class ProcessMonitor(RosRigClient):
 
 
 def processes_schedule_of(seed: int) -> list[Fault]:
-    """Draw what happens to the processes, from the moment in which the needle is steered [s]."""
+    """Draw the faults of the processes; times start when the needle is steered [s]."""
     draw = random.Random(f"faults of processes {seed}")
     faults = []
     for _ in range(draw.randint(1, _MOST)):
@@ -144,7 +143,7 @@ def processes_schedule_of(seed: int) -> list[Fault]:
 
 
 def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResult]:
-    """Yield the results of runs of real processes; what they leave is kept if they violate."""
+    """Yield the results of runs of real processes; keep the files of a violating run."""
     for seed in seeds:
         with tempfile.TemporaryDirectory(prefix="needle_soak_") as name:
             result = run_processes(seed, Path(name))
@@ -159,11 +158,11 @@ def run_processes(seed: int, folder: Path, faults: Sequence[Fault] | None = None
     Parameters
     ----------
     seed : int
-        Of the simulation and of what happens.
+        Seed of the simulation and the faults.
     folder : Path
-        Takes the nodes' logs.
+        For the logs of the nodes.
     faults : sequence of Fault, optional
-        In place of those of the seed.
+        Faults instead of those of the seed.
     """
     happened = tuple(processes_schedule_of(seed) if faults is None else faults)
     with (
@@ -188,7 +187,7 @@ def _insert(monitor: ProcessMonitor, graph: TrialProcesses, faults: Sequence[Fau
         monitor.pause(max(at - monitor.now, 0.0))
         act()
     monitor.pause(_STILL)
-    # From here on there is one person, and it wants the needle out.
+    # From here on, the monitor is the only operator.
     graph.end(PERSON)
     try:
         monitor.draw_out()

@@ -1,4 +1,4 @@
-"""The rig on the virtual runner: the rig's own components, the bench, the person in front of it."""
+"""The rig on the virtual runner: its own components, the simulated bench and the operator model."""
 
 from __future__ import annotations
 
@@ -43,18 +43,18 @@ from scenario.parts.recorder import Disk, RecorderStandIn
 NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node")
 SECOND_OPERATOR, SECOND_JOYSTICK = "second_operator", "second_joy_node"
 SECOND = (SECOND_JOYSTICK, SECOND_OPERATOR)
-"""Of a second person."""
+"""Nodes of a second operator."""
 _SECOND_JOY = "second_joy"
 _CONSOLE = (CONSOLE, VirtualHoldServer.name)
-# Whose topics are recorded.
+# Nodes whose topics are recorded.
 _RECORDED = ("device_driver", "plane_controller", "operator", "joy_node")
 _DEPTHS = (0.003, 0.008)
 _LATEST_START = 0.2
-# What the clock of the stamps shows at the begin [ns]: it may jump back.
+# Initial system time of the stamps [ns]; not zero, so that it may jump back.
 _CLOCK_NS = 1_750_000_000 * 10**9
-# A node that ended is started again by whoever sees it [s].
+# Delay until an ended node is started again [s].
 _RESTART = 1.0
-# What a handler takes of its component's time, but for the tracker's [s].
+# Compute time of a handler, except the tracker's [s].
 _COMPUTE = (0.02e-3, 0.2e-3)
 _INTERNAL = "internal error"
 
@@ -62,51 +62,51 @@ Watcher = Callable[[str, Any], None]
 
 
 class SoakRig:
-    """The rig from the needle to the person.
+    """The rig from the needle to the operator.
 
     Parameters
     ----------
     seed : int
-        Of all that is drawn.
+        Seed of all randomness.
     depth : float, optional
-        How far the needle goes in [m]; drawn if none is given.
+        Insertion depth [m]; random if none is given.
     at_page : bool
-        Whether the person holds by a page of the console, and leaves the joystick alone.
+        Whether the operator holds by a page of the console instead of the joystick.
 
     Attributes
     ----------
     faults : LinkFaults
-        What is wrong with topics, services and bus.
+        Active faults of topics, services and bus.
     runner : VirtualRunner
-        Runs all of it.
+        Runner of all components.
     bench : Bench
-        The needle.
+        Needle and motors.
     drives : DriveEmulator
-        What moves it.
+        Drives that move the needle.
     hand, second_hand : JoystickButtons
-        The person's, and that of a second one.
+        Buttons of the operator and of a second one.
     person : OperatorModel
-        Who uses them.
+        The operator.
     hand_node : str
-        Name of the node by which the person holds.
+        Name of the node that publishes the operator's hold.
     page : Page or None
-        Where the person holds, if at one.
+        Page of the operator, if any.
     disk, recorders : Disk or None, list of RecorderStandIn
-        What records, one after the other, and where; none unless `record` was called.
+        Disk and successive recorders; none unless `record` was called.
     steering : SteeringSettings
-        The controller's.
+        Settings of the controller.
     watchers : dict of str to list of Watcher
-        By topic, who is called with the sender and the message of each publication.
+        Functions by topic, called with sender and message of each publication.
     on_hold_received : callable
-        Called with each hold as the driver takes it, and when [s].
+        Called with each hold that the driver receives, and its time [s].
     frames_sent, adapter_opened : list of callable
-        Called with each batch of frames that the driver sends, and when it sends its first.
+        Called with each batch of frames that the driver sends, and before its first.
     log : list of str
-        What was logged, one line each.
+        Log lines.
     crashes : list of str
-        Errors that nothing foresaw.
+        Unexpected exceptions.
     digest : hash
-        Of who published what and when.
+        Digest of time, sender and topic of all publications.
     """
 
     def __init__(self, seed: int, depth: float | None = None, *, at_page: bool = False) -> None:
@@ -177,7 +177,7 @@ class SoakRig:
 
     @property
     def hand_presses(self) -> bool:
-        """Whether the hand presses what could move the needle, where it holds."""
+        """Whether the operator presses a button that could move the needle."""
         return self.hand.holds if self.page is None else bool(self.hand.button)
 
     def watch(self, topic: str, watcher: Watcher) -> None:
@@ -185,13 +185,13 @@ class SoakRig:
         self.watchers.setdefault(topic, []).append(watcher)
 
     def start(self, name: str) -> None:
-        """Make and start a node that does not run."""
+        """Start a node unless it runs."""
         if self.runner.runs(name):
             return
         try:
             self.runner.start(self._makers[name]())
         except UserError:
-            # As a recorder on a full disk.
+            # For example a recorder on a full disk.
             self.runner.timeline.call_after(_RESTART, partial(self.start, name))
 
     def kill(self, name: str) -> None:
@@ -208,12 +208,12 @@ class SoakRig:
         return _CONSOLE if name == CONSOLE else (name,)
 
     def record(self) -> None:
-        """Record all that is published from now on."""
+        """Start a recorder."""
         self.disk = Disk()
         self.start(RECORDER)
 
     def losses(self, *, check_killed: bool) -> list[str]:
-        """End the recording; return what the bags lack."""
+        """End the recording; return the losses of its bags."""
         losses: list[str] = []
         for recorder in self.recorders:
             losses += recorder.losses(check_killed=check_killed)
@@ -222,16 +222,16 @@ class SoakRig:
         return losses
 
     def unplug(self) -> None:
-        """Take the driver's adapter away."""
+        """Unplug the driver's CAN adapter."""
         self.runner.lose_port(DeviceDriver.name, CAN, "unplugged")
 
     def plug_in(self) -> None:
-        """Give the adapter back."""
+        """Plug the CAN adapter in again."""
         self._adapter_is_open = False
         self.runner.open_port(DeviceDriver.name, CAN)
 
     def run(self, seconds: float) -> None:
-        """Run for some time; who ends is started again."""
+        """Run for a duration [s]; restart nodes that end."""
         end = self.now + seconds
         while self.now < end:
             if self.runner.run(end - self.now):
@@ -277,7 +277,7 @@ class SoakRig:
         self.tracker = TrackerStandIn(self.bench, self.runner.timeline.stream("tips"))
         return self.tracker
 
-    # ---- what is seen ---------------------------------------------------------------------------
+    # ---- taps -----------------------------------------------------------------------------------
 
     def _tap_published(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
         topic = output.topic

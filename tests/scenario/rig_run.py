@@ -1,4 +1,4 @@
-"""One run of the rig under a schedule of faults, watched from beginning to end."""
+"""One run of the rig under a schedule of faults, with its invariants checked."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from scenario.parts.operator_model import OUT, OperatorGoal
 from scenario.rig import SECOND, SoakRig
 from scenario.schedule_runner import ScheduleRunner, relative_to_moments, watch_moments
 
-# So long moments are waited for whose faults shall follow them [s].
+# Longest wait for moments that faults follow [s].
 _FAULTS_OVER = 30.0
-# Once all faults are over [s]: a person has so long to insert, then so long to draw the needle
-# out. A killed node counts for 8 s more, and a driver looks for its drives again.
+# Time to insert after all faults, then to withdraw the needle [s]: a killed node stays in the graph
+# for 8 s, and a restarted driver sets its drives up again.
 _GO_ON, _DRAW_OUT = 60.0, 60.0
-# How often it is looked whether a run is over [s].
+# Period of the check whether a run is over [s].
 _LOOK = 0.1
-# A needle that nothing disturbs goes as deep [m], and is as near to the plane there [m].
+# Depth of a run without faults [m], and largest distance of its tip from the plane [m].
 UNDISTURBED_DEPTH, _CONVERGED = 0.08, 0.001
 _HOLD, _JOINTS = "/device/hold", "/joint_states"
-# The way of a press to the driver.
+# Topics between a press and the driver.
 _HOLD_LINKS = ("/joy", _HOLD)
-# Where one of them goes wrong the person holds by a page.
+# With a fault of one of these, the operator holds by a page.
 _AT_PAGE = (of.CONSOLE, of.PAGE, of.PAGE_LINE)
 _LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
-# The device's faults that take the joints from the controller.
+# Parts whose faults keep joint states from the controller.
 _TAKE_JOINTS = (_JOINTS, "device_driver", "plane_controller")
 
 
@@ -44,25 +44,24 @@ class RunResult:
     Attributes
     ----------
     seed : int
-        Its seed.
+        Seed of the run.
     faults : tuple of Fault
-        What happened to it.
+        Faults of the run.
     violations : tuple of Violation
-        Invariants that did not hold.
+        Violated invariants.
     relative_to_moments : tuple of Fault
-        Those faults that happened, each told by the last moment that it met; of real processes as
-        they were drawn.
+        Faults that began, relative to the last moment before each; as drawn for real processes.
     simulated : float
-        How long it took in its own time [s].
+        Duration in simulated time [s].
     of_processes : bool
-        Whether it was one of real processes: it cannot be had again, and has nothing of what
-        follows.
+        Whether it was a run of real processes, which is not repeatable and has none of the
+        following.
     digest : str
-        Of who published what and when, of every command and of the motors' ways.
+        Digest of all publications, commands and motor positions.
     inserted : bool
-        Whether the controller was done once.
+        Whether the controller was in state DONE once.
     log : tuple of str
-        What the nodes logged, one line each.
+        Log lines of the nodes.
     """
 
     seed: int
@@ -77,7 +76,7 @@ class RunResult:
 
 
 def schedule_of(seed: int) -> list[Fault]:
-    """Return the faults of a seed; every hundredth run has none."""
+    """Return the faults of a seed; every hundredth seed has none."""
     return draw_schedule(seed) if seed % 100 else []
 
 
@@ -87,14 +86,14 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     Parameters
     ----------
     seed : int
-        Of the run: delays, needle, noise.
+        Seed of delays, needle and noise.
     faults : sequence of Fault
-        What goes wrong meanwhile.
+        Faults of the run.
     """
     at_page = any(fault.part in _AT_PAGE for fault in faults)
     rig = SoakRig(seed, None if faults else UNDISTURBED_DEPTH, at_page=at_page)
     if any(fault.part == of.SECOND_PERSON for fault in faults):
-        # Their hand must be seen neutral before it counts.
+        # Their joystick must be received neutral before it counts.
         for name in SECOND:
             rig.start(name)
     of_recording = [fault for fault in faults if fault.part in (of.RECORDER, of.DISK)]
@@ -103,7 +102,7 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     watch = _watched(rig, faults)
     schedule = ScheduleRunner(rig.runner.timeline, faults, FaultInjector(rig).begin)
     watch_moments(rig, schedule.reach)
-    # What has not come when the needle is out again never comes.
+    # Moments that were not reached when the needle is out again are never reached.
     while rig.now < _FAULTS_OVER and (
         schedule.has_active or (schedule.has_pending and not _has_left(rig))
     ):
@@ -131,8 +130,8 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
 
 
 def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
-    """Return what watches over a rig from now on."""
-    # A hold counts from its arrival: what is late on its way outlives the hand by as much.
+    """Return a monitor that observes a rig from now on."""
+    # A hold counts from its arrival: a late message outlives the press by its delay.
     late = sum(
         fault.size * LATEST_MESSAGE
         for fault in faults
@@ -143,8 +142,8 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
     slow = (f.size for f in faults if f.part == "device_driver" and f.kind is Kind.SLOW)
     slowness = max(slow, default=0.0) * SLOWEST_HANDLER
     watch = InvariantMonitor(SafetyLimits(), RELEASE_BOUND + late, slowness)
-    strange = {rogue_topic(fault) for fault in faults}
-    joints_spoilt = _JOINTS in strange or any(fault.part in _TAKE_JOINTS for fault in faults)
+    rogue = {rogue_topic(fault) for fault in faults}
+    joints_faulty = _JOINTS in rogue or any(fault.part in _TAKE_JOINTS for fault in faults)
 
     def observe_motors(now: float, at: Motors) -> None:
         rig.digest.update(_rounded((at.insertion, at.rotation)))
@@ -161,7 +160,7 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
 
     def observe_hold(node: str, message: m.HoldState) -> None:
         if node == of.CONSOLE:
-            # It may have been pressed since the last tick.
+            # The hand may have been pressed since the last tick.
             watch.observe_hand(rig.now, holds=rig.hand_presses)
             watch.observe_page_hold(rig.now, pressed=message.pressed)
         if message.pressed:
@@ -176,18 +175,18 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
     rig.watch("device/status", lambda _, message: watch.observe_device(rig.now, message))
     rig.watch(
         "needle/controller_status",
-        lambda _, message: watch.observe_belief(rig.now, message, joints_heard=not joints_spoilt),
+        lambda _, message: watch.observe_belief(rig.now, message, joints_heard=not joints_faulty),
     )
     rig.watch("device/joint_trajectory", observe_command)
     rig.watch("device/estop", lambda _, said: watch.observe_estop(rig.now, pressed=said.pressed))
     rig.watch("device/hold", observe_hold)
-    if _HOLD in strange or any(fault.part == of.SECOND_PERSON for fault in faults):
+    if _HOLD in rogue or any(fault.part == of.SECOND_PERSON for fault in faults):
         rig.on_hold_received = hear
     return watch
 
 
 def _watch_set_points(rig: SoakRig, watch: InvariantMonitor) -> None:
-    """Let the watch see all set-points that the driver sends."""
+    """Pass all set-points that the driver sends to the monitor."""
     settings = [rig.drives.bus.drives[axis].settings for axis in ("insertion", "rotation")]
     axes = {its.node_id: axis for axis, its in enumerate(settings)}
     frames = SetPointFrames({its.node_id: its.motor.counts_per_unit for its in settings})
@@ -202,7 +201,7 @@ def _watch_set_points(rig: SoakRig, watch: InvariantMonitor) -> None:
 
 
 def _rounded(place: Sequence[float]) -> bytes:
-    """Return a place for the digest, to 1 nm and 1 nrad: Pythons' numpy differ in last bits."""
+    """Return a position for the digest, to 1 nm and 1 nrad: numpy versions differ in last bits."""
     return " ".join(f"{value:.9f}" for value in place).encode() + b"\n"
 
 

@@ -1,4 +1,4 @@
-"""The schedule of a schedule: each fault begins by what it meets, and ends after its time."""
+"""Runs a schedule of faults: each begins after its moment, and ends after its duration."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scenario.faults import Fault, Moment
 from scenario.rig import SoakRig
 
 Undo = Callable[[], None]
-# What it is when a field of a status becomes another.
+# Moment at which a field of a status gets a value.
 _DEVICE = {
     ("activity", "homing"): Moment.HOMING,
     ("state", "HOLDING"): Moment.HOLDING,
@@ -25,16 +25,16 @@ _CONTROLLER = {("state", "STEERING"): Moment.STEERING, ("state", "DONE"): Moment
 
 @dataclasses.dataclass(frozen=True)
 class ReachedMoment:
-    """A moment that came.
+    """A moment that was reached.
 
     Attributes
     ----------
     moment : Moment
-        Which.
+        The moment.
     nth : int
-        For the how manyth time, from 1.
+        Number of its occurrence, from 1.
     at : float
-        When [s].
+        Time [s].
     """
 
     moment: Moment
@@ -43,23 +43,23 @@ class ReachedMoment:
 
 
 class ScheduleRunner:
-    """Lets the faults of a schedule begin and end.
+    """Begins and ends the faults of a schedule.
 
     Parameters
     ----------
     timeline : Timeline
-        Its clock.
+        Clock of the run.
     faults : sequence of Fault
         The schedule.
     begin : callable
-        Lets a fault begin, and returns what ends it.
+        Begins a fault, and returns the function that ends it.
 
     Attributes
     ----------
     reached : list of ReachedMoment
-        All moments that came, in their order.
+        All moments so far, in order.
     begun : list of tuple of Fault and float
-        Faults that happened, and when they began [s].
+        Faults that began, with their times [s].
     """
 
     def __init__(
@@ -75,16 +75,16 @@ class ScheduleRunner:
 
     @property
     def has_active(self) -> bool:
-        """Whether a fault lasts, or its moment has come."""
+        """Whether a fault is active, or its moment was reached."""
         return self._under_way > 0
 
     @property
     def has_pending(self) -> bool:
-        """Whether the moment of a fault has not come yet."""
+        """Whether the moment of a fault was not reached yet."""
         return bool(self._waiting)
 
     def reach(self, moment: Moment) -> None:
-        """Take note that a moment has come."""
+        """Handle a moment: count it, and schedule the faults that follow it."""
         self._count[moment] += 1
         this = moment, self._count[moment]
         self.reached.append(ReachedMoment(*this, self._timeline.now))
@@ -94,7 +94,7 @@ class ScheduleRunner:
             self._timeline.call_after(fault.at, partial(self._happen, fault))
 
     def cancel_pending(self) -> None:
-        """Wait for no moment any more."""
+        """Cancel the faults whose moments were not reached."""
         self._waiting.clear()
 
     def _happen(self, fault: Fault) -> None:
@@ -107,13 +107,13 @@ class ScheduleRunner:
 
 
 def watch_moments(rig: SoakRig, reach: Callable[[Moment], None]) -> None:
-    """Call `reach` with each moment of a rig as it comes, the start at once."""
-    heard: dict[str, Any] = {}
+    """Call `reach` at each moment of a rig, at once for the start."""
+    last: dict[str, Any] = {}
 
     def watch_status(topic: str, moments: dict[tuple[str, str], Moment]) -> None:
         def see(_: str, message: Any) -> None:
-            before = heard.get(topic)
-            heard[topic] = message
+            before = last.get(topic)
+            last[topic] = message
             for (key, value), moment in moments.items():
                 if getattr(message, key) == value != getattr(before, key, ""):
                     reach(moment)
@@ -123,8 +123,8 @@ def watch_moments(rig: SoakRig, reach: Callable[[Moment], None]) -> None:
     def observe_hold(node: str, message: Any) -> None:
         if node != rig.hand_node:
             return
-        pressed = heard.get(node, False)
-        heard[node] = message.pressed
+        pressed = last.get(node, False)
+        last[node] = message.pressed
         if message.pressed != pressed:
             reach(Moment.PRESSED if message.pressed else Moment.RELEASED)
 
@@ -137,12 +137,14 @@ def watch_moments(rig: SoakRig, reach: Callable[[Moment], None]) -> None:
 
 
 def relative_to_moments(schedule: ScheduleRunner) -> list[Fault]:
-    """Return the faults that happened, each told by the last moment that it met.
+    """Return the faults that began, relative to the last moment before each.
 
-    So a change that shifts what a run does shifts its faults with it.
+    So a change that shifts the events of a run shifts its faults too.
     """
-    told = []
+    relative = []
     for fault, begun in schedule.begun:
         last = [one for one in schedule.reached if one.at <= begun][-1]
-        told.append(dataclasses.replace(fault, after=last.moment, nth=last.nth, at=begun - last.at))
-    return told
+        relative.append(
+            dataclasses.replace(fault, after=last.moment, nth=last.nth, at=begun - last.at)
+        )
+    return relative

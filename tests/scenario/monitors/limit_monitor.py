@@ -1,4 +1,4 @@
-"""Limits of a rig, judged from outside: set-points as they are sent, and the motors' ways."""
+"""Limits of a rig, checked on the transmitted set-points and the motion of the motors."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Iterator, Mapping
 
 from needle_device_driver.supervisor.limits import SafetyLimits
 
-# From one set-point to the next [s].
+# Period of the set-points [s].
 _SET_POINT_PERIOD = 0.02
-# A drive may be behind by its following error, which is judged by a position of a cycle ago, one
-# cycle later, and by what was on its way meanwhile: so many set-points more.
+# A drive lags by its following error and by these set-points: the error is computed from a position
+# of the previous cycle, one cycle later, and one more set-point may be in transit.
 _SET_POINTS_BEHIND = 3
-# What drives of such a rig swing over beyond its limits [m], [rad].
+# Overshoot of the drives beyond the limits [m], [rad].
 _PLACE_ROOM, _TURN_ROOM = 0.0011, 0.3
 # Function codes of the process data that carry controlword and mode, and the target (CiA 402).
 _CONTROL, _TARGET = 0x200, 0x300
@@ -22,7 +22,7 @@ _OPERATE, _CYCLIC_POSITION = 0x0F, 8
 
 
 class SetPointFrames:
-    """Reads frames.
+    """Decodes the set-points from the frames that are sent to the drives.
 
     Parameters
     ----------
@@ -35,19 +35,19 @@ class SetPointFrames:
         self._operates = dict.fromkeys(counts_per_unit, False)
 
     def take(self, identifier: int, data: bytes) -> tuple[int, float | None] | None:
-        """Return a drive's node id and where it shall go.
+        """Return the node id and the set-point of a drive.
 
         Parameters
         ----------
         identifier : int
-            Of a frame.
+            COB-ID of a frame.
         data : bytes
-            Its own.
+            Data of the frame.
 
         Returns
         -------
         tuple of int and (float or None), or None
-            [m] or [rad]; None in its place if the drive shall not go there. None for other frames.
+            Set-point [m] or [rad], None if the drive is not enabled for it. None for other frames.
         """
         node, function = identifier & 0x7F, identifier & ~0x7F
         if node not in self._operates or function not in (_CONTROL, _TARGET):
@@ -63,12 +63,12 @@ class SetPointFrames:
 
 
 class SpeedBudget:
-    """Judges a way by the time that it took, over all spans of it at once.
+    """Checks a motion against a speed limit, over all its time spans at once.
 
     Parameters
     ----------
     speed : float
-        At which it may go on, in its unit a second.
+        Speed limit, in its unit per second.
     """
 
     def __init__(self, speed: float) -> None:
@@ -76,18 +76,18 @@ class SpeedBudget:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew at the next place."""
+        """Reset; the next position is the first one."""
         self._least = {1.0: math.inf, -1.0: math.inf}
 
     def ahead(self, at: float, place: float) -> float:
-        """Return by how much the way to a place is longer than `speed` allows.
+        """Return by how much the motion to a position exceeds what `speed` allows.
 
-        That is the most over all spans that end now: in each, the way less what its time allows.
+        This is the maximum over all spans that end now of the distance less speed x duration.
 
         Parameters
         ----------
         at : float
-            When it is there [s].
+            Time [s].
         place : float
             In any unit.
         """
@@ -101,7 +101,7 @@ class SpeedBudget:
 
 @dataclasses.dataclass(frozen=True)
 class _Axis:
-    """One axis; `scale` is units for people in one of SI, `behind` the most that it may be [SI]."""
+    """One axis; `scale` converts from SI to `unit`, `behind` is its largest lag [SI]."""
 
     name: str
     unit: str
@@ -112,24 +112,24 @@ class _Axis:
     motor: SpeedBudget
 
     def said(self, way: float, most: float) -> str:
-        """Return a way beside its bound."""
+        """Return a distance beside its bound, as text."""
         return f"{way * self.scale:.4g} {self.unit} (at most {most * self.scale:.4g})"
 
 
 class LimitMonitor:
-    """Says what is beyond the limits.
+    """Reports set-points and motions beyond the limits.
 
     Parameters
     ----------
     bounds : SafetyLimits
         Of the rig.
     late : float
-        How late a set-point may be sent: the next one may then follow it so much sooner [s].
+        Lateness of a set-point; the next one may follow it so much sooner [s].
     """
 
     def __init__(self, bounds: SafetyLimits, late: float = 0.0) -> None:
         self._bounds = bounds
-        # One may be early by all of its period.
+        # A set-point may be early by its whole period.
         self._early = _SET_POINT_PERIOD + late
 
         def axis(name: str, unit: str, scale: float, speed: float, behind: float) -> _Axis:
@@ -142,21 +142,21 @@ class LimitMonitor:
         )
 
     def observe_set_point(self, at: float, axis: int, place: float | None) -> Iterator[str]:
-        """Take what is sent to a drive, whatever a bus makes of it.
+        """Observe a set-point that is sent to a drive.
 
         Parameters
         ----------
         at : float
-            When [s].
+            Time [s].
         axis : int
             0 is insertion, 1 rotation.
         place : float or None
-            Where to [m], [rad]; None if the drive is told not to go there.
+            Set-point [m], [rad]; None if the drive is not enabled.
 
         Yields
         ------
         str
-            What is beyond the limits.
+            Violation of a limit.
         """
         its = self._axes[axis]
         if place is None:
@@ -167,12 +167,12 @@ class LimitMonitor:
             yield f"set-points of {its.name} {its.said(ahead, bound)} ahead of its speed limit"
 
     def observe_motors(self, at: float, insertion: float, rotation: float) -> Iterator[str]:
-        """Take where the motors really are; yields what is beyond the limits.
+        """Observe the true position of the motors; yields violations of the limits.
 
         Parameters
         ----------
         at : float
-            When [s].
+            Time [s].
         insertion, rotation : float
             [m], [rad].
         """
@@ -183,7 +183,7 @@ class LimitMonitor:
         if abs(rotation) > farthest:
             yield f"rotation is {rotation:.4g} rad, at most {farthest:.4g} either way"
         for its, place in zip(self._axes, (insertion, rotation), strict=True):
-            # Who is behind goes on as fast as it can (docs/safety.md, following_error).
+            # A lagging drive catches up at its full speed (docs/safety.md, following_error).
             ahead = its.motor.ahead(at, place)
             if ahead > its.behind:
                 yield f"{its.name} went {its.said(ahead, its.behind)} farther than its speed allows"

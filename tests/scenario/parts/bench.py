@@ -57,7 +57,7 @@ class Bench(Component):
     watchers : list of callable
         Called with the time [s] and the motors at every tick.
     deepest_tip : ndarray, shape (3,)
-        Where the true tip was when it was farthest in, in `rig` [m].
+        True tip at the largest insertion, in `rig` [m].
     """
 
     name = "bench"
@@ -117,19 +117,19 @@ class CameraState(enum.Enum):
 
 
 class TrackerStandIn(Component):
-    """Stands in for the tracker: tells the tip of every exposure.
+    """Replaces the tracker: publishes the tip of every exposure.
 
     Parameters
     ----------
     bench : Bench
-        What is seen.
+        Rig with the needle.
     chance : Random
-        Draws noise, and what is wrong.
+        Draws noise and wrong tips.
 
     Attributes
     ----------
     camera_state : CameraState
-        What the cameras do.
+        State of the cameras.
     """
 
     name = "stereo_tracker"
@@ -138,7 +138,7 @@ class TrackerStandIn(Component):
         self._bench, self._chance = bench, chance
         self.camera_state = CameraState.CLEAR
         self._last = bench.tip
-        # Answers, and when they are given [s].
+        # Answers with their due times [s].
         self._answers: list[tuple[float, list[Action]]] = []
         self.outputs = (
             Output("needle/tip", m.Point),

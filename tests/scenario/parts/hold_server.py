@@ -1,4 +1,4 @@
-"""The console's hold on the line of a page: its real talk, without sockets and without a thread."""
+"""The console's hold protocol with a page, without sockets and threads."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _LOOK = 0.005
 
 
 class VirtualHoldServer(Component):
-    """Serves the hold as `hold.hold_server` does; the console hears it at its port."""
+    """Serves the hold as `hold.hold_server` does; the console receives it at its port."""
 
     name = "hold_server"
 
     def __init__(self) -> None:
         self._actions: list[Action] = []
         self._protocol = HoldProtocol(lambda _: "", self._publish_state, self._notice, 0.0)
-        # Connection to the page's number.
+        # Connection to page number.
         self._pages: dict[int, int] = {}
         self.ports = (Port(PAGE_LINE, self._handle_batch), Port(PAGE, lambda *_: ()))
         self.timers = (Timer(_LOOK, self._look), Timer(PERIOD, self._send_counts))
@@ -49,7 +49,7 @@ class VirtualHoldServer(Component):
     def _handle_message(self, message: PageMessage, now: float) -> Actions:
         page = self._pages.get(message.connection)
         if message.text is None:
-            # First of all: what a gone page held ends now.
+            # End the hold of a closed page first.
             if page is not None:
                 self._close(message.connection, now)
         elif page is not None:
@@ -57,7 +57,7 @@ class VirtualHoldServer(Component):
         elif message.text == CONNECT:
             self._pages[message.connection] = self._protocol.open(now, is_local=True)
         else:
-            # Of a connection that nobody knows, as after a restart.
+            # Unknown connection, as after a restart.
             yield self._abort(message.connection, now)
 
     def _send_counts(self, at: Moment) -> Actions:

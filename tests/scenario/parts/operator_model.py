@@ -1,4 +1,4 @@
-"""The person at the rig: prepares it, inserts, mends what a fault left, draws the needle out."""
+"""Model of the operator: prepares the rig, inserts, recovers from faults, withdraws the needle."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from needle_core.status_messages import ControllerStatus, DeviceStatus
 INSERT, RETRACT, STOP = 0, 1, 2
 _PERIOD = 0.1
 _JOY_RATE = 50.0
-# Between two calls of one service [s].
+# Shortest time between two calls of one service [s].
 _CALL_AGAIN = 0.5
-# How long a finger stays off before it presses again, and how long it presses in vain [s].
+# Pause between release and press, and time after which a press without effect is repeated [s].
 _PAUSE, _RETRY_AFTER = 0.3, 3.0
 OUT = 3e-4
-"""A needle that is in no farther looks as if it were out [m]."""
+"""Insertion up to which the needle looks withdrawn [m]."""
 
 
 class OperatorGoal(enum.Enum):
-    """Aim of the person."""
+    """Goal of the operator."""
 
     INSERT = "insert"
     WITHDRAW = "draw out"
@@ -31,12 +31,12 @@ class OperatorGoal(enum.Enum):
 
 @dataclasses.dataclass
 class JoystickButtons:
-    """Buttons that are down.
+    """Buttons of the joystick, true while pressed.
 
     Attributes
     ----------
     insert, retract, stop : bool
-        Each of them.
+        One for each button.
     """
 
     insert: bool = False
@@ -45,19 +45,19 @@ class JoystickButtons:
 
     @property
     def holds(self) -> bool:
-        """Whether it presses what could move the needle."""
+        """Whether a button that could move the needle is pressed."""
         return self.insert or self.retract
 
     @property
     def button(self) -> str:
-        """The button of a page that a finger is on; empty: none, or more than one."""
+        """Button of a page that is pressed; empty for none or more than one."""
         if self.insert is self.retract or self.stop:
             return ""
         return "insert" if self.insert else "retract"
 
 
 class Joystick(c.Component):
-    """Publishes what the hand does.
+    """Publishes the state of the buttons.
 
     Parameters
     ----------
@@ -79,31 +79,31 @@ class Joystick(c.Component):
 
 
 class OperatorModel(c.Component):
-    """Acts by what the rig says of itself, and by where the needle is seen to be.
+    """Acts on the published states of the rig and the visible insertion of the needle.
 
     Parameters
     ----------
     hand : JoystickButtons
-        Its own.
+        Its buttons.
     insertion : callable
-        Returns how far the needle is in, as anybody can see [m].
+        Returns the insertion of the needle [m].
     source : str
-        Name of the node by which it holds, as the device knows it.
+        Name of the node that publishes its hold.
 
     Attributes
     ----------
     goal : OperatorGoal
-        What it wants now.
+        Present goal.
     device, controller : DeviceStatus, ControllerStatus
-        What they said last.
+        Last received status.
     done : bool
-        Whether the controller has said once that it is done.
+        Whether the controller was in state DONE once.
     absent : bool
-        Whether it minds nothing, whatever its hand does.
+        Whether it does nothing; the hand may still move.
     shows_lost_press : callable
-        Returns whether what it holds by shows that a press is lost.
+        Returns whether its input device shows a lost press.
     extra_actions : list of Action
-        What it does beside, at its next look.
+        Actions to send in the next period.
     """
 
     name = "person"
@@ -168,7 +168,7 @@ class OperatorModel(c.Component):
             yield from self._try("device/home", at)
 
     def _next_action(self, state: str) -> tuple[bool, bool, tuple[str, bool | None] | None]:
-        """Return whether to press to insert, to draw out, and what to call."""
+        """Return whether to press insert, whether to press retract, and the service to call."""
         if self.device.activity == "homing":
             return False, False, None
         is_out = self._insertion() < OUT
@@ -182,12 +182,12 @@ class OperatorModel(c.Component):
             return False, True, None
         if is_out and (self.done or self.goal is OperatorGoal.WITHDRAW):
             self.goal = OperatorGoal.LEAVE
-        # Homing is for axes that are off.
+        # Homing needs disabled axes.
         off = state == "HOLDING" and is_out and not self.device.homed
         return False, False, ("device/enable", False) if off else None
 
     def _press(self, now: float, *, insert: bool, retract: bool) -> None:
-        """Let go of what is not wanted; press what is, from neutral, anew where asked to."""
+        """Release other buttons and stale presses; press the given button from neutral."""
         hand = self._hand
         lost = self.device.press_again == self._source or self.shows_lost_press(now)
         stale = hand.holds and (insert, retract) != (hand.insert, hand.retract)
@@ -196,7 +196,7 @@ class OperatorModel(c.Component):
             return
         duration = now - self._changed_at
         if hand.holds:
-            # Who holds in vain lets go after a while, and tries again.
+            # Release a press without effect after a while, and try again.
             if duration > _RETRY_AFTER and self.device.hold_owner != self._source:
                 self._release(now)
         elif (insert or retract) and duration > _PAUSE:

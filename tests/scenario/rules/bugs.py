@@ -1,4 +1,4 @@
-"""Bugs that take a safety rule away, planted where the rule is enforced."""
+"""Bugs that disable a safety rule, planted in the code that enforces it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Plant = Callable[[pytest.MonkeyPatch], None]
 
 
 def set_to(where: Any, /, **values: Any) -> Plant:
-    """Return what gives a class or module other attributes."""
+    """Return a bug that replaces attributes of a class or module."""
 
     def plant(patch: pytest.MonkeyPatch) -> None:
         for name, value in values.items():
@@ -40,13 +40,13 @@ def set_to(where: Any, /, **values: Any) -> Plant:
 
 
 def wrapped(where: Any, name: str, around: Callable[..., Any]) -> Plant:
-    """Return what calls a function in place of another, which it gets first."""
+    """Return a bug that wraps a function; the wrapper gets the original as its first argument."""
     original = getattr(where, name)
     return set_to(where, **{name: lambda *given, **named: around(original, *given, **named)})
 
 
 def _do_nothing(*_: Any, **__: Any) -> None:
-    """Do nothing, and find nothing wrong."""
+    """Do nothing, and report no error."""
 
 
 def _empty_procedure(*_: Any, **__: Any) -> Any:
@@ -55,7 +55,7 @@ def _empty_procedure(*_: Any, **__: Any) -> Any:
 
 
 def _of_context(**wrong: Any) -> Plant:
-    """Judge commands as if the device were otherwise."""
+    """Return a bug that checks commands in a wrong context."""
 
     def checked(check: Any, asked: Any, context: Any, limits: Any) -> Any:
         return check(asked, dataclasses.replace(context, **wrong), limits)
@@ -64,7 +64,7 @@ def _of_context(**wrong: Any) -> Plant:
 
 
 def _of_messages(change: Callable[[Hold, HoldState], HoldState]) -> Plant:
-    """Take another message than the one that came."""
+    """Return a bug that changes each received hold."""
 
     def received(receive: Any, hold: Hold, message: HoldState, *more: Any, **how: Any) -> Any:
         return receive(hold, change(hold, message), *more, **how)
@@ -196,4 +196,4 @@ BUGS: dict[str, Plant] = {
     "look_ahead": _set_points_far_ahead,
     "loop_heartbeat": set_to(FrameLink, beat=_do_nothing),
 }
-"""By the rule's name."""
+"""Bugs by the name of the rule."""
