@@ -1,4 +1,4 @@
-"""Step E: bags that lose nothing and open everywhere, and nodes that end in order."""
+"""Step E: complete and readable bags, and clean exits of all nodes."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ MOMENTS = 25
 PROCESSOR_SHARE, MEMORY_GROWTH_MB = 0.35, 5.0
 LAST_SECONDS = 0.5
 SIGNALS = 100
-# A bag is completed first: last words are heard for up to a second, and a disk may be slow. For the
-# others launchers wait so long before they send SIGTERM [s].
+# Longest time to exit [s]. The recorder first receives late messages for up to a second and completes
+# its bag; for other nodes, launchers send SIGTERM after 5 s.
 LONGEST_END, LONGEST_END_OF_OTHERS = {"recorder": 10.0}, 5.0
 
 
 def full_rate(bench: Workbench) -> Iterator[Finding]:
-    """Record stereo at 2 x 30 Hz with everything else while both cores are busy."""
+    """Record stereo at 2 x 30 Hz with all other topics while both cores are busy."""
     seen = record_full_rate(bench.folder, DURATION)
     missing, counted = seen["missing"], seen["counted"]
     yield Finding(
@@ -45,7 +45,7 @@ def full_rate(bench: Workbench) -> Iterator[Finding]:
 
 
 def killed(bench: Workbench) -> Iterator[Finding]:
-    """Kill the recorder at random moments, with images and without; recover."""
+    """Kill the recorder at random moments, with images and without, and recover the bag."""
     for what, words in (("images", ()), ("small", ("small",))):
         folder = bench.folder / f"killed_{what}"
         folder.mkdir()

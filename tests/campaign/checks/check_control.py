@@ -1,4 +1,4 @@
-"""Step B: the paper's results reproduced, then beaten: studies of 10,000 needles each."""
+"""Step B: the paper's results and those of preset best, in studies of 10,000 needles each."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def best(bench: Workbench) -> Iterator[Finding]:
 
 
 def trouble(bench: Workbench) -> Iterator[Finding]:
-    """Study preset best under each trouble, of which it is told nothing."""
+    """Study preset best under each disturbance, which it does not know."""
     return _studied(TROUBLE + MISINFORMED + WANDERING, bench)
 
 
 def points(bench: Workbench) -> Iterator[Finding]:
-    """Steer needles to points, at rest and moving, under troubles it is told nothing of."""
+    """Steer needles to points, at rest and moving, under unknown disturbances."""
     targets = ("--targets", "10000")
     asked = (dataclasses.replace(study, options=(*targets, *study.options)) for study in POINTS)
     return _studied(asked, bench)
@@ -58,7 +58,7 @@ def _studied(studies: Iterable[Study], bench: Workbench) -> Iterator[Finding]:
 
 
 def curvature(bench: Workbench) -> Iterator[Finding]:
-    """Find the curvature from a pure insertion of 60 mm."""
+    """Fit the curvature to a pure insertion of 60 mm."""
     off = curvature_errors(INSERTIONS, np.random.default_rng(60))
     yield Finding(
         "curvature_fit",

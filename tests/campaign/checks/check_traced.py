@@ -1,4 +1,4 @@
-"""Step C on metal under lamps: a tracker for real images, as far as path tracing goes."""
+"""Step C on path-traced images: metal needles under lamps."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ _CHI_SQUARED_95 = 7.815  # of three degrees of freedom
 
 
 def path_traced(_: Workbench) -> Iterator[Finding]:
-    """Find metal needles under lamps, before backdrops of all kinds; say how well they are known.
+    """Find metal needles under lamps over all floors, with consistent covariances.
 
-    Tells of the half of the set that nobody looks at, as far as `traced_set` has drawn it; what is
-    missing is drawn now.
+    It uses the held-out half of the set; missing sequences are traced first.
     """
     looks = [
         look
@@ -53,7 +52,7 @@ def path_traced(_: Workbench) -> Iterator[Finding]:
 
 
 def path_traced_variations(_: Workbench) -> Iterator[Finding]:
-    """Find the same needles where the images or what is known of the rig are otherwise."""
+    """Find the same needles with degraded images or wrong parameters."""
     sequences = [
         sequence
         for sequence in drawn(checkout() / ".traced", scenes(HELD_BACK))
@@ -90,7 +89,7 @@ def _pairs(looks: Sequence[TrackedPair]) -> int:
 
 
 def _kinds(needles: Sequence[TrackedPair]) -> Iterator[Finding]:
-    """Tell of each rig, metal, light and floor by itself."""
+    """Yield the share found for each rig, metal, light and floor."""
     kinds: dict[str, list[TrackedPair]] = {}
     for look in needles:
         seen = look.scene.look
