@@ -1,4 +1,4 @@
-"""A pytest plugin of scripts/test: collect once, run on all cores, hold each test to its budget.
+"""A pytest plugin of scripts/test: collects once, runs on all cores, enforces CPU budgets.
 
 The process that collected forks one shard per core. The shards take test files from one pipe, the
 longest ones first, and send their reports back. Smoke tests and the campaign start real nodes: they
@@ -28,11 +28,11 @@ from needle_bringup.workplace import processes_with
 from needle_core.process.ros_domain import reserve_domain_id
 
 SHARDS = os.cpu_count() or 1
-# What takes longest is begun first, or one of them would hold up the end of the run.
+# Start the longest files first, to balance the shards.
 LONG = re.compile(r"tests/(static|scenario)/|.*/test/(tracking|studies|curvature)/")
 ALONE = ("tests/smoke/", "tests/campaign/")
 WHOLE = 1000
-"""With more tests than this, a run is one of all."""
+"""Number of tests above which a run counts as complete."""
 _INDEX_BYTES = 4
 # Environment variable by which processes of this run are found.
 _RUN_MARK = "NEEDLE_TEST_RUN"
@@ -42,16 +42,16 @@ _budget = CpuBudget()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Reserve a ROS domain, and end as Ctrl-C does: with all cleaning up."""
+    """Reserve a ROS domain, and clean up on signals as on Ctrl-C."""
     os.environ["ROS_DOMAIN_ID"] = str(_reserved.enter_context(reserve_domain_id()))
-    # A shell that runs this in the background ignores SIGINT, and all below would, too.
+    # A shell ignores SIGINT in background jobs, and children inherit that.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     config.pluginmanager.register(_budget)
 
 
 def pytest_unconfigure() -> None:
-    """Give the ROS domain back."""
+    """Release the ROS domain."""
     _reserved.close()
 
 
@@ -63,7 +63,7 @@ def pytest_runtestloop(session: pytest.Session) -> object:
     if len(session.items) > WHOLE:
         _warm_up()
         _budget.is_enforced = True
-    # The first look at it empties it: that must not be a shard's.
+    # The first access empties the folder, so it must not happen in a shard.
     session.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
     files = _by_file(session.items)
     alone = [item for file in files if file.startswith(ALONE) for item in files[file]]
@@ -77,7 +77,7 @@ def pytest_runtestloop(session: pytest.Session) -> object:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Fail the session when processes are left, and end them."""
+    """Kill leftover processes, and fail the session if there are any."""
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
     for line in _kill_leftover_processes():
         session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
@@ -104,7 +104,7 @@ def _kill_leftover_processes() -> list[str]:
 
 
 def _warm_up() -> None:
-    """Load compiled code, or compile it: that counts to no test, and is done for all shards."""
+    """Load or compile numerical code once for all shards, outside of any test's budget."""
     for part in compile_ahead.PARTS.values():
         part()
     troubled = ["--targets", "2", "--depth-mm", "2", "--play-deg", "10", "--lag-mm", "5"]
@@ -114,13 +114,13 @@ def _warm_up() -> None:
 
 
 class _Sender:
-    """Stands in a shard for the terminal: sends reports to the process that collected."""
+    """Sends the reports of a shard to the main process."""
 
     def __init__(self, config: pytest.Config, to: Connection) -> None:
         self._config, self._to = config, to
 
     def pytest_runtest_logstart(self, nodeid: str, location: object) -> None:
-        """Say which test begins, for whoever has to name it if this process dies."""
+        """Send the name of the test, reported if this process dies."""
         self._to.send(nodeid)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -163,7 +163,7 @@ def _run_in_shards(session: pytest.Session, files: Sequence[Sequence[pytest.Item
 
 
 def _taken(waiting: int, files: Sequence[Sequence[pytest.Item]]) -> Iterator[pytest.Item]:
-    """Yield the tests of the files that a shard takes."""
+    """Yield the tests of the files that this shard takes from the pipe."""
     while index := os.read(waiting, _INDEX_BYTES):
         yield from files[int.from_bytes(index, "big")]
 
@@ -179,43 +179,43 @@ def _be_a_shard(session: pytest.Session, to: Connection, items: Iterator[pytest.
         to.send(None)
         code = 0
     finally:
-        # Nothing of what the process that forked has to clean up is this one's to clean up.
+        # Skip the clean-up, which belongs to the main process.
         os._exit(code)
 
 
 def _run_all(session: pytest.Session, items: Iterator[pytest.Item]) -> None:
-    """Run tests; each is told the next one, since fixtures that both share stay."""
+    """Run tests; pytest keeps fixtures that the next test shares."""
     item = next(items, None)
     while item is not None:
         following = next(items, None)
         item.ihook.pytest_runtest_protocol(item=item, nextitem=following)
-        _heed_wish_to_end(session)
+        _check_stop(session)
         item = following
 
 
 def _pass_on_reports(session: pytest.Session, shards: dict[Connection, int]) -> None:
-    """Hand the shards' reports to pytest until all shards are done."""
+    """Pass the reports of the shards to pytest until all are done."""
     hook = session.config.hook
     at_work = dict.fromkeys(shards, "a first test")
     while at_work:
         for shard in wait(list(at_work)):
             assert isinstance(shard, Connection)
             try:
-                told: Any = shard.recv()
+                message: Any = shard.recv()
             except EOFError:
                 pytest.exit(f"a shard died in {at_work[shard]}", pytest.ExitCode.INTERNAL_ERROR)
-            if told is None:
+            if message is None:
                 del at_work[shard]
-            elif isinstance(told, str):
-                at_work[shard] = told
+            elif isinstance(message, str):
+                at_work[shard] = message
             else:
-                report = hook.pytest_report_from_serializable(config=session.config, data=told)
+                report = hook.pytest_report_from_serializable(config=session.config, data=message)
                 hook.pytest_runtest_logreport(report=report)
-        _heed_wish_to_end(session)
+        _check_stop(session)
 
 
-def _heed_wish_to_end(session: pytest.Session) -> None:
-    """End as pytest's own loop does, after `-x` say."""
+def _check_stop(session: pytest.Session) -> None:
+    """Raise as pytest's own loop does, for example after `-x`."""
     if session.shouldfail:
         raise session.Failed(session.shouldfail)
     if session.shouldstop:

@@ -14,8 +14,8 @@ MOMENTS = 25
 PROCESSOR_SHARE, MEMORY_GROWTH_MB = 0.35, 5.0
 LAST_SECONDS = 0.5
 SIGNALS = 100
-# Longest time to exit [s]. The recorder first receives late messages for up to a second and completes
-# its bag; for other nodes, launchers send SIGTERM after 5 s.
+# Longest time to exit [s]. The recorder first receives late messages for up to a second and
+# completes its bag; for other nodes, launchers send SIGTERM after 5 s.
 LONGEST_END, LONGEST_END_OF_OTHERS = {"recorder": 10.0}, 5.0
 
 

@@ -1,4 +1,4 @@
-"""Generated scenes with obstacles: which can be solved, which are taken on, and how they end.
+"""Generated scenes with obstacles: solvable, accepted and reached ones.
 
 python -m campaign.steering.obstacle_study --scenes 1000 --seed 1
 """
@@ -34,11 +34,11 @@ from needle_sim.needle.se3 import FloatArray
 NEEDLE_RADIUS = 0.00035
 CURVATURE = SteeringSettings.curvature
 SAMPLES = 4000
-"""Points of the search that judges a scene."""
+"""Random points of the search for a path."""
 DEPTH = 0.2
 _SUBSTEPS = 4
 Drive = Callable[[FloatArray, JointSample], SteeringCommand | None]
-"""Takes a tip and the joints at its exposure; None where there is no way on."""
+"""Function from a tip and its joints to a command; None if there is no path."""
 LABELS = {
     "scenes": "scenes",
     "solvable": "solvable with 90 % of the curvature, 0.75 mm clear",
@@ -66,11 +66,11 @@ class SceneOutcome:
         Whether the search finds a path with all, 90 % or 85 % of the curvature, 0.35, 0.75 or
         1.25 mm clear of everything.
     taken, stopped : bool
-        Whether the controller set out, and whether it saw no way on.
+        Whether the controller started, and whether it stopped for lack of a path.
     miss : float
-        True distance from the target at the end [m]; inf where it was not taken on.
+        True distance from the target at the end [m]; inf if it did not start.
     least : float
-        Least clearance of the true needle's surface [m]; likewise.
+        Least clearance of the needle's surface [m]; inf if it did not start.
     """
 
     bare: bool
@@ -83,7 +83,7 @@ class SceneOutcome:
 
 
 def solvability(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcome:
-    """Return whether a scene can be solved, of a needle that has not set out."""
+    """Return whether a scene has a path, as the outcome of a needle that was not started."""
     bare, solvable, roomy = (
         find_path(
             scene.target,
@@ -242,7 +242,7 @@ def figures(outcomes: Sequence[SceneOutcome], times: Sequence[float]) -> dict[st
 
     solvable = [one for one in outcomes if one.solvable]
     roomy = [one for one in outcomes if one.roomy]
-    # The solvability misses some ways: where a needle was led there, there is one.
+    # The search misses some paths: a scene whose needle arrived is solvable.
     unsolvable = [
         one
         for one in outcomes

@@ -21,24 +21,23 @@ _NOISE = 12.0  # grey levels
 _QUALITY = 20  # of JPEG
 _GAIN = 0.4
 SETTLED = 3
-"""Pairs of a sequence's begin that do not count: a tracker without the insertion wants to see a
-needle three times."""
+"""First pairs of a sequence that do not count: a tracker without insertion needs three pairs."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Variation:
-    """One thing that is otherwise.
+    """One wrong parameter or degradation of the images.
 
     Attributes
     ----------
     name : str
-        As a person reads it.
+        Description.
     width : float
-        Needle width that is known, over the true one.
+        Given needle width relative to the true one.
     zero : float
-        Added to the insertion that is known [m].
+        Error of the given insertion [m].
     seen : callable
-        Image and generator of noise in, image out.
+        Function from image and random generator to image.
     """
 
     name: str
@@ -67,8 +66,8 @@ def _dim(image: Image, _: np.random.Generator) -> Image:
 
 AS_TRACED = Variation("as traced")
 VARIATIONS = (
-    Variation("width known 0.7 times", width=0.7),
-    Variation("width known 1.3 times", width=1.3),
+    Variation("width told 0.7 times", width=0.7),
+    Variation("width told 1.3 times", width=1.3),
     Variation("stage 1 mm too long", zero=1e-3),
     Variation("stage 1 mm too short", zero=-1e-3),
     Variation("blur of 1 px", seen=_blurred(1.0)),
@@ -80,7 +79,7 @@ VARIATIONS = (
 
 
 class KnownInput(enum.Enum):
-    """The tracker's knowledge beside the pairs of a sequence."""
+    """Inputs of the tracker besides the pairs of a sequence."""
 
     NOTHING = "without"
     INSERTION = "with"
@@ -94,11 +93,11 @@ class TrackedPair:
     Attributes
     ----------
     scene : TracedScene
-        What it showed.
+        Scene of the pair.
     known : KnownInput
-        What the tracker was known.
+        Further inputs of the tracker.
     tip : SpatialTip or None
-        What it believed.
+        Reported tip.
     truth : ndarray, shape (3,), or None
         The end of the shaft's axis in `rig` [m]; None where there is no needle.
     """
@@ -129,19 +128,19 @@ class TrackedPair:
 def tracked_pairs(
     sequence: DrawnSequence, known: KnownInput, variation: Variation = AS_TRACED
 ) -> Iterator[TrackedPair]:
-    """Yield what is said of a sequence's pairs.
+    """Yield the tracker's results for the pairs of a sequence.
 
-    Of a needle the first `SETTLED` pairs are shown and not yielded, nor are pairs that have not all
-    of its last 10 mm in both images.
+    With a needle, the first `SETTLED` pairs are processed and not yielded, nor are pairs without
+    all of its last 10 mm in both images.
 
     Parameters
     ----------
     sequence : DrawnSequence
         The pairs.
     known : KnownInput
-        What the tracker is known.
+        Further inputs of the tracker.
     variation : Variation
-        What is otherwise than the tracker expects.
+        Wrong parameter or degradation.
     """
     rng = np.random.default_rng(sequence.scene.seed)
     stereo = load_calibration(sequence.calibration)

@@ -23,18 +23,18 @@ from needle_tracker.optics.calibration import StereoCalibration, load_calibratio
 Array = NDArray[np.float64]
 
 WRONG = 1.5e-3
-_SEEN = 0.95  # share of the last 10 mm in view, in both cameras: the needle is to be seen
+_SEEN = 0.95  # visible share of the last 10 mm in both cameras from which the needle must be found
 STEP = 1e-3
 FIRST_STEP = 6
 SPACING = 5e-4
 CURVATURE = 8.2
-# How far the steered needle may stray, in a control loop's place: the bevel is turned back.
+# Distance from the axis at which the bevel is turned back [m].
 _STRAY = 4e-3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Exposure:
-    """One stereo pair and what it shows.
+    """One stereo pair and its truth.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ def insertion_sequence(
     seed : int
         Of the renderer, the start and the steering; not negative.
     steps : int
-        How many exposures, from 6 mm of insertion on.
+        Number of exposures, from 6 mm of insertion on.
     noise : float, optional
         Standard deviation of the sensor's noise, in place of the scenario's [grey levels].
     """
@@ -133,21 +133,21 @@ class TrackedRun:
 
     @property
     def found(self) -> NDArray[np.bool_]:
-        """Tell whether there is a tip."""
+        """Whether there is a tip, for each exposure."""
         return np.asarray(np.isfinite(self.normalised))
 
     @property
     def distances(self) -> Array:
-        """Length of the errors [m], of the tips there are."""
+        """Lengths of the errors of all tips [m]."""
         return np.asarray(np.linalg.norm(self.errors[self.found], axis=1))
 
     @property
     def depths(self) -> Array:
-        """Size of the errors along the cameras' depth [m], of the tips there are."""
+        """Absolute errors of all tips in depth [m]."""
         return np.asarray(np.abs(self.errors[self.found, 0]))
 
     def slowest_recovery(self) -> int:
-        """Return the most pairs that it took to find the needle once it was seen again."""
+        """Return the largest number of pairs until a visible needle was found again."""
         longest = waiting = 0
         for seen, found in zip(self.seen, self.found, strict=True):
             waiting = 0 if found or not seen else waiting + 1
@@ -156,7 +156,7 @@ class TrackedRun:
 
 
 def new_tracker(calibration: StereoCalibration) -> NeedleTracker:
-    """Return a tracker as the node's defaults make it."""
+    """Return a tracker with the defaults of the node."""
     return NeedleTracker(calibration, default_settings(calibration))
 
 
@@ -188,7 +188,7 @@ def track_run(
         states.append(measured.state)
         seen.append(min(exposure.seen) >= _SEEN)
         error, square = np.full(3, np.nan), np.nan
-        # In the entry zone a tip may be the stage's alone: it was not found.
+        # In the entry zone, a tip may come from the insertion alone: it does not count as found.
         if measured.tip is not None and measured.state is not TrackState.ENTRY:
             error = measured.tip.position - exposure.T_rig_tip[:3, 3]
             square = float(error @ np.linalg.solve(measured.tip.covariance, error))
