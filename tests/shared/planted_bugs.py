@@ -1,4 +1,4 @@
-"""Bugs that are planted: one for each invariant at least, and those that a schedule once found."""
+"""Planted bugs: at least one for each invariant, and those that a schedule once found."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ NEVER_RAISED = KeyboardInterrupt
 
 
 class PlantedBug(NamedTuple):
-    """A bug, what finds it, and the first seed from 1 on that does.
+    """A bug, the invariant that detects it, and the first seed from 1 that does.
 
     The faults are those of the same seed, or of `faults_of` for a bug that few schedules show.
     """
@@ -69,7 +69,7 @@ def _forgiving(lapses: Any, session: PageSession, now: float) -> bool:
 
 
 def _axis_scaled(name: str, scale: float) -> Plant:
-    """Return what has an emulated axis go otherwise than its motor."""
+    """Return a bug that scales the motion of an emulated axis."""
 
     def axes(true: Any, bus: EmulatedBus, now: float) -> dict[str, AxisState]:
         found: dict[str, AxisState] = true(bus, now)
@@ -243,4 +243,4 @@ _MENDED: dict[str, tuple[str, Plant]] = {
     ),
 }
 MENDED = {name: PlantedBug(*row, seed=0) for name, row in _MENDED.items()}
-"""By the schedule, in tests/scenario/tests/schedules, that found them; it has the seed."""
+"""By the schedule in tests/scenario/tests/schedules that found them, with its seed."""

@@ -18,7 +18,7 @@ from reference.markdown import cell, code
 from reference.node_pages import node_page, topics_page
 from reference.rig_nodes import RigNode, executables, rig_nodes
 
-# Of every node or component, or of a command that ends by itself.
+# Modules of every node or component, or of a command that ends by itself.
 BESIDE_NODES = (
     "needle_core/ros/base_node.py",
     "needle_core/ros/component_node.py",
@@ -33,7 +33,7 @@ def nodes() -> list[RigNode]:
 
 
 def runtime_modules() -> Iterator[tuple[str, ast.Module]]:
-    """Yield (path below the package's folder, tree) of all modules that a rig runs."""
+    """Yield (path below the package's folder, tree) of all runtime modules."""
     for path in sorted(SOURCES.glob("*/*/**/*.py")):
         package, below, *_ = path.relative_to(SOURCES).parts
         if below == package:
@@ -41,7 +41,7 @@ def runtime_modules() -> Iterator[tuple[str, ast.Module]]:
 
 
 def makers_in(tree: ast.Module) -> Iterator[tuple[str, int, int]]:
-    """Yield (function, first line, last line) of what makes an endpoint."""
+    """Yield (function, first line, last line) of the calls that create an endpoint."""
     for part in ast.walk(tree):
         if isinstance(part, ast.FunctionDef):
             for call in ast.walk(part):
@@ -118,7 +118,7 @@ def test_every_part_and_complaint_of_diagnostics_is_there(nodes: list[RigNode]) 
         for part in ast.walk(tree)
         if isinstance(part, ast.Attribute)
     )
-    compared = 4  # `is Level.ERROR`, `>= Level.WARN`, `== ...`: nothing is said there
+    compared = 4  # comparisons `is Level.ERROR`, `>= Level.WARN`, `== ...` without a text
     assert words - compared <= len(found) <= words
 
 

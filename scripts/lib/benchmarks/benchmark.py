@@ -1,4 +1,4 @@
-"""`scripts/bench`: every speed and memory figure beside its reference, measured in the same run."""
+"""`scripts/bench`: every speed and memory figure beside its reference of the same run."""
 
 from __future__ import annotations
 

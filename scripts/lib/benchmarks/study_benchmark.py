@@ -1,4 +1,4 @@
-"""Speed and memory of studies and of the node's update, beside the loop written plainly."""
+"""Speed and memory of studies and of the node's update, beside the reference loops."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def studies() -> Iterator[Row]:
 
 
 def updates() -> Iterator[Row]:
-    """One update of the node's controller: estimate with covariance, command, reach."""
+    """One update of the node: estimate with covariance, command, reachability."""
     d = design()
     s, errors = (-0.003, 0.0, 0.0), uniform_numbers(1, 1, 0, 0, UPDATES)[:, 0] * TIP_NOISE
     plain = _least_time(
@@ -95,7 +95,7 @@ def updates() -> Iterator[Row]:
 
 
 def memory() -> Iterator[Row]:
-    """Peak memory of a study: it must not grow with the steps."""
+    """Peak memory of a study, which must not grow with the steps."""
     for name in ("paper", "best"):
         short, long = (_peak_memory(name, depth) for depth in (0.030, 0.120))
         what = f"{name}, memory of 1,000 x {STEPS}"
@@ -103,7 +103,7 @@ def memory() -> Iterator[Row]:
 
 
 def noise_of(needle: int) -> list[float]:
-    """Return the noise on x that the study gives one of its needles."""
+    """Return the noise on x of one needle of the study [m]."""
     shares = (uniform_numbers(1, NOISE, k, needle, 1)[0, 0] for k in range(STEPS))
     return [float(TIP_NOISE * (2.0 * share - 1.0)) for share in shares]
 
@@ -133,7 +133,7 @@ def _control_study() -> float:
 
 
 def _require_agreement(name: str, one: Sequence[float], other: Sequence[float]) -> None:
-    """Refuse to compare loops that do not compute the same."""
+    """Raise UserError unless both loops compute the same."""
     off = max(abs(a - b) for a, b in zip(one, other, strict=True))
     if off > 1e-6:
         raise UserError(f"the loop in {name} ends up to {off:g} m elsewhere: not the same loop")
@@ -151,7 +151,7 @@ def _peak_memory(name: str, depth: float) -> float:
 
 
 def _study_one_by_one(name: str) -> float:
-    """Return the time of the study with the same code in a loop over needles, each alone."""
+    """Return the time of the study with the same code, one needle at a time [s]."""
     factory = controller_factory(name, TIP_NOISE)
     chosen = range(0, NEEDLES, NEEDLES // ALONE_NEEDLES)
     return (
@@ -162,7 +162,7 @@ def _study_one_by_one(name: str) -> float:
 
 
 def _tips_of_a_run(preset: str) -> list[tuple[FloatArray, JointSample]]:
-    """Return what the node takes over a whole closed-loop run."""
+    """Return the tips and joint positions of a closed-loop run."""
     control = PlaneControl(dataclasses.replace(SETTINGS, preset=preset), offset_plane(0.003))
     needle = NeedleBatch(np.array([[0.0, np.deg2rad(2.0), np.deg2rad(15.0)]]))
     length, rotation = SETTINGS.step_length, 0.0
@@ -186,9 +186,9 @@ def _update_all(preset: str, taken: Sequence[tuple[FloatArray, JointSample]]) ->
 
 
 def _least_time(work: Callable[[], object], times: int) -> float:
-    """Return the shortest of some times [s] of this process on the processor.
+    """Return the shortest CPU time of repeated work [s].
 
-    All that is measured runs in one thread; what else the machine does counts for little.
+    CPU time of one thread depends little on other load.
     """
     seconds = []
     for _ in range(times):
