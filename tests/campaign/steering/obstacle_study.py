@@ -17,11 +17,8 @@ import numpy as np
 
 from campaign.steering.obstacle_scenes import ObstacleScene, clearance, make_scene
 from campaign.steering.path_search import find_path
-from needle_bringup.studies.study_laws import rrt_law
 from needle_controller.laws.law import SteeringCommand
-from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import offset_plane
-from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import next_step
 from needle_controller.protocol.joint_history import JointSample
@@ -106,8 +103,6 @@ def steer(
     settings: SteeringSettings,
     rng: np.random.Generator,
     times: list[float],
-    *,
-    rrt: bool = False,
 ) -> SceneOutcome:
     """Steer a needle through a scene as the node does; return how it ended.
 
@@ -121,10 +116,8 @@ def steer(
         Of the tips' noise.
     times : list of float
         What each update takes of the processor is added here [s].
-    rrt : bool
-        Whether the published planner leads it, which takes on whatever it is given.
     """
-    drive = _reference(scene, settings) if rrt else _best(scene, settings)
+    drive = _start_controller(scene, settings)
     if drive is None:
         return solved
     plant = NeedlePlant(initial_pose(scene.pitch, scene.roll), curvature=CURVATURE)
@@ -151,7 +144,7 @@ def steer(
     raise AssertionError
 
 
-def _best(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
+def _start_controller(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
     """Return what steers a needle as the node does, None where that refuses to start."""
     obstacles = tuple(float(value) for value in scene.obstacles.ravel())
     control = PlaneControl(dataclasses.replace(settings, obstacles=obstacles), offset_plane(0.0))
@@ -166,32 +159,10 @@ def _best(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
     return drive
 
 
-def _reference(scene: ObstacleScene, settings: SteeringSettings) -> Drive:
-    """Return what steers a needle by the published planner, with the estimator of `best`."""
-    estimator = make_controller(settings, np.eye(3), np.zeros(3))[0]
-    motion = TargetMotion()
-    motion.see(0.0, scene.target)
-    law = rrt_law(motion, settings, np.random.default_rng(1), scene.obstacles)
-    before: list[JointSample] = []
-
-    def drive(tip: FloatArray, joints: JointSample) -> SteeringCommand:
-        if before:
-            last = before.pop()
-            estimator.advance(joints.insertion - last.insertion, joints.rotation - last.rotation)
-            estimator.correct(tip)
-        else:
-            estimator.reset(tip, [joints.insertion, joints.rotation])
-        before.append(joints)
-        return law(estimator.estimate(), 0.0, joints.insertion, math.inf)
-
-    return drive
-
-
 def study(
     scenes: int,
     seed: int,
     *,
-    rrt: bool = False,
     pitch_bound: float,
     roll_bound: float,
     entry_angle_std: float,
@@ -209,8 +180,6 @@ def study(
         What the controller is told of that [rad].
     noise : float
         Largest error of a measured coordinate, as it is told [m].
-    rrt : bool
-        See `steer`.
     """
     settings = SteeringSettings(
         depth=DEPTH,
@@ -227,7 +196,7 @@ def study(
             seed, n, curvature=CURVATURE, pitch_bound=pitch_bound, roll_bound=roll_bound
         )
         rng = np.random.default_rng([seed, n, 1])
-        outcomes.append(steer(scene, solvability(scene, settings), settings, rng, times, rrt=rrt))
+        outcomes.append(steer(scene, solvability(scene, settings), settings, rng, times))
     return figures(outcomes, times)
 
 
@@ -282,13 +251,11 @@ def _run(words: Sequence[str]) -> int:
         ("--noise-mm", "1", "A", "largest error of each coordinate of a measured tip, as is told"),
     )
     parser = study_parser("obstacle_study", "Steer needles past generated obstacles.", options)
-    parser.add_argument("--rrt", action="store_true", help="steer by the published RRT planner")
     given = parser.parse_args(words)
     path = output_file("--json", given.json)
     seen = study(
         whole_number("--scenes", given.scenes, 1, 100_000),
         whole_number("--seed", given.seed, 0, 2**31 - 1),
-        rrt=given.rrt,
         pitch_bound=math.radians(number("--pitch-deg", given.pitch_deg, 0.0, 20.0, "deg")),
         roll_bound=math.radians(number("--roll-deg", given.roll_deg, 0.0, 180.0, "deg")),
         entry_angle_std=math.radians(number("--told-deg", given.told_deg, 0.1, 45.0, "deg")),
