@@ -1,4 +1,4 @@
-"""Checks: how one is run, and what it finds."""
+"""Runs of `simulate` for the checks of `scripts/verify`, and their findings."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from needle_bringup.workplace import processes_with
 from needle_core.errors import UserError
 
 T = TypeVar("T")
-# Every process that a check starts carries this in its environment, so that none can hide.
+# Environment variable that marks every process of a check.
 MARK = "NEEDLE_VERIFICATION"
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """One thing that a step must show.
+    """One required figure beside the measured one.
 
     Attributes
     ----------
     key : str
         Short name, for `--json`.
     what : str
-        What is looked at.
+        Description of the figure.
     wanted, seen : str
-        What it must be, and what it is.
+        Required and measured value, as text.
     passed : bool
-        Whether that is good enough.
+        Whether the measured value meets the requirement.
     """
 
     key: str
@@ -65,9 +65,9 @@ class SimulateRun:
     wall : float
         Time from the command to its end [s].
     output : str
-        stdout and stderr, as they came.
+        stdout and stderr.
     bag : Path
-        The folder that was asked for.
+        Folder of the run.
     left_over : list of str
         Processes that outlived the command.
     """
@@ -80,7 +80,7 @@ class SimulateRun:
 
     @property
     def summary(self) -> Mapping[str, Any]:
-        """summary.json's content; empty where there is none."""
+        """Content of summary.json; empty if there is none."""
         path = self.bag / "summary.json"
         return dict(yaml.safe_load(path.read_text("utf-8"))) if path.is_file() else {}
 
@@ -91,14 +91,14 @@ class SimulateRun:
 
 
 class Workbench:
-    """Place in which checks run what they look at.
+    """Folder in which checks run `simulate`.
 
     Parameters
     ----------
     command : sequence of str
-        What runs `simulate`.
+        Command of `simulate`.
     folder : Path
-        Takes the bags.
+        For the bags.
     """
 
     def __init__(self, command: Sequence[str], folder: Path) -> None:
@@ -107,16 +107,16 @@ class Workbench:
         self._runs: dict[str, SimulateRun] = {}
 
     def run(self, name: str, *arguments: str) -> SimulateRun:
-        """Run `simulate`; a name that has run before gives that run again."""
+        """Run `simulate`, or return the earlier run of the same name."""
         if name not in self._runs:
             self._runs[name] = self._run(self.folder / name, arguments)
         return self._runs[name]
 
     def _run(self, bag: Path, arguments: Sequence[str]) -> SimulateRun:
         mark, begin = uuid.uuid4().hex, time.monotonic()
-        said = bag.with_name(bag.name + ".output")
-        # Into a file: a process that is left over would keep a pipe open.
-        with said.open("wb") as output:
+        log = bag.with_name(bag.name + ".output")
+        # Write to a file: a leftover process would keep a pipe open.
+        with log.open("wb") as output:
             done = subprocess.run(
                 [*self._command, *arguments, "--bag", str(bag)],
                 env={**os.environ, MARK: mark},
@@ -130,19 +130,19 @@ class Workbench:
         for pid, _ in running:
             os.kill(pid, signal.SIGKILL)
         left_over = [f"{pid} {name}" for pid, name in running]
-        text = said.read_text("utf-8", "replace")
+        text = log.read_text("utf-8", "replace")
         return SimulateRun(done.returncode, wall, text, bag, left_over)
 
 
 def in_own_process(function: Callable[..., T], *arguments: object) -> T:
-    """Call a function in a fresh process: it may start ROS, or move into another network."""
+    """Call a function in a new process, in which it may start ROS or enter another network."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result()
 
 
 @contextlib.contextmanager
 def busy(count: int) -> Iterator[None]:
-    """Keep the processors busy with so many processes."""
+    """Load the CPU with a number of processes."""
     idle = [sys.executable, "-c", "while True: pass"]
     processes = [subprocess.Popen(idle) for _ in range(count)]
     try:
@@ -154,7 +154,7 @@ def busy(count: int) -> Iterator[None]:
 
 
 def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:
-    """Return the messages of some topics, as they were sent, byte for byte.
+    """Return the serialized messages of some topics.
 
     Raises
     ------
@@ -171,8 +171,8 @@ def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:
     return found
 
 
-def unreadable(bag: Path) -> str:
-    """Return why a bag does not open with rosbags and mcap; an empty text if it does."""
+def bag_read_error(bag: Path) -> str:
+    """Return why rosbags or mcap cannot read a bag; empty if they can."""
     try:
         with Reader(bag) as reader:
             count = sum(1 for _ in reader.messages())
@@ -181,9 +181,9 @@ def unreadable(bag: Path) -> str:
         for file in bag.glob("*.mcap"):
             with file.open("rb") as stream:
                 seen += sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages())
-    # any failure to read is what is looked for
+    # Any error is a finding.
     except Exception as error:  # noqa: BLE001
         return f"{type(error).__name__}: {error}"
     if told == count == seen:
         return ""
-    return f"metadata.yaml tells of {told} messages, rosbags reads {count}, mcap {seen}"
+    return f"metadata.yaml reports {told} messages, rosbags reads {count}, mcap {seen}"

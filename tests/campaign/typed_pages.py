@@ -1,4 +1,4 @@
-"""Types what the documents say, word for word and in order, and tells what did not work.
+"""Executes the code blocks of the pages, word for word and in order, and reports failures.
 
     python tests/campaign/typed_pages.py [PAGE ...]       # in a fresh clone, at full length
 
@@ -33,38 +33,38 @@ PAGES = (
 COMMAND, PROGRAM, FILE = "command", "python", "file"
 FILES = ("yaml", "toml", "python")
 NOT_TYPED = ("text",)
-# Executables that go on until Ctrl-C, as anything with `--loop`.
+# Executables that run until Ctrl-C; others do so with `--loop`.
 NODES = (
     "sim_rig", "stereo_tracker", "plane_controller", "recorder", "device_driver", "drive_emulator",
     "stereo_camera", "operator", "live_view",
 )  # fmt: skip
-# It types these pages itself.
+# Left out, because it runs these blocks itself.
 LEFT_OUT = ("scripts/test",)
-# A command; a service that refuses because something is still under way is asked again [s].
+# Time-outs of a command, of a node's start or a service's success, and of a node's exit [s].
 LIMIT = 600.0
 READY = 60.0
 ENDS = 40.0
 INTERRUPTED = 130
-# How often to look whether nodes live [s].
+# Period of the check that nodes are alive [s].
 LOOK = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """A block of a page, to be typed.
+    """A block of a page.
 
     Attributes
     ----------
     line : int
-        Where it begins in the page, from 1.
+        First line in the page, from 1.
     kind : str
         COMMAND, PROGRAM or FILE.
     text : str
-        Its lines.
+        Its text.
     name : str
-        A FILE's name.
+        Name of a FILE.
     ends_nodes : bool
-        Whether Ctrl-C comes before it.
+        Whether Ctrl-C is pressed before it.
     """
 
     line: int
@@ -75,16 +75,16 @@ class Block:
 
 
 class PageError(Exception):
-    """Something that does not work as a page says."""
+    """A block that fails."""
 
 
 def blocks(page: str) -> list[Block]:
-    """Return what a page says to type, in order.
+    """Return the blocks of a page, in order.
 
     Raises
     ------
     PageError
-        For a fence of an unknown kind, or a file's without a name.
+        For a fence of an unknown kind, or a file without a name.
     """
     found = []
     marks: list[str] = []
@@ -114,7 +114,7 @@ def blocks(page: str) -> list[Block]:
 
 
 def commands(text: str) -> list[str]:
-    """Return a block's commands; one that goes on over several lines is one."""
+    """Return the commands of a block; a command may span several lines."""
     found: list[str] = []
     for line in text.replace("\\\n", " ").splitlines():
         if found and found[-1].count('"') % 2:
@@ -125,23 +125,23 @@ def commands(text: str) -> list[str]:
 
 
 class Session:
-    """Someone who types a page.
+    """A user who types the blocks of a page.
 
     Parameters
     ----------
     folder : Path
-        The checkout, or what looks like one.
+        The checkout, or a copy.
     environment : mapping
-        Of every command.
+        Environment of the commands.
     say : callable
-        Takes each command before it is run.
+        Called with each command before it runs.
     change : callable, optional
-        Changes a command before it is run: a test has less time.
+        Changes a command before it runs, for shorter tests.
 
     Attributes
     ----------
     said : list of str
-        What each command printed.
+        Output of each command.
     """
 
     def __init__(
@@ -160,12 +160,12 @@ class Session:
         self.said: list[str] = []
 
     def type(self, page: Path) -> None:
-        """Type a page, then end what it started.
+        """Type a page, then end its nodes.
 
         Raises
         ------
         PageError
-            At the first block that does not work.
+            At the first block that fails.
         """
         found = blocks(page.read_text("utf-8"))
         for block in found:
@@ -248,7 +248,7 @@ class Session:
         return said
 
     def _end_of(self, process: subprocess.Popen[bytes], command: str) -> int:
-        """Return a command's exit code; what it speaks to must live until then."""
+        """Return the exit code of a command; the nodes must run until then."""
         end = time.monotonic() + LIMIT
         while True:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -261,7 +261,7 @@ class Session:
 
     def _start_node(self, name: str, command: str) -> None:
         log = self._logs / name
-        # Without job control a background process would ignore Ctrl-C.
+        # exec: a background job of a shell without job control ignores SIGINT.
         shell = self._shell(f"exec {self._change(command)}")
         with log.open("wb") as output:
             process = subprocess.Popen(
@@ -277,7 +277,7 @@ class Session:
         listing = ["bash", "-c", "source scripts/env.sh; ros2 node list"]
         while f"/{name}" not in self._ask(listing).split():
             if process.poll() is not None or time.monotonic() > end:
-                raise PageError(f"{command}\nis not there: {log.read_text('utf-8')}")
+                raise PageError(f"{command}\ndoes not start: {log.read_text('utf-8')}")
 
     def _ask(self, shell: list[str]) -> str:
         return subprocess.run(
@@ -296,7 +296,7 @@ class Session:
         Raises
         ------
         PageError
-            If a node does not end, ended before, or complained.
+            If a node does not end, ended before, or printed a traceback.
         """
         for name, (process, log) in list(self._nodes.items()):
             if process.poll() is not None:
@@ -317,7 +317,7 @@ class Session:
 
 @contextlib.contextmanager
 def fresh_clone() -> Iterator[Path]:
-    """Make a clone of this checkout's last commit, for as long as the context lasts."""
+    """Yield a temporary clone of the last commit."""
     with tempfile.TemporaryDirectory(prefix="needle_clone_") as folder:
         clone = Path(folder) / "needle"
         subprocess.run(["git", "clone", "--quiet", str(ROOT), str(clone)], check=True)
@@ -325,9 +325,9 @@ def fresh_clone() -> Iterator[Path]:
 
 
 def main(pages: list[str]) -> int:
-    """Type pages in a fresh clone; returns 1 where one does not work, 130 when interrupted."""
+    """Type pages in a fresh clone; return 1 if a page fails, 130 on an interrupt."""
     for number in (signal.SIGTERM, signal.SIGHUP):
-        # The clone and what runs in it must not outlive this.
+        # Remove the clone and end its processes on these signals too.
         signal.signal(number, signal.default_int_handler)
     try:
         return _type_all(pages)

@@ -1,4 +1,4 @@
-"""`scripts/verify`: runs what the steps of the project must show, at full size."""
+"""`scripts/verify`: full-size checks of each step, with required and measured figures."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _verify(arguments: Sequence[str]) -> int:
 
 
 def _findings(check: Check, bench: Workbench) -> Iterator[Finding]:
-    """Run a check; one that cannot be made has missed."""
+    """Run a check; a check that fails to run is a missed finding."""
     try:
         yield from check(bench)
     except (UserError, ModuleNotFoundError) as error:

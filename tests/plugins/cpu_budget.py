@@ -1,10 +1,8 @@
-"""A pytest plugin: how much CPU each test uses, and that none of a layer uses more than it may.
+"""A pytest plugin that measures the CPU time of each test, and enforces the budget of its layer.
 
-A test that uses `ENDLESS` is taken for one that never ends, and fails; a check of the campaign may
-take hours.
-Processes that a test started and that ended count, too; what is shared by a module or the session
-counts to nobody. CPU-seconds are those of a machine on which `_reference` takes `NOMINAL`: on a
-slower one, or one whose cores share their units with other work, a test may use more.
+A test that uses `ENDLESS` fails, except in the campaign. Ended child processes count; fixtures of a
+module or the session do not. CPU-seconds are those of a machine on which `_reference` takes
+`NOMINAL`: on a slower or loaded machine, a test may use more.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from typing import Any
 import pytest
 
 NOMINAL = 0.020
-"""CPU time of `_reference` on the machine whose seconds the limits are [s]."""
+"""CPU time of `_reference` on the machine of the limits [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,11 +29,11 @@ class Layer:
     Attributes
     ----------
     name : str
-        Of the layer.
+        Name of the layer.
     files : re.Pattern
-        Its test files.
+        Pattern of its test files.
     each : float
-        What one of its tests may use [CPU-s].
+        Budget of one test [CPU-s].
     """
 
     name: str
@@ -58,22 +56,22 @@ LAYERS = (
     Layer("static", re.compile(r"tests/static/"), 120.0),
     Layer("oracles and site", re.compile(r"tests/"), 20.0),
 )
-"""The first whose pattern matches is a test's."""
+"""Layers; a test belongs to the first with a matching pattern."""
 TOLERANCE = 1.5
-"""By so much CPU-seconds vary on a machine whose cores share their caches with other work."""
+"""Factor by which CPU-seconds vary on a machine with shared caches."""
 ENDLESS = 300.0
-"""CPU-seconds at which a test is ended."""
+"""CPU-seconds at which a test is stopped."""
 _CPU, _OVER = "cpu_s", "over_budget"
 
 
 class CpuBudget:
-    """Measures tests where they run, and adds up where their reports arrive.
+    """Measures tests in the shards, and adds up their reports in the main process.
 
     Attributes
     ----------
     is_enforced : bool
-        Whether a test over its budget fails the run: where only a few run, each may be the first
-        that has to load a library.
+        Whether a test over its budget fails the run; not in a run of few tests, where each may be
+        the first to load a library.
     """
 
     def __init__(self) -> None:
@@ -86,7 +84,7 @@ class CpuBudget:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any) -> Generator[None, object, object]:
-        """Note what fixtures use that several tests share."""
+        """Measure the fixtures that several tests share."""
         begin, inner = _cpu(), self._shared
         try:
             return (yield)
@@ -96,12 +94,12 @@ class CpuBudget:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_logstart(self) -> None:
-        """Begin to measure a test."""
+        """Start to measure a test."""
         self._shared, self._begin = 0.0, _cpu()
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, object, object]:
-        """End a test that never ends by itself."""
+        """Stop a test that does not end."""
         signal.signal(signal.SIGPROF, _fail_endless)
         is_unlimited = item.get_closest_marker("campaign") is not None
         signal.setitimer(signal.ITIMER_PROF, 0.0 if is_unlimited else ENDLESS)
@@ -114,7 +112,7 @@ class CpuBudget:
     def pytest_runtest_makereport(
         self, item: pytest.Item, call: pytest.CallInfo[None]
     ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-        """Write into a test's last report what all of it used."""
+        """Write the CPU time into the last report of a test."""
         report = yield
         if call.when == "teardown":
             whole = _cpu() - self._begin
@@ -125,25 +123,25 @@ class CpuBudget:
         return report
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Add a test up."""
-        told: dict[str, Any] = dict(report.user_properties)
-        if report.when != "teardown" or _CPU not in told:
+        """Add the CPU time of a test."""
+        properties: dict[str, Any] = dict(report.user_properties)
+        if report.when != "teardown" or _CPU not in properties:
             return
         layer = _layer(report.nodeid)
-        self._used[layer.name] += told[_CPU]
+        self._used[layer.name] += properties[_CPU]
         self._tests[layer.name] += 1
-        if _OVER in told:
+        if _OVER in properties:
             self._over.append(
-                f"{report.nodeid}: {told[_OVER]:.2f} CPU-s, of {layer.each:g} at most"
+                f"{report.nodeid}: {properties[_OVER]:.2f} CPU-s, of {layer.each:g} at most"
             )
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Fail the session if a test used more than it may."""
+        """Fail the session if a test exceeded its budget."""
         if self._over and session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """Print the sum of each layer, and who used too much."""
+        """Print the sum of each layer, and the tests over budget."""
         sums = (
             f"{layer.name} {self._used[layer.name]:.0f} ({self._tests[layer.name]} tests)"
             for layer in LAYERS
@@ -163,13 +161,13 @@ def _layer(nodeid: str) -> Layer:
 
 
 def _cpu() -> float:
-    """Return the CPU time of this process and of those it has waited for [s]."""
+    """Return the CPU time of this process and its ended children [s]."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return time.process_time() + children.ru_utime + children.ru_stime
 
 
 def _slowness() -> float:
-    """Return how many times slower than the nominal machine this one is at the moment."""
+    """Return the present slowness relative to the nominal machine."""
     begin = time.process_time()
     _reference()
     return max(1.0, (time.process_time() - begin) / NOMINAL)

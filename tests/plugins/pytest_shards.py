@@ -1,4 +1,4 @@
-"""A pytest plugin of scripts/test: collect once, run on all cores, hold each test to its budget.
+"""A pytest plugin of scripts/test: collects once, runs on all cores, enforces CPU budgets.
 
 The process that collected forks one shard per core. The shards take test files from one pipe, the
 longest ones first, and send their reports back. Smoke tests and the campaign start real nodes: they
@@ -14,6 +14,7 @@ import multiprocessing
 import os
 import re
 import signal
+import time
 from collections.abc import Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -22,32 +23,35 @@ import pytest
 
 import compile_ahead
 from cpu_budget import CpuBudget
-from left_processes import end_left_processes
 from needle_bringup.studies import monte_carlo
+from needle_bringup.workplace import processes_with
 from needle_core.process.ros_domain import reserve_domain_id
 
 SHARDS = os.cpu_count() or 1
-# What takes longest is begun first, or one of them would hold up the end of the run.
+# Start the longest files first, to balance the shards.
 LONG = re.compile(r"tests/(static|scenario)/|.*/test/(tracking|studies|curvature)/")
 ALONE = ("tests/smoke/", "tests/campaign/")
 WHOLE = 1000
-"""With more tests than this, a run is one of all."""
+"""Number of tests above which a run counts as complete."""
 _INDEX_BYTES = 4
+# Environment variable by which processes of this run are found.
+_RUN_MARK = "NEEDLE_TEST_RUN"
+_EXIT_GRACE = 2.0  # time that a signalled process has to exit [s]
 _reserved = contextlib.ExitStack()
 _budget = CpuBudget()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Reserve a ROS domain, and end as Ctrl-C does: with all cleaning up."""
+    """Reserve a ROS domain, and clean up on signals as on Ctrl-C."""
     os.environ["ROS_DOMAIN_ID"] = str(_reserved.enter_context(reserve_domain_id()))
-    # A shell that runs this in the background ignores SIGINT, and all below would, too.
+    # A shell ignores SIGINT in background jobs, and children inherit that.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     config.pluginmanager.register(_budget)
 
 
 def pytest_unconfigure() -> None:
-    """Give the ROS domain back."""
+    """Release the ROS domain."""
     _reserved.close()
 
 
@@ -59,7 +63,7 @@ def pytest_runtestloop(session: pytest.Session) -> object:
     if len(session.items) > WHOLE:
         _warm_up()
         _budget.is_enforced = True
-    # The first look at it empties it: that must not be a shard's.
+    # The first access empties the folder, so it must not happen in a shard.
     session.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
     files = _by_file(session.items)
     alone = [item for file in files if file.startswith(ALONE) for item in files[file]]
@@ -73,16 +77,34 @@ def pytest_runtestloop(session: pytest.Session) -> object:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Fail the session when processes are left, and end them."""
+    """Kill leftover processes, and fail the session if there are any."""
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
-    for line in end_left_processes():
+    for line in _kill_leftover_processes():
         session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
         if reporter is not None:
             reporter.write_line(f"FAILED process left behind: {line}", red=True)
 
 
+def _kill_leftover_processes() -> list[str]:
+    """Kill processes that tests started and left; return a line for each."""
+    run = os.environ.get(_RUN_MARK, "")
+    if not run:
+        return []
+    end = time.monotonic() + _EXIT_GRACE
+    while True:
+        # A zombie has no command.
+        found = [one for one in processes_with(_RUN_MARK, run) if one[0] != os.getpid() and one[1]]
+        if not found or time.monotonic() > end:
+            break
+        time.sleep(0.05)
+    for process, _ in found:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
+    return [f"{process} {command}" for process, command in found]
+
+
 def _warm_up() -> None:
-    """Load compiled code, or compile it: that counts to no test, and is done for all shards."""
+    """Load or compile numerical code once for all shards, outside of any test's budget."""
     for part in compile_ahead.PARTS.values():
         part()
     troubled = ["--targets", "2", "--depth-mm", "2", "--play-deg", "10", "--lag-mm", "5"]
@@ -92,13 +114,13 @@ def _warm_up() -> None:
 
 
 class _Sender:
-    """Stands in a shard for the terminal: sends reports to the process that collected."""
+    """Sends the reports of a shard to the main process."""
 
     def __init__(self, config: pytest.Config, to: Connection) -> None:
         self._config, self._to = config, to
 
     def pytest_runtest_logstart(self, nodeid: str, location: object) -> None:
-        """Say which test begins, for whoever has to name it if this process dies."""
+        """Send the name of the test, reported if this process dies."""
         self._to.send(nodeid)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -141,7 +163,7 @@ def _run_in_shards(session: pytest.Session, files: Sequence[Sequence[pytest.Item
 
 
 def _taken(waiting: int, files: Sequence[Sequence[pytest.Item]]) -> Iterator[pytest.Item]:
-    """Yield the tests of the files that a shard takes."""
+    """Yield the tests of the files that this shard takes from the pipe."""
     while index := os.read(waiting, _INDEX_BYTES):
         yield from files[int.from_bytes(index, "big")]
 
@@ -157,43 +179,43 @@ def _be_a_shard(session: pytest.Session, to: Connection, items: Iterator[pytest.
         to.send(None)
         code = 0
     finally:
-        # Nothing of what the process that forked has to clean up is this one's to clean up.
+        # Skip the clean-up, which belongs to the main process.
         os._exit(code)
 
 
 def _run_all(session: pytest.Session, items: Iterator[pytest.Item]) -> None:
-    """Run tests; each is told the next one, since fixtures that both share stay."""
+    """Run tests; pytest keeps fixtures that the next test shares."""
     item = next(items, None)
     while item is not None:
         following = next(items, None)
         item.ihook.pytest_runtest_protocol(item=item, nextitem=following)
-        _heed_wish_to_end(session)
+        _check_stop(session)
         item = following
 
 
 def _pass_on_reports(session: pytest.Session, shards: dict[Connection, int]) -> None:
-    """Hand the shards' reports to pytest until all shards are done."""
+    """Pass the reports of the shards to pytest until all are done."""
     hook = session.config.hook
     at_work = dict.fromkeys(shards, "a first test")
     while at_work:
         for shard in wait(list(at_work)):
             assert isinstance(shard, Connection)
             try:
-                told: Any = shard.recv()
+                message: Any = shard.recv()
             except EOFError:
                 pytest.exit(f"a shard died in {at_work[shard]}", pytest.ExitCode.INTERNAL_ERROR)
-            if told is None:
+            if message is None:
                 del at_work[shard]
-            elif isinstance(told, str):
-                at_work[shard] = told
+            elif isinstance(message, str):
+                at_work[shard] = message
             else:
-                report = hook.pytest_report_from_serializable(config=session.config, data=told)
+                report = hook.pytest_report_from_serializable(config=session.config, data=message)
                 hook.pytest_runtest_logreport(report=report)
-        _heed_wish_to_end(session)
+        _check_stop(session)
 
 
-def _heed_wish_to_end(session: pytest.Session) -> None:
-    """End as pytest's own loop does, after `-x` say."""
+def _check_stop(session: pytest.Session) -> None:
+    """Raise as pytest's own loop does, for example after `-x`."""
     if session.shouldfail:
         raise session.Failed(session.shouldfail)
     if session.shouldstop:

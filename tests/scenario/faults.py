@@ -1,4 +1,4 @@
-"""Faults by one vocabulary: what goes wrong, on which part of the rig, when, for how long."""
+"""Vocabulary of faults, and schedules of faults: part of the rig, kind, begin, duration, size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from needle_core.errors import UserError
 
 
 class Kind(enum.Enum):
-    """Ways to go wrong."""
+    """Kinds of faults."""
 
     OFF = "off"
     STUCK = "stuck"
@@ -27,7 +27,7 @@ class Kind(enum.Enum):
 
 
 class Moment(enum.Enum):
-    """A moment that a fault may follow, as it is heard of the rig."""
+    """Moment of a run that a fault may follow."""
 
     START = "start"
     ADAPTER_OPENED = "adapter opened"
@@ -55,22 +55,22 @@ SERVICES = (
 BUS, ADAPTER, CAMERAS, CLOCK = "bus", "adapter", "cameras", "system clock"
 PERSON, PARAMETERS = "person", "parameters"
 SECOND_PERSON = "second person"
-"""At a joystick and an operator of their own: keeps it pressed, draws out, presses and lets go at
-random, loses the joystick while pressing."""
+"""With a joystick and operator node of their own: keeps it pressed, retracts, presses at random,
+loses the joystick during a press."""
 CONSOLE, PAGE, PAGE_LINE = "console", "page", "page line"
-"""Where one of them goes wrong the person holds by a page of the console, not by the joystick."""
+"""With a fault of one of these, the operator holds by a page of the console, not the joystick."""
 RECORDER, DISK = "recorder", "disk"
-"""Where one of them goes wrong a recorder is there, with a disk of its own."""
+"""With a fault of one of these, the rig has a recorder with a disk."""
 DRIVES = ("insertion drive", "rotation drive")
-STRANGER = "stranger on "
-"""Begins the name of a part where a foreign node publishes or calls what is not its own."""
-STRANGE_TOPICS = (
+ROGUE = "stranger on "
+"""Prefix of parts on which a foreign node publishes, or that it calls."""
+ROGUE_TOPICS = (
     "/device/hold", "/device/joint_trajectory", "/device/estop", "/joint_states", "/needle/tip",
     "/target_plane",
 )  # fmt: skip
 FLOOD = "flood"
-"""A stranger that publishes 5,000 times a second what is not its own; `size` draws the topic."""
-_STRANGE_SERVICES = (*SERVICES, "/device/stop", "/plane_controller/stop", "/device/enable off")
+"""A foreign node that publishes 5,000 messages per second; `size` selects the topic."""
+_ROGUE_SERVICES = (*SERVICES, "/device/stop", "/plane_controller/stop", "/device/enable off")
 
 _DRAWN_TOGETHER: dict[str, tuple[Kind, ...]] = {
     **dict.fromkeys(PROCESSES, (Kind.OFF, Kind.STUCK, Kind.SLOW)),
@@ -83,8 +83,8 @@ _DRAWN_TOGETHER: dict[str, tuple[Kind, ...]] = {
     CLOCK: (Kind.WRONG, Kind.SLOW),
     PERSON: (Kind.WRONG, Kind.STUCK, Kind.INTERMITTENT, Kind.OFF),
     PARAMETERS: (Kind.WRONG, Kind.GARBAGE),
-    **{STRANGER + name: (Kind.WRONG, Kind.GARBAGE) for name in STRANGE_TOPICS},
-    **{STRANGER + name: (Kind.WRONG,) for name in _STRANGE_SERVICES},
+    **{ROGUE + name: (Kind.WRONG, Kind.GARBAGE) for name in ROGUE_TOPICS},
+    **{ROGUE + name: (Kind.WRONG,) for name in _ROGUE_SERVICES},
 }
 _DRAWN_ALONE: dict[str, tuple[Kind, ...]] = {
     SECOND_PERSON: (Kind.STUCK, Kind.WRONG, Kind.INTERMITTENT, Kind.OFF),
@@ -96,14 +96,14 @@ _DRAWN_ALONE: dict[str, tuple[Kind, ...]] = {
     DISK: (Kind.OFF, Kind.STUCK, Kind.GARBAGE, Kind.SLOW),
 }
 VOCABULARY = {**_DRAWN_TOGETHER, **_DRAWN_ALONE}
-"""What can go wrong with each part."""
+"""Kinds of faults by part."""
 
 _LATEST, _SHORTEST, _LONGEST = 6.0, 0.02, 4.0
-# After another moment than the start [s]; for the how manyth time it comes.
+# Delay after a moment other than the start [s], and number of its occurrence.
 _SOONEST_AFTER, _LATEST_AFTER = 0.001, 1.0
 _TIMES = (1, 1, 2, 3)
 _MOST = 6
-# How often a part goes wrong that is drawn alone.
+# Probability of a fault of each part that is drawn alone.
 _ALONE = 1.0 / 8.0
 
 
@@ -116,17 +116,17 @@ class Fault:
     part : str
         One of `VOCABULARY`.
     kind : Kind
-        One that it knows.
+        One of the part's kinds.
     at : float
-        When it begins, from `after` on [s].
+        Begin, from `after` [s].
     lasts : float
-        How long [s]; what happens in a moment takes none of it.
+        Duration [s]; ignored for an instantaneous fault.
     size : float
-        How bad, 0..1: what that means depends on part and kind.
+        Severity 0..1; its meaning depends on part and kind.
     after : Moment
-        What it follows.
+        Moment that it follows.
     nth : int
-        For the how manyth time that comes, from 1.
+        Number of the moment's occurrence, from 1.
     """
 
     part: str
@@ -138,25 +138,25 @@ class Fault:
     nth: int = 1
 
     def __str__(self) -> str:
-        """Return it in a line."""
+        """Return the fault as one line."""
         what = f"{self.part}: {self.kind.value} ({self.size:.2f})"
         when = f"{self.at:.3f} s after {self.after.value} {self.nth}"
         return f"{what}, {when}, for {self.lasts:.3f} s"
 
 
-def strange_topic(fault: Fault) -> str:
-    """Return the topic on which a fault lets a stranger publish; empty: on none."""
+def rogue_topic(fault: Fault) -> str:
+    """Return the topic on which a fault lets a foreign node publish; empty if none."""
     if fault.part == FLOOD:
-        return STRANGE_TOPICS[int(fault.size * len(STRANGE_TOPICS))]
-    name = fault.part.removeprefix(STRANGER)
-    return name if name in STRANGE_TOPICS and name != fault.part else ""
+        return ROGUE_TOPICS[int(fault.size * len(ROGUE_TOPICS))]
+    name = fault.part.removeprefix(ROGUE)
+    return name if name in ROGUE_TOPICS and name != fault.part else ""
 
 
 def draw_schedule(seed: int) -> list[Fault]:
-    """Draw up to six faults of the parts that were there first, and of each later one its own.
+    """Draw up to six faults of the parts drawn together, and at most one of each other part.
 
-    Half of them follow the start, the others anything that may come. What is drawn alone has a
-    chance of its own, so that a part more changes no schedule but by its own fault.
+    Half of them follow the start, the others any moment. Each part drawn alone has its own random
+    stream, so that a new part adds its fault and changes no other.
     """
     generator = random.Random(f"faults of {seed}")
     faults = []
@@ -174,20 +174,20 @@ def _draw(generator: random.Random, part: str) -> Fault:
         part,
         generator.choice(VOCABULARY[part]),
         generator.uniform(0.0, _LATEST),
-        _as_often_short_as_long(generator, _SHORTEST, _LONGEST),
+        _log_uniform(generator, _SHORTEST, _LONGEST),
         generator.random(),
     )
     if generator.random() >= 0.5:
         return fault
     return dataclasses.replace(
         fault,
-        at=_as_often_short_as_long(generator, _SOONEST_AFTER, _LATEST_AFTER),
+        at=_log_uniform(generator, _SOONEST_AFTER, _LATEST_AFTER),
         after=generator.choice(tuple(Moment)),
         nth=generator.choice(_TIMES),
     )
 
 
-def _as_often_short_as_long(generator: random.Random, shortest: float, longest: float) -> float:
+def _log_uniform(generator: random.Random, shortest: float, longest: float) -> float:
     return float(shortest * (longest / shortest) ** generator.random())
 
 
@@ -207,7 +207,7 @@ def read_schedule(path: Path) -> tuple[int, list[Fault]]:
     Raises
     ------
     UserError
-        If it is none of `write_schedule`.
+        If the file is not a valid schedule.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Faults of messages, calls and frames on their way."""
+"""Faults of messages, calls and frames in transit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from needle_core.can_frame import CAN
 from needle_core.runners.transport import Arrival, Arrivals, Link
 from scenario.faults import BUS, PAGE_LINE, TOPICS
 
-# From sending what was lost to sending it again [s]: a reliable topic, and TCP.
+# Delay of a retransmission [s]: reliable topic, TCP.
 _RESEND, _RESEND_TCP = (0.02, 0.1), (0.2, 0.4)
 _BEST_EFFORT = ("/joy", "/device/hold")
 _PARTS = {CAN: BUS, PAGE_LINE: PAGE_LINE}
@@ -27,15 +27,15 @@ class LinkFault:
     Attributes
     ----------
     until : float
-        When it ends [s].
+        End [s].
     loss : float
-        Share of messages that do not arrive.
+        Share of lost messages.
     late : float
-        How much later they arrive at most [s].
+        Largest added delay [s].
     duplicates : float
-        Share that arrives twice.
+        Share of duplicated messages.
     reorders : bool
-        Whether later ones may overtake earlier ones.
+        Whether messages may be reordered.
     """
 
     until: float
@@ -46,25 +46,25 @@ class LinkFault:
 
 
 class LinkFaults:
-    """The faults that are on, by the part that they are on; a fault of the virtual runner.
+    """Active faults by link; called by the virtual runner for each message.
 
-    What is sent again when it is lost (reliable topics, TCP) comes late instead, and in order. On
-    the bus each frame of a batch meets its own.
+    Reliable topics and TCP retransmit lost messages, which arrive late and in order. On the bus,
+    faults apply to each frame of a batch.
     """
 
     def __init__(self) -> None:
         self._on: dict[str, LinkFault] = {}
 
     def begin(self, part: str, fault: LinkFault) -> None:
-        """Let a fault begin; it takes the place of another on the same link."""
+        """Begin a fault, which replaces another one on the same link."""
         self._on[part] = fault
 
     def end(self, part: str) -> None:
-        """Let the fault on a link end."""
+        """End the fault on a link."""
         self._on.pop(part, None)
 
     def __call__(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals | None:
-        """Return what arrives of a message that is sent now; None: nothing befalls it."""
+        """Return the arrivals of a message that is sent now; None without a fault."""
         if not self._on:
             return None
         part = _PARTS.get(link.topic, f"/{link.topic}")

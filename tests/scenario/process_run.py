@@ -1,4 +1,4 @@
-"""One run of the rig as real processes: some are killed or stopped, and judged from outside."""
+"""One run of the rig as real processes, some of which are killed or stopped."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState, Joy
 from trajectory_msgs.msg import JointTrajectory
 
-from campaign.trials.rig_hand import RigHand, ros
+from campaign.trials.ros_rig_client import RosRigClient, ros
 from campaign.trials.trial_processes import TrialProcesses, graph_in_real_time
 from needle_core.convert import from_ros
 from needle_core.errors import UserError
@@ -27,42 +27,41 @@ from needle_core.status_messages import DeviceStatus
 from needle_device_driver.device import HOLDS
 from needle_device_driver.supervisor.limits import SafetyLimits
 from scenario.faults import Fault, Kind
-from scenario.judging.invariants import RELEASE_BOUND, Watch
-from scenario.parts.person import OUT
+from scenario.monitors.invariants import RELEASE_BOUND, InvariantMonitor
+from scenario.parts.operator_model import OUT
 from scenario.rig_run import RunResult
 
 PERSON = "simulated_operator"
 PARTS = ("device_driver", "plane_controller", "stereo_tracker", PERSON)
-# The stand-in does not promise to speak often, as the operator of a person does (0.1 s): its hold
-# lives for the driver's own 0.25 s.
+# Messages of the simulated operator do not have the lifetime of 0.1 s that those of the operator
+# node have: its hold lasts for the driver's own 0.25 s.
 _RELEASE_BOUND = RELEASE_BOUND - 0.1 + 0.25
 _MOST = 3
 _LATEST, _SHORTEST, _LONGEST = 3.0, 0.05, 3.0
 _DEEP_ENOUGH = 0.002
 _START, _DRAW_OUT, _STILL = 120.0, 60.0, 1.0
-# The emulated drives move on with each SYNC, and say so: without a driver they stand still [s].
+# Gap after which the emulated drives stood still: they publish with each SYNC of the driver [s].
 _WITHOUT_SYNC = 0.1
 
 
-class Witness(RigHand):
-    """Hears holds, status and motors, and judges them; draws the needle out when it is asked to.
+class ProcessMonitor(RosRigClient):
+    """Checks holds, status and motors; withdraws the needle on request.
 
-    Times are those at which a message was sent, so that a witness who is late judges no other. It
-    judges motion from the first word of the person on: DDS may let it hear that later than the
-    driver does.
+    Times are source time stamps, so that its own lateness has no effect. It checks motion from the
+    first hold on, because DDS may deliver that later to it than to the driver.
 
     Attributes
     ----------
-    watch : Watch
-        What it judges with.
+    watch : InvariantMonitor
+        The invariants.
     """
 
     def __init__(self) -> None:
-        self.watch = Watch(SafetyLimits(), _RELEASE_BOUND)
+        self.watch = InvariantMonitor(SafetyLimits(), _RELEASE_BOUND)
         self._begun = time.time()
-        self._hears_person = False
+        self._received_hold = False
         super().__init__("sim/drive_positions")
-        # Whose press it is that moves the needle.
+        # Source whose press moves the needle.
         self._holder = PERSON
         self.create_subscription(Joy, "device/hold", self._on_hold, to_qos(HOLDS))
         self.create_subscription(
@@ -71,16 +70,16 @@ class Witness(RigHand):
 
     @property
     def now(self) -> float:
-        """System time since it began [s]."""
+        """System time since the start of the run [s]."""
         return time.time() - self._begun
 
     def draw_out(self) -> None:
-        """Mend what a person can mend, then hold until the needle is out.
+        """Reset and enable the device, then hold until the needle is out.
 
         Raises
         ------
         UserError
-            If it does not come out.
+            If the needle does not come out.
         """
         self._holder = self.get_name()
         end = self.now + _DRAW_OUT
@@ -94,7 +93,7 @@ class Witness(RigHand):
             elif state == "DISABLED":
                 self.call("device/enable", True)
             elif self.status.get("hold_owner") != self.get_name():
-                # A hold that does not count has to be let go of first.
+                # A hold that does not count must be released first.
                 self.pressed = not self.pressed
             elif activity != "retraction":
                 self.call("device/retract")
@@ -105,14 +104,14 @@ class Witness(RigHand):
     def _on_hold(self, message: Joy, info: dict[str, int]) -> None:
         hold = from_ros(HoldState, message)
         if hold.source == self._holder:
-            self._hears_person = True
+            self._received_hold = True
             pressed, at = hold.pressed, self._sent_at(info)
-            self.watch.see_hand(at, holds=pressed)
+            self.watch.observe_hand(at, holds=pressed)
             if pressed:
-                self.watch.see_hold(at)
+                self.watch.observe_hold(at)
 
     def _on_command(self, message: JointTrajectory) -> None:
-        self.watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
+        self.watch.observe_command([(at.positions[0], at.positions[1]) for at in message.points])
 
     def _on_places(self, message: JointState, info: dict[str, int]) -> None:
         before = self.places[-1].time if self.places else 0.0
@@ -120,20 +119,20 @@ class Witness(RigHand):
         at = self.places[-1]
         moved_at = at.time - self._begun
         if at.time - before > _WITHOUT_SYNC:
-            self.watch.see_drives_go_on(moved_at)
-        if self._hears_person:
-            self.watch.see_motors(moved_at, at.insertion, at.rotation)
+            self.watch.observe_drives_go_on(moved_at)
+        if self._received_hold:
+            self.watch.observe_motors(moved_at, at.insertion, at.rotation)
 
     def _sent_at(self, info: dict[str, int]) -> float:
         return info["source_timestamp"] * 1e-9 - self._begun
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         super()._on_status(message)
-        self.watch.see_device(self.now, DeviceStatus.parse(values_of(message)))
+        self.watch.observe_device(self.now, DeviceStatus.parse(values_of(message)))
 
 
 def processes_schedule_of(seed: int) -> list[Fault]:
-    """Draw what happens to the processes, from the moment in which the needle is steered [s]."""
+    """Draw the faults of the processes; times start when the needle is steered [s]."""
     draw = random.Random(f"faults of processes {seed}")
     faults = []
     for _ in range(draw.randint(1, _MOST)):
@@ -144,7 +143,7 @@ def processes_schedule_of(seed: int) -> list[Fault]:
 
 
 def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResult]:
-    """Yield the results of runs of real processes; what they leave is kept if they violate."""
+    """Yield the results of runs of real processes; keep the files of a violating run."""
     for seed in seeds:
         with tempfile.TemporaryDirectory(prefix="needle_soak_") as name:
             result = run_processes(seed, Path(name))
@@ -159,58 +158,58 @@ def run_processes(seed: int, folder: Path, faults: Sequence[Fault] | None = None
     Parameters
     ----------
     seed : int
-        Of the simulation and of what happens.
+        Seed of the simulation and the faults.
     folder : Path
-        Takes the nodes' logs.
+        For the logs of the nodes.
     faults : sequence of Fault, optional
-        In place of those of the seed.
+        Faults instead of those of the seed.
     """
     happened = tuple(processes_schedule_of(seed) if faults is None else faults)
     with (
         reserve_domain_id() as domain,
         ros(domain),
-        closing(Witness()) as witness,
+        closing(ProcessMonitor()) as monitor,
         closing(TrialProcesses(folder, domain, graph_in_real_time(seed))) as graph,
     ):
-        _insert(witness, graph, happened)
-        violations = tuple(witness.watch.violations)
-        return RunResult(seed, happened, violations, happened, witness.now, of_processes=True)
+        _insert(monitor, graph, happened)
+        violations = tuple(monitor.watch.violations)
+        return RunResult(seed, happened, violations, happened, monitor.now, of_processes=True)
 
 
-def _insert(witness: Witness, graph: TrialProcesses, faults: Sequence[Fault]) -> None:
-    witness.until(lambda: witness.insertion > _DEEP_ENOUGH, "steering", _START)
-    begun = witness.now
+def _insert(monitor: ProcessMonitor, graph: TrialProcesses, faults: Sequence[Fault]) -> None:
+    monitor.until(lambda: monitor.insertion > _DEEP_ENOUGH, "steering", _START)
+    begun = monitor.now
     events: list[tuple[float, Callable[[], None]]] = []
     for fault in faults:
         for at, happen in ((fault.at, _begin), (fault.at + fault.lasts, _end)):
-            events.append((begun + at, partial(happen, witness, graph, fault)))
+            events.append((begun + at, partial(happen, monitor, graph, fault)))
     for at, act in sorted(events, key=lambda event: event[0]):
-        witness.pause(max(at - witness.now, 0.0))
+        monitor.pause(max(at - monitor.now, 0.0))
         act()
-    witness.pause(_STILL)
-    # From here on there is one person, and it wants the needle out.
+    monitor.pause(_STILL)
+    # From here on, the monitor is the only operator.
     graph.end(PERSON)
     try:
-        witness.draw_out()
+        monitor.draw_out()
     except UserError as error:
-        witness.watch.violate("the_way_goes_on", witness.now, str(error))
+        monitor.watch.violate("the_way_goes_on", monitor.now, str(error))
 
 
-def _begin(witness: Witness, graph: TrialProcesses, fault: Fault) -> None:
+def _begin(monitor: ProcessMonitor, graph: TrialProcesses, fault: Fault) -> None:
     if graph.nodes[fault.part].exit_code is not None:
         return
     if fault.part == "device_driver":
-        witness.watch.see_driver(witness.now, speaks=False)
+        monitor.watch.observe_driver(monitor.now, speaks=False)
     if fault.kind is Kind.OFF:
         graph.kill(fault.part)
     else:
         graph.signal(fault.part, signal.SIGSTOP)
 
 
-def _end(witness: Witness, graph: TrialProcesses, fault: Fault) -> None:
+def _end(monitor: ProcessMonitor, graph: TrialProcesses, fault: Fault) -> None:
     if graph.nodes[fault.part].exit_code is not None:
         graph.begin(fault.part)
     else:
         graph.signal(fault.part, signal.SIGCONT)
     if fault.part == "device_driver":
-        witness.watch.see_driver(witness.now, speaks=True)
+        monitor.watch.observe_driver(monitor.now, speaks=True)

@@ -1,4 +1,4 @@
-"""The rig on the virtual runner: the rig's own components, the bench, the person in front of it."""
+"""The rig on the virtual runner: its own components, the simulated bench and the operator model."""
 
 from __future__ import annotations
 
@@ -28,33 +28,33 @@ from needle_sim.drive_emulator import DriveEmulator, DriveEmulatorParameters
 from scenario.faults import CONSOLE, PAGE, RECORDER
 from scenario.link_faults import LinkFaults
 from scenario.parts.bench import ANSWER, TIP_NOISE, Bench, TrackerStandIn
-from scenario.parts.hold_server import HoldServer
-from scenario.parts.page import Page
-from scenario.parts.person import (
+from scenario.parts.hold_server import VirtualHoldServer
+from scenario.parts.operator_model import (
     INSERT,
     RETRACT,
     STOP,
-    Hand,
     Joystick,
-    Person,
+    JoystickButtons,
+    OperatorModel,
 )
+from scenario.parts.page import Page
 from scenario.parts.recorder import Disk, RecorderStandIn
 
 NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node")
 SECOND_OPERATOR, SECOND_JOYSTICK = "second_operator", "second_joy_node"
 SECOND = (SECOND_JOYSTICK, SECOND_OPERATOR)
-"""Of a second person."""
+"""Nodes of a second operator."""
 _SECOND_JOY = "second_joy"
-_CONSOLE = (CONSOLE, HoldServer.name)
-# Whose topics are recorded.
+_CONSOLE = (CONSOLE, VirtualHoldServer.name)
+# Nodes whose topics are recorded.
 _RECORDED = ("device_driver", "plane_controller", "operator", "joy_node")
 _DEPTHS = (0.003, 0.008)
 _LATEST_START = 0.2
-# What the clock of the stamps shows at the begin [ns]: it may jump back.
+# Initial system time of the stamps [ns]; not zero, so that it may jump back.
 _CLOCK_NS = 1_750_000_000 * 10**9
-# A node that ended is started again by whoever sees it [s].
+# Delay until an ended node is started again [s].
 _RESTART = 1.0
-# What a handler takes of its component's time, but for the tracker's [s].
+# Compute time of a handler, except the tracker's [s].
 _COMPUTE = (0.02e-3, 0.2e-3)
 _INTERNAL = "internal error"
 
@@ -62,57 +62,57 @@ Watcher = Callable[[str, Any], None]
 
 
 class SoakRig:
-    """The rig from the needle to the person.
+    """The rig from the needle to the operator.
 
     Parameters
     ----------
     seed : int
-        Of all that is drawn.
+        Seed of all randomness.
     depth : float, optional
-        How far the needle goes in [m]; drawn if none is given.
+        Insertion depth [m]; random if none is given.
     at_page : bool
-        Whether the person holds by a page of the console, and leaves the joystick alone.
+        Whether the operator holds by a page of the console instead of the joystick.
 
     Attributes
     ----------
     faults : LinkFaults
-        What is wrong with topics, services and bus.
+        Active faults of topics, services and bus.
     runner : VirtualRunner
-        Runs all of it.
+        Runner of all components.
     bench : Bench
-        The needle.
+        Needle and motors.
     drives : DriveEmulator
-        What moves it.
-    hand, second_hand : Hand
-        The person's, and that of a second one.
-    person : Person
-        Who uses them.
+        Drives that move the needle.
+    hand, second_hand : JoystickButtons
+        Buttons of the operator and of a second one.
+    person : OperatorModel
+        The operator.
     hand_node : str
-        Name of the node by which the person holds.
+        Name of the node that publishes the operator's hold.
     page : Page or None
-        Where the person holds, if at one.
+        Page of the operator, if any.
     disk, recorders : Disk or None, list of RecorderStandIn
-        What records, one after the other, and where; none unless `record` was called.
+        Disk and successive recorders; none unless `record` was called.
     steering : SteeringSettings
-        The controller's.
+        Settings of the controller.
     watchers : dict of str to list of Watcher
-        By topic, who is called with the sender and the message of each publication.
-    hears_hold : callable
-        Called with each hold as the driver takes it, and when [s].
+        Functions by topic, called with sender and message of each publication.
+    on_hold_received : callable
+        Called with each hold that the driver receives, and its time [s].
     frames_sent, adapter_opened : list of callable
-        Called with each batch of frames that the driver sends, and when it sends its first.
+        Called with each batch of frames that the driver sends, and before its first.
     log : list of str
-        What was logged, one line each.
+        Log lines.
     crashes : list of str
-        Errors that nothing foresaw.
+        Unexpected exceptions.
     digest : hash
-        Of who published what and when.
+        Digest of time, sender and topic of all publications.
     """
 
     def __init__(self, seed: int, depth: float | None = None, *, at_page: bool = False) -> None:
         self.faults = LinkFaults()
         self.watchers: dict[str, list[Watcher]] = {}
-        self.hears_hold: Callable[[HoldState, float], None] = lambda *_: None
+        self.on_hold_received: Callable[[HoldState, float], None] = lambda *_: None
         self.frames_sent: list[Callable[[Any], None]] = []
         self.adapter_opened: list[Callable[[], None]] = []
         self._adapter_is_open = False
@@ -127,8 +127,8 @@ class SoakRig:
                 **dict.fromkeys((*names, *SECOND), uniform(*_COMPUTE)),
                 "stereo_tracker": uniform(*ANSWER),
             },
-            faults=(self._meet_faults,),
-            taps=(self._see_published,),
+            faults=(self._apply_faults,),
+            taps=(self._tap_published,),
         )
         timeline = self.runner.timeline
         timeline.clock_offset_ns = _CLOCK_NS
@@ -140,11 +140,11 @@ class SoakRig:
             nominal_speed=0.005,
             tip_noise_bound=TIP_NOISE,
         )
-        self.hand, self.second_hand = Hand(), Hand()
+        self.hand, self.second_hand = JoystickButtons(), JoystickButtons()
         self.drives = DriveEmulator(DriveEmulatorParameters(boot_time=0.1))
         self.bench = Bench(self.drives.bus, timeline.stream("needle"))
         self.hand_node = CONSOLE if at_page else "operator"
-        self.person = Person(self.hand, lambda: self.bench.motors.insertion, self.hand_node)
+        self.person = OperatorModel(self.hand, lambda: self.bench.motors.insertion, self.hand_node)
         self.page: Page | None = None
         self.disk: Disk | None = None
         self.recorders: list[RecorderStandIn] = []
@@ -154,9 +154,9 @@ class SoakRig:
             "plane_controller": lambda: PlaneController(self.steering),
             "operator": lambda: Operator(_operator_settings()),
             "stereo_tracker": self._make_tracker,
-            "joy_node": lambda: Joystick(Hand() if at_page else self.hand),
+            "joy_node": lambda: Joystick(JoystickButtons() if at_page else self.hand),
             CONSOLE: lambda: Console(ConsoleParameters()),
-            HoldServer.name: HoldServer,
+            VirtualHoldServer.name: VirtualHoldServer,
             PAGE: self._make_page,
             RECORDER: self._make_recorder,
             SECOND_OPERATOR: lambda: Operator(_operator_settings(), SECOND_OPERATOR, _SECOND_JOY),
@@ -177,7 +177,7 @@ class SoakRig:
 
     @property
     def hand_presses(self) -> bool:
-        """Whether the hand presses what could move the needle, where it holds."""
+        """Whether the operator presses a button that could move the needle."""
         return self.hand.holds if self.page is None else bool(self.hand.button)
 
     def watch(self, topic: str, watcher: Watcher) -> None:
@@ -185,20 +185,20 @@ class SoakRig:
         self.watchers.setdefault(topic, []).append(watcher)
 
     def start(self, name: str) -> None:
-        """Make and start a node that does not run."""
+        """Start a node unless it runs."""
         if self.runner.runs(name):
             return
         try:
             self.runner.start(self._makers[name]())
         except UserError:
-            # As a recorder on a full disk.
+            # For example a recorder on a full disk.
             self.runner.timeline.call_after(_RESTART, partial(self.start, name))
 
     def kill(self, name: str) -> None:
         """Kill a node as SIGKILL does."""
         if self.runner.runs(name):
             self.runner.kill(name)
-            if name == HoldServer.name and self.page is not None:
+            if name == VirtualHoldServer.name and self.page is not None:
                 self.page.cut()
             if name == RECORDER:
                 self.recorders[-1].cut(self.now)
@@ -208,38 +208,38 @@ class SoakRig:
         return _CONSOLE if name == CONSOLE else (name,)
 
     def record(self) -> None:
-        """Record all that is published from now on."""
+        """Start a recorder."""
         self.disk = Disk()
         self.start(RECORDER)
 
-    def losses(self, *, judges_killed: bool) -> list[str]:
-        """End the recording; return what the bags lack."""
+    def losses(self, *, check_killed: bool) -> list[str]:
+        """End the recording; return the losses of its bags."""
         losses: list[str] = []
         for recorder in self.recorders:
-            losses += recorder.losses(judges_killed=judges_killed)
+            losses += recorder.losses(check_killed=check_killed)
         if self.disk is not None:
             self.disk.close()
         return losses
 
     def unplug(self) -> None:
-        """Take the driver's adapter away."""
+        """Unplug the driver's CAN adapter."""
         self.runner.lose_port(DeviceDriver.name, CAN, "unplugged")
 
     def plug_in(self) -> None:
-        """Give the adapter back."""
+        """Plug the CAN adapter in again."""
         self._adapter_is_open = False
         self.runner.open_port(DeviceDriver.name, CAN)
 
     def run(self, seconds: float) -> None:
-        """Run for some time; who ends is started again."""
+        """Run for a duration [s]; restart nodes that end."""
         end = self.now + seconds
         while self.now < end:
             if self.runner.run(end - self.now):
                 for name, ended in tuple(self.runner.exits.items()):
                     del self.runner.exits[name]
-                    self._see_exit(name, ended.text)
+                    self._on_exit(name, ended.text)
 
-    def _see_exit(self, name: str, why: str) -> None:
+    def _on_exit(self, name: str, why: str) -> None:
         if why.startswith(_INTERNAL):
             self.crashes.append(f"{name}: {why}")
         if name in self._makers and name != PAGE:
@@ -257,12 +257,12 @@ class SoakRig:
         return driver
 
     def _take_hold(self, handler: Any, message: HoldState, at: Any) -> Any:
-        self.hears_hold(message, at.steady)
+        self.on_hold_received(message, at.steady)
         return handler(message, at)
 
     def _make_page(self) -> Page:
         self.page = Page(lambda: self.hand.button, self.runner.timeline.stream("page"))
-        self.person.sees_lost_press = self.page.asks_for_a_new_press
+        self.person.shows_lost_press = self.page.asks_for_a_new_press
         return self.page
 
     def _make_recorder(self) -> RecorderStandIn:
@@ -277,22 +277,22 @@ class SoakRig:
         self.tracker = TrackerStandIn(self.bench, self.runner.timeline.stream("tips"))
         return self.tracker
 
-    # ---- what is seen ---------------------------------------------------------------------------
+    # ---- taps -----------------------------------------------------------------------------------
 
-    def _see_published(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
+    def _tap_published(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
         topic = output.topic
         self.digest.update(f"{stamp_ns} {sender} {topic}\n".encode())
         for watcher in self.watchers.get(topic, ()):
             watcher(sender, message)
         if output is LOG:
-            self._see_log(message)
+            self._on_log(message)
 
-    def _see_log(self, line: LogLine) -> None:
+    def _on_log(self, line: LogLine) -> None:
         self.log.append(f"{self.now:9.3f} {line.source}: {line.severity}: {line.text}")
         if line.text.startswith(_INTERNAL):
             self.crashes.append(f"{line.source}: {line.text}")
 
-    def _meet_faults(self, link: Link, message: Any, now: float, rng: Any) -> Arrivals | None:
+    def _apply_faults(self, link: Link, message: Any, now: float, rng: Any) -> Arrivals | None:
         if link.topic == CAN and link.sender == "device_driver":
             for see in () if self._adapter_is_open else self.adapter_opened:
                 see()

@@ -1,4 +1,4 @@
-"""One run of the rig under a schedule of faults, watched from beginning to end."""
+"""One run of the rig under a schedule of faults, with its invariants checked."""
 
 from __future__ import annotations
 
@@ -9,32 +9,31 @@ from typing import Any
 from needle_core import messages as m
 from needle_device_driver.supervisor.limits import SafetyLimits
 from scenario import faults as of
-from scenario.course import Course, told_by_moments
-from scenario.fault_orders import LATEST_MESSAGE, SLOWEST_HANDLER, FaultOrders
-from scenario.faults import Fault, Kind, draw_schedule, strange_topic
-from scenario.judging.invariants import RELEASE_BOUND, Violation, Watch
-from scenario.judging.set_point_frames import SetPointFrames
-from scenario.moments import watch_moments
+from scenario.fault_injector import LATEST_MESSAGE, SLOWEST_HANDLER, FaultInjector
+from scenario.faults import Fault, Kind, draw_schedule, rogue_topic
+from scenario.monitors.invariants import RELEASE_BOUND, InvariantMonitor, Violation
+from scenario.monitors.limit_monitor import SetPointFrames
 from scenario.parts.bench import Motors
-from scenario.parts.person import OUT, Wish
+from scenario.parts.operator_model import OUT, OperatorGoal
 from scenario.rig import SECOND, SoakRig
+from scenario.schedule_runner import ScheduleRunner, relative_to_moments, watch_moments
 
-# So long moments are waited for whose faults shall follow them [s].
+# Longest wait for moments that faults follow [s].
 _FAULTS_OVER = 30.0
-# Once all faults are over [s]: a person has so long to insert, then so long to draw the needle
-# out. A killed node counts for 8 s more, and a driver looks for its drives again.
+# Time to insert after all faults, then to withdraw the needle [s]: a killed node stays in the graph
+# for 8 s, and a restarted driver sets its drives up again.
 _GO_ON, _DRAW_OUT = 60.0, 60.0
-# How often it is looked whether a run is over [s].
+# Period of the check whether a run is over [s].
 _LOOK = 0.1
-# A needle that nothing disturbs goes as deep [m], and is as near to the plane there [m].
+# Depth of a run without faults [m], and largest distance of its tip from the plane [m].
 UNDISTURBED_DEPTH, _CONVERGED = 0.08, 0.001
 _HOLD, _JOINTS = "/device/hold", "/joint_states"
-# The way of a press to the driver.
+# Topics between a press and the driver.
 _HOLD_LINKS = ("/joy", _HOLD)
-# Where one of them goes wrong the person holds by a page.
+# With a fault of one of these, the operator holds by a page.
 _AT_PAGE = (of.CONSOLE, of.PAGE, of.PAGE_LINE)
 _LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
-# The device's faults that take the joints from the controller.
+# Parts whose faults keep joint states from the controller.
 _TAKE_JOINTS = (_JOINTS, "device_driver", "plane_controller")
 
 
@@ -45,31 +44,30 @@ class RunResult:
     Attributes
     ----------
     seed : int
-        Its seed.
+        Seed of the run.
     faults : tuple of Fault
-        What happened to it.
+        Faults of the run.
     violations : tuple of Violation
-        Invariants that did not hold.
-    told_by_moments : tuple of Fault
-        Those faults that happened, each told by the last moment that it met; of real processes as
-        they were drawn.
+        Violated invariants.
+    relative_to_moments : tuple of Fault
+        Faults that began, relative to the last moment before each; as drawn for real processes.
     simulated : float
-        How long it took in its own time [s].
+        Duration in simulated time [s].
     of_processes : bool
-        Whether it was one of real processes: it cannot be had again, and has nothing of what
-        follows.
+        Whether it was a run of real processes, which is not repeatable and has none of the
+        following.
     digest : str
-        Of who published what and when, of every command and of the motors' ways.
+        Digest of all publications, commands and motor positions.
     inserted : bool
-        Whether the controller was done once.
+        Whether the controller was in state DONE once.
     log : tuple of str
-        What the nodes logged, one line each.
+        Log lines of the nodes.
     """
 
     seed: int
     faults: tuple[Fault, ...]
     violations: tuple[Violation, ...]
-    told_by_moments: tuple[Fault, ...]
+    relative_to_moments: tuple[Fault, ...]
     simulated: float
     of_processes: bool = False
     digest: str = ""
@@ -78,7 +76,7 @@ class RunResult:
 
 
 def schedule_of(seed: int) -> list[Fault]:
-    """Return the faults of a seed; every hundredth run has none."""
+    """Return the faults of a seed; every hundredth seed has none."""
     return draw_schedule(seed) if seed % 100 else []
 
 
@@ -88,34 +86,36 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     Parameters
     ----------
     seed : int
-        Of the run: delays, needle, noise.
+        Seed of delays, needle and noise.
     faults : sequence of Fault
-        What goes wrong meanwhile.
+        Faults of the run.
     """
     at_page = any(fault.part in _AT_PAGE for fault in faults)
     rig = SoakRig(seed, None if faults else UNDISTURBED_DEPTH, at_page=at_page)
     if any(fault.part == of.SECOND_PERSON for fault in faults):
-        # Their hand must be seen neutral before it counts.
+        # Their joystick must be received neutral before it counts.
         for name in SECOND:
             rig.start(name)
     of_recording = [fault for fault in faults if fault.part in (of.RECORDER, of.DISK)]
     if of_recording:
         rig.record()
     watch = _watched(rig, faults)
-    course = Course(rig.runner.timeline, faults, FaultOrders(rig).begin)
-    watch_moments(rig, course.meet)
-    # What has not come when the needle is out again never comes.
-    while rig.now < _FAULTS_OVER and (course.is_under_way or (course.waits and not _has_left(rig))):
+    schedule = ScheduleRunner(rig.runner.timeline, faults, FaultInjector(rig).begin)
+    watch_moments(rig, schedule.reach)
+    # Moments that were not reached when the needle is out again are never reached.
+    while rig.now < _FAULTS_OVER and (
+        schedule.has_active or (schedule.has_pending and not _has_left(rig))
+    ):
         rig.run(_LOOK)
-    course.give_up()
+    schedule.cancel_pending()
     calm = rig.now
     while rig.now < calm + _GO_ON + _DRAW_OUT and not _has_left(rig):
-        if rig.now > calm + _GO_ON and rig.person.wish is Wish.INSERT:
-            rig.person.wish = Wish.DRAW_OUT
+        if rig.now > calm + _GO_ON and rig.person.goal is OperatorGoal.INSERT:
+            rig.person.goal = OperatorGoal.WITHDRAW
         rig.run(_LOOK)
     if not _has_left(rig):
         watch.violate("the_way_goes_on", rig.now, _state_of(rig))
-    losses = rig.losses(judges_killed=len(of_recording) == 1)
+    losses = rig.losses(check_killed=len(of_recording) == 1)
     if losses:
         watch.violate("nothing_recorded_is_lost", rig.now, "; ".join(losses))
     for error in rig.crashes:
@@ -124,14 +124,14 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
         off = f"the tip went to {rig.bench.deepest_tip[0] * 1e3:.2f} mm from the plane"
         watch.violate("undisturbed_converges", rig.now, f"{off}; {_state_of(rig)}")
     return RunResult(
-        seed, tuple(faults), tuple(watch.violations), tuple(told_by_moments(course)), rig.now,
+        seed, tuple(faults), tuple(watch.violations), tuple(relative_to_moments(schedule)), rig.now,
         digest=rig.digest.hexdigest(), inserted=rig.person.done, log=tuple(rig.log),
     )  # fmt: skip
 
 
-def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
-    """Return what watches over a rig from now on."""
-    # A hold counts from its arrival: what is late on its way outlives the hand by as much.
+def _watched(rig: SoakRig, faults: Sequence[Fault]) -> InvariantMonitor:
+    """Return a monitor that observes a rig from now on."""
+    # A hold counts from its arrival: a late message outlives the press by its delay.
     late = sum(
         fault.size * LATEST_MESSAGE
         for fault in faults
@@ -141,52 +141,52 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
     late += 0.15 if rig.hand_node == of.CONSOLE else 0.0
     slow = (f.size for f in faults if f.part == "device_driver" and f.kind is Kind.SLOW)
     slowness = max(slow, default=0.0) * SLOWEST_HANDLER
-    watch = Watch(SafetyLimits(), RELEASE_BOUND + late, slowness)
-    strange = {strange_topic(fault) for fault in faults}
-    joints_spoilt = _JOINTS in strange or any(fault.part in _TAKE_JOINTS for fault in faults)
+    watch = InvariantMonitor(SafetyLimits(), RELEASE_BOUND + late, slowness)
+    rogue = {rogue_topic(fault) for fault in faults}
+    joints_faulty = _JOINTS in rogue or any(fault.part in _TAKE_JOINTS for fault in faults)
 
-    def see_motors(now: float, at: Motors) -> None:
+    def observe_motors(now: float, at: Motors) -> None:
         rig.digest.update(_rounded((at.insertion, at.rotation)))
-        watch.see_hand(now, holds=rig.hand_presses)
-        watch.see_driver(now, speaks=rig.runner.is_responsive("device_driver"))
-        watch.see_motors(now, at.insertion, at.rotation)
+        watch.observe_hand(now, holds=rig.hand_presses)
+        watch.observe_driver(now, speaks=rig.runner.is_responsive("device_driver"))
+        watch.observe_motors(now, at.insertion, at.rotation)
         if rig.recorders:
-            watch.see_waiting(now, rig.recorders[-1].recording.bytes_waiting)
+            watch.observe_waiting(now, rig.recorders[-1].recording.bytes_waiting)
 
-    def see_command(_: str, message: m.Trajectory) -> None:
+    def observe_command(_: str, message: m.Trajectory) -> None:
         for point in message.points:
             rig.digest.update(_rounded(point.positions))
-        watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
+        watch.observe_command([(at.positions[0], at.positions[1]) for at in message.points])
 
-    def see_hold(node: str, message: m.HoldState) -> None:
+    def observe_hold(node: str, message: m.HoldState) -> None:
         if node == of.CONSOLE:
-            # It may have been pressed since the last tick.
-            watch.see_hand(rig.now, holds=rig.hand_presses)
-            watch.see_page_hold(rig.now, pressed=message.pressed)
+            # The hand may have been pressed since the last tick.
+            watch.observe_hand(rig.now, holds=rig.hand_presses)
+            watch.observe_page_hold(rig.now, pressed=message.pressed)
         if message.pressed:
-            (watch.see_hold if node == rig.hand_node else watch.see_other_hold)(rig.now)
+            (watch.observe_hold if node == rig.hand_node else watch.observe_other_hold)(rig.now)
 
     def hear(message: m.HoldState, now: float) -> None:
         pressed = message.pressed and 0.0 <= message.speed_scale <= 1.0
-        watch.witness.hear(now, message.source, pressed=pressed, lifetime=message.lifetime)
+        watch.hold_monitor.receive(now, message.source, pressed=pressed, lifetime=message.lifetime)
 
-    rig.bench.watchers.append(see_motors)
+    rig.bench.watchers.append(observe_motors)
     _watch_set_points(rig, watch)
-    rig.watch("device/status", lambda _, message: watch.see_device(rig.now, message))
+    rig.watch("device/status", lambda _, message: watch.observe_device(rig.now, message))
     rig.watch(
         "needle/controller_status",
-        lambda _, message: watch.see_belief(rig.now, message, joints_heard=not joints_spoilt),
+        lambda _, message: watch.observe_belief(rig.now, message, joints_heard=not joints_faulty),
     )
-    rig.watch("device/joint_trajectory", see_command)
-    rig.watch("device/estop", lambda _, said: watch.see_estop(rig.now, pressed=said.pressed))
-    rig.watch("device/hold", see_hold)
-    if _HOLD in strange or any(fault.part == of.SECOND_PERSON for fault in faults):
-        rig.hears_hold = hear
+    rig.watch("device/joint_trajectory", observe_command)
+    rig.watch("device/estop", lambda _, said: watch.observe_estop(rig.now, pressed=said.pressed))
+    rig.watch("device/hold", observe_hold)
+    if _HOLD in rogue or any(fault.part == of.SECOND_PERSON for fault in faults):
+        rig.on_hold_received = hear
     return watch
 
 
-def _watch_set_points(rig: SoakRig, watch: Watch) -> None:
-    """Let the watch see all set-points that the driver sends."""
+def _watch_set_points(rig: SoakRig, watch: InvariantMonitor) -> None:
+    """Pass all set-points that the driver sends to the monitor."""
     settings = [rig.drives.bus.drives[axis].settings for axis in ("insertion", "rotation")]
     axes = {its.node_id: axis for axis, its in enumerate(settings)}
     frames = SetPointFrames({its.node_id: its.motor.counts_per_unit for its in settings})
@@ -195,18 +195,18 @@ def _watch_set_points(rig: SoakRig, watch: Watch) -> None:
         for frame in batch:
             if (set_point := frames.take(frame.identifier, frame.data)) is not None:
                 node, place = set_point
-                watch.see_set_point(rig.now, axes[node], place)
+                watch.observe_set_point(rig.now, axes[node], place)
 
     rig.frames_sent.append(see)
 
 
 def _rounded(place: Sequence[float]) -> bytes:
-    """Return a place for the digest, to 1 nm and 1 nrad: Pythons' numpy differ in last bits."""
+    """Return a position for the digest, to 1 nm and 1 nrad: numpy versions differ in last bits."""
     return " ".join(f"{value:.9f}" for value in place).encode() + b"\n"
 
 
 def _has_left(rig: SoakRig) -> bool:
-    return rig.person.wish is Wish.LEAVE and rig.bench.motors.insertion < OUT
+    return rig.person.goal is OperatorGoal.LEAVE and rig.bench.motors.insertion < OUT
 
 
 def _state_of(rig: SoakRig) -> str:

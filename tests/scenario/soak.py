@@ -28,12 +28,11 @@ from needle_core.commands.cli import (
 )
 from needle_core.errors import UserError
 from scenario.faults import Fault, read_schedule, write_schedule
-from scenario.judging.invariants import Violation
-from scenario.many_runs import results_here, results_of_cluster
+from scenario.many_runs import Tally, results_here, results_of_cluster
+from scenario.monitors.invariants import Violation
 from scenario.process_run import results_of_processes
 from scenario.rig_run import RunResult, run
 from scenario.shrinking import shrink
-from scenario.tally import Tally
 
 EXAMPLES = """\
 examples:
@@ -138,7 +137,7 @@ def _tell(result: RunResult, folder: Path | None) -> None:
     _print_violations(f"seed {result.seed}", result.violations)
     keep(result.faults)
     kept = shrink(result.faults, still)
-    told = list(run(result.seed, kept).told_by_moments)
+    told = list(run(result.seed, kept).relative_to_moments)
     if still(told):
         kept = told
     _print_faults(kept)

@@ -1,4 +1,4 @@
-"""Driver and emulated drives on a virtual clock, with a hand that holds and commands."""
+"""Driver and emulated drives on a virtual clock, with a client that holds and commands."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.drive_emulator import POSITIONS, DriveEmulator, DriveEmulatorParameters
 
 FASTEST = 0.005
-"""Of a driven needle [m/s]."""
+"""Largest insertion speed [m/s]."""
 DRIVER = DeviceDriver.name
 _JOINTS = (m.INSERTION_JOINT, m.ROTATION_JOINT)
-_LOOK, _PATIENCE = 0.02, 60.0
+_PERIOD, _TIMEOUT = 0.02, 60.0
 
 
 class Held(NamedTuple):
-    """A hand's action at a moment.
+    """State of the operator's hand.
 
     Attributes
     ----------
     pressed : bool
         Whether the hold is pressed.
     speed : float
-        Share of the nominal speed, 0..1.
+        Speed scale 0..1.
     push : float
-        Speed at which the needle itself is pushed, of an axis that no motor moves [m/s].
+        Speed of a manual insertion without a motor [m/s].
     """
 
     pressed: bool
@@ -56,24 +56,24 @@ class Held(NamedTuple):
     push: float = 0.0
 
 
-class Hand(Component):
-    """Holds, sends what it is told to, and keeps what it hears.
+class VirtualRigClient(Component):
+    """Publishes a hold and queued actions, and keeps received messages.
 
     Parameters
     ----------
     steers : bool
-        Whether it sends commands: a second sender would have all of them refused.
+        Whether it sends commands; the driver rejects commands of two publishers.
 
     Attributes
     ----------
     held : Held
-        What it does.
+        Present state of the hand.
     joints : tuple of float
-        As the driver says [m], [rad]: a rotation that was homed anew begins at 0.
+        Last joint positions [m], [rad]; rotation is 0 after homing.
     places : list of tuple of float
-        As the drives say.
-    heard : Counter of str
-        Messages of each topic.
+        Positions of the drives.
+    received : Counter of str
+        Number of received messages by topic.
     """
 
     name = "hand"
@@ -82,7 +82,7 @@ class Hand(Component):
         self.status, self.controller = DeviceStatus(), ControllerStatus()
         self.joints = (0.0, 0.0)
         self.places: list[tuple[float, float]] = []
-        self.heard: Counter[str] = Counter()
+        self.received: Counter[str] = Counter()
         self.results: dict[int, str] = {}
         self.answers: list[Answer] = []
         self.actions: list[Action] = []
@@ -97,10 +97,10 @@ class Hand(Component):
         )
         commands = (Output("device/joint_trajectory", m.Trajectory),) if steers else ()
         self.outputs = (Output("device/hold", m.HoldState, BEST_EFFORT), *commands)
-        self.timers = (Timer(_LOOK, self._act),)
+        self.timers = (Timer(_PERIOD, self._act),)
 
     def on_answer(self, answer: Answer, at: Moment) -> Actions:
-        """Keep it."""
+        """Keep the answer."""
         self.answers.append(answer)
         return ()
 
@@ -116,12 +116,12 @@ class Hand(Component):
         return ()
 
     def _on_joints(self, message: m.JointState, at: Moment) -> Actions:
-        self.heard["joint_states"] += 1
+        self.received["joint_states"] += 1
         self.joints = (message.positions[0], message.positions[1])
         return ()
 
     def _on_positions(self, message: m.JointState, at: Moment) -> Actions:
-        self.heard[POSITIONS] += 1
+        self.received[POSITIONS] += 1
         self.places.append((message.positions[0], message.positions[1]))
         return ()
 
@@ -135,14 +135,14 @@ class Hand(Component):
 
 
 class VirtualRig:
-    """Drives, driver and hand, and what else is there.
+    """Drives, driver, client and other components.
 
     Parameters
     ----------
     seed : int
         Of the runner.
     *others : Component
-        With whom they run; a controller sends the commands, if there is one.
+        Further components; a controller among them sends the commands.
     driver, drives : mapping, optional
         Parameters of driver and drives.
     faults : sequence of Fault
@@ -157,24 +157,20 @@ class VirtualRig:
         drives: Mapping[str, Any] | None = None,
         faults: Sequence[Fault] = (),
     ) -> None:
-        self.hand = Hand(steers=not others)
+        self.hand = VirtualRigClient(steers=not others)
         self.drives = DriveEmulator(DriveEmulatorParameters(**(drives or {})))
         self.bus = self.drives.bus
-        self._driver = DeviceDriverParameters(
+        parameters = DeviceDriverParameters(
             link="virtual", channel=CAN, retraction_speed=FASTEST, **(driver or {})
         )
-        parts = [self.drives, DeviceDriver(self._driver), *others, self.hand]
+        parts = [self.drives, DeviceDriver(parameters), *others, self.hand]
         self.runner = VirtualRunner(parts, seed, faults=faults)
 
     @property
     def place(self) -> tuple[float, float]:
-        """True place of the motors now [m], [rad]."""
+        """True position of the motors [m], [rad]."""
         axes = self.bus.axes(self.runner.now)
         return axes["insertion"].position, axes["rotation"].position
-
-    def start_driver(self) -> None:
-        """Start the driver anew, after it was killed."""
-        self.runner.start(DeviceDriver(self._driver))
 
     def home(self) -> None:
         """Home both axes, the needle being out, and enable them."""
@@ -185,29 +181,29 @@ class VirtualRig:
         self.call("device/enable", True)
 
     def press(self) -> None:
-        """Let go, as every hold begins, and press until that counts."""
+        """Release, then press until the device reports this hold."""
         self.release()
         self.hand.held = Held(True)
         self.until(lambda: self.hand.status.hold_owner == "hand", "the hold")
 
     def release(self) -> None:
-        """Let go, for so long that it is known."""
+        """Release, and run until the device has received it."""
         self.hand.held = Held(False)
         self.runner.run(0.1)
 
     def call(self, name: str, request: bool | None = None) -> None:
-        """Call a service until it agrees: it refuses while the axes switch off."""
+        """Call a service until it succeeds; it fails while the axes switch off."""
 
-        def agrees() -> bool:
+        def succeeds() -> bool:
             self.hand.answers.clear()
             self.hand.actions.append(Call(name, request))
             self.until(lambda: bool(self.hand.answers), f"an answer of {name}")
             return self.hand.answers[0].success
 
-        self.until(agrees, name)
+        self.until(succeeds, name)
 
     def command(self, insertion: float, rotation: float, duration: float) -> int:
-        """Send a step to this place [m], [rad] in `duration` [s]; return its stamp."""
+        """Send a step to a position [m], [rad] with a duration [s]; return its stamp."""
         stamp_ns = self.runner.timeline.stamp_ns
         points = (m.TrajectoryPoint((insertion, rotation), duration),)
         self.hand.actions.append(
@@ -216,16 +212,16 @@ class VirtualRig:
         return stamp_ns
 
     def until(self, condition: Callable[[], bool], what: str) -> None:
-        """Let time go by until a condition holds.
+        """Run until a condition holds.
 
         Raises
         ------
         UserError
-            If it does not within a minute of its time.
+            If it does not hold within a minute of virtual time.
         """
-        end = self.runner.now + _PATIENCE
+        end = self.runner.now + _TIMEOUT
         while not condition():
             if self.runner.now > end:
                 status = self.hand.status
-                raise UserError(f"waited {_PATIENCE:g} s in vain for {what}: {status}")
-            self.runner.run(_LOOK)
+                raise UserError(f"timed out after {_TIMEOUT:g} s: {what}: {status}")
+            self.runner.run(_PERIOD)

@@ -1,13 +1,13 @@
-"""What `scripts/bench` compares with must be the same loop."""
+"""The reference loops of `scripts/bench` compute the same as the study."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-import benchmark
 import drive_benchmark
 import reference_loop
+import study_benchmark
 from needle_bringup.studies.study_controllers import controller_factory
 from needle_sim.studies.study import run_study
 
@@ -15,30 +15,31 @@ NEEDLES = (0, 5_000, 9_999)
 
 
 def test_the_plain_loop_ends_where_the_study_does() -> None:
-    # Other code in other words: an oracle for the study, too.
-    starts = benchmark.STARTS
+    # Independent code: also an oracle for the study.
+    starts = study_benchmark.STARTS
     ends = run_study(
-        starts, controller_factory("paper", benchmark.TIP_NOISE), benchmark.STUDY
+        starts, controller_factory("paper", study_benchmark.TIP_NOISE), study_benchmark.STUDY
     ).x_end
-    design = benchmark.design()
+    design = study_benchmark.design()
     plain = [
-        reference_loop.steer(starts[k].tolist(), benchmark.noise_of(k), design) for k in NEEDLES
+        reference_loop.steer(starts[k].tolist(), study_benchmark.noise_of(k), design)
+        for k in NEEDLES
     ]
     np.testing.assert_allclose(plain, ends[list(NEEDLES)], atol=1e-9)
 
 
 def test_python_control_simulates_the_same_loop() -> None:
-    design, start = benchmark.design(), benchmark.STARTS[7].tolist()
-    noise = benchmark.noise_of(7)[:25]
+    design, start = study_benchmark.design(), study_benchmark.STARTS[7].tolist()
+    noise = study_benchmark.noise_of(7)[:25]
     system = reference_loop.control_system(design)
     assert reference_loop.control_steer(system, start, noise) == pytest.approx(
         reference_loop.steer(start, noise, design), abs=1e-12
     )
 
 
-@pytest.mark.parametrize("key", drive_benchmark.WAYS)
-def test_every_way_to_the_drives_is_measured_to_its_sync(key: str) -> None:
-    delays, share = drive_benchmark.measure(drive_benchmark.WAYS[key][1], 8)
+@pytest.mark.parametrize("name", drive_benchmark.CLIENTS)
+def test_each_client_is_measured_until_the_sync(name: str) -> None:
+    delays, share = drive_benchmark.measure(drive_benchmark.CLIENTS[name], 8)
     assert len(delays) == 8
     assert min(delays) > 0.0
     assert share > 0.0

@@ -22,7 +22,7 @@ class Cluster:
     """A scheduler and its workers on this machine."""
 
     def __init__(self, folder: Path, workers: int) -> None:
-        # Dask's processes find the parts that die as they find all else.
+        # Workers import `dying_part` from this folder.
         paths = os.pathsep.join([str(_SHARED), os.environ.get("PYTHONPATH", "")])
         self._environment = {**os.environ, "PYTHONPATH": paths}
         self.scheduler = self._start(
@@ -41,7 +41,7 @@ class Cluster:
         return subprocess.Popen(command, env=self._environment, stderr=errors, text=True)
 
     def end(self) -> None:
-        """End all of it, workers first."""
+        """End the workers, then the scheduler."""
         for process in (self.workers, self.scheduler):
             process.terminate()
             process.wait(_ENDS)

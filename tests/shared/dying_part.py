@@ -1,4 +1,4 @@
-"""Parts that end their first worker, or each."""
+"""Parts of a study that kill their first worker, or every worker."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from needle_bringup.studies.cluster_study import ClusterPart, PartDone, run_part
 
 
 def end_the_first(asked: tuple[Path, ClusterPart]) -> PartDone:
-    """Do a part; the first worker that would is killed in the midst of it."""
+    """Run a part; kill the first worker that runs it."""
     mark, part = asked
     with contextlib.suppress(FileExistsError):
         mark.touch(exist_ok=False)
@@ -20,5 +20,5 @@ def end_the_first(asked: tuple[Path, ClusterPart]) -> PartDone:
 
 
 def end_every(_: object) -> None:
-    """End each worker that would do it."""
+    """Kill each worker that runs it."""
     os.kill(os.getpid(), signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Pages and the protocol of their hold, in a time of their own."""
+"""Pages and their hold protocol, in virtual time."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from needle_console.hold.page_session import HoldRefusal, PageHold
 
 
 class Scene:
-    """A hold protocol and its pages, in a time of their own.
+    """A hold protocol and its pages, in virtual time.
 
-    `bars` has why a page may not hold, by whether it is on the rig's machine.
+    `bars` gives the reason why a page may not hold, by whether it is local.
     """
 
     def __init__(self) -> None:

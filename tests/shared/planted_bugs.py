@@ -1,4 +1,4 @@
-"""Bugs that are planted: one for each invariant at least, and those that a schedule once found."""
+"""Planted bugs: at least one for each invariant, and those that a schedule once found."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
 from scenario import link_faults, rig_run
-from scenario.judging import limit_witness
-from scenario.judging.hold_witness import HoldWitness
-from scenario.judging.invariants import Watch
+from scenario.monitors import limit_monitor
+from scenario.monitors.hold_monitor import HoldMonitor
+from scenario.monitors.invariants import InvariantMonitor
 from scenario.rules.bugs import BUGS, Plant, set_to, wrapped
 
 NEVER_RAISED = KeyboardInterrupt
 
 
 class PlantedBug(NamedTuple):
-    """A bug, what finds it, and the first seed from 1 on that does.
+    """A bug, the invariant that detects it, and the first seed from 1 that does.
 
     The faults are those of the same seed, or of `faults_of` for a bug that few schedules show.
     """
@@ -69,7 +69,7 @@ def _forgiving(lapses: Any, session: PageSession, now: float) -> bool:
 
 
 def _axis_scaled(name: str, scale: float) -> Plant:
-    """Return what has an emulated axis go otherwise than its motor."""
+    """Return a bug that scales the motion of an emulated axis."""
 
     def axes(true: Any, bus: EmulatedBus, now: float) -> dict[str, AxisState]:
         found: dict[str, AxisState] = true(bus, now)
@@ -186,20 +186,20 @@ def _unless_stopped(set_up: Any, driver: DeviceDriver, now: float) -> Any:
     return (yield from set_up(driver, now))
 
 
-def _judge_forgets(**values: float) -> Plant:
-    def forgetful(see_device: Any, watch: Watch, at: float, said: Any) -> None:
-        see_device(watch, at, said)
+def _monitor_forgets(**values: float) -> Plant:
+    def forgetful(observe_device: Any, watch: InvariantMonitor, at: float, said: Any) -> None:
+        observe_device(watch, at, said)
         vars(watch).update(values)
 
-    return wrapped(Watch, "see_device", forgetful)
+    return wrapped(InvariantMonitor, "observe_device", forgetful)
 
 
-def _judge_of_drives_never_behind(patch: pytest.MonkeyPatch) -> None:
+def _monitor_of_drives_never_behind(patch: pytest.MonkeyPatch) -> None:
     bounds = dataclasses.replace(
         SafetyLimits(), insertion_following_error=1e-6, rotation_following_error=1e-6
     )
     patch.setattr(rig_run, "SafetyLimits", lambda: bounds)
-    patch.setattr(limit_witness, "_SET_POINTS_BEHIND", 1)
+    patch.setattr(limit_monitor, "_SET_POINTS_BEHIND", 1)
 
 
 _MENDED: dict[str, tuple[str, Plant]] = {
@@ -224,20 +224,23 @@ _MENDED: dict[str, tuple[str, Plant]] = {
         wrapped(cia402_axis, "await_start", _forgetful),
     ),
     "a_reliable_topic_out_of_order": ("the_way_goes_on", set_to(link_faults, _RESENT={})),
-    "a_blocked_drive_catches_up": ("none_beyond_limits", _judge_of_drives_never_behind),
-    "set_points_come_twice": ("none_beyond_limits", _judge_of_drives_never_behind),
-    "set_points_come_late": ("none_beyond_limits", _judge_of_drives_never_behind),
-    "old_set_points_come_after_new_ones": ("none_beyond_limits", _judge_of_drives_never_behind),
+    "a_blocked_drive_catches_up": ("none_beyond_limits", _monitor_of_drives_never_behind),
+    "set_points_come_twice": ("none_beyond_limits", _monitor_of_drives_never_behind),
+    "set_points_come_late": ("none_beyond_limits", _monitor_of_drives_never_behind),
+    "old_set_points_come_after_new_ones": ("none_beyond_limits", _monitor_of_drives_never_behind),
     "a_fault_ends_homing_on_a_late_bus": (
         "no_motion_without_hold",
-        _judge_forgets(_homing_until=-1.0),
+        _monitor_forgets(_homing_until=-1.0),
     ),
-    "a_rebooted_drive_is_homed_where_it_stands": ("turns_as_commanded", _judge_forgets(_zero=0.0)),
+    "a_rebooted_drive_is_homed_where_it_stands": (
+        "turns_as_commanded",
+        _monitor_forgets(_zero=0.0),
+    ),
     "an_overtaken_release": ("no_motion_by_itself", wrapped(JoySource, "receive", _unstamped)),
     "a_driver_killed_under_a_press": (
         "no_motion_by_another",
-        set_to(HoldWitness, lose_device=lambda *_: None),
+        set_to(HoldMonitor, lose_device=lambda *_: None),
     ),
 }
 MENDED = {name: PlantedBug(*row, seed=0) for name, row in _MENDED.items()}
-"""By the schedule, in tests/scenario/tests/schedules, that found them; it has the seed."""
+"""By the schedule in tests/scenario/tests/schedules that found them, with its seed."""

@@ -1,4 +1,4 @@
-"""Random messages of any type, valid and extreme: what a careless or broken sender might say."""
+"""Random messages of any type, valid and extreme, as of a faulty publisher."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ARRAY = re.compile(r"(.*)\[(\d+)\]$")
 
 
 def random_message(kind: Any, rng: random.Random) -> Any:
-    """Return a message of a class whose every field is random, some of them extreme."""
+    """Return a message with random fields, some of them extreme."""
     message = kind()
     for name, type_name in kind.get_fields_and_field_types().items():
         setattr(message, name, _value(type_name, rng))
@@ -38,7 +38,7 @@ def _value(type_name: str, rng: random.Random) -> Any:
         return bytes([rng.randrange(256)])
     if type_name in ("float", "double"):
         number = rng.choice((rng.choice(_SPECIAL), rng.uniform(-1.0, 1.0)))
-        # what a float cannot hold is not valid
+        # A value beyond float32 is not valid.
         return number if type_name == "double" or not 3e38 < abs(number) < math.inf else 3e38
     if type_name.startswith("string") or type_name.startswith("wstring"):
         return rng.choice((*_TEXTS, "x" * rng.randrange(3000)))

@@ -1,4 +1,4 @@
-"""The one node class over real DDS: what comes from others and from ports reaches a component."""
+"""ComponentNode over real DDS: messages and port data reach a component."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
@@ -47,16 +49,27 @@ from needle_core.ros import base_node
 from needle_core.ros.component_node import ComponentNode
 from needle_core.ros.main import run_component
 from needle_core.settings.parameter_fields import check_fields, parameter
-from own_context import own_context
 
 PATIENCE = 60.0  # [s]
 LONGEST = 1000
 NO_TYPE = 11
 
 
+@contextmanager
+def own_context() -> Iterator[Context]:
+    """Yield a ROS context with a domain of its own."""
+    with reserve_domain_id() as domain:
+        context = Context()
+        rclpy.init(context=context, domain_id=domain)
+        try:
+            yield context
+        finally:
+            context.try_shutdown()
+
+
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """A number that may change."""
+    """Settings with a parameter that may change."""
 
     gain: float = parameter(1.0, unit="-", lower=0.0, upper=10.0, description="A number.")
 
@@ -65,7 +78,7 @@ class Settings:
 
 
 class Echo(Component):
-    """Says again what it hears, and does what a word asks for."""
+    """Echoes messages, and executes commands in them."""
 
     name = "echo"
 
@@ -129,7 +142,7 @@ class Echo(Component):
 
 
 class Wire:
-    """A port in memory, which brings in what it is made with."""
+    """A port in memory, which delivers given items."""
 
     def __init__(self, *first: Any) -> None:
         self.sent: list[Any] = []
@@ -148,7 +161,7 @@ class Wire:
 
 
 class Bench:
-    """The node, and somebody who talks to it."""
+    """The node, and another node that talks to it."""
 
     def __init__(self, context: Context) -> None:
         self.context, self.wire = context, Wire()
@@ -192,7 +205,7 @@ class Bench:
             self._executor.spin_once(timeout_sec=0.02)
 
     def say(self, text: str) -> None:
-        """Say a word, and wait until it is said again."""
+        """Publish a word, and wait for its echo."""
         before = len(self.heard)
         self.words.publish(String(data=text))
         self.until(lambda: text in self.heard[before:])
@@ -232,7 +245,7 @@ def test_bad_bytes_long_ones_and_a_failing_handler_are_named_and_end_nothing(ben
     bench.until(lambda: "undecodable" in health("input"))
     bench.words.publish(String(data="x" * 2 * LONGEST))
     bench.until(lambda: "too long" in health("input") and "'refused word': '2'" in health("input"))
-    # What a handler did before it failed is done.
+    # Actions before the failure of a handler are executed.
     bench.say("fail")
     bench.until(lambda: "internal error: ValueError: no such word" in health("handlers"))
     bench.say("on")

@@ -1,4 +1,4 @@
-"""The rig as nodes of a graph: it steers a short way, and the bag that it leaves is whole."""
+"""The rig as nodes of a graph: a short insertion and a complete bag."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_drives_are_steered_by_a_graph_of_nodes_and_the_bag_is_whole(tmp_path: P
     assert done.returncode == 1, done.stdout + done.stderr
     summary = json.loads((bag / "summary.json").read_text("utf-8"))
     assert (summary["level"], summary["converged"]) == ("drive", False)
-    # In real time, on a busy machine, a hold may come late and a step be asked for anew.
+    # In real time on a busy machine, a late hold may cause a repeated step.
     assert summary["steps"] > 0
     assert (bag / "report.html").stat().st_size > 1000
     with Reader(bag) as reader:

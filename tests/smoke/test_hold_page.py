@@ -1,4 +1,4 @@
-"""What hold.js makes of fingers, mouse and keys, in a real browser."""
+"""hold.js with fingers, mouse and keys, in a real browser."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _STATE = "document.documentElement.dataset.holdState"
 
 
 class Scene:
-    """The page in a browser, and what the server hands on."""
+    """The page in a browser, and the states that the server reports."""
 
     def __init__(
         self,
@@ -48,12 +48,12 @@ class Scene:
         self.until(lambda: not self.states[-1].pressed, "released")
 
     def let_pass(self, count: int) -> None:
-        """Let so many states be handed on."""
+        """Wait for a number of states."""
         enough = len(self.states) + count
         self.until(lambda: len(self.states) >= enough, "states")
 
     def hold(self, press: Callable[[], None], let_go: Callable[[], None]) -> None:
-        """Press until it counts for a while: on a busy machine a hold may be lost at once."""
+        """Press until the hold lasts: on a busy machine it may be lost at once."""
         deadline = time.monotonic() + PATIENCE
         while True:
             assert time.monotonic() < deadline, "no press counts"
@@ -65,7 +65,7 @@ class Scene:
                 return
 
     def ends(self, hold: Callable[[], None], act: Callable[[], object]) -> None:
-        """See a hold end by an act: one that a busy machine has lost meanwhile is held again."""
+        """Check that an act ends a hold; repeat if a busy machine lost the hold before."""
         deadline = time.monotonic() + PATIENCE
         while True:
             assert time.monotonic() < deadline, "holds end by themselves alone"
@@ -77,11 +77,11 @@ class Scene:
                 return
 
     def never_pressed(self, press: Callable[[], None]) -> bool:
-        """Press, and look whether that counts."""
+        """Press, and return whether the hold counts."""
         self.until(lambda: self.tab.run(_STATE) in ("ready", "again"), "ready")
         seen = len(self.states)
         press()
-        # The browser has taken it when it answers.
+        # The browser has processed the event when it answers.
         self.tab.run("0")
         self.let_pass(15)
         return not any(state.pressed for state in self.states[seen:])

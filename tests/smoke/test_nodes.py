@@ -1,4 +1,4 @@
-"""Every node as a process: it starts, another one hears it, and it ends when it is told."""
+"""Every node as a process: it starts, is discovered, and ends on a signal."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from needle_tracker.optics.calibration import SIDES
 from reference.rig_nodes import executables
 
 PATIENCE = 60.0  # [s]
-# What the checkout's environment need not have.
+# Packages that the environment may lack.
 EXTRAS = {"console": "nicegui", "openigtlink": "pyigtl"}
 
 
 @pytest.fixture
 def listener() -> Iterator[Node]:
-    """Yield a node that is in the graph with those under test."""
+    """Yield a node in the graph of the tested nodes."""
     context = Context()
     rclpy.init(context=context)
     node = rclpy.create_node("listener", context=context)
@@ -40,7 +40,7 @@ def listener() -> Iterator[Node]:
 
 
 def words(name: str, folder: Path) -> list[str]:
-    """Return what a node cannot do without, and a namespace in which it is alone."""
+    """Return the required parameters of a node, and its own namespace."""
     parameters = {
         "device_driver": ["link:=slcan", f"channel:={folder / 'can'}", "connect_timeout:=60.0"],
         "drive_emulator": [f"pty:={folder / 'can'}"],
@@ -55,7 +55,7 @@ def words(name: str, folder: Path) -> list[str]:
 
 
 def awaited(condition: Callable[[], bool]) -> bool:
-    """Return whether a condition comes true in time."""
+    """Return whether a condition holds before the time-out."""
     until = time.monotonic() + PATIENCE
     while not condition() and time.monotonic() < until:
         time.sleep(0.1)

@@ -1,4 +1,4 @@
-"""The documents' site: no warning, no dead link, nothing that is loaded from elsewhere."""
+"""The documents' site: no warning, no dead link, nothing loaded from the network."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import pytest
 from code_lines import ROOT
 from docs_site.navigation import listed, navigation, parts
 
-# Of what a page loads by itself, in place of what a reader may follow.
+# Elements that a page loads by itself, with their attribute.
 LOADS = {"link": "href", "script": "src", "img": "src"}
 
 
 class Page(HTMLParser):
-    """What a page refers to, and the places in it that can be referred to."""
+    """Links, loaded files and anchors of a page."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()

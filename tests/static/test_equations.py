@@ -1,4 +1,4 @@
-"""docs/equations.md says where the paper's equations are: all that the code cites, and no other."""
+"""docs/equations.md lists exactly the equations that the code cites."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from code_lines import ROOT
 from reference.endpoints import SOURCES
 
 PAGE = ROOT / "docs" / "equations.md"
-# Those that implement the paper.
+# Packages that implement the paper.
 PACKAGES = ("needle_controller", "needle_sim")
 # "(7)", "(6)-(8)"; neither "SE(3)" nor "25(1)".
 CITED = re.compile(r"(?<![\w.])\((\d{1,2})\)(?:-\((\d{1,2})\))?")
@@ -60,7 +60,7 @@ def by_page() -> dict[int, list[str]]:
 
 
 def module_of(name: str) -> str:
-    """Return the module that a name of the page is, or is in; it must be there."""
+    """Return the existing module of a name on the page."""
     parts = name.split(".")
     for length in range(len(parts), 1, -1):
         module = ".".join(parts[:length])

@@ -1,4 +1,4 @@
-"""The contract that keeps ROS in its rooms must be able to fail."""
+"""The contract that keeps ROS in the folders `ros` can fail."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def broken(importer: str, imported: str) -> list[str]:
         ("needle_sim.drives.ros", "rclpy"),
         ("needle_sim.needle.plant", "std_srvs"),
         ("needle_sim.needle.plant", "rcl_interfaces"),
-        # Through a module of the room, ROS would be imported all the same.
+        # A module of the folder would import ROS indirectly.
         ("needle_sim.needle.plant", "needle_sim.ros.conversions"),
         ("needle_sim.needle.plant", "needle_core.ros.base_node"),
     ],

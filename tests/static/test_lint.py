@@ -1,4 +1,4 @@
-"""What is judged without being run: style, types and walls of all packages, scripts and tests."""
+"""Static checks of all packages, scripts and tests: style, types and import contracts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = sorted(path.parent for path in (ROOT / "ros2_ws/src").glob("*/package.xml"))
-# Every release of numpy tells other types of the same functions.
+# Type stubs differ between releases of numpy.
 on_typed_numpy = pytest.mark.skipif(
     not np.__version__.startswith("2.4."),
     reason=f"types are checked, for Python 3.10 too, where numpy is 2.4; this is {np.__version__}",

@@ -1,4 +1,4 @@
-"""package.xml names what its package imports, so that rosdep and colcon serve a stranger."""
+"""package.xml lists the packages that its package imports, for rosdep and colcon."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import pytest
 
 PACKAGES = sorted(Path(__file__).parents[2].glob("ros2_ws/src/*/package.xml"))
-# What rosdep calls them.
+# Names of rosdep keys.
 ROSDEP_KEYS = {
     "can": "python3-can",
     "cv2": "python3-opencv",
@@ -24,7 +24,7 @@ ROSDEP_KEYS = {
     "tqdm": "python3-tqdm",
     "yaml": "python3-yaml",
 }
-# rosdep knows no key of them, or they belong to an extra that has its own lock.
+# Packages without a rosdep key, or of an extra with its own lock.
 FROM_THE_LOCK_ALONE = {
     "canopen",
     "distributed",

@@ -1,4 +1,4 @@
-"""Files for others' tools: what they name exists, and versions agree."""
+"""Project files of other tools: named files exist, and versions agree."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCRIPT = re.compile(r"(?<![\w./])(?:needle/)?((?:scripts|\.ci)/[\w/.]+)")
 
 
 def example() -> str:
-    """Return the workflow that docs/tests.md has for another repository."""
+    """Return the workflow for another repository in docs/tests.md."""
     page = (ROOT / "docs/tests.md").read_text("utf-8")
     return page.partition("```yaml\n")[2].partition("```")[0]
 

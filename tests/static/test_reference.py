@@ -12,13 +12,13 @@ import yaml
 from code_lines import ROOT
 from needle_core.settings.parameter_fields import specs
 from reference.command_pages import commands_page, scripts
-from reference.diagnostic_pages import IN_EVERY_NODE, complaints, diagnostics_page
-from reference.endpoints import HEARS, MAKERS, OPEN_ENDED, PUBLISHES, SOURCES
+from reference.diagnostic_pages import IN_EVERY_NODE, diagnostic_texts, diagnostics_page
+from reference.endpoints import MAKERS, OPEN_ENDED, PUBLISHES, SOURCES, SUBSCRIBES
 from reference.markdown import cell, code
 from reference.node_pages import node_page, topics_page
 from reference.rig_nodes import RigNode, executables, rig_nodes
 
-# Of every node or component, or of a command that ends by itself.
+# Modules of every node or component, or of a command that ends by itself.
 BESIDE_NODES = (
     "needle_core/ros/base_node.py",
     "needle_core/ros/component_node.py",
@@ -33,7 +33,7 @@ def nodes() -> list[RigNode]:
 
 
 def runtime_modules() -> Iterator[tuple[str, ast.Module]]:
-    """Yield (path below the package's folder, tree) of all modules that a rig runs."""
+    """Yield (path below the package's folder, tree) of all runtime modules."""
     for path in sorted(SOURCES.glob("*/*/**/*.py")):
         package, below, *_ = path.relative_to(SOURCES).parts
         if below == package:
@@ -41,7 +41,7 @@ def runtime_modules() -> Iterator[tuple[str, ast.Module]]:
 
 
 def makers_in(tree: ast.Module) -> Iterator[tuple[str, int, int]]:
-    """Yield (function, first line, last line) of what makes an endpoint."""
+    """Yield (function, first line, last line) of the calls that create an endpoint."""
     for part in ast.walk(tree):
         if isinstance(part, ast.FunctionDef):
             for call in ast.walk(part):
@@ -52,7 +52,7 @@ def makers_in(tree: ast.Module) -> Iterator[tuple[str, int, int]]:
 
 
 def test_every_place_that_makes_an_endpoint_was_seen_to(nodes: list[RigNode]) -> None:
-    seen = {place for node in nodes for _, noted in node.ways for place in noted.places}
+    seen = {place for node in nodes for _, record in node.variants for place in record.places}
     missed = [
         f"{path}:{first}"
         for path, tree in runtime_modules()
@@ -110,7 +110,7 @@ def test_every_part_and_complaint_of_diagnostics_is_there(nodes: list[RigNode]) 
                 continue
             if "_diagnostics" in ast.unparse(call.func) and isinstance(call.args[0], ast.Constant):
                 assert call.args[0].value in parts, path
-    found = complaints()
+    found = diagnostic_texts()
     assert all(cell(code(each.text)) in page for each in found)
     words = sum(
         part.attr in ("WARN", "ERROR") and getattr(part.value, "id", "") == "Level"
@@ -118,7 +118,7 @@ def test_every_part_and_complaint_of_diagnostics_is_there(nodes: list[RigNode]) 
         for part in ast.walk(tree)
         if isinstance(part, ast.Attribute)
     )
-    compared = 4  # `is Level.ERROR`, `>= Level.WARN`, `== ...`: nothing is said there
+    compared = 4  # comparisons `is Level.ERROR`, `>= Level.WARN`, `== ...` without a text
     assert words - compared <= len(found) <= words
 
 
@@ -138,7 +138,7 @@ def test_the_picture_of_the_graph_is_as_the_nodes_are(nodes: list[RigNode]) -> N
     arrows = [part.attrib for part in picture.iter() if "data-topics" in part.attrib]
     assert len(arrows) == 5
     for arrow in arrows:
-        publisher, hearer = by_name[arrow["data-from"]], by_name[arrow["data-to"]]
+        publisher, subscriber = by_name[arrow["data-from"]], by_name[arrow["data-to"]]
         topics = set(arrow["data-topics"].split())
         assert topics <= {end.name for end, _ in publisher.endpoints(PUBLISHES)}
-        assert topics <= {end.name for end, _ in hearer.endpoints(HEARS)}
+        assert topics <= {end.name for end, _ in subscriber.endpoints(SUBSCRIBES)}

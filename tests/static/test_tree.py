@@ -1,4 +1,4 @@
-"""The shape of the tree: modules and folders of a size to be read, and the counter of lines."""
+"""Size of modules and folders, first words of docstrings, and the counter of code lines."""
 
 from __future__ import annotations
 

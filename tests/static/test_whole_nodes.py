@@ -1,4 +1,4 @@
-"""Every node of ours is one that is destroyed if its construction fails."""
+"""Every node is destroyed if its construction fails."""
 
 from __future__ import annotations
 

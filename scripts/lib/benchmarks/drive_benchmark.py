@@ -1,14 +1,13 @@
-"""The driver's 50 Hz cycle beside stock python-can and canopen, on the same emulated drives.
+"""The driver's 50 Hz cycle beside stock python-can, on the same emulated drives.
 
-Each way moves both axes for a while over a pseudo-terminal; the drives' process notes when each
-SYNC arrives. The ways take turns, so that what else the machine does falls on all of them.
+Each client moves both axes over a pseudo-terminal; the process of the drives records when each SYNC
+arrives.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import os
 import queue
 import select
@@ -17,25 +16,14 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import can
-import canopen
 import numpy as np
-from canopen.objectdictionary import (
-    INTEGER8,
-    INTEGER32,
-    UNSIGNED8,
-    UNSIGNED16,
-    UNSIGNED32,
-    ODRecord,
-    ODVariable,
-)
-from canopen.profiles.p402 import BaseNode402
 
+from figure_rows import Row
 from needle_core.component import PortChange
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
@@ -52,34 +40,23 @@ PERIOD = 0.02
 CYCLES = 250
 TURNS = 3
 NODES = (1, 2)
-_SET_UP_PATIENCE = 5.0  # [s]
 BITRATE = 500_000
 # 2 mm/s and 1 rad/s.
 COUNTS_PER_CYCLE = (800, 209)
 
 
-@dataclass(frozen=True)
-class Way:
-    """A way to run the cycle: its key, name, p99 delay from set-points to SYNC, CPU share."""
-
-    key: str
-    what: str
-    delay_p99_ms: float
-    cpu_percent: float
-
-
 class Client(Protocol):
-    """Something that moves both axes."""
+    """Moves both axes."""
 
     def cycle(self, number: int) -> None:
-        """Send set-points number `number` and SYNC, take the answers."""
+        """Send set-points number `number` and SYNC, receive the answers."""
 
     def close(self) -> None:
-        """Let go."""
+        """Switch off and close the port."""
 
 
 class Driver:
-    """needle_device_driver's own cycle, its supervisor and ROS apart."""
+    """needle_device_driver's own cycle, without supervisor and ROS."""
 
     def __init__(self, channel: str) -> None:
         values = DeviceDriverParameters()
@@ -124,7 +101,7 @@ class Driver:
         return self._link.now
 
     def _wait(self, is_there: Callable[[], bool], seconds: float) -> None:
-        """Send what is to be sent, and take what comes."""
+        """Send queued frames, and receive until the condition holds."""
         self._port.send(self._link.pop_outgoing())
         until = self._now() + seconds
         with contextlib.suppress(queue.Empty):
@@ -137,7 +114,7 @@ class Driver:
 
 
 class PlainSlcan:
-    """Frames of python-can's slcan as it comes, answers by its Notifier."""
+    """python-can's slcan bus, answers by its Notifier."""
 
     def __init__(self, channel: str) -> None:
         self._bus = can.Bus(interface="slcan", channel=channel, bitrate=BITRATE, sleep_after_open=0)
@@ -176,80 +153,38 @@ class PlainSlcan:
         self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
 
-class Node402:
-    """canopen's BaseNode402 on python-can's slcan."""
-
-    def __init__(self, channel: str) -> None:
-        # It asks for a reading that nobody sends before the first SYNC, and says so.
-        logging.getLogger("canopen.profiles").setLevel(logging.ERROR)
-        self._network = canopen.Network()
-        self._network.connect(
-            interface="slcan", channel=channel, bitrate=BITRATE, sleep_after_open=0
-        )
-        self._nodes: list[Any] = [BaseNode402(node, _objects()) for node in NODES]  # type: ignore[no-untyped-call]
-        for node in self._nodes:
-            self._network.add_node(node)
-            # slcan falls behind where others keep the machine busy, and the set-up is not measured.
-            node.sdo.RESPONSE_TIMEOUT = _SET_UP_PATIENCE
-        _map_pdos(lambda n, *entry: self._network[n].sdo.download(entry[0], entry[1], entry[2]))
-        for node in self._nodes:
-            # It wants to know the network state first.
-            node.sdo.download(0x1017, 0, (50).to_bytes(2, "little"))
-            node.nmt.wait_for_heartbeat()
-            node.setup_402_state_machine()
-        self._network.nmt.send_command(1)
-        for node in self._nodes:
-            node.op_mode = "CYCLIC SYNCHRONOUS POSITION"
-            for word in (0x06, 0x07, 0x0F):
-                node.controlword = word
-        time.sleep(PERIOD)
-
-    def cycle(self, number: int) -> None:
-        """Set both targets, send them and SYNC, wait for both positions."""
-        for node, counts in zip(self._nodes, COUNTS_PER_CYCLE, strict=True):
-            node.rpdo[2]["Target position"].raw = (number + 1) * counts
-            node.rpdo[2].transmit()
-        self._network.sync.transmit()
-        for node in self._nodes:
-            node.tpdo[2].wait_for_reception(PERIOD / 2)
-
-    def close(self) -> None:
-        """Switch off."""
-        self._network.disconnect()
-
-
-WAYS: dict[str, tuple[str, Callable[[str], Client]]] = {
-    "driver": ("device_driver", Driver),
-    "slcan": ("python-can slcan", PlainSlcan),
-    "node402": ("canopen BaseNode402", Node402),
+CLIENTS: dict[str, Callable[[str], Client]] = {
+    "device_driver": Driver,
+    "python-can slcan": PlainSlcan,
 }
 
 
-def ways(cycles: int = CYCLES) -> list[Way]:
-    """Measure every way, in turns."""
-    delays: dict[str, list[float]] = {key: [] for key in WAYS}
-    shares: dict[str, list[float]] = {key: [] for key in WAYS}
+def rows(cycles: int = CYCLES) -> Iterator[Row]:
+    """Yield delay and CPU share of the driver's 50 Hz cycle beside python-can's slcan."""
+    figures: dict[str, list[tuple[float, float]]] = {name: [] for name in CLIENTS}
+    # The clients take turns, so that other load on the machine affects both.
     for _ in range(TURNS):
-        for key, (_, client) in WAYS.items():
-            delay, share = measure(client, cycles)
-            delays[key].append(float(np.percentile(delay, 99)))
-            shares[key].append(share)
-    # The turn that the rest of the machine disturbed least.
-    return [
-        Way(key, what, 1e3 * min(delays[key]), 100.0 * min(shares[key]))
-        for key, (what, _) in WAYS.items()
-    ]
+        for name, client in CLIENTS.items():
+            delays, share = measure(client, cycles)
+            figures[name].append((1e3 * float(np.percentile(delays, 99)), 100.0 * share))
+    # Minimum over the turns: the one that other load disturbed least.
+    (_, driver), (against, reference) = (
+        (name, np.min(values, axis=0).tolist()) for name, values in figures.items()
+    )
+    what = "50 Hz cycle, p99 until SYNC is out"
+    yield Row("drives_delay_p99", what, "ms", driver[0], against, reference[0])
+    yield Row("drives_cpu", "50 Hz cycle, share of a core", "%", driver[1], against, reference[1])
 
 
 def measure(make: Callable[[str], Client], cycles: int) -> tuple[list[float], float]:
-    """Run a way for some cycles.
+    """Run a client for some cycles.
 
     Returns
     -------
     delays : list of float
-        From the moment of a cycle's set-points to the SYNC at the drives [s].
+        Time from the set-points of a cycle to the SYNC at the drives [s].
     share : float
-        Of one core that this process took.
+        CPU share of this process, of one core.
     """
     with tempfile.TemporaryDirectory(prefix="needle_bench_") as folder:
         channel = Path(folder) / "can"
@@ -273,13 +208,13 @@ def measure(make: Callable[[str], Client], cycles: int) -> tuple[list[float], fl
             share = (time.process_time() - worked) / (time.monotonic() - start)
             client.close()
             arrived = json.loads(drives.communicate("\n")[0])
-    # The first SYNC at or after a cycle's begin is its own.
+    # The first SYNC at or after the begin of a cycle belongs to it.
     after = np.searchsorted(arrived, begun)
     return [arrived[k] - at for k, at in zip(after, begun, strict=True) if k < len(arrived)], share
 
 
 def serve(channel: str) -> None:
-    """Run the drives until a line comes, then print when each SYNC arrived."""
+    """Run the drives until a line arrives on stdin, then print when each SYNC arrived."""
     values = DriveEmulatorParameters(boot_time=0.0)
     now = time.monotonic()
     bus = EmulatedBus(values.insertion, values.rotation, now)
@@ -306,7 +241,7 @@ def serve(channel: str) -> None:
 
 
 def _map_pdos(write: Callable[[int, int, int, bytes], Any]) -> None:
-    """Map what the driver maps: command at once, target and position with SYNC."""
+    """Map the PDOs as the driver does: controlword at once, target and position with SYNC."""
     maps: Sequence[tuple[int, int, int, Sequence[int], int]] = (
         (0x1400, 0x1600, 0x200, (0x60400010, 0x60600008), 255),
         (0x1401, 0x1601, 0x300, (0x607A0020,), 1),
@@ -322,38 +257,6 @@ def _map_pdos(write: Callable[[int, int, int, bytes], Any]) -> None:
             write(node, mapping, 0, bytes([len(entries)]))
             write(node, parameters, 2, bytes([kind]))
             write(node, parameters, 1, (cob_id + node).to_bytes(4, "little"))
-
-
-def _objects() -> canopen.ObjectDictionary:
-    """Return the objects that BaseNode402 and the PDOs name."""
-    objects = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
-    for name, index, kind in (
-        ("Controlword", 0x6040, UNSIGNED16),
-        ("Statusword", 0x6041, UNSIGNED16),
-        ("Modes of operation", 0x6060, INTEGER8),
-        ("Modes of operation display", 0x6061, INTEGER8),
-        ("Position actual value", 0x6064, INTEGER32),
-        ("Target position", 0x607A, INTEGER32),
-        ("Supported drive modes", 0x6502, UNSIGNED32),
-    ):
-        objects.add_object(_variable(name, index, 0, kind))
-    for base in (0x1400, 0x1401, 0x1800, 0x1801):
-        parameters = ODRecord(f"PDO {base:04X}", base)
-        for number, kind in enumerate((UNSIGNED8, UNSIGNED32, UNSIGNED8)):
-            parameters.add_member(_variable(f"{number}", base, number, kind))
-        mapping = ODRecord(f"PDO {base + 0x200:04X}", base + 0x200)
-        mapping.add_member(_variable("count", base + 0x200, 0, UNSIGNED8))
-        for number in range(1, 9):
-            mapping.add_member(_variable(f"{number}", base + 0x200, number, UNSIGNED32))
-        objects.add_object(parameters)
-        objects.add_object(mapping)
-    return objects
-
-
-def _variable(name: str, index: int, subindex: int, kind: int) -> ODVariable:
-    variable = ODVariable(name, index, subindex)
-    variable.data_type = kind
-    return variable
 
 
 if __name__ == "__main__":

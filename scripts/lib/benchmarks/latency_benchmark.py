@@ -1,52 +1,73 @@
-"""From both images to the set-points made from them, in the whole graph of a rig in real time.
+"""Latency from both images to their set-points, in the whole graph of a rig in real time.
 
-Tracker, controller, driver, recorder and console run as on a rig; its drives are emulated, and its
-cameras show what was drawn before: no renderer shares the processor with what is measured. A first
-insertion, in one process, says how the needle goes; the second goes the same way.
+Tracker, controller, driver, recorder and console run as on a rig, with emulated drives. The cameras
+publish images that were drawn before, so that no renderer competes for the CPU: a first insertion,
+in one process, gives the path of the needle; the second one follows it. This file, run as a
+program, is the process of the cameras and the operator.
 """
 
 from __future__ import annotations
 
 import os
+import random
 import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+import time
+from collections import deque
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rclpy
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_srvs.srv import Trigger
 
-import latency_rig
 import needle_tracker
+from campaign.trials.ros_rig_client import CONTROLLER_START, RosRigClient
 from campaign.trials.steered_needle import FRAME_RATE, OFFSET, steer
 from campaign.trials.trial_processes import TrialProcesses
+from figure_rows import Row
 from needle_bags.reading.bag_reader import read_run
 from needle_bags.run.stage_timing import stage_timings
 from needle_bringup.simulation.rig_configuration import GRAPH_WATCHDOG, can_adapter
 from needle_core.component import Actions
+from needle_core.convert import Converter
 from needle_core.errors import UserError
+from needle_core.message_types import NANOSECONDS, rclpy_types, to_nanoseconds
 from needle_core.process.ros_domain import reserve_domain_id
+from needle_core.ros.base_node import IMAGES
 from needle_core.settings.parameter_files import Parameters
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.cameras import camera_info_message, image_message
 from needle_sim.sensors import TipSensor
 from scenario.virtual_rig import Held
 
 CALIBRATION = Path(needle_tracker.__file__).resolve().parents[1] / "config" / "calibration.yaml"
 FRAME = 1.0 / FRAME_RATE
 SPEED, DEPTH = 0.002, 0.030
-# Images count from here: before, the tracker believes the insertion [m].
+# Images count from this insertion: before, the tracker relies on the measured insertion [m].
 FIRST = 0.006
+# Spacing of the drawn images along the insertion [m].
 _SPACING = 6e-5
 _LOOPBACK = "127.0.0.1"
 STAGES = ("tracker", "controller", "driver", "image to set-point")
+_IMAGES_FILE, _INSERTIONS_FILE = "images.npy", "insertions.npy"
+# Jitter of the exposures, so that they do not synchronise with the driver's cycles [s].
+_JITTER = 0.01
+# Time from exposure to both images in the computer, as of a USB 3 camera [s].
+_TRANSFER = 0.01
+_JOINT_SAMPLES = 100
+_PAIRS_BEFORE_START = 30
+_TIMEOUT = 60.0
 
 
-def measure(depth: float = DEPTH) -> Mapping[str, tuple[float, float]]:
-    """Steer a needle so deep [m]; return by stage the median and 99 % of its time [s].
+def rows(depth: float = DEPTH) -> Iterator[Row]:
+    """Yield median and 99 % of the time of each stage, over an insertion to a depth [m].
 
     Raises
     ------
@@ -59,16 +80,18 @@ def measure(depth: float = DEPTH) -> Mapping[str, tuple[float, float]]:
         _run(folder, depth)
         run = read_run(folder / "bag")
         timings = {timing.name: timing for timing in stage_timings(run)}
-    figures = {}
     for stage in STAGES:
         timing = timings[stage]
         seconds = timing.seconds[run.insertion_at(timing.stamps) > FIRST]
-        figures[stage] = (float(np.median(seconds)), float(np.percentile(seconds, 99)))
-    return figures
+        key = f"latency_{stage.replace(' ', '_').replace('-', '_')}"
+        for percent in (50, 99):
+            value = 1e3 * float(np.percentile(seconds, percent))
+            what = f"{stage}, p{percent}"
+            yield Row(f"{key}_p{percent}", what, "ms", value, "a frame", 1e3 * FRAME)
 
 
 class _DrawingSensor(TipSensor):
-    """Tells the tip, and draws the needle on its way."""
+    """Measures the tip, and draws the needle on its way."""
 
     def __init__(self, *parts: Any) -> None:
         super().__init__(*parts)
@@ -87,17 +110,17 @@ class _DrawingSensor(TipSensor):
 
 
 def draw(folder: Path, depth: float) -> None:
-    """Steer a needle in this process, and leave images of it on its way in a folder."""
+    """Steer a needle in this process; save images of it on its way in a folder."""
     sensors: list[_DrawingSensor] = []
 
-    def see(*parts: Any) -> _DrawingSensor:
+    def make_sensor(*parts: Any) -> _DrawingSensor:
         sensors.append(_DrawingSensor(*parts))
         return sensors[0]
 
     hold = lambda seconds: Held(pressed=seconds > 0.2)  # noqa: E731
-    steer(hold, 1, latency=0.01, see=see, depth=depth, nominal_speed=SPEED)
-    np.save(folder / latency_rig.IMAGES_FILE, np.array(sensors[0].images))
-    np.save(folder / latency_rig.INSERTIONS_FILE, np.array(sensors[0].insertions))
+    steer(hold, 1, latency=0.01, see=make_sensor, depth=depth, nominal_speed=SPEED)
+    np.save(folder / _IMAGES_FILE, np.array(sensors[0].images))
+    np.save(folder / _INSERTIONS_FILE, np.array(sensors[0].insertions))
 
 
 def _run(folder: Path, depth: float) -> None:
@@ -105,7 +128,7 @@ def _run(folder: Path, depth: float) -> None:
     parameters: Parameters = {
         "recorder": {"bag": str(folder / "bag")},
         "drive_emulator": {"pty": adapter},
-        # Emulated drives are processes: on a busy machine they answer as late as others.
+        # Emulated drives are processes, which answer late on a busy machine.
         "device_driver": {
             "channel": adapter,
             **dict.fromkeys(("watchdog", "reply_age_limit", "hold_timeout"), GRAPH_WATCHDOG),
@@ -119,7 +142,7 @@ def _run(folder: Path, depth: float) -> None:
         },
         "console": {"address": _LOOPBACK, **_free_ports()},
     }
-    rig = [sys.executable, latency_rig.__file__, str(folder), str(CALIBRATION), str(depth)]
+    rig = [sys.executable, __file__, str(folder), str(CALIBRATION), str(depth)]
     with (
         reserve_domain_id() as domain,
         closing(TrialProcesses(folder, domain, parameters)) as graph,
@@ -133,12 +156,108 @@ def _run(folder: Path, depth: float) -> None:
         )
         graph.check()
     if done.returncode:
-        raise UserError(f"the needle did not get there: {done.stderr.strip().splitlines()[-1]}")
+        raise UserError(
+            f"the needle did not reach the depth: {done.stderr.strip().splitlines()[-1]}"
+        )
 
 
 def _free_ports() -> dict[str, object]:
-    """Return two ports for the console's page and hold that nobody has now."""
+    """Return two free ports for the console's page and hold."""
     with socket.socket() as page, socket.socket() as hold:
         for each in (page, hold):
             each.bind((_LOOPBACK, 0))
         return {"port": page.getsockname()[1], "hold_port": hold.getsockname()[1]}
+
+
+class LatencyRig(RosRigClient):
+    """Cameras and operator: publishes the image drawn nearest to the insertion, and holds.
+
+    Parameters
+    ----------
+    folder : Path
+        With images, (N, 2, height, width), and the insertion of each pair, (N,) [m].
+    calibration : Path
+        File of the cameras.
+    """
+
+    def __init__(self, folder: Path, calibration: Path) -> None:
+        super().__init__()
+        self._images = np.load(folder / _IMAGES_FILE)
+        self._insertions = np.load(folder / _INSERTIONS_FILE)
+        self._converter = Converter(rclpy_types())
+        rig = load_stereo_rig(calibration)
+        self._views = [
+            (
+                camera,
+                f"{side}_camera_optical",
+                self.create_publisher(Image, f"stereo/{side}/image_raw", IMAGES),
+                self.create_publisher(CameraInfo, f"stereo/{side}/camera_info", IMAGES),
+            )
+            for side, camera in (("left", rig.left), ("right", rig.right))
+        ]
+        self._joints: deque[tuple[int, float]] = deque([(0, 0.0)], maxlen=_JOINT_SAMPLES)
+        self._random = random.Random(1)
+        self._due = time.monotonic()
+        self.published = 0
+
+    def insert(self, depth: float) -> None:
+        """Prepare the rig, then hold until the needle reaches a depth [m]."""
+        self.prepare()
+        self._publish_until(lambda: self.published >= _PAIRS_BEFORE_START, "images")
+        start = self._clients_of[CONTROLLER_START]
+        self._publish_until(start.service_is_ready, "the controller")
+        while not self._has_started(start):
+            published = self.published
+            self._publish_until(lambda least=published: self.published > least, "another image")
+        self.send_hold()
+        self._publish_until(lambda least=self.published: self.published > least, "a release")
+        self.pressed = True
+        self._publish_until(lambda: self._joints[-1][1] >= depth, "the depth")
+        self.pressed = False
+        self.send_hold()
+
+    def _has_started(self, start: Any) -> bool:
+        future = start.call_async(Trigger.Request())
+        self._publish_until(future.done, "an answer of the controller")
+        return bool(future.result().success)
+
+    def _publish_until(self, condition: Any, what: str) -> None:
+        end = time.monotonic() + _TIMEOUT
+        while not condition():
+            if time.monotonic() > end:
+                raise UserError(f"timed out after {_TIMEOUT:g} s: {what}; device: {self.status}")
+            wait = self._due - time.monotonic()
+            self.spin(max(wait, 0.0))
+            if time.monotonic() >= self._due:
+                self._publish_pair()
+                # A late camera does not catch up.
+                self._due = max(self._due, time.monotonic() - FRAME)
+                self._due += FRAME + self._random.uniform(-_JITTER, _JITTER)
+
+    def _publish_pair(self) -> None:
+        exposed_ns = time.time_ns() - round(_TRANSFER * NANOSECONDS)
+        times, insertions = (np.array(column) for column in zip(*self._joints, strict=True))
+        insertion = np.interp(exposed_ns - times[0], times - times[0], insertions)
+        pair = self._images[int(np.argmin(np.abs(self._insertions - insertion)))]
+        for pixels, (camera, frame, image, info) in zip(pair, self._views, strict=True):
+            camera_info = camera_info_message(camera, frame, exposed_ns)
+            info.publish(self._converter.to_ros(camera_info))
+            image.publish(self._converter.to_ros(image_message(pixels, frame, exposed_ns)))
+        self.published += 1
+
+    def _on_places(self, message: JointState, info: dict[str, int]) -> None:
+        super()._on_places(message, info)
+        self._joints.append((to_nanoseconds(message.header.stamp), message.position[0]))
+
+
+def main() -> None:
+    """Run the cameras and the operator for an insertion as deep as the command line states."""
+    folder, calibration, depth = sys.argv[1:]
+    rclpy.init()
+    with closing(LatencyRig(Path(folder), Path(calibration))) as rig:
+        rig.insert(float(depth))
+    rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

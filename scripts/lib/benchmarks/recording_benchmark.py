@@ -1,4 +1,4 @@
-"""The recorder's writer beside rosbags' and beside the disk itself, with the same messages."""
+"""The recorder beside rosbags' writer, the disk itself and the images sent."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from campaign.trials.recording_trials import record_full_rate
+from figure_rows import Row
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.recording.recording import reuse_freed_memory
 from needle_core.files.bag_topic import BagTopic
@@ -31,18 +31,8 @@ _STORE = get_typestore(Stores.ROS2_JAZZY)
 Message = tuple[int, int, bytes]
 
 
-@dataclass(frozen=True)
-class Speeds:
-    """Speed of each way to take the same messages to the disk [MB/s]."""
-
-    megabytes: float
-    recorder: float
-    rosbags: float
-    disk: float
-
-
-def measure() -> Speeds:
-    """Write stereo pairs and what goes with them; the disk's own cache is emptied each time."""
+def writer_rows() -> Iterator[Row]:
+    """Yield the time to write stereo pairs and small messages to the disk, fsync included."""
     reuse_freed_memory()  # as the recorder does
     images = np.random.default_rng(1).integers(0, 256, (2, 1024 * 768 + 64), dtype=np.uint8)
     left, right = (image.tobytes() for image in images)
@@ -58,10 +48,12 @@ def measure() -> Speeds:
 
     size = sum(len(data) for _, _, data in messages()) / 1e6
     ways = (_record, _write_rosbags, _write_plainly)
-    # In turn, so that what else the machine does meets all of them.
+    # The ways take turns, so that other load on the machine affects all.
     seconds = [[_timed(way, messages) for way in ways] for _ in range(3)]
-    recorder, rosbags, disk = (size / min(times) for times in zip(*seconds, strict=True))
-    return Speeds(size, recorder, rosbags, disk)
+    recorder, rosbags, disk = (min(times) for times in zip(*seconds, strict=True))
+    what = f"recorder's writer, {size:.0f} MB"
+    yield Row("recording", what, "s", recorder, "rosbags Writer", rosbags)
+    yield Row("recording", what, "s", recorder, "the disk alone", disk)
 
 
 def _timed(
@@ -111,21 +103,13 @@ def _write_plainly(path: Path, messages: Iterator[Message]) -> None:
             stream.write(data)
 
 
-def reception() -> dict[str, float]:
-    """Record stereo images at 2 x 30 Hz with all that goes with them, over DDS.
-
-    Returns
-    -------
-    dict
-        Shares [%]: `recorded` and `heard` of the images, by the recorder and by a bare subscriber
-        with the tracker's quality of service; `core`, of a core, what the recorder takes.
-    """
+def reception_rows() -> Iterator[Row]:
+    """Yield the recorded share of stereo images at 2 x 30 Hz over DDS, and the CPU share."""
     with tempfile.TemporaryDirectory(prefix="needle_bench_") as folder:
         found = record_full_rate(Path(folder), SECONDS, others=0)
     images = 2 * 30.0 * SECONDS
     lost = sum(found["missing"].get(f"/stereo/{side}/image_raw", 0) for side in ("left", "right"))
-    return {
-        "recorded": 100.0 * (1.0 - lost / images),
-        "heard": 100.0 * (1.0 - found["unheard"] / images),
-        "core": 100.0 * found["share"],
-    }
+    recorded = 100.0 * (1.0 - lost / images)
+    yield Row("stereo_received", "stereo recorded", "%", recorded, "images sent", 100.0)
+    core = 100.0 * found["share"]
+    yield Row("recorder_core", "recorder, share of a core", "%", core, "one core", 100.0)

@@ -1,7 +1,7 @@
-"""The paper's loop for one needle in plain Python: what `scripts/bench` compares with.
+"""The paper's loop for one needle in plain Python, a reference of `scripts/bench`.
 
-Plant [KC09] (1)-(2), observer (9), law (10), written again with numbers and the `math` module, and
-the same loop as systems of python-control.
+Plant [KC09] (1)-(2), observer (9) and law (10) with floats and the `math` module, and the same loop
+as systems of python-control.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def observer_step(s: Linear, design: Design, turn: float, measured: float) -> Li
 
 
 def law_turn(s: Linear, design: Design) -> float:
-    """Return how far the base turns over the next step [rad]."""
+    """Return the rotation of the base over the next step [rad]."""
     length = design.step
     v = -sum(gain * value for gain, value in zip(design.feedback, s, strict=True))
     wanted = (s[0], s[1] + length * s[2] + 0.5 * length**2 * v, s[2] + length * v)
@@ -109,7 +109,7 @@ def law_turn(s: Linear, design: Design) -> float:
 
 
 def steer(start: Sequence[float], noise: Sequence[float], design: Design) -> float:
-    """Steer one needle for as many steps as there is noise [m]; return its last x [m]."""
+    """Steer one needle, a step for each value of noise [m]; return its last x [m]."""
     plant = plant_start(*start)
     s = (plant[9] + noise[0], 0.0, 0.0)
     turn = law_turn(s, design)
@@ -123,8 +123,8 @@ def steer(start: Sequence[float], noise: Sequence[float], design: Design) -> flo
 def control_system(design: Design) -> Any:
     """Return the same loop as an interconnected system of python-control.
 
-    Input: the measurement's noise; output: x. States: the needle's twelve; then s, the last turn,
-    and 1 once there was a first measurement.
+    Input: noise of the measurement; output: x. States: twelve of the needle; s; the last turn; 1
+    after the first measurement.
     """
     import control  # noqa: PLC0415  (it takes a second to import)
 

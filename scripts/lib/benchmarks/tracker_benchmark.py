@@ -1,10 +1,9 @@
-"""The tracker beside the plain OpenCV way, on the same rendered pairs: speeds and errors."""
+"""Speed and error of the tracker beside plain OpenCV, on the same rendered pairs."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import needle_tracker
-from campaign.tracking.tracker_sequences import Exposure, insertion_sequence
-from campaign.tracking.tracker_study import new_tracker, track_run
+from campaign.tracking.tracker_study import Exposure, insertion_sequence, new_tracker, track_run
+from figure_rows import Row
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
@@ -27,18 +26,8 @@ PAIRS = 60
 _DIFFERENCE = 25  # [grey levels]
 
 
-@dataclass(frozen=True)
-class Way:
-    """One way to find the tip: its key, speed [pairs/s] and 95 % error [mm]."""
-
-    key: str
-    what: str
-    pairs_per_s: float
-    distance_p95_mm: float
-
-
 class PlainTracker:
-    """Track as is written first: undistort, subtract the empty image, farthest pixel, rays.
+    """Plain OpenCV tracker: undistort, subtract the empty image, farthest pixel, triangulate.
 
     Parameters
     ----------
@@ -75,7 +64,7 @@ class PlainTracker:
         found = cv2.triangulatePoints(*self._projections, *points).reshape(4)
         tip = np.asarray(found[:3] / found[3], dtype=np.float64)
         if corrected:
-            # What lies deep seems to lie at its depth over the index.
+            # Refraction makes the apparent depth the true one divided by the refractive index.
             surface = self._window.point[0]
             tip[0] = surface - (surface - tip[0]) * self._window.inside
         return tip
@@ -85,51 +74,49 @@ class PlainTracker:
         return np.asarray(cv2.undistort(image, camera.camera_matrix, camera.distortion))
 
 
-def ways() -> list[Way]:
-    """Measure all ways on the same pairs, one thread each."""
+def rows() -> Iterator[Row]:
+    """Yield time and 95 % error of the tracker and plain OpenCV, on the same pairs, one thread."""
     cv2.setNumThreads(1)
     package = Path(needle_tracker.__file__).resolve().parents[1]
     path = package / "config" / "calibration.yaml"
     exposures = list(insertion_sequence(path, SCENARIO, 1, PAIRS))
-    bare = _without_needle(path)
-    plain = PlainTracker(load_calibration(path), bare)
+    plain = PlainTracker(load_calibration(path), _without_needle(path))
+    references = [
+        (name, *_run_plain(partial(plain.tip, corrected=corrected), exposures))
+        for name, corrected in (("plain OpenCV", False), ("plain OpenCV, corrected after", True))
+    ]
     tracker = new_tracker(load_calibration(path))
     tracker.warm_up()
-    found = []
     for key, what, searching in (
-        ("full", "tracker, full frame", True),
-        ("region", "tracker, region", False),
+        ("tracker_full", "tracker, full frame", True),
+        ("tracker_region", "tracker, region", False),
     ):
         run = track_run(tracker, exposures, searching=searching)
-        seconds = float(np.median(run.seconds))
-        found.append(_way(key, what, seconds, run.errors))
-    for key, what, corrected in (
-        ("plain", "plain OpenCV", False),
-        ("plain_corrected", "plain OpenCV, corrected after", True),
-    ):
-        errors, seconds = _run_plain(partial(plain.tip, corrected=corrected), exposures)
-        found.append(_way(key, what, seconds, errors))
-    return found
+        seconds, error = float(np.median(run.seconds)), _p95_mm(run.errors)
+        for name, plain_seconds, plain_error in references:
+            pair = f"{what}, a pair ({1.0 / seconds:.0f}/s)"
+            yield Row(f"{key}_pair", pair, "ms", 1e3 * seconds, name, 1e3 * plain_seconds)
+            yield Row(f"{key}_error", f"{what}, 95 % error", "mm", error, name, plain_error)
 
 
 def _without_needle(path: Path) -> tuple[Image, Image]:
-    """Return the clean scene before the needle is in it, as a rig's owner would take it."""
+    """Render the clean scene without the needle."""
     return StereoRenderer(load_stereo_rig(path), 1).render(np.eye(4), np.zeros((1, 3)), 0)
 
 
 def _run_plain(
     find: Callable[[tuple[Image, Image]], Array], exposures: Sequence[Exposure]
-) -> tuple[Array, float]:
+) -> tuple[float, float]:
+    """Return the median time of a pair [s] and the 95 % error [mm]."""
     errors, seconds = [], []
     for exposure in exposures:
         begin = time.thread_time()
         tip = find((exposure.left, exposure.right))
         seconds.append(time.thread_time() - begin)
         errors.append(tip - exposure.T_rig_tip[:3, 3])
-    return np.array(errors), float(np.median(seconds))
+    return float(np.median(seconds)), _p95_mm(np.array(errors))
 
 
-def _way(key: str, what: str, seconds: float, errors: Array) -> Way:
-    good = errors[np.all(np.isfinite(errors), axis=1)] * 1e3
-    distance = np.linalg.norm(good, axis=1)
-    return Way(key, what, 1.0 / seconds, float(np.percentile(distance, 95)))
+def _p95_mm(errors: Array) -> float:
+    found = errors[np.all(np.isfinite(errors), axis=1)] * 1e3
+    return float(np.percentile(np.linalg.norm(found, axis=1), 95))

@@ -1,4 +1,4 @@
-"""Pages of the libraries: what autodoc writes from the docstrings of a room's modules."""
+"""Pages of the libraries, written by autodoc from the docstrings."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ ROOMS = (
     "needle_sim.needle",
     "needle_sim.studies",
 )
-"""What own estimators, laws, planners, studies and programs that read bags are made of."""
+"""Packages for own estimators, laws, planners, studies and programs that read bags."""
 
 
 def api_pages() -> dict[str, str]:
-    """Return every page by its file's name: an index, and one for each room."""
+    """Return every page by its file name: an index, and one page for each package."""
     rows = []
     found = {}
     for room in ROOMS:
@@ -42,8 +42,8 @@ def api_pages() -> dict[str, str]:
             )
         )
     index = (
-        "# Libraries\n\nOf the packages' pure libraries, which know no ROS, those that something "
-        "of your own is made of. SI units throughout.\n\n" + table(("room", "what it is"), rows)
+        "# Libraries\n\nLibraries without ROS for your own components, in SI units.\n\n"
+        + table(("package", "purpose"), rows)
     )
     return {"api.md": index, **found}
 

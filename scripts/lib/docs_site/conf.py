@@ -6,10 +6,9 @@ import re
 from typing import Any
 
 from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx import addnodes
 from sphinx.application import Sphinx
-
-from docs_site.mathml import add_mathml
 
 project = "Needle steering"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
@@ -27,7 +26,7 @@ napoleon_use_ivar = True
 # In a docstring, `x` is a name or a value.
 default_role = "py:obj"
 
-# The navigation holds pages, not the functions in them: every page would carry all of them.
+# List pages in the navigation, not their functions, which every page would repeat.
 toc_object_entries = False
 
 html_theme = "furo"
@@ -43,16 +42,16 @@ _FULL_NAME = re.compile(r"needle_\w+(\.\w+)+")
 
 
 def _escape(app: Sphinx, what: str, *described: Any) -> None:
-    """Say what reStructuredText would take for marks: |x| is an absolute value."""
+    """Escape `|x|`, an absolute value, which is a substitution in reStructuredText."""
     lines: list[str] = described[-1]
     lines[:] = [line.replace("|", "\\|") for line in lines]
     if what in ("attribute", "data"):
-        # Napoleon takes what is before the first colon for a type.
+        # Napoleon reads the text before the first colon as a type.
         lines[:1] = [f": {line}" for line in lines[:1]]
 
 
 def _link_names(app: Sphinx, page: nodes.document) -> None:
-    """Lead a full name in a text, where the libraries' pages have it, to its description."""
+    """Link full names in a text to their descriptions on the library pages."""
     for literal in list(page.findall(nodes.literal)):
         name = literal.astext()
         if _FULL_NAME.fullmatch(name) and not isinstance(literal.parent, nodes.reference):
@@ -63,8 +62,18 @@ def _link_names(app: Sphinx, page: nodes.document) -> None:
             link += literal
 
 
+def _inline_math(writer: Any, node: nodes.math) -> None:
+    writer.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def _displayed_math(writer: Any, node: nodes.math_block) -> None:
+    writer.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
 def setup(app: Sphinx) -> None:
-    """Add what Sphinx itself lacks."""
+    """Register the hooks, and a renderer that writes equations as MathML."""
     app.connect("autodoc-process-docstring", _escape, priority=_BEFORE_NAPOLEON)
     app.connect("doctree-read", _link_names)
-    add_mathml(app)
+    app.add_html_math_renderer("mathml", (_inline_math, None), (_displayed_math, None))

@@ -9,19 +9,19 @@ from collections.abc import Iterable, Mapping
 FRONT = "README.md"
 OVERVIEW = "docs/README.md"
 GENERATED = "<!-- generated pages -->"
-"""Where docs/README.md has the pages that only the site has."""
+"""Placeholder in docs/README.md for the generated pages."""
 _FOLDER = "docs"
 _SECTION = re.compile(r"^## (.+)$", re.MULTILINE)
 _PAGE = re.compile(r"\[([^\]]+)\]\((?![a-z]+:)([^)#]+\.md)\)")
 
 
 def navigation(overview: str) -> str:
-    """Return what the front page ends with: a hidden table of contents for each section.
+    """Return a hidden table of contents for each section, for the end of the front page.
 
     Parameters
     ----------
     overview : str
-        Text of docs/README.md: sections with links; one to a place within a page is none.
+        Text of docs/README.md: sections with links to pages.
     """
     _, *sections = _SECTION.split(overview)
     trees = [toctree([f"All pages </{OVERVIEW}>"])]
@@ -34,7 +34,7 @@ def navigation(overview: str) -> str:
 
 
 def toctree(entries: Iterable[str], caption: str = "") -> str:
-    """Return a hidden table of contents; nothing where there are no entries."""
+    """Return a hidden table of contents; an empty text without entries."""
     lines = [entry.replace(".md", "") for entry in entries]
     if not lines:
         return ""

@@ -1,4 +1,4 @@
-"""Copies the checkout's pages to where Sphinx reads them, under the same paths."""
+"""Copies the pages of the checkout to the source folder of Sphinx, under the same paths."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PAGES = ("*.md", "bags/*.md", "docs/**/*.md", "ros2_ws/src/*/README.md")
 REFERENCE = "docs/reference"
 """Where the generated pages go."""
 LISTING = "files.md"
-"""What a link to a folder leads to: a page with all its files."""
+"""Page with all files of a folder, target of a link to the folder."""
 _LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)")
 _NOT_LISTED = ("build", "__pycache__")
 
@@ -26,19 +26,19 @@ def pages() -> list[Path]:
 
 
 def write_tree(folder: Path, generated: dict[str, str]) -> None:
-    """Write everything that Sphinx reads into a folder.
+    """Write the input of Sphinx into a folder.
 
     Parameters
     ----------
     folder : Path
-        An empty one.
+        Empty folder.
     generated : dict of str to str
         Pages of the reference by their path below `REFERENCE`; `x/y.md` is a part of `x.md`.
     """
     for page in pages():
         text = (ROOT / page).read_text("utf-8")
         for target in sorted(set(_LINK.findall(text))):
-            text = _bring(page, target, text, folder)
+            text = _copy_target(page, target, text, folder)
         _write(folder / page, text)
     for name, below in parts(generated).items():
         tree = toctree([f"/{REFERENCE}/{part}" for part in below])
@@ -51,8 +51,8 @@ def write_tree(folder: Path, generated: dict[str, str]) -> None:
     _write(folder / FRONT, (folder / FRONT).read_text("utf-8") + navigation(overview))
 
 
-def _bring(page: Path, target: str, text: str, folder: Path) -> str:
-    """Copy what a page links to or shows; return its text, links to folders led to pages."""
+def _copy_target(page: Path, target: str, text: str, folder: Path) -> str:
+    """Copy the target of a link; return the text, with a link to a folder replaced by its page."""
     there = (ROOT / page.parent / target).resolve()
     if there.suffix == ".md" or not there.is_relative_to(ROOT):
         return text

@@ -22,14 +22,14 @@ _WIDTH = "100"
 
 
 def scripts() -> list[str]:
-    """Return the names of the scripts that are run."""
+    """Return the names of the executable scripts."""
     return sorted(
         path.name for path in SCRIPTS.iterdir() if path.is_file() and os.access(path, os.X_OK)
     )
 
 
 def help_of_module(module: str, name: str) -> str:
-    """Return what a command prints on `--help`, in this process."""
+    """Return the `--help` text of a command, run in this process."""
     said = io.StringIO()
     with (
         contextlib.redirect_stdout(said),
@@ -42,7 +42,7 @@ def help_of_module(module: str, name: str) -> str:
 
 
 def help_of_script(name: str) -> str:
-    """Return what a script prints on `--help`; Python scripts run in this process."""
+    """Return the `--help` text of a script; a Python script runs in this process."""
     text = (SCRIPTS / name).read_text("utf-8")
     module = re.search(r'^run python -m (\S+) "\$@"$', text, re.MULTILINE)
     if module:
@@ -70,7 +70,7 @@ def commands_page(nodes: Sequence[RigNode]) -> str:
     """Return the page."""
     links = ", ".join(node_link(node.name, NODES) for node in nodes)
     page = [
-        "# Command lines\n\nExit codes are the same of all "
+        "# Command lines\n\nExit codes are the same for all "
         f"([architecture](../architecture.md#exit-codes)). Nodes: {links}.\n\n## Scripts\n\n"
     ]
     for name in scripts():
@@ -79,6 +79,6 @@ def commands_page(nodes: Sequence[RigNode]) -> str:
     for package, name, module in executables("command"):
         page.append(f"### {name}\n\n    ros2 run {package} {name}\n\n")
         page.append(block(help_of_module(module, name)))
-    # Its own options beside the node's parameters.
+    # The player has its own options beside its parameters.
     page.append(f"### player\n\n{block(help_of_module('needle_bags.ros.player', 'player'))}")
     return "".join(page)

@@ -1,4 +1,4 @@
-"""The page of diagnostics: parts and keys as nodes set them, warnings and errors as worded."""
+"""The page of diagnostics: parts and keys of each node, and the texts of warnings and errors."""
 
 from __future__ import annotations
 
@@ -14,51 +14,48 @@ from reference.rig_nodes import RigNode
 
 LEVELS = ("WARN", "ERROR")
 IN_EVERY_NODE = {
-    "input": "a message or request was refused, or the node failed on it; counted by topic",
-    "duplicates": "another node publishes what this one alone should",
+    "input": "a message or request was rejected, or its handler failed; counted by topic",
+    "duplicates": "another node publishes on a topic of this node",
 }
 """Parts that any node may report, by `needle_core.ros`."""
-_WORDS = "..."
+_FILLED_IN = "..."
 
 
 @dataclasses.dataclass(frozen=True)
-class Complaint:
-    """A place in the code where a warning or error is worded.
+class DiagnosticText:
+    """A warning or error text in the code.
 
     Attributes
     ----------
     package, module : str
-        Where; the module's path below the package's own.
-    line : int
-        From 1.
+        Package, and path of the module below it.
     level : str
         WARN or ERROR.
     text : str
-        The words; `...` stands for what is filled in, or for words of another place.
+        The text; `...` stands for values, or for text of another module.
     """
 
     package: str
     module: str
-    line: int
     level: str
     text: str
 
 
-def complaints() -> list[Complaint]:
-    """Return every place of the runtime packages that words a warning or an error."""
+def diagnostic_texts() -> list[DiagnosticText]:
+    """Return every warning and error text of the runtime packages."""
     return [
         each
         for path in sorted(SOURCES.glob("*/*/**/*.py"))
         if path.relative_to(SOURCES).parts[1] != "test"
-        for each in complaints_in(path)
+        for each in diagnostic_texts_in(path)
     ]
 
 
-def complaints_in(path: Path) -> Iterator[Complaint]:
-    """Yield those of a module: `Level.WARN, words`, in a call, a tuple or a table."""
+def diagnostic_texts_in(path: Path) -> Iterator[DiagnosticText]:
+    """Yield the texts of a module: `Level.WARN, text` in a call, a tuple or a table."""
     package, _, *rest = path.relative_to(SOURCES).parts
     source = path.read_text("utf-8")
-    # Few modules do: to understand the others takes most of the time.
+    # Parse only modules with diagnostics, because parsing takes most of the time.
     if "Level." not in source:
         return
     for part in ast.walk(ast.parse(source)):
@@ -70,11 +67,11 @@ def complaints_in(path: Path) -> Iterator[Complaint]:
             beside = [(value, key) for key, value in zip(part.keys, part.values, strict=True)]
         for item, words in beside:
             for level in _levels(item):
-                yield Complaint(package, "/".join(rest), item.lineno, level, _text(words))
+                yield DiagnosticText(package, "/".join(rest), level, _text(words))
 
 
 def _levels(item: ast.expr) -> list[str]:
-    """Return the levels that an expression is, or chooses from."""
+    """Return the levels that an expression may have."""
     if isinstance(item, ast.IfExp):
         return [*_levels(item.body), *_levels(item.orelse)]
     if not isinstance(item, ast.Attribute) or getattr(item.value, "id", "") != "Level":
@@ -87,12 +84,13 @@ def _text(words: ast.expr | None) -> str:
         return str(words.value)
     if isinstance(words, ast.JoinedStr):
         return "".join(
-            str(part.value) if isinstance(part, ast.Constant) else _WORDS for part in words.values
+            str(part.value) if isinstance(part, ast.Constant) else _FILLED_IN
+            for part in words.values
         )
     if isinstance(words, ast.Attribute):
         # A state: `State.FAULT`.
-        return f"{words.attr}: {_WORDS}" if words.attr.isupper() else _WORDS
-    return _WORDS
+        return f"{words.attr}: {_FILLED_IN}" if words.attr.isupper() else _FILLED_IN
+    return _FILLED_IN
 
 
 def diagnostics_page(nodes: Sequence[RigNode]) -> str:
@@ -102,7 +100,9 @@ def diagnostics_page(nodes: Sequence[RigNode]) -> str:
         for node in nodes
         for part, keys in node.parts.items()
     ]
-    worded = {(each.package, each.module, each.level, each.text): each for each in complaints()}
+    worded = {
+        (each.package, each.module, each.level, each.text): each for each in diagnostic_texts()
+    }
     rows = [
         (
             f"{code(each.package)}",
@@ -114,13 +114,13 @@ def diagnostics_page(nodes: Sequence[RigNode]) -> str:
     ]
     every = [(code(part), text) for part, text in IN_EVERY_NODE.items()]
     return (
-        "# Diagnostics\n\nEvery node tells its health on `/diagnostics`, once a second and "
-        "whenever it changes, part by part, as `NODE: PART`. What to do about it is in the READMEs "
-        "of the packages.\n\n"
+        "# Diagnostics\n\nEvery node publishes its state on `/diagnostics`, once a second and on "
+        "every change, part by part, as `NODE: PART`. The READMEs of the packages list remedies."
+        "\n\n"
         "## Parts\n\n"
         + table(("node", "part", "keys of its values"), parts)
         + "In every node:\n\n"
         + table(("part", "a warning that"), every)
-        + "## What warns and what fails\n\nAs the code words it; `...` is filled in.\n\n"
+        + "## Warnings and errors\n\n`...` stands for values.\n\n"
         + table(("package", "module", "level", "message"), rows)
     )

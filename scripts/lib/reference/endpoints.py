@@ -1,4 +1,4 @@
-"""Record of what nodes publish, hear, serve, call, declare and report while they are made."""
+"""Records topics, services, parameters and diagnostics of nodes while they are constructed."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from needle_core.diagnostics import Diagnostic
 from needle_core.ros.base_node import DiagnosticsPublisher
 from needle_core.ros.parameters import NodeParameters
 
-PUBLISHES, HEARS, SERVES, CALLS = "publishes", "hears", "serves", "calls"
+PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
 MAKERS = {
     "create_publisher": PUBLISHES,
-    "create_subscription": HEARS,
+    "create_subscription": SUBSCRIBES,
     "create_service": SERVES,
     "create_client": CALLS,
 }
-"""Methods of rclpy's Node by what they make."""
+"""Roles by the method of rclpy's Node that creates the endpoint."""
 OPEN_ENDED = {
-    "needle_bags/ros/graph_topics.py:_subscribe": "`recorder` hears every topic of the "
-    "graph, by its choice.",
-    "needle_bags/ros/player.py:_publisher": "`player` publishes what its bag has; what a rig "
-    "obeys below `/replay` alone.",
+    "needle_bags/ros/graph_topics.py:_subscribe": "`recorder` subscribes to every topic "
+    "that it records.",
+    "needle_bags/ros/player.py:_publisher": "`player` publishes the topics of its bag; "
+    "commands, holds and targets only below `/replay`.",
     "needle_bags/ros/parameter_snapshots.py:__init__": "`recorder` asks every node for its "
     "parameters.",
 }
-"""Functions whose endpoints are those of others: what a reader should know of them."""
+"""Functions whose endpoints depend on the graph or a bag, with a note for the reader."""
 SOURCES = ROOT / "ros2_ws" / "src"
 
 Place = tuple[str, int]
@@ -47,9 +47,9 @@ class Endpoint:
     Attributes
     ----------
     role : str
-        PUBLISHES, HEARS, SERVES or CALLS.
+        PUBLISHES, SUBSCRIBES, SERVES or CALLS.
     name : str
-        As in the graph without a namespace: relative, but for what is absolute.
+        Name without a namespace, relative unless it is absolute.
     type_name : str
         `package/Type`.
     qos : str
@@ -63,19 +63,19 @@ class Endpoint:
 
 
 @dataclasses.dataclass
-class Noted:
-    """Record of what one node did while it was made, in one of its ways to be set.
+class NodeRecord:
+    """Record of one node in one of its variants.
 
     Attributes
     ----------
     endpoints : list of Endpoint
         In order, each once.
     parameters : list of type
-        Dataclasses that were declared.
+        Declared parameter dataclasses.
     parts : dict of str to list of str
         Parts of its diagnostics, with the keys of their values.
     places : set of Place
-        Lines of code that an endpoint was made from.
+        Lines of code that created an endpoint.
     """
 
     endpoints: list[Endpoint] = dataclasses.field(default_factory=list)
@@ -86,7 +86,7 @@ class Noted:
     def add(
         self, role: str, node: Any, kind: type, name: str, qos: QoSProfile | int | None
     ) -> None:
-        """Note an endpoint that is being made, unless it is one of rclpy's own."""
+        """Record an endpoint, unless rclpy itself creates it."""
         maker = sys._getframe(2)
         if not _place(maker)[0]:
             return
@@ -106,7 +106,7 @@ def type_name(kind: type) -> str:
 
 
 def in_words(qos: QoSProfile | int | None) -> str:
-    """Return a quality of service as a reader wants it: `reliable, 10`, `reliable, latched, 1`."""
+    """Return a quality of service as text: `reliable, 10`, `reliable, latched, 1`."""
     if not isinstance(qos, QoSProfile):
         return ""
     words = ["reliable" if qos.reliability == ReliabilityPolicy.RELIABLE else "best effort"]
@@ -120,14 +120,14 @@ def _plain_name(name: str, node: str) -> str:
 
 
 def _place(frame: FrameType) -> Place:
-    """Return the line that a frame is at; an empty file's where it is none of the packages."""
+    """Return file and line of a stack frame; an empty file outside of the packages."""
     file = frame.f_code.co_filename
     path = file.partition("/ros2_ws/src/")[2]
     return (path.partition("/")[2], frame.f_lineno) if path else ("", 0)
 
 
 def _places(frame: FrameType | None) -> set[Place]:
-    """Return the lines of the packages that led here."""
+    """Return the lines of the packages on the call stack."""
     found: set[Place] = set()
     while frame is not None:
         found.add(_place(frame))
@@ -136,42 +136,42 @@ def _places(frame: FrameType | None) -> set[Place]:
 
 
 @contextlib.contextmanager
-def noting() -> Iterator[Noted]:
-    """Note what nodes do while the context lasts.
+def record_nodes() -> Iterator[NodeRecord]:
+    """Record the nodes that are constructed within the context.
 
-    It patches rclpy and two of our own classes: of a process that does nothing else.
+    It patches rclpy and two classes of this project, so the process should do nothing else.
     """
-    noted = Noted()
+    record = NodeRecord()
 
     def patched_maker(name: str, role: str) -> Any:
         make = getattr(Node, name)
 
-        def note_and_make(self: Node, kind: type, topic: str, *rest: Any, **more: Any) -> Any:
+        def record_and_make(self: Node, kind: type, topic: str, *rest: Any, **more: Any) -> Any:
             # A subscription's third argument is the callback.
-            at = {PUBLISHES: 0, HEARS: 1}.get(role)
+            at = {PUBLISHES: 0, SUBSCRIBES: 1}.get(role)
             qos = None if at is None else more.get("qos_profile", (*rest, None, None)[at])
-            noted.add(role, self, kind, topic, qos)
+            record.add(role, self, kind, topic, qos)
             return make(self, kind, topic, *rest, **more)
 
-        return note_and_make
+        return record_and_make
 
     declare, report = NodeParameters.__init__, DiagnosticsPublisher.set
 
-    def note_and_declare(self: Any, node: Node, parameters: type, *rest: Any) -> None:
-        noted.parameters.append(parameters)
+    def record_and_declare(self: Any, node: Node, parameters: type, *rest: Any) -> None:
+        record.parameters.append(parameters)
         declare(self, node, parameters, *rest)
 
-    def note_and_report(self: Any, part: str, diagnostic: Diagnostic) -> None:
-        keys = noted.parts.setdefault(part, [])
+    def record_and_report(self: Any, part: str, diagnostic: Diagnostic) -> None:
+        keys = record.parts.setdefault(part, [])
         keys += [key for key in diagnostic.values if key not in keys]
         report(self, part, diagnostic)
 
     with contextlib.ExitStack() as stack:
         for name, role in MAKERS.items():
             stack.enter_context(_patched(Node, name, patched_maker(name, role)))
-        stack.enter_context(_patched(NodeParameters, "__init__", note_and_declare))
-        stack.enter_context(_patched(DiagnosticsPublisher, "set", note_and_report))
-        yield noted
+        stack.enter_context(_patched(NodeParameters, "__init__", record_and_declare))
+        stack.enter_context(_patched(DiagnosticsPublisher, "set", record_and_report))
+        yield record
 
 
 @contextlib.contextmanager

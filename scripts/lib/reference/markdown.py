@@ -7,17 +7,17 @@ from collections.abc import Iterable, Sequence
 
 
 def cell(text: str) -> str:
-    """Return text as it may stand in a table."""
+    """Return text escaped for a table cell."""
     return " ".join(text.split()).replace("|", "\\|")
 
 
 def code(text: str) -> str:
-    """Return text as code, also with backticks in it."""
+    """Return text as inline code, backticks included."""
     return f"`` {text} ``" if "`" in text else f"`{text}`"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table and an empty line; a column without a word is left out, all without rows."""
+    """Return a table and an empty line, without empty columns; an empty text without rows."""
     rows = list(rows)
     used = [k for k in range(len(head)) if any(row[k] for row in rows)]
     lines = [f"| {' | '.join(cell(row[k]) for k in used)} |" for row in rows]
@@ -28,7 +28,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def block(text: str, language: str = "text") -> str:
-    """Return text as it was printed, or stands in a file."""
+    """Return text as a fenced block."""
     fence = max(["```", *(f"{ticks}`" for ticks in re.findall(r"`{3,}", text))], key=len)
     return f"{fence}{language}\n{text.rstrip()}\n{fence}\n\n"
 

@@ -1,4 +1,4 @@
-"""Pages of the nodes: what each says, hears, answers, takes and reports."""
+"""Pages of the nodes: topics, services, parameters and diagnostics of each."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from needle_core.settings.parameter_fields import ParameterSpec, specs
-from reference.endpoints import CALLS, HEARS, OPEN_ENDED, PUBLISHES, SERVES, Endpoint
+from reference.endpoints import CALLS, OPEN_ENDED, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from reference.markdown import block, code, node_link, table
 from reference.rig_nodes import RigNode
 
@@ -19,7 +19,7 @@ Every node also publishes `/diagnostics` and `/rosout`, and has ROS's own servic
 
 def node_page(node: RigNode) -> str:
     """Return the page of a node."""
-    ends = node.endpoints(PUBLISHES, HEARS)
+    ends = node.endpoints(PUBLISHES, SUBSCRIBES)
     calls = node.endpoints(SERVES, CALLS)
     topics = [
         (end.role, code(end.name), code(end.type_name), end.qos, when)
@@ -27,7 +27,7 @@ def node_page(node: RigNode) -> str:
         if not _is_of_every_node(end)
     ]
     services = [
-        ("answers" if end.role == SERVES else "calls", code(end.name), code(end.type_name), when)
+        ("serves" if end.role == SERVES else "calls", code(end.name), code(end.type_name), when)
         for end, when in sorted(calls, key=lambda each: (each[0].role != SERVES, each[0].name))
     ]
     note = "".join(
@@ -53,7 +53,7 @@ def node_page(node: RigNode) -> str:
 
 
 def parameter_table(parameters: type) -> str:
-    """Return the parameters of a dataclass, as they are declared."""
+    """Return the table of a dataclass's parameters."""
     rows = []
     for name, spec, default in specs(parameters):
         shown = list(default) if isinstance(default, tuple) else default
@@ -64,10 +64,10 @@ def parameter_table(parameters: type) -> str:
                 code(text.lower() if isinstance(shown, bool) else text),
                 "" if spec.unit == "-" else spec.unit,
                 _allowed(spec),
-                spec.description + ("" if spec.read_only else " *May be set while it runs.*"),
+                spec.description + ("" if spec.read_only else " *May be set at run time.*"),
             )
         )
-    return table(("parameter", "default", "unit", "range", "what it is"), rows)
+    return table(("parameter", "default", "unit", "range", "description"), rows)
 
 
 def _allowed(spec: ParameterSpec) -> str:
@@ -86,11 +86,11 @@ def _is_of_every_node(end: Endpoint) -> bool:
 
 
 def nodes_index(nodes: Sequence[RigNode]) -> str:
-    """Return the page that leads to the nodes' own."""
+    """Return the index of the node pages."""
     rows = [
         (node_link(node.name, NODES), code(node.package), _first_sentence(node)) for node in nodes
     ]
-    return f"# Nodes\n\n{_EVERY_NODE}\n{table(('node', 'package', 'what it does'), rows)}"
+    return f"# Nodes\n\n{_EVERY_NODE}\n{table(('node', 'package', 'purpose'), rows)}"
 
 
 def _first_sentence(node: RigNode) -> str:
@@ -100,29 +100,29 @@ def _first_sentence(node: RigNode) -> str:
 
 
 def topics_page(nodes: Sequence[RigNode]) -> str:
-    """Return all topics, with who is at either end."""
+    """Return the page of topics, with publishers and subscribers."""
     found: dict[tuple[str, str], dict[str, list[str]]] = {}
     for node in nodes:
-        for end, when in node.endpoints(PUBLISHES, HEARS):
+        for end, when in node.endpoints(PUBLISHES, SUBSCRIBES):
             if not _is_of_every_node(end):
-                sides = found.setdefault((end.name, end.type_name), {PUBLISHES: [], HEARS: []})
+                sides = found.setdefault((end.name, end.type_name), {PUBLISHES: [], SUBSCRIBES: []})
                 sides[end.role].append(_at_end(node, end.qos, when))
     rows = [
-        (code(name), code(kind), "<br>".join(ends[PUBLISHES]), "<br>".join(ends[HEARS]))
+        (code(name), code(kind), "<br>".join(ends[PUBLISHES]), "<br>".join(ends[SUBSCRIBES]))
         for (name, kind), ends in sorted(found.items(), key=lambda each: each[0][0].lstrip("/"))
     ]
     return (
-        "# Topics\n\nNames are relative but where they begin with `/`: a namespace moves the whole "
-        "rig. Types are ROS's own. The number is the depth of the queue; what is latched reaches "
-        "those, too, who come later.\n\n"
-        + table(("topic", "type", "published by", "heard by"), rows)
+        "# Topics\n\nNames are relative unless they begin with `/`, so a namespace moves the whole "
+        "rig. The number is the queue depth; latched messages also reach later subscribers."
+        "\n\n"
+        + table(("topic", "type", "publishers", "subscribers"), rows)
         + "".join(f"{text}\n\n" for text in OPEN_ENDED.values() if "ask" not in text)
         + _EVERY_NODE
     )
 
 
 def services_page(nodes: Sequence[RigNode]) -> str:
-    """Return all services, with who answers and who calls."""
+    """Return the page of services, with servers and clients."""
     found: dict[tuple[str, str], dict[str, list[str]]] = {}
     for node in nodes:
         for end, when in node.endpoints(SERVES, CALLS):
@@ -134,7 +134,7 @@ def services_page(nodes: Sequence[RigNode]) -> str:
     ]
     return (
         "# Services\n\n"
-        + table(("service", "type", "answered by", "called by"), rows)
+        + table(("service", "type", "servers", "clients"), rows)
         + "".join(f"{text}\n\n" for text in OPEN_ENDED.values() if "ask" in text)
         + _EVERY_NODE
     )

@@ -1,4 +1,4 @@
-"""Every node of the rig, made once in each way that changes what it says or hears."""
+"""Constructs every node of the rig in each variant that has other topics or services."""
 
 from __future__ import annotations
 
@@ -32,73 +32,76 @@ from needle_core.convert import from_ros, ros_type
 from needle_core.message_types import rclpy_types
 from needle_core.process.ros_domain import reserve_domain_id
 from needle_core.ros.component_node import ComponentNode
-from reference.endpoints import SOURCES, Endpoint, Noted, noting
+from reference.endpoints import SOURCES, Endpoint, NodeRecord, record_nodes
 
 BAG = ROOT / "bags" / "regression"
 
 
 @dataclasses.dataclass(frozen=True)
-class Way:
-    """A way to set a node.
+class NodeVariant:
+    """A configuration of a node.
 
     Attributes
     ----------
     when : str
-        In words, for a reader; empty where there is only one.
+        Description for the reader; empty for the only variant.
     parameters : tuple of str
-        As `-p` takes them; `{scratch}` is a folder.
+        Arguments of `-p`; `{scratch}` is a folder.
     make : callable
-        Takes the node's module, returns the node.
+        Constructs the node from its module.
     then : callable
-        Has the node do what it does later.
+        Runs the node's callbacks.
     """
 
     when: str = ""
     parameters: tuple[str, ...] = ()
     make: Callable[[ModuleType], Node] = lambda module: _class_of(module)()
-    then: Callable[[Any, Noted], None] = lambda node, noted: None
+    then: Callable[[Any, NodeRecord], None] = lambda node, record: None
 
 
 @dataclasses.dataclass(frozen=True)
 class RigNode:
-    """A node, as it is.
+    """A node of the rig and its records.
 
     Attributes
     ----------
     name, package : str
-        The executable's, and whose it is.
+        Executable and package.
     module : ModuleType
-        Where it is.
-    ways : list of (str, Noted)
-        In which way, and what was noted.
+        Module of the node.
+    variants : list of (str, NodeRecord)
+        Description of each variant, and its record.
     """
 
     name: str
     package: str
     module: ModuleType
-    ways: list[tuple[str, Noted]]
+    variants: list[tuple[str, NodeRecord]]
 
     def endpoints(self, *roles: str) -> list[tuple[Endpoint, str]]:
-        """Return its endpoints, each once, with the ways that have it; all: an empty text."""
+        """Return each endpoint with the variants that have it; an empty text for all."""
         found: dict[Endpoint, list[str]] = {}
-        for when, noted in self.ways:
-            for endpoint in noted.endpoints:
+        for when, record in self.variants:
+            for endpoint in record.endpoints:
                 if endpoint.role in roles:
                     found.setdefault(endpoint, []).append(when)
-        every = len(self.ways)
-        return [(end, "" if len(ways) == every else ", ".join(ways)) for end, ways in found.items()]
+        every = len(self.variants)
+        return [
+            (end, "" if len(variants) == every else ", ".join(variants))
+            for end, variants in found.items()
+        ]
 
     @property
     def parameters(self) -> type:
         """Its dataclass of parameters."""
-        return self.ways[0][1].parameters[0]
+        return self.variants[0][1].parameters[0]
 
     @property
     def parts(self) -> dict[str, list[str]]:
-        """Parts of its diagnostics, each with all keys that were seen."""
+        """Parts of its diagnostics, with the keys of each."""
         found: dict[str, list[str]] = {}
-        for _, noted in self.ways:
-            for part, keys in noted.parts.items():
+        for _, record in self.variants:
+            for part, keys in record.parts.items():
                 known = found.setdefault(part, [])
                 known += [key for key in keys if key not in known]
         return found
@@ -121,40 +124,40 @@ def executables(kind: str) -> Iterator[tuple[str, str, str]]:
 
 
 def rig_nodes() -> list[RigNode]:
-    """Make every node of the rig in all its ways, and return what was noted."""
+    """Construct every node of the rig in all its variants; return the records."""
     found = []
     with reserve_domain_id() as domain, tempfile.TemporaryDirectory() as scratch:
         for package, name, module_name in executables("node"):
             module = importlib.import_module(module_name)
-            ways = [
-                (way.when, _noted(module, way, domain, Path(scratch, f"{name}_{number}")))
-                for number, way in enumerate(WAYS.get(name, (Way(),)))
+            variants = [
+                (variant.when, _record(module, variant, domain, Path(scratch, f"{name}_{number}")))
+                for number, variant in enumerate(NODE_VARIANTS.get(name, (NodeVariant(),)))
             ]
-            found.append(RigNode(name, package, module, ways))
+            found.append(RigNode(name, package, module, variants))
     return found
 
 
-def _noted(module: ModuleType, way: Way, domain: int, scratch: Path) -> Noted:
+def _record(module: ModuleType, variant: NodeVariant, domain: int, scratch: Path) -> NodeRecord:
     arguments = ["--ros-args", "--log-level", "fatal"]
-    for parameter in way.parameters:
+    for parameter in variant.parameters:
         arguments += ["-p", parameter.format(scratch=scratch)]
     options = SignalHandlerOptions.NO
     rclpy.init(args=arguments, domain_id=domain, signal_handler_options=options)
     try:
-        with noting() as noted:
-            node = way.make(module)
+        with record_nodes() as record:
+            node = variant.make(module)
             try:
-                way.then(node, noted)
+                variant.then(node, record)
             finally:
                 getattr(node, "close", lambda: None)()
                 node.destroy_node()
     finally:
         rclpy.try_shutdown()
-    return noted
+    return record
 
 
 def _class_of(module: ModuleType) -> Callable[[], Node]:
-    """Return what makes a module's node: its class, or what its `main` runs a component by."""
+    """Return the constructor of a module's node: its class, or what `main` passes to `run_node`."""
     found = [
         each
         for each in vars(module).values()
@@ -163,15 +166,15 @@ def _class_of(module: ModuleType) -> Callable[[], Node]:
     if found:
         return found[0]
     run_node, find_spec = "needle_core.ros.main.run_node", "importlib.util.find_spec"
-    # What it says and hears is the same without its extra.
+    # Topics and services do not depend on optional packages.
     with mock.patch(run_node, return_value=0) as run, mock.patch(find_spec):
         module.main()
     make: Callable[[], Node] = run.call_args.args[0]
     return make
 
 
-def _turn(node: Any, _: Noted) -> None:
-    """Let everything happen that happens by itself."""
+def _spin(node: Any, _: NodeRecord) -> None:
+    """Run the callbacks that are ready."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     for _turns in range(5):
@@ -180,9 +183,9 @@ def _turn(node: Any, _: Noted) -> None:
 
 
 def _live_view(module: ModuleType) -> Node:
-    """Make it as where there is tf2_msgs, for whose message another one stands in."""
+    """Construct the node with a stand-in for tf2_msgs."""
     kind = type(String)("TFMessage", (String,), {"__module__": "tf2_msgs.msg"})
-    # Not by mock.patch.dict, which would forget all that is imported meanwhile.
+    # mock.patch.dict would remove all modules that are imported meanwhile.
     sys.modules["tf2_msgs.msg"] = mock.Mock(TFMessage=kind)
     try:
         return _class_of(module)()
@@ -190,18 +193,18 @@ def _live_view(module: ModuleType) -> Node:
         del sys.modules["tf2_msgs.msg"]
 
 
-def _hear(node: Any, noted: Noted) -> None:
-    """Hear an empty message of everything, images included."""
+def _feed_messages(node: Any, record: NodeRecord) -> None:
+    """Handle an empty message on every topic, images included."""
     for row in node.component.inputs:
         if row.lazy:
             node._listen(row.topic, True)
         message = from_ros(row.message, rclpy_types().make(ros_type(row.message))())
         node._handle(lambda row=row, message=message: row.handler(message, node._moment()))
-    _tick(node, noted)
+    _run_timers(node, record)
 
 
 def _console(_: ModuleType) -> Node:
-    """Make the console without its page: that wants NiceGUI and ports."""
+    """Construct the console without its page, which needs NiceGUI and ports."""
 
     def make(settings: ConsoleParameters, _: str) -> Console:
         return Console(settings)
@@ -211,7 +214,7 @@ def _console(_: ModuleType) -> Node:
     )
 
 
-def _look_at_page(node: Any, noted: Noted) -> None:
+def _operate_page(node: Any, record: NodeRecord) -> None:
     desk = node._ports[PAGE]
     desk.view("left")
     for button in Button:
@@ -231,64 +234,66 @@ def _player(module: ModuleType, *more: str) -> Node:
     return node
 
 
-def _make_and_look(node: Any, _: Noted) -> None:
+def _publish_and_check(node: Any, _: NodeRecord) -> None:
     node._make_publishers()
     node.check_graph()
 
 
-def _report_and_close(node: Any, _: Noted) -> None:
+def _report_and_close(node: Any, _: NodeRecord) -> None:
     node.report()
     node.recording.close()
 
 
-def _tick(node: Any, noted: Noted) -> None:
-    """Do what every timer does."""
+def _run_timers(node: Any, record: NodeRecord) -> None:
+    """Run every timer callback."""
     for timer in list(node.timers):
         timer.callback()
-    _turn(node, noted)
+    _spin(node, record)
 
 
 def _camera(module: ModuleType) -> Node:
-    """Make what publishes images, without any."""
+    """Construct the camera node without a camera."""
     with mock.patch("needle_tracker.stereo_camera.open_source"):
         return _class_of(module)()
 
 
-WAYS: dict[str, tuple[Way, ...]] = {
-    "console": (Way(make=_console, then=_look_at_page),),
-    "device_driver": (Way(then=_tick),),
-    "live_view": (Way(make=_live_view, then=_hear),),
-    "openigtlink": (Way("", ("port:=0",), then=_hear),),
+NODE_VARIANTS: dict[str, tuple[NodeVariant, ...]] = {
+    "console": (NodeVariant(make=_console, then=_operate_page),),
+    "device_driver": (NodeVariant(then=_run_timers),),
+    "live_view": (NodeVariant(make=_live_view, then=_feed_messages),),
+    "openigtlink": (NodeVariant("", ("port:=0",), then=_feed_messages),),
     "operator": (
-        Way("sources pedal and joystick", ("device:=/dev/null", "key:=48"), then=_tick),
-        Way("source joy", ("source:=joy", "key:=0"), then=_tick),
+        NodeVariant(
+            "sources pedal and joystick", ("device:=/dev/null", "key:=48"), then=_run_timers
+        ),
+        NodeVariant("source joy", ("source:=joy", "key:=0"), then=_run_timers),
     ),
     "player": (
-        Way(make=_player, then=_make_and_look),
-        Way(
+        NodeVariant(make=_player, then=_publish_and_check),
+        NodeVariant(
             "with `--clock`",
             make=lambda module: _player(module, "--clock", "100"),
-            then=_make_and_look,
+            then=_publish_and_check,
         ),
     ),
     "recorder": (
-        Way("", ("bag:={scratch}",), then=_report_and_close),
-        Way(
+        NodeVariant("", ("bag:={scratch}",), then=_report_and_close),
+        NodeVariant(
             "with `snapshot_seconds`",
             ("bag:={scratch}", "snapshot_seconds:=1.0"),
             then=_report_and_close,
         ),
     ),
     "sim_rig": (
-        Way("level tip", ("level:=tip",), then=_tick),
-        Way("level camera", ("level:=camera",), then=_tick),
-        Way("level drive", ("level:=drive",), then=_tick),
+        NodeVariant("level tip", ("level:=tip",), then=_run_timers),
+        NodeVariant("level camera", ("level:=camera",), then=_run_timers),
+        NodeVariant("level drive", ("level:=drive",), then=_run_timers),
     ),
     "simulated_operator": (
-        Way(then=_tick),
-        Way("with `wait_for_recorder`", ("wait_for_recorder:=true",)),
+        NodeVariant(then=_run_timers),
+        NodeVariant("with `wait_for_recorder`", ("wait_for_recorder:=true",)),
     ),
-    "stereo_camera": (Way(make=_camera, then=_tick),),
-    "stereo_tracker": (Way(then=_turn),),
+    "stereo_camera": (NodeVariant(make=_camera, then=_run_timers),),
+    "stereo_tracker": (NodeVariant(then=_spin),),
 }
-"""How to make a node that wants more than its name, or has several ways."""
+"""Variants of the nodes that need parameters or have several."""

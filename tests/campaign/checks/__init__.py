@@ -1,1 +1,1 @@
-"""What each step must show, at full size."""
+"""Full-size checks of `scripts/verify`, by step."""

@@ -1,11 +1,11 @@
-"""Step E: bags that lose nothing and open everywhere, and nodes that end in order."""
+"""Step E: complete and readable bags, and clean exits of all nodes."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
 
-from campaign.checking import Check, Finding, Workbench, unreadable
+from campaign.checking import Check, Finding, Workbench, bag_read_error
 from campaign.trials.recording_trials import record_and_kill, record_full_rate
 from campaign.trials.signal_trials import signal_trials
 
@@ -14,13 +14,13 @@ MOMENTS = 25
 PROCESSOR_SHARE, MEMORY_GROWTH_MB = 0.35, 5.0
 LAST_SECONDS = 0.5
 SIGNALS = 100
-# A bag is completed first: last words are heard for up to a second, and a disk may be slow. For the
-# others launchers wait so long before they send SIGTERM [s].
+# Longest time to exit [s]. The recorder first receives late messages for up to a second and
+# completes its bag; for other nodes, launchers send SIGTERM after 5 s.
 LONGEST_END, LONGEST_END_OF_OTHERS = {"recorder": 10.0}, 5.0
 
 
 def full_rate(bench: Workbench) -> Iterator[Finding]:
-    """Record stereo at 2 x 30 Hz with everything else while both cores are busy."""
+    """Record stereo at 2 x 30 Hz with all other topics while both cores are busy."""
     seen = record_full_rate(bench.folder, DURATION)
     missing, counted = seen["missing"], seen["counted"]
     yield Finding(
@@ -40,12 +40,12 @@ def full_rate(bench: Workbench) -> Iterator[Finding]:
         f"{seen['grew']:+.1f} MB, {seen['memory']:.0f} MB at the end",
         seen["grew"] <= MEMORY_GROWTH_MB,
     )
-    why = unreadable(bench.folder / "full_rate")
+    why = bag_read_error(bench.folder / "full_rate")
     yield Finding("full_rate_readers", "rosbags and mcap", "read all", why or "read all", not why)
 
 
 def killed(bench: Workbench) -> Iterator[Finding]:
-    """Kill the recorder at random moments, with images and without; recover."""
+    """Kill the recorder at random moments, with images and without, and recover the bag."""
     for what, words in (("images", ()), ("small", ("small",))):
         folder = bench.folder / f"killed_{what}"
         folder.mkdir()

@@ -1,4 +1,4 @@
-"""Step I: the needle goes in continuously, as fast as a person wants, or pushed by hand."""
+"""Step I: continuous insertion at the operator's speed, or by hand."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HANDS: dict[str, tuple[float, Callable[[np.random.Generator], Hand]]] = {
 
 
 def hands(_: Workbench) -> Iterator[Finding]:
-    """Steer while a person goes fast, slowly, stops, lets go, or pushes the needle itself."""
+    """Steer while the operator changes speed, stops, releases, or pushes the needle by hand."""
     for name, (bound, new_hand) in HANDS.items():
         errors, done = [], 0
         for seed in range(SEED, SEED + NEEDLES):
@@ -42,8 +42,8 @@ def hands(_: Workbench) -> Iterator[Finding]:
 
 
 def frame_rates(bench: Workbench) -> Iterator[Finding]:
-    """Study preset best at 5 mm/s beside stepwise; tips a second make no difference."""
-    # 5 mm/s times 10, 33 and 100 ms; of tips between two uses nothing is taken but that they came.
+    """Study preset best at 5 mm/s beside stepwise insertion, at several frame rates."""
+    # 5 mm/s times 10, 33 and 100 ms; tips between two used ones have no effect.
     figures = {
         delay: run(Study(f"delay_{delay}", "best", ("--turn-delay-mm", delay)), bench.folder)
         for delay in ("0", "0.05", "0.17", "0.5")

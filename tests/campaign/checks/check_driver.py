@@ -1,4 +1,4 @@
-"""Step D: the device driver on emulated drives: exact over many steps, bounded when a node dies."""
+"""Step D: the device driver on emulated drives, over many steps and with killed nodes."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from scenario.virtual_rig import FASTEST, VirtualRig
 
 STEPS = 10_000
 MOMENTS = 50
-# What the memory of driver and drives may grow by in 9,000 steps [MB]: less than a byte a cycle.
+# Largest growth of memory of driver and drives in 9,000 steps [MB]: less than a byte per cycle.
 MEMORY_SLACK = 2.0
 _DEEPEST, _MOST_ROTATION, _STEP = 0.19, 3.0, 0.002
 _COUNTS = DriveEmulatorParameters().insertion_counts_per_unit, COUNTS_PER_RADIAN
 
 
 def many_steps(_: Workbench) -> Iterator[Finding]:
-    """Add up random steps to the count, all of them succeed, and memory does not grow."""
+    """Make random steps: exact to a count, all succeed, without growth of memory."""
     off, outcomes, growth = in_own_process(random_steps, STEPS)
     yield Finding(
         "steps_position",
@@ -47,20 +47,20 @@ def many_steps(_: Workbench) -> Iterator[Finding]:
 
 
 def random_steps(count: int) -> tuple[list[float], list[str], float]:
-    """Make random steps to the deepest, back, and again.
+    """Make random steps to the largest depth, retract, and repeat.
 
     Returns
     -------
     list of float, list of str, float
-        How far the motors are from the sum of all commands [counts], the results, and the growth of
-        this process's memory [MB].
+        Distance of the motors from the sum of all commands [counts], the results, and the growth of
+        memory of this process [MB].
     """
     rng, rig, memory = random.Random(1), VirtualRig(1), [0.0]
     rig.home()
     rig.press()
     at = list(rig.place)
     for number in range(count):
-        # From a hundredth of a mm up, as often in each decade.
+        # Log-uniform from 0.01 mm.
         length = math.exp(rng.uniform(math.log(1e-5), math.log(_STEP)))
         turn = rng.uniform(-0.6, 0.6)
         turn = -turn if abs(at[1] + turn) > _MOST_ROTATION else turn
@@ -69,14 +69,14 @@ def random_steps(count: int) -> tuple[list[float], list[str], float]:
             rig.until(lambda: rig.hand.status.activity == "retraction", "a retraction")
             rig.until(lambda: rig.hand.status.activity == "none", "its end")
             rig.press()
-            # It ends at the home switch, which may be a few counts before 0.
+            # A retraction ends at the home switch, a few counts from 0.
             at[0] = rig.place[0]
         at = [at[0] + length, at[1] + turn]
-        # A count's rounding of where it begins must not make the fastest step too fast.
+        # Margin: rounding of the start to a count must not make the fastest step too fast.
         duration = max(length / FASTEST, abs(turn) / 3.0) * rng.uniform(1.01, 1.5)
         stamp = rig.command(at[0], at[1], duration)
         rig.until(lambda stamp=stamp: stamp in rig.hand.results, "a result")  # type: ignore[misc]
-        # What this keeps itself would be taken for a leak.
+        # Recorded positions would count as growth of memory.
         rig.hand.places.clear()
         if number in (count // 10, count - 1):
             memory.append(_memory())
@@ -91,7 +91,7 @@ def _memory() -> float:
 
 
 def killed_nodes(_: Workbench) -> Iterator[Finding]:
-    """End every motion within its bound when a node of the graph is killed; go on when told."""
+    """Kill each node of the graph: motion ends within its bound, and continues on command."""
     rng = random.Random(4)
     for node in PARTS:
         ends = [in_own_process(_kill, n, node, rng.uniform(0.0, 2.0)) for n in range(MOMENTS)]

@@ -1,4 +1,4 @@
-"""Steps I and K: whatever a person holds, its hold ends with it, and nothing moves by itself."""
+"""Steps I and K: a hold ends with its source, and nothing resumes by itself."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ WHAT = {
     "operator_frozen": "operator stopped by SIGSTOP, and going on with the pedal still pressed",
     CABLE: "cable between two computers cut for 0.3 to 5 s, 5 ms late and 1 % lost at all times",
 }
-# From a loss to the last motion, and between two samples of the joints that can show it [ms].
+# Longest time from a loss to the last motion, and period of the joint samples [ms].
 BOUND, SAMPLING = 150.0, 20.0
 
 
 def hold_sources(_: Workbench) -> Iterator[Finding]:
-    """End every motion soon after its pedal or joystick is lost, and never resume it."""
+    """Lose the pedal, joystick or operator node: motion ends in time and does not resume."""
     for kind in WHAT:
         if kind != CABLE:
             yield _finding(kind)
 
 
 def two_computers(_: Workbench) -> Iterator[Finding]:
-    """End every motion soon after the cable is cut, go on only when a person presses anew."""
+    """Cut the cable: motion ends in time, and continues only after a new press."""
     yield _finding(CABLE)
 
 

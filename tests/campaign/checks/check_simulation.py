@@ -1,4 +1,4 @@
-"""Step A: the rig steers end to end in simulation, from one command."""
+"""Step A: the simulated rig steers end to end by one command."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
-from campaign.checking import Check, Finding, Workbench, payloads, unreadable
+from campaign.checking import Check, Finding, Workbench, bag_read_error, payloads
 
 SAME_TOPICS = ("/needle/tip", "/device/joint_trajectory", "/device/result", "/sim/tip_pose")
-# Options of simulate -> what the error over the last 20 mm may be [mm RMS].
+# Largest error over the last 20 mm [mm RMS], by options of `simulate`.
 CONVERGING = {
     "--level drive": 1.0,
     "--level camera --insertion continuous": 0.06,
@@ -18,7 +18,7 @@ CONVERGING = {
 
 
 def camera(bench: Workbench) -> Iterator[Finding]:
-    """Steer by images: converged, quick, with a bag that opens and a report."""
+    """Steer by images: converged, fast, with a readable bag and a report."""
     run = bench.run("level_camera_1", "--level", "camera")
     left = "; ".join(run.left_over)
     what, wanted = "scripts/simulate: exit code, what is left", "0, nothing"
@@ -30,7 +30,7 @@ def camera(bench: Workbench) -> Iterator[Finding]:
     passed = run.summary.get("converged") is True and abs(r1 or 9.0) <= 1.0
     yield Finding("camera_converged", "level camera: converged, |r1|", wanted, seen, passed)
     yield Finding("camera_wall", "its time", "< 40 s", f"{run.wall:.1f} s", run.wall < 40.0)
-    why = unreadable(run.bag)
+    why = bag_read_error(run.bag)
     yield Finding("camera_bag", "its bag", "opens with rosbags and mcap", why or "opens", not why)
     kinds = ("report.html", "summary.json", "parameters.yaml", "*.png")
     missing = ", ".join(kind for kind in kinds if not any(run.bag.glob(kind)))
@@ -38,7 +38,7 @@ def camera(bench: Workbench) -> Iterator[Finding]:
 
 
 def same_seed(bench: Workbench) -> Iterator[Finding]:
-    """One seed, one run, bit for bit, with cameras and tracker in processes of their own."""
+    """Run the same seed twice: the same bits, with cameras and tracker in separate processes."""
     one, again = (bench.run(f"level_camera_{n}", "--level", "camera") for n in (1, 2))
     differ = _differences(one.bag, again.bag)
     seen = f"different: {', '.join(differ)}" if differ else "the same"
@@ -47,7 +47,7 @@ def same_seed(bench: Workbench) -> Iterator[Finding]:
 
 
 def converging(bench: Workbench) -> Iterator[Finding]:
-    """Converge at level drive, and while a person holds."""
+    """Converge at level drive, and with continuous insertion."""
     for options, largest in CONVERGING.items():
         name = options.replace("--", "").replace(" ", "_")
         summary = bench.run(name, *options.split()).summary
@@ -62,7 +62,7 @@ def converging(bench: Workbench) -> Iterator[Finding]:
 
 
 def tip_speed(bench: Workbench) -> Iterator[Finding]:
-    """Run without images quickly."""
+    """Run level tip fast."""
     run = bench.run("level_tip_1", "--level", "tip")
     what, steps = "level tip: from the command to the result of 120 steps", run.summary.get("steps")
     seen = f"{steps} steps in {run.wall:.1f} s"
@@ -73,12 +73,12 @@ CHECKS: tuple[Check, ...] = (camera, same_seed, converging, tip_speed)
 
 
 def _differences(one: Path, other: Path) -> list[str]:
-    """Return the topics whose messages differ in any bit, or are not there.
+    """Return the topics that are missing, or whose messages differ in any bit.
 
-    Where simulated time stands still what is said is repeated: each thing counts once.
+    Consecutive equal messages count once, because nodes repeat them while simulated time stops.
     """
     told = [
-        {topic: [data for data, _ in itertools.groupby(said)] for topic, said in messages.items()}
+        {topic: [data for data, _ in itertools.groupby(sent)] for topic, sent in messages.items()}
         for messages in (payloads(one, SAME_TOPICS), payloads(other, SAME_TOPICS))
     ]
     return [

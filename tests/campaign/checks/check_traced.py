@@ -1,4 +1,4 @@
-"""Step C on metal under lamps: a tracker for real images, as far as path tracing goes."""
+"""Step C on path-traced images: metal needles under lamps."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ import numpy as np
 
 from campaign.checking import Check, Finding, Workbench
 from campaign.tracking.traced_set import HELD_BACK, RIGS, drawn, scenes
-from campaign.tracking.traced_study import Told, TracedAnswer, traced_looks
+from campaign.tracking.traced_study import VARIATIONS, KnownInput, TrackedPair, tracked_pairs
 from campaign.tracking.tracker_study import WRONG
-from campaign.tracking.variations import VARIATIONS
 from needle_bringup.workplace import checkout
 
-_LEAST = {Told.EMPTY_PHANTOM: 0.97, Told.INSERTION: 0.97, Told.NOTHING: 0.92}
+_LEAST = {KnownInput.EMPTY_PHANTOM: 0.97, KnownInput.INSERTION: 0.97, KnownInput.NOTHING: 0.92}
 _LEAST_OF_A_KIND = 0.85
 _LEAST_VARIED = 0.9
 _LARGEST_P95 = {"bench": 0.3, "top_and_side": 0.25, "webcams": 0.3}  # [mm]
@@ -21,22 +20,21 @@ _CHI_SQUARED_95 = 7.815  # of three degrees of freedom
 
 
 def path_traced(_: Workbench) -> Iterator[Finding]:
-    """Find metal needles under lamps, before backdrops of all kinds; say how well they are known.
+    """Find metal needles under lamps over all floors, with consistent covariances.
 
-    Tells of the half of the set that nobody looks at, as far as `traced_set` has drawn it; what is
-    missing is drawn now.
+    It uses the held-out half of the set; missing sequences are traced first.
     """
     looks = [
         look
         for sequence in drawn(checkout() / ".traced", scenes(HELD_BACK))
-        for told in Told
-        for look in traced_looks(sequence, told)
+        for known in KnownInput
+        for look in tracked_pairs(sequence, known)
     ]
     needles = [look for look in looks if look.truth is not None]
-    for told, least in _LEAST.items():
-        found = _found([look for look in needles if look.told is told])
-        key = f"path_traced_found_{told.name.lower()}"
-        what = f"path-traced, {told.value} insertion, {_pairs(needles)} pairs: a tip"
+    for known, least in _LEAST.items():
+        found = _found([look for look in needles if look.known is known])
+        key = f"path_traced_found_{known.name.lower()}"
+        what = f"path-traced, {known.value} insertion, {_pairs(needles)} pairs: a tip"
         yield Finding(key, what, f">= {least:.0%}", f"{found:.1%}", found >= least)
     yield from _kinds(needles)
     for rig in RIGS:
@@ -54,7 +52,7 @@ def path_traced(_: Workbench) -> Iterator[Finding]:
 
 
 def path_traced_variations(_: Workbench) -> Iterator[Finding]:
-    """Find the same needles where the images or what is told of the rig are otherwise."""
+    """Find the same needles with degraded images or wrong parameters."""
     sequences = [
         sequence
         for sequence in drawn(checkout() / ".traced", scenes(HELD_BACK))
@@ -64,7 +62,7 @@ def path_traced_variations(_: Workbench) -> Iterator[Finding]:
         looks = [
             look
             for sequence in sequences
-            for look in traced_looks(sequence, Told.INSERTION, variation)
+            for look in tracked_pairs(sequence, KnownInput.INSERTION, variation)
         ]
         tips = [look for look in looks if look.tip is not None]
         found, median = _found(looks), 1e3 * float(np.median([look.error for look in tips]))
@@ -82,23 +80,23 @@ def path_traced_variations(_: Workbench) -> Iterator[Finding]:
 CHECKS: tuple[Check, ...] = (path_traced, path_traced_variations)
 
 
-def _found(looks: Sequence[TracedAnswer]) -> float:
+def _found(looks: Sequence[TrackedPair]) -> float:
     return float(np.mean([look.tip is not None for look in looks]))
 
 
-def _pairs(looks: Sequence[TracedAnswer]) -> int:
-    return len(looks) // len(Told)
+def _pairs(looks: Sequence[TrackedPair]) -> int:
+    return len(looks) // len(KnownInput)
 
 
-def _kinds(needles: Sequence[TracedAnswer]) -> Iterator[Finding]:
-    """Tell of each rig, metal, light and floor by itself."""
-    kinds: dict[str, list[TracedAnswer]] = {}
+def _kinds(needles: Sequence[TrackedPair]) -> Iterator[Finding]:
+    """Yield the share found for each rig, metal, light and floor."""
+    kinds: dict[str, list[TrackedPair]] = {}
     for look in needles:
         seen = look.scene.look
         for kind in (look.scene.rig, seen.metal, seen.lamps, seen.floor):
             kinds.setdefault(kind, []).append(look)
     for kind, looks in sorted(kinds.items()):
-        shares = [_found([look for look in looks if look.told is told]) for told in _LEAST]
+        shares = [_found([look for look in looks if look.known is known]) for known in _LEAST]
         yield Finding(
             f"path_traced_{kind}",
             f"path-traced, {kind}, {_pairs(looks)} pairs: a tip with the empty phantom and the "
@@ -109,9 +107,9 @@ def _kinds(needles: Sequence[TracedAnswer]) -> Iterator[Finding]:
         )
 
 
-def _errors(rig: str, needles: Sequence[TracedAnswer]) -> Iterator[Finding]:
+def _errors(rig: str, needles: Sequence[TrackedPair]) -> Iterator[Finding]:
     tips = [look for look in needles if look.tip is not None]
-    errors = 1e3 * np.array([look.error for look in tips if look.told is not Told.NOTHING])
+    errors = 1e3 * np.array([look.error for look in tips if look.known is not KnownInput.NOTHING])
     largest = 1e3 * max(look.error for look in tips)
     p95 = float(np.percentile(errors, 95))
     yield Finding(

@@ -26,8 +26,8 @@ SETS = 20
 # 95 % bounds of a chi-squared variable with three degrees of freedom's 95 % quantile.
 _QUANTILE_95 = 7.815
 _LEAST_INSIDE = 0.90
-# No lower bound: claims cover a ground face like the floor and light from one side, and the quick
-# renderer has neither. Whether they claim too much shows in path-traced images.
+# No lower bound: the covariance covers faces like the floor and light from one side, which the fast
+# renderer lacks. Path-traced images show whether it is too large.
 _MOST_MEAN = 4.5
 
 
@@ -57,7 +57,7 @@ def heavy_clutter(_: Workbench) -> Iterator[Finding]:
 
 
 def occlusion(_: Workbench) -> Iterator[Finding]:
-    """Believe nothing wrong while hands and covers block the view, and find the needle again."""
+    """Report no wrong tip while hands and covers block the view, and find the needle again."""
     runs = run_scenario(_calibration(), "occlusion", range(1, 31), 130)
     wrong = sum(int(np.count_nonzero(run.distances > WRONG)) for run in runs)
     count = sum(len(run.states) for run in runs)
@@ -74,7 +74,7 @@ def occlusion(_: Workbench) -> Iterator[Finding]:
 
 
 def absent(_: Workbench) -> Iterator[Finding]:
-    """Find no needle where there is none, with the stage's length known."""
+    """Find no needle in images without one, with known insertion."""
     runs = run_scenario(_calibration(), "absent", range(1, 7), STEPS)
     found = sum(int(run.found.sum()) for run in runs)
     count = sum(len(run.states) for run in runs)
@@ -82,7 +82,7 @@ def absent(_: Workbench) -> Iterator[Finding]:
 
 
 def calibration(_: Workbench) -> Iterator[Finding]:
-    """Calibrate a rig from a board's corners, each good to 0.1 px."""
+    """Calibrate a rig from board corners with errors of 0.1 px."""
     runs = [calibrated_tip_errors(_calibration(), seed, 0.1) for seed in range(1, SETS + 1)]
     p95 = float(np.percentile(runs, 95)) * 1e3
     what = f"calibration at 0.1 px corners, {SETS} sets: 95 % error of tips"
@@ -114,7 +114,7 @@ def _closed_loop(bench: Workbench, scenario: str, seeds: int, largest: float) ->
     for seed in range(1, seeds + 1):
         run = bench.run(f"{scenario}_{seed}", "--params", str(parameters), "--seed", str(seed))
         rms = run.summary.get("r1_rms_last_20_mm")
-        # A run that ends early has held nothing.
+        # A run that ends early counts as infinitely wrong.
         squares.append(rms**2 if rms is not None and run.code == 0 else np.inf)
     rms, missed = float(np.sqrt(np.mean(squares))), int(np.count_nonzero(np.isinf(squares)))
     return Finding(

@@ -1,4 +1,4 @@
-"""The studies of step B: what is asked of `monte_carlo`, and what it must answer."""
+"""The studies of step B: options of `monte_carlo` and required figures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MIXED = (
     *("--bump-mm", "1"),
 )
 """A little of everything at once."""
-# A study runs in one thread; numpy's others only wait, which counts as processor time too.
+# A study runs in one thread; idle threads of numpy would count as CPU time.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 Figures = Mapping[str, Any]
@@ -35,7 +35,7 @@ Figures = Mapping[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """One study, and what it must show.
+    """One study and its required figures.
 
     Attributes
     ----------
@@ -44,9 +44,9 @@ class Study:
     controller : str
         The preset.
     options : tuple of str
-        Of monte_carlo, beside the controller, the draws and the seed.
+        Options of monte_carlo besides controller, draws and seed.
     at_least, at_most : dict
-        Result's key to bound.
+        Bounds by key of the result.
     """
 
     key: str
@@ -91,7 +91,7 @@ TROUBLE = tuple(
     )
 )
 _KNOWN = {"inside_2_sigma": 0.93, "inside_3_sigma": 0.99}
-TOLD_WRONG = tuple(
+MISINFORMED = tuple(
     Study(key, "best", options, {AT_END: least, **_KNOWN}, {TRUSTED_FAR_OFF: 0.0})
     for key, options, least in (
         ("normal_noise", NORMAL, 0.999),
@@ -112,7 +112,7 @@ TOLD_WRONG = tuple(
         ("mixed", MIXED, 0.97),
     )
 )
-"""What is claimed to `best` stays +-1 mm, or the standard deviation that such noise has."""
+"""Wrong assumptions: `best` still assumes +-1 mm, or the standard deviation of that noise."""
 WANDERING = tuple(
     Study(key, "best", options, at_least)
     for key, options, at_least in (
@@ -131,17 +131,17 @@ WANDERING = tuple(
         ("step_2", ("--step-mm", "2"), {AT_END: 0.99}),
     )
 )
-"""A heading, a roll or a bias that moves by itself, and other troubles that no row above has."""
+"""Random walks of heading, roll or bias, and other disturbances."""
 _COMPARED = (
     *("normal_noise", "noise_13", "noise_20", "outliers", "slip_5", "play_40", "lag_8", "kappa_08"),
     *("kappa_12", "late", "flips"),
 )
 COMPARED = {
     BEST.key: BEST,
-    **{study.key: study for study in TROUBLE + TOLD_WRONG if study.key in _COMPARED},
+    **{study.key: study for study in TROUBLE + MISINFORMED if study.key in _COMPARED},
     **{study.key: study for study in WANDERING},
 }
-"""Rows of the table of estimators, by key."""
+"""Rows of the estimator table, by key."""
 REACHED = "within_1_mm_point"
 _WELL = ("--noise-mm", "0.05", "--claimed-mm", "0.05")
 _MOVING = ("--target-drift-mm-per-s", "0.0333", "--target-breath-mm", "3")
@@ -163,16 +163,16 @@ POINTS = tuple(
         ("_late_untold", ("--untold-delay", "3"), 0.97, {}),
     )
 )
-"""Needles to points, each to one of its own."""
+"""Needles steered to points, each to another one."""
 
 
 def run(study: Study, folder: Path) -> Figures:
-    """Run a study in a process of its own: 10 needles from each of the 1000 starts.
+    """Run a study in its own process: 10 needles from each of the 1000 starts.
 
     Raises
     ------
     UserError
-        If it does not run.
+        If the study fails.
     """
     file = folder / f"{study.key}.json"
     command = [find_executable("needle_sim", "monte_carlo"), "--controller", study.controller]
@@ -181,8 +181,8 @@ def run(study: Study, folder: Path) -> Figures:
     return dict(json.loads(file.read_text(encoding="utf-8")))
 
 
-def judge(study: Study, figures: Figures) -> Iterator[Finding]:
-    """Compare a study's figures with what they must be."""
+def compare_figures(study: Study, figures: Figures) -> Iterator[Finding]:
+    """Compare the figures of a study with the required ones."""
     bounds = [(*bound, True) for bound in study.at_least.items()]
     for key, bound, is_least in (*bounds, *((*bound, False) for bound in study.at_most.items())):
         value = figures[key]

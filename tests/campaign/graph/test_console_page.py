@@ -23,7 +23,7 @@ if MISSING:
 from playwright.sync_api import Page, expect, sync_playwright  # noqa: E402
 from playwright.sync_api import TimeoutError as TooLate  # noqa: E402
 
-# Without 3D: drawn by the processor, the needle in space would cost more than all else.
+# Without 3D, whose software rendering would take most of the CPU.
 FLAGS = [
     "--disable-3d-apis",
     "--no-sandbox",
@@ -34,7 +34,7 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-# Until what is awaited has come [s].
+# Time-out of a condition [s].
 LIMIT = 30.0
 DEPTH = """() => parseFloat([...document.querySelectorAll(".reading")].find(
     (row) => row.querySelector(".name").textContent === "Depth"
@@ -45,7 +45,7 @@ Hand = Callable[[], None]
 
 
 def free_port() -> int:
-    """Return a port that is free, as is the next one."""
+    """Return the first of two consecutive free ports."""
     while True:
         with socket.socket() as page, socket.socket() as hold:
             page.bind(("127.0.0.1", 0))
@@ -59,7 +59,7 @@ def free_port() -> int:
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    """Return the address of a console on a simulated rig; all ends in order afterwards."""
+    """Yield the address of a console on a simulated rig; check its clean exit afterwards."""
     words = ["--level", "tip", "--port", str(free_port())]
     with subprocess.Popen(
         [sys.executable, "-m", "needle_bringup.simulation.console", *words],
@@ -96,7 +96,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def page(browser: Any, address: str) -> Iterator[Page]:
-    """Return a page, ready to steer; what its scripts complain of fails the last test."""
+    """Yield a page, ready to steer; an error of its scripts fails the last test."""
     opened = browser.new_page()
     errors: list[str] = []
     opened.on("pageerror", lambda error: errors.append(str(error)))
@@ -118,10 +118,10 @@ def press(page: Page, name: str) -> None:
 
 
 def check_stands_still(page: Page) -> float:
-    """Fail unless the needle stays where it is once nobody holds; return where [mm]."""
+    """Check that the needle does not move without a hold; return its depth [mm]."""
     expect(reading(page, "Device")).to_have_text("HOLDING")
     expect(page.locator("[data-hold=insert]")).not_to_have_text(re.compile("held"))
-    # Whoever is not moved is exposed once a second: two new tips are a second at least.
+    # At rest, the rig exposes once a second: two new tips take at least a second.
     tip = reading(page, "Tip")
     expect(tip).not_to_have_text(tip.inner_text())
     at = float(page.evaluate(DEPTH))
@@ -133,10 +133,10 @@ def check_stands_still(page: Page) -> float:
 
 
 def hold_until(page: Page, press: Hand, let_go: Hand, wanted: str) -> None:
-    """Hold until the depth [mm] is as wanted, and on: only the test lets go.
+    """Hold until the depth [mm] meets the condition, without a release.
 
-    A browser that a busy machine keeps waiting for 0.25 s loses the hold; as a person would, the
-    test then lets go and presses anew.
+    A browser that is delayed by 0.25 s on a busy machine loses the hold; the test then releases and
+    presses again, as an operator would.
     """
     for _ in range(int(LIMIT)):
         press()
@@ -150,8 +150,8 @@ def hold_until(page: Page, press: Hand, let_go: Hand, wanted: str) -> None:
 
 
 def make_ready(page: Page) -> None:
-    """Press the buttons in their order, as the page advises."""
-    # Before time has started, nobody answers.
+    """Press the buttons in the advised order."""
+    # Services answer only after simulated time has started.
     expect(reading(page, "Depth")).to_have_text("0.0 mm of 120 mm")
     for button, wanted in (
         ("Confirm needle out", "Not homed"),
@@ -164,7 +164,7 @@ def make_ready(page: Page) -> None:
 
 
 def test_a_needle_is_steered_by_the_space_bar_and_stops_with_it(page: Page) -> None:
-    # Not one of the buttons on the way here has moved it.
+    # None of the buttons so far has moved the needle.
     assert check_stands_still(page) == 0.0
     page.evaluate("document.activeElement.blur()")
     space = page.keyboard
@@ -180,7 +180,7 @@ def test_a_pointer_holds_and_stop_ends_it_until_a_new_press(page: Page) -> None:
     hold = page.locator("[data-hold=insert]")
     hold.hover()
     hold_until(page, page.mouse.down, page.mouse.up, f"> {begin + 1.0}")
-    # As by another hand: the pointer is still down.
+    # Stop while the pointer is still down.
     page.evaluate("document.getElementById('stop').click()")
     at = check_stands_still(page)
     page.mouse.up()
@@ -195,14 +195,14 @@ def test_another_page_sees_and_can_stop_but_not_move(
     other = browser.new_page()
     try:
         other.goto(address)
-        # Who steers looks at their page: one that lies behind gets less of the processor.
+        # A browser throttles background pages, so bring the steering page to the front.
         page.bring_to_front()
         hold_until(page, page.mouse.down, page.mouse.up, f"> {begin + 0.5}")
         expect(other.locator("#hold-words")).to_have_text("another page steers")
         expect(other.get_by_role("button", name="Switch off")).to_be_disabled()
         expect(page.get_by_role("button", name="Switch off")).to_be_enabled()
         press(other, "Stop")
-        # Whether the first page's hold had ended before or not, the device was told.
+        # The device received the stop, whether or not the hold had ended before.
         expect(other.locator(".answer")).to_contain_text("device/stop: ")
         at = check_stands_still(other)
         other.locator("[data-hold=insert]").hover()

@@ -1,4 +1,4 @@
-"""What a command started, and what that started, ends with it."""
+"""All descendants of a command end with it."""
 
 import os
 import subprocess
@@ -8,7 +8,7 @@ import pytest
 
 from needle_bringup.workplace import ending_descendants, processes_with
 
-# A child that starts another in a session of its own.
+# A child that starts another one in its own session.
 CODE = """
 import signal, subprocess, sys
 ends = "import signal; print('on', flush=True); signal.pause()"

@@ -1,4 +1,4 @@
-"""Nodes as processes: whoever is killed, none is left."""
+"""No process is left when a node or its parent is killed."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ time.sleep(1000)
 
 
 def assert_ends(pid: int) -> None:
-    """Wait until a process is gone, or a zombie."""
+    """Wait until a process has ended or is a zombie."""
     with contextlib.suppress(OSError):
         while "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]:
             wait_for([], 0.0)

@@ -1,4 +1,4 @@
-"""README's nodes by hand: they steer in whatever order they start."""
+"""Nodes that are started by hand steer in any order of their start."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ NODES = {
 ORDERS = random.Random(1).sample(list(itertools.permutations(NODES)), 6)
 
 
-class Hand:
-    """Starts nodes as somebody does in terminals."""
+class ManualStart:
+    """Starts nodes as a user does in terminals."""
 
     def __init__(self, folder: Path, domain: int) -> None:
         self.bag = folder / "bag"
@@ -37,7 +37,7 @@ class Hand:
         self.nodes: dict[str, NodeProcess] = {}
 
     def start(self, name: str) -> None:
-        """Start a node, or start it again."""
+        """Start or restart a node."""
         package, words = NODES[name]
         self.nodes[name] = NodeProcess(
             name,
@@ -48,16 +48,16 @@ class Hand:
         )
 
     def has_steered(self) -> bool:
-        """Return whether the stand-in ends, having inserted the needle."""
+        """Return whether the simulated operator ends after the insertion."""
         return wait_for([self.nodes[STAND_IN]], PATIENCE) == [] and (
             self.nodes[STAND_IN].exit_code == 0
         )
 
 
 @contextmanager
-def hand_at(folder: Path) -> Iterator[Hand]:
+def hand_at(folder: Path) -> Iterator[ManualStart]:
     with reserve_domain_id() as domain:
-        hand = Hand(folder, domain)
+        hand = ManualStart(folder, domain)
         try:
             yield hand
         finally:

@@ -1,4 +1,4 @@
-"""What only real processes and rcl itself show of `needle_core`."""
+"""Behaviour of `needle_core` that needs real processes or rcl."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ spin = lambda node, end: 7
 sys.exit(run_node(node, help_text="", parameters=object, args=["one"], spin=spin))
 """
     with reserve_domain_id() as domain:
-        # Of what the rig says to each other; discovery has the one before.
+        # Port of user data; the one before belongs to discovery.
         port = ports_of(domain)[FIRST_PARTICIPANT + 1]
         (SHARED_MEMORY / f"fastrtps_port{port}").write_bytes(b"")
         environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
@@ -104,7 +104,7 @@ def test_a_node_goes_when_what_it_said_has_reached_a_subscriber_that_stood_still
                 env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                # Nothing is read ahead: what is left can be waited for.
+                # Unbuffered, so that select() finds the remaining output.
                 bufsize=0,
             )
             ends.enter_context(process)
@@ -116,7 +116,7 @@ def test_a_node_goes_when_what_it_said_has_reached_a_subscriber_that_stood_still
         assert says.stdout is not None
         assert says.stdout.readline() == b"is listened to\n"
         hears.send_signal(signal.SIGSTOP)
-        # It hears on until all of its threads stand still.
+        # Wait until all of its threads are stopped.
         os.waitid(os.P_PID, hears.pid, os.WSTOPPED)
         try:
             says.stdin.write(b"\n")
@@ -152,7 +152,7 @@ def test_a_kill_frees_the_name_that_a_process_has() -> None:
 
 
 class Desk:
-    """What is prepared in the worker."""
+    """State that is prepared in the worker."""
 
     lies_there: ClassVar[str] = ""
 

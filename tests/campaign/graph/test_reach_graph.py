@@ -1,4 +1,4 @@
-"""Who reaches a node that was started with nothing set, and who reads its memory."""
+"""Network reach and shared memory of a node with default environment."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from needle_core.process.ros_domain import ports_of, reserve_domain_id
 
 LIMIT = 30.0
 OPEN = {DISCOVERY_RANGE: "SUBNET"}
-# Asks the other computer for a rig, and presses its emergency stop as long as it must: until the
-# one that is open has felt it, then for as long again and two seconds more.
+# Sends emergency stops to both rigs on the other computer until the open one is stopped, then for
+# the same time again and two seconds.
 ASK = """
 import json, time
 import rclpy
@@ -68,7 +68,7 @@ def domain() -> Iterator[int]:
 
 
 def bare(domain: int, **more: str) -> dict[str, str]:
-    """Return an environment as plain ROS has it: nothing of scripts/env.sh about networks."""
+    """Return the environment without the network settings of scripts/env.sh."""
     environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
     for name in (DISCOVERY_RANGE, PROFILES):
         environment.pop(name, None)

@@ -1,4 +1,4 @@
-"""An extended Kalman filter with the roll law of `best`: what a bank of hypotheses is compared to.
+"""An extended Kalman filter with the roll law of `best`, the reference of the filter bank.
 
 One needle is a position p, an orientation R and a curvature kappa; their error (dp, dtheta, dkappa)
 has R_true = exp(dtheta) R in the frame of the plane. The filter knows no torsion, no jumps, no
@@ -28,7 +28,7 @@ STATES = 7
 ORIENTATION_DRIFT = math.radians(5.0) ** 2 / 0.1
 """Variance by which the orientation drifts over a length: 5 deg over 100 mm [rad^2/m]."""
 CURVATURE_SPREAD = 0.2
-"""Standard deviation of the curvature, as a share of what is assumed."""
+"""Standard deviation of the curvature, relative to the assumed one."""
 NEEDLE = np.dtype(
     [
         ("position", np.float64, 3),
@@ -69,7 +69,7 @@ class EkfNeedles:
         self._insertion = 0.0
 
     def start(self, tips: FloatArray) -> FloatArray:
-        """Take the first measured tips; see `study.Controller.start`."""
+        """Start with the first measured tips; see `study.Controller.start`."""
         self._needles = np.zeros(len(tips), NEEDLE)
         self._needles["position"] = tips
         self._needles["rotation"] = np.eye(3)
@@ -84,11 +84,11 @@ class EkfNeedles:
         tips: FloatArray,
         age: float | FloatArray,
     ) -> FloatArray:
-        """Take a step and what was measured after it; see `study.Controller.step`."""
+        """Predict a step and correct with its tips; see `study.Controller.step`."""
         length = float(np.max(d_insertion))
         self._insertion += length
         _advance_all(self._needles, length, d_rotation)
-        # A tip that is late is moved on by what the needle is thought to have gone since.
+        # Move a late tip on by the predicted motion since its exposure.
         self._moved.append(self._needles["moved"].copy())
         late = round(float(np.max(age)) / length)
         since = np.sum(self._moved[len(self._moved) - late :], axis=0) if late else 0.0
@@ -96,7 +96,7 @@ class EkfNeedles:
         return self._rates()
 
     def belief(self) -> Belief:
-        """Return what is known after the last step; see `study.Controller.belief`."""
+        """Return the estimate after the last step; see `study.Controller.belief`."""
         needles = self._needles
         known = np.array([_plane_uncertainty(needle) for needle in needles])
         x, sin_pitch = needles["position"][:, 0].copy(), needles["rotation"][:, 0, 2].copy()

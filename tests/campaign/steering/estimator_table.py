@@ -1,4 +1,4 @@
-"""Estimators side by side under everything that `control_studies` lets go wrong, as one table.
+"""Table of estimators under all disturbances of `control_studies`.
 
 python -m campaign.steering.estimator_table --needles 10000 --table table.md --json now.json
     --before before.json
@@ -31,15 +31,15 @@ from needle_sim.studies.study import Controller, run_study
 
 ESTIMATORS = ("best", "ekf", "paper")
 EDGES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.7, 1.0)
-"""Of the bins of the stated probability of a miss."""
+"""Edges of the bins of the stated probability of a miss."""
 _STARTS = 1000
 Bins = list[tuple[int, float, int]]
-"""Of each bin: needles, sum of what they state, misses."""
+"""Needles, sum of stated probabilities, and misses of each bin."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """Figures of one estimator under one kind of trouble.
+    """Figures of one estimator under one disturbance.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Row:
 
 
 Table = dict[str, dict[str, Row]]
-"""By trouble and estimator."""
+"""Rows by disturbance and estimator."""
 
 
 def steer(study: Study, estimator: str, needles: int) -> Row:
@@ -131,7 +131,7 @@ def _bins(stated: Any, missed: Any) -> Bins:
 
 
 def agrees(needles: int, stated: float, misses: int) -> bool:
-    """Tell whether misses agree with what was stated: within the 95 % interval of their share.
+    """Return whether the stated probability is in the 95 % interval of the share of misses.
 
     Parameters
     ----------
@@ -262,7 +262,7 @@ def _run(words: Sequence[str]) -> int:
     for key in keys:
         table[key] = {"before": before[key]["best"]} if key in before else {}
         for name in estimators:
-            # The paper's law cannot flip, and is unstable when held over 2 mm.
+            # The paper's law cannot flip, and is unstable with steps of 2 mm.
             if name == "paper" and {"--flips", "--step-mm"} & set(COMPARED[key].options):
                 continue
             row = table[key][name] = steer(COMPARED[key], name, needles)
@@ -273,7 +273,7 @@ def _run(words: Sequence[str]) -> int:
                 flush=True,
             )
         if json_file is not None:
-            # After each row: an hour's figures are not lost with the last.
+            # Write after each row, so that an interruption loses one row only.
             json_file.write_text(json.dumps(table, default=dataclasses.asdict), encoding="utf-8")
     text = markdown(table, ["before", *estimators] if before else estimators)
     print(text)

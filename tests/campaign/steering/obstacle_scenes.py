@@ -10,22 +10,22 @@ import numpy as np
 from needle_sim.needle.se3 import FloatArray
 
 NEAREST, FARTHEST = 0.060, 0.120
-"""Length of the arc that leads to a target where nothing is in the way [m]."""
+"""Length of the arc to the target without obstacles [m]."""
 LARGEST_CURVATURE_SHARE = 0.85
-"""Of the needle's curvature, of that arc."""
+"""Largest curvature of that arc, relative to the needle's."""
 MOST_OBSTACLES = 6
 SMALLEST, LARGEST = 0.003, 0.010
 """Radius of an obstacle [m]."""
 _ASIDE = 0.012
-"""Distance of its middle from the straight way, in x and in y, at most [m]."""
+"""Largest distance of its centre from the straight line, in x and y [m]."""
 _FREE_BELOW, _FREE_AROUND = 0.012, 0.004
-"""What is clear around the entry, and around the target and a depth of 15 mm [m]."""
+"""Clearance around the entry, and around the target and a depth of 15 mm [m]."""
 _TRIES = 100
 
 
 @dataclasses.dataclass(frozen=True)
 class ObstacleScene:
-    """A target with obstacles before it, and how the needle lies at the entry.
+    """A target behind obstacles, and the orientation of the needle at the entry.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class ObstacleScene:
     obstacles : ndarray, shape (N, 7)
         Ends of the axis and radius of each capsule [m]; a sphere's ends are one.
     pitch, roll : float
-        Of the needle at the entry, which nobody is told [rad].
+        Orientation at the entry, unknown to the controller [rad].
     """
 
     target: FloatArray
@@ -46,7 +46,7 @@ class ObstacleScene:
 def make_scene(
     seed: int, number: int, *, curvature: float, pitch_bound: float, roll_bound: float
 ) -> ObstacleScene:
-    """Return a scene; its obstacles may leave no way to the target.
+    """Return a scene, which may have no path to the target.
 
     Parameters
     ----------

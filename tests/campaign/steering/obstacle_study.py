@@ -1,4 +1,4 @@
-"""Generated scenes with obstacles: which can be solved, which are taken on, and how they end.
+"""Generated scenes with obstacles: solvable, accepted and reached ones.
 
 python -m campaign.steering.obstacle_study --scenes 1000 --seed 1
 """
@@ -16,12 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from campaign.steering.obstacle_scenes import ObstacleScene, clearance, make_scene
-from campaign.steering.path_judge import way_after
-from needle_bringup.studies.study_laws import rrt_law
+from campaign.steering.path_search import find_path
 from needle_controller.laws.law import SteeringCommand
-from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import offset_plane
-from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import next_step
 from needle_controller.protocol.joint_history import JointSample
@@ -34,11 +31,11 @@ from needle_sim.needle.se3 import FloatArray
 NEEDLE_RADIUS = 0.00035
 CURVATURE = SteeringSettings.curvature
 SAMPLES = 4000
-"""Points of the search that judges a scene."""
+"""Random points of the search for a path."""
 DEPTH = 0.2
 _SUBSTEPS = 4
 Drive = Callable[[FloatArray, JointSample], SteeringCommand | None]
-"""Takes a tip and the joints at its exposure; None where there is no way on."""
+"""Function from a tip and its joints to a command; None if there is no path."""
 LABELS = {
     "scenes": "scenes",
     "solvable": "solvable with 90 % of the curvature, 0.75 mm clear",
@@ -63,14 +60,14 @@ class SceneOutcome:
     Attributes
     ----------
     bare, solvable, roomy : bool
-        Whether the judge finds a way with all, 90 % or 85 % of the curvature, 0.35, 0.75 or 1.25 mm
-        clear of everything.
+        Whether the search finds a path with all, 90 % or 85 % of the curvature, 0.35, 0.75 or
+        1.25 mm clear of everything.
     taken, stopped : bool
-        Whether the controller set out, and whether it saw no way on.
+        Whether the controller started, and whether it stopped for lack of a path.
     miss : float
-        True distance from the target at the end [m]; inf where it was not taken on.
+        True distance from the target at the end [m]; inf if it did not start.
     least : float
-        Least clearance of the true needle's surface [m]; likewise.
+        Least clearance of the needle's surface [m]; inf if it did not start.
     """
 
     bare: bool
@@ -82,10 +79,10 @@ class SceneOutcome:
     least: float = math.inf
 
 
-def judge(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcome:
-    """Return whether a scene can be solved, of a needle that has not set out."""
+def solvability(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcome:
+    """Return whether a scene has a path, as the outcome of a needle that was not started."""
     bare, solvable, roomy = (
-        way_after(
+        find_path(
             scene.target,
             scene.obstacles,
             share * CURVATURE,
@@ -102,18 +99,16 @@ def judge(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcome:
 
 def steer(
     scene: ObstacleScene,
-    judged: SceneOutcome,
+    solved: SceneOutcome,
     settings: SteeringSettings,
     rng: np.random.Generator,
     times: list[float],
-    *,
-    rrt: bool = False,
 ) -> SceneOutcome:
     """Steer a needle through a scene as the node does; return how it ended.
 
     Parameters
     ----------
-    scene, judged : ObstacleScene, SceneOutcome
+    scene, solved : ObstacleScene, SceneOutcome
         The scene, and what is known of it.
     settings : SteeringSettings
         The controller's; its `tip_noise_bound` is the largest error of a measured coordinate, too.
@@ -121,12 +116,10 @@ def steer(
         Of the tips' noise.
     times : list of float
         What each update takes of the processor is added here [s].
-    rrt : bool
-        Whether the published planner leads it, which takes on whatever it is given.
     """
-    drive = _reference(scene, settings) if rrt else _best(scene, settings)
+    drive = _start_controller(scene, settings)
     if drive is None:
-        return judged
+        return solved
     plant = NeedlePlant(initial_pose(scene.pitch, scene.roll), curvature=CURVATURE)
     noise = settings.tip_noise_bound
     joints, least = JointSample(0, 0.0, 0.0), math.inf
@@ -141,7 +134,7 @@ def steer(
         if step is None:
             miss = float(np.linalg.norm(_tip(plant) - scene.target))
             return dataclasses.replace(
-                judged, taken=True, stopped=command is None, miss=miss, least=least
+                solved, taken=True, stopped=command is None, miss=miss, least=least
             )
         length, turn = step.insertion - joints.insertion, step.rotation - joints.rotation
         for _ in range(_SUBSTEPS):
@@ -151,7 +144,7 @@ def steer(
     raise AssertionError
 
 
-def _best(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
+def _start_controller(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
     """Return what steers a needle as the node does, None where that refuses to start."""
     obstacles = tuple(float(value) for value in scene.obstacles.ravel())
     control = PlaneControl(dataclasses.replace(settings, obstacles=obstacles), offset_plane(0.0))
@@ -166,32 +159,10 @@ def _best(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
     return drive
 
 
-def _reference(scene: ObstacleScene, settings: SteeringSettings) -> Drive:
-    """Return what steers a needle by the published planner, with the estimator of `best`."""
-    estimator = make_controller(settings, np.eye(3), np.zeros(3))[0]
-    motion = TargetMotion()
-    motion.see(0.0, scene.target)
-    law = rrt_law(motion, settings, np.random.default_rng(1), scene.obstacles)
-    before: list[JointSample] = []
-
-    def drive(tip: FloatArray, joints: JointSample) -> SteeringCommand:
-        if before:
-            last = before.pop()
-            estimator.advance(joints.insertion - last.insertion, joints.rotation - last.rotation)
-            estimator.correct(tip)
-        else:
-            estimator.reset(tip, [joints.insertion, joints.rotation])
-        before.append(joints)
-        return law(estimator.estimate(), 0.0, joints.insertion, math.inf)
-
-    return drive
-
-
 def study(
     scenes: int,
     seed: int,
     *,
-    rrt: bool = False,
     pitch_bound: float,
     roll_bound: float,
     entry_angle_std: float,
@@ -209,8 +180,6 @@ def study(
         What the controller is told of that [rad].
     noise : float
         Largest error of a measured coordinate, as it is told [m].
-    rrt : bool
-        See `steer`.
     """
     settings = SteeringSettings(
         depth=DEPTH,
@@ -227,7 +196,7 @@ def study(
             seed, n, curvature=CURVATURE, pitch_bound=pitch_bound, roll_bound=roll_bound
         )
         rng = np.random.default_rng([seed, n, 1])
-        outcomes.append(steer(scene, judge(scene, settings), settings, rng, times, rrt=rrt))
+        outcomes.append(steer(scene, solvability(scene, settings), settings, rng, times))
     return figures(outcomes, times)
 
 
@@ -242,7 +211,7 @@ def figures(outcomes: Sequence[SceneOutcome], times: Sequence[float]) -> dict[st
 
     solvable = [one for one in outcomes if one.solvable]
     roomy = [one for one in outcomes if one.roomy]
-    # The judge misses some ways: where a needle was led there, there is one.
+    # The search misses some paths: a scene whose needle arrived is solvable.
     unsolvable = [
         one
         for one in outcomes
@@ -282,19 +251,17 @@ def _run(words: Sequence[str]) -> int:
         ("--noise-mm", "1", "A", "maximum error of each coordinate, known to the controller"),
     )
     parser = study_parser("obstacle_study", "Steer needles around generated obstacles.", options)
-    parser.add_argument("--rrt", action="store_true", help="use the published RRT planner")
     given = parser.parse_args(words)
     path = output_file("--json", given.json)
     seen = study(
         whole_number("--scenes", given.scenes, 1, 100_000),
         whole_number("--seed", given.seed, 0, 2**31 - 1),
-        rrt=given.rrt,
         pitch_bound=math.radians(number("--pitch-deg", given.pitch_deg, 0.0, 20.0, "deg")),
         roll_bound=math.radians(number("--roll-deg", given.roll_deg, 0.0, 180.0, "deg")),
         entry_angle_std=math.radians(number("--told-deg", given.told_deg, 0.1, 45.0, "deg")),
         noise=number("--noise-mm", given.noise_mm, 0.01, 10.0, "mm") * 1e-3,
     )
-    tell(LABELS, seen, path)
+    print_figures(LABELS, seen, path)
     return EXIT_DONE
 
 
@@ -311,7 +278,9 @@ def study_parser(
     return parser
 
 
-def tell(labels: Mapping[str, str], seen: Mapping[str, float | None], path: Path | None) -> None:
+def print_figures(
+    labels: Mapping[str, str], seen: Mapping[str, float | None], path: Path | None
+) -> None:
     """Print a study's figures, and write them where --json says."""
     for name, label in labels.items():
         value = seen[name]

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from campaign.steering.obstacle_scenes import ObstacleScene, make_scene
-from campaign.steering.obstacle_study import CURVATURE, study_parser, tell
+from campaign.steering.obstacle_study import CURVATURE, print_figures, study_parser
 from needle_controller.planning.entry import entry_state
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_evaluation import PathSettings
@@ -142,7 +142,7 @@ def _run(words: Sequence[str]) -> int:
         number("--radius-mm", given.radius_mm, 20.0, 10_000.0, "mm") * 1e-3,
         number("--tolerance-mm", given.tolerance_mm, 0.0, 10.0, "mm") * 1e-3,
     )
-    tell(LABELS, seen, path)
+    print_figures(LABELS, seen, path)
     return EXIT_DONE
 
 

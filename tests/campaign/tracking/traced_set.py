@@ -38,7 +38,7 @@ _STREAM = 23
 
 @dataclasses.dataclass(frozen=True)
 class TracedScene:
-    """A sequence by name: what it shows follows from this.
+    """Name of a sequence, which determines its content.
 
     Attributes
     ----------
@@ -61,13 +61,13 @@ class TracedScene:
 
     @property
     def name(self) -> str:
-        """Of its files."""
+        """Stem of its files."""
         return f"{self.rig}_{self.appearance}_{self.seed}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DrawnSequence:
-    """Images of a scene, and what is true of them.
+    """Images of a scene, and the truth.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ def scenes(first_seed: int) -> list[TracedScene]:
 
 
 def drawn(folder: Path, wanted: Sequence[TracedScene]) -> Iterator[DrawnSequence]:
-    """Yield sequences that are there; trace those that are not.
+    """Yield stored sequences, and trace missing ones.
 
     Parameters
     ----------

@@ -4,25 +4,82 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from campaign.tracking.traced_set import DrawnSequence, TracedScene
-from campaign.tracking.variations import AS_TRACED, Variation
 from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.stereo.triangulation import SpatialTip
 
+Image = NDArray[np.uint8]
+_NOISE = 12.0  # grey levels
+_QUALITY = 20  # of JPEG
+_GAIN = 0.4
 SETTLED = 3
-"""Pairs of a sequence's begin that do not count: a tracker without the insertion wants to see a
-needle three times."""
+"""First pairs of a sequence that do not count: a tracker without insertion needs three pairs."""
 
 
-class Told(enum.Enum):
-    """The tracker's knowledge beside the pairs of a sequence."""
+@dataclasses.dataclass(frozen=True)
+class Variation:
+    """One wrong parameter or degradation of the images.
+
+    Attributes
+    ----------
+    name : str
+        Description.
+    width : float
+        Given needle width relative to the true one.
+    zero : float
+        Error of the given insertion [m].
+    seen : callable
+        Function from image and random generator to image.
+    """
+
+    name: str
+    width: float = 1.0
+    zero: float = 0.0
+    seen: Callable[[Image, np.random.Generator], Image] = lambda image, _: image
+
+
+def _blurred(sigma: float) -> Callable[[Image, np.random.Generator], Image]:
+    return lambda image, _: np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.uint8)
+
+
+def _coded(image: Image, _: np.random.Generator) -> Image:
+    code = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+    return np.asarray(cv2.imdecode(code, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+
+def _noisy(image: Image, rng: np.random.Generator) -> Image:
+    values = image + rng.normal(0.0, _NOISE, image.shape)
+    return np.asarray(np.clip(np.rint(values), 0.0, 255.0), np.uint8)
+
+
+def _dim(image: Image, _: np.random.Generator) -> Image:
+    return np.asarray(np.rint(_GAIN * image), np.uint8)
+
+
+AS_TRACED = Variation("as traced")
+VARIATIONS = (
+    Variation("width told 0.7 times", width=0.7),
+    Variation("width told 1.3 times", width=1.3),
+    Variation("stage 1 mm too long", zero=1e-3),
+    Variation("stage 1 mm too short", zero=-1e-3),
+    Variation("blur of 1 px", seen=_blurred(1.0)),
+    Variation("blur of 2 px", seen=_blurred(2.0)),
+    Variation("JPEG 20", seen=_coded),
+    Variation("noise 12", seen=_noisy),
+    Variation("gain 0.4", seen=_dim),
+)
+
+
+class KnownInput(enum.Enum):
+    """Inputs of the tracker besides the pairs of a sequence."""
 
     NOTHING = "without"
     INSERTION = "with"
@@ -30,23 +87,23 @@ class Told(enum.Enum):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class TracedAnswer:
+class TrackedPair:
     """The tracker's answer to a path-traced pair.
 
     Attributes
     ----------
     scene : TracedScene
-        What it showed.
-    told : Told
-        What the tracker was told.
+        Scene of the pair.
+    known : KnownInput
+        Further inputs of the tracker.
     tip : SpatialTip or None
-        What it believed.
+        Reported tip.
     truth : ndarray, shape (3,), or None
         The end of the shaft's axis in `rig` [m]; None where there is no needle.
     """
 
     scene: TracedScene
-    told: Told
+    known: KnownInput
     tip: SpatialTip | None
     truth: NDArray[np.float64] | None
 
@@ -68,22 +125,22 @@ class TracedAnswer:
         return np.asarray(self.tip.position - self.truth)
 
 
-def traced_looks(
-    sequence: DrawnSequence, told: Told, variation: Variation = AS_TRACED
-) -> Iterator[TracedAnswer]:
-    """Yield what is said of a sequence's pairs.
+def tracked_pairs(
+    sequence: DrawnSequence, known: KnownInput, variation: Variation = AS_TRACED
+) -> Iterator[TrackedPair]:
+    """Yield the tracker's results for the pairs of a sequence.
 
-    Of a needle the first `SETTLED` pairs are shown and not yielded, nor are pairs that have not all
-    of its last 10 mm in both images.
+    With a needle, the first `SETTLED` pairs are processed and not yielded, nor are pairs without
+    all of its last 10 mm in both images.
 
     Parameters
     ----------
     sequence : DrawnSequence
         The pairs.
-    told : Told
-        What the tracker is told.
+    known : KnownInput
+        Further inputs of the tracker.
     variation : Variation
-        What is otherwise than the tracker expects.
+        Wrong parameter or degradation.
     """
     rng = np.random.default_rng(sequence.scene.seed)
     stereo = load_calibration(sequence.calibration)
@@ -93,14 +150,14 @@ def traced_looks(
         dataclasses.replace(
             default_settings(stereo),
             needle_width=variation.width * sequence.scene.look.diameter,
-            reference=(left, right) if told is Told.EMPTY_PHANTOM else None,
+            reference=(left, right) if known is KnownInput.EMPTY_PHANTOM else None,
         ),
     )
     for number, pair in enumerate(sequence.pairs):
         left, right = (variation.seen(image, rng) for image in pair)
         insertion = float(sequence.insertions[number]) + variation.zero
-        tip = tracker.process(left, right, None if told is Told.NOTHING else insertion).tip
+        tip = tracker.process(left, right, None if known is KnownInput.NOTHING else insertion).tip
         if not sequence.scene.look.needle:
-            yield TracedAnswer(sequence.scene, told, tip, None)
+            yield TrackedPair(sequence.scene, known, tip, None)
         elif number >= SETTLED and sequence.seen[number].min() >= 1.0:
-            yield TracedAnswer(sequence.scene, told, tip, sequence.tips[number])
+            yield TrackedPair(sequence.scene, known, tip, sequence.tips[number])

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from campaign.tracking.tracker_sequences import Exposure, insertion_sequence
+from needle_sim.camera.renderer import StereoRenderer
+from needle_sim.camera.scenarios import find_scenario
+from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.filter.measurement import TrackState
 from needle_tracker.filter.needle_tracker import NeedleTracker
@@ -19,7 +23,88 @@ from needle_tracker.optics.calibration import StereoCalibration, load_calibratio
 Array = NDArray[np.float64]
 
 WRONG = 1.5e-3
-_SEEN = 0.95  # share of the last 10 mm in view, in both cameras: the needle is to be seen
+_SEEN = 0.95  # visible share of the last 10 mm in both cameras from which the needle must be found
+STEP = 1e-3
+FIRST_STEP = 6
+SPACING = 5e-4
+CURVATURE = 8.2
+# Distance from the axis at which the bevel is turned back [m].
+_STRAY = 4e-3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Exposure:
+    """One stereo pair and its truth.
+
+    Attributes
+    ----------
+    insertion : float
+        Length of needle in the phantom [m].
+    T_rig_tip : ndarray, shape (4, 4)
+        The tip's true pose.
+    left, right : ndarray of uint8, shape (height, width)
+        The images.
+    seen : pair of float
+        Share of the last 10 mm that the left and the right camera see.
+    """
+
+    insertion: float
+    T_rig_tip: NDArray[np.float64]
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+    seen: tuple[float, float]
+
+
+def insertion_sequence(
+    calibration: Path, scenario: str, seed: int, steps: int, noise: float | None = None
+) -> Iterator[Exposure]:
+    """Yield one exposure for each millimetre of a simulated insertion.
+
+    The bevel is turned at random, from held to spun, and away from where the needle strays to.
+
+    Parameters
+    ----------
+    calibration : Path
+        The rig's calibration file.
+    scenario : str
+        One of the renderer's.
+    seed : int
+        Of the renderer, the start and the steering; not negative.
+    steps : int
+        Number of exposures, from 6 mm of insertion on.
+    noise : float, optional
+        Standard deviation of the sensor's noise, in place of the scenario's [grey levels].
+    """
+    trouble = find_scenario(scenario)
+    if noise is not None:
+        trouble = dataclasses.replace(trouble, noise=noise)
+    renderer = StereoRenderer(load_stereo_rig(calibration), seed, scenario=trouble)
+    rng = np.random.default_rng([seed, 41])
+    pitch, roll = rng.uniform(-1.0, 1.0, 2) * (math.radians(5.0), math.pi)
+    plant = NeedlePlant(initial_pose(float(pitch), float(roll)), curvature=CURVATURE)
+    turn = 0.0
+    for number in range(FIRST_STEP + steps):
+        if number % 8 == 0:
+            turn = float(rng.choice([0.0, 0.02, 0.06, 0.3]) * rng.choice([-1.0, 1.0]))
+            turn += _turn_back(np.asarray(plant.T_rig_tip), 8)
+        plant.advance(STEP, turn)
+        if number < FIRST_STEP:
+            continue
+        pose = np.asarray(plant.T_rig_tip)
+        path = plant.centreline(SPACING)
+        left, right = renderer.render(pose, path, number)
+        seen = renderer.visible_share(pose, path, number)
+        yield Exposure(STEP * (number + 1), pose, left, right, seen)
+
+
+def _turn_back(pose: NDArray[np.float64], steps: int) -> float:
+    """Return the rotation per step that turns the bending towards the axis, 0 while near it."""
+    sideways = pose[:2, 3] + 0.02 * pose[:2, 2]
+    if float(np.hypot(*sideways)) < _STRAY:
+        return 0.0
+    # The needle bends towards -y of its own frame.
+    wanted = pose[:3, :3].T @ np.array([-sideways[0], -sideways[1], 0.0])
+    return math.remainder(math.atan2(wanted[0], -wanted[1]), 2.0 * math.pi) / steps
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -48,21 +133,21 @@ class TrackedRun:
 
     @property
     def found(self) -> NDArray[np.bool_]:
-        """Tell whether there is a tip."""
+        """Whether there is a tip, for each exposure."""
         return np.asarray(np.isfinite(self.normalised))
 
     @property
     def distances(self) -> Array:
-        """Length of the errors [m], of the tips there are."""
+        """Lengths of the errors of all tips [m]."""
         return np.asarray(np.linalg.norm(self.errors[self.found], axis=1))
 
     @property
     def depths(self) -> Array:
-        """Size of the errors along the cameras' depth [m], of the tips there are."""
+        """Absolute errors of all tips in depth [m]."""
         return np.asarray(np.abs(self.errors[self.found, 0]))
 
     def slowest_recovery(self) -> int:
-        """Return the most pairs that it took to find the needle once it was seen again."""
+        """Return the largest number of pairs until a visible needle was found again."""
         longest = waiting = 0
         for seen, found in zip(self.seen, self.found, strict=True):
             waiting = 0 if found or not seen else waiting + 1
@@ -71,7 +156,7 @@ class TrackedRun:
 
 
 def new_tracker(calibration: StereoCalibration) -> NeedleTracker:
-    """Return a tracker as the node's defaults make it."""
+    """Return a tracker with the defaults of the node."""
     return NeedleTracker(calibration, default_settings(calibration))
 
 
@@ -103,7 +188,7 @@ def track_run(
         states.append(measured.state)
         seen.append(min(exposure.seen) >= _SEEN)
         error, square = np.full(3, np.nan), np.nan
-        # In the entry zone a tip may be the stage's alone: it was not found.
+        # In the entry zone, a tip may come from the insertion alone: it does not count as found.
         if measured.tip is not None and measured.state is not TrackState.ENTRY:
             error = measured.tip.position - exposure.T_rig_tip[:3, 3]
             square = float(error @ np.linalg.solve(measured.tip.covariance, error))

@@ -1,4 +1,4 @@
-"""Publishes stereo images and what goes with them, as a rig at full rate does.
+"""Publishes stereo images and all other topics of a rig at full rate.
 
 `python -m campaign.trials.recording_load SECONDS [small]`: the nanoseconds of every header's stamp
 are the message's number on its topic, from 0. Begins when a node named recorder listens to every
@@ -49,11 +49,11 @@ STREAMS: Final = (
     ("sim/tip_pose", PoseStamped, 50.0, RELIABLE),
     ("joint_states", JointState, 50.0, JOINT_STATES),
 )
-_STAMP: Final = 4  # behind the four bytes that say how CDR is encoded
+_STAMP: Final = 4  # after the four bytes of the CDR encapsulation header
 
 
 def main(duration: float, *, images: bool) -> None:
-    """Send for so long [s]; print how much of each topic."""
+    """Publish for a duration [s]; print the number of messages by topic."""
     restrict_discovery()
     rclpy.init(args=[])
     node = WholeNode("recording_load")
@@ -66,12 +66,12 @@ def main(duration: float, *, images: bool) -> None:
         for publisher in publishers
     ):
         time.sleep(0.05)
-    # Others that listen, too, have the time that discovery takes.
+    # Wait for the discovery of other subscribers.
     time.sleep(1.0)
     begin = time.monotonic()
     while (elapsed := time.monotonic() - begin) < duration:
         for number, (_, _, rate, _) in enumerate(chosen):
-            # Not faster than real time after a pause: a camera does not catch up either.
+            # Do not catch up after a pause, as a camera does not.
             if elapsed * rate >= counts[number]:
                 struct.pack_into("<iI", data[number], _STAMP, 1, counts[number])
                 publishers[number].publish(bytes(data[number]))

@@ -1,4 +1,4 @@
-"""Recordings of numbered messages: at full rate, and killed at random moments."""
+"""Recordings of numbered messages: at full rate, and with a recorder that is killed."""
 
 from __future__ import annotations
 
@@ -16,29 +16,28 @@ from typing import Any
 import numpy as np
 from rosbags.rosbag2 import Reader
 
-from campaign.checking import busy, unreadable
+from campaign.checking import bag_read_error, busy
 from needle_bags.reading.bag_messages import read_contents
 from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import reserve_domain_id
 
-# The first bytes of every message: the encoding, then the stamp's seconds; its nanoseconds are the
-# message's number.
+# Bytes of the stamp's nanoseconds, which are the number of the message.
 _NUMBER = slice(8, 12)
 _START_UP = 30.0
 _LOAD = "campaign.trials.recording_load"
 
 
 def record_full_rate(folder: Path, duration: float, others: int = 2) -> dict[str, Any]:
-    """Record what a rig at full rate sends for so long [s], while other processes are busy.
+    """Record a rig at full rate for a duration [s], while other processes load the CPU.
 
     Returns
     -------
     dict
-        By topic what was `sent`, is `missing` in the bag, and is `counted` as lost by the recorder;
-        the recorder's `share` of a core, its `memory` and how much that `grew` in the second half
-        [MB], the rate of writing, `MB_per_s`, and its exit `code`.
+        Number of messages `sent`; by topic the number `missing` in the bag, and `counted` as lost
+        by the recorder; the recorder's `share` of a core, its `memory` and by how much that `grew`
+        in the second half [MB], the write rate `MB_per_s`, and the exit `code`.
     """
     bag = folder / "full_rate"
     with (
@@ -77,26 +76,25 @@ def record_full_rate(folder: Path, duration: float, others: int = 2) -> dict[str
 
 
 def record_and_kill(folder: Path, moments: int, *words: str) -> Iterator[tuple[str, float, int]]:
-    """Kill a recorder at random moments, recover each time what it leaves.
+    """Kill a recorder at random moments, and recover each bag.
 
     Yields
     ------
     str, float, int
-        Why the bag cannot be read; from its last message to the kill [s]; messages missing between
-        others of their topic.
+        Reason if the bag cannot be read; time from its last message to the kill [s]; number of
+        messages missing between others of their topic.
     """
     rng = np.random.default_rng(5)
     for number in range(moments):
         bag = folder / f"killed_{number}"
-        # A domain for each: what a killed process leaves in shared memory may keep the next one
-        # from hearing the same partners.
+        # A new domain each time: shared memory of a killed process may block discovery.
         with (
             reserve_domain_id() as domain,
             recorder(domain, bag) as recording,
             _process(domain, _LOAD, "3600", *words),
         ):
             deadline = time.monotonic() + _START_UP
-            # The first chunk of data is on the disk.
+            # Wait for the first chunk of data on the disk.
             while sum(file.stat().st_size for file in bag.glob("*.mcap")) < 50_000:
                 if time.monotonic() > deadline or recording.poll() is not None:
                     raise UserError(f"the recorder does not record into {bag}")
@@ -106,10 +104,10 @@ def record_and_kill(folder: Path, moments: int, *words: str) -> Iterator[tuple[s
             recording.kill()
             recording.wait(10.0)
         recover_bag(bag)
-        if why := unreadable(bag):
+        if why := bag_read_error(bag):
             yield why, 0.0, 0
             continue
-        # A best-effort topic may lose what is sent before the recorder is known to it, no more.
+        # A best-effort topic may lose messages before the discovery of the recorder.
         gaps = sum(
             max(found) - min(found) + 1 - len(set(found))
             for topic, found in _numbers(bag).items()
@@ -122,7 +120,7 @@ def record_and_kill(folder: Path, moments: int, *words: str) -> Iterator[tuple[s
 def recorder(
     domain: int, bag: Path, name: str = "recorder"
 ) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
-    """Start a recorder of this node name; it is killed in the end."""
+    """Start a recorder with this node name; kill it at the end."""
     words = ["--ros-args", "-r", f"__node:={name}", "-p", f"bag:={bag}"]
     return _process(domain, "needle_bags.ros.recorder", *words)
 
@@ -144,7 +142,7 @@ def _process(domain: int, module: str, *words: str) -> Iterator[subprocess.Popen
 
 
 def _numbers(bag: Path) -> dict[str, list[int]]:
-    """Return the numbers of the load's messages in a bag, for each topic."""
+    """Return the numbers of the messages in a bag, by topic."""
     found: dict[str, list[int]] = {}
     with Reader(bag) as reader:
         for connection, _, data in reader.messages():
@@ -155,12 +153,12 @@ def _numbers(bag: Path) -> dict[str, list[int]]:
 
 
 def _processor_time(pid: int) -> float:
-    """Return the processor time that a process has taken [s]."""
+    """Return the CPU time of a process [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _memory(pid: int) -> float:
-    """Return the memory of a process that is its own [MB]: without what it shares."""
+    """Return the private memory of a process [MB]."""
     fields = Path(f"/proc/{pid}/statm").read_text("utf-8").split()
     return (int(fields[1]) - int(fields[2])) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -1,4 +1,4 @@
-"""Signals to every node at once, at random moments of a run in real time at 2 x 30 Hz."""
+"""Signals to all nodes at once, at random moments of a run in real time at 2 x 30 Hz."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from campaign.checking import busy, unreadable
+from campaign.checking import bag_read_error, busy
 from campaign.trials.trial_processes import TrialProcesses
 from needle_bringup.simulation.node_graph import NodeProcess
 from needle_bringup.simulation.rig_configuration import command_line_parameters
@@ -18,7 +18,7 @@ from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import reserve_domain_id
 
-# From the start-up to the middle of the insertion [s].
+# Latest signal, in the middle of the insertion [s].
 _LATEST = 12.0
 _START_UP, _SECOND_WITHIN, _HANGS, _POLL = 60.0, 0.3, 20.0, 0.005
 _KINDS = ("SIGINT", "SIGINT twice", "SIGTERM", "SIGHUP")
@@ -33,12 +33,12 @@ class Ended(NamedTuple):
     node : str
         Its name.
     when : str
-        What was sent, and when after all nodes had begun.
+        Signal, and its time after the start of all nodes.
     seconds : float
         From the (first) signal to the end [s].
     wrong : str
-        Why that is no orderly end: its exit code, what it wrote that no node must write, or why the
-        recorder's bag cannot be read.
+        Error of the end: exit code, forbidden output, or why the recorder's bag cannot be read;
+        empty if there is none.
     """
 
     node: str
@@ -48,16 +48,16 @@ class Ended(NamedTuple):
 
 
 def signal_trials(folder: Path, count: int, burners: int) -> Iterator[Ended]:
-    """Yield how each node ended, from `count` graphs one after the other.
+    """Yield the end of each node of `count` graphs, one after the other.
 
     Parameters
     ----------
     folder : Path
-        Takes a folder for each graph.
+        For a folder of each graph.
     count : int
-        Graphs.
+        Number of graphs.
     burners : int
-        Processes that keep the cores busy meanwhile; it keys all that is drawn, too.
+        Number of processes that load the CPU; also the seed.
     """
     rng = random.Random(burners)
     with busy(burners):
@@ -78,7 +78,7 @@ def _trial(
     parameters["sim_rig"]["camera_rate"] = 30.0
     with contextlib.closing(TrialProcesses(folder, domain, parameters)) as graph:
         nodes = list(graph.nodes.values())
-        # Before it catches SIGTERM a node is no more than Python's interpreter.
+        # A node that does not catch SIGTERM yet is still starting.
         deadline = time.monotonic() + _START_UP
         while not all(_catches(node.pid, signal.SIGTERM) for node in nodes):
             if time.monotonic() > deadline:
@@ -86,8 +86,8 @@ def _trial(
             time.sleep(_POLL)
         time.sleep(moment)
         number, sent_at = signal.Signals[kind.split(maxsplit=1)[0]], time.monotonic()
-        # As a terminal does: none sees another's end before it has the signal itself. They are
-        # stopped meanwhile: each that gets it may take the processor from who sends it.
+        # As a terminal does, no node observes another's end before its own signal. All are stopped
+        # meanwhile, because a signalled node could delay the sender.
         for each in (signal.SIGSTOP, number, signal.SIGCONT):
             _send(nodes, each)
         if kind.endswith("twice"):
@@ -102,7 +102,7 @@ def _trial(
         for node in nodes:
             wrong = _wrong(node)
             if node.name == "recorder" and bag.exists():
-                wrong = wrong or unreadable(bag)
+                wrong = wrong or bag_read_error(bag)
             yield Ended(node.name, f"{kind} at {moment:.1f} s", ends.get(node.name, _HANGS), wrong)
 
 
@@ -120,5 +120,5 @@ def _send(nodes: list[NodeProcess], number: signal.Signals) -> None:
 def _wrong(node: NodeProcess) -> str:
     if node.exit_code not in (0, 130):
         return node.describe_end()
-    said = node.log.read_text("utf-8", "replace")
-    return next((f"it said {word!r}" for word in _WRONG if word in said), "")
+    output = node.log.read_text("utf-8", "replace")
+    return next((f"it printed {word!r}" for word in _WRONG if word in output), "")

@@ -1,4 +1,4 @@
-"""One continuous insertion on a virtual clock: controller, driver, emulated drives, a needle."""
+"""One continuous insertion on a virtual clock: controller, driver, emulated drives and needle."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from transport_faults import delay
 
 OFFSET = 0.003
 TIP_STD = 5e-5
-"""Of a tip by the cameras [m]."""
+"""Standard deviation of a tip measured by the cameras [m]."""
 FRAME_RATE = 30.0
 _LONGEST = 600.0
 _STEERING = ("STEERING", "WAITING_FOR_TIP")
 Hand = Callable[[float], Held]
-"""From the time since steering began [s] to what a hand does."""
+"""Function from the time since the begin of steering [s] to the state of the hand."""
 
 
 class _SteeredRig(SimRig):
-    """Moves the needle, and the hand on at each of its cycles."""
+    """Moves the needle, and updates the hand in each cycle."""
 
     tell: Callable[[SimulatedBench, float], None] = staticmethod(lambda *_: None)
 
@@ -48,22 +48,22 @@ def steer(
     see: Callable[[SimulatedBench, SimRigParameters], Sensor] = TipSensor,
     **settings: float,
 ) -> tuple[str, np.ndarray]:
-    """Steer a needle to its end; return the controller's state then, and the way of the tip.
+    """Steer a needle to the end; return the final state of the controller, and the path of the tip.
 
     Parameters
     ----------
     hand : Hand
-        Holds, or pushes.
+        Holds or pushes.
     seed : int
-        Of the needle, the noise of its tip, and the runner.
+        Seed of the needle, the noise of its tip, and the runner.
     pushed : bool
         Whether a hand moves the insertion axis.
     latency : float
-        From an exposure to the controller [s].
+        Time from an exposure to the controller [s].
     see : callable
-        Makes what sees the needle.
+        Constructs the tip sensor.
     **settings : float
-        Of the controller.
+        Settings of the controller.
 
     Returns
     -------
@@ -116,7 +116,7 @@ def steer(
 
 
 def rms_at_end(way: np.ndarray, length: float = 0.02) -> float:
-    """Return the RMS distance from the plane x = `OFFSET` over the last `length` of a way [m]."""
+    """Return the RMS distance from the plane x = `OFFSET` over the last `length` of a path [m]."""
     grid = np.linspace(way[-1, 0] - length, way[-1, 0], 201)
     return math.sqrt(float(np.mean((np.interp(grid, *way.T) - OFFSET) ** 2)))
 
@@ -130,7 +130,7 @@ def constant(speed: float) -> Hand:
 
 
 def changing(rng: np.random.Generator) -> Hand:
-    """Return a hand that goes on at another speed, stops or lets go every 0.3 to 3 s."""
+    """Return a hand that changes speed, stops or releases every 0.3 to 3 s."""
     share = _pieces(rng)
 
     def hand(time: float) -> Held:

@@ -1,4 +1,4 @@
-"""The nodes of a trial as processes that can be killed and started again. No ROS in here."""
+"""The nodes of a trial as processes that can be killed and restarted. Imports no ROS."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class TrialProcesses(NodeGraph):
     Parameters
     ----------
     folder : Path
-        Takes their parameters and logs.
+        For parameters and logs.
     domain : int
         ROS_DOMAIN_ID.
     parameters : Parameters
-        Node to its parameters: all are started.
+        Parameters by node; all nodes are started.
     before : mapping, optional
-        Node to words before its command.
+        Prefix of the command by node.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class TrialProcesses(NodeGraph):
             self.begin(name)
 
     def begin(self, name: str, *command: str, file: Path | None = None) -> None:
-        """Start a node, also again: its own executable, or another command."""
+        """Start or restart a node, by its executable or another command."""
         command = command or (find_executable(_PACKAGES[name], name),)
         words = ("--ros-args", "--disable-external-lib-logs", "--params-file")
         self.nodes[name] = NodeProcess(
@@ -68,31 +68,31 @@ class TrialProcesses(NodeGraph):
         )
 
     def begin_module(self, name: str, module: str, values: Mapping[str, object]) -> None:
-        """Start a node that a module runs, with these parameters."""
+        """Start a node by a module, with these parameters."""
         file = self._folder / f"{name}.yaml"
         write_parameters(file, {name: dict(values)})
         self.begin(name, sys.executable, "-m", module, file=file)
 
     def kill(self, name: str) -> None:
-        """End a node as a crash does, and wait until it is gone."""
+        """Kill a node with SIGKILL, and wait for its end."""
         self.signal(name, signal.SIGKILL)
         wait_for([self.nodes[name]], _KILL_GRACE)
 
     def signal(self, name: str, number: signal.Signals) -> None:
-        """Send a node a signal."""
+        """Send a signal to a node."""
         os.kill(self.nodes[name].pid, number)
 
     def end(self, name: str) -> None:
-        """End a node in order."""
+        """Stop a node."""
         stop([self.nodes.pop(name)])
 
     def close(self) -> None:
-        """End all, in order."""
+        """Stop all nodes."""
         self.stop()
 
 
 def without_recorder(options: SimulateOptions) -> Parameters:
-    """Return the parameters of a simulation's nodes but the recorder, for which none waits."""
+    """Return the parameters of a simulation's nodes without the recorder."""
     parameters = command_line_parameters(options, Path())
     del parameters["recorder"]
     for values in parameters.values():

@@ -57,7 +57,7 @@ class Bench(Component):
     watchers : list of callable
         Called with the time [s] and the motors at every tick.
     deepest_tip : ndarray, shape (3,)
-        Where the true tip was when it was farthest in, in `rig` [m].
+        True tip at the largest insertion, in `rig` [m].
     """
 
     name = "bench"
@@ -106,7 +106,7 @@ class Bench(Component):
             self.deepest_tip = self._plant.T_rig_tip[:3, 3]
 
 
-class Sight(enum.Enum):
+class CameraState(enum.Enum):
     """States of the cameras."""
 
     CLEAR = "clear"
@@ -117,28 +117,28 @@ class Sight(enum.Enum):
 
 
 class TrackerStandIn(Component):
-    """Stands in for the tracker: tells the tip of every exposure.
+    """Replaces the tracker: publishes the tip of every exposure.
 
     Parameters
     ----------
     bench : Bench
-        What is seen.
+        Rig with the needle.
     chance : Random
-        Draws noise, and what is wrong.
+        Draws noise and wrong tips.
 
     Attributes
     ----------
-    sight : Sight
-        What the cameras do.
+    camera_state : CameraState
+        State of the cameras.
     """
 
     name = "stereo_tracker"
 
     def __init__(self, bench: Bench, chance: random.Random) -> None:
         self._bench, self._chance = bench, chance
-        self.sight = Sight.CLEAR
+        self.camera_state = CameraState.CLEAR
         self._last = bench.tip
-        # Answers, and when they are given [s].
+        # Answers with their due times [s].
         self._answers: list[tuple[float, list[Action]]] = []
         self.outputs = (
             Output("needle/tip", m.Point),
@@ -151,10 +151,10 @@ class TrackerStandIn(Component):
         noise = [draw(-TIP_NOISE, TIP_NOISE) for _ in range(3)]
         wrong = [draw(-0.02, 0.02) for _ in range(3)]
         late = draw(0.0, _LATEST_ANSWER)
-        if self.sight is not Sight.FROZEN:
+        if self.camera_state is not CameraState.FROZEN:
             self._last = self._bench.tip + noise
-        seen = self._last + wrong if self.sight is Sight.WRONG else self._last
-        due = at.steady + (late if self.sight is Sight.LATE else 0.0)
+        seen = self._last + wrong if self.camera_state is CameraState.WRONG else self._last
+        due = at.steady + (late if self.camera_state is CameraState.LATE else 0.0)
         self._answers.append((due, list(self._answer(seen, at.stamp_ns))))
         for answer in [one for one in self._answers if one[0] <= at.steady]:
             self._answers.remove(answer)
@@ -162,7 +162,7 @@ class TrackerStandIn(Component):
 
     def _answer(self, seen: np.ndarray, stamp_ns: int) -> Actions:
         x, y, z = seen.tolist()
-        found = self.sight is not Sight.BLACK
+        found = self.camera_state is not CameraState.BLACK
         covariance = [0.0] * 36
         variance = TIP_NOISE**2 / 3.0 if found else math.inf
         covariance[::7] = [variance] * 3 + [_UNKNOWN_ORIENTATION] * 3

@@ -1,4 +1,4 @@
-"""The console's hold on the line of a page: its real talk, without sockets and without a thread."""
+"""The console's hold protocol with a page, without sockets and threads."""
 
 from __future__ import annotations
 
@@ -9,56 +9,56 @@ from needle_console.hold.hold_protocol import PERIOD, HoldProtocol
 from needle_console.hold.page_session import PageHold
 from needle_core.component import Action, Actions, Component, Log, Moment, Port, Send, Timer
 from scenario.faults import PAGE_LINE
-from scenario.parts.page import CONNECT, Said
+from scenario.parts.page import CONNECT, PageMessage
 
 _LOOK = 0.005
 
 
-class HoldServer(Component):
-    """Serves the hold as `hold.hold_server` does; the console hears it at its port."""
+class VirtualHoldServer(Component):
+    """Serves the hold as `hold.hold_server` does; the console receives it at its port."""
 
     name = "hold_server"
 
     def __init__(self) -> None:
         self._actions: list[Action] = []
-        self._protocol = HoldProtocol(lambda _: "", self._tell, self._notice, 0.0)
-        # Connection to the page's number.
+        self._protocol = HoldProtocol(lambda _: "", self._publish_state, self._notice, 0.0)
+        # Connection to page number.
         self._pages: dict[int, int] = {}
-        self.ports = (Port(PAGE_LINE, self._take), Port(PAGE, lambda *_: ()))
+        self.ports = (Port(PAGE_LINE, self._handle_batch), Port(PAGE, lambda *_: ()))
         self.timers = (Timer(_LOOK, self._look), Timer(PERIOD, self._send_counts))
 
-    def _tell(self, state: PageHold) -> None:
+    def _publish_state(self, state: PageHold) -> None:
         self._actions.append(Send(PAGE, (HoldRequest(state, self._protocol.counts()),)))
 
     def _notice(self, text: str) -> None:
         self._actions.append(Log("warning", text))
 
-    def _told(self) -> Actions:
+    def _pending_actions(self) -> Actions:
         actions, self._actions = self._actions, []
         return actions
 
     def _look(self, at: Moment) -> Actions:
         self._protocol.update(at.steady)
-        return self._told()
+        return self._pending_actions()
 
-    def _take(self, batch: Sequence[Said], at: Moment) -> Actions:
-        for said in batch:
-            yield from self._hear(said, at.steady)
-        yield from self._told()
+    def _handle_batch(self, batch: Sequence[PageMessage], at: Moment) -> Actions:
+        for message in batch:
+            yield from self._handle_message(message, at.steady)
+        yield from self._pending_actions()
 
-    def _hear(self, said: Said, now: float) -> Actions:
-        page = self._pages.get(said.connection)
-        if said.text is None:
-            # First of all: what a gone page held ends now.
+    def _handle_message(self, message: PageMessage, now: float) -> Actions:
+        page = self._pages.get(message.connection)
+        if message.text is None:
+            # End the hold of a closed page first.
             if page is not None:
-                self._close(said.connection, now)
+                self._close(message.connection, now)
         elif page is not None:
-            self._protocol.receive(page, said.text, now)
-        elif said.text == CONNECT:
-            self._pages[said.connection] = self._protocol.open(now, is_local=True)
+            self._protocol.receive(page, message.text, now)
+        elif message.text == CONNECT:
+            self._pages[message.connection] = self._protocol.open(now, is_local=True)
         else:
-            # Of a connection that nobody knows, as after a restart.
-            yield self._abort(said.connection, now)
+            # Unknown connection, as after a restart.
+            yield self._abort(message.connection, now)
 
     def _send_counts(self, at: Moment) -> Actions:
         for connection, page in tuple(self._pages.items()):
@@ -66,13 +66,13 @@ class HoldServer(Component):
                 yield self._abort(connection, at.steady)
             else:
                 word = self._protocol.message_for(page, at.steady)
-                yield Send(PAGE_LINE, (Said(connection, word),))
-        yield from self._told()
+                yield Send(PAGE_LINE, (PageMessage(connection, word),))
+        yield from self._pending_actions()
 
     def _abort(self, connection: int, now: float) -> Action:
         if connection in self._pages:
             self._close(connection, now)
-        return Send(PAGE_LINE, (Said(connection),))
+        return Send(PAGE_LINE, (PageMessage(connection),))
 
     def _close(self, connection: int, now: float) -> None:
         self._protocol.close(self._pages.pop(connection), now)

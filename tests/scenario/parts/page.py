@@ -1,4 +1,4 @@
-"""A page of the console under a finger: what its script does, `static/hold.js`, in virtual time."""
+"""Model of a console page: the behaviour of `static/hold.js`, in virtual time."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from needle_core.component import Action, Actions, Component, Exit, Moment, Port
 from scenario.faults import PAGE_LINE
 
 _RETRY = 1.0
-# Without a word for so long the link is not called open [s].
+# Silence after which the link counts as lost [s].
 _SILENCE = 0.5
-# So often the page looks for the finger, and sends what it is made to [s].
+# Period in which the page samples the finger and sends [s].
 _LOOK = 0.01
 _GARBAGE = ("", "{}", "[1]", '{"count": 1}', "\x00", '{"pressed": true, "speed": 1e999}')
 _KEPT = 50
 CONNECT = "connect"
-"""First word on a connection, in place of a WebSocket's request."""
+"""First message on a connection, in place of a WebSocket's request."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Said:
-    """A word on the line between page and console.
+class PageMessage:
+    """A message between page and console.
 
     Attributes
     ----------
     connection : int
-        Which: a page that connects again takes another one.
+        Number of the connection; each new one has another number.
     text : str or None
-        A message; None: the connection ends.
+        Text; None ends the connection.
     """
 
     connection: int
@@ -42,26 +42,26 @@ class Said:
 @dataclasses.dataclass
 class _Press:
     mode: str
-    # The newest count when it began.
+    # Newest count at its begin.
     after: int
 
 
 class Page(Component):
-    """Tells over its line what the finger does, as often as it is asked.
+    """Sends the state of the finger in reply to each count.
 
-    A finger that is down already when it is loaded is none until it comes anew.
+    A finger that is down when the page loads counts only after a new press.
 
     Parameters
     ----------
     finger : callable
-        Returns the button that is under the finger: `insert`, `retract`, or none (empty).
+        Returns the pressed button: `insert`, `retract`, or empty for none.
     chance : Random
-        Draws what it is made to send, and the number of its connection.
+        Draws garbage and connection numbers.
 
     Attributes
     ----------
     sends_garbage, repeats : bool
-        Whether it sends, beside its own messages, what nobody understands, or old ones of its own.
+        Whether it also sends invalid messages, or repeats old ones.
     """
 
     name = "page"
@@ -71,58 +71,58 @@ class Page(Component):
         self.sends_garbage = self.repeats = False
         self._sent: deque[str] = deque(maxlen=_KEPT)
         self._connection = 0
-        # When it connects again: where nobody answers, too.
+        # Time of the next connection attempt.
         self._retry_at = 0.0
         self._is_cut = False
         self._count = 0
         self._press: _Press | None = None
         self._lost = False
-        self._heard_at = -_SILENCE
+        self._received_at = -_SILENCE
         self._under_finger = finger()
-        self.ports = (Port(PAGE_LINE, self._take),)
+        self.ports = (Port(PAGE_LINE, self._handle_batch),)
         self.timers = (Timer(_LOOK, self._look),)
 
     def asks_for_a_new_press(self, now: float) -> bool:
-        """Tell whether it shows that the finger holds nothing: the press is lost, or the link."""
-        return self._lost or now - self._heard_at > _SILENCE
+        """Return whether the page shows a lost press or a lost link."""
+        return self._lost or now - self._received_at > _SILENCE
 
     def cut(self) -> None:
-        """Let the connection end, as the kernel does for a server that is gone."""
+        """End the connection, as the kernel does for a terminated server."""
         self._is_cut = True
 
     def on_stop(self, at: Moment) -> Actions:
-        """Go away: the connection ends."""
-        yield Send(PAGE_LINE, (Said(self._connection),))
+        """Close the page, which ends the connection."""
+        yield Send(PAGE_LINE, (PageMessage(self._connection),))
         yield Exit(0)
 
     # ---- the connection -------------------------------------------------------------------------
 
-    def _take(self, batch: Sequence[Said], at: Moment) -> Actions:
-        # The finger comes first, as in a browser that stood still.
-        yield from self._see_finger()
-        for said in batch:
-            if said.connection != self._connection:
+    def _handle_batch(self, batch: Sequence[PageMessage], at: Moment) -> Actions:
+        # Sample the finger first, as a browser does that was suspended.
+        yield from self._update_finger()
+        for message in batch:
+            if message.connection != self._connection:
                 continue
-            if said.text is None:
+            if message.text is None:
                 self._lose_connection(at.steady)
             else:
-                yield from self._hear(json.loads(said.text), at)
+                yield from self._handle_message(json.loads(message.text), at)
 
     def _lose_connection(self, now: float) -> None:
         self._drop()
         self._count, self._is_cut = 0, False
         self._retry_at = now + _RETRY
 
-    def _hear(self, told: dict[str, object], at: Moment) -> Actions:
+    def _handle_message(self, told: dict[str, object], at: Moment) -> Actions:
         self._retry_at = math.inf
         self._count = int(str(told["count"]))
-        self._heard_at = at.steady
-        # Once lost, a press is over, whatever the finger does.
+        self._received_at = at.steady
+        # A lost press stays lost until a new one.
         if self._press and int(str(told["heard"])) > self._press.after and not told["held"]:
             self._drop()
-        yield from self._tell()
+        yield from self._publish_state()
 
-    def _tell(self) -> Actions:
+    def _publish_state(self) -> Actions:
         if not self._count:
             return
         message = {
@@ -136,12 +136,12 @@ class Page(Component):
         yield self._send(text)
 
     def _send(self, text: str) -> Action:
-        return Send(PAGE_LINE, (Said(self._connection, text),))
+        return Send(PAGE_LINE, (PageMessage(self._connection, text),))
 
     # ---- the finger -----------------------------------------------------------------------------
 
     def _look(self, at: Moment) -> Actions:
-        yield from self._see_finger()
+        yield from self._update_finger()
         if self._is_cut:
             self._lose_connection(at.steady)
         if at.steady >= self._retry_at:
@@ -153,16 +153,16 @@ class Page(Component):
         if self.repeats and self._sent:
             yield self._send(self._chance.choice(self._sent))
 
-    def _see_finger(self) -> Actions:
+    def _update_finger(self) -> Actions:
         before, self._under_finger = self._under_finger, self._finger()
         if self._under_finger == before:
             return
         if self._press:
             self._press = None
-            yield from self._tell()
+            yield from self._publish_state()
         self._lost = False
         if self._under_finger and not before:
-            # The next count is answered with it.
+            # The reply to the next count reports it.
             self._press = _Press(self._under_finger, self._count)
 
     def _drop(self) -> None:

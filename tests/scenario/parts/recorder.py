@@ -20,7 +20,7 @@ from needle_bags.recording.worker import Job, RunJob, no_op
 from needle_core.component import Actions, Component, Input, Moment, Output, Timer
 from needle_core.files.bag_topic import BagTopic
 from scenario.faults import Fault, Kind
-from scenario.judging.bag_witness import WAITING_LIMIT, BagWitness
+from scenario.monitors.bag_monitor import WAITING_LIMIT, BagMonitor
 
 # How often the worker looks for jobs [s], and what each takes [s], at least and at most.
 _WORK, _JOB = 0.005, (2e-6, 40e-6)
@@ -165,7 +165,7 @@ class RecorderStandIn(Component):
         self._killed_at: float | None = None
         self._refused_at: float | None = None
         self._bag = _Bag(disk, disk.next_bag())
-        self._witness = BagWitness(self._bag.directory)
+        self._monitor = BagMonitor(self._bag.directory)
         workers: list[_Jobs] = []
 
         def make_worker(do: RunJob, end: Job) -> _Jobs:
@@ -190,16 +190,16 @@ class RecorderStandIn(Component):
         for file in self._bag.opened:
             file.close()
 
-    def losses(self, *, judges_killed: bool) -> list[str]:
+    def losses(self, *, check_killed: bool) -> list[str]:
         """End it in order, unless it was killed; return what its bag lacks and does not name.
 
         Parameters
         ----------
-        judges_killed : bool
+        check_killed : bool
             Whether the bag of a killed one counts: nothing else kept it from writing.
         """
         if self._killed_at is not None:
-            return self._witness.losses_of_killed(self._killed_at) if judges_killed else []
+            return self._monitor.losses_of_killed(self._killed_at) if check_killed else []
         self.recording.close()
         if not self.recording.is_whole:
             if self._refused_at is None:
@@ -207,13 +207,13 @@ class RecorderStandIn(Component):
             if self._refused_at is None:
                 return [f"{self._bag.directory} is not whole: {self.recording.error}"]
             # A disk that refused data leaves what a kill leaves.
-            return self._witness.losses_of_killed(self._refused_at) if judges_killed else []
-        return self._witness.losses_of_ended()
+            return self._monitor.losses_of_killed(self._refused_at) if check_killed else []
+        return self._monitor.losses_of_ended()
 
     def _hear(self, topic: str, message: Any, at: Moment) -> Actions:
         self._now = at.steady
         self._count += 1
-        self._witness.take(at.steady, topic)
+        self._monitor.take(at.steady, topic)
         data = repr(message).encode()
         self.recording.append(Received(topic, data, at.stamp_ns, at.sent_ns, self._count))
         return ()

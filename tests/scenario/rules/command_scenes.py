@@ -1,4 +1,4 @@
-"""Scenes for the rules of holds and commands, each called as its rule is."""
+"""Scenes for the rules of holds and commands, each with the name of its rule."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from scenario.rules.scene import AT_REST, COMMANDS, HOLD, STATUS, Held, Scene
 
 
 def hold_to_run() -> None:
-    """A step without a hold is refused; one that has lost it stops."""
+    """A step without a hold is rejected; a step that loses its hold stops."""
     scene = Scene()
     scene.home()
     scene.step()
     assert scene.refuses(Rule.HOLD_TO_RUN)
     scene.press()
     scene.step()
-    assert not scene.rests(0.1)
+    assert not scene.is_at_rest(0.1)
     scene.release()
-    assert scene.rests()
+    assert scene.is_at_rest()
 
 
 def hold_age() -> None:
-    """A hand that hangs stops the needle, and does not hold when it is back."""
+    """A frozen source stops the needle, and its old press does not count afterwards."""
     scene = Scene()
     scene.moving()
     scene.silence(0.5)
-    assert scene.named(Rule.HOLD_AGE)
-    assert scene.rests(0.5)
+    assert scene.is_logged(Rule.HOLD_AGE)
+    assert scene.is_at_rest(0.5)
 
 
 def hold_new_press() -> None:
-    """What was pressed before the axes were enabled moves nothing."""
+    """A press from before the axes were enabled moves nothing."""
     scene = Scene()
     scene.home()
     scene.hand.held = Held(True)
@@ -45,58 +45,58 @@ def hold_new_press() -> None:
 
 
 def hold_one_owner() -> None:
-    """A second hand does not count beside the first, nor when that lets go."""
+    """A second press does not count during the first, nor after its release."""
     scene = Scene()
     scene.ready()
-    other = scene.let_in(HOLD)
+    other = scene.start_node(HOLD)
     for count, pressed in enumerate((False, True), 1):
-        scene.told(other, Publish(HOLD.topic, m.HoldState("other", "", count, pressed, 1.0, 0.1)))
-    assert scene.named(Rule.HOLD_ONE_OWNER)
+        scene.act(other, Publish(HOLD.topic, m.HoldState("other", "", count, pressed, 1.0, 0.1)))
+    assert scene.is_logged(Rule.HOLD_ONE_OWNER)
     assert scene.hand.status.hold_owner == "hand"
 
 
 def hold_in_order() -> None:
-    """An old press of the hand that comes again does not count."""
+    """A repeated old press does not count."""
     scene = Scene()
     scene.ready()
-    other = scene.let_in(HOLD)
+    other = scene.start_node(HOLD)
     old = m.HoldState(scene.hand.name, scene.hand.session._session, 1, False, 0.0, 0.1)
-    scene.told(other, Publish(HOLD.topic, old))
-    assert scene.named(Rule.HOLD_IN_ORDER)
+    scene.act(other, Publish(HOLD.topic, old))
+    assert scene.is_logged(Rule.HOLD_IN_ORDER)
     assert scene.hand.status.holds_ignored > 0
     assert scene.hand.status.hold_owner == "hand"
 
 
 def speed_scale() -> None:
-    """A speed that is no number is a release."""
+    """A speed scale that is not a number is a release."""
     scene = Scene()
     scene.moving()
     scene.hand.held = Held(True, math.nan)
     scene.runner.run(0.1)
-    assert scene.rests()
+    assert scene.is_at_rest()
     assert scene.hand.status.hold_owner == ""
 
 
 def one_device() -> None:
-    """Where another device speaks nothing moves."""
+    """Nothing moves while another device publishes its status."""
     scene = Scene()
     scene.moving()
-    scene.let_in(STATUS)
+    scene.start_node(STATUS)
     assert scene.fails(Rule.ONE_DEVICE)
 
 
 def no_motion_by_itself() -> None:
-    """Enabling moves nothing, whatever was under way before and is pressed still."""
+    """Enabling moves nothing, whatever was executed before and is still pressed."""
     scene = Scene()
     scene.home()
-    assert scene.rests()
+    assert scene.is_at_rest()
     scene.press()
     scene.step()
     scene.call("device/enable", False)
     scene.runner.run(0.1)
-    assert scene.rests()
+    assert scene.is_at_rest()
     scene.call("device/enable", True)
-    assert scene.rests(1.0)
+    assert scene.is_at_rest(1.0)
 
 
 def command_state() -> None:
@@ -104,23 +104,23 @@ def command_state() -> None:
     scene = Scene()
     first = scene.moving()
     second = scene.step(0.001, 0.1, 0.5)
-    assert scene.named(Rule.COMMAND_STATE)
+    assert scene.is_logged(Rule.COMMAND_STATE)
     scene.until(lambda: first in scene.hand.results, "the first step")
     assert scene.hand.results[first] == "succeeded"
     assert scene.hand.results[second].startswith("aborted")
 
 
 def command_one_publisher() -> None:
-    """With two who command nobody is obeyed."""
+    """Commands of two publishers are rejected."""
     scene = Scene()
     scene.ready()
-    scene.let_in(COMMANDS)
+    scene.start_node(COMMANDS)
     scene.step()
     assert scene.refuses(Rule.COMMAND_ONE_PUBLISHER)
 
 
 def command_form() -> None:
-    """A command without a time is none."""
+    """A command without a time is rejected."""
     scene = Scene()
     scene.ready()
     scene.send(((0.001, 0.0), 0.0))
@@ -128,7 +128,7 @@ def command_form() -> None:
 
 
 def command_finite() -> None:
-    """A command that is no number is none."""
+    """A command that is not a number is rejected."""
     scene = Scene()
     scene.ready()
     scene.send(((math.nan, 0.0), 1.0))
@@ -136,7 +136,7 @@ def command_finite() -> None:
 
 
 def command_newer() -> None:
-    """A command that comes twice is obeyed once."""
+    """A command that arrives twice is executed once."""
     scene = Scene()
     scene.ready()
     stamp = scene.send(((0.001, 0.0), 0.5))
@@ -146,7 +146,7 @@ def command_newer() -> None:
 
 
 def tip_age() -> None:
-    """A command after a tip of 2.1 s ago is refused."""
+    """A command for a tip of 2.1 s ago is rejected."""
     scene = Scene()
     scene.ready()
     scene.runner.run(3.0)
@@ -155,7 +155,7 @@ def tip_age() -> None:
 
 
 def homed_first() -> None:
-    """Without a home position no step begins."""
+    """No step begins before homing."""
     scene = Scene()
     scene.until(lambda: scene.state == "DISABLED", "the driver")
     scene.call("device/enable", True)
@@ -165,7 +165,7 @@ def homed_first() -> None:
 
 
 def forward_only() -> None:
-    """A step does not draw the needle out."""
+    """A step does not withdraw the needle."""
     scene = Scene()
     scene.ready()
     scene.until_done(scene.step())
@@ -174,7 +174,7 @@ def forward_only() -> None:
 
 
 def max_depth() -> None:
-    """No step ends deeper than it may."""
+    """No step ends beyond the largest depth."""
     scene = Scene({"max_depth": 0.02})
     scene.ready()
     for _ in range(10):
@@ -216,7 +216,7 @@ def max_rotation_rate() -> None:
 
 
 def max_turns() -> None:
-    """No step turns the needle farther than its cables go."""
+    """No step turns the needle beyond its cable limit."""
     scene = Scene({"max_turns": 0.25})
     scene.ready()
     scene.until_done(scene.step())
@@ -225,7 +225,7 @@ def max_turns() -> None:
 
 
 def coordinated() -> None:
-    """Rotation follows insertion, at a speed that a person changes."""
+    """Rotation follows insertion in proportion, also while the speed scale changes."""
     scene = Scene()
     scene.ready()
     scene.hand.places.clear()
@@ -242,7 +242,7 @@ def coordinated() -> None:
 
 
 def retraction() -> None:
-    """The needle comes out while the hold lasts, without turning, and no farther than home."""
+    """The needle is retracted during the hold, without rotation, up to home."""
     scene = Scene()
     scene.ready()
     scene.until_done(scene.step())
@@ -251,7 +251,7 @@ def retraction() -> None:
     scene.call("device/retract")
     scene.runner.run(0.1)
     scene.release()
-    assert scene.rests()
+    assert scene.is_at_rest()
     assert 0.0 < scene.place[0] < deep
     scene.press()
     scene.call("device/retract")
@@ -261,12 +261,12 @@ def retraction() -> None:
 
 
 def homing_needle_out() -> None:
-    """Nothing is homed before somebody has said that the needle is out."""
+    """Homing needs the confirmation that the needle is out."""
     scene = Scene()
     scene.until(lambda: scene.state == "DISABLED", "the driver")
     scene.hand.answers.clear()
     scene.hand.actions.append(Call("device/home"))
-    assert scene.rests(1.0)
+    assert scene.is_at_rest(1.0)
     assert [answer.success for answer in scene.hand.answers] == [False]
 
 

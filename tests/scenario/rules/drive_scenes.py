@@ -1,4 +1,4 @@
-"""Scenes for the rules of axes, drives and bus, each called as its rule is."""
+"""Scenes for the rules of axes, drives and bus, each with the name of its rule."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scenario.rules.scene import AXES, DRIVER, ESTOP, Scene
 
 ON = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 SYNC = 0x080
-# Objects that say in which units a drive's speeds are.
+# Objects with the units of a drive's speeds.
 UNITS = {0x608F, 0x60A8, 0x60A9, 0x60AA}
 DEEP = 0.1
 
@@ -24,7 +24,7 @@ def states(scene: Scene) -> list[PowerState]:
 
 
 def following_error() -> None:
-    """An axis that does not follow stops both."""
+    """A following error of one axis stops both."""
     scene = Scene()
     scene.moving()
     scene.bus.stall("insertion")
@@ -33,7 +33,7 @@ def following_error() -> None:
 
 
 def unhomed_outward_only() -> None:
-    """After a drive's reboot the needle goes out by as much as it was in, and never in."""
+    """After a drive's reboot the needle moves outwards only, by its last insertion."""
     scene = Scene()
     scene.ready()
     scene.until_done(scene.step())
@@ -52,7 +52,7 @@ def unhomed_outward_only() -> None:
 
 
 def homing_time() -> None:
-    """A homing that does not end is ended."""
+    """A homing that takes too long is stopped."""
     scene = Scene({"max_depth": 0.02}, drives={"insertion_start": DEEP})
     scene.until(lambda: scene.state == "DISABLED", "the driver")
     scene.call("device/confirm_needle_out", True)
@@ -63,20 +63,20 @@ def homing_time() -> None:
 
 
 def estop_latches() -> None:
-    """An emergency stop ends the motion; taking it back moves nothing."""
+    """An emergency stop ends the motion; releasing it moves nothing."""
     scene = Scene()
     scene.moving()
-    other = scene.let_in(ESTOP)
-    scene.told(other, Publish(ESTOP.topic, m.EmergencyStop(True)))
-    assert scene.rests()
-    assert scene.named(Rule.ESTOP_LATCHES)
-    scene.told(other, Publish(ESTOP.topic, m.EmergencyStop(False)))
-    assert scene.rests()
+    other = scene.start_node(ESTOP)
+    scene.act(other, Publish(ESTOP.topic, m.EmergencyStop(True)))
+    assert scene.is_at_rest()
+    assert scene.is_logged(Rule.ESTOP_LATCHES)
+    scene.act(other, Publish(ESTOP.topic, m.EmergencyStop(False)))
+    assert scene.is_at_rest()
     assert scene.state == "ESTOPPED"
 
 
 def one_fault_stops_both() -> None:
-    """The fault of one drive switches the other off, too."""
+    """The fault of one drive also switches off the other."""
     scene = Scene()
     scene.moving()
     scene.bus.emergency("insertion", 0x2310)
@@ -86,7 +86,7 @@ def one_fault_stops_both() -> None:
 
 
 def inner_limit_switch() -> None:
-    """A step ends at the inner end's switch."""
+    """A step ends at the inner limit switch."""
     scene = Scene({"max_depth": 0.3})
     scene.ready()
     motor = scene.bus.drives["insertion"].motor
@@ -98,7 +98,7 @@ def inner_limit_switch() -> None:
 
 
 def reply_age() -> None:
-    """A drive that says nothing more is a fault."""
+    """A silent drive is a fault."""
     scene = Scene()
     scene.moving()
     scene.bus.hang("rotation")
@@ -106,7 +106,7 @@ def reply_age() -> None:
 
 
 def axis_speed() -> None:
-    """A drive whose speeds are in another unit is stopped within 8 mm."""
+    """A drive with another unit of speed is stopped within 8 mm."""
     scene = Scene(drives={"rpm": True, "insertion_start": DEEP, "insertion_max_speed": 0.15})
     for drive in scene.bus.drives.values():
         for key in [key for key in drive._objects._entries if key[0] in UNITS]:
@@ -121,7 +121,7 @@ def axis_speed() -> None:
 
 
 def settling_time() -> None:
-    """A step that does not arrive ends as a fault."""
+    """A step that does not reach its target is a fault."""
     scene = Scene()
     scene.moving()
     scene.until(lambda: scene.place[0] > 0.0018, "the step's end")
@@ -131,7 +131,7 @@ def settling_time() -> None:
 
 
 def link_loss() -> None:
-    """An adapter that is pulled out is named."""
+    """An unplugged adapter is logged."""
     scene = Scene()
     scene.moving()
     scene.runner.lose_port(DRIVER, CAN, "unplugged")
@@ -139,15 +139,15 @@ def link_loss() -> None:
 
 
 def one_master() -> None:
-    """Somebody else's SYNC is a fault."""
+    """A SYNC of another master is a fault."""
     scene = Scene()
     scene.moving()
-    scene.bus_says = [CanFrame(SYNC)]
+    scene.extra_frames = [CanFrame(SYNC)]
     assert scene.fails(Rule.ONE_MASTER)
 
 
 def drive_watchdog() -> None:
-    """Drives without a driver end their motion, and have a fault."""
+    """Drives without a driver stop, and report a fault."""
     scene = Scene()
     scene.moving()
     scene.runner.freeze(DRIVER, 1.0)
@@ -166,7 +166,7 @@ def drive_emergency() -> None:
 
 
 def drive_reboot() -> None:
-    """A drive that starts anew is a fault."""
+    """A reboot of a drive is a fault."""
     scene = Scene(drives={"boot_time": 0.05})
     scene.ready()
     scene.bus.reboot("rotation", scene.runner.now)
@@ -176,16 +176,16 @@ def drive_reboot() -> None:
 
 
 def quick_stop() -> None:
-    """A release stops the drives where they are, not at their next set-point."""
+    """A release stops the drives at once, before their next set-point."""
     scene = Scene()
     scene.moving()
     scene.release()
     assert states(scene) == [PowerState.QUICK_STOP_ACTIVE] * 2
-    assert scene.rests()
+    assert scene.is_at_rest()
 
 
 def software_limits() -> None:
-    """The drive itself knows how far it may go."""
+    """The drive itself enforces the limits of travel."""
     scene = Scene()
     scene.home()
     for axis in AXES:
@@ -197,7 +197,7 @@ def software_limits() -> None:
 
 
 def look_ahead() -> None:
-    """A driver that dies leaves a tenth of a millimetre to go."""
+    """After a kill of the driver, the needle moves by at most 0.1 mm."""
     scene = Scene()
     scene.ready()
     scene.step(duration=0.41)
@@ -210,7 +210,7 @@ def look_ahead() -> None:
 
 
 def loop_heartbeat() -> None:
-    """Each cycle sends a heartbeat, and drives that stand still stay content."""
+    """Each cycle sends a heartbeat, and drives at rest report no fault."""
     scene = Scene()
     scene.ready()
     before = scene.heartbeats

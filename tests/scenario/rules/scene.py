@@ -1,4 +1,4 @@
-"""A scene for one safety rule: driver, emulated drives, a hand, and whoever is in its way."""
+"""A scene for one safety rule: driver, emulated drives, a client, and other nodes."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from scenario.virtual_rig import DRIVER, Held, VirtualRig
 JOINTS = (m.INSERTION_JOINT, m.ROTATION_JOINT)
 AXES = ("insertion", "rotation")
 HEARTBEAT = 0x700 + 127
-"""COB-ID of the computer's heartbeat."""
+"""COB-ID of the driver's heartbeat."""
 AT_REST = (1e-6, 1e-4)
-"""What motors at rest may still move [m], [rad]: counts of their encoders."""
+"""Largest motion of motors at rest [m], [rad]: encoder counts."""
 
 
-class Witness(Component):
-    """Keeps what is logged."""
+class LogCollector(Component):
+    """Collects log lines."""
 
-    name = "witness"
+    name = "log_collector"
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -48,13 +48,13 @@ class Witness(Component):
         return ()
 
 
-class Other(Component):
-    """A second node that sends what is not its own.
+class SecondNode(Component):
+    """A second node that publishes on topics of the rig.
 
     Parameters
     ----------
     *outputs : Output
-        Where it publishes.
+        Its topics.
     """
 
     name = "other"
@@ -85,10 +85,10 @@ class Scene(VirtualRig):
 
     Attributes
     ----------
-    bus_says : list of CanFrame
-        What somebody else puts on the bus, in the drives' next batch.
+    extra_frames : list of CanFrame
+        Frames of another bus node, sent with the drives' next batch.
     heartbeats : int
-        The computer's, so far.
+        Number of the driver's heartbeats.
     """
 
     def __init__(
@@ -96,21 +96,21 @@ class Scene(VirtualRig):
         driver: Mapping[str, Any] | None = None,
         drives: Mapping[str, Any] | None = None,
     ) -> None:
-        self.bus_says: list[CanFrame] = []
+        self.extra_frames: list[CanFrame] = []
         self.heartbeats = 0
-        super().__init__(1, driver=driver, drives=drives, faults=(self._see_frames,))
-        self._witness = Witness()
-        self.runner.start(self._witness)
+        super().__init__(1, driver=driver, drives=drives, faults=(self._tap_frames,))
+        self._log = LogCollector()
+        self.runner.start(self._log)
 
-    def _see_frames(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
+    def _tap_frames(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
         if link.topic == CAN:
             if link.sender == DRIVER:
                 self.heartbeats += sum(frame.identifier == HEARTBEAT for frame in message)
             else:
-                message, self.bus_says = (*message, *self.bus_says), []
+                message, self.extra_frames = (*message, *self.extra_frames), []
         return (Arrival(0.0, message),)
 
-    # ---- what is done -------------------------------------------------------------------------
+    # ---- actions ------------------------------------------------------------------------------
 
     def ready(self) -> None:
         """Home, enable, press."""
@@ -118,7 +118,7 @@ class Scene(VirtualRig):
         self.press()
 
     def step(self, length: float = 0.002, turn: float = 1.0, duration: float = 1.0) -> int:
-        """Send a step from where the joints are [m], [rad], [s]; return its stamp."""
+        """Send a step from the present position [m], [rad], [s]; return its stamp."""
         at = self.hand.joints
         stamp = self.command(at[0] + length, at[1] + turn, duration)
         self.runner.run(0.1)
@@ -130,7 +130,7 @@ class Scene(VirtualRig):
         age: float = 0.0,
         stamp: int | None = None,
     ) -> int:
-        """Send a command with these points and times, its stamp given [ns] or so old [s]."""
+        """Send a command with these points and times, and a stamp [ns] or an age [s]."""
         if stamp is None:
             stamp = self.runner.timeline.stamp_ns - round(age * 1e9)
         way = tuple(m.TrajectoryPoint(place, time) for place, time in points)
@@ -139,47 +139,47 @@ class Scene(VirtualRig):
         return stamp
 
     def until_done(self, stamp: int) -> None:
-        """Let a step end."""
+        """Run until a step ends."""
         self.until(lambda: stamp in self.hand.results, "the result of a step")
 
     def moving(self) -> int:
-        """Be in the middle of a step."""
+        """Get ready, and run until a step is under way; return its stamp."""
         self.ready()
         begin = self.place[0]
         stamp = self.step()
         self.until(lambda: self.place[0] > begin + 0.0005, "a step under way")
         return stamp
 
-    def let_in(self, *outputs: Output) -> Other:
-        """Start another node, and let the rest see it."""
-        other = Other(*outputs)
+    def start_node(self, *outputs: Output) -> SecondNode:
+        """Start another node, and run until others have discovered it."""
+        other = SecondNode(*outputs)
         self.runner.start(other)
         self.runner.run(0.3)
         return other
 
-    def told(self, other: Other, *actions: Action) -> None:
-        """Let the other node act, and time go by."""
+    def act(self, other: SecondNode, *actions: Action) -> None:
+        """Let the other node act, and run 0.1 s."""
         other.actions += actions
         self.runner.run(0.1)
 
     def silence(self, seconds: float) -> None:
-        """Let the hand stand still, as a process that hangs."""
+        """Freeze the client, as a hanging process."""
         self.runner.freeze(self.hand.name, seconds)
         self.runner.run(seconds)
 
-    # ---- what is seen -------------------------------------------------------------------------
+    # ---- observations -------------------------------------------------------------------------
 
     @property
     def state(self) -> str:
-        """What the device says of itself."""
+        """State of the device."""
         return self.hand.status.state
 
-    def named(self, rule: Rule) -> bool:
-        """Return whether a rule was named in the log."""
-        return any(f"[{rule.value}]" in line for line in self._witness.lines)
+    def is_logged(self, rule: Rule) -> bool:
+        """Return whether the log names a rule."""
+        return any(f"[{rule.value}]" in line for line in self._log.lines)
 
-    def rests(self, seconds: float = 0.3) -> bool:
-        """Return whether no motor moves for some time."""
+    def is_at_rest(self, seconds: float = 0.3) -> bool:
+        """Return whether no motor moves for a time [s]."""
         before = self.place
         self.runner.run(seconds)
         after = self.place
@@ -189,13 +189,13 @@ class Scene(VirtualRig):
         )
 
     def refuses(self, rule: Rule) -> bool:
-        """Return whether the last command was refused for a rule, and nothing moves."""
-        return self.rests() and self.named(rule) and self.state != "MOVING"
+        """Return whether the last command was rejected by a rule, and nothing moves."""
+        return self.is_at_rest() and self.is_logged(rule) and self.state != "MOVING"
 
     def fails(self, rule: Rule) -> bool:
-        """Return whether the device is in FAULT for a rule, and nothing moves."""
+        """Return whether the device is in FAULT by a rule, and nothing moves."""
         self.runner.run(0.3)
-        return self.rests() and self.named(rule) and self.state == "FAULT"
+        return self.is_at_rest() and self.is_logged(rule) and self.state == "FAULT"
 
 
-__all__ = ["AXES", "COMMANDS", "DRIVER", "ESTOP", "HOLD", "STATUS", "Held", "Other", "Scene"]
+__all__ = ["AXES", "COMMANDS", "DRIVER", "ESTOP", "HOLD", "STATUS", "Held", "Scene", "SecondNode"]

@@ -136,10 +136,10 @@ def test_both_drives_are_asked_side_by_side_and_homing_begins_when_both_have_tak
 
 def test_an_emergency_stop_calls_a_set_up_off_until_it_is_released() -> None:
     scene = Scene()
-    other = scene.let_in(ESTOP)
-    scene.told(other, Publish(ESTOP.topic, EmergencyStop(True)))
+    other = scene.start_node(ESTOP)
+    scene.act(other, Publish(ESTOP.topic, EmergencyStop(True)))
     scene.until(lambda: scene.state == "ESTOPPED", "the emergency stop")
-    assert scene.rests(1.5)
+    assert scene.is_at_rest(1.5)
     assert scene.state == "ESTOPPED"
-    scene.told(other, Publish(ESTOP.topic, EmergencyStop(False)))
+    scene.act(other, Publish(ESTOP.topic, EmergencyStop(False)))
     scene.until(lambda: scene.state == "DISABLED", "the set-up")

@@ -16,8 +16,8 @@ def test_every_part_is_spoilt_in_every_way_it_knows() -> None:
     drawn = [fault for seed in range(2000) for fault in draw_schedule(seed)]
     known = {(part, kind) for part, kinds in VOCABULARY.items() for kind in kinds}
     assert {(fault.part, fault.kind) for fault in drawn} == known
-    floods = {faults.strange_topic(fault) for fault in drawn if fault.part == faults.FLOOD}
-    assert floods == set(faults.STRANGE_TOPICS)
+    floods = {faults.rogue_topic(fault) for fault in drawn if fault.part == faults.FLOOD}
+    assert floods == set(faults.ROGUE_TOPICS)
 
 
 def test_a_part_more_shifts_no_fault_of_another(monkeypatch: pytest.MonkeyPatch) -> None:

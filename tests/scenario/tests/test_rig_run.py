@@ -35,7 +35,7 @@ def test_an_undisturbed_run_converges() -> None:
 def test_a_seed_gives_one_run() -> None:
     one, again = (run(3, schedule_of(3)) for _ in range(2))
     assert one.faults
-    assert run(3, one.told_by_moments).digest == again.digest == one.digest
+    assert run(3, one.relative_to_moments).digest == again.digest == one.digest
 
 
 @pytest.mark.parametrize("seed", range(2, 14))
@@ -54,7 +54,7 @@ def test_each_schedule_has_its_bug() -> None:
 def test_what_once_violated_does_not_any_more(name: str) -> None:
     result = run(*read_schedule(SCHEDULES / f"{name}.json"))
     assert not result.violations
-    assert len(result.told_by_moments) == len(result.faults), "each fault met its moment"
+    assert len(result.relative_to_moments) == len(result.faults), "each fault met its moment"
 
 
 @pytest.mark.usefixtures("impatient")

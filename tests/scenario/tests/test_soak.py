@@ -12,7 +12,7 @@ import pytest
 from needle_core.commands.cli import EXIT_INTERRUPTED
 from scenario import soak
 from scenario.faults import Fault, Kind, read_schedule
-from scenario.judging.invariants import Violation
+from scenario.monitors.invariants import Violation
 from scenario.rig_run import RunResult
 
 FAULTS = (Fault("bus", Kind.OFF, 1.0, 1.0, 0.5),)

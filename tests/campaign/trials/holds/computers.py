@@ -1,4 +1,4 @@
-"""Two computers of a trial, and the cable between them; the kernel's part. No ROS in here."""
+"""Two virtual computers of a trial, and the cable between them. Imports no ROS."""
 
 from __future__ import annotations
 
@@ -20,16 +20,15 @@ from needle_core.errors import UserError
 
 ADDRESSES = ("10.213.78.1", "10.213.78.2")
 _LIBC = ctypes.CDLL(None, use_errno=True)
-# Shared memory, too: through it nodes of one machine would go on talking beside the cable. It
-# lasts as long as its input, and so no longer than this process.
+# Separate shared memory too, which would bypass the cable. It lasts until its stdin closes.
 _LIVE = "mount -t tmpfs shm /dev/shm && ip link set lo up && echo ready && exec cat"
-# linux/if_tun.h: frames as they are on an Ethernet, nothing before them.
+# linux/if_tun.h: plain Ethernet frames.
 _TUN, _TUNSETIFF, _IFF_TAP, _IFF_NO_PI = "/dev/net/tun", 0x400454CA, 0x0002, 0x1000
 _LONGEST_FRAME = 65536
 
 
 def enter_network(pid: int) -> None:
-    """Put this thread, and all that it starts from now on, into the network of a process.
+    """Move this thread, and processes it starts later, into the network of a process.
 
     Raises
     ------
@@ -44,7 +43,7 @@ def enter_network(pid: int) -> None:
 
 
 class Computer:
-    """A network and shared memory that no other process of this machine sees."""
+    """A separate network and shared memory."""
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
@@ -58,28 +57,28 @@ class Computer:
             raise UserError("no second computer can be made here: it takes root and iproute2")
         self.pid = self._process.pid
         self.inside = ("nsenter", "--target", str(self.pid), "--net", "--mount", "--")
-        """Words before a command that run it there."""
+        """Command prefix that runs a command on this computer."""
 
     def run(self, words: str) -> None:
-        """Run a command there to its end; raises CalledProcessError if it fails."""
+        """Run a command on this computer; raises CalledProcessError if it fails."""
         subprocess.run([*self.inside, *words.split()], check=True)
 
     def close(self) -> None:
-        """Let it go; it ends with the last process in it."""
+        """Close it; it ends with its last process."""
         self._process.communicate()
 
 
 class Cable:
-    """The cable between two computers, which get the addresses of `ADDRESSES`.
+    """Cable between two computers with the addresses `ADDRESSES`.
 
     Parameters
     ----------
     computers : sequence of Computer
-        The two.
+        Both computers.
     delay : float
-        Time that a frame takes [s].
+        Delay of a frame [s].
     loss : float
-        Share of frames that never arrive.
+        Share of lost frames.
     """
 
     def __init__(
@@ -97,15 +96,15 @@ class Cable:
             computer.run("ip link set cable0 up")
 
     def cut(self) -> None:
-        """Let nothing through, nor what is on its way."""
+        """Drop all frames, also those in transit."""
         self._order(True)
 
     def mend(self) -> None:
-        """Let through what is sent from now on."""
+        """Transmit frames again."""
         self._order(False)
 
     def close(self) -> None:
-        """Take it away."""
+        """Remove it."""
         self._orders.close()
         self._process.join()
 
@@ -128,7 +127,7 @@ def two_computers(
 
 
 def _be_cable(orders: Connection, pids: Sequence[int], delay: float, loss: float) -> None:
-    """Hand on frames until the orders end."""
+    """Forward frames until the orders end."""
     ends = [_plug(pid) for pid in pids]
     orders.send(None)
     draw, is_cut = random.Random(1), False
@@ -140,7 +139,7 @@ def _be_cable(orders: Connection, pids: Sequence[int], delay: float, loss: float
         now = time.monotonic()
         while under_way and under_way[0][0] <= now:
             _, to, frame = under_way.popleft()
-            # Lost, as where a receiver's queue is full, or its interface still down.
+            # The frame is lost if the receiver's queue is full or its interface is down.
             with contextlib.suppress(OSError):
                 os.write(ends[to], frame)
         for file, _ in poll.poll(max(under_way[0][0] - now, 0.0) if under_way else -1):
@@ -159,7 +158,7 @@ def _be_cable(orders: Connection, pids: Sequence[int], delay: float, loss: float
 
 
 def _plug(pid: int) -> int:
-    """Return the file of a new interface in the network of a process."""
+    """Return the file descriptor of a new interface in the network of a process."""
     enter_network(pid)
     file = os.open(_TUN, os.O_RDWR | os.O_NONBLOCK)
     fcntl.ioctl(file, _TUNSETIFF, struct.pack("16sH", b"cable0", _IFF_TAP | _IFF_NO_PI))

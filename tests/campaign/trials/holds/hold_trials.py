@@ -1,4 +1,4 @@
-"""What a person holds is lost at random moments while a needle goes in at 5 mm/s, all the time."""
+"""Losses of the hold's source at random moments of an insertion at 5 mm/s."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sensor_msgs.msg import Joy
 
 from campaign.trials.holds.computers import enter_network, two_computers
 from campaign.trials.holds.piped_pedal import KEY, PipedPedal
-from campaign.trials.rig_hand import CONTROLLER_START, RigHand, ros
+from campaign.trials.ros_rig_client import CONTROLLER_START, RosRigClient, ros
 from campaign.trials.trial_processes import TrialProcesses, without_recorder
 from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_core.errors import UserError
@@ -29,25 +29,25 @@ from needle_core.settings.parameter_files import Parameters
 CABLE = "cable_cut"
 KINDS = ("pedal_unplugged", "joy_silent", "operator_frozen", CABLE)
 DELAY, LOSS = 0.005, 0.01
-"""Of all that passes the cable."""
+"""Delay [s] and loss of all frames on the cable."""
 OPERATOR = "operator"
-_OPERATOR_MODULE = "campaign.trials.holds.piped_operator"
+_OPERATOR_MODULE = "campaign.trials.holds.piped_pedal"
 _SPEED, _DEPTH_MM = 0.005, 190.0
-_DEEP = 0.17  # from here on the next trial has a rig of its own [m]
+_DEEP = 0.17  # from here on, the next trial starts a new rig [m]
 _JOY_PERIOD = 0.02
-# Latest moment of a loss after the needle has begun to move, and how long what comes back is
-# watched [s]; a needle that moved so shortly before moves now.
+# Latest loss after the begin of the motion, observation time after the return of the source, and
+# time since the last motion of a moving needle [s].
 _LATEST, _BACK, RECENT = 0.4, 2.0, 0.05
-# A loss lasts so long [s].
+# Shortest and longest loss [s].
 _LASTS = {CABLE: (0.3, 5.0)}
 _LASTS_ELSE = (0.6, 0.6)
 _NEUTRAL, _AGAIN, _GIVE_UP = 0.2, 2.0, 60.0
-# A needle that goes farther than a late stop would take it moves [m].
+# Insertion that shows a motion, longer than a late stop [m].
 _UNDER_WAY = 0.2e-3
 
 
 class Source(NamedTuple):
-    """What is held: pressed or let go of, lost, and got back as it was."""
+    """Source of the hold, which can be pressed, lost and brought back."""
 
     press: Callable[[bool], None]
     lose: Callable[[], None]
@@ -55,16 +55,16 @@ class Source(NamedTuple):
 
 
 def hold_trials(kind: str, count: int, seed: int = 1) -> list[dict[str, Any]]:
-    """Return what came of each loss; this process may be in another network from now on.
+    """Return the figures of each loss; this process may enter another network.
 
     Parameters
     ----------
     kind : str
         One of `KINDS`.
     count : int
-        Losses.
+        Number of losses.
     seed : int
-        Of all that is drawn.
+        Seed of all randomness.
     """
     rng = random.Random(f"{seed} {kind}")
     outcomes: list[dict[str, Any]] = []
@@ -74,10 +74,10 @@ def hold_trials(kind: str, count: int, seed: int = 1) -> list[dict[str, Any]]:
         cable: tuple[Callable[[], None], ...] = ()
         persons: Sequence[str] = ()
         if kind == CABLE:
-            # Controller and person are on one computer, the rig and who sees it on the other.
+            # Controller and operator are on one computer, the rig and this process on the other.
             one, other, wire = stack.enter_context(two_computers(delay=DELAY, loss=LOSS))
             enter_network(other.pid)
-            # What a person sets on both computers; the rest follows from it.
+            # The setting of the user on both computers.
             os.environ[DISCOVERY_RANGE] = "SUBNET"
             os.environ.pop(PROFILES, None)
             restrict_discovery()
@@ -89,12 +89,12 @@ def hold_trials(kind: str, count: int, seed: int = 1) -> list[dict[str, Any]]:
             before = dict.fromkeys((OPERATOR, "plane_controller"), persons)
             parameters = _parameters(rng.randrange(1000))
             with (
-                closing(RigHand(holds=False)) as hand,
+                closing(RosRigClient(holds=False)) as hand,
                 closing(TrialProcesses(place, domain, parameters, before)) as graph,
                 _held(kind, place, graph, hand, cable) as source,
             ):
                 hand.prepare()
-                hand.insist(CONTROLLER_START)
+                hand.call_until_success(CONTROLLER_START)
                 while len(outcomes) < count and hand.insertion < _DEEP:
                     outcomes.append(_lose(hand, source, rng, *_LASTS.get(kind, _LASTS_ELSE)))
                     graph.check()
@@ -106,10 +106,10 @@ def _held(
     kind: str,
     folder: Path,
     graph: TrialProcesses,
-    hand: RigHand,
+    hand: RosRigClient,
     cable: tuple[Callable[[], None], ...],
 ) -> Iterator[Source]:
-    """Start an operator, and give what its person holds."""
+    """Start an operator node, and yield the source of its hold."""
     if kind == "joy_silent":
         joy = hand.create_publisher(Joy, "joy", RELIABLE)
         pressed = [False]
@@ -134,9 +134,9 @@ def _held(
 
 
 def _lose(
-    hand: RigHand, source: Source, rng: random.Random, shortest: float, longest: float
+    hand: RosRigClient, source: Source, rng: random.Random, shortest: float, longest: float
 ) -> dict[str, Any]:
-    """Hold, lose the source at a random moment, get it back as it was, and watch."""
+    """Hold, lose the source at a random moment, bring it back unchanged, and observe."""
     again = _hold_anew(hand, source)
     hand.pause(rng.uniform(0.0, _LATEST))
     lost = time.time()
@@ -146,18 +146,18 @@ def _lose(
     source.come_back()
     hand.pause(_BACK)
     return {
-        "moving": hand.way(lost - RECENT, lost) > 0.0,
+        "moving": hand.travelled_distance(lost - RECENT, lost) > 0.0,
         "last_motion_ms": (hand.last_motion(lost, back) - lost) * 1e3,
-        "distance_mm": hand.way(lost, back) * 1e3,
-        "resumed_mm": hand.way(back) * 1e3,
+        "distance_mm": hand.travelled_distance(lost, back) * 1e3,
+        "resumed_mm": hand.travelled_distance(back) * 1e3,
         "again_s": again,
     }
 
 
-def _hold_anew(hand: RigHand, source: Source) -> float:
-    """Press anew until the needle moves, and return how long that took [s].
+def _hold_anew(hand: RosRigClient, source: Source) -> float:
+    """Press again until the needle moves; return the time that took [s].
 
-    What was lost must be there and neutral first; raises UserError if it never moves.
+    Raises UserError if the needle does not move.
     """
     begin = time.monotonic()
     while time.monotonic() < begin + _GIVE_UP:
@@ -167,16 +167,16 @@ def _hold_anew(hand: RigHand, source: Source) -> float:
         source.press(True)
         again = time.monotonic() + _AGAIN
         while time.monotonic() < again:
-            hand.look(0.005)
+            hand.spin(0.005)
             if hand.insertion > at + _UNDER_WAY:
                 return time.monotonic() - begin
     raise UserError(f"the held needle does not move; device: {hand.status}")
 
 
 def _parameters(seed: int) -> Parameters:
-    """Return the parameters of a level tip whose needle moves as long as it is held.
+    """Return the parameters of a level tip with continuous insertion.
 
-    One that rests after each step would be at rest at many losses.
+    A stepwise needle would be at rest at many losses.
     """
     parameters = without_recorder(
         SimulateOptions(

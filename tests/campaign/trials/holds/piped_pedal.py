@@ -1,4 +1,7 @@
-"""A foot pedal without hardware: its events come through a named pipe. No ROS in here."""
+"""A simulated foot pedal, whose events come through a named pipe.
+
+`python -m campaign.trials.holds.piped_pedal` runs the operator with this pedal.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import contextlib
 import errno
 import os
 import struct
+import sys
 from pathlib import Path
 
 KEY = 48
@@ -16,12 +20,12 @@ _LONGEST_READ = 65536
 
 
 class PipedPedal:
-    """The pedal: what a foot does to it, and its plug. It is plugged in at first.
+    """The pedal, initially plugged in.
 
     Parameters
     ----------
     path : Path
-        Where its device file appears.
+        Path of its device file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -31,21 +35,21 @@ class PipedPedal:
         self.plug()
 
     def plug(self) -> None:
-        """Plug it in; a key that is down is so from the first look on."""
+        """Plug it in; a pressed key is pressed from the first read on."""
         os.mkfifo(self._path)
-        # For both ways: one that writes alone would wait for a reader.
+        # Opened for reading too: a write-only open fails without a reader.
         self._pipe = os.open(self._path, os.O_RDWR | os.O_NONBLOCK)
         self.press(self._down)
 
     def unplug(self) -> None:
-        """Pull its plug."""
+        """Unplug it."""
         if self._pipe is not None:
             os.close(self._pipe)
             self._path.unlink()
         self._pipe = None
 
     def press(self, down: bool) -> None:
-        """Press it, or let go of it, also while it is unplugged."""
+        """Press or release it, also while it is unplugged."""
         self._down = down
         if self._pipe is not None:
             events = _EVENT.pack(0, 0, _KEY, KEY, down) + _EVENT.pack(0, 0, _SYN, 0, 0)
@@ -53,14 +57,14 @@ class PipedPedal:
 
 
 class PipeDevice:
-    """The kernel's side of a device file, for the pipe of a `PipedPedal`.
+    """Event device that reads the pipe of a `PipedPedal`.
 
-    As there, who opens it sees no event from before, but the state that came of it.
+    After opening, it has the present state and no earlier events, as the kernel's event devices.
 
     Parameters
     ----------
     path : str
-        The pipe; raises OSError if it is not there.
+        The pipe; raises OSError if it does not exist.
     """
 
     keys = frozenset((KEY,))
@@ -72,7 +76,7 @@ class PipeDevice:
             self.read()
 
     def read(self) -> bytes:
-        """Return the events that wait; raises OSError where the pedal was unplugged."""
+        """Return pending events; raises OSError if the pedal was unplugged."""
         try:
             data = os.read(self._pipe, _LONGEST_READ)
         except BlockingIOError:
@@ -84,13 +88,20 @@ class PipeDevice:
         return data
 
     def keys_down(self) -> frozenset[int]:
-        """Return the codes of the keys that are down."""
+        """Return the codes of the pressed keys."""
         return self.keys if self._is_down else frozenset()
 
     def axis(self, code: int) -> float:
-        """Refuse: a pedal has no axes."""
+        """Raise OSError, because a pedal has no axes."""
         raise OSError(errno.EINVAL, f"axis {code} of a pedal")
 
     def close(self) -> None:
-        """Let go of the pipe."""
+        """Close the pipe."""
         os.close(self._pipe)
+
+
+if __name__ == "__main__":
+    # The trial itself uses the pedal without the operator's imports.
+    from needle_bringup.ros import operator
+
+    sys.exit(operator.main(PipeDevice))

@@ -1,4 +1,4 @@
-"""Effects of each fault of the vocabulary on the rig, at its begin and at its end."""
+"""Injects the faults of the vocabulary into the rig, and removes them."""
 
 from __future__ import annotations
 
@@ -15,78 +15,78 @@ from needle_core.component import Call
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import from_values
 from scenario import faults
-from scenario.course import Undo
 from scenario.faults import Fault, Kind
 from scenario.link_faults import LinkFault
-from scenario.parts.bench import Sight
-from scenario.parts.stranger import Stranger
+from scenario.parts.bench import CameraState
+from scenario.parts.rogue_publisher import RoguePublisher
 from scenario.rig import SECOND_JOYSTICK, SECOND_OPERATOR, SoakRig
+from scenario.schedule_runner import Undo
 
 _LINKS = (*faults.TOPICS, *faults.SERVICES, faults.BUS, faults.PAGE_LINE)
 SLOWEST_HANDLER = 0.05
-"""What the slowest of nodes takes for each handler [s]."""
+"""Largest added time of a handler of a slow node [s]."""
 LATEST_MESSAGE = 1.0
-"""What the worst of faults delays a message by [s]."""
+"""Largest delay of a message by a fault [s]."""
 _LATEST_FRAME = 0.1
 _JUMP_NS = 20_000_000_000
 _DRIFT_NS, _DRIFT_PERIOD = 2_000_000, 0.02
-# Seconds between two changes of mind of a hand that trembles.
-_TREMBLING = (0.03, 0.3)
-_WAVERING = ((True, False), (False, False), (False, True), (True, True))
+# Time between two changes of an unsteady hand [s].
+_TREMOR_PERIOD = (0.03, 0.3)
+_HAND_STATES = ((True, False), (False, False), (False, True), (True, True))
 _MOTION_ERROR = 0x5530
-_SIGHTS = {
-    Kind.OFF: Sight.BLACK,
-    Kind.STUCK: Sight.FROZEN,
-    Kind.WRONG: Sight.WRONG,
-    Kind.SLOW: Sight.LATE,
-    Kind.GARBAGE: Sight.WRONG,
+_CAMERA_STATES = {
+    Kind.OFF: CameraState.BLACK,
+    Kind.STUCK: CameraState.FROZEN,
+    Kind.WRONG: CameraState.WRONG,
+    Kind.SLOW: CameraState.LATE,
+    Kind.GARBAGE: CameraState.WRONG,
 }
 _SWITCHED_ON = ("device/enable", "device/confirm_needle_out")
 
 
 def _nothing() -> None:
-    """Do nothing: the fault was over at once."""
+    """No-op end of a fault without duration."""
 
 
-class FaultOrders:
-    """Lets faults begin and end.
+class FaultInjector:
+    """Begins and ends faults.
 
     Parameters
     ----------
     rig : SoakRig
-        What they happen to.
+        The rig.
     """
 
     def __init__(self, rig: SoakRig) -> None:
         self._rig = rig
         self._timeline = rig.runner.timeline
-        self._strangers = itertools.count(1)
-        self._spoilers: dict[str, Callable[[Fault], Undo]] = {
+        self._rogues = itertools.count(1)
+        self._injectors: dict[str, Callable[[Fault], Undo]] = {
             **dict.fromkeys(
-                (*faults.PROCESSES, faults.CONSOLE, faults.RECORDER), self._spoil_process
+                (*faults.PROCESSES, faults.CONSOLE, faults.RECORDER), self._inject_process_fault
             ),
-            faults.DISK: self._spoil_disk,
-            **dict.fromkeys(_LINKS, self._spoil_link),
-            **dict.fromkeys(faults.DRIVES, self._spoil_drive),
+            faults.DISK: self._inject_disk_fault,
+            **dict.fromkeys(_LINKS, self._inject_link_fault),
+            **dict.fromkeys(faults.DRIVES, self._inject_drive_fault),
             faults.ADAPTER: self._unplug,
-            faults.PAGE: self._spoil_page,
-            faults.CAMERAS: self._spoil_cameras,
-            faults.CLOCK: self._spoil_clock,
-            faults.PERSON: self._confuse_person,
-            faults.SECOND_PERSON: self._let_second_person_in,
+            faults.PAGE: self._inject_page_fault,
+            faults.CAMERAS: self._inject_camera_fault,
+            faults.CLOCK: self._inject_clock_fault,
+            faults.PERSON: self._inject_operator_error,
+            faults.SECOND_PERSON: self._inject_second_operator,
             faults.PARAMETERS: self._change_parameters,
         }
 
     def begin(self, fault: Fault) -> Undo:
-        """Let a fault begin; returns what ends it."""
-        return self._spoilers.get(fault.part, self._let_stranger_act)(fault)
+        """Begin a fault; return the function that ends it."""
+        return self._injectors.get(fault.part, self._inject_rogue_publisher)(fault)
 
     def _chance_of(self, fault: Fault) -> random.Random:
         return self._timeline.stream(f"fault of {fault.part}")
 
     # ---- parts ----------------------------------------------------------------------------------
 
-    def _spoil_process(self, fault: Fault) -> Undo:
+    def _inject_process_fault(self, fault: Fault) -> Undo:
         rig, names = self._rig, self._rig.processes_of(fault.part)
         if fault.kind is Kind.OFF:
             for name in names:
@@ -108,32 +108,32 @@ class FaultOrders:
         self._rig.unplug()
         return self._rig.plug_in
 
-    def _spoil_page(self, fault: Fault) -> Undo:
+    def _inject_page_fault(self, fault: Fault) -> Undo:
         rig = self._rig
         if fault.kind is Kind.OFF:
             if rig.runner.runs(faults.PAGE):
                 rig.runner.stop(faults.PAGE)
             return partial(rig.start, faults.PAGE)
         if fault.kind is Kind.STUCK:
-            return self._spoil_process(fault)
+            return self._inject_process_fault(fault)
         doing = "sends_garbage" if fault.kind is Kind.GARBAGE else "repeats"
         setattr(rig.page, doing, True)
         return lambda: setattr(rig.page, doing, False)
 
-    def _spoil_link(self, fault: Fault) -> Undo:
+    def _inject_link_fault(self, fault: Fault) -> Undo:
         late = fault.size * (_LATEST_FRAME if fault.part == faults.BUS else LATEST_MESSAGE)
-        spoil = partial(LinkFault, self._timeline.now + fault.lasts)
-        spoilt = {
-            Kind.OFF: spoil(loss=1.0),
-            Kind.INTERMITTENT: spoil(loss=fault.size),
-            Kind.SLOW: spoil(late=late),
-            Kind.REORDERED: spoil(late=late, reorders=True),
-            Kind.DUPLICATED: spoil(late=late, duplicates=0.5, reorders=True),
+        fault_until_end = partial(LinkFault, self._timeline.now + fault.lasts)
+        fault_on_link = {
+            Kind.OFF: fault_until_end(loss=1.0),
+            Kind.INTERMITTENT: fault_until_end(loss=fault.size),
+            Kind.SLOW: fault_until_end(late=late),
+            Kind.REORDERED: fault_until_end(late=late, reorders=True),
+            Kind.DUPLICATED: fault_until_end(late=late, duplicates=0.5, reorders=True),
         }[fault.kind]
-        self._rig.faults.begin(fault.part, spoilt)
+        self._rig.faults.begin(fault.part, fault_on_link)
         return partial(self._rig.faults.end, fault.part)
 
-    def _spoil_drive(self, fault: Fault) -> Undo:
+    def _inject_drive_fault(self, fault: Fault) -> Undo:
         axis, now = fault.part.partition(" ")[0], self._timeline.now
         bus = self._rig.drives.bus
         drive = bus.drives[axis]
@@ -155,12 +155,12 @@ class FaultOrders:
                 return go_on
         return _nothing
 
-    def _spoil_cameras(self, fault: Fault) -> Undo:
-        self._rig.tracker.sight = _SIGHTS[fault.kind]
-        # The tracker may be another by then.
-        return lambda: setattr(self._rig.tracker, "sight", Sight.CLEAR)
+    def _inject_camera_fault(self, fault: Fault) -> Undo:
+        self._rig.tracker.camera_state = _CAMERA_STATES[fault.kind]
+        # The tracker may have been restarted by then.
+        return lambda: setattr(self._rig.tracker, "camera_state", CameraState.CLEAR)
 
-    def _spoil_clock(self, fault: Fault) -> Undo:
+    def _inject_clock_fault(self, fault: Fault) -> Undo:
         timeline = self._timeline
         if fault.kind is Kind.WRONG:
             before = timeline.clock_offset_ns
@@ -170,20 +170,20 @@ class FaultOrders:
         def drift() -> None:
             timeline.clock_offset_ns -= round(fault.size * _DRIFT_NS)
 
-        self._again_and_again(fault, drift, lambda: _DRIFT_PERIOD)
+        self._repeat(fault, drift, lambda: _DRIFT_PERIOD)
         return _nothing
 
-    def _confuse_person(self, fault: Fault) -> Undo:
+    def _inject_operator_error(self, fault: Fault) -> Undo:
         person, hand = self._rig.person, self._rig.hand
         person.absent = True
 
-        def tremble() -> None:
+        def toggle() -> None:
             hand.insert = not hand.insert
 
         if fault.kind is Kind.OFF:
             hand.insert = hand.retract = hand.stop = False
         elif fault.kind is Kind.INTERMITTENT:
-            self._again_and_again(fault, tremble)
+            self._repeat(fault, toggle)
         elif fault.kind is Kind.WRONG:
             hand.insert, hand.retract = fault.size < 0.6, fault.size > 0.4
             hand.stop = fault.size > 0.9
@@ -193,37 +193,37 @@ class FaultOrders:
 
         return end
 
-    def _spoil_disk(self, fault: Fault) -> Undo:
-        assert self._rig.disk is not None, "who records nothing has no disk"
+    def _inject_disk_fault(self, fault: Fault) -> Undo:
+        assert self._rig.disk is not None, "the rig has no recorder"
         return self._rig.disk.spoil(fault)
 
-    def _let_second_person_in(self, fault: Fault) -> Undo:
+    def _inject_second_operator(self, fault: Fault) -> Undo:
         rig, hand, chance = self._rig, self._rig.second_hand, self._chance_of(fault)
 
-        def let_go() -> None:
+        def release() -> None:
             hand.insert = hand.retract = False
 
-        def waver() -> None:
-            hand.insert, hand.retract = chance.choice(_WAVERING)
+        def change_hand() -> None:
+            hand.insert, hand.retract = chance.choice(_HAND_STATES)
 
         if fault.kind is Kind.INTERMITTENT:
-            self._again_and_again(fault, waver)
-            return let_go
+            self._repeat(fault, change_hand)
+            return release
         hand.insert, hand.retract = fault.kind is not Kind.WRONG, fault.kind is Kind.WRONG
         if fault.kind is not Kind.OFF:
-            return let_go
+            return release
         return partial(rig.kill, SECOND_JOYSTICK if fault.size < 0.5 else SECOND_OPERATOR)
 
-    def _again_and_again(
+    def _repeat(
         self, fault: Fault, act: Callable[[], None], pause: Callable[[], float] | None = None
     ) -> None:
-        """Act now, and after each pause while a fault lasts."""
+        """Act now, and after each pause during a fault."""
         end, chance = self._timeline.now + fault.lasts, self._chance_of(fault)
 
         def go_on() -> None:
             if self._timeline.now < end:
                 act()
-                seconds = pause() if pause else chance.uniform(*_TREMBLING)
+                seconds = pause() if pause else chance.uniform(*_TREMOR_PERIOD)
                 self._timeline.call_after(seconds, go_on)
 
         go_on()
@@ -252,17 +252,17 @@ class FaultOrders:
         change_to(changed)
         return partial(change_to, rig.steering)
 
-    # ---- strangers ------------------------------------------------------------------------------
+    # ---- rogue publishers -----------------------------------------------------------------------
 
-    def _let_stranger_act(self, fault: Fault) -> Undo:
+    def _inject_rogue_publisher(self, fault: Fault) -> Undo:
         rig = self._rig
-        if not faults.strange_topic(fault):
-            name = fault.part.removeprefix(faults.STRANGER).removeprefix("/")
+        if not faults.rogue_topic(fault):
+            name = fault.part.removeprefix(faults.ROGUE).removeprefix("/")
             on = True if name in _SWITCHED_ON else None
             if name.endswith(" off"):
                 name, on = name.removesuffix(" off"), False
-            rig.person.asides.append(Call(name, on))
+            rig.person.extra_actions.append(Call(name, on))
             return _nothing
-        name = f"stranger_{next(self._strangers)}"
-        rig.runner.start(Stranger(name, fault, rig.bench, self._chance_of(fault)))
+        name = f"stranger_{next(self._rogues)}"
+        rig.runner.start(RoguePublisher(name, fault, rig.bench, self._chance_of(fault)))
         return partial(rig.runner.stop, name)

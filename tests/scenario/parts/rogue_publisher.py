@@ -1,4 +1,4 @@
-"""Strangers: foreign nodes that publish what is not their own, well formed or not."""
+"""Foreign nodes that publish on topics of the rig, well formed or not."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from typing import Any
 
 from needle_core import component as c
 from needle_core import messages as m
-from scenario.faults import FLOOD, Fault, Kind, strange_topic
+from scenario.faults import FLOOD, Fault, Kind, rogue_topic
 from scenario.parts.bench import Bench
 
 _PERIOD = 0.05
-# A flood is five messages in each of these [s].
+# Period of a flood [s], and messages in each period.
 _FLOOD_PERIOD, _AT_ONCE = 0.001, 5
 _JOINTS = (m.INSERTION_JOINT, m.ROTATION_JOINT)
 
 
-class Stranger(c.Component):
-    """Publishes on one topic from its start on.
+class RoguePublisher(c.Component):
+    """Publishes on one topic from its start.
 
     Parameters
     ----------
     name : str
-        Its own.
+        Name of the node.
     fault : Fault
-        Says on which topic, how often, and whether it is well formed.
+        Gives the topic, the rate and whether messages are well formed.
     bench : Bench
-        What it imitates.
+        Rig that it imitates.
     chance : Random
         Draws its messages.
     """
@@ -37,7 +37,7 @@ class Stranger(c.Component):
         self.name = name
         self._garbage = fault.kind is Kind.GARBAGE
         self._bench, self._chance = bench, chance
-        self._topic = strange_topic(fault).removeprefix("/")
+        self._topic = rogue_topic(fault).removeprefix("/")
         rows: dict[str, tuple[type[Any], Any, Callable[[int], Any]]] = {
             "device/hold": (m.HoldState, c.BEST_EFFORT, self._hold),
             "device/joint_trajectory": (m.Trajectory, c.RELIABLE, self._trajectory),
@@ -53,7 +53,7 @@ class Stranger(c.Component):
         self.timers = (c.Timer(_FLOOD_PERIOD if floods else _PERIOD, self._act),)
 
     def on_stop(self, at: c.Moment) -> c.Actions:
-        """Take an emergency stop back, and exit."""
+        """Release an emergency stop, and exit."""
         if self._topic == "device/estop":
             yield c.Publish(self._topic, m.EmergencyStop(False))
         yield c.Exit(0)
@@ -66,7 +66,7 @@ class Stranger(c.Component):
         return self._chance.choice((math.nan, math.inf, -1e300)) if self._garbage else value
 
     def _hold(self, stamp_ns: int) -> m.HoldState:
-        # As typed by hand, without a session: only so does a first press count.
+        # Without a session, as from `ros2 topic pub`: only then does a first press count.
         return m.HoldState("stranger", "", stamp_ns, True, self._number(1.0), m.HOLD_LIFETIME)
 
     def _trajectory(self, stamp_ns: int) -> m.Trajectory:

@@ -1,4 +1,4 @@
-"""Search at leisure whether a scene can be solved at all, by other code than the planner's.
+"""Thorough search for a path through a scene, independent of the planner.
 
 A tree of needles that are driven in steps of 1 mm, the bevel turned at its greatest rate towards a
 random point, each from the nearest needle that has it within reach and for a random length; from
@@ -18,13 +18,13 @@ from needle_sim.needle.se3 import FloatArray
 
 _STEP = 0.001
 _HIT = 0.0005
-"""Distance from the target that counts as there [m]."""
+"""Distance from the target that counts as reached [m]."""
 _WIDE = 0.04
 _LONGEST = 0.2
 
 
 @compiled
-def way_after(
+def find_path(
     target: FloatArray,
     obstacles: FloatArray,
     curvature: float,
@@ -33,7 +33,7 @@ def way_after(
     samples: int,
     seed: int,
 ) -> int:
-    """Return the number of random points after which a way to the target was found; -1 if none.
+    """Return the number of random points after which a path was found; -1 if none.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def _drive(
     obstacles: FloatArray,
     clear: float,
 ) -> float:
-    """Drive a needle towards a point; return how far it went [m], -1 where it came too near."""
+    """Steer a needle towards a point; return its travel [m], -1 if it came too near."""
     gone = 0.0
     while gone < longest:
         x, y, z = point[0] - state[0], point[1] - state[1], point[2] - state[2]

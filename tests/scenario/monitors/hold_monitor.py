@@ -1,58 +1,57 @@
-"""Presses as the device hears them: which of them may move the needle, judged from outside."""
+"""Presses that reach the device, and which of them may move the needle."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 
-# A message counts for no longer, whatever it promises [s] (docs/safety.md, hold_age).
+# Longest lifetime of a message [s] (docs/safety.md, hold_age).
 _HOLD_AGE = 0.25
 
 
 @dataclasses.dataclass
 class _Press:
-    # Until when its messages make it last [s].
+    # End of the lifetime of its messages [s].
     until: float
-    # Whether the device named its sender as the owner.
+    # Whether the device reported its sender as the owner.
     owns: bool = False
-    # Whether it can never count: it was there, and the device said that another had the hold.
+    # Whether it can never count, because the device reported another owner meanwhile.
     spent: bool = False
 
 
-class HoldWitness:
-    """Hears every hold that reaches the device, and what that says of the owner.
+class HoldMonitor:
+    """Follows every hold that reaches the device, and the owner that the device reports.
 
-    Hold to run has one owner, until it is let go; a press beside it takes a release and a new press
-    to count. So a press that was there when the device named another owner, or nobody, is none by
-    which anything may move, as long as it lasts. Nothing else of the device's own rules is known
-    here.
+    A hold has one owner until its release; a press beside it counts only after a release and a new
+    press. So a press during which the device reports another owner, or none, must move nothing for
+    as long as it lasts. The monitor uses no other rule of the device.
 
     Attributes
     ----------
-    hears : bool
-        Whether anything was heard yet.
+    has_received : bool
+        Whether any message was received.
     """
 
     def __init__(self) -> None:
-        self.hears = False
+        self.has_received = False
         self._presses: dict[str, _Press] = {}
         self._ended = -math.inf
 
-    def hear(self, at: float, sender: str, *, pressed: bool, lifetime: float) -> None:
-        """Take a message as the device does.
+    def receive(self, at: float, sender: str, *, pressed: bool, lifetime: float) -> None:
+        """Receive a message at the same time as the device.
 
         Parameters
         ----------
         at : float
             When [s].
         sender : str
-            Whose it is.
+            Its source.
         pressed : bool
-            Whether it can be understood, and says so.
+            Whether it is valid and reports a press.
         lifetime : float
-            How long it counts by its own word [s].
+            Its own lifetime [s].
         """
-        self.hears = True
+        self.has_received = True
         self._end_lapsed(at)
         if not pressed:
             if sender in self._presses:
@@ -61,26 +60,26 @@ class HoldWitness:
         until = at + min(lifetime, _HOLD_AGE)
         self._presses.setdefault(sender, _Press(until)).until = until
 
-    def see_owner(self, at: float, owner: str) -> None:
-        """Take whose hold counts by the device's own word; empty: nobody's."""
+    def observe_owner(self, at: float, owner: str) -> None:
+        """Observe the owner that the device reports; empty if there is none."""
         self._end_lapsed(at)
         for sender, press in self._presses.items():
             if sender == owner:
                 press.owns = True
                 continue
             if press.owns and not press.spent:
-                # A stop, or a loss, has taken the hold from it.
+                # A stop or a loss ended its hold.
                 self._ended = at
             press.spent = True
 
     def lose_device(self, at: float) -> None:
-        """Take that the device ended: by its drives' own watchdog what was under way may last."""
+        """Observe the end of the device; its drives may move until their watchdog stops them."""
         self._end_lapsed(at)
         for sender in tuple(self._presses):
             self._end(sender, at)
 
     def forget(self) -> None:
-        """Begin anew, as the device does that was started again."""
+        """Reset, as a restarted device does."""
         self._presses.clear()
 
     def idle(self, at: float) -> float:

@@ -1,4 +1,4 @@
-"""Invariants of every run, judged from outside: motors, hand, and what is published."""
+"""Invariants of every run, checked on motors, hand and published messages."""
 
 from __future__ import annotations
 
@@ -8,38 +8,38 @@ from collections.abc import Sequence
 
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 from needle_device_driver.supervisor.limits import SafetyLimits
-from scenario.judging.bag_witness import WAITING_LIMIT
-from scenario.judging.hold_witness import HoldWitness
-from scenario.judging.limit_witness import LimitWitness
+from scenario.monitors.bag_monitor import WAITING_LIMIT
+from scenario.monitors.hold_monitor import HoldMonitor
+from scenario.monitors.limit_monitor import LimitMonitor
 
-# A motor that goes no farther in a tick rests [m], [rad].
+# Largest motion in a tick of a motor at rest [m], [rad].
 _REST_INSERTION, _REST_ROTATION = 2e-7, 5e-4
-# So near its set-point an axis has arrived [m], [rad] (config/drives.yaml); blocked there and freed
-# after a stop, it goes the rest of it.
+# Distance to the set-point at which an axis has arrived [m], [rad] (config/drives.yaml). An axis
+# that was blocked there moves the rest when it is freed after a stop.
 _ARRIVED_INSERTION, _ARRIVED_ROTATION = 5e-6, 1e-3
-# From a release, or a loss, to the last motion [s]: a joystick that falls silent (0.1), an operator
-# that stops (0.1), their looks and the driver's cycle (0.02 each), a driver that stops (0.02), the
-# ramp (0.03); and what each of them is late by itself.
+# Time from a release or a loss to the last motion [s]: joystick time-out (0.1), operator time-out
+# (0.1), their periods and the driver's cycle (0.02 each), stop of the driver (0.02), ramp (0.03),
+# and the lateness of each.
 RELEASE_BOUND = 0.35
-# A stop by the watchdog of the drives, and the ramp [s].
+# Duration of a stop by the watchdog of the drives, with the ramp [s].
 WATCHDOG_BOUND = 0.2
-# Who is new is heard so long after it began to speak, and that counts as its press (docs/safety.md,
-# hold_new_press) [s].
+# Discovery time of a new publisher [s], whose press counts from then (docs/safety.md,
+# hold_new_press).
 DISCOVERED_WITHIN = 0.2
-# So long after the finger is off a page's hold may still be said [s]: an echo counts for 0.25 s
-# (docs/safety.md, hold's end), and the hand is looked at every 0.005 s.
+# A page's hold may be published so long after the finger is off [s]: an echo counts for 0.25 s
+# (docs/safety.md, hold's end), and the hand is sampled every 0.005 s.
 PAGE_LIFETIME = 0.26
-# How long a status may be behind the motors [s].
+# Largest lag of a status behind the motors [s].
 _STATUS_LAG = 0.15
-# The controller knows of a motion when its next tip has come: two steps.
+# The controller learns of a motion with its next tip: two steps [m].
 _BELIEF = 0.0045
-# A needle may still be on its way by one of so many commands: a path ends when its tip is 2 s old,
-# also where newer ones were refused, and tips come 20 times a second.
+# Number of commands that may still be executed: a path ends when its tip is 2 s old, also where
+# newer commands were refused, and tips come 20 times a second.
 _COMMANDS = 50
-# Farther in than commanded [m], and farther turned than the part of the way that was made wants
-# [rad]: a rotation drive falls silent at 3 rad/s, and insertion goes on until that is noticed.
+# Tolerated insertion beyond the command [m], and rotation out of proportion [rad]: a rotation drive
+# may fall silent at 3 rad/s, and insertion continues until that is detected.
 _BEYOND_COMMAND, _OUT_OF_PROPORTION = 0.0006, 0.5
-# What is small has an eighth more room, and the last of it may go beyond [B].
+# Small messages have an eighth more room, and the last one may exceed it [B].
 _WAITING = WAITING_LIMIT + WAITING_LIMIT // 8 + 70_000
 
 
@@ -54,7 +54,7 @@ class Violation:
     at : float
         When, from the start of the run [s].
     text : str
-        What was seen, with values and units.
+        Observation, with values and units.
     """
 
     invariant: str
@@ -62,24 +62,24 @@ class Violation:
     text: str
 
 
-class Watch:
-    """Watches one run. Times are seconds from its start.
+class InvariantMonitor:
+    """Checks the invariants of one run. Times are seconds from its start.
 
     Parameters
     ----------
     bounds : SafetyLimits
         Of the rig.
     release_bound : float
-        From a release, or a loss, to the last motion [s].
+        Longest time from a release or a loss to the last motion [s].
     late : float
-        How late the driver may send a set-point [s].
+        Lateness of the driver's set-points [s].
 
     Attributes
     ----------
     violations : list of Violation
         The first of each kind.
-    witness : HoldWitness
-        Of the holds that reach the device; it is asked where it hears any.
+    hold_monitor : HoldMonitor
+        Of the holds that reach the device; used once it has received any.
     """
 
     def __init__(
@@ -87,8 +87,8 @@ class Watch:
     ) -> None:
         self._release_bound = release_bound
         self.violations: list[Violation] = []
-        self.witness = HoldWitness()
-        self._limits = LimitWitness(bounds, late)
+        self.hold_monitor = HoldMonitor()
+        self._limits = LimitMonitor(bounds, late)
         self._before: tuple[float, float, float] | None = None
         self._pressed_until = self._told_until = self._other_until = -1.0
         self._pressed_since = self._other_since = -1.0
@@ -108,29 +108,29 @@ class Watch:
         self._rest = (0.0, 0.0)
 
     def violate(self, invariant: str, at: float, text: str) -> None:
-        """Note a violation; of each invariant the first counts."""
+        """Record a violation, the first of each invariant."""
         if all(one.invariant != invariant for one in self.violations):
             self.violations.append(Violation(invariant, at, text))
 
-    # ---- what happens ---------------------------------------------------------------------------
+    # ---- observations ---------------------------------------------------------------------------
 
-    def see_hand(self, at: float, *, holds: bool) -> None:
-        """Take whether the hand presses what could move the needle."""
+    def observe_hand(self, at: float, *, holds: bool) -> None:
+        """Observe whether the hand presses a button that could move the needle."""
         if holds and not self._holds:
             self._pressed_since = at
         if holds:
             self._pressed_until = at
         self._holds = holds
 
-    def see_hold(self, at: float) -> None:
-        """Take a message by which the hand's own node says that it presses."""
+    def observe_hold(self, at: float) -> None:
+        """Observe a message by which the hand's own node reports a press."""
         self._told_until = at
 
-    def see_page_hold(self, at: float, *, pressed: bool) -> None:
-        """Take whether the console says that the hand, at its page, presses."""
+    def observe_page_hold(self, at: float, *, pressed: bool) -> None:
+        """Observe whether the console reports a press of the hand at its page."""
         idle = at - self._pressed_until
         if pressed and idle > PAGE_LIFETIME:
-            said = f"said to be held {idle:.3f} s after the finger was off"
+            said = f"reported as held {idle:.3f} s after the finger was off"
             self.violate("hold_is_of_now", at, said)
         begins = pressed and not self._page_holds
         if begins and self._pressed_since < self._page_ended - PAGE_LIFETIME:
@@ -141,64 +141,64 @@ class Watch:
             self._page_ended = at
         self._page_holds = pressed
 
-    def see_other_hold(self, at: float) -> None:
-        """Take that somebody else pressed: from outside that is a hold like any other."""
+    def observe_other_hold(self, at: float) -> None:
+        """Observe a press of another source, which is a valid hold."""
         if at - self._other_until > self._release_bound:
             self._other_since = at + DISCOVERED_WITHIN
         self._other_until = at
 
-    def see_device(self, at: float, status: DeviceStatus) -> None:
-        """Take a device/status as it is published."""
+    def observe_device(self, at: float, status: DeviceStatus) -> None:
+        """Observe a published device/status."""
         state, before = status.state, self._status.state
         if state in ("FAULT", "ESTOPPED") and not status.fault:
-            self.violate("faults_are_named", at, f"{state} without a word why")
+            self.violate("faults_are_named", at, f"{state} without a reason")
         if state in ("HOLDING", "DISABLED") and before not in ("MOVING", "HOLDING", state):
-            # Enabled, or reset: a press from before may not count.
+            # Enabled or reset: an earlier press must not count.
             self._must_press_after = at
         if self._is_homing:
-            # Whatever ends it, the drives' own watchdog bounds what is under way.
+            # The watchdog of the drives bounds the motion after any end of a homing.
             self._homing_until = at + WATCHDOG_BOUND
             if status.homed and self._before is not None:
-                # The rotation is homed where it stands.
+                # Rotation is homed at its present position.
                 self._zero = self._before[2]
         self._status, self._status_at = status, at
-        self.witness.see_owner(at, status.hold_owner)
+        self.hold_monitor.observe_owner(at, status.hold_owner)
 
-    def see_command(self, points: Sequence[tuple[float, float]]) -> None:
-        """Take a command for the joints, whoever sent it: insertion [m] and rotation [rad]."""
+    def observe_command(self, points: Sequence[tuple[float, float]]) -> None:
+        """Observe a command of any sender: insertion [m] and rotation [rad]."""
         if self._before is not None:
             _, insertion, rotation = self._before
-            # What comes late is taken up from where the needle is, on to the next point ahead.
+            # A late command starts from the present position, to the next point ahead.
             ahead = [point for point in points if point[0] > insertion] or points[-1:]
             self._commands.append(((insertion, rotation - self._zero), *ahead))
 
-    def see_driver(self, at: float, *, speaks: bool) -> None:
-        """Take whether the driver runs and hears its drives: else it cannot know better."""
+    def observe_driver(self, at: float, *, speaks: bool) -> None:
+        """Observe whether the driver runs and is connected to its drives."""
         if not speaks and self._silent_since is None:
-            self.witness.lose_device(at)
+            self.hold_monitor.lose_device(at)
         self._silent_since = None if speaks else self._silent_since or at
         if not speaks:
-            self.witness.forget()
-            # Who starts anew has not heard it; it starts disabled.
+            self.hold_monitor.forget()
+            # A restarted driver has not received it, and starts disabled.
             self._estop_since = None
 
-    def see_estop(self, at: float, *, pressed: bool) -> None:
-        """Take what is said of the emergency stop."""
+    def observe_estop(self, at: float, *, pressed: bool) -> None:
+        """Observe a message of the emergency stop."""
         self._estop_since = (self._estop_since or at) if pressed else None
 
-    def see_set_point(self, at: float, axis: int, place: float | None) -> None:
-        """Take what is sent to a drive; see `LimitWitness.see_set_point`."""
-        for text in self._limits.see_set_point(at, axis, place):
+    def observe_set_point(self, at: float, axis: int, place: float | None) -> None:
+        """Observe a set-point; see `LimitMonitor.observe_set_point`."""
+        for text in self._limits.observe_set_point(at, axis, place):
             self.violate("none_beyond_limits", at, text)
 
-    def see_drives_go_on(self, at: float) -> None:
-        """Take that the drives' own time stood still until now: what was under way ends by it."""
+    def observe_drives_go_on(self, at: float) -> None:
+        """Observe that the time of the drives stood still until now."""
         self._ends_until = at + WATCHDOG_BOUND
 
-    def see_motors(self, at: float, insertion: float, rotation: float) -> None:
-        """Take where the motors really are."""
+    def observe_motors(self, at: float, insertion: float, rotation: float) -> None:
+        """Observe the true position of the motors."""
         before, self._before = self._before, (at, insertion, rotation)
-        for text in self._limits.see_motors(at, insertion, rotation):
+        for text in self._limits.observe_motors(at, insertion, rotation):
             self.violate("none_beyond_limits", at, text)
         if before is None:
             return
@@ -217,19 +217,19 @@ class Watch:
         begins, self._moving_since = self._moving_since is None, self._moving_since or at
         if self._is_homing or at <= self._homing_until:
             return
-        self._judge_hold(at, begins=begins)
-        self._judge_status(at)
+        self._check_hold(at, begins=begins)
+        self._check_status(at)
         if along > _REST_INSERTION:
-            self._judge_way(at, insertion, rotation)
+            self._check_path(at, insertion, rotation)
 
-    def see_waiting(self, at: float, waiting: int) -> None:
-        """Take how much waits for the recorder's disk [B]."""
+    def observe_waiting(self, at: float, waiting: int) -> None:
+        """Observe how much waits for the recorder's disk [B]."""
         if waiting > _WAITING:
             self.violate("queues_are_bounded", at, f"{waiting} bytes wait, at most {_WAITING}")
 
-    def see_belief(self, at: float, status: ControllerStatus, *, joints_heard: bool) -> None:
-        """Take a needle/controller_status as it is published, while joints reach the controller."""
-        # Before its first step it has nothing but the needle's place of before.
+    def observe_belief(self, at: float, status: ControllerStatus, *, joints_heard: bool) -> None:
+        """Observe a published needle/controller_status, while joints reach the controller."""
+        # Before its first step the controller has only the earlier position of the needle.
         steers = status.state == "STEERING" and status.step != 0
         if not (steers and joints_heard) or self._before is None:
             return
@@ -239,22 +239,22 @@ class Watch:
             said = f"the controller says {status.insertion_m * 1e3:.2f} mm, {seen}"
             self.violate("belief_equals_joints", at, said)
 
-    # ---- judgement ------------------------------------------------------------------------------
+    # ---- checks ---------------------------------------------------------------------------------
 
     @property
     def _is_homing(self) -> bool:
         return self._status.activity == "homing"
 
-    def _judge_hold(self, at: float, *, begins: bool) -> None:
+    def _check_hold(self, at: float, *, begins: bool) -> None:
         estop = self._estop_since
         if estop is not None and at - estop > self._release_bound:
             self.violate("estop_stops", at, f"motion {at - estop:.3f} s after an emergency stop")
-        # The hand's hold lasts as long as it presses and its node says so.
+        # The hold lasts while the hand presses and its node reports the press.
         idle = at - max(min(self._pressed_until, self._told_until), self._other_until)
         if idle > self._release_bound and at > self._ends_until:
-            said = f"motion {idle:.3f} s after the last moment in which anybody held and said so"
+            said = f"motion {idle:.3f} s after the last hold that was pressed and published"
             self.violate("no_motion_without_hold", at, said)
-        by_others = self.witness.idle(at) if self.witness.hears else 0.0
+        by_others = self.hold_monitor.idle(at) if self.hold_monitor.has_received else 0.0
         if by_others > RELEASE_BOUND and at > self._ends_until:
             said = f"motion {by_others:.3f} s after the last press of an owner reached the device"
             self.violate("no_motion_by_another", at, said)
@@ -263,8 +263,8 @@ class Watch:
             said = f"motion by a press of {since:.3f} s; the device became ready at {ready:.3f} s"
             self.violate("no_motion_by_itself", at, said)
 
-    def _judge_way(self, at: float, insertion: float, rotation: float) -> None:
-        """Judge a motion inwards: nobody but a command moves the needle there, and as it says."""
+    def _check_path(self, at: float, insertion: float, rotation: float) -> None:
+        """Check that a motion inwards follows one of the last commands."""
         off = [
             abs(rotation - self._zero - _rotation_at(insertion, command))
             for command in self._commands
@@ -272,24 +272,24 @@ class Watch:
         ]
         where = f"at {insertion * 1e3:.2f} mm"
         if not off:
-            said = f"{where} it goes in, which none of the last commands wants"
+            said = f"{where} it goes in beyond all of the last commands"
             self.violate("turns_as_commanded", at, said)
         elif min(off) > _OUT_OF_PROPORTION:
             said = f"{where} it is {min(off):.2f} rad from the nearest command"
             self.violate("turns_as_commanded", at, said)
 
-    def _judge_status(self, at: float) -> None:
+    def _check_status(self, at: float) -> None:
         state = self._status.state
         if state not in ("HOLDING", "DISABLED") or self._silent_since is not None:
             return
         lag = at - max(self._status_at, self._moving_since or at)
         if lag > _STATUS_LAG:
-            said = f"it moves {lag:.3f} s after device/status said {state}"
+            said = f"it moves {lag:.3f} s after device/status reported {state}"
             self.violate("status_is_true", at, said)
 
 
 def _rotation_at(insertion: float, command: Sequence[tuple[float, float]]) -> float:
-    """Return the rotation that a command wants at an insertion, from where it began."""
+    """Return the commanded rotation at an insertion [rad], from the start of the command."""
     before = command[0]
     for place in command[1:]:
         if insertion <= place[0]:

@@ -1,4 +1,4 @@
-"""Messages as a recorder takes them, beside those in its bag: what is missing is said to be."""
+"""Messages that a recorder received, compared with those in its bag."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from needle_core.files.bag_path import METADATA_FILE
 from needle_core.files.yaml_files import load_yaml
 
 WAITING_LIMIT = 400_000
-"""What waits for the soak's disk at most [B]; a real recorder may keep far more."""
-# A killed recorder's bag has what it took so long before [s]: it writes out every 0.1 s
-# (docs/architecture.md), and a burst takes its time.
+"""Queue limit of the soak's recorder [B]; the default of the node is far larger."""
+# The bag of a killed recorder has all messages older than this [s]: it flushes every 0.1 s
+# (docs/architecture.md), and a burst takes longer.
 _WRITTEN_OUT = 0.3
 
 
-class BagWitness:
-    """Takes note of every message that one recorder takes.
+class BagMonitor:
+    """Keeps the time and topic of every message that one recorder receives.
 
     Parameters
     ----------
@@ -32,29 +32,28 @@ class BagWitness:
 
     def __init__(self, bag: Path) -> None:
         self._bag = bag
-        # Topic to the times at which its messages were taken [s].
+        # Reception times by topic [s].
         self._taken: defaultdict[str, list[float]] = defaultdict(list)
 
     def take(self, at: float, topic: str) -> None:
-        """Take a message at a time [s]."""
+        """Record the reception of a message at a time [s]."""
         self._taken[topic].append(at)
 
     def losses_of_ended(self) -> list[str]:
-        """Return what the bag of a recorder that ended in order lacks and does not name."""
+        """Return the losses of a cleanly ended recorder that its bag does not report."""
         kept, told = _counts(self._bag), _said_lost(self._bag)
         return [
-            f"{topic}: {len(taken)} came, {kept[topic]} are in the bag, {told[topic]} said to be "
-            "lost"
+            f"{topic}: {len(taken)} came, {kept[topic]} are in the bag, {told[topic]} reported lost"
             for topic, taken in sorted(self._taken.items())
             if kept[topic] + told[topic] < len(taken)
         ]
 
     def losses_of_killed(self, killed_at: float) -> list[str]:
-        """Return what the recovered bag of a recorder lacks that it had long enough."""
+        """Return the losses of a killed recorder among messages that it must have flushed."""
         try:
             recover_bag(self._bag)
         except UserError:
-            # Nothing of it can be recovered.
+            # Nothing can be recovered.
             kept = Counter[str]()
         else:
             kept = _counts(self._bag)
@@ -80,7 +79,7 @@ def _counts(bag: Path) -> Counter[str]:
 
 
 def _said_lost(bag: Path) -> Counter[str]:
-    """Return what metadata.yaml says of messages that are not in the bag."""
+    """Return the lost messages that metadata.yaml reports, by topic."""
     content = load_yaml((bag / METADATA_FILE).read_text(encoding="utf-8"))
     custom = content["rosbag2_bagfile_information"]["custom_data"] or {}
     return Counter(json.loads(custom.get(MESSAGES_LOST, "{}")))

@@ -1,4 +1,4 @@
-"""The person at the rig: prepares it, inserts, mends what a fault left, draws the needle out."""
+"""Model of the operator: prepares the rig, inserts, recovers from faults, withdraws the needle."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from needle_core import messages as m
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 INSERT, RETRACT, STOP = 0, 1, 2
-_LOOK = 0.1
+_PERIOD = 0.1
 _JOY_RATE = 50.0
-# Between two calls of one service [s].
+# Shortest time between two calls of one service [s].
 _CALL_AGAIN = 0.5
-# How long a finger stays off before it presses again, and how long it presses in vain [s].
-_PAUSE, _IN_VAIN = 0.3, 3.0
+# Pause between release and press, and time after which a press without effect is repeated [s].
+_PAUSE, _RETRY_AFTER = 0.3, 3.0
 OUT = 3e-4
-"""A needle that is in no farther looks as if it were out [m]."""
+"""Insertion up to which the needle looks withdrawn [m]."""
 
 
-class Wish(enum.Enum):
-    """Aim of the person."""
+class OperatorGoal(enum.Enum):
+    """Goal of the operator."""
 
     INSERT = "insert"
-    DRAW_OUT = "draw out"
+    WITHDRAW = "draw out"
     LEAVE = "leave"
 
 
 @dataclasses.dataclass
-class Hand:
-    """Buttons that are down.
+class JoystickButtons:
+    """Buttons of the joystick, true while pressed.
 
     Attributes
     ----------
     insert, retract, stop : bool
-        Each of them.
+        One for each button.
     """
 
     insert: bool = False
@@ -45,100 +45,102 @@ class Hand:
 
     @property
     def holds(self) -> bool:
-        """Whether it presses what could move the needle."""
+        """Whether a button that could move the needle is pressed."""
         return self.insert or self.retract
 
     @property
     def button(self) -> str:
-        """The button of a page that a finger is on; empty: none, or more than one."""
+        """Button of a page that is pressed; empty for none or more than one."""
         if self.insert is self.retract or self.stop:
             return ""
         return "insert" if self.insert else "retract"
 
 
 class Joystick(c.Component):
-    """Publishes what the hand does.
+    """Publishes the state of the buttons.
 
     Parameters
     ----------
-    hand : Hand
+    hand : JoystickButtons
         The person's.
     name, topic : str
         Of the component, and where it publishes.
     """
 
-    def __init__(self, hand: Hand, name: str = "joy_node", topic: str = "joy") -> None:
+    def __init__(self, hand: JoystickButtons, name: str = "joy_node", topic: str = "joy") -> None:
         self.name = name
         self.outputs = (c.Output(topic, m.Joystick, c.BEST_EFFORT),)
 
-        def tell(at: c.Moment) -> c.Actions:
+        def publish(at: c.Moment) -> c.Actions:
             buttons = (int(hand.insert), int(hand.retract), int(hand.stop))
             yield c.Publish(topic, m.Joystick(at.stamp_ns, (), buttons))
 
-        self.timers = (c.Timer(1.0 / _JOY_RATE, tell),)
+        self.timers = (c.Timer(1.0 / _JOY_RATE, publish),)
 
 
-class Person(c.Component):
-    """Acts by what the rig says of itself, and by where the needle is seen to be.
+class OperatorModel(c.Component):
+    """Acts on the published states of the rig and the visible insertion of the needle.
 
     Parameters
     ----------
-    hand : Hand
-        Its own.
+    hand : JoystickButtons
+        Its buttons.
     insertion : callable
-        Returns how far the needle is in, as anybody can see [m].
+        Returns the insertion of the needle [m].
     source : str
-        Name of the node by which it holds, as the device knows it.
+        Name of the node that publishes its hold.
 
     Attributes
     ----------
-    wish : Wish
-        What it wants now.
+    goal : OperatorGoal
+        Present goal.
     device, controller : DeviceStatus, ControllerStatus
-        What they said last.
+        Last received status.
     done : bool
-        Whether the controller has said once that it is done.
+        Whether the controller was in state DONE once.
     absent : bool
-        Whether it minds nothing, whatever its hand does.
-    sees_lost_press : callable
-        Returns whether what it holds by shows that a press is lost.
-    asides : list of Action
-        What it does beside, at its next look.
+        Whether it does nothing; the hand may still move.
+    shows_lost_press : callable
+        Returns whether its input device shows a lost press.
+    extra_actions : list of Action
+        Actions to send in the next period.
     """
 
     name = "person"
 
-    def __init__(self, hand: Hand, insertion: Callable[[], float], source: str) -> None:
+    def __init__(self, hand: JoystickButtons, insertion: Callable[[], float], source: str) -> None:
         self._hand = hand
         self._insertion = insertion
         self._source = source
-        self.wish = Wish.INSERT
+        self.goal = OperatorGoal.INSERT
         self.device, self.controller = DeviceStatus(), ControllerStatus()
         self.done = False
         self.absent = False
-        self.sees_lost_press: Callable[[float], bool] = lambda _: False
-        self.asides: list[c.Action] = []
+        self.shows_lost_press: Callable[[float], bool] = lambda _: False
+        self.extra_actions: list[c.Action] = []
         self._called: dict[str, float] = {}
         self._changed_at = 0.0
         self.inputs = (
-            c.Input("device/status", DeviceStatus, self._see_device, c.LATCHED),
-            c.Input("needle/controller_status", ControllerStatus, self._see_controller, c.LATCHED),
+            c.Input("device/status", DeviceStatus, self._on_device_status, c.LATCHED),
+            c.Input(
+                "needle/controller_status", ControllerStatus, self._on_controller_status, c.LATCHED
+            ),
         )
         self.outputs = (c.Output("device/estop", m.EmergencyStop),)
-        self.timers = (c.Timer(_LOOK, self._look),)
+        self.timers = (c.Timer(_PERIOD, self._act),)
 
-    def _see_device(self, message: DeviceStatus, at: c.Moment) -> c.Actions:
+    def _on_device_status(self, message: DeviceStatus, at: c.Moment) -> c.Actions:
         self.device = message
         return ()
 
-    def _see_controller(self, message: ControllerStatus, at: c.Moment) -> c.Actions:
+    def _on_controller_status(self, message: ControllerStatus, at: c.Moment) -> c.Actions:
         self.controller = message
         self.done = self.done or message.state == "DONE"
         return ()
 
-    def _look(self, at: c.Moment) -> c.Actions:
-        yield from self.asides
-        self.asides = []
+    def _act(self, at: c.Moment) -> c.Actions:
+        yield from self.extra_actions
+        self.extra_actions = []
         if self.absent:
             return
         state = self.device.state
@@ -150,7 +152,7 @@ class Person(c.Component):
         elif state == "DISABLED":
             yield from self._prepare(at)
         elif state in ("HOLDING", "MOVING"):
-            insert, retract, call = self._wanted(state)
+            insert, retract, call = self._next_action(state)
             if call is not None:
                 yield from self._try(call[0], at, call[1])
         self._press(at.steady, insert=insert, retract=retract)
@@ -158,50 +160,50 @@ class Person(c.Component):
     def _prepare(self, at: c.Moment) -> c.Actions:
         is_out = self._insertion() < OUT
         if self.device.homed or not is_out:
-            if self.wish is not Wish.LEAVE:
+            if self.goal is not OperatorGoal.LEAVE:
                 yield from self._try("device/enable", at, True)
         elif not self.device.needle_out_confirmed:
             yield from self._try("device/confirm_needle_out", at, True)
         else:
             yield from self._try("device/home", at)
 
-    def _wanted(self, state: str) -> tuple[bool, bool, tuple[str, bool | None] | None]:
-        """Return whether to press to insert, to draw out, and what to call."""
+    def _next_action(self, state: str) -> tuple[bool, bool, tuple[str, bool | None] | None]:
+        """Return whether to press insert, whether to press retract, and the service to call."""
         if self.device.activity == "homing":
             return False, False, None
         is_out = self._insertion() < OUT
         steering = self.controller.state
-        if self.wish is Wish.INSERT and self.device.homed:
+        if self.goal is OperatorGoal.INSERT and self.device.homed:
             if steering in ("STEERING", "WAITING_FOR_TIP"):
                 return True, False, None
             if is_out and steering in ("IDLE", "DONE", "FAULT") and not self.done:
                 return False, False, ("plane_controller/start", None)
-        if not is_out and self.wish is not Wish.LEAVE:
+        if not is_out and self.goal is not OperatorGoal.LEAVE:
             return False, True, None
-        if is_out and (self.done or self.wish is Wish.DRAW_OUT):
-            self.wish = Wish.LEAVE
-        # Homing is for axes that are off.
+        if is_out and (self.done or self.goal is OperatorGoal.WITHDRAW):
+            self.goal = OperatorGoal.LEAVE
+        # Homing needs disabled axes.
         off = state == "HOLDING" and is_out and not self.device.homed
         return False, False, ("device/enable", False) if off else None
 
     def _press(self, now: float, *, insert: bool, retract: bool) -> None:
-        """Let go of what is not wanted; press what is, from neutral, anew where asked to."""
+        """Release other buttons and stale presses; press the given button from neutral."""
         hand = self._hand
-        lost = self.device.press_again == self._source or self.sees_lost_press(now)
+        lost = self.device.press_again == self._source or self.shows_lost_press(now)
         stale = hand.holds and (insert, retract) != (hand.insert, hand.retract)
         if hand.holds and (stale or lost):
-            self._let_go(now)
+            self._release(now)
             return
-        for_so_long = now - self._changed_at
+        duration = now - self._changed_at
         if hand.holds:
-            # Who holds in vain lets go after a while, and tries again.
-            if for_so_long > _IN_VAIN and self.device.hold_owner != self._source:
-                self._let_go(now)
-        elif (insert or retract) and for_so_long > _PAUSE:
+            # Release a press without effect after a while, and try again.
+            if duration > _RETRY_AFTER and self.device.hold_owner != self._source:
+                self._release(now)
+        elif (insert or retract) and duration > _PAUSE:
             hand.insert, hand.retract = insert, retract
             self._changed_at = now
 
-    def _let_go(self, now: float) -> None:
+    def _release(self, now: float) -> None:
         self._hand.insert = self._hand.retract = False
         self._changed_at = now
 

@@ -1,4 +1,4 @@
-"""A node in the place of a person: calls services, holds, and sees where the needle goes."""
+"""A node that replaces the operator: calls services, holds, and records the needle's motion."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from needle_core.ros.base_node import (
     values_of,
 )
 
-PATIENCE = 20.0
+TIMEOUT = 20.0
 CONTROLLER_START = "plane_controller/start"
 _HOLD_PERIOD = 0.05
-# What counts as motion: less than any set-point, more than rounding [m].
+# Threshold of a motion, below any set-point and above rounding [m].
 _STILL = 1e-9
 _SERVICES = {
     **dict.fromkeys(("device/home", "device/retract", "device/reset", CONTROLLER_START), Trigger),
@@ -42,8 +42,8 @@ _SERVICES = {
 
 @contextmanager
 def ros(domain: int) -> Iterator[None]:
-    """Start ROS in this process and in this domain, and shut it down in the end."""
-    # Its hold must not lapse where a node appears.
+    """Initialize ROS in this process and a domain; shut it down at the end."""
+    # Shared memory could delay the hold while another node starts.
     restrict_discovery(shared_memory=False)
     rclpy.init(args=[], domain_id=domain)
     try:
@@ -52,37 +52,37 @@ def ros(domain: int) -> Iterator[None]:
         rclpy.try_shutdown()
 
 
-class Place(NamedTuple):
-    """Place of the motors at the system time at which it was said [s], [m], [rad]."""
+class MotorPosition(NamedTuple):
+    """Position of the motors with its source time stamp [s], [m], [rad]."""
 
     time: float
     insertion: float
     rotation: float
 
 
-class RigHand(WholeNode):
-    """A node whose callbacks run where a trial waits for something.
+class RosRigClient(WholeNode):
+    """A node whose callbacks run while a trial waits.
 
     Parameters
     ----------
     places_from : str
-        Topic (sensor_msgs/JointState) that says where the needle is.
+        Topic (sensor_msgs/JointState) of the position.
     holds : bool
-        Whether it says something on device/hold.
+        Whether it publishes device/hold.
 
     Attributes
     ----------
-    places : list of Place
-        As they were said.
+    places : list of MotorPosition
+        Received positions.
     status, controller : dict of str to str
-        What device and controller said last.
+        Last status of device and controller.
     pressed : bool
-        Whether it presses.
+        Whether the hold is pressed.
     """
 
     def __init__(self, places_from: str = "joint_states", *, holds: bool = True) -> None:
         super().__init__("hand")
-        self.places: list[Place] = []
+        self.places: list[MotorPosition] = []
         self.status: dict[str, str] = {}
         self.controller: dict[str, str] = {}
         self.pressed = False
@@ -110,81 +110,81 @@ class RigHand(WholeNode):
 
     # ---- waiting ------------------------------------------------------------------------------
 
-    def look(self, timeout: float = 0.0) -> None:
-        """Take one message, waiting for it at most `timeout` [s]."""
+    def spin(self, timeout: float = 0.0) -> None:
+        """Run one callback, waiting for it at most `timeout` [s]."""
         self._executor.spin_once(timeout_sec=timeout)
 
-    def until(self, condition: Callable[[], bool], what: str, patience: float = PATIENCE) -> None:
+    def until(self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT) -> None:
         """Wait for a condition.
 
         Raises
         ------
         UserError
-            If it does not come within `patience` [s].
+            If the condition does not hold within `timeout` [s].
         """
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > deadline:
-                told = f"device: {self.status}, controller: {self.controller.get('state')}"
-                raise UserError(f"waited {patience:g} s in vain: {what}; {told}")
-            self.look(0.01)
+                status = f"device: {self.status}, controller: {self.controller.get('state')}"
+                raise UserError(f"timed out after {timeout:g} s: {what}; {status}")
+            self.spin(0.01)
 
     def pause(self, seconds: float) -> None:
-        """Listen for so long."""
+        """Run callbacks for a duration [s]."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self.look(0.005)
+            self.spin(0.005)
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Destroy the node."""
         self._executor.shutdown()
         self.destroy_node()
 
-    # ---- acting -------------------------------------------------------------------------------
+    # ---- actions ------------------------------------------------------------------------------
 
     def call(self, name: str, data: bool | None = None) -> bool:
-        """Call a service; return whether it agrees."""
+        """Call a service; return its `success`."""
         client = self._clients_of[name]
-        self.until(client.service_is_ready, f"service {name}", 3.0 * PATIENCE)
+        self.until(client.service_is_ready, f"service {name}", 3.0 * TIMEOUT)
         request = Trigger.Request() if data is None else SetBool.Request(data=data)
         future = client.call_async(request)
         self.until(future.done, f"an answer from {name}")
         return bool(future.result().success)
 
-    def insist(self, name: str, data: bool | None = None) -> None:
-        """Call a service until it agrees; raises as `until`."""
-        self.until(lambda: self.call(name, data), f"{name} agrees")
+    def call_until_success(self, name: str, data: bool | None = None) -> None:
+        """Call a service until it succeeds; raises as `until`."""
+        self.until(lambda: self.call(name, data), f"success of {name}")
 
     def prepare(self) -> None:
-        """Home both axes, the needle being out, and enable them; raises as `until`."""
-        self.insist("device/confirm_needle_out", True)
-        self.insist("device/home")
+        """Confirm that the needle is out, home both axes and enable them; raises as `until`."""
+        self.call_until_success("device/confirm_needle_out", True)
+        self.call_until_success("device/home")
         off_at_home = {"homed": "true", "state": "DISABLED"}.items()
         self.until(lambda: off_at_home <= self.status.items(), "homed")
-        self.insist("device/enable", True)
+        self.call_until_success("device/enable", True)
 
     def send_hold(self) -> None:
-        """Say what the hold is."""
+        """Publish the hold."""
         message = self._session.next_message(time.time_ns(), pressed=self.pressed)
         self._hold.publish(self._converter.to_ros(message))
 
-    # ---- seeing -------------------------------------------------------------------------------
+    # ---- motion -------------------------------------------------------------------------------
 
     @property
     def insertion(self) -> float:
-        """The needle's insertion now [m]."""
+        """Present insertion [m]."""
         return self.places[-1].insertion if self.places else 0.0
 
     def last_motion(self, begin: float, end: float) -> float:
-        """Return when the needle moved last of a time [s]; its beginning where it did not."""
+        """Return the time of the last motion in an interval [s]; its begin if there was none."""
         return max((at.time for at, _ in self._motions(begin, end)), default=begin)
 
-    def way(self, begin: float, end: float = math.inf) -> float:
-        """Return how far the needle moved in a time, to and fro [m]."""
+    def travelled_distance(self, begin: float, end: float = math.inf) -> float:
+        """Return the distance travelled in an interval, in both directions [m]."""
         return sum(way for _, way in self._motions(begin, end))
 
-    def _motions(self, begin: float, end: float) -> Iterator[tuple[Place, float]]:
-        """Yield each place of a time that is another than that before, and how far from it."""
+    def _motions(self, begin: float, end: float) -> Iterator[tuple[MotorPosition, float]]:
+        """Yield each changed position in an interval, and its distance from the one before."""
         for before, after in itertools.pairwise(self.places):
             way = abs(after.insertion - before.insertion)
             if begin < after.time <= end and way > _STILL:
@@ -193,7 +193,7 @@ class RigHand(WholeNode):
     def _on_places(self, message: JointState, info: dict[str, int]) -> None:
         at = dict(zip(message.name, message.position, strict=True))
         sent = info["source_timestamp"] * 1e-9
-        self.places.append(Place(sent, at["insertion_joint"], at["rotation_joint"]))
+        self.places.append(MotorPosition(sent, at["insertion_joint"], at["rotation_joint"]))
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         self.status = values_of(message)
