@@ -128,8 +128,8 @@ def test_a_turned_base_is_rejected_except_for_the_part_before(
 def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "tips.csv"
     for text, message in (
-        ("", "there is no row in it"),
-        ("x_m,y_m,z_m\n", "there is no row in it"),
+        ("", "the file has no rows"),
+        ("x_m,y_m,z_m\n", "the file has no rows"),
         ("a,b\n1,2\n", "x_m is missing"),
         ("x_m,y_m,z_m\n0,0,0.01\n", "1 tips are too few"),
         ("x_m,y_m,z_m\n0,0,nan\n", "z_m = nan is not finite"),

@@ -79,7 +79,7 @@ def test_retraction_is_detected_from_the_median_of_five_samples() -> None:
     assert not any(watched(watch, *[0.02 - 1.99e-4] * 5))
     assert watch.reason == ""
     assert watched(watch, *[0.02 - 2.01e-4] * 3)[-1]
-    assert "was retracted: draw it out first" in watch.reason
+    assert "was retracted: withdraw it first" in watch.reason
     # A later insertion does not cancel the retraction; a needle that is out does.
     watched(watch, *[0.025] * 5)
     assert watch.reason
