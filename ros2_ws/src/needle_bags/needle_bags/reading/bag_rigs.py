@@ -49,8 +49,8 @@ def namespace_of(contents: BagDirectory, wanted: str | None = None) -> str:
     found = namespaces(contents)
     if not found:
         raise UserError(
-            f"{contents.path} holds no needle run: no topic {_LANDMARK} among its "
-            f"{len(contents.topics)}; it needs a bag that the rig's recorder made"
+            f"{contents.path} contains no needle run: no topic {_LANDMARK} among its "
+            f"{len(contents.topics)}; give a bag that the rig's recorder made"
         )
     listed = ", ".join(name.rstrip("/") or "/" for name in found)
     if wanted is not None:

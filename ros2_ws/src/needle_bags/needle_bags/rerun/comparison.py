@@ -33,15 +33,15 @@ class Tolerance:
     reason: str
 
 
-LENGTH = Tolerance("m", 1e-7, 1e-6, "below a hundredth of the error of a tip")
-ANGLE = Tolerance("rad", 1e-6, 1e-6, "a hundredth of an encoder count of the rotation")
+LENGTH = Tolerance("m", 1e-7, 1e-6, "below 1 % of the tip error")
+ANGLE = Tolerance("rad", 1e-6, 1e-6, "1 % of an encoder count of the rotation")
 QUATERNION = Tolerance("-", 1e-6, 0.0, "as an angle, halved")
 RATIO = Tolerance("-", 1e-6, 1e-6, "as an angle: sines of angles")
 CURVATURE = Tolerance("1/m", 1e-5, 1e-6, "turns a heading by 1e-6 rad in 120 mm")
 ROTATION_RATE = Tolerance("rad/m", 1e-3, 1e-6, "1e-6 rad in a step of 1 mm")
 VIRTUAL_INPUT = Tolerance("1/m^2", 1e-3, 1e-5, "follows from the rotation per length")
 DURATION = Tolerance("s", 1e-9, 1e-6, "a nanosecond is the message's own resolution")
-COVARIANCE = Tolerance("of sigmas", 0.0, 1e-3, "nobody knows a variance to a thousandth")
+COVARIANCE = Tolerance("of sigmas", 0.0, 1e-3, "variances are not known to 0.1 %")
 
 
 @dataclasses.dataclass(frozen=True)

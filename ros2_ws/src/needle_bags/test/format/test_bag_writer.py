@@ -108,7 +108,7 @@ def test_mcap_reads_the_file_alone(texts: Path) -> None:
 
 
 def test_an_existing_bag_is_not_replaced(texts: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds a bag already"):
+    with pytest.raises(UserError, match="already contains a bag"):
         BagWriter(texts)
     (tmp_path / "parameters.yaml").write_text("{}")
     with pytest.raises(UserError, match="it is a file"):

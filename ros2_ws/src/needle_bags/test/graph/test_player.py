@@ -155,7 +155,7 @@ def test_topics_that_control_a_rig_are_not_played(
     assert qos["/plane"].durability == DurabilityPolicy.TRANSIENT_LOCAL
     assert qos["/noisy"].reliability == ReliabilityPolicy.BEST_EFFORT
     old, odd = scene.logged
-    assert "/old is not played: std_msgs/msg/Header is defined otherwise" in old
+    assert "/old is not played: std_msgs/msg/Header has another definition" in old
     assert "/odd is not played: the definition of no_msgs/msg/Such is not installed" in odd
 
 

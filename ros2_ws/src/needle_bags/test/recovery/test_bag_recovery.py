@@ -65,7 +65,7 @@ def test_without_metadata_everything_is_recovered_in_order(tmp_path: Path) -> No
     assert (recovery.messages, recovery.lost, recovery.kept) == (300, "", [])
     after = yaml.safe_load((path / "metadata.yaml").read_text())
     note = after["rosbag2_bagfile_information"]["custom_data"].pop("recovered")
-    assert note == "its metadata or index was made anew; all that was written is here"
+    assert note == "its metadata or index was rebuilt; it contains everything that was written"
     for document in (before, after):
         for key in ("parameters", "parameter_changes"):
             document["rosbag2_bagfile_information"]["custom_data"].pop(key, None)
@@ -85,7 +85,7 @@ def test_the_command_reports_the_loss_and_leaves_a_whole_bag(
     path = write(tmp_path / "bag")
     before = contents(path)
     assert recover.main([str(path)]) == 0
-    assert "is whole: 300 messages of 3 topics; nothing to do" in capsys.readouterr().out
+    assert "is complete: 300 messages of 3 topics; nothing to do" in capsys.readouterr().out
     assert contents(path) == before
     first = damage(path / "bag_0.mcap")
     assert recover.main([str(path), "--json", str(tmp_path / "out.json")]) == 0
@@ -168,7 +168,7 @@ def test_an_unrecoverable_bag_gives_a_one_line_error_and_is_kept(
         "other": "byte 0 of bag_0.mcap (a record is damaged: InvalidMagic)",
         "empty": "is not a bag",
         "missing": "no such bag directory",
-        "damaged": "nothing comes before byte",
+        "damaged": "it has no data before byte",
     }.items():
         path = tmp_path / name
         before = contents(path) if path.exists() else {}
