@@ -70,7 +70,7 @@ BAD_WINDOWS = [
     ("phantom", {"surface_height": 0.0, "refractive_index": 1.3}, "beside"),
     ("right.window", GONE, "right.window is missing, and so phantom is missing"),
     ("left.window.layers", GONE, "left.window.layers is missing"),
-    ("left.window.normal", [0, 0, 1], "lies along the needle"),
+    ("left.window.normal", [0, 0, 1], "is parallel to the needle"),
     ("left.window.normal", [1, 1, 0], "normal has length 1.41"),
     ("left.window.normal", [-1, 0, 0], "not above the surface"),
     ("left.window.inside", 0.9, r"inside = 0.9 is outside \[1, 3\]"),
