@@ -186,4 +186,4 @@ def unreadable(bag: Path) -> str:
         return f"{type(error).__name__}: {error}"
     if told == count == seen:
         return ""
-    return f"metadata.yaml tells of {told} messages, rosbags reads {count}, mcap {seen}"
+    return f"metadata.yaml lists {told} messages, rosbags reads {count}, mcap {seen}"

@@ -93,7 +93,7 @@ def _bench(arguments: Sequence[str]) -> int:
     file = output_file("--json", given.json)
     benches = {name: bench for name, bench in BENCHES.items() if (given.only or "") in name}
     if not benches:
-        raise UserError(f"--only {given.only!r} is in none of {', '.join(BENCHES)}")
+        raise UserError(f"--only {given.only!r} is not in {', '.join(BENCHES)}")
     values: dict[str, JsonValue] = {}
     print(f"{'':34}{'here':>12}  {'reference':>12}  {'ratio':>8}")
     with ending_descendants():
@@ -271,7 +271,7 @@ def _require_agreement(name: str, one: Sequence[float], other: Sequence[float]) 
     """Refuse to compare loops that do not compute the same."""
     off = max(abs(a - b) for a, b in zip(one, other, strict=True))
     if off > 1e-6:
-        raise UserError(f"the loop in {name} ends up to {off:g} m elsewhere: not the same loop")
+        raise UserError(f"the loop in {name} ends up to {off:g} m away: not the same loop")
 
 
 def _peak_memory(name: str, depth: float) -> float:

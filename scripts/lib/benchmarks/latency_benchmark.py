@@ -133,7 +133,7 @@ def _run(folder: Path, depth: float) -> None:
         )
         graph.check()
     if done.returncode:
-        raise UserError(f"the needle did not get there: {done.stderr.strip().splitlines()[-1]}")
+        raise UserError(f"the needle did not arrive: {done.stderr.strip().splitlines()[-1]}")
 
 
 def _free_ports() -> dict[str, object]:

@@ -20,7 +20,7 @@ def readings(snapshot: Snapshot) -> dict[str, str]:
     """
     return {
         "Depth": _depth(snapshot),
-        "Distance from the plane": _off_plane(snapshot),
+        "Distance from plane": _off_plane(snapshot),
         "Rotation of the base": _turn(snapshot.rotation),
         "Tip": _tip(snapshot),
         "Reach": _reach(snapshot),

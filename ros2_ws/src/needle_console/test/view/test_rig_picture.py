@@ -139,7 +139,7 @@ def test_readings_are_in_mm_and_degrees() -> None:
     picture.set_controller(dataclasses.replace(told, reachable=True, reachable_depth_m=0.043))
     shown = readings(picture.snapshot(0.0))
     assert shown["Depth"] == "50.0 mm of 120 mm"
-    assert shown["Distance from the plane"] == f"{MINUS}2.00 mm (95 %: {MINUS}2.50 to {MINUS}1.50)"
+    assert shown["Distance from plane"] == f"{MINUS}2.00 mm (95 %: {MINUS}2.50 to {MINUS}1.50)"
     assert shown["Rotation of the base"].startswith("5.7")
     assert shown["Reach"] == "the plane can be reached, from 43 mm on"
     picture.set_controller(
