@@ -42,8 +42,8 @@ def api_pages() -> dict[str, str]:
             )
         )
     index = (
-        "# Libraries\n\nOf the packages' pure libraries, which know no ROS, those that something "
-        "of your own is made of. SI units throughout.\n\n" + table(("room", "what it is"), rows)
+        "# Libraries\n\nThe packages' libraries without ROS, for your own programs. SI units "
+        "throughout.\n\n" + table(("room", "what it is"), rows)
     )
     return {"api.md": index, **found}
 

@@ -15,7 +15,7 @@ from reference.rig_nodes import RigNode
 LEVELS = ("WARN", "ERROR")
 IN_EVERY_NODE = {
     "input": "a message or request was refused, or the node failed on it; counted by topic",
-    "duplicates": "another node publishes what this one alone should",
+    "duplicates": "another node publishes a topic that only this node should",
 }
 """Parts that any node may report, by `needle_core.ros`."""
 _WORDS = "..."
@@ -114,9 +114,9 @@ def diagnostics_page(nodes: Sequence[RigNode]) -> str:
     ]
     every = [(code(part), text) for part, text in IN_EVERY_NODE.items()]
     return (
-        "# Diagnostics\n\nEvery node tells its health on `/diagnostics`, once a second and "
-        "whenever it changes, part by part, as `NODE: PART`. What to do about it is in the READMEs "
-        "of the packages.\n\n"
+        "# Diagnostics\n\nEvery node reports its health on `/diagnostics`, once a second and "
+        "whenever it changes, part by part, as `NODE: PART`. The packages' READMEs describe "
+        "the remedies.\n\n"
         "## Parts\n\n"
         + table(("node", "part", "keys of its values"), parts)
         + "In every node:\n\n"

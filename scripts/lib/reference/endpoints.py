@@ -26,10 +26,10 @@ MAKERS = {
 }
 """Methods of rclpy's Node by what they make."""
 OPEN_ENDED = {
-    "needle_bags/ros/graph_topics.py:_subscribe": "`recorder` hears every topic of the "
-    "graph, by its choice.",
-    "needle_bags/ros/player.py:_publisher": "`player` publishes what its bag has; what a rig "
-    "obeys below `/replay` alone.",
+    "needle_bags/ros/graph_topics.py:_subscribe": "`recorder` subscribes to all topics "
+    "that its parameters select.",
+    "needle_bags/ros/player.py:_publisher": "`player` publishes the topics of its bag; "
+    "commands, holds and targets under `/replay` only.",
     "needle_bags/ros/parameter_snapshots.py:__init__": "`recorder` asks every node for its "
     "parameters.",
 }

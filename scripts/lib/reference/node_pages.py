@@ -113,9 +113,9 @@ def topics_page(nodes: Sequence[RigNode]) -> str:
     ]
     return (
         "# Topics\n\nNames are relative but where they begin with `/`: a namespace moves the whole "
-        "rig. Types are ROS's own. The number is the depth of the queue; what is latched reaches "
-        "those, too, who come later.\n\n"
-        + table(("topic", "type", "published by", "heard by"), rows)
+        "rig. Types are ROS's own. The number is the depth of the queue; latched messages also "
+        "reach late subscribers.\n\n"
+        + table(("topic", "type", "publishers", "subscribers"), rows)
         + "".join(f"{text}\n\n" for text in OPEN_ENDED.values() if "ask" not in text)
         + _EVERY_NODE
     )

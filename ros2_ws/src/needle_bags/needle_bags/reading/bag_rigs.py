@@ -56,7 +56,7 @@ def namespace_of(contents: BagDirectory, wanted: str | None = None) -> str:
     if wanted is not None:
         namespace = f"/{wanted.strip('/')}/".replace("//", "/")
         if namespace not in found:
-            raise UserError(f"{contents.path} has no rig in {wanted}; it has those in {listed}")
+            raise UserError(f"{contents.path} has no rig in {wanted}; it has rigs in {listed}")
         return namespace
     if len(found) > 1:
         raise UserError(

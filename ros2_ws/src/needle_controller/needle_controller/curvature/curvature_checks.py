@@ -99,7 +99,7 @@ def fit_checked(
         allowed = _CONTRADICTION * math.hypot(settings.entry_std, float(free.entry_std))
         if distance > allowed:
             warnings.append(
-                f"the entry was not used: the tips start {1e3 * distance:.1f} mm beside it, "
+                f"the entry was not used: the tips start {1e3 * distance:.1f} mm from it, "
                 f"limit {1e3 * allowed:.1f} mm"
             )
             settings = dataclasses.replace(settings, entry=(e, f, g), entry_std=math.inf)

@@ -87,7 +87,7 @@ def first_path(
     reason = f"no path to the target point {is_clear} of the {len(obstacles)} obstacles"
     nearest = nearest_entry(planner, entry, target, obstacles)
     if nearest is None:
-        reason += f", nor from any entry up to {_OFFSETS[-1]:.4g} m beside it"
+        reason += f", nor from any entry up to {_OFFSETS[-1]:.4g} m from it"
     else:
         reason += "; there is one from an entry at ({:.4g}, {:.4g}) m instead of (0, 0)".format(
             *nearest
