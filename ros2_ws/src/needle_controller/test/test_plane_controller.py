@@ -215,7 +215,7 @@ def test_invalid_targets_are_rejected_and_the_last_stays() -> None:
     for x, z in ((0.01, 0.1), (0.09, 0.1)):
         bench.receive("target_point", m.Point(0, "rig", (x, 0.0, z)))
         assert bench.status.target_point_m == (0.01, 0.0, 0.1)
-    assert "entering at" in bench.health["target_point"].message
+    assert "from an entry at" in bench.health["target_point"].message
     # A plane replaces the point.
     bench.receive("target_plane", plane)
     assert bench.status.target_point_m is None

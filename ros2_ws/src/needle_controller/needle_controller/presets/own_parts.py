@@ -130,7 +130,7 @@ class OwnPart:
             raise self.error(f"{what} has shape {array.shape}, expected {shape}: {meaning}")
         if not np.all(np.isfinite(array)):
             number = next(float(v) for v in array.ravel() if not math.isfinite(v))
-            raise self.error(f"{what} contains {number}, expected finite {meaning}")
+            raise self.error(f"{what} contains {number}, must be finite: {meaning}")
         return array
 
 

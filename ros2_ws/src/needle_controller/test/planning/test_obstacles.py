@@ -99,10 +99,10 @@ def test_a_file_is_read_or_rejected_in_one_line(tmp_path: Path) -> None:
         ("spheres:", "cubes:", "cubes is not one of"),
         ("radius: 0.004", "size: 0.004", "spheres, number 1: expected center, radius"),
         ("0.002, 0.05", ".nan, 0.05", "y of obstacle 1 = nan"),
-        ("[0.0, 0.002, 0.05]", "[0.0, 0.05]", "center = .* wants three numbers"),
+        ("[0.0, 0.002, 0.05]", "[0.0, 0.05]", "center = .* expected three numbers"),
         ("radius: 0.003", "radius: '3 mm'", "capsules, number 1: radius = '3 mm'"),
         ("frame: rig", "frame: [", "not YAML in line 4"),
-        (FILE, "- 3", "wants"),
+        (FILE, "- 3", "expected"),
         ("spheres:", "spheres: 3\nboxes:", "boxes is not one of"),
     ):
         path.write_text(FILE.replace(old, new), encoding="utf-8")

@@ -141,13 +141,13 @@ def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
         ("import numpy as np", "numpy", "loading it raised NameError"),
         ("= settings, initial", "= setting, initial", "raised NameError"),
         ("return pose_estimate(", "return (", "returned tuple, expected an Estimate"),
-        ("(self.place, self.turn", "(self.place * np.nan, self.turn", "holds nan"),
-        ("(self.place, self.turn", "(1e3 * self.place, self.turn", "is wanted in m"),
+        ("(self.place, self.turn", "(self.place * np.nan, self.turn", "contains nan"),
+        ("(self.place, self.turn", "(1e3 * self.place, self.turn", "expected m, in the target plane"),
         ("(self.place, self.turn", "(0 * self.place, self.turn", "0.02 m off"),
         ("np.eye(6) * 1e-6)", "[[1, 2], [3]])", "estimate() raised ValueError"),
         ("reset(self, tip, joints)", "reset(self, tip)", "reset(tip, joints) raised TypeError"),
         ("np.eye(6) * 1e-6)", "np.full((6, 6), np.inf))", "covariance holds inf"),
-        ("np.where(np.isfinite(tip), tip, self.place)", "tip", "holds nan"),
+        ("np.where(np.isfinite(tip), tip, self.place)", "tip", "contains nan"),
         ("+ T_new_old[:3, 3]", "- T_new_old[:3, 3]", "change_frame by 0.002 m along x moves x by"),
         ("@ step.shift", "@ step.shif", "advance(d_insertion, d_rotation) raised AttributeError"),
     ):
@@ -200,7 +200,7 @@ def test_an_own_law_is_limited_and_gets_the_remaining_insertion(offer: Offer) ->
 def test_invalid_laws_are_rejected_with_the_reason(offer: Offer) -> None:
     rate = "40.0 * insertion"
     for wrong, said in (
-        ("np.nan", "holds nan"),
+        ("np.nan", "contains nan"),
         ("np.zeros(3)", "has shape (3,), expected ()"),
         ("'fast'", "is of type str"),
         ("estimate.speed", "to_plane(estimate, insertion) raised AttributeError"),

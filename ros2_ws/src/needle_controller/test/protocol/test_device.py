@@ -61,7 +61,7 @@ def test_silence_of_the_device_and_its_end_are_logged() -> None:
         assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
         assert rig.steering.on_time(1e3) == []
         heard = rig.settle(1) if by_joints else rig.steering.on_device(MOVING)
-        assert "heard again" in logged(heard)
+        assert "sends messages again" in logged(heard)
         assert not rig.steering.watchdog.silence
         rig.steering.on_device(HELD)
         rig.run(step)

@@ -49,7 +49,7 @@ def test_start_waits_until_joints_and_device_agree() -> None:
         rig.steering.on_device(
             dataclasses.replace(HOLDING, insertion_m=insertion, rotation_rad=rotation)
         )
-        assert ("waiting for joint_states to say" not in rig.start()) is agree
+        assert ("waiting for joint_states to agree" not in rig.start()) is agree
     for unsaid in (
         dataclasses.replace(HOLDING, insertion_m=None),
         dataclasses.replace(HOLDING, rotation_rad=None),
@@ -68,7 +68,7 @@ def test_start_waits_until_joints_and_device_agree() -> None:
 
 def test_start_is_refused_for_an_inserted_or_rolled_needle() -> None:
     assert Rig(started=False, insertion=0.002).start() == "steering"
-    assert "is 0.0021 m in and was not followed" in Rig(started=False, insertion=0.0021).start()
+    assert "is 0.0021 m in, on an unknown path" in Rig(started=False, insertion=0.0021).start()
     for short, said in ((0.9e-6, "has reached the depth 0.001 m"), (1.1e-6, "steering")):
         assert said in Rig(started=False, depth=0.001, insertion=0.001 - short).start()
     for degrees, started in ((79.0, True), (-79.0, True), (81.0, False), (-81.0, False)):
