@@ -122,7 +122,7 @@ def test_the_report_of_a_rerun(make_run: MakeRun, tmp_path: Path, drawn: list[Fi
     assert summary["controller"] == "best"
     words, sentence = verdict_text(summary)
     assert words == "Rerun"
-    assert "those of steered, which paper steered" in sentence
+    assert "come from steered, steered by paper" in sentence
     assert "those that best would have sent" in sentence
     # The command is that of the run in which the needle went in.
     assert "command" not in rerun.run_info

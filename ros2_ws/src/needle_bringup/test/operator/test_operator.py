@@ -88,7 +88,7 @@ def test_a_pedal_is_held_until_it_is_lost() -> None:
     assert (held.source, held.pressed, held.speed_scale) == ("operator", True, 0.5)
     assert held.lifetime == m.HOLD_LIFETIME
     scene.update(InputState(insert=True), press_again="operator")
-    assert "the device does not take this press" in scene.logs[-1]
+    assert "the device ignores this press" in scene.logs[-1]
     assert not scene.update(InputLost("unplugged")).pressed
     assert scene.logs[-1] == "nothing is held: unplugged"
     for _ in range(2):

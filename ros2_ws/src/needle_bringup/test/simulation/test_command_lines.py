@@ -145,7 +145,7 @@ def test_user_components_are_found_in_the_current_folder(
     for name, said in (
         (f"{module}:Missing", "has no attribute 'Missing'"),
         (f"{module}:Needy", "missing 1 required positional argument: 'wanted'"),
-        (f"{module}:Other", "makes a Other, no Component"),
+        (f"{module}:Other", "makes a Other, not a Component"),
         ("no_such_module:X", "--component no_such_module:X: No module named"),
     ):
         with pytest.raises(UserError, match=said):

@@ -149,4 +149,4 @@ def test_a_cluster_gives_the_figures_of_one_machine(
     assert "warning" not in capsys.readouterr().err
     monkeypatch.setattr(cluster_study, "_witness_digest", lambda _: "other bits")
     figures_of(tmp_path, "--scheduler", ADDRESS)
-    assert f"warning: {socket.gethostname()} rounds otherwise" in capsys.readouterr().err
+    assert f"warning: {socket.gethostname()} rounds unlike" in capsys.readouterr().err

@@ -146,7 +146,7 @@ def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
         ("(self.place, self.turn", "(0 * self.place, self.turn", "0.02 m off"),
         ("np.eye(6) * 1e-6)", "[[1, 2], [3]])", "estimate() raised ValueError"),
         ("reset(self, tip, joints)", "reset(self, tip)", "reset(tip, joints) raised TypeError"),
-        ("np.eye(6) * 1e-6)", "np.full((6, 6), np.inf))", "covariance holds inf"),
+        ("np.eye(6) * 1e-6)", "np.full((6, 6), np.inf))", "covariance contains inf"),
         ("np.where(np.isfinite(tip), tip, self.place)", "tip", "contains nan"),
         ("+ T_new_old[:3, 3]", "- T_new_old[:3, 3]", "change_frame by 0.002 m along x moves x by"),
         ("@ step.shift", "@ step.shif", "advance(d_insertion, d_rotation) raised AttributeError"),

@@ -41,7 +41,7 @@ def test_wrong_squares_are_found_by_their_size(
     result = calibrate(said_larger(views[4:], 0.003), SIZES, GIVEN, lenses_of(calibration))
     error, sigma = square_error(result)
     assert error == pytest.approx(-0.003, abs=max(4.0 * sigma, 3e-4))
-    assert "smaller than the session says" in contradictions(result, (error, sigma))[0]
+    assert "smaller than in the session" in contradictions(result, (error, sigma))[0]
 
 
 def test_one_place_does_not_determine_the_size_of_the_squares(
