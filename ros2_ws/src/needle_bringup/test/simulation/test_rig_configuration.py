@@ -119,7 +119,7 @@ def test_a_file_must_not_conflict_with_the_command_line() -> None:
     for given, said in (
         ({"plane_controller": {"depth": 0.1}}, "plane_controller: depth .* use --depth-mm"),
         ({"simulated_operator": {"wait_for_recorder": True}}, "simulate sets it itself"),
-        ({"recorder": {"topics": ["/needle/tip"]}}, "recorder: topics does not go into the file"),
+        ({"recorder": {"topics": ["/needle/tip"]}}, "recorder: topics cannot be in the file"),
     ):
         with pytest.raises(UserError, match=said):
             refuse_reserved(path, given, options)

@@ -170,7 +170,7 @@ def test_an_unusable_chain_is_rejected_with_the_reason(
             "is for images of 2048x1536, the left ones are 1024",
         ),
         ("cam0", {"intrinsics": [0, 0, 512, 384]}, "left camera: focal lengths 0, 0 px"),
-        ("cam1", {"T_cn_cnm1": [[2, 0, 0, 0]] * 4}, "is no rotation"),
+        ("cam1", {"T_cn_cnm1": [[2, 0, 0, 0]] * 4}, "is not a rotation"),
         ("cam1", {"T_cn_cnm1": None}, "cam1.T_cn_cnm1"),
         ("cam1", None, "found 1 of 2 cameras"),
     ):
