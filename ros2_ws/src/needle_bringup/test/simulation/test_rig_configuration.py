@@ -176,6 +176,6 @@ def test_contradictions_are_reported() -> None:
         assert said in line
     unseen: Parameters = {node: {"curvature": 12.0} for node in ("sim_rig", "plane_controller")}
     (line,) = contradictions(unseen, NODES)
-    assert line == "sim_rig has curvature 12, but stereo_tracker looks for max_curvature 9"
+    assert line == "sim_rig has curvature 12, but stereo_tracker expects max_curvature 9"
     assert contradictions(unseen, ("sim_rig", "plane_controller")) == []
     assert contradictions({"sim_rig": {"curvature": CURVATURE * (1 + 1e-6)}}, NODES) == []
