@@ -167,7 +167,7 @@ class ControllerStatus(KeyValues):
     command_ns, tip_after_ns : int
         Stamp of the newest command; earliest exposure of the next useful tip.
     tips_rejected, tips_rejected_for : int, str
-        Number of rejected tips, and the reason of the last rejection.
+        Number of rejected tips, and the count for each reason.
     watchdog_trips : int
         Number of expired watchdogs.
     preset : str

@@ -124,7 +124,7 @@ class GraphTopics:
                 self._refuse(name, f"{name} is not recorded: {error}")
 
     def describe_all(self) -> None:
-        """Describe the topics without any message."""
+        """Describe the topics that have not received a message."""
         for topic in self._topics.values():
             if not topic.described:
                 self._describe(topic)

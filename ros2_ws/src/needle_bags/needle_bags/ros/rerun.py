@@ -292,7 +292,7 @@ def _viewers(
 
 
 def _viewer_counts(viewers: Mapping[str, BagStage]) -> str:
-    """Return a line for each viewer; empty without any."""
+    """Return one line per viewer, or an empty text if there are none."""
     lines = []
     for name, viewer in viewers.items():
         counts = ", ".join(f"{count} {what}" for what, count in viewer.runner.counts.items())

@@ -98,7 +98,7 @@ def innovations(run: Run) -> Innovations | None:
 
 
 def gate_room(run: Run) -> GateRoom:
-    """Return the margins of the tips of a run."""
+    """Return how far the tips of a run were from being rejected."""
     finite = np.isfinite(run.tips.values).all(axis=1)
     stamps, tips = run.tips.stamps[finite], run.tips.values[finite]
     insertion = run.insertion_at(stamps)

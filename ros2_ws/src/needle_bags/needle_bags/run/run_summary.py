@@ -225,7 +225,7 @@ def watchdog_trips(run: Run) -> int:
 
 
 def is_aborted(result: Result) -> bool:
-    """Return whether a step or path was aborted, not completed or replaced."""
+    """Return whether a step or path was aborted, rather than completed or replaced."""
     return result.outcome.startswith("aborted")
 
 

@@ -13,7 +13,7 @@ PROGRESS_FD = "NEEDLE_PROGRESS_FD"
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """Insertion and final depth [m], and why the needle waits; empty if it advances."""
+    """Insertion and final depth [m]; reason for waiting, empty while the needle advances."""
 
     insertion: float
     depth: float

@@ -174,7 +174,7 @@ def replay_words(arguments: Mapping[str, str]) -> dict[str, list[str]]:
 def _with_file(
     parameters: Parameters, arguments: Mapping[str, str], reserved: Mapping[str, str]
 ) -> Parameters:
-    """Return the parameters, replaced by those of a parameter file."""
+    """Return the parameters, overridden by those in a parameter file."""
     if not arguments["params"]:
         return parameters
     given = _read("params", arguments, list(parameters))

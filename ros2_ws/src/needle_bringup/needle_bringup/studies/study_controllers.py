@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from needle_bringup.studies.study_estimators import BestEstimators, EachEstimator, Estimators
+from needle_bringup.studies.study_estimators import BestEstimators, Estimators, SeparateEstimators
 from needle_bringup.studies.study_laws import (
     PointLaws,
     best_point_laws,
@@ -275,7 +275,7 @@ def new_estimators(settings: SteeringSettings, first: int) -> Callable[[int], Es
     def new(n: int) -> Estimator:
         return make_controller(settings, np.eye(3), np.zeros(3), number=first + n)[0]
 
-    return lambda _: EachEstimator(new)
+    return lambda _: SeparateEstimators(new)
 
 
 def point_controller_factory(

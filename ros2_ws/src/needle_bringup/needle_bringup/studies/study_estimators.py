@@ -37,7 +37,7 @@ class Estimators(Protocol):
         """Return the estimated tips, (N, 3) [m], and their covariances, (N, 3, 3) [m^2]."""
 
 
-class EachEstimator:
+class SeparateEstimators:
     """Estimators of any kind, called one by one; see `Estimators`.
 
     Parameters

@@ -20,7 +20,7 @@ from needle_controller.model.target_plane import offset_plane
 from needle_controller.observers.estimator import Estimate
 from needle_controller.planning.obstacles import Obstacles
 from needle_controller.presets.path_steering import PathSteering, tip_state
-from needle_controller.presets.point_steering import Foresight, prompt_point_law
+from needle_controller.presets.point_steering import ArrivalPrediction, prompt_point_law
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.point_study import INSERTION_SPEED
@@ -95,7 +95,7 @@ def best_rates(settings: SteeringSettings) -> Callable[[ManyFilters, float], Flo
 
 def best_point_laws(settings: SteeringSettings, motion: TargetMotion) -> PointLaws:
     """Return the law of `best` for points, in compiled loops."""
-    law, foresight = PointLawSettings(**settings.turning), Foresight(motion)
+    law, prediction = PointLawSettings(**settings.turning), ArrivalPrediction(motion)
 
     def commands(
         filters: ManyFilters, insertion: FloatArray, rotation_left: FloatArray
@@ -103,7 +103,7 @@ def best_point_laws(settings: SteeringSettings, motion: TargetMotion) -> PointLa
         def left(targets: FloatArray) -> FloatArray:
             return filters.point_rates(law, targets, rotation_left)[1]
 
-        targets = foresight.look(insertion / INSERTION_SPEED, insertion, left)
+        targets = prediction.predict(insertion / INSERTION_SPEED, insertion, left)
         return filters.point_rates(law, targets, rotation_left)
 
     return commands

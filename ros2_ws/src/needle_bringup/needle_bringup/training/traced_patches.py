@@ -31,7 +31,7 @@ _SMALLER, _BLUR = (
     0.8,
     0.45,
 )  # scale below which images are blurred first, and the blur in new pixels
-_TRACKS, _OF_NEEDLE = 0.4, 0.6  # probability of tracks, and of traced needles as tracks
+_TRACKS, _OF_NEEDLE = 0.4, 0.6  # probability of old tracks in a patch; of traced ones among them
 _DARK = 8.0  # grey levels added before taking ratios of dark pixels
 
 

@@ -16,7 +16,7 @@ from needle_bringup.studies.study_controllers import (
     needles_at_a_time,
     point_controller_factory,
 )
-from needle_bringup.studies.study_estimators import BestEstimators, EachEstimator
+from needle_bringup.studies.study_estimators import BestEstimators, SeparateEstimators
 from needle_bringup.studies.study_laws import each_rate, planned_law
 from needle_controller.filter.filter_settings import FilterSettings
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
@@ -66,7 +66,7 @@ def test_the_controller_gets_the_claimed_noise(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(study_controllers, "make_controller", make)
     own = {"estimator": "recorder"}
     monkeypatch.setattr(
-        "needle_controller.presets.steering_settings.check_is_offered", lambda *_: None
+        "needle_controller.presets.steering_settings.check_registered", lambda *_: None
     )
     for scale in (1.0, 2.0):
         needles = controller_factory("best", 0.002, sigma_scale=scale, turn_delay=0.0004, own=own)()
@@ -85,7 +85,9 @@ def test_the_controller_gets_the_claimed_noise(monkeypatch: pytest.MonkeyPatch) 
 def test_python_and_compiled_loops_give_the_same_bits() -> None:
     settings = SteeringSettings(**PAPER_NOISE)
     one_by_one = SteeredNeedles(
-        lambda _: EachEstimator(lambda n: make_controller(settings, np.eye(3), np.zeros(3))[0]),
+        lambda _: SeparateEstimators(
+            lambda n: make_controller(settings, np.eye(3), np.zeros(3))[0]
+        ),
         each_rate(lambda _: make_controller(settings, np.eye(3))[1]),
     )
     compiled = controller_factory("best", settings.tip_noise_bound)()
@@ -134,7 +136,7 @@ def test_the_belief_is_that_of_the_estimates() -> None:
 def test_needles_off_their_target_report_a_miss() -> None:
     tips = np.array([[0.0005, 0.0, 0.0], [-0.003, 0.0, 0.0]])
     needles = SteeredNeedles(
-        lambda _: EachEstimator(lambda _: HypothesisFilter(FilterSettings())),
+        lambda _: SeparateEstimators(lambda _: HypothesisFilter(FilterSettings())),
         each_rate(lambda _: still),
     )
     needles.start(tips)

@@ -1,6 +1,6 @@
 """SVG drawings: chart of r1 over depth, dial of the rotation.
 
-They need no library in the browser, whose load could delay the hold.
+They need no browser library; loading one could delay the hold.
 """
 
 from __future__ import annotations

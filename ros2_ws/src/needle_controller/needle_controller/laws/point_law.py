@@ -1,11 +1,11 @@
-"""A law for points: the bevel is turned so that the needle's arc leads to the target.
+"""Law for points: turns the bevel so that the needle's arc leads to the target.
 
-No plane and no plan. From the mean pose the arc that leads to the target takes a share of the
-needle's curvature; what it takes grows while the needle bends elsewhere. So the bevel is left
-alone until a turn to the target, made one step later, would leave no reserve; then it is turned
-there, the needle bends to the target and past that direction, and the bevel is left alone again.
-The reserve, and what is kept for doubt, shrink to nothing over the last centimetres, where nothing
-can be made up for. Every hypothesis then says which turn of the base gives that turn of the tip.
+The law needs no plane and no plan. The arc from the mean pose to the target needs a share of the
+needle's curvature, which grows while the needle bends elsewhere. The law waits until a turn towards
+the target, made one step later, would leave no reserve. Then it turns the bevel; the needle bends
+towards the target and past that direction, and the law waits again. The reserve, which grows with
+the uncertainty, shrinks to zero over the last centimetres, where errors can no longer be
+corrected. Each hypothesis then determines the turn of the base for that turn of the tip.
 """
 
 # Compiled code takes keywords slowly or not at all.
@@ -38,7 +38,7 @@ Records = npt.NDArray[np.void]
 
 
 class PointLaw:
-    """Turns the base so that the tip comes to a point.
+    """Turns the base so that the tip reaches a point.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class PointLaw:
     Raises
     ------
     OutOfBoundsError
-        A setting that is outside its bounds, or the last turns end before they begin.
+        A setting is outside its bounds, or `last_turns_from` is not above `last_turn`.
     """
 
     def __init__(self, settings: PointLawSettings) -> None:
@@ -64,17 +64,18 @@ class PointLaw:
         target: npt.ArrayLike,
         rotation_left: float = math.inf,
     ) -> SteeringCommand:
-        """Return the rotation rate to hold over the next step, and the insertion left.
+        """Return the rotation rate for the next step, and the remaining insertion.
 
         Parameters
         ----------
         estimate : Estimate
-            Of the hypothesis filter, or of another estimator of the full pose: then as one
-            hypothesis without torsion.
+            Estimate of the hypothesis filter, or of another estimator of the full pose, which
+            counts as one hypothesis without torsion.
         target : array_like, shape (3,)
-            Where the tip is to go, in the estimate's frame [m]. It may move between calls.
+            Target of the tip in the frame of the estimate [m]. It may move between calls.
         rotation_left : float
-            What the base may still turn, either way [rad]: it turns as seldom as that takes.
+            Remaining rotation of the base, in either direction [rad]: with less, it turns less
+            often.
         """
         known = hypotheses_of(estimate)
         turn, left = point_turn(
@@ -105,18 +106,18 @@ def point_turn(
     rotation_left: float,
     settings: PointLawSettings,
 ) -> tuple[float, float]:
-    """Return the turn of the base over the next step [rad] and the insertion left [m].
+    """Return the turn of the base in the next step [rad] and the remaining insertion [m].
 
     Parameters
     ----------
     coordinates, curvature : ndarray, shape (6,), float
-        Of the tip, and of its path [1/m].
+        Coordinates of the tip, and curvature of its path [1/m].
     uncertainty, torsions, base, wound :
         See `Hypotheses`.
     target : ndarray, shape (3,)
-        Where the tip is to go [m].
+        Target of the tip [m].
     rotation_left : float
-        What the base may still turn, either way; infinite where that is not limited [rad].
+        Remaining rotation of the base, in either direction; infinite without a limit [rad].
     settings : PointLawSettings
         The settings.
     """
@@ -142,8 +143,8 @@ def point_turn(
             tip_turn = allowed_turn(to_torsion, wound, settings.max_winding)[0]
         if abs(tip_turn) < settings.scatter_dead_band * (1.0 - t.agreement):
             tip_turn = 0.0
-        asked = base_turn(t, tip_turn, base, settings.step_length)
-        turns += t.weight * min(max(asked, -settings.largest_turn), settings.largest_turn)
+        base_turned = base_turn(t, tip_turn, base, settings.step_length)
+        turns += t.weight * min(max(base_turned, -settings.largest_turn), settings.largest_turn)
         weights += t.weight
     most = min(settings.max_rotation_per_length * settings.step_length, rotation_left)
     return min(max(turns / weights, -most), most), left

@@ -1,4 +1,4 @@
-"""The way to a point, and when the bevel has to be turned for it; compiled. See `point_law`."""
+"""Path to a point, and the turn of the bevel for it; compiled. See `point_law`."""
 
 # Compiled code takes keywords slowly or not at all.
 # ruff: noqa: PLR0917
@@ -17,7 +17,7 @@ from needle_core.settings.bounds import Bounds
 Records = npt.NDArray[np.void]
 
 _BEVEL = -0.5 * math.pi
-"""Direction to which a needle bends, about its heading from its own x axis [rad]: -y."""
+"""Direction in which a needle bends, about its heading from its x axis [rad]: -y."""
 _NO_TURN = 1e-6
 
 
@@ -27,33 +27,32 @@ class PointLawSettings(NamedTuple):
     Attributes
     ----------
     step_length : float
-        Inserted length over which a command is held [m].
+        Inserted length per command [m].
     max_rotation_per_length : float
-        Most the base turns per inserted length [rad/m].
+        Maximum rotation of the base per inserted length [rad/m].
     max_winding : float
-        The base's angle is kept within +- this: the turn then goes the other way round [rad].
+        Limit of the base's angle in both directions; beyond it the base turns the other way [rad].
     reserve : float
-        Share of the curvature that is kept back: the bevel is turned to the target no later than
-        when the way there takes the rest. Less means fewer turns, and less to make up for errors.
+        Share of the curvature kept in reserve: the bevel turns to the target before the arc to it
+        needs the rest. A smaller reserve means fewer turns, and less room to correct errors.
     doubt : float
-        Standard deviations of that need that count as need.
+        Number of standard deviations of the needed curvature that are added to it.
     last_turn : float
-        Insertion left at which reserve and doubt are 0: what is unknown then cannot be made up for
-        by another turn [m].
+        Remaining insertion at which reserve and doubt are 0: no later turn can correct an error
+        [m].
     last_turns_from : float
-        Insertion left from which they shrink to that [m].
+        Remaining insertion from which both shrink to that [m].
     close_enough : float
-        A miss that is left alone [m]; so is half a standard deviation of where the tip would be at
-        the target.
+        Dead band of the miss [m], at least half the standard deviation of the tip at the target.
     dead_band : float
-        An error of the bevel's direction that is left alone [rad].
+        Dead band of the bevel's direction [rad].
     scatter_dead_band : float
-        What is added to it where the hypotheses' rolls point everywhere, in proportion to how
-        little they agree [rad].
+        Increase of `dead_band` for a hypothesis whose rolls do not agree at all; proportional to
+        1 - agreement [rad].
     largest_turn : float
-        Most that a single hypothesis asks of a step, before the mean [rad].
+        Largest turn of a single hypothesis per step, before averaging [rad].
     smallest_weight : float
-        Hypotheses that weigh less than this share of the heaviest have no say in the turn.
+        Hypotheses with a weight below this share of the largest are ignored.
     """
 
     step_length: Annotated[float, Bounds(1e-5, 0.1, "m")] = 0.001
@@ -74,18 +73,18 @@ class PointLawSettings(NamedTuple):
 
 @compiled
 def write_need(target: Array, need: Array) -> float:
-    """Write how far the way to a target has to bend off, and return how long it is [m].
+    """Write the lateral offset that the arc to a target has to cover; return its length [m].
 
-    The way is an arc, of whatever curvature leads there. A target beside or behind the tip is as
-    near as it gets: the length is then what it lies ahead, <= 0.
+    The arc may have any curvature. For a target beside or behind the tip the length is the distance
+    ahead, <= 0.
 
     Parameters
     ----------
     target : ndarray, shape (3,)
-        In the tip's frame [m].
+        Target in the frame of the tip [m].
     need : ndarray, shape (2,), written
-        Along the tip's x and y: half the arc's curvature times its length squared, which is what
-        the target lies off the heading where the arc is short [m].
+        Along x and y of the tip: half the curvature of the arc times its length squared, the
+        offset of the target from the heading if the arc is short [m].
     """
     across = math.hypot(target[0], target[1])
     need[:] = 0.0
@@ -101,18 +100,18 @@ def write_need(target: Array, need: Array) -> float:
 
 @compiled
 def way_as_bent(target: Array, way: float, curvature: float) -> float:
-    """Return how far a needle has to go until it is as near to a target as it gets [m].
+    """Return the insertion until the needle is closest to a target [m].
 
-    Where no arc of the needle's leads there, that is where the tightest one comes nearest.
+    If no arc of the needle leads there, this is the closest point of the tightest arc.
 
     Parameters
     ----------
     target : ndarray, shape (3,)
-        In the tip's frame [m].
+        Target in the frame of the tip [m].
     way : float
-        On the arc that leads there, see `write_need` [m].
+        Length of the arc to it, see `write_need` [m].
     curvature : float
-        Of the needle's path [1/m].
+        Curvature of the needle's path [1/m].
     """
     across = math.hypot(target[0], target[1])
     square = across * across + target[2] * target[2]
@@ -123,16 +122,16 @@ def way_as_bent(target: Array, way: float, curvature: float) -> float:
 
 @compiled
 def mean_slack(torsions: Records, rate: float) -> float:
-    """Return how much longer a turn of the tip takes for the shaft's torsion [m].
+    """Return the insertion by which torsion of the shaft prolongs a turn of the tip [m].
 
-    A lag takes its length, and a play the insertion over which the base turns through it.
+    A lag adds its length, and play the insertion in which the base turns through it.
 
     Parameters
     ----------
     torsions : ndarray of TORSION, shape (K,)
         See `Hypotheses`.
     rate : float
-        Most the base turns per inserted length [rad/m].
+        Maximum rotation of the base per inserted length [rad/m].
     """
     slack = weights = 0.0
     for k in range(torsions.size):
@@ -152,18 +151,18 @@ def wanted_turn(
     rotation_left: float,
     settings: PointLawSettings,
 ) -> float:
-    """Return the turn of the tip that leads it to the target [rad]; 0 where it is to be left alone.
+    """Return the turn of the tip towards the target [rad], or 0 if it can wait.
 
     Parameters
     ----------
     need : ndarray, shape (2,)
         See `write_need` [m].
     left : float
-        Insertion left, > 0 [m].
+        Remaining insertion, > 0 [m].
     curvature : float
-        Of the needle's path [1/m].
+        Curvature of the needle's path [1/m].
     std : float
-        Standard deviation of where the tip would be at the target, across its heading [m].
+        Standard deviation of the tip at the target, across its heading [m].
     slack : float
         See `mean_slack` [m].
     rotation_left : float
@@ -180,7 +179,7 @@ def wanted_turn(
     turning = abs(turn) / rate + slack
     if turning >= left:
         return better_end(need, left, curvature, abs(turn) / turning)
-    # Whether it can wait for a step, and then still has what is kept back.
+    # Can the turn wait for a step and still leave the reserve?
     later = left - settings.step_length
     if later <= 0.0:
         return turn
@@ -194,7 +193,7 @@ def wanted_turn(
     share_then = math.hypot(rest[0], rest[1]) / (0.5 * curvature * straight * straight)
     early = (left - settings.last_turn) / (settings.last_turns_from - settings.last_turn)
     early = min(max(early, 0.0), 1.0)
-    # As a share of what bending all the way would do.
+    # As a share of the offset that full curvature covers.
     unsure = std / (0.5 * curvature * left * left)
     kept = early * (settings.reserve + settings.doubt * unsure)
     kept = min(kept, affordable_reserve(left, rotation_left - abs(turn), settings.last_turn))
@@ -203,18 +202,18 @@ def wanted_turn(
 
 @compiled
 def affordable_reserve(left: float, rotation_left: float, last_turn: float) -> float:
-    """Return the share of the curvature that can be kept back without too many turns to come.
+    """Return the reserve whose number of turns fits the rotation budget.
 
-    With a share r kept back, the needle bends to the target and as far past that direction: what is
-    left falls to sqrt(r / (2 - r)) of itself from one half turn to the next. So many half turns
-    as can be made shall bring it to the last one.
+    With a reserve r, the needle bends to the target and as far past that direction: the remaining
+    insertion falls by the factor sqrt(r / (2 - r)) from one half turn to the next. The affordable
+    half turns must reach the last turn.
 
     Parameters
     ----------
     left, last_turn : float
-        Insertion left, now and at the last turn [m].
+        Remaining insertion, now and at the last turn [m].
     rotation_left : float
-        What the base may turn after the turn that is to be made now [rad].
+        Rotation budget after the present turn [rad].
     """
     half_turns = rotation_left / math.pi
     if half_turns <= 0.0 or left <= last_turn:
@@ -225,7 +224,7 @@ def affordable_reserve(left: float, rotation_left: float, last_turn: float) -> f
 
 @compiled
 def turn_to(need: Array) -> float:
-    """Return the turn that brings the bevel's direction to that of a need, in +-pi [rad]."""
+    """Return the turn that points the bevel towards a needed offset, in +-pi [rad]."""
     turn = math.atan2(need[1], need[0]) - _BEVEL
     return float((turn + math.pi) % (2.0 * math.pi) - math.pi)
 
@@ -234,20 +233,20 @@ def turn_to(need: Array) -> float:
 def rest_after(
     need: Array, left: float, curvature: float, rate: float, length: float
 ) -> tuple[float, float]:
-    """Return what is left of a need after a length at a constant rotation rate, (x, y) [m].
+    """Return the rest of a needed offset after a length at a constant rotation rate, (x, y) [m].
 
-    To first order: with u the bevel's direction, curvature u(s) (left - s) ds adds up along it.
+    To first order: with u the direction of the bevel, the integral of curvature u(s) (left - s) ds.
 
     Parameters
     ----------
     need : ndarray, shape (2,)
         See `write_need` [m].
     left, curvature : float
-        Insertion left [m], curvature of the needle's path [1/m].
+        Remaining insertion [m], curvature of the needle's path [1/m].
     rate : float
         Rotation of the tip per inserted length [rad/m].
     length : float
-        Inserted, <= left [m].
+        Inserted length, <= left [m].
     """
     rest = left - length
     if abs(rate * length) < _NO_TURN:
@@ -263,9 +262,9 @@ def rest_after(
 
 @compiled
 def better_end(need: Array, left: float, curvature: float, rate: float) -> float:
-    """Return a quarter turn to the side that ends nearer to the target, or 0 [rad].
+    """Return a quarter turn to the side that ends closer to the target, or 0 [rad].
 
-    For where the target is too near for the whole turn to it: not to turn may be better.
+    For a target too near for the whole turn: no turn may be better.
     """
     best = 0.0
     missed = rest_after(need, left, curvature, 0.0, left)

@@ -84,7 +84,9 @@ def design_gains(
     # measurement every step_length is equivalent to white noise of this density.
     noise = np.array(process_noise)[::-1] / (measurement_std**2 * step_length)
     observer = np.real(np.poly(_optimal_poles(noise, "process_noise, measurement_std")))[1:]
-    sampled = transition(step_length) - held_input(step_length)[:, None] @ feedback[None, :]
+    sampled = (
+        transition(step_length) - held_input_response(step_length)[:, None] @ feedback[None, :]
+    )
     radius = float(np.max(np.abs(np.linalg.eigvals(sampled))))
     if radius >= 1.0:
         raise UserError(
@@ -95,7 +97,7 @@ def design_gains(
     return Gains(feedback, observer, poles)
 
 
-def held_input(length: float) -> Array:
+def held_input_response(length: float) -> Array:
     """Return G, the change of s by a unit input v held over an inserted length, shape (3,)."""
     return np.array([length**3 / 6.0, length**2 / 2.0, length])
 

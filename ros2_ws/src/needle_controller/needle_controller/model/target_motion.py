@@ -72,14 +72,14 @@ class TargetMotion:
         return self._times[-1]
 
     def see(self, time: float, points: npt.ArrayLike) -> None:
-        """Add an observation; a time that is not after the last one starts anew.
+        """Add an observation; a time not later than the last one discards all earlier observations.
 
         Parameters
         ----------
         time : float
-            When it was there [s].
+            Time of the observation [s].
         points : array_like, shape (..., 3)
-            Where [m].
+            Observed positions [m].
         """
         if self._times and time <= self._times[-1]:
             self.forget()
@@ -105,7 +105,7 @@ class TargetMotion:
         Parameters
         ----------
         time : array_like, shape (...)
-            When, for each target [s].
+            Time for each target [s].
         """
         if self._motion is None:
             self._motion = _Motion(np.array(self._times), np.array(self._points))

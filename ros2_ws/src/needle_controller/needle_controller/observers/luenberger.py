@@ -236,7 +236,7 @@ def saturate(needle: Any, model: ObserverModel) -> None:
 
 @compiled
 def advance_observer(needle: Any, length: float, turn: float, model: ObserverModel) -> None:
-    """Advance the linearized state by the actual motion.
+    """Advance the linearized state by the actual motion: A s + B v of (9).
 
     v is constant over the length, with the value that leads to the same roll as (5) with u: (7) for
     short steps, and finite even for a rotation without insertion. s cannot follow beyond +-90 deg.

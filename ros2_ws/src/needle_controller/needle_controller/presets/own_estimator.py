@@ -27,7 +27,7 @@ _CHECKS = (
 
 
 class OwnEstimator:
-    """An estimator of another package as an `estimator.Estimator`.
+    """Wraps an estimator of another package as an `estimator.Estimator`.
 
     Exceptions and invalid estimates become an `OwnPartError` that names the package.
 

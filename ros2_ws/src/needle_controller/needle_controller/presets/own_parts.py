@@ -134,7 +134,7 @@ class OwnPart:
         return array
 
 
-def check_is_offered(kind: str, name: str) -> EntryPoint:
+def check_registered(kind: str, name: str) -> EntryPoint:
     """Return the entry point of a part, without loading it.
 
     Parameters
@@ -167,14 +167,14 @@ def check_is_offered(kind: str, name: str) -> EntryPoint:
 def own_part(kind: str, name: str) -> OwnPart:
     """Return a loaded part that has the methods of its kind.
 
-    The parameters are those of `check_is_offered`, which raises, too.
+    The parameters are those of `check_registered`, which raises, too.
 
     Raises
     ------
     OwnPartError
         A module that cannot be imported, an object that is no class, or a missing method.
     """
-    entry = check_is_offered(kind, name)
+    entry = check_registered(kind, name)
     origin = f"{_package(entry)}, {entry.value}"
     part = OwnPart(kind, name, origin, object)
     with part.errors_in("loading it"):

@@ -1,4 +1,4 @@
-"""The point law within a preset: with a rig's settings, on a target that may move."""
+"""Steering to a point that may move: the point law with the settings of a rig."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from needle_controller.observers.estimator import Estimate
 from needle_controller.presets.own_law import OwnLaw, tried_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
-_LOOKS = 4
-"""How often the time of arrival is corrected at a step; it goes on from that of the step before."""
-_CORRECTED = 0.5
-"""Share of such a correction: the target may come towards the needle faster than that goes in."""
-_AVERAGED = 0.010
-"""The needle will be as fast as over so much insertion [m]."""
-_CLOCKS_APART = 1.0
-"""A target seen so long after the tip is stamped by another clock [s]."""
+_ITERATIONS = 4
+"""Corrections of the arrival time per step; the iteration continues from the previous step."""
+_RELAXATION = 0.5
+"""Share of each correction: a target may approach faster than the needle advances."""
+_SPEED_WINDOW = 0.010
+"""Insertion over which the speed of the needle is averaged [m]."""
+_CLOCK_DIFFERENCE = 1.0
+"""Target stamps later than the tip's by more than this come from another clock [s]."""
 
 
 class LawToPoint(Protocol):
-    """A law for points: `PointLaw`, or that of another package."""
+    """Law for points: `PointLaw`, or a plug-in."""
 
     def __call__(
         self, estimate: Estimate, target: npt.ArrayLike, rotation_left: float = np.inf
@@ -37,99 +37,90 @@ class LawToPoint(Protocol):
         """Return the command for the next step; see `PointLaw`."""
 
 
-class Foresight:
-    """Foresees where a target will be when the needle is there.
+class ArrivalPrediction:
+    """Prediction of the target's position at the arrival of the needle.
 
-    Of one needle; or, in a study, of several that are inserted alike: times, lengths and points
-    then have one row for each.
+    A study predicts several needles that advance alike: times, lengths and points then have one
+    row per needle.
 
     Parameters
     ----------
     motion : TargetMotion
-        Where the target was seen; times are seconds of the tips' clock.
-
-    Attributes
-    ----------
-    motion : TargetMotion
-        See above.
+        Observed motion of the target; times are seconds of the tips' clock.
     """
 
     def __init__(self, motion: TargetMotion) -> None:
         self.motion = motion
         self._insertions: deque[tuple[float, float]] = deque()
         self._arrival: Array | float | None = None
-        self._foretold: Array | None = None
+        self._predicted: Array | None = None
 
     @property
     def aim(self) -> Array:
-        """Target as expected when the needle is there [m]."""
-        return self.motion.last if self._foretold is None else self._foretold
+        """Predicted position of the target at the arrival [m]."""
+        return self.motion.last if self._predicted is None else self._predicted
 
-    def look(
+    def predict(
         self,
         time: Array | float,
         insertion: Array | float,
         left: Callable[[Array], Array | float],
     ) -> Array:
-        """Return the target as expected when the needle is there [m].
+        """Return the predicted position of the target at the arrival [m].
 
         Parameters
         ----------
         time, insertion : float
-            Of the last tip [s], [m].
+            Time [s] and insertion [m] of the last tip.
         left : callable
-            Returns the insertion that is left to a point [m].
+            Returns the remaining insertion to a point [m].
         """
         now = float(np.max(time))
         speed = self._speed(now, float(np.max(insertion)))
-        self._foretold = None
-        if speed is None or not -_CLOCKS_APART <= now - self.motion.seen <= WINDOW:
+        self._predicted = None
+        if speed is None or not -_CLOCK_DIFFERENCE <= now - self.motion.seen <= WINDOW:
             return self.aim
         if self._arrival is None:
             self._arrival = time + np.maximum(left(self.aim), 0.0) / speed
-        for _ in range(_LOOKS):
-            self._foretold = self.motion.at(self._arrival)
+        for _ in range(_ITERATIONS):
+            self._predicted = self.motion.at(self._arrival)
             arrival = time + np.maximum(left(self.aim), 0.0) / speed
-            self._arrival = self._arrival + _CORRECTED * (arrival - self._arrival)
+            self._arrival = self._arrival + _RELAXATION * (arrival - self._arrival)
         return self.aim
 
     def _speed(self, time: float, insertion: float) -> float | None:
-        """Return how fast the needle goes in [m/s]; None while it has not moved."""
-        seen = self._insertions
-        if seen and (time <= seen[-1][0] or insertion < seen[-1][1]):
-            seen.clear()
-        seen.append((time, insertion))
-        while len(seen) > 2 and insertion - seen[1][1] >= _AVERAGED:
-            seen.popleft()
-        began, inserted = seen[0]
-        return (insertion - inserted) / (time - began) if insertion > inserted else None
+        """Return the insertion speed [m/s], or None before the needle has moved."""
+        samples = self._insertions
+        if samples and (time <= samples[-1][0] or insertion < samples[-1][1]):
+            samples.clear()
+        samples.append((time, insertion))
+        while len(samples) > 2 and insertion - samples[1][1] >= _SPEED_WINDOW:
+            samples.popleft()
+        first_time, first = samples[0]
+        return (insertion - first) / (time - first_time) if insertion > first else None
 
 
 class PointSteering:
-    """Steers to where a target will be when the needle is there.
+    """Steers to the predicted position of a target at the arrival of the needle.
 
     Parameters
     ----------
     settings : SteeringSettings
-        What the law is made of; `SteeringSettings.check_steers_to_points` says who can.
+        Settings of the law; `SteeringSettings.check_steers_to_points` accepts them.
     motion : TargetMotion
-        Where the target was seen, in `rig`; times are seconds of the tips' clock.
+        Observed motion of the target, in `rig`; times are seconds of the tips' clock.
 
-    Attributes
-    ----------
-    motion : TargetMotion
-        See above.
     """
 
     def __init__(self, settings: SteeringSettings, motion: TargetMotion) -> None:
         self._law = point_law(settings)
-        self._foresight = Foresight(motion)
+        self._prediction = ArrivalPrediction(motion)
         self.motion = motion
 
     @property
     def aim(self) -> Array:
-        """Target as expected when the needle is there, in `rig`, shape (3,) [m]."""
-        return self._foresight.aim
+        """Predicted position of the target at the arrival, in `rig`, shape (3,) [m]."""
+        return self._prediction.aim
 
     def command(
         self,
@@ -139,18 +130,18 @@ class PointSteering:
         rotation_left: float,
         from_rig: Callable[[Array], Array] = np.asarray,
     ) -> SteeringCommand:
-        """Return the rotation rate to hold over the next step, and the insertion left.
+        """Return the rotation rate for the next step, and the remaining insertion.
 
         Parameters
         ----------
         estimate : Estimate
-            Of the needle at `time`.
+            Estimate of the needle at `time`.
         time, insertion : float
-            Of the tip that it is made from [s], [m].
+            Time [s] and insertion [m] of its tip.
         rotation_left : float
-            What the base may still turn, either way [rad].
+            Remaining rotation of the base, in either direction [rad].
         from_rig : callable
-            Takes points of `rig` to the estimate's frame.
+            Transforms points from `rig` to the frame of the estimate.
         """
 
         def left(target: Array) -> float:
@@ -158,19 +149,19 @@ class PointSteering:
             assert command.insertion_left is not None
             return command.insertion_left
 
-        aim = self._foresight.look(time, insertion, left)
+        aim = self._prediction.predict(time, insertion, left)
         return self._law(estimate, from_rig(aim), rotation_left)
 
 
 def point_law(settings: SteeringSettings) -> LawToPoint:
-    """Return the law for points; `SteeringSettings.check_steers_to_points` says who can."""
+    """Return the law for points of checked settings."""
     if settings.law:
         return OwnLaw(tried_law(settings.law), settings).to_point
     return PointLaw(PointLawSettings(**settings.turning))
 
 
 def prompt_point_law(settings: SteeringSettings) -> LawToPoint:
-    """Return the law for points that turns the bevel at once: as paths are planned."""
+    """Return the law for points that turns the bevel at once, as planned paths require."""
     if settings.law:
         return point_law(settings)
     return PointLaw(

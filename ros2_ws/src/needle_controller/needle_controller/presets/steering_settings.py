@@ -14,7 +14,7 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.gains import Gains, design_gains
 from needle_controller.model.point_reach import check_point
 from needle_controller.model.target_plane import TargetPlane, check_within_reach, offset_plane
-from needle_controller.presets.own_parts import GROUPS, check_is_offered, own_part
+from needle_controller.presets.own_parts import GROUPS, check_registered, own_part
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter, parameter
 
@@ -257,7 +257,7 @@ class SteeringSettings:
                 raise UserError(f"{name} = {list(numbers)}, expected three numbers, for s1, s2, s3")
         for kind in GROUPS:
             if name := getattr(self, kind):
-                check_is_offered(kind, name)
+                check_registered(kind, name)
         self.check_plane(self.plane())
         if self.target_point:
             if len(self.target_point) != 3:

@@ -9,7 +9,12 @@ import pytest
 from scipy import integrate, linalg
 
 from needle_controller.model.feedback_linearization import A, B, C, transition
-from needle_controller.model.gains import Gains, design_gains, held_input, sampled_observer_gain
+from needle_controller.model.gains import (
+    Gains,
+    design_gains,
+    held_input_response,
+    sampled_observer_gain,
+)
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.errors import UserError
 
@@ -66,13 +71,13 @@ def test_held_input_is_the_integral() -> None:
         value, _ = integrate.quad(lambda at: (transition(0.02 - at) @ B)[i, 0], 0.0, 0.02)
         return float(value)
 
-    np.testing.assert_allclose(held_input(0.02), [column(i) for i in range(3)], rtol=1e-10)
+    np.testing.assert_allclose(held_input_response(0.02), [column(i) for i in range(3)], rtol=1e-10)
 
 
 def test_the_defaults_are_stable_in_steps() -> None:
     parameters = SteeringSettings()
     design, length = parameters.gains(), parameters.step_length
-    law = transition(length) - np.outer(held_input(length), design.feedback)
+    law = transition(length) - np.outer(held_input_response(length), design.feedback)
     assert np.max(np.abs(np.linalg.eigvals(law))) < 1.0
     assert np.max(design.observer_poles.real) < 0.0
 

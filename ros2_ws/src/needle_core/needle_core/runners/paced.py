@@ -21,7 +21,7 @@ class PacedRunner(VirtualRunner):
     """Runs components no faster than the wall clock, and delivers input of real ports.
 
     External input is handled at the virtual time that corresponds to the wall clock, or at once if
-    the computer has fallen behind. Lost time is not caught up: the needle must not run ahead of the
+    the computer has fallen behind. Lost time is not made up: the needle must not run ahead of the
     operator's hand.
 
     Parameters

@@ -90,7 +90,7 @@ class AxisSnapshot:
 class Axis(abc.ABC):
     """One axis. Positions in m or rad, speeds in m/s or rad/s, not negative.
 
-    An order to move returns at once; `poll` shows its progress. `configure`, `home`, `reset` and
+    A motion command returns at once; `poll` shows its progress. `configure`, `home`, `reset` and
     `close` are procedures. Every method but `poll` may raise `AxisError`.
 
     Attributes
@@ -107,7 +107,7 @@ class Axis(abc.ABC):
 
     @abc.abstractmethod
     def power(self, on: bool) -> None:
-        """Switch the axis on, with its resting position as target, or off; moves nothing."""
+        """Switch the axis on, holding its present position, or off; does not move it."""
 
     @abc.abstractmethod
     def home(self, speed: float) -> Procedure[None]:

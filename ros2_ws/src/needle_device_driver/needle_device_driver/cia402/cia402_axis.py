@@ -201,7 +201,7 @@ class Cia402Axis(Axis):
         position = self._settings.position(machine.at.position - self._zero)
         set_point = self._settings.position(machine.target - self._zero)
         return AxisSnapshot(
-            time=self.monitor.fresh_time,
+            time=self.monitor.fresh_since,
             position=position,
             set_point=set_point if self.actuated else position,
             velocity=self._velocity,

@@ -1,4 +1,4 @@
-"""Leads a drive through its CiA 402 states to a goal, cycle by cycle."""
+"""Takes a drive through its CiA 402 states to a goal state, cycle by cycle."""
 
 from __future__ import annotations
 

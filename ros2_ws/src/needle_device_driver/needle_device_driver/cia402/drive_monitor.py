@@ -115,7 +115,7 @@ class DriveMonitor:
             link.subscribe(function_code + node_id, partial(self._receive, handler))
 
     @property
-    def fresh_time(self) -> float:
+    def fresh_since(self) -> float:
         """Steady time from which the age of the feedback counts [s]."""
         if self._is_waiting or self._nmt_state != NMT_OPERATIONAL:
             return self._fresh_time
@@ -142,7 +142,7 @@ class DriveMonitor:
 
     def expect_answer(self) -> None:
         """Note that a SYNC is sent now."""
-        self._fresh_time = self.fresh_time
+        self._fresh_time = self.fresh_since
         self._answers.clear()
         if self._syncs >= _FORGET_AFTER and not self._is_behind:
             self.discard_outstanding()

@@ -106,7 +106,7 @@ class SdoClient:
             toggle ^= _TOGGLE
 
     def download(self, index: int, subindex: int, data: bytes) -> Procedure[None]:
-        """Write one to four bytes to an entry; raises as `upload`."""
+        """Write one to four bytes to an entry; raises the same errors as `upload`."""
         command = _DOWNLOAD | (_MAX_EXPEDITED - len(data)) << 2 | _EXPEDITED | _HAS_SIZE
         request = struct.pack("<BHB", command, index, subindex) + data.ljust(4, b"\0")
         yield from self._exchange(request)

@@ -70,7 +70,7 @@ def test_outer_end_is_negative_limit_or_home_switch() -> None:
 def test_drive_without_feedback_has_no_joints_and_needs_no_cycles() -> None:
     bench = DriveBench()
     assert bench.axes[0].monitor.feedback == Feedback(0, 0, 0, 0, 0, 0)
-    assert bench.axes[0].monitor.fresh_time == -math.inf
+    assert bench.axes[0].monitor.fresh_since == -math.inf
 
 
 # ---- homing -------------------------------------------------------------------------------------

@@ -235,7 +235,7 @@ class SdoServer:
         }
 
     def answer(self, request: bytes) -> bytes | None:
-        """Return the answer to a request; None if it needs none or has not 8 bytes."""
+        """Return the answer to a request, or None if it needs none or is not 8 bytes long."""
         if len(request) != 8:
             return None
         specifier = request[0] >> 5

@@ -30,7 +30,7 @@ def is_box(rig: StereoRig) -> bool:
 
 
 def reach_sideways(camera: SimulatedCamera, rig: StereoRig) -> float:
-    """Return the half width of a camera's wall; infinite for a shared surface [m]."""
+    """Return the half width of a camera's wall [m], infinite if the surface is shared."""
     other = rig.right if camera is rig.left else rig.left
     return other.window.inner if is_box(rig) else np.inf
 

@@ -229,9 +229,7 @@ class NeedleDetector:
             None if the maps show no shaft.
         """
         shrink, width = self._shrink, self.width_px
-        # The network needs context beyond the end: half as much as behind it.
-        line = FIT.line_widths * width
-        back, ahead = line + along, 0.5 * line + along
+        back, ahead = FIT.line_widths * width + along, along + FIT.aside_widths * width
         box = self._box(point, direction, (-back, ahead), across)
         if box is None:
             return None

@@ -353,7 +353,7 @@ def place_log_odds(sighting: Sighting, insertion: float | None, settings: Tracke
 
 
 def _merged(place: Array, covariance: Array, tip: SpatialTip) -> tuple[Array, Array]:
-    """Return the mean of two positions by their covariances; a position far off replaces it."""
+    """Return the covariance-weighted mean; a distant new position replaces the old one."""
     total = covariance + tip.covariance
     off = tip.position - place
     if float(off @ np.linalg.solve(total, off)) > PAIRING.gate:
@@ -367,7 +367,7 @@ def _log_sum(one: float, other: float) -> float:
 
 
 def tip_at_entry(insertion: float, settings: TrackerSettings) -> SpatialTip:
-    """Return the tip of a short needle that is not seen: on the z axis of `rig`."""
+    """Return the tip of a needle that is not visible yet, on the z axis of `rig`."""
     reach = settings.reach
     sideways = math.hypot(reach.hole_tolerance, insertion * math.sin(reach.entry_angle))
     along = math.hypot(reach.hole_tolerance, insertion * (1.0 - math.cos(reach.entry_angle)))
