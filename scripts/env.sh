@@ -24,7 +24,7 @@ _needle_env() {
         read -r mode rest <"$root/.venv/.needle-setup" || true
     fi
     if [ -z "$mode" ]; then
-        echo "env.sh: this checkout is not set up yet (or only half): run $root/scripts/setup" >&2
+        echo "env.sh: this checkout is not set up, or only in part: run $root/scripts/setup" >&2
         return 1
     fi
     if [ "$mode" = apt ] && [ "${ROS_DISTRO:-}" != jazzy ]; then
@@ -85,7 +85,7 @@ _needle_code=0
 if [ -n "$_needle_file" ]; then
     _needle_env "$(CDPATH='' builtin cd -- "$(dirname -- "$_needle_file")/.." >/dev/null && pwd -P)" || _needle_code=$?
 else
-    echo "env.sh: this is for bash and zsh" >&2
+    echo "env.sh: only bash and zsh are supported" >&2
     _needle_code=1
 fi
 unset -f _needle_env _needle_prepend

@@ -58,7 +58,7 @@ class Scene:
 def test_pyigtls_client_hears_the_needle_in_mm() -> None:
     pyigtl = pytest.importorskip("pyigtl", reason="the lock is not installed: docs/viewers.md")
     with contextlib.closing(Scene(pyigtl.OpenIGTLinkClient)) as scene:
-        assert scene.hears("NeedleStatus").string == "nothing heard of the needle"
+        assert scene.hears("NeedleStatus").string == "no needle data received"
         status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
         scene.say("needle/controller_status", status)
         x, y, z, w = TURN.as_quat().tolist()

@@ -190,7 +190,7 @@ def test_an_answer_that_never_comes_is_told(domain: int, ros2: type[Ros2]) -> No
         (("topic", "pub", "/t", "sensor_msgs/msg/Joyy"), "no msg type"),
         (("topic", "pub", "/t", "sensor_msgs/msg/Joy", "{axes: [a]}"), "no sequence<float>"),
         (("topic", "pub", "/t", "sensor_msgs/msg/Joy", "{axis: [1]}"), "no field 'axis'"),
-        (("topic", "pub", "/t", "std_msgs/msg/Bool", "{data: 1}"), "data: 1 is no boolean"),
+        (("topic", "pub", "/t", "std_msgs/msg/Bool", "{data: 1}"), "data: 1 is not a boolean"),
         (("topic", "pub", "/t", "std_msgs/msg/Bool", "true"), "expected to be a dictionary"),
         (("topic", "pub", "/t", "std_msgs/msg/Bool", "{data: ["), "not YAML"),
         (("service", "call", "/s", "std_srvs/msg/SetBool"), "no srv type"),

@@ -98,7 +98,7 @@ def _findings(check: Check, bench: Workbench) -> Iterator[Finding]:
 def _chosen(steps: Sequence[str], only: Sequence[str] | None) -> list[tuple[str, Check]]:
     for step in steps:
         if step not in STEPS:
-            raise UserError(f"step {step!r} does not exist (yet); there is {', '.join(STEPS)}")
+            raise UserError(f"step {step!r} does not exist; known: {', '.join(STEPS)}")
     checks = [(step, check) for step in steps for check in STEPS[step]]
     names = [check.__name__ for _, check in checks]
     for name in only or ():

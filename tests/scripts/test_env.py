@@ -99,7 +99,7 @@ def test_one_line_where_set_up_has_not_run(name: str, checkout: Path) -> None:
     result = shell(name, f". {str(checkout / 'scripts/env.sh')!r} || echo code $?")
     assert result.stdout == "code 1\n"
     assert result.stderr.splitlines() == [
-        f"env.sh: this checkout is not set up yet (or only half): run {checkout / 'scripts/setup'}"
+        f"env.sh: this checkout is not set up, or only in part: run {checkout / 'scripts/setup'}"
     ]
 
 

@@ -141,7 +141,7 @@ def test_a_net_that_diverges_ends_the_run_and_is_not_stored(folder: Path, tmp_pa
     run = loop.new_run(0)
     with torch.no_grad():
         run.net.out.weight.mul_(1e6)
-    with pytest.raises(RuntimeError, match="diverged at step 0: go on from"):
+    with pytest.raises(RuntimeError, match="diverged at step 0: resume from"):
         loop.train(run, Pool(folder), loop.Plan(40, 5.0, tmp_path / "n.onnx", tmp_path / "c.pt"))
     assert not list(tmp_path.iterdir())
 

@@ -58,7 +58,7 @@ def _bench(arguments: Sequence[str]) -> int:
     file = output_file("--json", given.json)
     benches = {name: bench for name, bench in BENCHES.items() if (given.only or "") in name}
     if not benches:
-        raise UserError(f"--only {given.only!r} is in none of {', '.join(BENCHES)}")
+        raise UserError(f"--only {given.only!r} is not in {', '.join(BENCHES)}")
     values: dict[str, JsonValue] = {}
     print(f"{'':34}{'here':>12}  {'reference':>12}  {'ratio':>8}")
     with ending_descendants():

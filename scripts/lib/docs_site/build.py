@@ -71,7 +71,7 @@ def _docs() -> int:
         raise UserError(f"--out {out} is not a folder")
     if out.is_dir() and any(out.iterdir()):
         if not (out / _BUILT).is_file():
-            raise UserError(f"--out {out}: something else than a site is there")
+            raise UserError(f"--out {out}: it contains something other than a site")
         shutil.rmtree(out)
     good = build(out)
     print(f"site: {out / 'index.html'}")

@@ -64,8 +64,8 @@ def own_scenes(folder: Path, width: float) -> tuple[TracedScene, TracedScene]:
     believed = np.array([tip is not None for tip in tips], np.bool_)
     if believed.sum() < _LEAST_TIPS:
         raise UserError(
-            f"{folder}: the tracker believed {believed.sum()} tips of {len(tips)} pairs, and "
-            f"{_LEAST_TIPS} are needed to say where the needle was; `track_images` tells why"
+            f"{folder}: the tracker accepted {believed.sum()} tips of {len(tips)} pairs, and "
+            f"{_LEAST_TIPS} are needed to locate the needle; `track_images` gives the reasons"
         )
     path = TipPath(insertions[believed], np.array([tip.position for tip in tips if tip]))
     least, most = insertions[believed].min(), insertions[believed].max()

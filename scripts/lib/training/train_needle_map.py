@@ -111,7 +111,7 @@ def wait_for_samples(folder: Path, drawn: int, process: BaseProcess) -> None:
             files = (len(list(folder.glob(f"{kind}-*.npz"))) for kind in ("drawn", "traced"))
             bar.update(sum(min(n, drawn) for n in files) - bar.n)
             if not process.is_alive():
-                raise SystemExit("what draws the samples has ended: its error is above")
+                raise SystemExit("the sample generator has ended: its error is above")
             if bar.n < bar.total:
                 time.sleep(_POLL)
 

@@ -244,7 +244,7 @@ def train(run: Run, pool: Pool, plan: Plan) -> None:
         if not (shaft.item() < _WORST[0] and end.item() < _WORST[1]):
             bad += 1
             if bad >= _MOST_BAD:
-                raise RuntimeError(f"diverged at step {run.step}: go on from {plan.checkpoint}")
+                raise RuntimeError(f"diverged at step {run.step}: resume from {plan.checkpoint}")
             continue
         bad = 0
         run.optimizer.zero_grad()

@@ -171,7 +171,7 @@ def test_a_needle_is_steered_by_the_space_bar_and_stops_with_it(page: Page) -> N
     hold_until(page, lambda: space.down("Space"), lambda: space.up("Space"), "> 3")
     space.up("Space")
     assert 3.0 < check_stands_still(page) < 10.0
-    expect(reading(page, "Off the plane")).to_contain_text("95 %")
+    expect(reading(page, "Distance from plane")).to_contain_text("95 %")
     expect(reading(page, "Reach")).to_contain_text("can be reached")
 
 

@@ -42,7 +42,7 @@ def tips_of(path: Path) -> Array:
             {name.strip(): text for name, text in row.items()} for row in csv.DictReader(stream)
         ]
     if not rows or not set(_COLUMNS) <= rows[0].keys():
-        raise UserError(f"{path}: wants columns {', '.join(_COLUMNS)}")
+        raise UserError(f"{path}: expected columns {', '.join(_COLUMNS)}")
     # A tip that was not measured anew comes again, and as zeros before the first.
     values = dict.fromkeys(tuple(float(row[name]) for name in _COLUMNS) for row in rows)
     x, y, z = np.array([value[:3] for value in values if any(value[:2])]).T * 1e-3

@@ -30,7 +30,7 @@ def checkout() -> Path:
     for folder in Path(__file__).resolve().parents:
         if (folder / "scripts" / "simulate").is_file():
             return folder
-    raise UserError("this runs from a checkout only: there is no scripts/simulate beside it")
+    raise UserError("this runs from a checkout only: scripts/simulate is missing")
 
 
 def make_folder(option: str, name: str, *, exist_ok: bool = True) -> Path:
@@ -106,7 +106,7 @@ def ran(
     """
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode not in good:
-        last = (done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()[-1]
+        last = (done.stderr.strip() or done.stdout.strip() or "no output").splitlines()[-1]
         name = f"{what}: {Path(command[0]).name}" if what else " ".join(command)
         raise UserError(f"{name} ended with code {done.returncode}: {last}")
     return done

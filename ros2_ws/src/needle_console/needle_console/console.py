@@ -216,7 +216,7 @@ class Console(Component):
 
     def _on_lag(self, seconds: float, at: Moment) -> None:
         if seconds - self._lag >= _LAG_INCREASE:
-            text = f"too slow for this computer, {seconds:.1f} s behind the clock"
+            text = f"this computer is too slow, {seconds:.1f} s behind the clock"
             self._picture.set_health("simulation", bad=True, message=text, now=at.steady)
         self._lag = seconds
 

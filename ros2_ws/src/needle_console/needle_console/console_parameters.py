@@ -39,7 +39,7 @@ class ConsoleParameters:
         """
         check_fields(self)
         if self.port == self.hold_port:
-            raise UserError(f"port and hold_port are both {self.port}, wants two")
+            raise UserError(f"port and hold_port are both {self.port}, expected two")
 
     def why_no_hold(self, simulated: bool | None, *, is_local: bool) -> str:
         """Return why a page may only watch and stop; empty: it may hold.
@@ -54,8 +54,8 @@ class ConsoleParameters:
         if simulated or (self.hold_real_rig and is_local):
             return ""
         if self.hold_real_rig:
-            return "only watching: a real rig is held at its own machine"
-        return "only watching: hold_real_rig is off, and this is no simulation"
+            return "watching only: a real rig can be held at its own machine only"
+        return "watching only: hold_real_rig is off, and this is not a simulation"
 
     def access(self) -> Access:
         """Return the access control; raises as `Access`."""

@@ -105,5 +105,5 @@ def test_real_rig_is_held_only_locally_and_if_allowed(hold_real_rig: bool, is_lo
 
 
 def test_page_and_hold_need_two_ports() -> None:
-    with pytest.raises(UserError, match="8081, wants two"):
+    with pytest.raises(UserError, match="8081, expected two"):
         ConsoleParameters(port=8081)

@@ -51,9 +51,9 @@ COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"
 TARGET_PLANE, TARGET_POINT, OBSTACLES = "target_plane", "target_point", "obstacles"
 TARGETS = (TARGET_PLANE, TARGET_POINT, OBSTACLES)
 _KEPT_MESSAGE = {
-    TARGET_PLANE: "the last plane stays",
-    TARGET_POINT: "the last target stays",
-    OBSTACLES: "the last obstacles stay",
+    TARGET_PLANE: "keeping the last plane",
+    TARGET_POINT: "keeping the last target",
+    OBSTACLES: "keeping the last obstacles",
 }
 _LOG_PERIOD = 2.0
 """Shortest time between two log messages of one kind [s]."""

@@ -126,7 +126,7 @@ def test_it_steers_in_steps_and_publishes_its_estimate() -> None:
 
 
 def test_a_start_requires_a_driver_that_subscribes() -> None:
-    assert Bench().call("start") == (False, "no device/status has come")
+    assert Bench().call("start") == (False, "no device/status received")
     bench = Bench(receiver="/recorder")
     assert bench.call("start") == (False, f"waiting for subscriber of {COMMANDS}")
     assert bench.component.steering.state.value == "IDLE"
@@ -210,12 +210,12 @@ def test_invalid_targets_are_rejected_and_the_last_stays() -> None:
     for bad, said in (((np.nan, 0.0, 0.0), "not finite"), ((0.5, 0.0, 0.0), "cannot be reached")):
         bench.receive("target_plane", dataclasses.replace(plane, position=bad))
         assert said in bench.health["target_plane"].message
-    assert "the last plane stays" in bench.component.problems["target_plane"]
+    assert "keeping the last plane" in bench.component.problems["target_plane"]
     assert bench.status.target_offset_m == 0.005
     for x, z in ((0.01, 0.1), (0.09, 0.1)):
         bench.receive("target_point", m.Point(0, "rig", (x, 0.0, z)))
         assert bench.status.target_point_m == (0.01, 0.0, 0.1)
-    assert "entering at" in bench.health["target_point"].message
+    assert "from an entry at" in bench.health["target_point"].message
     # A plane replaces the point.
     bench.receive("target_plane", plane)
     assert bench.status.target_point_m is None
@@ -223,7 +223,7 @@ def test_invalid_targets_are_rejected_and_the_last_stays() -> None:
     ball = m.Marker("rig", "bone", 1, 2, 0, (0.0, 0.0, 0.06), STRAIGHT, (0.004, 0.004, 0.004))
     bench.receive("obstacles", m.Markers((ball,)))
     bench.receive("obstacles", m.Markers((dataclasses.replace(ball, kind=1),)))
-    assert "the last obstacles stay" in bench.health["obstacles"].message
+    assert "keeping the last obstacles" in bench.health["obstacles"].message
     assert bench.status.obstacles == 1
     bench.receive("obstacles", m.Markers(()))
     assert bench.status.obstacles == 0

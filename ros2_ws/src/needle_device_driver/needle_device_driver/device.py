@@ -159,7 +159,7 @@ class DeviceInterface:
         task, self._task = self._task, None
         if task is not None:
             task.running.cancel()
-            yield from task.then(ServiceResult(False, f"called off: {reason}"), at)
+            yield from task.then(ServiceResult(False, f"cancelled: {reason}"), at)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Check for another device, and count the publishers of commands."""
@@ -167,7 +167,7 @@ class DeviceInterface:
         others = [name for name in peers.publishers.get(STATUS, ()) if name != self._name]
         names = ", ".join(others)
         self.conflict = (
-            f"another device is there: {names} publishes {STATUS}; {CONFLICT_HINT}"
+            f"another device is running: {names} publishes {STATUS}; {CONFLICT_HINT}"
             if others
             else ""
         )
@@ -235,7 +235,7 @@ class DeviceInterface:
             def reply(result: ServiceResult, _: Moment) -> Actions:
                 yield Reply(number, result.success, result.message)
 
-            not_ready = self._not_ready() or ("another order is under way" if self.is_busy else "")
+            not_ready = self._not_ready() or ("another command is running" if self.is_busy else "")
             # Stopping and switching off always work, and cancel a procedure.
             if name == "stop" or (switch and not on):
                 yield from self.cancel("stopped on request", at)

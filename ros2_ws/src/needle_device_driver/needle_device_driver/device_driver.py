@@ -254,7 +254,7 @@ class DeviceDriver(Component):
     def _after_search(self, result: ServiceResult, at: Moment) -> Actions:
         if result.success:
             self.is_set_up, self.searches, self.waiting = True, False, ""
-            yield Log("info", f"both drives are there on {self.link.name}")
+            yield Log("info", f"found both drives on {self.link.name}")
             for text in self._drives.missing_optional_objects:
                 # Feed the watchdogs: logging can be slow.
                 self._drives.beat()
@@ -269,7 +269,7 @@ class DeviceDriver(Component):
     def _shut_down(self, at: Moment) -> Actions:
         self._is_ending, self.is_set_up, self.searches = True, False, False
         self.waiting = _NO_DRIVES
-        yield from self._device.cancel("the driver ends", at)
+        yield from self._device.cancel("shutting down", at)
         if self._cycle is not None:
             self._cycle[0].cancel()
         self._cycle = Running(self.supervisor.deconfigure()), at

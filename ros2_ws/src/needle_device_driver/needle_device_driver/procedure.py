@@ -71,7 +71,7 @@ def run_at_once(procedure: Procedure[T]) -> T:
     """
     running = Running(procedure)
     if not running.advance(0.0):
-        raise RuntimeError("the procedure waits, and nothing here can")
+        raise RuntimeError("the procedure waits, but this caller runs it in one step")
     return running.result[0]
 
 

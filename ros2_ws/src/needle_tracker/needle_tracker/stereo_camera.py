@@ -142,7 +142,7 @@ class StereoCamera(Component):
                     counts = f"{self._pairs} pairs, {self._dropped} unreadable"
                     yield Log("info", f"end of the recording: {counts}")
                     if missing:
-                        yield Log("warning", f"the recording is not whole: {missing}")
+                        yield Log("warning", f"the recording is incomplete: {missing}")
                     yield Exit(EXIT_DONE)
                     return
                 case None:
@@ -186,7 +186,7 @@ class StereoCamera(Component):
         elif self._dropped:
             level, message = Level.WARN, "some pairs could not be read"
         elif at.steady - self._started_at > 3.0 and rate < 0.8 * wanted:
-            level, message = Level.WARN, f"slower than the {wanted:g} Hz asked for"
+            level, message = Level.WARN, f"slower than the {wanted:g} Hz requested"
         yield Diagnose("images", Diagnostic(level, message, values))
 
 

@@ -124,7 +124,7 @@ def test_a_low_rate_is_reported(calibration: StereoCalibration) -> None:
     for step in range(40, 60):
         rig.gives(rig.pair(), 4.0 + 0.5 * (step - 40))
     level, message, values = rig.health(13.5)
-    assert (level, message) == (Level.WARN, "slower than the 10 Hz asked for")
+    assert (level, message) == (Level.WARN, "slower than the 10 Hz requested")
     assert (values["pairs"], values["rate_hz"]) == ("60", "2.0")
 
 
@@ -144,7 +144,7 @@ def test_the_end_of_a_recording_reports_missing_frames(calibration: StereoCalibr
     rig.asks(0.1)
     rig.asks(0.2)
     end = Log("info", "end of the recording: 1 pairs, 1 unreadable")
-    lacks = Log("warning", "the recording is not whole: 2 frames without a partner")
+    lacks = Log("warning", "the recording is incomplete: 2 frames without a partner")
     events = (EndOfRecording("2 frames without a partner"), EndOfRecording())
     assert [rig.gives(event) for event in events] == [[end, lacks, Exit(0)], [end, Exit(0)]]
 

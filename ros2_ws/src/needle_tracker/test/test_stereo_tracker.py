@@ -134,7 +134,7 @@ def test_a_pair_gives_tip_and_pose_with_the_stamp_of_the_exposure(
     ("fields", "reason"),
     [
         ({"encoding": "rgb8"}, "right image has 786432 bytes in rows of 1024"),
-        ({"encoding": "mono16"}, "right image is 'mono16', wants 8 bits, such as mono8"),
+        ({"encoding": "mono16"}, "right image is 'mono16', expected 8 bits, such as mono8"),
         ({"width": 640}, "right image is 640x768, the calibration is for 1024x768"),
         ({"data": PIXELS.tobytes()[1:]}, "right image has 786431 bytes in rows of 1024"),
     ],
@@ -268,7 +268,7 @@ def test_images_stamped_by_another_clock_than_joint_states_are_a_warning(bench: 
     bench.joints(10 * SECOND)
     for stamp, said in (
         (9 * SECOND, (Level.OK, "insertion known")),
-        (9 * SECOND - 1, (Level.WARN, "no pair is answered: exposed 1.0 s before the first")),
+        (9 * SECOND - 1, (Level.WARN, "no pair is processed: exposed 1.0 s before the first")),
     ):
         bench.image("left", stamp)
         bench.image("right", stamp)

@@ -127,7 +127,7 @@ def camera_views(
 
 def plan_views(run: Run, frames: Sequence[Frame]) -> list[View]:
     """Return drawings of needle and target from the side and from above."""
-    names = {0: "from the side, with the wanted plane", 1: "from above"}
+    names = {0: "from the side, with the target plane", 1: "from above"}
     return [_plan_view(run, frames, axis, name) for axis, name in names.items()]
 
 

@@ -69,7 +69,7 @@ def states_figure(run: Run) -> Figure:
                 shown = values[:, column] if len(series) else np.empty(0)
                 scaled = shown * factor if factor else np.degrees(np.unwrap(shown))
                 axes.plot(_insertion_mm(run, series), scaled, **style)
-        r1.set(title="Distance from the wanted plane  (r1)", ylabel="mm")
+        r1.set(title="Distance from the target plane  (r1)", ylabel="mm")
         r1.legend(loc="best", ncols=4)
         r2.set(title="Pitch: angle between the needle and the plane  (r2)", ylabel="deg")
         r3.set(title="Roll: where the bevel points  (r3)", ylabel="deg")
@@ -106,7 +106,7 @@ def _draw_rerun_commands(axes: Any, run: Run) -> None:
         np.stack([insertion, step, gap], axis=1).ravel() * MM,
         np.degrees(np.stack([begin, end, gap], axis=1).ravel()),
         **THIN,
-        label=f"{run.parameter('plane_controller', 'preset')} would have turned it, step by step",
+        label=f"{run.parameter('plane_controller', 'preset')} would have rotated it, step by step",
     )
 
 
@@ -124,11 +124,11 @@ def path_figure(run: Run) -> Figure:
         truth = run.truth.values[:, :3] * MM
         plane = target_offset(run) * MM
         side.axhspan(plane - GOAL * MM, plane + GOAL * MM, color=GOAL_BAND, alpha=0.16, lw=0)
-        side.axhline(plane, color=GOAL_BAND, lw=1.3, label="wanted plane, ±1 mm")
+        side.axhline(plane, color=GOAL_BAND, lw=1.3, label="target plane, ±1 mm")
         side.plot(truth[:, 2], truth[:, 0], **BROAD, label="needle (truth)")
         side.plot(tips[:, 2], tips[:, 0], **_MEASURED_DOTS, label="measured tip")
         side.set(
-            title="Seen from the side: the wanted plane is the green line",
+            title="Seen from the side: the target plane is the green line",
             xlabel="z, insertion direction [mm]",
             ylabel="x, up [mm]",
         )

@@ -37,11 +37,11 @@ Floats = npt.NDArray[np.float64]
 LETTERS = ("A", "B")
 _COLORS = (ESTIMATE, MEASURED)
 _ROWS = (
-    ("Distance from the wanted plane  (r1)", "mm"),
+    ("Distance from the target plane  (r1)", "mm"),
     ("Pitch  (r2)", "deg"),
     ("Roll  (r3)", "deg"),
     ("Accumulated rotation, measured", "deg"),
-    ("Turn commanded for each step", "deg"),
+    ("Rotation commanded for each step", "deg"),
 )
 
 
@@ -125,7 +125,7 @@ def _path(runs: tuple[Run, Run]) -> Figure:
             offset = target_offset(run) * MM
             side.plot(path[:, 2], path[:, 0] - offset, color=color, lw=1.5, label=letter)
             above.plot(path[:, 2], path[:, 1], color=color, lw=1.5)
-        side.set(title="Seen from the side; the wanted plane is 0", ylabel="x - plane [mm]")
+        side.set(title="Seen from the side; the target plane is 0", ylabel="x - plane [mm]")
         above.set(title="Seen from above", ylabel="y [mm]", xlabel="z, insertion direction [mm]")
         side.legend(loc="best", ncols=2)
         return figure

@@ -55,8 +55,8 @@ def innovation_figure(run: Run, found: Innovations) -> Figure:
         parts.set(title="Innovation: measured minus expected tip", ylabel="mm", ylim=(-top, top))
         parts.legend(loc="best", ncols=2)
         size.plot(insertion, np.maximum(found.squared, 1e-3), ".", color=INK, ms=4)
-        size.axhline(QUANTILE_95, color=RED, lw=1.1, label="95 % of tips should be below")
-        size.axhline(3.0, color=GREY, lw=0.9, ls=(0, (4, 2)), label="average where all fits: 3")
+        size.axhline(QUANTILE_95, color=RED, lw=1.1, label="95 % of tips expected below")
+        size.axhline(3.0, color=GREY, lw=0.9, ls=(0, (4, 2)), label="expected average: 3")
         size.set(title="Innovation squared, normalised by its covariance")
         _scale_by_tens(size)
         size.legend(loc="best", ncols=2)
@@ -80,7 +80,7 @@ def _draw_gate(axes: Any, run: Run) -> None:
     top = 1.0
     if room.margin is not None:
         top = room.margin * MM
-        axes.axhline(top, color=RED, lw=1.2, label="a tip above this is refused")
+        axes.axhline(top, color=RED, lw=1.2, label="a tip above this is rejected")
     marks: Sequence[tuple[Stamps, str, str, str]] = (
         (rejected_tips(run), "x", RED, "refused"),
         (missed_tips(run), "|", MEASURED, "no tip found"),
@@ -90,7 +90,7 @@ def _draw_gate(axes: Any, run: Run) -> None:
             where = run.insertion_at(stamps) * MM
             height = np.full(len(stamps), top)
             axes.plot(where, height, marker, color=color, ms=8, mew=1.6, label=label)
-    axes.set(title="The controller's gate: where no needle can be", ylabel="mm")
+    axes.set(title="The controller's gate: tips beyond the needle's reach", ylabel="mm")
     axes.legend(loc="best", ncols=2)
 
 

@@ -249,7 +249,7 @@ def refuse_existing_bag(directory: Path) -> None:
     if directory.exists() and not directory.is_dir():
         raise UserError(f"cannot record into {directory}: it is a file")
     if (directory / METADATA_FILE).exists() or any(directory.glob("*.mcap")):
-        raise UserError(f"{directory} holds a bag already: name a new directory")
+        raise UserError(f"{directory} already contains a bag: give a new directory")
 
 
 class BagCopy:

@@ -82,7 +82,7 @@ def _read(type_name: str) -> str:
         package, kind, name = type_name.split("/")
         return find_shared_file(package, f"{kind}/{name}.msg").read_text(encoding="utf-8")
     except ValueError:
-        raise UserError(f"{type_name!r} is not a message type: wants package/msg/Name") from None
+        raise UserError(f"{type_name!r} is not a message type: use package/msg/Name") from None
     except UserError:
         why = f"the definition of {type_name} is not installed (AMENT_PREFIX_PATH)"
         raise UserError(why) from None

@@ -122,7 +122,7 @@ def packed(needle: LiveNeedle, now: float) -> bytes:
 
 def _status(needle: LiveNeedle) -> str:
     if needle.answered_ns is None:
-        return "nothing heard of the needle"
+        return "no needle data received"
     return "tip found" if needle.tip_found else "no tip found"
 
 

@@ -142,7 +142,7 @@ class LiveView(Component):
         if found is None:
             return None
         stamp_ns, answered, image = found
-        shaft, note = np.empty((0, 2)), "no answer of the tracker"
+        shaft, note = np.empty((0, 2)), "no answer from the tracker"
         if answered:
             note = "tip found" if self._needle.tip_found else "no tip found"
         if answered and self._needle.tip_found and self._needle.shaft is not None:

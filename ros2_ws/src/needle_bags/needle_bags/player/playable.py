@@ -22,7 +22,7 @@ def unplayable(topic: BagTopic) -> str:
         return f"{topic.type_name} is not installed"
     if installed_hash != recorded_hash:
         return (
-            f"{topic.type_name} is defined otherwise in this bag than here (another ROS "
-            "distribution): play it where it was recorded"
+            f"{topic.type_name} has another definition in this bag than here (another "
+            "ROS distribution): play it where it was recorded"
         )
     return ""

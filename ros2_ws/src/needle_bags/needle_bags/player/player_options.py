@@ -144,7 +144,7 @@ def require_fits(options: PlayerOptions, contents: BagDirectory) -> None:
             raise UserError(f"{name} is not in {options.bag}; it has {', '.join(known)}")
     seconds = (contents.end - contents.start) / 1e9
     if options.start > seconds:
-        raise UserError(f"--start {options.start:g} s: {options.bag} has {seconds:.1f} s only")
+        raise UserError(f"--start {options.start:g} s: {options.bag} ends at {seconds:.1f} s")
 
 
 def _remap(text: str) -> tuple[str, str]:

@@ -66,7 +66,7 @@ def pixels_of(image: Any, path: Path) -> npt.NDArray[np.uint8]:
     size = (image.height, image.width)
     if image.step < image.width or len(image.data) != image.height * image.step:
         raise UserError(
-            f"{path}: an image says it has {size[0]} rows of {size[1]} pixels, and holds "
+            f"{path}: an image declares {size[0]} rows of {size[1]} pixels, but has "
             f"{len(image.data)} bytes"
         )
     rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)

@@ -49,14 +49,14 @@ def namespace_of(contents: BagDirectory, wanted: str | None = None) -> str:
     found = namespaces(contents)
     if not found:
         raise UserError(
-            f"{contents.path} holds no needle run: no topic {_LANDMARK} among its "
-            f"{len(contents.topics)}; it needs a bag that the rig's recorder made"
+            f"{contents.path} contains no needle run: no topic {_LANDMARK} among its "
+            f"{len(contents.topics)}; give a bag that the rig's recorder made"
         )
     listed = ", ".join(name.rstrip("/") or "/" for name in found)
     if wanted is not None:
         namespace = f"/{wanted.strip('/')}/".replace("//", "/")
         if namespace not in found:
-            raise UserError(f"{contents.path} has no rig in {wanted}; it has those in {listed}")
+            raise UserError(f"{contents.path} has no rig in {wanted}; it has rigs in {listed}")
         return namespace
     if len(found) > 1:
         raise UserError(

@@ -65,18 +65,18 @@ class RecorderHealth:
         waiting = self._recording.bytes_waiting
         if waiting <= WARN_WAITING:
             return ""
-        return f"the disk, or this machine, is slower than the graph: {megabytes(waiting)} wait"
+        return f"the disk or this machine is slower than the graph: {megabytes(waiting)} waiting"
 
     def _space_warning(self) -> str:
         space = self._recording.space
         try:
             usable = space.usable()
         except OSError as error:
-            return f"cannot look at the disk of {self._bag}: {error.strerror}"
+            return f"cannot read the free space on the disk of {self._bag}: {error.strerror}"
         if usable >= max(WARN_BEFORE * self._rate, WARN_RESERVES * space.reserve):
             return ""
         reserve = megabytes(space.reserve)
-        return f"the disk of {self._bag} is nearly full: recording ends at {reserve} free"
+        return f"the disk of {self._bag} is nearly full: recording stops at {reserve} free"
 
 
 class DecodeErrors:
@@ -99,4 +99,4 @@ class DecodeErrors:
             return Diagnostic(Level.OK, "all understood", {})
         parts = [f"{source} ({self._reasons[source]})" for source in self._counts]
         values = {source: str(count) for source, count in self._counts.items()}
-        return Diagnostic(Level.WARN, f"not understood: {'; '.join(parts)}", values)
+        return Diagnostic(Level.WARN, f"cannot decode: {'; '.join(parts)}", values)

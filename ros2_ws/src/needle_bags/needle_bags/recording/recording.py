@@ -259,7 +259,7 @@ class Recording:
             unwritten = min(CHUNK_SIZE, self._bytes_written - self._bytes_flushed)
             if self.space.usable() < unwritten:
                 left = megabytes(self.space.usable() + self.space.reserve)
-                self._end_early(f"the disk of {self._bag.directory} has only {left} left")
+                self._end_early(f"the disk of {self._bag.directory} has only {left} free")
                 return
         if is_due:
             self._bag.flush()
@@ -335,7 +335,7 @@ def open_recording(
     usable = space.usable()
     if usable < 0:
         left, kept = megabytes(usable + space.reserve), megabytes(space.reserve)
-        raise UserError(f"cannot record into {directory}: {left} free, {kept} are kept free")
+        raise UserError(f"cannot record into {directory}: {left} free, minimum {kept}")
     bag = BagWriter(
         directory,
         distribution=distribution,

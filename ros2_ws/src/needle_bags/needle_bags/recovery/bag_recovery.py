@@ -34,7 +34,7 @@ from needle_core.files.mcap_file import RUN_RECORD, custom_data_of
 # custom_data key: description of the loss.
 _RECOVERED: Final = "recovered"
 _DAMAGED: Final = ".damaged"
-_NOTHING_LOST: Final = "its metadata or index was made anew; all that was written is here"
+_NOTHING_LOST: Final = "its metadata or index was rebuilt; it contains everything that was written"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +109,7 @@ def recover_bag(path: Path) -> BagRecovery:
         is_unpacked = all(file.suffix == ".mcap" and file.exists() for file in files)
         if not is_unpacked and any(folder.glob("*.mcap.zstd")):
             raise UserError(
-                f"{path}: {error.reason}; its files are compressed as a whole: run "
+                f"{path}: {error.reason}; whole files are compressed: run "
                 f"`unzstd --rm {folder}/*.mcap.zstd` first"
             ) from error
     else:
@@ -120,7 +120,7 @@ def recover_bag(path: Path) -> BagRecovery:
     except OSError as error:
         reason = f"{path} cannot be recovered: {error.filename or path}: {error.strerror}"
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            reason += ": it is written anew, which takes as much room; nothing was changed"
+            reason += ": the copy needs as much space again; nothing was changed"
         raise UserError(reason) from error
 
 
@@ -150,7 +150,7 @@ class _Recovery:
         loss = self._read()
         parts = self._parts
         if not parts:
-            raise UserError(f"{self._path} cannot be recovered: nothing comes before {loss.where}")
+            raise UserError(f"{self._path} cannot be recovered: it has no data before {loss.where}")
         kept: list[str] = []
         if self._path.is_dir():
             information = _new_information(parts, self._metadata, loss.text or _NOTHING_LOST)

@@ -62,7 +62,7 @@ class PrefixCopy:
                     self._copy(record)
                     self.end = stream.tell()
             except EndOfFile:
-                self.reason = "the file ends within a record"
+                self.reason = "the file ends inside a record"
             except _DAMAGE as error:
                 self.reason = f"a record is damaged: {type(error).__name__}"
 

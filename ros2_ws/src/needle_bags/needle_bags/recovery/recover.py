@@ -56,12 +56,12 @@ def _lines(bag: Path, recovery: BagRecovery) -> list[str]:
     holds = f"{recovery.messages} messages of {len(recovery.bag.topics)} topics"
     left_out = [f"  left out: {line}" for line in recovery.left_out]
     if recovery.was_whole:
-        return [f"{bag} is whole: {holds}; nothing to do", *left_out]
+        return [f"{bag} is complete: {holds}; nothing to do", *left_out]
     lines = [f"recovered {bag}: {holds}"]
-    lines.append(f"  lost: {recovery.lost or 'nothing that had been written'}")
+    lines.append(f"  lost: {recovery.lost or 'nothing that was written'}")
     lines += left_out
     if recovery.kept:
-        lines.append(f"  previous files, to be deleted when done: {', '.join(recovery.kept)}")
+        lines.append(f"  previous files, delete them when done: {', '.join(recovery.kept)}")
     return lines
 
 

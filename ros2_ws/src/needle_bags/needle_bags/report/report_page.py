@@ -90,9 +90,9 @@ def verdict_text(summary: Mapping[str, JsonValue]) -> tuple[str, str]:
     if summary["rerun_of"] is not None:
         by = summary["steered_by"] or "another controller"
         return "Rerun", (
-            f"Nothing was steered here: joints and truth are those of {summary['rerun_of']}, which "
-            f"{by} steered. Estimates and commands are what {summary['controller'] or 'it'} would "
-            "have said there."
+            f"This is a rerun: joints and truth come from {summary['rerun_of']}, "
+            f"steered by {by}. Estimates and commands are those that "
+            f"{summary['controller'] or 'it'} would have sent."
         )
     final = summary["r1_final_mm"]
     depth = number(summary["insertion_final_mm"], "{:.0f} mm")
@@ -104,7 +104,7 @@ def verdict_text(summary: Mapping[str, JsonValue]) -> tuple[str, str]:
     target, distance = "plane", number(final, "{:+.2f} mm")
     if summary["point_error_mm"] is not None:
         target, distance = "point", number(summary["point_error_mm"], "{:.2f} mm")
-    distance = f"The tip ended {distance} from the wanted {target}"
+    distance = f"The tip ended {distance} from the {target}"
     if summary["converged"]:
         return "Converged", f"{distance} (goal: within ±1 mm), {depth} deep."
     if not summary["reached_depth"]:

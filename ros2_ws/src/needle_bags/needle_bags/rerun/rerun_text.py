@@ -152,7 +152,7 @@ _SUFFIX: Mapping[str, str] = {
 
 def _missing(run: Run, topic: TopicResult) -> str:
     parts = []
-    for stamps, words in ((topic.missing, "recorded but not today"), (topic.extra, "only today")):
+    for stamps, words in ((topic.missing, "recorded only"), (topic.extra, "only today")):
         if stamps:
             places = ", ".join(_where(run, stamp) for stamp in stamps[:_SHOWN])
             more = ", ..." if len(stamps) > _SHOWN else ""

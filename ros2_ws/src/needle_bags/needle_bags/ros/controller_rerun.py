@@ -127,7 +127,7 @@ class ControllerStage:
         if now in _STEERING and before not in _STEERING:
             reply, actions = self._controller.start(_NEVER)
             if not reply.success:
-                self.notes.append(f"would not have started: {reply.message}")
+                self.notes.append(f"steering would not start: {reply.message}")
             return actions
         if (
             before in _STEERING

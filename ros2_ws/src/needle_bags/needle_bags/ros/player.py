@@ -126,7 +126,7 @@ class Player(WholeNode):
             else:
                 playable[name] = topic
         if chosen and not playable:
-            raise UserError(f"{options.bag}: none of its topics can be played here")
+            raise UserError(f"{options.bag}: none of its topics can be played")
         return playable
 
     def prepare(self, spin: partial[None], end: ShutdownFlag) -> bool:
@@ -147,7 +147,7 @@ class Player(WholeNode):
         while time.monotonic() < begin + DISCOVERY and not (self.beside_rig or end.requested):
             spin()
             if self._rig() is not None:
-                self.get_logger().warning(f"a rig is on this graph: all is played under {REPLAY}")
+                self.get_logger().warning(f"a rig runs on this graph: playing under {REPLAY}")
                 self.beside_rig = True
                 self._make_publishers()
                 begin = time.monotonic()
@@ -187,7 +187,7 @@ class Player(WholeNode):
             or is_guarded(final, topic.type_name)
             or is_guarded(topic.name, topic.type_name)
         ):
-            raise UserError(f"{topic.name} may not be played as {final}: a rig would obey it")
+            raise UserError(f"{topic.name} must not be played as {final}: a rig would execute it")
         return publisher
 
     def _all_matched(self) -> bool:
@@ -350,8 +350,8 @@ def main(args: list[str] | None = None) -> int:
                 code = _play(player, options.loop, end)
             except RigAppearedError as error:
                 print(
-                    f"error: a rig came up on this graph ({error}): playing ended; give one of "
-                    "the two a ROS_DOMAIN_ID of its own",
+                    f"error: a rig started on this graph ({error}): playing ended; give one of "
+                    "the two its own ROS_DOMAIN_ID",
                     file=sys.stderr,
                 )
                 return EXIT_MISSED

@@ -169,14 +169,14 @@ class Recorder(WholeNode):
     def report_decode_error(self, source: str, error: Exception) -> None:
         """Count an input that could not be decoded; log the first of its source."""
         if self._decode_errors.add(source, error):
-            self.get_logger().warning(f"not understood: {source}: {error}")
+            self.get_logger().warning(f"cannot decode {source}: {error}")
         self._diagnostics.set("input", self._decode_errors.diagnostic())
 
     def _check_device_status(self, message: Received) -> None:
         status = deserialize_message(message.data, DiagnosticStatus)
         state = next((pair.value for pair in status.values if pair.key == "state"), "")
         if state in FAULTS and self._states.get(message.topic) != state:
-            reason = f"{message.topic} says {state}"
+            reason = f"{message.topic} reports {state}"
             self._snapshot_due = (time.monotonic() + FAULT_DELAY, reason)
         self._states[message.topic] = state
 
@@ -254,7 +254,7 @@ class Recorder(WholeNode):
         lost = self._lost()
         if self.recording.error is not None:
             whole = self.recording.is_whole
-            state = "the bag is whole up to there" if whole else recover_hint(self.bag)
+            state = "the bag is complete up to there" if whole else recover_hint(self.bag)
             print(f"error: recording ended: {self.recording.error}; {state}", file=sys.stderr)
         else:
             print(f"recorded {count} messages of {len(self._topics)} topics into {self.bag}")

@@ -80,8 +80,8 @@ exit codes: 0 no difference; 1 differences; 2 invalid or missing input; 3 the cu
 FILE = "calibration_file"
 TRACKER, CONTROLLER = "stereo_tracker", "plane_controller"
 NOT_COMPARED = {
-    LiveView.name: "since no bag tells when it looked",
-    OpenIGTLink.name: "since ports are not recorded",
+    LiveView.name: "because its update times are not recorded",
+    OpenIGTLink.name: "because ports are not recorded",
 }
 """Viewer to the reason why its output is not compared."""
 
@@ -174,7 +174,7 @@ def _run(words: Sequence[str]) -> int:
     if rerun.tips_without_images:
         print(f"note: {rerun.tips_without_images} recorded tips have no images in the bag")
     if rerun.unanswered:
-        print(f"note: {rerun.unanswered} pairs are left out: stereo_tracker did not hear them")
+        print(f"note: {rerun.unanswered} pairs are left out: stereo_tracker did not receive them")
     print("CHANGED" if comparison.changed else f"UNCHANGED: {len(rerun.recorded)} messages agree")
     for text in (
         describe(run, comparison),

@@ -108,7 +108,7 @@ def test_mcap_reads_the_file_alone(texts: Path) -> None:
 
 
 def test_an_existing_bag_is_not_replaced(texts: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds a bag already"):
+    with pytest.raises(UserError, match="already contains a bag"):
         BagWriter(texts)
     (tmp_path / "parameters.yaml").write_text("{}")
     with pytest.raises(UserError, match="it is a file"):
@@ -142,7 +142,7 @@ def test_a_disk_that_refuses_data_is_an_error_at_the_start(
         open_recording(tmp_path / "bag")
     monkeypatch.undo()
     monkeypatch.setattr(FreeSpace, "usable", lambda _: -1)
-    with pytest.raises(UserError, match=r"cannot record into .*bag: \d+ MB free, 1 MB are kept"):
+    with pytest.raises(UserError, match=r"cannot record into .*bag: \d+ MB free, minimum 1 MB"):
         open_recording(tmp_path / "bag", reserve=1_000_001)
     monkeypatch.undo()
     open_recording(tmp_path / "bag").close()
@@ -239,7 +239,7 @@ def test_health_reports_the_worst_problem() -> None:
         told.bytes_received += 5_000_000
         level, text = health.check(0.5, {}, [])
     assert level is Level.WARN
-    assert text == "the disk of bag is nearly full: recording ends at 1 MB free"
+    assert text == "the disk of bag is nearly full: recording stops at 1 MB free"
     told.bytes_waiting = WARN_WAITING + 1
     assert "slower than the graph: 50 MB wait" in health.check(0.5, {}, [])[1]
     assert health.check(0.5, {"/t": 3}, []) == (Level.WARN, "messages lost on /t")

@@ -74,7 +74,7 @@ def pose(stamp_ns: int, sigma: float = 1e-4) -> m.PoseWithCovariance:
 
 
 def test_messages_are_in_mm(component: OpenIGTLink) -> None:
-    assert says(component) == {"NeedleStatus": ("nothing heard of the needle", 7.0)}
+    assert says(component) == {"NeedleStatus": ("no needle data received", 7.0)}
     status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
     hear(component, "needle/controller_status", status)
     hear(component, "joint_states", m.JointState(1, ("insertion_joint",), (0.04,)))

@@ -39,7 +39,7 @@ def two_rigs(make_run: MakeRun, tmp_path: Path) -> Path:
 def test_two_rigs_require_a_namespace(two_rigs: Path) -> None:
     with pytest.raises(UserError, match=r"two holds 2 rigs, in /, /bench: choose one with --names"):
         read_run(two_rigs)
-    with pytest.raises(UserError, match=r"two has no rig in /desk; it has those in /, /bench"):
+    with pytest.raises(UserError, match=r"two has no rig in /desk; it has rigs in /, /bench"):
         read_run(two_rigs, "/desk")
     for name in ("bench", "/bench", "/bench/"):
         run = read_run(two_rigs, name)
@@ -117,7 +117,7 @@ def other_distribution(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (foreign, "holds no needle run"),
+        (foreign, "contains no needle run"),
         (other_type, "/needle/tip has type std_msgs/msg/String, the rig's has"),
         (other_distribution, r"as Jazzy has it \(bag of humble"),
     ],

@@ -39,7 +39,7 @@ def test_a_killed_recording_is_recovered(tmp_path: Path) -> None:
     assert not recovery.was_whole
     assert numbers(path) == list(range(recovery.messages))
     assert recovery.messages > 200
-    assert "(the file ends within a record) on: half a second at most if" in recovery.lost
+    assert "(the file ends inside a record) on: half a second at most if" in recovery.lost
     told = read_contents(path)
     custom = told.custom_data
     assert (custom["commit"], custom["run_info"]) == ("0123abc", "seed: 3")
@@ -65,7 +65,7 @@ def test_without_metadata_everything_is_recovered_in_order(tmp_path: Path) -> No
     assert (recovery.messages, recovery.lost, recovery.kept) == (300, "", [])
     after = yaml.safe_load((path / "metadata.yaml").read_text())
     note = after["rosbag2_bagfile_information"]["custom_data"].pop("recovered")
-    assert note == "its metadata or index was made anew; all that was written is here"
+    assert note == "its metadata or index was rebuilt; it contains everything that was written"
     for document in (before, after):
         for key in ("parameters", "parameter_changes"):
             document["rosbag2_bagfile_information"]["custom_data"].pop(key, None)
@@ -85,7 +85,7 @@ def test_the_command_reports_the_loss_and_leaves_a_whole_bag(
     path = write(tmp_path / "bag")
     before = contents(path)
     assert recover.main([str(path)]) == 0
-    assert "is whole: 300 messages of 3 topics; nothing to do" in capsys.readouterr().out
+    assert "is complete: 300 messages of 3 topics; nothing to do" in capsys.readouterr().out
     assert contents(path) == before
     first = damage(path / "bag_0.mcap")
     assert recover.main([str(path), "--json", str(tmp_path / "out.json")]) == 0
@@ -97,7 +97,7 @@ def test_the_command_reports_the_loss_and_leaves_a_whole_bag(
     assert f"recovered {path}: {kept} messages of 3 topics" in said
     assert "of bag_0.mcap (a record is damaged: CRCValidationError) on: " in said
     assert f"on: {(300 - kept) / 100:.1f} s follow" in said
-    assert "to be deleted when done: metadata.yaml.damaged, bag_0.mcap.damaged" in said
+    assert "delete them when done: metadata.yaml.damaged, bag_0.mcap.damaged" in said
 
 
 def test_a_bag_that_is_being_recorded_is_left_alone(tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def test_an_unrecoverable_bag_gives_a_one_line_error_and_is_kept(
         "other": "byte 0 of bag_0.mcap (a record is damaged: InvalidMagic)",
         "empty": "is not a bag",
         "missing": "no such bag directory",
-        "damaged": "nothing comes before byte",
+        "damaged": "it has no data before byte",
     }.items():
         path = tmp_path / name
         before = contents(path) if path.exists() else {}
@@ -185,7 +185,7 @@ def test_without_room_for_a_copy_nothing_is_changed(tmp_path: Path) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before["bag_0.mcap"]) // 2, limits[1]))
     try:
-        with pytest.raises(UserError, match="as much room; nothing was changed"):
+        with pytest.raises(UserError, match="as much space again; nothing was changed"):
             recover_bag(path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

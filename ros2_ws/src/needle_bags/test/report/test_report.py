@@ -122,8 +122,8 @@ def test_the_report_of_a_rerun(make_run: MakeRun, tmp_path: Path, drawn: list[Fi
     assert summary["controller"] == "best"
     words, sentence = verdict_text(summary)
     assert words == "Rerun"
-    assert "those of steered, which paper steered" in sentence
-    assert "what best would have said" in sentence
+    assert "come from steered, steered by paper" in sentence
+    assert "those that best would have sent" in sentence
     # The command is that of the run in which the needle went in.
     assert "command" not in rerun.run_info
     third = tmp_path / "third"
@@ -199,7 +199,7 @@ def test_verdicts(make_run: MakeRun) -> None:
     near = told(f"{x!s}, {y + 0.0003!s}, {z - 0.0004!s}")
     assert near["point_error_mm"] == pytest.approx(0.5)
     assert near["converged"] is True
-    assert "0.50 mm from the wanted point" in verdict_text(near)[1]
+    assert "0.50 mm from the point" in verdict_text(near)[1]
     far = told(f"{x!s}, {y + 0.002!s}, {z!s}")
     assert far["converged"] is False
     assert verdict_text(far)[0] == "Missed the point"

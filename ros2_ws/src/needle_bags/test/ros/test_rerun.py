@@ -104,7 +104,7 @@ def test_unchanged_code_gives_unchanged_outputs(
 def test_a_wrong_sign_in_the_projection_is_detected(mirrored: tuple[int, str]) -> None:
     code, said = mirrored
     assert code == 1
-    assert "needle/tip: 1 recorded but not today (at 30.0 mm" in said
+    assert "needle/tip: 1 recorded, missing in the rerun (at 30.0 mm" in said
 
 
 @pytest.mark.parametrize(
@@ -201,7 +201,7 @@ def test_viewers_show_the_recorded_needle_without_comparison(
     new = {topic.removeprefix("/"): n for topic, n in (after - before).items()}
     assert new.keys() == {live_view.TIP, live_view.PATH, live_view.MARKERS, *PICTURES}
     (view,) = [line for line in said.splitlines() if line.startswith("live_view: ")]
-    assert "nothing to compare, since no bag tells when it looked; sent " in view
+    assert "nothing to compare, because its update times are not recorded; sent " in view
     for topic, count in new.items():
         assert f"{count} {topic}" in view
     run = read_run(first_pictures)
@@ -213,7 +213,7 @@ def test_viewers_show_the_recorded_needle_without_comparison(
     tip = path.poses[-1].pose.position
     assert (tip.x, tip.y, tip.z) == tuple(run.tips.values[-1])
     (link,) = [line for line in said.splitlines() if line.startswith("openigtlink: ")]
-    assert "nothing to compare, since ports are not recorded; sent " in link
+    assert "nothing to compare, because ports are not recorded; sent " in link
     assert int(link.split()[-2]) == pytest.approx(10 * seconds, abs=3)
 
 
@@ -317,7 +317,7 @@ def test_bad_input_gives_a_one_line_error(
         (eight_steps, "--preset", "bset"): "--preset 'bset' is not one of",
         (eight_steps, "--json", "/nowhere/at/all.json"): "its folder must exist",
         (eight_steps, "--params", "/nowhere.yaml"): "/nowhere.yaml",
-        (eight_steps, "--output", eight_steps): "holds a bag already",
+        (eight_steps, "--output", eight_steps): "already contains a bag",
         (eight_steps, "--presets", "best"): "see --help",
         (make_run(steps=3),): "give them with --params",
     }

@@ -61,7 +61,7 @@ def test_an_image_of_a_wrong_size_gives_a_one_line_error(
     for height in (7, 2**32 - 1):
         assert report.main([str(make_run(str(height), image_height=height, steps=3))]) == 2
         said = capsys.readouterr().err
-        assert f"an image says it has {height} rows of 4 pixels" in said
+        assert f"an image declares {height} rows of 4 pixels" in said
         assert said.count("\n") == 1
 
 

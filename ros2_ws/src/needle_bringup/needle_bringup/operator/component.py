@@ -155,13 +155,13 @@ class Operator(Component):
         if decision.trouble:
             return Level.WARN, f"nothing is held: {decision.trouble}"
         if self._retraction.trouble:
-            return Level.WARN, f"not drawn out: {self._retraction.trouble}"
+            return Level.WARN, f"not withdrawn: {self._retraction.trouble}"
         if decision.ignored_press:
-            return Level.WARN, "what is held does not count: let go of all, then press again"
+            return Level.WARN, "the press is ignored: release all buttons, then press again"
         if self._release_required and decision.kind is not HoldKind.NOTHING:
-            return Level.WARN, "the device does not take this press: let go, then press again"
+            return Level.WARN, "the device ignores this press: release, then press again"
         return Level.OK, {
             HoldKind.NOTHING: "nothing is held",
             HoldKind.INSERT: "held to insert",
-            HoldKind.RETRACT: "held to draw the needle out",
+            HoldKind.RETRACT: "held to withdraw the needle",
         }[decision.kind]

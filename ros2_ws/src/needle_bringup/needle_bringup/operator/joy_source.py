@@ -64,11 +64,11 @@ class JoySource:
         last = max(controls.buttons)
         if last >= len(self._buttons):
             return InputLost(
-                f"the joystick's message has {len(self._buttons)} buttons, none {last}"
+                f"the joystick's message has {len(self._buttons)} buttons, but no {last}"
             )
         if controls.speed_axis is not None:
             if controls.speed_axis >= len(self._axes):
-                has = f"{len(self._axes)} axes, none {controls.speed_axis}"
+                has = f"{len(self._axes)} axes, but no {controls.speed_axis}"
                 return InputLost(f"the joystick's message has {has}")
             axis = self._axes[controls.speed_axis]
             if not math.isfinite(axis):
@@ -85,11 +85,11 @@ class JoySource:
         """Return why the last message is not valid; empty if it is."""
         publishers = self._publishers()
         if publishers > 1:
-            return f"{publishers} nodes publish the joystick's topic, which one counts?"
+            return f"{publishers} nodes publish the joystick's topic, expected 1"
         if math.isinf(self._arrival):
-            return "nothing was heard of the joystick's topic yet"
+            return "no message on the joystick's topic yet"
         if now - self._arrival > JOY_TIMEOUT:
-            return f"no message of the joystick for more than {JOY_TIMEOUT:g} s"
+            return f"no message from the joystick for more than {JOY_TIMEOUT:g} s"
         return ""
 
     def _is_down(self, button: int | None) -> bool:

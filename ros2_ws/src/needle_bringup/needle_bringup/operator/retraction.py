@@ -24,9 +24,9 @@ class _Phase(enum.Enum):
 # Error text if a phase times out.
 _TIMEOUT_TEXT = {
     _Phase.STEERING_ENDS: f"no answer from {STOP_STEERING}",
-    _Phase.HOLD_COUNTS: "the device does not take the hold (device/status says why)",
+    _Phase.HOLD_COUNTS: "the device ignores the hold (see the reason in device/status)",
     _Phase.DEVICE_ANSWERS: f"no answer from {RETRACT}",
-    _Phase.NEEDLE_LEAVES: "nothing is drawn out: the needle is out",
+    _Phase.NEEDLE_LEAVES: "nothing to withdraw: the needle is out",
 }
 
 

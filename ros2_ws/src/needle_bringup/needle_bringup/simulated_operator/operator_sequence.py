@@ -202,8 +202,8 @@ class OperatorSequence:
         self._device_source = status.source
         if status.simulated is False:
             self._end(
-                f"{status.source} is a real device, or not in simulated time (it says simulated = "
-                "false): there a person holds, no stand-in"
+                f"{status.source} is a real device, or not in simulated time (simulated = "
+                "false): a person must hold it, not simulated_operator"
             )
             return
         self._moving = status.state == "MOVING"
@@ -286,11 +286,11 @@ class OperatorSequence:
         if self._pending:
             return f"no answer from {call}"
         if call == START.service and self._starts is None:
-            return "needle/controller_status has not been heard"
+            return "no needle/controller_status received"
         if not self.may_act:
             names = ", ".join(self._devices)
-            return f"device/status of one simulated device is wanted, of {names} it is there"
-        return self._refusal or f"device/status does not say homed, {call} has to wait"
+            return f"expected device/status of one simulated device, received it from {names}"
+        return self._refusal or f"device/status does not report homed, {call} must wait"
 
     def _end(self, reason: str) -> None:
         if self.outcome is None:

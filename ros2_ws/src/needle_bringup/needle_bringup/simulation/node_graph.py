@@ -170,7 +170,7 @@ class NodeFailedError(UserError):
 
     def __init__(self, node: NodeProcess) -> None:
         self.is_bad_input = node.exit_code == EXIT_BAD_INPUT and node.name != OPERATOR
-        where = "" if self.is_bad_input else f" (all it said is in {node.log})"
+        where = "" if self.is_bad_input else f" (its output is in {node.log})"
         super().__init__(node.describe_end() + where)
 
 

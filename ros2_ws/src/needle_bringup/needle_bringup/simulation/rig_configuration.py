@@ -223,11 +223,11 @@ def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> 
             if name in reserved[node]:
                 option = OPTIONS.get(name)
                 hint = f"use {option}" if option else "simulate sets it itself"
-                raise UserError(f"{path}: {node}: {name} does not go into the file, {hint}")
+                raise UserError(f"{path}: {node}: {name} cannot be in the file, {hint}")
     chosen = [name for name in given.get("recorder", {}) if name in _CHOICES]
     if chosen:
         why = "simulate waits for a recorder of everything and reports the whole run"
-        raise UserError(f"{path}: recorder: {chosen[0]} does not go into the file: {why}")
+        raise UserError(f"{path}: recorder: {chosen[0]} cannot be in the file: {why}")
 
 
 def run_info(options: SimulateOptions) -> dict[str, Any]:
@@ -303,7 +303,7 @@ def contradictions(parameters: Parameters, nodes: Sequence[str]) -> list[str]:
         limit = parameters.get(other, {}).get(gate, default)
         value = parameters.get(node, {}).get(name, CURVATURE)
         if other in nodes and isinstance(value, float) and value > limit:
-            found.append(f"{node} has {name} {value:g}, but {other} looks for {gate} {limit:g}")
+            found.append(f"{node} has {name} {value:g}, but {other} expects {gate} {limit:g}")
     return found
 
 

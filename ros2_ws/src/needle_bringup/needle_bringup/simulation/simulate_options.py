@@ -122,17 +122,17 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
     if given.level == "tip":
         noise = number("--noise-mm", given.noise_mm or "1.0", 0.0, 20.0, "mm")
     elif given.noise_mm is not None:
-        raise UserError(f"--noise-mm goes with --level tip only, not with {given.level}")
+        raise UserError(f"--noise-mm applies to --level tip only, not with {given.level}")
     x_mm, pitch_deg, roll_deg = start(given.initial, largest_x=50.0, largest_pitch=45.0)
     target = None if given.target is None else _target(given.target)
     for option in ("planner", "obstacles"):
         if getattr(given, option) and target is None:
-            raise UserError(f"--{option} goes with --target only")
+            raise UserError(f"--{option} applies to --target only")
     depth = given.depth_mm or (DEPTH_MM if target is None else f"{LARGEST_DEPTH_MM:g}")
     factor = number("--real-time-factor", given.real_time_factor or "0", 0.0, 100.0, "-")
     if given.graph and given.real_time_factor is not None and factor != 1.0:
         raise UserError(
-            f"--real-time-factor {given.real_time_factor} does not go with --graph: processes run "
+            f"--real-time-factor {given.real_time_factor} excludes --graph: processes run "
             "in real time"
         )
     return SimulateOptions(
@@ -313,7 +313,7 @@ def _parser() -> CommandParser:
 def _components(given: Any) -> tuple[str, ...]:
     for name in given.component:
         if given.graph:
-            raise UserError(f"--component {name} does not go with --graph")
+            raise UserError(f"--component {name} excludes --graph")
         if not all(name.partition(":")):
             raise UserError(f"--component {name!r} is not MODULE:NAME, such as my_probe:Probe")
     return tuple(given.component)

@@ -132,7 +132,7 @@ def own_component(given: str) -> Component:
     finally:
         sys.path.pop(0)
     if not isinstance(component, Component):
-        raise UserError(f"--component {given}: makes a {type(component).__name__}, no Component")
+        raise UserError(f"--component {given}: makes a {type(component).__name__}, not a Component")
     return component
 
 

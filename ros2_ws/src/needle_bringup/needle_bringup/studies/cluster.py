@@ -94,7 +94,7 @@ def on_cluster(
                         yielded += 1
             except distributed.KilledWorker as error:
                 raise UserError(
-                    f"--scheduler {address}: {_line(error)} (out of memory? their logs say more)"
+                    f"--scheduler {address}: {_line(error)} (out of memory? see their logs)"
                 ) from error
             except (OSError, distributed.CancelledError) as error:
                 # The scheduler drops the tasks of a lost connection.
@@ -123,7 +123,7 @@ def _run(work: Callable[[Part], Result], wanted: Mapping[str, str], part: Part) 
     """Run a part on a worker."""
     here = identity()
     differing = [
-        f"{name} {here[name]} in place of {wanted[name]}"
+        f"{name} {here[name]} instead of {wanted[name]}"
         for name in wanted
         if here[name] != wanted[name]
     ]

@@ -118,11 +118,13 @@ def _noise(given: argparse.Namespace) -> dict[str, Any]:
     if len(kinds) > 1 or (kinds and given.noise_shape != "uniform"):
         names = [f"--{name.replace('_', '-')}" for name in kinds]
         others = [f"--noise-shape {given.noise_shape}"] if given.noise_shape != "uniform" else []
-        raise UserError(f"{' and '.join(names + others)} are each noise of another kind: give one")
+        raise UserError(f"{' and '.join(names + others)} are alternative kinds of noise: give one")
     if given.noise_shape not in _SHAPES:
         raise UserError(f"--noise-shape {given.noise_shape!r} is not {' or '.join(_SHAPES)}")
     if given.noise_mm != _NOISE_MM and (given.student or given.bias_walk):
-        raise UserError("--noise-mm goes without --student and --bias-walk, which say their own")
+        raise UserError(
+            "--noise-mm cannot be combined with --student and --bias-walk, which set their own"
+        )
     noise = number("--noise-mm", given.noise_mm, 0.0, 20.0, "mm") * 1e-3
     if given.correlated:
         lasting = number("--correlated", given.correlated, 0.0, 0.999, "-")

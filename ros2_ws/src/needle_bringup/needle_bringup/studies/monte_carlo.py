@@ -72,7 +72,7 @@ def monte_carlo(options: MonteCarloOptions) -> int:
             )
             for machine in differing:
                 print(
-                    f"warning: {machine} rounds otherwise than this machine (another processor?): "
+                    f"warning: {machine} rounds unlike this machine (another processor?): "
                     "figures may differ in their last digits",
                     file=sys.stderr,
                 )

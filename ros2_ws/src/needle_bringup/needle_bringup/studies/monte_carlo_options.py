@@ -119,11 +119,13 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
     if given.grid not in GRIDS:
         raise UserError(f"--grid {given.grid!r} is not one of {', '.join(GRIDS)}")
     if given.targets != "0" and given.turn_delay_mm != "0":
-        raise UserError("--turn-delay-mm is of needles that are steered to the plane")
+        raise UserError("--turn-delay-mm is for needles that are steered to the plane")
     if given.planner and given.targets == "0":
-        raise UserError("--planner goes with --targets only")
+        raise UserError("--planner applies to --targets only")
     if (given.planner or given.law) and given.controller not in PRESETS:
-        raise UserError(f"--controller {given.controller} is a law; it goes without another one")
+        raise UserError(
+            f"--controller {given.controller} is a law; it cannot be combined with another one"
+        )
     depth = given.depth_mm or (_DEPTH_MM if given.targets == "0" else _DEPTH_OF_POINTS_MM)
     return MonteCarloOptions(
         controller=given.controller,

@@ -325,7 +325,7 @@ def _claimed_settings(
     own: Mapping[str, Any],
 ) -> tuple[SteeringSettings, Array | None]:
     if name not in PRESETS:
-        raise UserError(f"--controller {name!r} is not available; there is {', '.join(PRESETS)}")
+        raise UserError(f"--controller {name!r} is not available; choose from {', '.join(PRESETS)}")
     settings = SteeringSettings(
         preset=name,
         tip_covariance="configured" if sigma_scale == 1.0 else "from_tip_pose",

@@ -21,8 +21,8 @@ CONTROLS = Controls(insert=0, retract=2, speed_axis=1, axis_at_zero=0.0, axis_at
 
 NO_HANDS: tuple[tuple[int, list[float], list[int], str], ...] = (
     (2, [0.0, 1.0], [1, 0, 0], "2 nodes publish"),
-    (1, [0.0, 1.0], [1, 0], "has 2 buttons, none 2"),
-    (1, [0.0], [1, 0, 0], "has 1 axes, none 1"),
+    (1, [0.0, 1.0], [1, 0], "has 2 buttons, but no 2"),
+    (1, [0.0], [1, 0, 0], "has 1 axes, but no 1"),
     (1, [0.0, math.nan], [1, 0, 0], "axis 1 is nan"),
 )
 
@@ -105,7 +105,7 @@ def test_the_last_message_of_a_joystick_is_used_while_recent() -> None:
     source.receive([0.0, 1.0], [1, 0, 0], 5.0)
     assert source.read(5.0 + 0.999 * JOY_TIMEOUT) == InputState(insert=True, speed=0.5)
     silent = source.read(5.0 + 1.001 * JOY_TIMEOUT)
-    assert silent == InputLost("no message of the joystick for more than 0.1 s")
+    assert silent == InputLost("no message from the joystick for more than 0.1 s")
     source.receive([0.0, 0.5], [0, 1, 1], 6.0)
     assert source.read(6.0) == InputState(retract=True, speed=0.25)
 

@@ -88,13 +88,13 @@ def test_a_pedal_is_held_until_it_is_lost() -> None:
     assert (held.source, held.pressed, held.speed_scale) == ("operator", True, 0.5)
     assert held.lifetime == m.HOLD_LIFETIME
     scene.update(InputState(insert=True), press_again="operator")
-    assert "the device does not take this press" in scene.logs[-1]
+    assert "the device ignores this press" in scene.logs[-1]
     assert not scene.update(InputLost("unplugged")).pressed
     assert scene.logs[-1] == "nothing is held: unplugged"
     for _ in range(2):
         assert not scene.update(InputState(insert=True)).pressed
     # What does not change is said once.
-    assert [text for text in scene.logs if "what is held does not count" in text] == scene.logs[-1:]
+    assert [text for text in scene.logs if "the press is ignored" in text] == scene.logs[-1:]
     assert [hold.count for hold in scene.holds] == list(range(1, len(scene.holds) + 1))
     assert len({hold.session for hold in scene.holds}) == 1
 
@@ -122,7 +122,7 @@ def test_the_controller_is_stopped_before_a_withdrawal() -> None:
     assert not scene.update(OUT).pressed
     assert scene.called == [STOP_STEERING]
     assert scene.update(OUT).pressed
-    assert scene.logs[-1] == "held to draw the needle out"
+    assert scene.logs[-1] == "held to withdraw the needle"
     scene.update(OUT, hold_owner="operator")
     assert scene.called == [STOP_STEERING, RETRACT]
     assert scene.update(OUT, hold_owner="operator", activity="retraction").pressed
@@ -132,7 +132,7 @@ def test_the_controller_is_stopped_before_a_withdrawal() -> None:
         scene.update(OUT)
     # Nobody takes the hold.
     assert not scene.holds[-1].pressed
-    assert "not drawn out: the device does not take the hold" in scene.logs[-1]
+    assert "not withdrawn: the device ignores the hold" in scene.logs[-1]
 
 
 def test_a_new_speed_is_applied_and_the_end_releases() -> None:

@@ -11,7 +11,7 @@ from needle_bringup.operator.retraction import (
 
 IN_VAIN = (
     f"no answer from {STOP_STEERING}",
-    "does not take the hold",
+    "the device ignores the hold",
     f"no answer from {RETRACT}",
     "the needle is out",
 )

@@ -29,9 +29,9 @@ REFUSED = (
     ("--initial --seed", "--initial"),
     ("--target 3,2", "X_MM,Y_MM,Z_MM"),
     ("--target 3,2,-5", "--target Z_MM = -5"),
-    ("--level camera --noise-mm 0", "--noise-mm goes with --level tip"),
-    ("--planner mine", "--planner goes with --target"),
-    ("--obstacles x", "--obstacles goes with --target"),
+    ("--level camera --noise-mm 0", "--noise-mm applies to --level tip"),
+    ("--planner mine", "--planner applies to --target"),
+    ("--obstacles x", "--obstacles applies to --target"),
     ("--target 0,0,90 --obstacles /no", "--obstacles /no: no such file"),
     ("--depth-mm 150.1", "--depth-mm"),
     ("--depth-mm deep", "'deep'"),
@@ -41,9 +41,9 @@ REFUSED = (
     ("--play-deg -1", "--play-deg"),
     ("--lag-mm inf", "--lag-mm"),
     ("--real-time-factor -1", "--real-time-factor"),
-    ("--real-time-factor 2 --graph", "--real-time-factor 2 does not go with --graph"),
+    ("--real-time-factor 2 --graph", "--real-time-factor 2 excludes --graph"),
     ("--component probe", "'probe' is not MODULE:NAME"),
-    ("--component a:B --graph", "does not go with --graph"),
+    ("--component a:B --graph", "excludes --graph"),
     ("--seed 1.5", "--seed"),
     ("--seed -1", "--seed"),
     ("--bag /tmp", "exists already"),
@@ -145,7 +145,7 @@ def test_user_components_are_found_in_the_current_folder(
     for name, said in (
         (f"{module}:Missing", "has no attribute 'Missing'"),
         (f"{module}:Needy", "missing 1 required positional argument: 'wanted'"),
-        (f"{module}:Other", "makes a Other, no Component"),
+        (f"{module}:Other", "makes a Other, not a Component"),
         ("no_such_module:X", "--component no_such_module:X: No module named"),
     ):
         with pytest.raises(UserError, match=said):

@@ -49,8 +49,8 @@ def test_invalid_launch_arguments_start_nothing(tmp_path: Path) -> None:
         (beside_rig, {"params": typo}, "params:=.*typo.yaml: no such file"),
         (simulated, {"params": typo}, "params:=.*typo.yaml: no such file"),
         (beside_rig, {"calibration": bag}, "calibration:=.*: a folder, not a file"),
-        (beside_rig, {"bag": bag}, "holds a bag already"),
-        (simulated, {"bag": bag}, "holds a bag already"),
+        (beside_rig, {"bag": bag}, "already contains a bag"),
+        (simulated, {"bag": bag}, "already contains a bag"),
         (simulated, {"seed": "-1"}, "--seed = -1"),
         # A driver that nobody configures would run on its defaults.
         (beside_rig, {"drives": emulator}, "'drive_emulator' is not started here, only device_d"),

@@ -119,7 +119,7 @@ def test_a_file_must_not_conflict_with_the_command_line() -> None:
     for given, said in (
         ({"plane_controller": {"depth": 0.1}}, "plane_controller: depth .* use --depth-mm"),
         ({"simulated_operator": {"wait_for_recorder": True}}, "simulate sets it itself"),
-        ({"recorder": {"topics": ["/needle/tip"]}}, "recorder: topics does not go into the file"),
+        ({"recorder": {"topics": ["/needle/tip"]}}, "recorder: topics cannot be in the file"),
     ):
         with pytest.raises(UserError, match=said):
             refuse_reserved(path, given, options)
@@ -176,6 +176,6 @@ def test_contradictions_are_reported() -> None:
         assert said in line
     unseen: Parameters = {node: {"curvature": 12.0} for node in ("sim_rig", "plane_controller")}
     (line,) = contradictions(unseen, NODES)
-    assert line == "sim_rig has curvature 12, but stereo_tracker looks for max_curvature 9"
+    assert line == "sim_rig has curvature 12, but stereo_tracker expects max_curvature 9"
     assert contradictions(unseen, ("sim_rig", "plane_controller")) == []
     assert contradictions({"sim_rig": {"curvature": CURVATURE * (1 + 1e-6)}}, NODES) == []

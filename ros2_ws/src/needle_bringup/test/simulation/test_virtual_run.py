@@ -179,7 +179,7 @@ def test_rendered_images_have_insertion_and_truth(lossy: tuple[Rig, str]) -> Non
 def test_pairs_that_the_tracker_did_not_receive_are_left_out_of_a_rerun(
     lossy: tuple[Rig, str],
 ) -> None:
-    assert "pairs are left out: stereo_tracker did not hear them" in lossy[1]
+    assert "pairs are left out: stereo_tracker did not receive them" in lossy[1]
 
 
 def late(latest: float) -> Fault:

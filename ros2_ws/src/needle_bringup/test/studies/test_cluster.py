@@ -107,7 +107,7 @@ def test_cluster_errors_are_one_line(dask: Dask, monkeypatch: pytest.MonkeyPatch
             list(on_cluster(address, square, parts))
         return str(error.value)
 
-    assert "(out of memory? their logs say more)" in refusal(-1)
+    assert "(out of memory? see their logs)" in refusal(-1)
     dask.lost_after = [0]
     assert refusal(1, 2).endswith("lost, with 0 of 2 parts done")
     dask.answers = False
@@ -124,7 +124,7 @@ def test_a_worker_with_different_code_is_rejected(
     here = cluster.identity()
     known = iter([{**here, "numpy": "1.0.0"}, here])
     monkeypatch.setattr(cluster, "identity", lambda: next(known))
-    with pytest.raises(UserError, match=r"has numpy \S+ in place of 1\.0\.0; all machines"):
+    with pytest.raises(UserError, match=r"has numpy \S+ instead of 1\.0\.0; all machines"):
         list(on_cluster(ADDRESS, square, [1]))
 
 
@@ -149,4 +149,4 @@ def test_a_cluster_gives_the_figures_of_one_machine(
     assert "warning" not in capsys.readouterr().err
     monkeypatch.setattr(cluster_study, "_witness_digest", lambda _: "other bits")
     figures_of(tmp_path, "--scheduler", ADDRESS)
-    assert f"warning: {socket.gethostname()} rounds otherwise" in capsys.readouterr().err
+    assert f"warning: {socket.gethostname()} rounds unlike" in capsys.readouterr().err

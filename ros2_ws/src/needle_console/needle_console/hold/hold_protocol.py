@@ -190,7 +190,7 @@ class HoldProtocol:
         """End an expired hold; after a stall, whichever method runs first does this."""
         if self._owner is not None and self._pages[self._owner].session.end_if_stale(now):
             self._pages[self._owner].why = _STALLED
-            self.refuse(HoldRefusal.LOST, "no fresh word of the page; it takes a new press")
+            self.refuse(HoldRefusal.LOST, "no recent message from the page; press again")
 
     def _report(self, now: float) -> None:
         self._end_if_stale(now)

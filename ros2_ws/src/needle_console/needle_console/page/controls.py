@@ -63,7 +63,7 @@ class Controls:
         device = snapshot.device
         must_release = device is not None and device.press_again == OWNER
         why = stop_reason(device) if device is not None and must_release else ""
-        self._not_counted.set_text(f"not counted by the device since: {why}" if why else "")
+        self._not_counted.set_text(f"ignored by the device: {why}" if why else "")
         for button, element in self._buttons.items():
             usable = button in possible and not self._bar
             if button not in _HOLDS:

@@ -7,7 +7,7 @@ const RETRY = 1000; // [ms]
 const SILENCE = 500; // The connection counts as lost after this time without a message [ms].
 const UNCONNECTED = "no hold: not connected";
 const HIDDEN = "the page is hidden";
-const UNFOCUSED = "the window lost the focus";
+const UNFOCUSED = "the window lost focus";
 const OTHER_POINTER = "a second finger or mouse button";
 const STYLE =
   "[data-hold] { touch-action: none; user-select: none; -webkit-user-select: none;" +

@@ -28,7 +28,7 @@ function showHold(status) {
 function holdText(status) {
   if (status.why) return status.why;
   if (status.bar) return status.bar;
-  if (status.held) return "held: let go to stop";
+  if (status.held) return "held: release to stop";
   return "pointer, touch or space bar";
 }
 

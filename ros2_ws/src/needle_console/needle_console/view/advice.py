@@ -66,25 +66,25 @@ def advise(snapshot: Snapshot, name: str) -> Advice:  # noqa: PLR0911 - each ret
             text = stop_reason(device) or "Configure device_driver."
             return Advice("The drives are not set up", text)
         case "ESTOPPED":
-            text = "Find out why. Release the emergency stop and every hold, then press Reset."
+            text = "Find the cause. Release the emergency stop and every hold, then press Reset."
             return Advice("Emergency stop", text, Button.RESET)
         case "FAULT":
-            text = "Put right what it says, let go of every hold, then press Reset."
+            text = "Correct the cause, release every hold, then press Reset."
             headline = f"Fault: {stop_reason(device) or 'no reason given'}"
             return Advice(headline, text, Button.RESET)
         case "MOVING":
             return _moving(device)
         case "DISABLED" | "HOLDING" if math.isnan(snapshot.insertion):
-            text = "Its joints are not heard: nodes are starting, or gone."
+            text = "No joint states received: nodes are starting, or have ended."
             return Advice("Waiting for the rig", text)
         case "DISABLED":
             return _disabled(device)
         case "HOLDING":
             steers = controller is not None and controller.state in STEERING
             if steers and device.press_again == name:
-                return Advice("The press does not count", "Let go, then press and hold again.")
+                return Advice("The press is ignored", "Release, then press and hold again.")
             return _holding(snapshot, device)
-    return Advice(f"Device: {device.state}", "This state is not known here.")
+    return Advice(f"Device: {device.state}", "The console does not know this state.")
 
 
 def usable_buttons(snapshot: Snapshot) -> frozenset[Button]:
@@ -113,18 +113,18 @@ def usable_buttons(snapshot: Snapshot) -> frozenset[Button]:
 
 def _moving(device: DeviceStatus) -> Advice:
     if device.activity == "homing":
-        return Advice("Homing", "The axes look for their switches. Keep clear; Stop ends it.")
-    what = "goes in" if device.activity == "step" else "is drawn out"
-    return Advice(f"The needle {what}", "Let go to stop it.")
+        return Advice("Homing", "The axes search for their switches. Keep clear; Stop ends it.")
+    what = "advances" if device.activity == "step" else "retracts"
+    return Advice(f"The needle {what}", "Release to stop it.")
 
 
 def _disabled(device: DeviceStatus) -> Advice:
     if device.homed:
-        return Advice("Ready, switched off", "Switching on moves nothing.", Button.ENABLE)
+        return Advice("Ready, switched off", "Switching on does not move anything.", Button.ENABLE)
     if not device.needle_out_confirmed:
         return Advice(
             "Not homed",
-            "Look: is the needle out of the tissue? Then confirm it. If it is in: Enable, and "
+            "Confirm if the needle is out of the tissue. If it is in, press Enable and "
             "Hold to retract.",
             Button.CONFIRM,
         )
@@ -136,7 +136,7 @@ def _holding(snapshot: Snapshot, device: DeviceStatus) -> Advice:
     if not device.homed:
         return Advice(
             "Not homed, switched on",
-            "Only the way out is open. When the needle is out: Switch off, confirm, Home.",
+            "Only retraction is possible. When the needle is out: Switch off, confirm, Home.",
             Button.RETRACT,
         )
     if controller is None:
@@ -148,19 +148,19 @@ def _holding(snapshot: Snapshot, device: DeviceStatus) -> Advice:
 
 def _not_steering(controller: ControllerStatus, *, is_in: bool) -> Advice:
     if controller.state == "DONE":
-        return Advice("The depth is reached", "Draw the needle out at last.", Button.RETRACT)
+        return Advice("The depth is reached", "Retract the needle.", Button.RETRACT)
     if controller.state == "FAULT":
         headline = f"Steering failed: {controller.reason}"
         if is_in:
-            return Advice(headline, "Draw the needle out, then start again.", Button.RETRACT)
+            return Advice(headline, "Retract the needle, then start again.", Button.RETRACT)
         return Advice(headline, "Start again.", Button.START)
     if is_in:
         return Advice(
-            "The needle is in, not steered",
-            "Steering begins outside the tissue: draw the needle out first.",
+            "The needle is in the tissue, not steered",
+            "Steering begins outside the tissue: retract the needle first.",
             Button.RETRACT,
         )
-    return Advice("Ready to steer", "Starting moves nothing yet.", Button.START)
+    return Advice("Ready to steer", "Starting does not move anything yet.", Button.START)
 
 
 def _steering(controller: ControllerStatus, device: DeviceStatus) -> Advice:
@@ -170,9 +170,9 @@ def _steering(controller: ControllerStatus, device: DeviceStatus) -> Advice:
             "Steering waits. Look at the images; Hold to retract is possible.",
         )
     if device.hold_owner:
-        return Advice(f"Held by {device.hold_owner}", "The next step is being worked out.")
+        return Advice(f"Held by {device.hold_owner}", "The controller computes the next step.")
     return Advice(
         "Steering waits for you",
-        "Press and hold to insert (or the space bar); let go to stop.",
+        "Press and hold to insert (or the space bar); release to stop.",
         Button.INSERT,
     )

@@ -20,8 +20,8 @@ def readings(snapshot: Snapshot) -> dict[str, str]:
     """
     return {
         "Depth": _depth(snapshot),
-        "Off the plane": _off_plane(snapshot),
-        "Turn of the base": _turn(snapshot.rotation),
+        "Distance from plane": _off_plane(snapshot),
+        "Rotation of the base": _turn(snapshot.rotation),
         "Tip": _tip(snapshot),
         "Reach": _reach(snapshot),
         "Estimate": _estimate(snapshot),

@@ -149,11 +149,11 @@ def test_barred_page_gets_the_reason(scene: Scene, is_local: bool) -> None:
     page = scene.page(is_local=is_local)
     scene.bars[not is_local] = "of no concern"
     scene.press(page)
-    scene.bars[is_local] = "only watching"
+    scene.bars[is_local] = "watching only"
     assert scene.say(page, True) is HoldRefusal.BARRED
     assert not scene.pressed
     told = scene.message_to(page)
-    assert (told["bar"], told["why"]) == ("only watching", "only watching")
+    assert (told["bar"], told["why"]) == ("watching only", "watching only")
     scene.bars[is_local] = ""
     assert scene.say(page, True) is HoldRefusal.NEW_PRESS
     scene.press(page)

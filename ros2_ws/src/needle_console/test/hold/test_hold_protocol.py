@@ -98,5 +98,5 @@ def test_refusals_are_counted_and_logged_once() -> None:
         scene.protocol.receive(scene.page, "{", 0.0)
     assert not scene.protocol.is_silent(scene.page, SILENCE)
     assert scene.protocol.is_silent(scene.page, SILENCE + 1.0)
-    assert scene.protocol.counts() == {"message not understood": 3, "silent page": 1}
-    assert scene.notices == ["hold: message not understood", "hold: silent page"]
+    assert scene.protocol.counts() == {"invalid message": 3, "silent page": 1}
+    assert scene.notices == ["hold: invalid message", "hold: silent page"]

@@ -64,8 +64,8 @@ def test_plane_is_shown_only_if_the_controller_accepted_it() -> None:
 def test_reason_of_an_ended_hold_is_kept_while_pressed() -> None:
     moving = DeviceStatus(state="MOVING", hold_owner="console")
     silent = DeviceStatus(state="HOLDING", reason="no hold message for 0.105 s, limit 0.1 s")
-    again = DeviceStatus(reason="hold of 'console' does not count (hold_new_press)")
-    stamps = DeviceStatus(reason="hold of 'console' does not count (hold_in_order)")
+    again = DeviceStatus(reason="hold of 'console' ignored (hold_new_press)")
+    stamps = DeviceStatus(reason="hold of 'console' ignored (hold_in_order)")
     for told, why in (
         ((moving, silent, again, again), silent.reason),
         # A stalled console did not receive more.
@@ -139,8 +139,8 @@ def test_readings_are_in_mm_and_degrees() -> None:
     picture.set_controller(dataclasses.replace(told, reachable=True, reachable_depth_m=0.043))
     shown = readings(picture.snapshot(0.0))
     assert shown["Depth"] == "50.0 mm of 120 mm"
-    assert shown["Off the plane"] == f"{MINUS}2.00 mm (95 %: {MINUS}2.50 to {MINUS}1.50)"
-    assert shown["Turn of the base"].startswith("5.7")
+    assert shown["Distance from plane"] == f"{MINUS}2.00 mm (95 %: {MINUS}2.50 to {MINUS}1.50)"
+    assert shown["Rotation of the base"].startswith("5.7")
     assert shown["Reach"] == "the plane can be reached, from 43 mm on"
     picture.set_controller(
         dataclasses.replace(

@@ -99,8 +99,8 @@ def fit_checked(
         allowed = _CONTRADICTION * math.hypot(settings.entry_std, float(free.entry_std))
         if distance > allowed:
             warnings.append(
-                f"the entry was not used: the tips start {1e3 * distance:.1f} mm beside it, "
-                f"wants <= {1e3 * allowed:.1f} mm"
+                f"the entry was not used: the tips start {1e3 * distance:.1f} mm from it, "
+                f"limit {1e3 * allowed:.1f} mm"
             )
             settings = dataclasses.replace(settings, entry=(e, f, g), entry_std=math.inf)
     if math.isfinite(settings.heading_std):
@@ -109,7 +109,7 @@ def fit_checked(
         if angle > allowed:
             warnings.append(
                 f"the heading was not used: the tips start {math.degrees(angle):.1f} deg off it, "
-                f"wants <= {math.degrees(allowed):.1f} deg"
+                f"limit {math.degrees(allowed):.1f} deg"
             )
             settings = dataclasses.replace(settings, heading=(x, y, z), heading_std=math.inf)
     return CheckedFit(fit_curvature(tips, insertion, settings), settings, tuple(warnings))
@@ -163,7 +163,7 @@ def check_independent_residuals(residuals: Array, repeating_error: float) -> Non
     allowed = max(_ALLOWED, _REPEATING * repeating_error)
     if shared > allowed and significance > _BY_CHANCE:
         raise UserError(
-            f"the tips follow no single arc: one after the other they are {1e3 * shared:.2f} mm "
-            f"beside it, wants <= {1e3 * allowed:.2f} mm; the base was turned on the way, or the "
-            "tissue changes (--until-mm takes what is before; a column rotation_rad tells which)"
+            f"the tips do not follow a single arc: in order they are {1e3 * shared:.2f} mm off "
+            f"it, limit {1e3 * allowed:.2f} mm; the base turned during the insertion, or the "
+            "tissue changes (--until-mm keeps the part before; a column rotation_rad shows turns)"
         )

@@ -52,7 +52,7 @@ class InsertionRecord:
         """
         if self.insertion is None:
             if least > 0.0 or math.isfinite(most):
-                raise UserError("--from-mm and --until-mm want an insertion, which is not recorded")
+                raise UserError("--from-mm and --until-mm need insertions, which are not recorded")
             return self
         kept = (self.insertion >= least) & (self.insertion <= most)
         # A retracted needle follows its own path back.
@@ -82,10 +82,10 @@ class InsertionRecord:
         where = ""
         if self.insertion is not None:
             first = float(self.insertion[int(np.argmax(turned > tolerance))])
-            where = f" from {1e3 * first:.1f} mm of insertion on (--until-mm takes what is before)"
+            where = f" from {1e3 * first:.1f} mm of insertion on (--until-mm keeps the part before)"
         raise UserError(
-            f"this is no pure insertion: the base turned by {math.degrees(np.max(turned)):.2f} "
-            f"deg, wants <= {math.degrees(tolerance):.2f} deg{where}"
+            f"this is not a pure insertion: the base turned by {math.degrees(np.max(turned)):.2f} "
+            f"deg, limit {math.degrees(tolerance):.2f} deg{where}"
         )
 
 
@@ -118,7 +118,7 @@ def read_csv(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
     """Read a CSV of tips; see `read_record`."""
     rows = _rows(path)
     if not rows:
-        raise UserError(f"{path}: there is no row in it")
+        raise UserError(f"{path}: the file has no rows")
     columns = set(rows[0][1])
     missing = [name for name in _COORDINATES if name not in columns]
     if missing:
@@ -126,7 +126,7 @@ def read_csv(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
         raise UserError(f"{path}: column {missing[0]} is missing (has {there})")
     of_name = None if insertion_file is None else _insertions(insertion_file)
     if of_name is not None and "name" not in columns:
-        raise UserError(f"{path}: column name is missing, which --insertion goes by")
+        raise UserError(f"{path}: column name is missing; --insertion needs it")
     tips, insertion, rotation = [], [], []
     for line, row in rows:
         if row.get("valid", "1").strip() in ("0", "false", "False"):
@@ -180,10 +180,10 @@ def read_bag(path: Path) -> InsertionRecord:
                 else:
                     _read_joints(message, joints)
             except AttributeError as error:
-                raise UserError(f"{path}: {sent.topic} is of another type: {error}") from error
+                raise UserError(f"{path}: {sent.topic} has an unexpected type: {error}") from error
     for topic, found in (("needle/tip", tips), ("joint_states", joints)):
         if not found:
-            raise UserError(f"{path}: the bag holds nothing on {topic}")
+            raise UserError(f"{path}: the bag has no messages on {topic}")
     times = np.array(sorted(joints), dtype=np.int64)
     values = np.array([joints[t] for t in times.tolist()])
     stamps = np.array([t for t in sorted(tips) if times[0] <= t <= times[-1]], dtype=np.int64)
@@ -200,7 +200,7 @@ def _read_tip(path: Path, message: Any, tips: dict[int, list[float]]) -> None:
     if not np.all(np.isfinite(position)):
         raise UserError(f"{path}: a tip is not finite: {position}")
     if message.header.frame_id != "rig":
-        raise UserError(f"{path}: a tip is in frame '{message.header.frame_id}', wants 'rig'")
+        raise UserError(f"{path}: a tip is in frame '{message.header.frame_id}', expected 'rig'")
     tips.setdefault(to_nanoseconds(message.header.stamp), position)
 
 

@@ -92,7 +92,7 @@ class CurvatureFitSettings:
         """Check every field; raises OutOfBoundsError or UserError with the value."""
         check_bounded_fields(self)
         if not abs(float(np.linalg.norm(self.heading)) - 1.0) < 1e-6:
-            raise UserError(f"heading = {self.heading} is not of unit length")
+            raise UserError(f"heading = {self.heading} is not a unit vector")
         if not np.all(np.isfinite(self.entry)):
             raise UserError(f"entry = {self.entry} is not finite")
 
@@ -263,7 +263,7 @@ def checked_tips(tips: npt.ArrayLike) -> Array:
     tips = np.asarray(tips, dtype=float)
     count = tips.shape[-2] if tips.ndim >= 2 else 0
     if count < FEWEST_TIPS:
-        raise UserError(f"{count} tips are too few for a curvature, wants >= {FEWEST_TIPS}")
+        raise UserError(f"{count} tips are too few for a curvature, minimum {FEWEST_TIPS}")
     if not np.all(np.isfinite(tips)):
         raise UserError("a tip is not finite")
     return tips
@@ -275,7 +275,7 @@ def _check_length(length: Array) -> None:
     span = float(np.min(np.max(length, axis=-1) - np.min(length, axis=-1)))
     if span < SHORTEST_ARC:
         raise UserError(
-            f"{span:.4g} m of insertion are too short for a curvature, wants >= {SHORTEST_ARC:g} m"
+            f"{span:.4g} m of insertion are too short for a curvature, minimum {SHORTEST_ARC:g} m"
         )
 
 

@@ -211,7 +211,7 @@ def _run(arguments: Sequence[str]) -> int:
         print(f"warning: {warning}", file=sys.stderr)
     if record.rotation is None:
         print(
-            "warning: whether the base turned is not recorded; the tips follow one arc",
+            "warning: the rotation of the base is not recorded; the tips follow one arc",
             file=sys.stderr,
         )
     values |= _forecast(options, record, checked)
@@ -235,7 +235,7 @@ def _run(arguments: Sequence[str]) -> int:
             f"z = {z:.2f} mm (95 %: +- {widths[0]:.2f}, {widths[1]:.2f}, {widths[2]:.2f} mm)"
         )
     if not math.isfinite(high):
-        print("the tips cannot tell this path from a straight line: insert deeper")
+        print("the tips do not distinguish this path from a straight line: insert deeper")
         return EXIT_MISSED
     return EXIT_DONE
 

@@ -128,14 +128,14 @@ class NoiseHypothesis:
         check_bounded_fields(self)
         text = f"multiples = {self.multiples}, shares = {self.shares}"
         if not 0 < len(self.multiples) == len(self.shares) <= NOISES:
-            raise UserError(f"{text}: want 1 to {NOISES} of each")
+            raise UserError(f"{text}: expected 1 to {NOISES} of each")
         if min(self.multiples + self.shares) <= 0.0 or abs(sum(self.shares) - 1.0) > 1e-9:
-            raise UserError(f"{text}: want multiples > 0, and shares > 0 whose sum is 1")
+            raise UserError(f"{text}: expected multiples > 0, and shares > 0 whose sum is 1")
         wanted = len(self.multiples) if self.shape == CORRELATED else 0
         if len(self.correlations) != wanted or not all(
             0.0 <= each < 1.0 for each in self.correlations
         ):
-            raise UserError(f"correlations = {self.correlations}, wants {wanted} numbers in [0, 1)")
+            raise UserError(f"correlations = {self.correlations}, needs {wanted} numbers in [0, 1)")
 
 
 TORSION_HYPOTHESES = (
@@ -274,10 +274,10 @@ class FilterSettings:
             ("lag_range", self.lag_range),
         ):
             if not (0.0 < least <= most < math.inf):
-                raise UserError(f"{name} = ({least:g}, {most:g}), wants 0 < least <= most")
+                raise UserError(f"{name} = ({least:g}, {most:g}), expected 0 < least <= most")
         for name in ("torsion_hypotheses", "roll_hypotheses", "noise_hypotheses"):
             if not getattr(self, name):
-                raise UserError(f"{name} = (), wants at least one")
+                raise UserError(f"{name} = (), expected at least one")
 
     @property
     def effective_bound(self) -> float:

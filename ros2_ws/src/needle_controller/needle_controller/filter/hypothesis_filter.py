@@ -84,9 +84,9 @@ class HypothesisFilter:
         """Advance by the actual motion; see `Estimator.advance`."""
         length, turn = float(d_insertion), float(d_rotation)
         if not (np.isfinite(length) and length >= 0.0):
-            raise ValueError(f"d_insertion = {length!r} m, wants finite and >= 0")
+            raise ValueError(f"d_insertion = {length!r} m, expected finite and >= 0")
         if not np.isfinite(turn):
-            raise ValueError(f"d_rotation = {turn!r} rad, wants finite")
+            raise ValueError(f"d_rotation = {turn!r} rad, expected finite")
         advance_needle(self.needle, self._hypotheses, self._events, length, turn, self._assumed)
 
     def correct(
@@ -138,7 +138,7 @@ class HypothesisFilter:
     def _warnings(self, ambiguous: float) -> tuple[str, ...]:
         warnings = []
         if ambiguous > AMBIGUOUS_WEIGHT:
-            warnings.append(f"the roll is not known yet: {100.0 * ambiguous:.0f} % says otherwise")
+            warnings.append(f"the roll is ambiguous: {100.0 * ambiguous:.0f} % for another value")
         if self.needle["outlier_probability"] > 0.5:
             warnings.append("tip refused as an outlier")
         if self.needle["tip_too_late"]:

@@ -19,11 +19,11 @@ from needle_core.compiled import compiled
 
 Records = npt.NDArray[np.void]
 
-LATE = "tips lie short of the insertion from the start: late, or the needle stuck; taken as late"
+LATE = "tips lag the insertion from the start: late tips or a stuck needle; assumed late"
 WARNINGS = (
     "too many tips are outliers",
     "tips are far noisier than claimed",
-    "the needle does not go in as the stage does",
+    "the needle does not advance with the stage",
     "the curvature is at its limit",
     LATE,
 )

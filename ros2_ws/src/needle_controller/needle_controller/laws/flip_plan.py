@@ -41,10 +41,10 @@ class FlipPlan:
                 raise UserError(f"flip {number} at {depth:g} m is not finite")
             if depth <= before:
                 bound = f"> {before:g} m" + (", the flip before it" if number > 1 else "")
-                raise UserError(f"flip {number} at {depth:g} m, wants {bound}")
+                raise UserError(f"flip {number} at {depth:g} m, expected {bound}")
             before = depth
         if self.first_sign not in (1.0, -1.0):
-            raise UserError(f"first_sign = {self.first_sign:g}, wants 1 or -1")
+            raise UserError(f"first_sign = {self.first_sign:g}, expected 1 or -1")
 
     def check_within(self, depth: float) -> None:
         """Check that every flip comes before the needle's end.

@@ -91,7 +91,7 @@ def design_gains(
     if radius >= 1.0:
         raise UserError(
             f"the law is unstable when held over step_length = {step_length:g} m "
-            f"(spectral radius {radius:.3g}, wants < 1): lower state_weights or step_length"
+            f"(spectral radius {radius:.3g}, must be < 1): lower state_weights or step_length"
         )
     poles = np.linalg.eigvals(A - observer[:, None] @ C).astype(complex)
     return Gains(feedback, observer, poles)
@@ -149,5 +149,5 @@ def _optimal_poles(weights: Array, names: str) -> npt.NDArray[np.complex128]:
     poles: npt.NDArray[np.complex128] = -np.sqrt(squares.astype(complex))
     worst = float(np.max(poles.real))
     if not worst < 0.0:
-        raise UserError(f"{names} give no stabilising gain (eigenvalue {worst:g}, wants < 0)")
+        raise UserError(f"{names} give no stabilising gain (eigenvalue {worst:g}, must be < 0)")
     return poles

@@ -29,7 +29,7 @@ def point_from_message(frame_id: str, position: npt.ArrayLike) -> Array:
     """
     point = np.asarray(position, dtype=float)
     if frame_id != RIG:
-        raise UserError(f"target_point is given in frame '{frame_id}', wants '{RIG}'")
+        raise UserError(f"target_point is given in frame '{frame_id}', expected '{RIG}'")
     if not np.all(np.isfinite(point)):
         raise UserError(f"target_point is not finite: {point}")
     return point
@@ -108,15 +108,15 @@ def check_point(point: npt.ArrayLike, curvature: float, depth: float) -> None:
     x, y, z = (float(value) for value in np.asarray(point, dtype=float))
     named = f"target point ({x:.4g}, {y:.4g}, {z:.4g}) m cannot be reached"
     if z <= 0.0:
-        raise UserError(f"{named}: it does not lie ahead of the entry, in +z")
+        raise UserError(f"{named}: it is not ahead of the entry (+z)")
     needed = float(least_insertion_to_point([x, y, z], curvature))
     if math.isnan(needed):
         across, widest = math.hypot(x, y), widest_at(z, curvature)
         share = 1.0 - widest / across
         raise UserError(
-            f"{named}: at this depth a needle of curvature {curvature:.4g} 1/m gets {widest:.4g} m "
-            f"to the side, not {across:.4g} m; entering at ({x * share:.4g}, {y * share:.4g}) m in "
-            "place of (0, 0) it could"
+            f"{named}: at this depth a needle of curvature {curvature:.4g} 1/m reaches "
+            f"{widest:.4g} m sideways, not {across:.4g} m; from an entry at ({x * share:.4g}, "
+            f"{y * share:.4g}) m instead of (0, 0) it can"
         )
     if needed > depth:
         raise UserError(f"{named}: it takes {needed:.4g} m of insertion, depth is {depth:.4g} m")

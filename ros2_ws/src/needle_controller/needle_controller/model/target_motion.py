@@ -144,7 +144,7 @@ class _Motion:
 def _weighted_models(since: Array, samples: Array) -> tuple[Array, Array]:
     """Return rates (H, N) and coefficients (H, N, T, 3) times weights, of samples (N, K, 3)."""
     walk = _walk_evidence(since, samples)
-    evidence, rates, coefficients = [_log_mean(np.sum(walk, axis=2))], [], []
+    evidence, rates, coefficients = [_log_mean(np.sum(walk, axis=2))[None]], [], []
     for begin in _BEGINS:
         inside = since >= -begin
         if begin < WINDOW and np.all(inside):
@@ -152,57 +152,60 @@ def _weighted_models(since: Array, samples: Array) -> tuple[Array, Array]:
         before = _log_mean(np.sum(walk[:, :, ~inside], axis=2)) - math.log(len(_BEGINS))
         for rate, log, fitted in _models(since[inside], samples[:, inside]):
             evidence.append(before + log)
-            rates.append(rate)
+            rates.append(np.broadcast_to(rate, log.shape))
             coefficients.append(fitted)
-    log = np.array(evidence)
+    log = np.concatenate(evidence)
     weights = np.exp(log - np.max(log, axis=0))
     weights /= np.sum(weights, axis=0)
-    return np.array(rates), weights[1:, :, None, None] * np.array(coefficients)
+    return np.concatenate(rates), weights[1:, :, None, None] * np.concatenate(coefficients)
 
 
 def _models(since: Array, samples: Array) -> Iterator[tuple[Array, Array, Array]]:
-    """Yield rate (N,) [Hz], log evidence (N,), coefficients (N, T, 3): rest, drift and breaths."""
-    still = np.zeros(len(samples))
+    """Yield rates (H, 1 or N) [Hz], log evidence (H, N), coefficients (H, N, T, 3).
+
+    First rest and drift, then breaths.
+    """
+    still = np.zeros((1, 1))
     for std in (_DRIFT_STD[:1], _DRIFT_STD):
-        yield still, *_fit(since, still[:1], samples, std)
+        yield still, *_fit(since, still, samples, std)
     fastest = min(_FASTEST, _OF_SAMPLING * (len(since) - 1) / -since[0])
     rates = np.arange(_SLOWEST, fastest, _RATE_STEP)
     if len(rates) < 3:
         return
-    some = rates[::_EVERY]
-    for rate in some:
-        log, fitted = _fit(since, np.array([rate]), samples, _BREATH_STD)
-        yield np.full(len(samples), rate), log - math.log(len(some)), fitted
-    likeliest = _likeliest_rates(since, samples, rates)
+    some = rates[::_EVERY, None]
+    log, fitted = _fit(since, some, samples, _BREATH_STD)
+    yield some, log - math.log(len(some)), fitted
+    likeliest = _likeliest_rates(since, samples, rates)[None]
     log, fitted = _fit(since, likeliest, samples, _BREATH_STD)
     yield likeliest, log - math.log(len(rates)), fitted
 
 
 def _fit(since: Array, rates: Array, samples: Array, std: tuple[float, ...]) -> tuple[Array, Array]:
-    """Return log evidence (N,) and coefficients (N, T, 3) of a model of samples (N, K, 3).
+    """Return log evidence (H, N), coefficients (H, N, T, 3) of models of samples (N, K, 3).
 
     Terms X, prior N(0, S^2) of the coefficients and scatter s give the samples the covariance
     X S^2 X' + s^2, and the coefficients the mean S (S X'X S + s^2)^-1 S X'y. The eigenvalues of
-    S X'X S serve every s.
+    S X'X S serve every s. Rates have shape (H, 1), for all targets, or (H, N).
     """
     scale = np.array(std)
-    scaled = _terms(since, rates[:, None])[:, :, : len(std)] * scale
-    values, vectors = np.linalg.eigh(scaled.swapaxes(1, 2) @ scaled)
-    projected = vectors.swapaxes(1, 2) @ (scaled.swapaxes(1, 2) @ samples)
+    scaled = _terms(since, rates[..., None])[..., : len(std)] * scale
+    transposed = scaled.swapaxes(-1, -2)
+    values, vectors = np.linalg.eigh(transposed @ scaled)
+    projected = vectors.swapaxes(-1, -2) @ (transposed @ samples)
     square, count = np.sum(samples**2, axis=(1, 2)), len(since)
     logs, fits = [], []
     for variance in np.square(_SCATTER):
         sums = np.maximum(values, 0.0) + variance
-        rest = square - np.sum(projected**2 / sums[..., None], axis=(1, 2))
-        determinant = np.sum(np.log(sums / variance), axis=1) + count * math.log(variance)
+        rest = square - np.sum(projected**2 / sums[..., None], axis=(-2, -1))
+        determinant = np.sum(np.log(sums / variance), axis=-1) + count * math.log(variance)
         logs.append(-1.5 * (determinant + count * math.log(2.0 * math.pi)) - 0.5 * rest / variance)
         fits.append(scale[:, None] * (vectors @ (projected / sums[..., None])))
-    log = np.array(logs)
-    weights = np.exp(log - np.max(log, axis=0))
-    weights /= np.sum(weights, axis=0)
-    coefficients = np.zeros((len(samples), _TERMS, 3))
-    coefficients[:, : len(std)] = np.einsum("sn,sntc->ntc", weights, np.array(fits))
-    return _log_mean(log.T), coefficients
+    log = np.stack(logs, axis=-1)
+    weights = np.exp(log - np.max(log, axis=-1, keepdims=True))
+    weights /= np.sum(weights, axis=-1, keepdims=True)
+    coefficients = np.zeros((*log.shape[:2], _TERMS, 3))
+    coefficients[:, :, : len(std)] = np.einsum("hns,shntc->hntc", weights, np.array(fits))
+    return _log_mean(log), coefficients
 
 
 def _walk_evidence(since: Array, samples: Array) -> Array:

@@ -79,17 +79,17 @@ def plane_from_pose(
     Raises
     ------
     UserError
-        Another frame, a number that is not finite, a quaternion that is not of unit length, or a
+        Another frame, a number that is not finite, a quaternion that is not a unit vector, or a
         plane that is almost perpendicular to the entering needle.
     """
     if frame_id != RIG:
-        raise UserError(f"target_plane is given in frame '{frame_id}', wants '{RIG}'")
+        raise UserError(f"target_plane is given in frame '{frame_id}', expected '{RIG}'")
     origin, q = np.asarray(position, dtype=float), np.asarray(quaternion, dtype=float)
     if not (np.all(np.isfinite(origin)) and np.all(np.isfinite(q))):
         raise UserError(f"target_plane is not finite: position {origin}, orientation {q}")
     norm = math.hypot(*q)
     if abs(norm - 1.0) > _UNIT_TOLERANCE:
-        raise UserError(f"target_plane's quaternion has length {norm:g}, wants 1")
+        raise UserError(f"target_plane's quaternion has length {norm:g}, expected 1")
     transform = np.eye(4)
     transform[:3, :3] = rotation_from_quaternion(q / norm)
     transform[:3, 3] = origin
@@ -97,9 +97,7 @@ def plane_from_pose(
     # The entering needle's sine of pitch in the plane's coordinates.
     if abs(transform[2, 0]) > np.sin(np.deg2rad(80.0)):
         angle = np.rad2deg(np.arcsin(min(1.0, abs(transform[2, 0]))))
-        raise UserError(
-            f"the needle enters at {angle:.0f} deg to target_plane, wants at most 80 deg"
-        )
+        raise UserError(f"the needle enters at {angle:.0f} deg to target_plane, limit 80 deg")
     return plane
 
 

@@ -124,7 +124,7 @@ class LuenbergerObserver:
         """Advance by the actual motion; see `Estimator.advance`."""
         length = float(d_insertion)
         if not (math.isfinite(length) and length >= 0.0):
-            raise ValueError(f"d_insertion = {length!r} m, wants finite and >= 0")
+            raise ValueError(f"d_insertion = {length!r} m, expected finite and >= 0")
         advance_observer(self._needle, length, float(d_rotation), self._model)
         self._inserted += length
         # P <- F P F^T + Q
@@ -167,7 +167,7 @@ class LuenbergerObserver:
         warnings: tuple[str, ...] = ()
         if self._needle["saturated"]:
             warnings = (
-                "the estimate was saturated: the roll it wants is beyond what its coordinates say",
+                "the estimate was saturated: its roll is beyond the range of its coordinates",
             )
         return Estimate(
             coordinates=np.array([x, self._tip[1], self._tip[2], yaw, pitch, roll]),

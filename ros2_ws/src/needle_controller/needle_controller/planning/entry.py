@@ -78,7 +78,7 @@ def first_path(
         ("entry", entry.position, clear),
     ):
         if (distance := obstacles.clearance(point)) < wanted:
-            return f"the {name} is {distance:.4g} m from an obstacle, wants >= {wanted:.4g} m"
+            return f"the {name} is {distance:.4g} m from an obstacle, minimum {wanted:.4g} m"
     possible = planner.may_have_path(entry, target, obstacles)
     path = planner.path(entry, target, obstacles, starts=THOROUGH_STARTS) if possible else None
     if path is not None:
@@ -87,9 +87,9 @@ def first_path(
     reason = f"no path to the target point {is_clear} of the {len(obstacles)} obstacles"
     nearest = nearest_entry(planner, entry, target, obstacles)
     if nearest is None:
-        reason += f", nor is one from an entry up to {_OFFSETS[-1]:.4g} m beside it"
+        reason += f", nor from any entry up to {_OFFSETS[-1]:.4g} m from it"
     else:
-        reason += "; entering at ({:.4g}, {:.4g}) m in place of (0, 0) there is one".format(
+        reason += "; there is one from an entry at ({:.4g}, {:.4g}) m instead of (0, 0)".format(
             *nearest
         )
     return reason

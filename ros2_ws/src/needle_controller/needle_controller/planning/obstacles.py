@@ -79,7 +79,7 @@ class Obstacles:
 
     def __init__(self, obstacles: Sequence[Obstacle] = ()) -> None:
         if len(obstacles) > MOST_OBSTACLES:
-            raise UserError(f"{len(obstacles)} obstacles, wants at most {MOST_OBSTACLES}")
+            raise UserError(f"{len(obstacles)} obstacles, limit {MOST_OBSTACLES}")
         rows = [
             [float(number) for number in (*one.start, *one.end, one.radius)] for one in obstacles
         ]
@@ -125,9 +125,9 @@ def obstacles_from_markers(message: Markers) -> Obstacles:
             continue
         name = f"obstacle {number} ('{marker.namespace}' {marker.number})"
         if marker.frame_id != RIG:
-            raise UserError(f"{name} is given in frame '{marker.frame_id}', wants '{RIG}'")
+            raise UserError(f"{name} is given in frame '{marker.frame_id}', expected '{RIG}'")
         if marker.kind not in {SPHERE, CYLINDER}:
-            raise UserError(f"{name} is of type {marker.kind}, wants SPHERE (2) or CYLINDER (3)")
+            raise UserError(f"{name} is of type {marker.kind}, expected SPHERE (2) or CYLINDER (3)")
         found.append(_obstacle_from_marker(name, marker))
     return Obstacles(found)
 
@@ -142,7 +142,7 @@ def _obstacle_from_marker(name: str, marker: Marker) -> Obstacle:
         quaternion = np.array(marker.orientation)
         length = math.hypot(*quaternion)
         if not abs(length - 1.0) <= _ROUND:
-            raise UserError(f"{name}'s quaternion has length {length:g}, wants 1")
+            raise UserError(f"{name}'s quaternion has length {length:g}, expected 1")
         half = 0.5 * sizes[2] * rotation_from_quaternion(quaternion / length)[:, 2]
         diameters = sizes[:2]
     if np.ptp(diameters) > _ROUND * float(np.max(np.abs(diameters))):
@@ -161,22 +161,22 @@ def read_obstacles(path: Path) -> Obstacles:
     """
     document = read_yaml(path)
     if not isinstance(document, dict):
-        raise UserError(f"{path}: wants frame, spheres and capsules")
+        raise UserError(f"{path}: expected frame, spheres and capsules")
     unknown = sorted(str(key) for key in document if key not in {"frame", *_KINDS})
     if unknown:
         raise UserError(f"{path}: {unknown[0]} is not one of frame, {', '.join(_KINDS)}")
     if document.get("frame") != RIG:
-        raise UserError(f"{path}: frame {document.get('frame')!r}, wants '{RIG}'")
+        raise UserError(f"{path}: frame {document.get('frame')!r}, expected '{RIG}'")
     obstacles = []
     for kind, (first, last) in _KINDS.items():
         rows = document.get(kind) or []
         if not isinstance(rows, list):
-            raise UserError(f"{path}: {kind} is no list")
+            raise UserError(f"{path}: {kind} is not a list")
         for number, row in enumerate(rows, start=1):
             name = f"{path}: {kind}, number {number}"
             if not isinstance(row, dict) or set(row) != {first, last, "radius"}:
                 wanted = ", ".join(dict.fromkeys((first, last, "radius")))
-                raise UserError(f"{name}: wants {wanted}")
+                raise UserError(f"{name}: expected {wanted}")
             start, end = (_point(f"{name}: {key}", row[key]) for key in (first, last))
             obstacles.append(Obstacle(start, end, _number(f"{name}: radius", row["radius"])))
     try:
@@ -187,13 +187,13 @@ def read_obstacles(path: Path) -> Obstacles:
 
 def _point(name: str, value: Any) -> list[float]:
     if not isinstance(value, list) or len(value) != 3:
-        raise UserError(f"{name} = {value!r}, wants three numbers")
+        raise UserError(f"{name} = {value!r}, expected three numbers")
     return [_number(name, number) for number in value]
 
 
 def _number(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise UserError(f"{name} = {value!r}, wants a number")
+        raise UserError(f"{name} = {value!r}, expected a number")
     return float(value)
 
 

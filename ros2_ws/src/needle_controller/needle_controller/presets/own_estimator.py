@@ -82,7 +82,7 @@ class OwnEstimator:
             estimate = self._own.estimate()
         if not isinstance(estimate, Estimate):
             raise part.error(
-                f"estimate() returned {type(estimate).__name__}, wants an Estimate "
+                f"estimate() returned {type(estimate).__name__}, expected an Estimate "
                 "(needle_controller.observers.estimator.pose_estimate makes one)"
             )
         for name, shape, meaning in _CHECKS:
@@ -121,7 +121,7 @@ def tried_estimator(name: str) -> OwnPart:
     if error > _LARGEST_ERROR:
         raise part.error(
             f"after {_TRIAL_STEPS} exact tips, 1 mm apart, its position is {error:.3g} m "
-            "off; it is wanted in m, in the target plane, z along the insertion"
+            "off; expected m, in the target plane, z along the insertion"
         )
     estimator.advance(_STEP, 0.0)
     estimator.correct(np.full(3, np.nan), None, 0.0)

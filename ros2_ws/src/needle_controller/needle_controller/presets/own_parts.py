@@ -125,12 +125,12 @@ class OwnPart:
             array = np.asarray(values, dtype=float)
         except (TypeError, ValueError):
             given = type(values).__name__
-            raise self.error(f"{what} is of type {given}, wants {meaning}") from None
+            raise self.error(f"{what} is of type {given}, expected {meaning}") from None
         if array.shape != shape:
-            raise self.error(f"{what} has shape {array.shape}, wants {shape}: {meaning}")
+            raise self.error(f"{what} has shape {array.shape}, expected {shape}: {meaning}")
         if not np.all(np.isfinite(array)):
             number = next(float(v) for v in array.ravel() if not math.isfinite(v))
-            raise self.error(f"{what} holds {number}, wants finite {meaning}")
+            raise self.error(f"{what} contains {number}, must be finite: {meaning}")
         return array
 
 
@@ -155,12 +155,12 @@ def check_registered(kind: str, name: str) -> EntryPoint:
     if not found:
         names = ", ".join(dict.fromkeys(f"{one.name} ({_package(one)})" for one in offered))
         raise OwnPartError(
-            f"{kind} = {name!r}: no installed package offers it; offered: {names or 'none'}. One "
-            f"is offered by an entry point of group {GROUPS[kind]!r}: {_PAGE}"
+            f"{kind} = {name!r}: no installed package provides it; available: {names or 'none'}. "
+            f"A package provides one by an entry point of group {GROUPS[kind]!r}: {_PAGE}"
         )
     if len(found) > 1:
         packages = ", ".join(package for _, package in found)
-        raise OwnPartError(f"{kind} = {name!r} is offered by several packages: {packages}")
+        raise OwnPartError(f"{kind} = {name!r} is provided by several packages: {packages}")
     return next(iter(found.values()))
 
 
@@ -181,7 +181,7 @@ def own_part(kind: str, name: str) -> OwnPart:
         loaded = entry.load()
     if not inspect.isclass(loaded):
         raise part.error(
-            f"{entry.value} is a {type(loaded).__name__}, wants a class that is made with "
+            f"{entry.value} is a {type(loaded).__name__}, expected a class that is made with "
             f"{_CONSTRUCTORS[kind]}"
         )
     methods = _METHODS[kind]

@@ -253,20 +253,20 @@ class SteeringSettings:
         for name in ("state_weights", "process_noise"):
             numbers = getattr(self, name)
             if len(numbers) != 3:
-                raise UserError(f"{name} = {list(numbers)}, wants three numbers, for s1, s2, s3")
+                raise UserError(f"{name} = {list(numbers)}, expected three numbers, for s1, s2, s3")
         for kind in GROUPS:
             if name := getattr(self, kind):
                 check_registered(kind, name)
         self.check_plane(self.plane())
         if self.target_point:
             if len(self.target_point) != 3:
-                raise UserError(f"target_point = {list(self.target_point)}, wants x, y and z")
+                raise UserError(f"target_point = {list(self.target_point)}, expected x, y and z")
             self.check_point(self.target_point)
         if len(self.obstacles) % 7:
-            raise UserError(f"obstacles has {len(self.obstacles)} numbers, wants 7 for each")
+            raise UserError(f"obstacles has {len(self.obstacles)} numbers, expected 7 for each")
         FlipPlan(self.flip_depths).check_within(self.depth)
         if self.flip_depths and self.law:
-            raise UserError(f"flip_depths are of the law of best; law {self.law} says itself")
+            raise UserError(f"flip_depths apply to the law of best only, not to law {self.law}")
         if self.flip_depths and self.preset in ONE_SIDED_PRESETS:
             raise UserError(
                 f"flip_depths: preset {self.preset} cannot steer with the bevel flipped (its "

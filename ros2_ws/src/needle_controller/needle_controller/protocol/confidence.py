@@ -67,10 +67,10 @@ def assess_confidence(estimate: Estimate, miss_probability: float | None = None)
         return Confidence(r1=x, low=low, high=high)
     reason = ""
     if miss_probability is None and std > NEAR:
-        reason = f"x is not known to {1e3 * NEAR:g} mm"
+        reason = f"the uncertainty of x exceeds {1e3 * NEAR:g} mm"
     elif miss_probability is not None and miss_probability > MAX_MISS_PROBABILITY:
         percent = 100.0 * miss_probability
-        reason = f"{percent:.0f} % that the tip misses its target by {1e3 * NEAR:g} mm or more"
+        reason = f"{percent:.0f} % probability of a miss by {1e3 * NEAR:g} mm or more"
     verdict = f"doubtful: {reason}" if reason else "trusted"
     return Confidence(verdict, bool(reason), x, low, high)
 

@@ -163,7 +163,7 @@ class ContinuousSteering(Steering):
                 return actions + self._finish(update, joints)
         elif self.state is SteeringState.WAITING_FOR_TIP:
             self.state, self.reason = SteeringState.STEERING, ""
-            actions.append(Log("info", "STEERING: a good tip came"))
+            actions.append(Log("info", "STEERING: received a good tip"))
         return actions + self._send_path(SendPath(tip.stamp_ns, ahead.points(joints.insertion)))
 
     def _is_due(self, joints: JointSample, ahead: PathAhead) -> bool:

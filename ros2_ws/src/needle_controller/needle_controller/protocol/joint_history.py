@@ -169,7 +169,7 @@ class JointHistory:
             self.problem = ""
             return SampleResult.JUMPED
         self.problem = (
-            f"joint_states do not follow from the last: {sample.insertion:.4g} m, "
+            f"joint_states are inconsistent with the last: {sample.insertion:.4g} m, "
             f"{sample.rotation:.4g} rad after {latest.insertion:.4g} m, {latest.rotation:.4g} rad, "
             f"{(sample.stamp_ns - latest.stamp_ns) * 1e-9:.4g} s later"
         )

@@ -109,7 +109,7 @@ class FailureCounter:
         self._aborts = 0 if moved else self._aborts + 1
         if self._aborts < MAX_ABORTS_AT_REST:
             return ""
-        return f"{self._aborts} commands in a row ended without motion, the last {text}"
+        return f"{self._aborts} commands in a row ended without motion; last result: {text}"
 
     def count_unfollowed(self, step: SendStep, at: JointSample) -> tuple[str, bool]:
         """Count a step that the joints did not follow.
@@ -130,12 +130,12 @@ class FailureCounter:
         """
         self._unfollowed += 1
         text = (
-            f"a step is said to have succeeded, but joint_states stand at {at.insertion:.6g} m, "
+            f"device/result reports success, but joint_states are at {at.insertion:.6g} m, "
             f"{at.rotation:.4g} rad, not at {step.insertion:.6g} m, {step.rotation:.4g} rad"
         )
         if self._unfollowed < MAX_UNFOLLOWED_STEPS:
             return text, False
-        return f"{text}; so were {self._unfollowed} in a row: see to drives and joint_states", True
+        return f"{text}; {self._unfollowed} times in a row: check drives and joint_states", True
 
 
 class RetractionMonitor:
@@ -156,12 +156,12 @@ class RetractionMonitor:
     def reason(self) -> str:
         """Reason to draw the needle out before it is steered; empty if there is none."""
         if self._retracted:
-            return "the needle was retracted: draw it out first"
+            return "the needle was retracted: withdraw it first"
         if self._before is not None and self._after is not None:
             return (
                 f"joint_states jumped from {self._before.insertion:.4g} m, "
                 f"{self._before.rotation:.4g} rad to {self._after.insertion:.4g} m, "
-                f"{self._after.rotation:.4g} rad: draw the needle out first"
+                f"{self._after.rotation:.4g} rad: withdraw the needle first"
             )
         return ""
 
@@ -245,7 +245,7 @@ class Watchdog:
         """Reset the silence of the device, and log its end."""
         self._received_since = None
         was_silent, self.silence = bool(self.silence), ""
-        return [Log("info", "the device is heard again")] if was_silent else []
+        return [Log("info", "the device sends messages again")] if was_silent else []
 
     def waited(self, steady: float, *, moving: bool) -> float:
         """Return the waiting time [s], which does not run while the needle moves."""
@@ -263,7 +263,7 @@ class Watchdog:
             self._received_since = steady
         if self.silence or steady - self._received_since < timeout:
             return []
-        self.silence = f"nothing heard of the device for {timeout:g} s, a step under way"
+        self.silence = f"no message from the device for {timeout:g} s during a step"
         return [Log("warning", self.silence)]
 
     def has_moved(self, latest: JointSample | None) -> bool:

@@ -56,15 +56,15 @@ def reason_not_to_start(rig: RigState, control: PlaneControl, settings: Steering
     if rig.steering:
         return "already steering"
     if rig.device is None:
-        return "no device/status has come"
+        return "no device/status received"
     reason = _device_reason(rig.device)
     if reason:
         return reason
     if rig.joints is None:
-        return "no joint_states have come"
+        return "no joint_states received"
     if not _agree(rig.device, rig.joints):
         return (
-            f"waiting for joint_states to say what the device does ({rig.joints.insertion:.4g} m, "
+            f"waiting for joint_states to agree with device/status ({rig.joints.insertion:.4g} m, "
             f"{rig.joints.rotation:.4g} rad; the device {rig.device.insertion_m:.4g} m, "
             f"{rig.device.rotation_rad:.4g} rad)"
         )
@@ -73,7 +73,7 @@ def reason_not_to_start(rig: RigState, control: PlaneControl, settings: Steering
 
 def _device_reason(device: DeviceStatus) -> str:
     if device.state == "MOVING":
-        return "waiting for the device, which moves"
+        return "waiting for the device to stop"
     if not device.homed:
         return "the device is not homed"
     if device.state != "HOLDING":
@@ -91,19 +91,19 @@ def _agree(device: DeviceStatus, joints: JointSample) -> bool:
 
 def _needle_reason(joints: JointSample, control: PlaneControl, settings: SteeringSettings) -> str:
     if joints.insertion >= settings.depth - DEPTH_TOLERANCE:
-        return f"insertion {joints.insertion:g} m is at the depth {settings.depth:g} m"
+        return f"insertion {joints.insertion:g} m has reached the depth {settings.depth:g} m"
     if not is_out(joints, settings):
         if control.started:
             return ""
         return (
-            f"the needle is {joints.insertion:g} m in and was not followed there: "
-            f"draw it out first (<= {settings.needle_out_insertion:g} m)"
+            f"the needle is {joints.insertion:g} m in, on an unknown path: "
+            f"withdraw it first (<= {settings.needle_out_insertion:g} m)"
         )
     roll = control.start_roll(joints.rotation)
     if abs(roll) > control.largest_start_roll:
         return (
             f"the needle's roll in target_plane is {roll:.3g} rad (rotation_joint "
-            f"{joints.rotation:.4g} rad), wants within {control.largest_start_roll:.3g} rad"
+            f"{joints.rotation:.4g} rad), must be within {control.largest_start_roll:.3g} rad"
         )
     try:
         return control.reason_without_path(joints.rotation)

@@ -244,7 +244,7 @@ class Steering:
         self.watchdog_trips += 1
         why = (
             f"no device/result for step {self.step + 1} in {timeout:g} s, and the device does "
-            "not move: the command or its answer is lost"
+            "not move: the command or its result was lost"
         )
         return self._leave(SteeringState.FAULT, why, "error")
 
@@ -337,9 +337,9 @@ class Steering:
         actions: list[Action] = [PublishUpdate(tip.stamp_ns, update)]
         if self.state is SteeringState.WAITING_FOR_TIP:
             self.state = SteeringState.STEERING
-            actions.append(Log("info", "STEERING: a good tip came"))
+            actions.append(Log("info", "STEERING: received a good tip"))
         if update.blocked:
-            why = f"no way on from insertion {joints.insertion:.4g} m is clear of the obstacles"
+            why = f"no path from insertion {joints.insertion:.4g} m avoids the obstacles"
             return None, [*actions, *self._leave(SteeringState.IDLE, why, "warning")]
         return update, actions
 
@@ -387,7 +387,7 @@ class Steering:
         if self.control.started:
             self.control.restart()
         self.tips.last = None
-        why = f"needle retracted to {sample.insertion:.4g} m: draw it out before steering again"
+        why = f"needle retracted to {sample.insertion:.4g} m: withdraw it before steering again"
         return self._leave(SteeringState.IDLE, why, "warning") if self._steering else []
 
     def _leave(self, state: SteeringState, reason: str, severity: str) -> list[Action]:

@@ -75,7 +75,7 @@ class TipCovariance:
     def problem(self) -> str:
         """Return why the covariance cannot be used; empty if it can."""
         if self.frame_id != RIG:
-            return f"needle/tip_pose in frame '{self.frame_id}', wants '{RIG}'"
+            return f"needle/tip_pose in frame '{self.frame_id}', expected '{RIG}'"
         if np.any(np.isinf(self.matrix)):
             return "needle/tip_pose says that no tip was found"
         if np.any(np.isnan(self.matrix)):
@@ -86,7 +86,7 @@ class TipCovariance:
         least = float(np.linalg.eigvalsh(self.matrix)[0])
         if not least > 0.0:
             return (
-                "covariance of needle/tip_pose is not positive definite (its least variance is "
+                "covariance of needle/tip_pose is not positive definite (its smallest variance is "
                 f"{least:.3g} m^2)"
             )
         return ""
@@ -131,7 +131,7 @@ def check_message(tip: TipMeasurement, last: AcceptedTip | None) -> RejectedTip 
         The last tip that was used.
     """
     if tip.frame_id != RIG:
-        return RejectedTip(tip, TipFault.FRAME, f"tip in frame '{tip.frame_id}', wants '{RIG}'")
+        return RejectedTip(tip, TipFault.FRAME, f"tip in frame '{tip.frame_id}', expected '{RIG}'")
     if not np.all(np.isfinite(tip.position)):
         return RejectedTip(tip, TipFault.NOT_FINITE, f"tip is not finite: {tip.position}")
     if last is not None and tip.stamp_ns <= last.tip.stamp_ns:
@@ -154,7 +154,7 @@ def check_stamp(
         Ends of the history.
     """
     if oldest is not None and tip.stamp_ns < oldest.stamp_ns:
-        return RejectedTip(tip, TipFault.BEFORE_JOINTS, "tip is older than any joint_states kept")
+        return RejectedTip(tip, TipFault.BEFORE_JOINTS, "tip is older than all stored joint_states")
     if latest is not None and tip.stamp_ns > latest.stamp_ns + STAMP_AHEAD_NS:
         ahead = (tip.stamp_ns - latest.stamp_ns) * 1e-9
         text = f"tip's stamp is {ahead:.4g} s ahead of joint_states"
@@ -183,7 +183,7 @@ def check_position(
     reach = LARGEST_SCALE * max(joints.insertion, 0.0) + margin
     if distance > reach:
         text = (
-            f"tip is {distance:.4g} m from the entry point, wants <= {reach:.4g} m "
+            f"tip is {distance:.4g} m from the entry point, limit {reach:.4g} m "
             f"({LARGEST_SCALE:g} insertion {joints.insertion:.4g} m + margin {margin:.4g} m)"
         )
         return RejectedTip(tip, TipFault.TOO_FAR, text)
@@ -194,7 +194,7 @@ def check_position(
     if jump <= allowed:
         return None
     text = (
-        f"tip jumped {jump:.4g} m since the last used one, wants <= {allowed:.4g} m "
+        f"tip jumped {jump:.4g} m since the last used one, limit {allowed:.4g} m "
         f"(insertion since then + margin {margin:.4g} m)"
     )
     return RejectedTip(tip, TipFault.JUMP, text)

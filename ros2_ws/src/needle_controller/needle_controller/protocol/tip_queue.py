@@ -211,7 +211,7 @@ class TipQueue:
         queue = self._queue
         # A topic keeps its order, so earlier tips with a later stamp had a wrong one.
         while queue and queue[-1].stamp_ns > tip.stamp_ns:
-            text = "a tip exposed before it came after it"
+            text = "a tip with an earlier exposure arrived after it"
             self._count(RejectedTip(queue.pop(), TipFault.AHEAD_OF_JOINTS, text))
         if not queue or queue[-1].stamp_ns < tip.stamp_ns:
             queue.append(tip)

@@ -115,7 +115,7 @@ def test_steered_insertions_are_rejected(arc: float, size: float | None, degrees
 def test_the_error_names_a_remedy() -> None:
     misses = np.zeros((60, 3))
     misses[:, 0] = 1e-3 * np.sin(np.linspace(0.0, 2.0 * np.pi, 60))
-    with pytest.raises(UserError, match=r"beside it, wants <= 0\.05 mm.*--until-mm.*rotation_rad"):
+    with pytest.raises(UserError, match=r"off it, limit 0\.05 mm.*--until-mm.*rotation_rad"):
         check_independent_residuals(misses, REPEATING)
     check_independent_residuals(misses, 1e-3)
     assert neighbour_correlation(np.zeros((8, 3))) == (0.0, 0.0)

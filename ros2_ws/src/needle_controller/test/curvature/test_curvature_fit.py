@@ -143,7 +143,7 @@ def test_a_straight_path_has_no_upper_bound() -> None:
         ({"measurement_std": math.nan}, "measurement_std"),
         ({"outlier_limit": 0.0}, "outlier_limit"),
         ({"slip_std": 0.0}, "slip_std"),
-        ({"heading": (0.0, 0.0, 2.0)}, "unit length"),
+        ({"heading": (0.0, 0.0, 2.0)}, "unit vector"),
         ({"entry": (0.0, math.inf, 0.0)}, "entry"),
     ],
 )

@@ -60,7 +60,7 @@ def test_a_steered_insertion_without_rotation_is_rejected(
     path = write_csv(tmp_path / "tips.csv", noisy, insertion if known else None, None)
     assert command(path) == 2
     error = capsys.readouterr().err
-    assert "the tips follow no single arc" in error
+    assert "the tips do not follow a single arc" in error
     assert error.count("\n") == 1
     turned = np.zeros(len(insertion))
     # A recorded rotation of 0 is accepted.
@@ -128,8 +128,8 @@ def test_a_turned_base_is_rejected_except_for_the_part_before(
 def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "tips.csv"
     for text, message in (
-        ("", "there is no row in it"),
-        ("x_m,y_m,z_m\n", "there is no row in it"),
+        ("", "the file has no rows"),
+        ("x_m,y_m,z_m\n", "the file has no rows"),
         ("a,b\n1,2\n", "x_m is missing"),
         ("x_m,y_m,z_m\n0,0,0.01\n", "1 tips are too few"),
         ("x_m,y_m,z_m\n0,0,nan\n", "z_m = nan is not finite"),
@@ -236,7 +236,7 @@ def test_bags_without_a_needle_are_one_line(
     tips, insertion = needle
     path = write_bag(tmp_path / "bag", tips[:0], insertion[:0], insertion[:0])
     assert command(path) == 2
-    assert "nothing on needle/tip" in capsys.readouterr().err
+    assert "no messages on needle/tip" in capsys.readouterr().err
     next(path.glob("*.mcap")).write_bytes(b"not an mcap file")
     assert command(path) == 2
     error = capsys.readouterr().err

@@ -257,7 +257,7 @@ def test_warns_of_an_ambiguous_roll() -> None:
 
 @pytest.mark.parametrize(("length", "turn"), [(-1e-6, 0.0), (np.nan, 0.0), (0.001, np.inf)])
 def test_invalid_advances_raise_errors(length: float, turn: float) -> None:
-    with pytest.raises(ValueError, match="wants finite"):
+    with pytest.raises(ValueError, match="expected finite"):
         HypothesisFilter(FilterSettings()).advance(length, turn)
 
 

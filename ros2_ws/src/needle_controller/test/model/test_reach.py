@@ -157,10 +157,10 @@ def test_refusals_of_a_point_say_why_and_from_where_it_would_go() -> None:
     with pytest.raises(UserError, match=r"takes 0\.1\d* m of insertion, depth is 0\.1 m"):
         check_point([0.005, 0.0, 0.11], CURVATURE, 0.1)
     aside = np.array([0.03, -0.04, 0.06])
-    with pytest.raises(UserError, match="in place of") as refusal:
+    with pytest.raises(UserError, match="instead of") as refusal:
         check_point(aside, CURVATURE, 0.15)
     # The point can be reached from that entry, but not from a slightly nearer one.
-    (place,) = re.findall(r"entering at \((.*?)\)", str(refusal.value))
+    (place,) = re.findall(r"entry at \((.*?)\)", str(refusal.value))
     entry = np.array([*(float(part) for part in place.split(",")), 0.0])
     check_point(aside - 1.001 * entry, CURVATURE, 0.15)
     with pytest.raises(UserError):

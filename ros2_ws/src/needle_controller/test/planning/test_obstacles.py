@@ -95,14 +95,14 @@ def test_a_file_is_read_or_rejected_in_one_line(tmp_path: Path) -> None:
         [[0.0, 0.002, 0.05, 0.0, 0.002, 0.05, 0.004], [-0.02, 0.0, 0.07, 0.02, 0.0, 0.07, 0.003]],
     )
     for old, new, words in (
-        ("frame: rig", "frame: world", "frame 'world', wants 'rig'"),
+        ("frame: rig", "frame: world", "frame 'world', expected 'rig'"),
         ("spheres:", "cubes:", "cubes is not one of"),
-        ("radius: 0.004", "size: 0.004", "spheres, number 1: wants center, radius"),
+        ("radius: 0.004", "size: 0.004", "spheres, number 1: expected center, radius"),
         ("0.002, 0.05", ".nan, 0.05", "y of obstacle 1 = nan"),
-        ("[0.0, 0.002, 0.05]", "[0.0, 0.05]", "center = .* wants three numbers"),
+        ("[0.0, 0.002, 0.05]", "[0.0, 0.05]", "center = .* expected three numbers"),
         ("radius: 0.003", "radius: '3 mm'", "capsules, number 1: radius = '3 mm'"),
         ("frame: rig", "frame: [", "not YAML in line 4"),
-        (FILE, "- 3", "wants"),
+        (FILE, "- 3", "expected"),
         ("spheres:", "spheres: 3\nboxes:", "boxes is not one of"),
     ):
         path.write_text(FILE.replace(old, new), encoding="utf-8")
@@ -127,8 +127,8 @@ def test_markers_become_capsules_or_are_rejected_by_name() -> None:
     found = obstacles_from_markers(Markers((deleting, BALL, lying)))
     np.testing.assert_allclose(found.table, expected, atol=1e-12)
     rows: list[tuple[dict[str, Any], str]] = [
-        ({"frame_id": "map"}, r"obstacle 1 \('bone' 4\) is given in frame 'map', wants 'rig'"),
-        ({"kind": CUBE}, "of type 1, wants SPHERE"),
+        ({"frame_id": "map"}, r"obstacle 1 \('bone' 4\) is given in frame 'map', expected 'rig'"),
+        ({"kind": CUBE}, "of type 1, expected SPHERE"),
         ({"scale": (0.006, 0.01, 0.006)}, "is not round"),
         ({"position": (0.01, -0.02, math.nan)}, "is not finite"),
         ({"kind": CYLINDER, "orientation": (0.0, 0.0, 0.0, 0.0)}, "quaternion has length 0"),

@@ -140,14 +140,14 @@ def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
         ("class Own", "class Other", "has no attribute 'Own'"),
         ("import numpy as np", "numpy", "loading it raised NameError"),
         ("= settings, initial", "= setting, initial", "raised NameError"),
-        ("return pose_estimate(", "return (", "returned tuple, wants an Estimate"),
-        ("(self.place, self.turn", "(self.place * np.nan, self.turn", "holds nan"),
-        ("(self.place, self.turn", "(1e3 * self.place, self.turn", "is wanted in m"),
+        ("return pose_estimate(", "return (", "returned tuple, expected an Estimate"),
+        ("(self.place, self.turn", "(self.place * np.nan, self.turn", "contains nan"),
+        ("(self.place, self.turn", "(1e3 * self.place, self.turn", "expected m, in"),
         ("(self.place, self.turn", "(0 * self.place, self.turn", "0.02 m off"),
         ("np.eye(6) * 1e-6)", "[[1, 2], [3]])", "estimate() raised ValueError"),
         ("reset(self, tip, joints)", "reset(self, tip)", "reset(tip, joints) raised TypeError"),
-        ("np.eye(6) * 1e-6)", "np.full((6, 6), np.inf))", "covariance holds inf"),
-        ("np.where(np.isfinite(tip), tip, self.place)", "tip", "holds nan"),
+        ("np.eye(6) * 1e-6)", "np.full((6, 6), np.inf))", "covariance contains inf"),
+        ("np.where(np.isfinite(tip), tip, self.place)", "tip", "contains nan"),
         ("+ T_new_old[:3, 3]", "- T_new_old[:3, 3]", "change_frame by 0.002 m along x moves x by"),
         ("@ step.shift", "@ step.shif", "advance(d_insertion, d_rotation) raised AttributeError"),
     ):
@@ -163,7 +163,7 @@ def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
 
 def test_a_name_is_offered_by_one_package_and_is_a_class(offer: Offer) -> None:
     name = offer("estimator", ESTIMATOR)
-    with pytest.raises(UserError, match=rf"offered: .*{name} \({name} 1.0\)"):
+    with pytest.raises(UserError, match=rf"available: .*{name} \({name} 1.0\)"):
         SteeringSettings(estimator="nobody")
     with pytest.raises(UserError, match=r"law = 'own_module_\d+': no installed package"):
         SteeringSettings(law=name)
@@ -172,7 +172,7 @@ def test_a_name_is_offered_by_one_package_and_is_a_class(offer: Offer) -> None:
     with pytest.raises(UserError, match=r"several packages: (one|two) 1.0, (one|two) 1.0"):
         SteeringSettings(law="both")
     function = offer("law", "def Own(estimate):\n    return 0.0\n")
-    with pytest.raises(OwnPartError, match=r"is a function, wants a class .* \(settings\)"):
+    with pytest.raises(OwnPartError, match=r"is a function, expected a class .* \(settings\)"):
         tried_law(function)
 
 
@@ -200,8 +200,8 @@ def test_an_own_law_is_limited_and_gets_the_remaining_insertion(offer: Offer) ->
 def test_invalid_laws_are_rejected_with_the_reason(offer: Offer) -> None:
     rate = "40.0 * insertion"
     for wrong, said in (
-        ("np.nan", "holds nan"),
-        ("np.zeros(3)", "has shape (3,), wants ()"),
+        ("np.nan", "contains nan"),
+        ("np.zeros(3)", "has shape (3,), expected ()"),
         ("'fast'", "is of type str"),
         ("estimate.speed", "to_plane(estimate, insertion) raised AttributeError"),
     ):

@@ -193,7 +193,7 @@ def test_aborts_delayed_by_a_cut_cable_count_once() -> None:
     rig = ContinuousRig()
     stamps = [path_in(rig.see()).stamp_ns for _ in range(3 * MAX_ABORTS_AT_REST)]
     for stamp in stamps:
-        rig.steering.on_result(stamp, "aborted: nobody holds to run")
+        rig.steering.on_result(stamp, "aborted: the hold is not pressed")
     assert where(rig) == AT_WORK
 
 
@@ -222,7 +222,7 @@ def test_the_tip_timeout_ends_with_a_good_tip() -> None:
     rig.steering.on_time(10.0)
     rig.steering.on_time(12.1)
     assert where(rig)[0] is SteeringState.WAITING_FOR_TIP
-    assert "a good tip came" in logged(rig.go(0.2 * MM))
+    assert "received a good tip" in logged(rig.go(0.2 * MM))
     assert where(rig)[0] is SteeringState.STEERING
     assert rig.steering.reason == ""
 

@@ -56,12 +56,12 @@ def test_silence_of_the_device_and_its_end_are_logged() -> None:
         rig.steering.on_device(MOVING)
         rig.steering.on_time(0.0)
         assert rig.steering.on_time(9.9) == []
-        assert "nothing heard of the device for 10 s" in logged(rig.steering.on_time(10.0))
+        assert "no message from the device for 10 s" in logged(rig.steering.on_time(10.0))
         assert rig.steering.watchdog.silence
         assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
         assert rig.steering.on_time(1e3) == []
         heard = rig.settle(1) if by_joints else rig.steering.on_device(MOVING)
-        assert "heard again" in logged(heard)
+        assert "sends messages again" in logged(heard)
         assert not rig.steering.watchdog.silence
         rig.steering.on_device(HELD)
         rig.run(step)
@@ -88,7 +88,7 @@ def test_a_retraction_ends_steering_until_the_needle_is_out() -> None:
     assert rig.steering.tips.last is None
     rig.insertion = 0.004
     rig.settle()
-    assert "retracted: draw it out first" in rig.start()
+    assert "retracted: withdraw it first" in rig.start()
     while rig.insertion > 0.0:
         rig.insertion = max(rig.insertion - 0.0005, 0.0)
         # The retraction is logged once.
@@ -157,8 +157,8 @@ def test_unfollowed_steps_are_a_fault() -> None:
             assert rig.steering.state is SteeringState.STEERING
             rig.run(rig.good_tips(), part=share)
             said = logged(rig.settle())
-            assert "said to have succeeded" in said
-            assert ("so were 3 in a row" in said) is (count == MAX_UNFOLLOWED_STEPS)
+            assert "device/result reports success" in said
+            assert ("3 times in a row" in said) is (count == MAX_UNFOLLOWED_STEPS)
         assert where(rig) == (FAULT, NOTHING)
         assert rig.steering.step == 3
         # A start resets the count.
@@ -172,7 +172,7 @@ def test_a_followed_step_resets_the_count_of_unfollowed_ones() -> None:
     for _ in range(MAX_UNFOLLOWED_STEPS + 1):
         rig.run(rig.good_tips(), part=0.5)
         rig.settle()
-        assert "said to have succeeded" in rig.steering.reason
+        assert "device/result reports success" in rig.steering.reason
         assert rig.steering.tips.after_ns <= rig.now - TICK
         rig.run(rig.good_tips())
     assert rig.steering.state is SteeringState.STEERING

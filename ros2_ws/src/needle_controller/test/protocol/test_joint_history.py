@@ -109,7 +109,7 @@ def test_a_spike_is_dropped_and_a_lasting_jump_is_accepted() -> None:
     for stamp, insertion, rotation in SPIKES:
         made = history((START, 0.05, 0.0))
         made.add(JointSample(START + stamp, insertion, rotation))
-        assert "do not follow from the last" in made.problem
+        assert "are inconsistent with the last" in made.problem
         # A sample that is inconsistent with the spike restarts the count.
         assert made.add(JointSample(START + 5 * HOUR, 1.0, 0.0)) is SampleResult.REJECTED
         heard = [
@@ -124,7 +124,7 @@ def test_a_spike_is_dropped_and_a_lasting_jump_is_accepted() -> None:
 def test_the_problem_names_both_positions_and_the_time() -> None:
     made = history((START, 0.05, -1.0))
     made.add(JointSample(START + TICK, 0.0625, 2.5))
-    said = "joint_states do not follow from the last: 0.0625 m, 2.5 rad after 0.05 m, -1 rad"
+    said = "joint_states are inconsistent with the last: 0.0625 m, 2.5 rad after 0.05 m, -1 rad"
     assert made.problem == f"{said}, 0.02 s later"
     made.add(JointSample(START - HOUR, 0.0625, 2.5))
     assert made.problem == f"{said}, -3600 s later"

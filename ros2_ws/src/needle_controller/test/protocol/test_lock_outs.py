@@ -122,7 +122,7 @@ def test_a_spike_in_joint_states_does_not_stop_steering() -> None:
                 rig.now + ahead * SECOND, rig.insertion + insertion, rig.rotation + rotation
             )
         )
-        assert ("do not follow" in logged(actions)) is (max(ahead, insertion, rotation) > 0.001)
+        assert ("are inconsistent" in logged(actions)) is (max(ahead, insertion, rotation) > 0.001)
         if step is not None:
             rig.run(step)
         rig.run(rig.good_tips())
@@ -142,7 +142,7 @@ def test_inconsistent_joints_are_logged_once() -> None:
     for second in (0.0, 9.0):
         rig.steering.on_device(MOVING) if second == 0.0 else rig.joints()
         rig.steering.on_time(second)
-    assert "nothing heard" in logged(rig.steering.on_time(10.0))
+    assert "no message from the device" in logged(rig.steering.on_time(10.0))
 
 
 def test_after_a_joint_jump_the_needle_must_be_out_or_back() -> None:
@@ -153,7 +153,7 @@ def test_after_a_joint_jump_the_needle_must_be_out_or_back() -> None:
         rig.insertion = 0.005
         assert "IDLE: joint_states jumped from 0.01" in logged(rig.settle(CONFIRMED_BY))
         assert where(rig) == (IDLE, Awaiting.NOTHING)
-        assert "draw the needle out" in rig.start()
+        assert "withdraw the needle" in rig.start()
         if back:
             rig.insertion = deep
             assert "joint_states went 0." in logged(rig.settle(CONFIRMED_BY))
@@ -162,7 +162,7 @@ def test_after_a_joint_jump_the_needle_must_be_out_or_back() -> None:
             assert rig.steering.step == 16
     while rig.insertion > 0.0:
         if rig.insertion > rig.steering.settings.needle_out_insertion:
-            assert "draw the needle out" in rig.start()
+            assert "withdraw the needle" in rig.start()
         rig.insertion = max(rig.insertion - 0.0005, 0.0)
         rig.settle(1)
     rig.settle()

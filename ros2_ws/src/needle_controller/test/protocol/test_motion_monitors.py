@@ -79,7 +79,7 @@ def test_retraction_is_detected_from_the_median_of_five_samples() -> None:
     assert not any(watched(watch, *[0.02 - 1.99e-4] * 5))
     assert watch.reason == ""
     assert watched(watch, *[0.02 - 2.01e-4] * 3)[-1]
-    assert "was retracted: draw it out first" in watch.reason
+    assert "was retracted: withdraw it first" in watch.reason
     # A later insertion does not cancel the retraction; a needle that is out does.
     watched(watch, *[0.025] * 5)
     assert watch.reason
@@ -112,7 +112,7 @@ def test_jumped_joints_are_back_at_their_last_observed_position() -> None:
         watch, before = RetractionMonitor(), JointSample(0, 0.02, 0.3)
         watched(watch, *[0.02] * 5)
         assert watch.add_jump(before, JointSample(1, 0.01, 0.3), TOLERANCE)
-        assert "jumped from 0.02 m, 0.3 rad to 0.01 m, 0.3 rad: draw" in watch.reason
+        assert "jumped from 0.02 m, 0.3 rad to 0.01 m, 0.3 rad: withdraw" in watch.reason
         # Samples after the jump are not a retraction.
         assert not any(watched(watch, *[0.01] * 5, *[0.005] * 5))
         assert watch.add_jump(JointSample(2, 0.005, 0.3), JointSample(3, *back), TOLERANCE) is away

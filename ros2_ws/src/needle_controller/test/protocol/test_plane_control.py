@@ -272,8 +272,8 @@ def test_the_reason_without_path_names_an_entry_with_a_path() -> None:
     )
     control.target_point = np.array([0.0, 0.008, 0.1])
     said = control.reason_without_path(0.0)
-    assert "in place of (0, 0) there is one" in said
-    x, y = (float(part) for part in said.split("entering at (")[1].split(") m")[0].split(","))
+    assert "m instead of (0, 0)" in said
+    x, y = (float(part) for part in said.split("entry at (")[1].split(") m")[0].split(","))
     assert y > 0.0
     shift = np.array([x, y, 0.0])
     control.target_point = control.target_point - shift

@@ -104,7 +104,7 @@ def test_a_tip_timeout_ends_with_a_good_tip() -> None:
     rig.expose(bad(rig, [np.nan] * 3))
     assert where(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
     actions = rig.expose()
-    assert "STEERING: a good tip came" in logged(actions)
+    assert "STEERING: received a good tip" in logged(actions)
     sent(actions)
     assert where(rig) == (STEERING, Awaiting.RESULT)
     # Stop and start also work while it waits.

@@ -22,13 +22,13 @@ HOLDING = dataclasses.replace(HELD, insertion_m=0.0, rotation_rad=0.0)
 
 def test_start_reports_the_missing_device_state() -> None:
     bare = Steering(SETTINGS)
-    assert "no device/status has come" in bare.on_start()[0].message
+    assert "no device/status received" in bare.on_start()[0].message
     bare.on_device(HELD)
-    assert bare.on_start()[0].message == "no joint_states have come"
+    assert bare.on_start()[0].message == "no joint_states received"
     rig = Rig(started=False)
     for status, said in (
-        (MOVING, "waiting for the device, which moves"),
-        (device("MOVING", False), "waiting for the device, which moves"),
+        (MOVING, "waiting for the device to stop"),
+        (device("MOVING", False), "waiting for the device to stop"),
         (device("HOLDING", False), "not homed"),
         (device("DISABLED"), "not enabled (DISABLED)"),
         (device("ESTOPPED"), "not enabled (ESTOPPED)"),
@@ -49,7 +49,7 @@ def test_start_waits_until_joints_and_device_agree() -> None:
         rig.steering.on_device(
             dataclasses.replace(HOLDING, insertion_m=insertion, rotation_rad=rotation)
         )
-        assert ("waiting for joint_states to say" not in rig.start()) is agree
+        assert ("waiting for joint_states to agree" not in rig.start()) is agree
     for unsaid in (
         dataclasses.replace(HOLDING, insertion_m=None),
         dataclasses.replace(HOLDING, rotation_rad=None),
@@ -68,8 +68,8 @@ def test_start_waits_until_joints_and_device_agree() -> None:
 
 def test_start_is_refused_for_an_inserted_or_rolled_needle() -> None:
     assert Rig(started=False, insertion=0.002).start() == "steering"
-    assert "is 0.0021 m in and was not followed" in Rig(started=False, insertion=0.0021).start()
-    for short, said in ((0.9e-6, "is at the depth 0.001 m"), (1.1e-6, "steering")):
+    assert "is 0.0021 m in, on an unknown path" in Rig(started=False, insertion=0.0021).start()
+    for short, said in ((0.9e-6, "has reached the depth 0.001 m"), (1.1e-6, "steering")):
         assert said in Rig(started=False, depth=0.001, insertion=0.001 - short).start()
     for degrees, started in ((79.0, True), (-79.0, True), (81.0, False), (-81.0, False)):
         said = Rig(started=False, preset="paper", rotation=math.radians(degrees)).start()
@@ -155,7 +155,7 @@ def test_start_is_refused_without_a_path_past_obstacles(monkeypatch: pytest.Monk
     steering.control.obstacles = Obstacles(wall)
     while not none_sent(actions := rig.expose()):
         rig.run(sent(actions))
-    assert "IDLE: no way on from insertion 0.0" in logged(actions)
+    assert "IDLE: no path from insertion 0.0" in logged(actions)
     assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
     said = steering.control.reason_without_path(0.0)
-    assert "no path to the target point is clear of the 3 obstacles, nor is one from" in said
+    assert "no path to the target point is clear of the 3 obstacles, nor from any entry" in said

@@ -191,7 +191,7 @@ def test_the_last_step_ends_at_the_depth() -> None:
     assert "insertion 0.0025 m reached; r1 = " in rig.steering.reason
     assert "m (95 %), doubtful: " in rig.steering.reason
     assert rig.steering.confidence.is_doubtful
-    assert "at the depth" in rig.start()
+    assert "reached the depth" in rig.start()
 
 
 def test_an_uncertain_estimate_halves_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:

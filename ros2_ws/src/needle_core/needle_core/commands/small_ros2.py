@@ -76,5 +76,5 @@ def _find(kind: str, name: str, known: Mapping[str, T]) -> T:
     close = difflib.get_close_matches(name, known, n=3)
     hint = f"did you mean {' or '.join(close)}?"
     if not close:
-        hint = f"there is {', '.join(sorted(known))}"
+        hint = f"known: {', '.join(sorted(known))}"
     raise UserError(f"{kind} '{name}' not found; {hint}")

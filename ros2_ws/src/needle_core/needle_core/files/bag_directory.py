@@ -144,15 +144,15 @@ class BagDirectory:
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
             raise UserError(
-                f"{self.path}: a message of {message.topic} does not fit its definition "
-                f"({reason}): it was recorded so, or damaged where no checksum tells"
+                f"{self.path}: a message of {message.topic} does not match its definition "
+                f"({reason}): recorded so, or damaged without a checksum"
             ) from error
 
     def _open_directory(self) -> None:
         information = read_information(self.path)
         version = information.get("version")
         if not isinstance(version, int):
-            raise ValueError(f"{METADATA_FILE} is of version {version!r}")
+            raise ValueError(f"{METADATA_FILE} has version {version!r}")
         try:
             kind = self._require_known(information)
             # Old versions put the bag's name in front.
@@ -167,8 +167,8 @@ class BagDirectory:
             if version <= _NEWEST_VERSION:
                 raise
             raise UserError(
-                f"{self.path}: {METADATA_FILE} is of version {version} and not read here, where "
-                f"{_NEWEST_VERSION} is the newest: the bag need not be broken"
+                f"{self.path}: {METADATA_FILE} has version {version}, supported up to version "
+                f"{_NEWEST_VERSION}; the bag may be intact"
             ) from error
         self._compare(total)
 
@@ -187,9 +187,9 @@ class BagDirectory:
         mode = str(information.get("compression_mode") or "none").lower()
         packing = str(information.get("compression_format") or "zstd").lower()
         if kind not in ("mcap", "sqlite3"):
-            raise UserError(f"{self.path}: its storage {kind!r} is not read here")
+            raise UserError(f"{self.path}: its storage {kind!r} is not supported")
         if mode != "none" and packing != "zstd":
-            raise UserError(f"{self.path}: its compression {packing!r} is not read here")
+            raise UserError(f"{self.path}: its compression {packing!r} is not supported")
         return kind
 
     def _open(self, path: Path, kind: str) -> McapFile | SqliteData:
@@ -214,7 +214,7 @@ class BagDirectory:
             metadata = entry["topic_metadata"]
             name, type_name = str(metadata["name"]), str(metadata["type"])
             if metadata.get("serialization_format", "cdr") != "cdr":
-                raise UserError(f"{self.path}: {name} is not in CDR, which alone is read here")
+                raise UserError(f"{self.path}: {name} is not in CDR, the only supported encoding")
             known = self.topics.get(name)
             if known is not None and known.type_name != type_name:
                 raise UserError(
@@ -233,6 +233,6 @@ class BagDirectory:
             found.update(file.counts())
         if +self.counts != +found or total != found.total():
             raise ValueError(
-                f"{METADATA_FILE} tells of {self.counts.total()} messages, the data of "
+                f"{METADATA_FILE} lists {self.counts.total()} messages, the data has "
                 f"{found.total()}, or of others"
             )

@@ -45,7 +45,7 @@ def recover_hint(path: Path) -> str:
 def repair_hint(path: Path) -> str:
     """Return the command that repairs a bag, by the type of its files."""
     if any(path.glob("*.db3*")) and not any(path.glob("*.mcap")):
-        return f"`recover` mends MCAP only; SQLite has `ros2 bag reindex {path}`"
+        return f"`recover` repairs MCAP only; SQLite needs `ros2 bag reindex {path}`"
     return recover_hint(path)
 
 

@@ -61,7 +61,7 @@ class McapFile:
             self._reader = SeekingReader(self._stream, validate_crcs=True)
             self._stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
             if self._stream.read() != MCAP0_MAGIC:
-                raise BrokenMcapError("it has no end: the recording was cut off")
+                raise BrokenMcapError("it has no footer: the recording was cut off")
             summary = self._reader.get_summary()
             if summary is None or summary.statistics is None:
                 raise BrokenMcapError("it has no index")
@@ -133,7 +133,7 @@ class McapFile:
         listed = {topic: n for topic, n in self.counts().items() if n and topic in topics}
         if start <= first and last < stop and read_counts != listed:
             raise BrokenMcapError(
-                f"it holds {read_counts.total()} messages of these topics, its index tells of "
+                f"it holds {read_counts.total()} messages of these topics, its index lists "
                 f"{sum(listed.values())}, or of others"
             )
 

@@ -88,7 +88,7 @@ def read_calibration(path: Path) -> str:
     text = read_text(path)
     if kind := foreign_format(text):
         raise UserError(
-            f"calibration {path} is {kind}: it does not say where rig and phantom are; "
+            f"calibration {path} is {kind}: it does not contain the places of rig and phantom; "
             "`calibrate_stereo --lenses` takes it, see docs/calibration.md"
         )
     return text

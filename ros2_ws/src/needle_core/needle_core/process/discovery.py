@@ -64,13 +64,13 @@ def clean_environment(
     if no_domain and not own_graph:
         raise UserError(f"ROS_DOMAIN_ID={domain} is not a number from 0 to {_LAST_DOMAIN}")
     profiles = Path(environment.get(PROFILES) or THIS_MACHINE)
-    decides = "it decides who is reached" if profiles.is_file() else ""
+    decides = "it decides which nodes are reached" if profiles.is_file() else ""
     # Variable, whether to warn, whether to remove it, effect.
     for name, is_reported, is_removed, effect in (
         ("ROS_DOMAIN_ID", no_domain, True, f"it is not a number from 0 to {_LAST_DOMAIN}"),
-        (DISCOVERY_RANGE, reach == _OFF, own_graph, "with it, no node finds another"),
-        ("ROS_DISCOVERY_SERVER", True, closed or own_graph, "with it, nodes meet at a server only"),
-        ("ROS_LOCALHOST_ONLY", local_only, True, "nodes keep to this machine in any case"),
+        (DISCOVERY_RANGE, reach == _OFF, own_graph, "it prevents nodes from finding each other"),
+        ("ROS_DISCOVERY_SERVER", True, closed or own_graph, "it limits discovery to a server"),
+        ("ROS_LOCALHOST_ONLY", local_only, True, "nodes stay on this machine in any case"),
         ("ROS_STATIC_PEERS", closed, True, f"{DISCOVERY_RANGE}={reach} looks for none"),
         ("FASTDDS_DEFAULT_PROFILES_FILE", True, True, f"Fast DDS reads {PROFILES}"),
         (PROFILES, profiles.name not in _OURS, not decides, decides or "no such file"),

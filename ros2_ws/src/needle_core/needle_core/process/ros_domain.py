@@ -15,7 +15,7 @@ from needle_core.errors import UserError
 from needle_core.process.shared_memory import remove_dead_ports, remove_incomplete_ports
 
 # Hint shown when two devices conflict.
-CONFLICT_HINT = "end one of the two, or give one a ROS_DOMAIN_ID of its own"
+CONFLICT_HINT = "stop one of the two, or give one its own ROS_DOMAIN_ID"
 # Length of an abstract socket's name [bytes].
 _MAX_NAME = 107
 _NAMES = Path("/proc/net/unix")
@@ -114,7 +114,7 @@ def reserve_domain_id() -> Iterator[int]:
                 finally:
                     remove_dead_ports(ports_of(domain))
                 return
-    raise UserError("no free ROS_DOMAIN_ID on this machine: is anything left running?")
+    raise UserError("no free ROS_DOMAIN_ID on this machine: check for processes left running")
 
 
 def ports_of(domain: int) -> range:

@@ -169,7 +169,9 @@ class ComponentNode(WholeNode):
             try:
                 self._claims.append(Claim(name, self.get_fully_qualified_name()))
             except UserError as error:
-                raise UserError(f"another {row.topic} is there: {error}; {CONFLICT_HINT}") from None
+                raise UserError(
+                    f"another publisher of {row.topic} is running: {error}; {CONFLICT_HINT}"
+                ) from None
             self.context.on_shutdown(self._claims[-1].release)
         kind = self._types.make(ros_type(row.message))
         return self.create_publisher(kind, self._name_of(row.topic), to_qos(row.delivery))
@@ -178,7 +180,7 @@ class ComponentNode(WholeNode):
         def on_incompatible(_: Any) -> None:
             policy = "transient_local" if row.delivery.latched else "reliable"
             option = "durability" if row.delivery.latched else "reliability"
-            why = f"a publisher's QoS does not fit: --qos-{option} {policy} does"
+            why = f"a publisher's QoS is incompatible: --qos-{option} {policy} does"
             self._diagnostics.reject(row.topic, "incompatible QoS", why)
 
         kind = self._types.make(ros_type(row.message))

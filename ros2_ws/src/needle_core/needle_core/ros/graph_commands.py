@@ -103,7 +103,7 @@ def _fill(message: Any, values: Any) -> list[Any]:
             try:
                 setattr(message, name, _converted(value, field, types[name], stamps))
             except (AssertionError, TypeError, ValueError, OverflowError) as error:
-                raise CommandError(f"{name}: {value!r} is no {types[name]}") from error
+                raise CommandError(f"{name}: {value!r} is not a {types[name]}") from error
     return stamps
 
 

@@ -140,8 +140,8 @@ def run_component(
 
 def _hint(argument: str) -> str:
     if ":=" in argument:
-        return f"a parameter is set by --ros-args -p {argument}"
-    return "it goes after --ros-args" if argument in _ROS_OPTIONS else "see --help"
+        return f"set a parameter with --ros-args -p {argument}"
+    return "put it after --ros-args" if argument in _ROS_OPTIONS else "see --help"
 
 
 def _run(

@@ -123,7 +123,7 @@ class VirtualRunner:
         """
         name = component.name
         if name in self._processes:
-            raise ValueError(f"component {name!r} runs already")
+            raise ValueError(f"component {name!r} is already running")
         self.exits.pop(name, None)
         compute = self._compute.get(name, uniform(*COMPUTE))
         process = Process(component, compute, self.timeline, self._execute)

@@ -78,7 +78,7 @@ def check_fields(parameters: Any) -> None:
         if type(value) is not type(default):
             raise UserError(
                 f"{name} = {value!r} is of type {type(value).__name__}, "
-                f"wants {type(default).__name__}"
+                f"expected {type(default).__name__}"
             )
         for element in value if isinstance(value, tuple) else (value,):
             if isinstance(element, (int, float)) and not isinstance(element, bool):

@@ -158,8 +158,8 @@ def check_command_line(words: Sequence[str], node: str) -> list[str]:
     for name, source in overrides.items():
         if winners[name] != source:
             raise UserError(
-                f"{source} does not reach {node}, {winners[name]} wins: "
-                "write '/**' behind all other sections, and -p behind all files"
+                f"{source} does not reach {node}, {winners[name]} overrides it: "
+                "put '/**' after all other sections, and -p after all files"
             )
     return warnings
 
@@ -208,7 +208,7 @@ def _sections(path: Path, content: Mapping[Any, Any], above: str = "") -> Iterat
         # rcl compares only the beginning of the key.
         is_section = str(key).startswith(_SECTION)
         if not isinstance(value, Mapping):
-            wrong = "wants NAME: VALUE pairs" if is_section else f"stands outside {_SECTION}"
+            wrong = "needs NAME: VALUE pairs" if is_section else f"is outside {_SECTION}"
             raise UserError(f"{path}: '{name}' {wrong}")
         yield from [(above, value)] if is_section else _sections(path, value, name)
 
@@ -225,7 +225,7 @@ def _unique(where: object, pairs: Iterable[tuple[str, T]]) -> dict[str, T]:
     found: dict[str, T] = {}
     for name, value in pairs:
         if name in found:
-            raise UserError(f"{where}: '{name}' stands there twice")
+            raise UserError(f"{where}: '{name}' is a duplicate")
         found[name] = value
     return found
 

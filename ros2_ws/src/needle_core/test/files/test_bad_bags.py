@@ -53,9 +53,9 @@ def test_a_message_of_another_type_is_refused(bag: Path) -> None:
     file = plain(bag, use_chunking=False)
     first = struct.pack("<QQ", 1000, 1)
     file.write_bytes(file.read_bytes().replace(first + payload(0), first + b"\x07" * 8))
-    assert "a message of /a does not fit its definition" in reason(bag)
+    assert "a message of /a does not match its definition" in reason(bag)
     write_mcap(file, encoding="json")
-    with pytest.raises(UserError, match="/a is not in CDR, which alone is read here"):
+    with pytest.raises(UserError, match="/a is not in CDR, the only supported encoding"):
         read(file)
 
 
@@ -94,8 +94,8 @@ def test_an_incomplete_bag_is_reported_with_its_remedy(bag: Path, tmp_path: Path
         ({"compression_mode": "FILE", "compression_format": "lz4"}, "compression 'lz4'"),
         ({"compression_mode": "MESSAGE", "compression_format": "br"}, "compression 'br'"),
         ({"storage_identifier": "my_storage"}, "storage 'my_storage'"),
-        ({"version": 10, "relative_file_paths": None}, "metadata.yaml is of version 10"),
-        ({"version": 10, "topics_with_message_count": [{"topic": "/a"}]}, "of version 10"),
+        ({"version": 10, "relative_file_paths": None}, "metadata.yaml has version 10"),
+        ({"version": 10, "topics_with_message_count": [{"topic": "/a"}]}, "has version 10"),
         ({"version": 10, "message_count": None, "topics_with_message_count": 3}, "version 10"),
     ],
 )
@@ -114,4 +114,6 @@ def test_a_truncated_sqlite_bag_is_refused_with_another_remedy(tmp_path: Path) -
     bag = rosbag(tmp_path / "bag", StoragePlugin.SQLITE3)
     (file,) = bag.glob("*.db3")
     file.write_bytes(file.read_bytes()[:5000])
-    assert refusal(bag).endswith(f"`recover` mends MCAP only; SQLite has `ros2 bag reindex {bag}`")
+    assert refusal(bag).endswith(
+        f"`recover` repairs MCAP only; SQLite needs `ros2 bag reindex {bag}`"
+    )

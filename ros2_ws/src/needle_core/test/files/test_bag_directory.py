@@ -115,7 +115,7 @@ def test_an_index_with_other_messages_is_rejected(tmp_path: Path, chunked: bool)
             mcap.add_message(1 + number % 2, 1000 + number, payload(number), 1, number)
         mcap._Writer__statistics.channel_message_counts = {1: COUNT - 1, 2: 1}  # type: ignore[attr-defined]
         mcap.finish()  # type: ignore[no-untyped-call]
-    assert "its index tells of 60, or of others" in reason(file)
+    assert "its index lists 60, or of others" in reason(file)
 
 
 def test_metadata_with_other_messages_are_rejected(bag: Path) -> None:

@@ -71,16 +71,16 @@ def test_profiles_of_the_users_own_stay_and_are_named(
         environment = {PROFILES: own}
         restrict_discovery(environment, shared_memory=shared_memory)
         assert environment == {DISCOVERY_RANGE: "LOCALHOST", PROFILES: own}
-        assert capsys.readouterr().err == f"{PROFILES}={own}: it decides who is reached\n"
+        assert capsys.readouterr().err == f"{PROFILES}={own}: it decides which nodes are reached\n"
 
 
 @pytest.mark.parametrize(
     ("variable", "value", "effect"),
     [
         ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp", "the rig's nodes run on rmw_fastrtps_cpp"),
-        (SERVER, "10.0.0.1:11811", "with it, nodes meet at a server only"),
+        (SERVER, "10.0.0.1:11811", "it limits discovery to a server"),
         ("ROS_STATIC_PEERS", "10.0.0.1", f"{DISCOVERY_RANGE}=LOCALHOST looks for none"),
-        (LOCALHOST_ONLY, "1", "nodes keep to this machine in any case"),
+        (LOCALHOST_ONLY, "1", "nodes stay on this machine in any case"),
         ("FASTDDS_DEFAULT_PROFILES_FILE", "/mine.xml", f"Fast DDS reads {PROFILES}"),
         (PROFILES, "/not/there.xml", "no such file"),
     ],
@@ -102,8 +102,8 @@ def test_variables_that_ask_for_a_network_stay_and_are_reported(
     assert kept(**asked) == {**asked, PROFILES: str(NETWORK)}
     assert kept(**{DISCOVERY_RANGE: "OFF"})[DISCOVERY_RANGE] == "OFF"
     assert capsys.readouterr().err.splitlines() == [
-        f"{SERVER}=a:1: with it, nodes meet at a server only",
-        f"{DISCOVERY_RANGE}=OFF: with it, no node finds another",
+        f"{SERVER}=a:1: it limits discovery to a server",
+        f"{DISCOVERY_RANGE}=OFF: it prevents nodes from finding each other",
     ]
 
 

@@ -108,8 +108,8 @@ def test_arguments_are_explained_or_rejected_before_the_start(
         assert capsys.readouterr().out.startswith("HELP\n")
     for words, said in (
         (("--fast",), "'--fast'; see --help"),
-        (("-p", "x:=1"), "'-p'; it goes after --ros-args"),
-        (("rate:=1", "--ros-args", "-p", "other:=1"), "is set by --ros-args -p rate:=1"),
+        (("-p", "x:=1"), "'-p'; put it after --ros-args"),
+        (("rate:=1", "--ros-args", "-p", "other:=1"), "set a parameter with --ros-args -p rate:=1"),
         (("--ros-args", "--params-file", "none.yaml"), "none.yaml: cannot be read"),
     ):
         assert run(None, *words) == 2

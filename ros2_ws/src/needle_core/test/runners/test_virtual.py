@@ -287,7 +287,7 @@ def test_a_frozen_component_keeps_its_queue_and_a_timer_fires_once(
 def test_a_killed_component_loses_its_state_and_is_dropped_after_its_lease() -> None:
     sender, receiver, late = Sender(delivery=LATCHED), Receiver(), Receiver("late")
     runner = VirtualRunner([sender, receiver], seed=1)
-    with pytest.raises(ValueError, match="component 'sender' runs already"):
+    with pytest.raises(ValueError, match="component 'sender' is already running"):
         runner.start(Sender())
     runner.run(1.0)
     count = sender.count

@@ -75,7 +75,7 @@ def test_parameters_are_applied_with_their_types_or_rejected_with_the_node() -> 
     for wrong, said in (
         ({"rate": 100.1}, "rate = 100.1 Hz is outside [1, 100] Hz"),
         ({"rate": 50}, "rate = 50 is not of type float (write 50.0)"),
-        ({"count": True}, "count = True is of type bool, wants int"),
+        ({"count": True}, "count = True is of type bool, expected int"),
         ({"gains": [1.0, -0.1]}, "gains = -0.1 is outside [0, 9]"),
         ({"law": "pdi"}, "law = 'pdi' is not one of mpc, pid"),
         ({"raet": 20.0}, "unknown parameter 'raet' (did you mean 'rate'?)"),

@@ -64,13 +64,13 @@ def test_a_misspelt_node_is_named(file: Path) -> None:
 def test_a_file_that_is_not_a_parameter_file_is_a_one_line_error(file: Path) -> None:
     for text, words in (
         (f"{DRIVES}\nsim_rig: {{}}\n{DRIVES}", "duplicate key 'device_driver' in line 3"),
-        (f"{DRIVES}\n/{DRIVES}", "'/device_driver' stands there twice"),
-        (f"rig1: {{{DRIVES}}}\n/rig1/{DRIVES}", "'/rig1/device_driver' stands there twice"),
-        ("a: {ros__parameters: {x.y: 1, x: {y: 2}}}", "a: 'x.y' stands there twice"),
+        (f"{DRIVES}\n/{DRIVES}", "'/device_driver' is a duplicate"),
+        (f"rig1: {{{DRIVES}}}\n/rig1/{DRIVES}", "'/rig1/device_driver' is a duplicate"),
+        ("a: {ros__parameters: {x.y: 1, x: {y: 2}}}", "a: 'x.y' is a duplicate"),
         ("[1, 2", "not YAML in line 2"),
         ("just text", "not a ROS parameter file"),
-        ("a: {ros_parameters: {x: 1}}", "'a/ros_parameters/x' stands outside ros__parameters"),
-        ("a: {ros__parameters: [1]}", "'a/ros__parameters' wants NAME: VALUE pairs"),
+        ("a: {ros_parameters: {x: 1}}", "'a/ros_parameters/x' is outside ros__parameters"),
+        ("a: {ros__parameters: [1]}", "'a/ros__parameters' needs NAME: VALUE pairs"),
     ):
         file.write_text(text)
         with pytest.raises(UserError) as caught:
@@ -94,7 +94,8 @@ def test_an_override_that_ros_puts_below_a_file_stops_the_node(file: Path) -> No
     with pytest.raises(UserError) as caught:
         checked(file, f"{every}\n{DRIVES}", "/device_driver", *words)
     assert str(caught.value).startswith(
-        f"-p max_depth:=0.06 does not reach /device_driver, section 'device_driver' of {file} wins:"
+        "-p max_depth:=0.06 does not reach /device_driver, section 'device_driver' of "
+        f"{file} overrides it:"
     )
 
 

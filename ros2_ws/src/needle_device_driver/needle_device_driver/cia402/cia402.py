@@ -168,4 +168,4 @@ class TransitionMonitor:
             }
         if state in reachable:
             return ""
-        return f"went from {before.name} to {state.name} by itself"
+        return f"changed from {before.name} to {state.name} without a command"

@@ -159,8 +159,8 @@ class Cia402Axis(Axis):
         bound = settings.magnitude(settings.speed * self._period * 1.01) + 1
         if step > bound:
             raise AxisError(
-                f"{self.name} axis: set-point {step / settings.counts_per_unit:.6g} ahead in a "
-                f"cycle at {speed:.6g}/s, at most {bound / settings.counts_per_unit:.6g}",
+                f"{self.name} axis: set-point step of {step / settings.counts_per_unit:.6g} in a "
+                f"cycle at {speed:.6g}/s, limit {bound / settings.counts_per_unit:.6g}",
                 Rule.LOOK_AHEAD,
             )
         self._machine.target = counts
@@ -234,7 +234,7 @@ class Cia402Axis(Axis):
             with self._as_axis_error():
                 self._machine.set_goal(Goal.OFF)
                 if not (yield from self._switch_off_now()):
-                    raise DriveError("does not say that it is off; its watchdog will switch it off")
+                    raise DriveError("does not confirm power-off; its watchdog will switch it off")
                 yield from disarm_watchdog(self._link, self._settings)
         finally:
             self._configured = False
@@ -351,7 +351,7 @@ class Cia402Axis(Axis):
         yield from arm_watchdog(self._link, self._settings, self._watchdog)
         if self.monitor.rebooted:
             # The reboot has undone the first part of the set-up.
-            raise DriveError(f"node {self._settings.node_id} started anew while it was set up")
+            raise DriveError(f"node {self._settings.node_id} rebooted during set-up")
         self.monitor.end_set_up()
         self._opening = self._link.openings
         yield from self._refresh()

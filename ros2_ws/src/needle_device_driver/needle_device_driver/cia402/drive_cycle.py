@@ -109,7 +109,7 @@ class DriveCycle:
         elif not link.is_open:
             level, message = Level.WARN, waiting
         elif count:
-            level, message = Level.WARN, f"{count} SYNCs were not answered in their cycle"
+            level, message = Level.WARN, f"{count} SYNCs had no reply within their cycle"
         return Diagnostic(level, message, values)
 
     def probe(self) -> Procedure[str]:

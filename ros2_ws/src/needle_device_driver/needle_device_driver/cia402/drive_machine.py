@@ -170,7 +170,7 @@ class DriveMachine:
         self.at = at
         state = self.state
         if state is None:
-            self._set_problem(f"says 0x{at.statusword:04X}, no statusword of CiA 402")
+            self._set_problem(f"reports 0x{at.statusword:04X}, not a CiA 402 statusword")
             return
         self._set_problem(self._transitions.unexplained(state))
         follows = at.mode == Mode.CYCLIC_SYNCHRONOUS_POSITION
@@ -202,8 +202,8 @@ class DriveMachine:
             distance = abs(self._track[-1] - self._track[0])
             when = "in its quick stop" if state is DriveState.QUICK_STOP_ACTIVE else "when stopped"
             self._set_problem(
-                f"runs on {when} ({distance} counts in {_WINDOW * self._period:g} s) and is "
-                "switched off: its ramp 0x6085, the ramp's unit"
+                f"keeps moving {when} ({distance} counts in {_WINDOW * self._period:g} s) and is "
+                "switched off: check the ramp 0x6085 and its unit"
             )
 
     def _check_switching(self, state: DriveState) -> None:
@@ -232,7 +232,7 @@ class DriveMachine:
             self._set_problem(
                 f"is not {self._goal.value} after {_MAX_SWITCHING * self._period:g} s: "
                 f"{state.name}, mode {self.at.mode}"
-                + ("" if self.at.statusword & REMOTE else ", not under the bus's control (bit 9)")
+                + ("" if self.at.statusword & REMOTE else ", not under remote control (bit 9)")
             )
 
     def _next_command(self) -> DriveCommand:

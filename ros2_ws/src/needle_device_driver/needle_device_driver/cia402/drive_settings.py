@@ -86,7 +86,7 @@ class DriveSettings:
         """
         check_bounded_fields(self)
         if self.homing_method not in HOMING_METHODS:
-            raise UserError(f"homing_method = {self.homing_method} is none of CiA 402's")
+            raise UserError(f"homing_method = {self.homing_method} is not a CiA 402 method")
         if not self.lower < self.upper:
             raise OutOfBoundsError("lower", self.lower, -math.inf, self.upper, "SI")
 

@@ -33,12 +33,12 @@ _MODE_TIMEOUT = 0.5
 _UNUSED_PDOS = (0x1802, 0x1803)
 _FIRST_TRANSMIT_PDO = 0x1800
 
-_LEFT_OUT = "has no {}: check on the rig what it does there (docs/hardware.md)"
-_KEPT = "keeps its own {} (refused {}): check on the rig what it does there (docs/hardware.md)"
-NO_INPUTS = "has no digital inputs to map: a retraction ends at 0 only, not at the switch"
+_LEFT_OUT = "has no {}: check the effect on the rig (docs/hardware.md)"
+_KEPT = "keeps its own {} (refused {}): check the effect on the rig (docs/hardware.md)"
+NO_INPUTS = "has no digital inputs to map: a retraction ends at 0, not at the switch"
 _NO_FOLLOWING_ERROR = (
-    "has no following error to map: an axis that is stopped while it is blocked is pulled on by up "
-    "to the following error window when it comes free"
+    "has no following error to map: an axis that stops while it is blocked can move by up to the "
+    "following error window when it is freed"
 )
 
 
@@ -80,7 +80,7 @@ def set_up(
     profile = (yield from access.read(od.DEVICE_TYPE)) & 0xFFFF
     monitor.clear_reboot()
     if profile != od.CIA402:
-        raise DriveError(f"node {node} is of device profile {profile}, wanted {od.CIA402}")
+        raise DriveError(f"node {node} has device profile {profile}, expected {od.CIA402}")
     # The loop does not run during the set-up, so the watchdog must be off.
     yield from access.write(od.CONSUMER_HEARTBEAT, 0)
     settings, assumed = yield from read_units(access, settings)
@@ -120,7 +120,7 @@ def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) 
 def write_homing(access: ObjectAccess, settings: DriveSettings, speed: float) -> Procedure[None]:
     """Write the speeds of a homing; `speed` [unit/s] is at least one of the drive's units."""
     if speed * settings.counts_per_unit < settings.speed_unit:
-        raise DriveError(f"homing at {speed:g}/s is less than one of the drive's units of speed")
+        raise DriveError(f"homing at {speed:g}/s is less than one speed unit of the drive")
     yield from access.write(od.HOMING_SPEED_SWITCH, settings.magnitude(speed, settings.speed_unit))
     # Leave the switch slowly: its edge defines the position.
     yield from access.write(

@@ -55,11 +55,11 @@ def read_units(
     ramp = yield from _counts_in(access, settings, od.RAMP_UNIT)
     factor = (yield from _ratio(access, od.SPEED_FACTOR)) if speed is None else None
     if factor not in (None, 1.0):
-        raise DriveError(f"the drive scales speeds by {factor:g} (0x6096), wanted counts/s")
+        raise DriveError(f"the drive scales speeds by {factor:g} (0x6096), expected counts/s")
     ramps = "counts/s^2" if speed is None else "the unit of its speeds per second"
     assumptions = ["counts/s (0x60A9)"] * (speed is None) + [f"{ramps} (0x60AA)"] * (ramp is None)
     assumed = (
-        f"does not tell its units; assumed: {', '.join(assumptions)}; "
+        f"does not report its units; assumed: {', '.join(assumptions)}; "
         "home it without a needle first (docs/hardware.md)"
     )
     speed = speed or 1.0
@@ -95,14 +95,14 @@ def _counts_in(
         unit_text = f"{scale}{unit} (0x{entry.index:04X} = 0x{code:08X})"
         hint = "; *_counts_per_turn converts rpm without 0x608F" if turns else ""
         raise DriveError(
-            f"the drive counts {what} in {unit_text}, wanted {' or '.join(wanted)}{hint}"
+            f"the drive measures {what} in {unit_text}, expected {' or '.join(wanted)}{hint}"
         )
     feed = None
     if turns and not settings.counts_per_turn:
         feed = yield from _ratio(access, od.FEED_CONSTANT)
     if feed and round(feed / turn, 6) != 1.0:
         both = f"{turn:g} (0x608F, 0x6091) and {feed:g} (0x6092)"
-        raise DriveError(f"the drive tells {both} counts in a turn: *_counts_per_turn says which")
+        raise DriveError(f"the drive reports {both} counts per turn: set *_counts_per_turn")
     return 10.0**power * turn / 60.0
 
 

@@ -97,7 +97,7 @@ def arm_watchdog(link: FrameLink, settings: DriveSettings, watchdog: float) -> P
 
 
 def disarm_watchdog(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
-    """Switch the drive's watchdog off before the driver ends; raises as `set_up`."""
+    """Switch the drive's watchdog off before shutting down; raises as `set_up`."""
     if settings.actuated:
         yield from ObjectAccess(link, settings.node_id).write(od.CONSUMER_HEARTBEAT, 0)
 
@@ -134,7 +134,7 @@ def reset_fault(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
 
     state = drive_state((yield from access.read(od.STATUSWORD)))
     if settings.actuated and state in POWERED:
-        raise DriveError("is still stopping: reset again when it stands")
+        raise DriveError("is still stopping: reset again after it stops")
     if state not in FAULTS:
         return
     # A rising edge of the bit acknowledges the fault.

@@ -97,8 +97,8 @@ class SpeedMonitor:
         self._fast_cycles = self._fast_cycles + 1 if is_fast else 0
         if self._fast_cycles >= _MAX_FAST_CYCLES and not self.problem:
             self.problem = (
-                f"moves at {settings.text(speed)}/s, at most {settings.text(bound)}/s where "
-                f"{settings.text(commanded)}/s are commanded"
+                f"moves at {settings.text(speed)}/s, limit {settings.text(bound)}/s at "
+                f"{settings.text(commanded)}/s commanded"
             )
         return not is_fast
 
@@ -182,13 +182,13 @@ class HomingRun:
         distance = abs(self._travelled) / settings.counts_per_unit
         if distance > self._longest:
             self.problem = (
-                f"went {settings.text(distance)} without finding its home, at most "
+                f"moved {settings.text(distance)} without finding home, limit "
                 f"{settings.text(self._longest)}"
             )
         elif self._travelled * self._towards < 0 and distance > settings.following_error:
             self.problem = (
-                f"went {settings.text(distance)} away from the limit switch of homing method "
-                f"{settings.homing_method}: direction of the motor, of the switches?"
+                f"moved {settings.text(distance)} away from the limit switch of homing method "
+                f"{settings.homing_method}: check the directions of motor and switches"
             )
 
 

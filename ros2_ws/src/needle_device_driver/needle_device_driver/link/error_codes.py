@@ -79,7 +79,7 @@ _ERROR_CLASSES = {
     0x7: "additional modules",
     0x8: "monitoring",
     0x9: "external error",
-    0xF: "error of the vendor's own",
+    0xF: "vendor-specific error",
 }
 
 

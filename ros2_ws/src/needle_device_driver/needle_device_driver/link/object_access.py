@@ -124,7 +124,9 @@ class ObjectAccess:
         got = yield from self.read(entry)
         lower, upper = accepted or (value, value)
         if not lower <= got <= upper:
-            raise DriveError(f"node {self._node_id} took {value} for {entry} and has {got}")
+            raise DriveError(
+                f"node {self._node_id} was set to {value} at {entry} but reads back {got}"
+            )
 
     def write_optional(self, entry: Entry, value: int) -> Procedure[None]:
         """Write an entry; a refusal is ignored."""
@@ -160,13 +162,12 @@ class ObjectAccess:
     def _error(self, action: str, entry: Entry, error: Exception) -> DriveError:
         if isinstance(error, SdoAbortedError):
             return DriveRefusalError(
-                f"node {self._node_id} refuses to {action} {entry}: {error} "
-                "(docs/hardware.md says what for)",
+                f"node {self._node_id} refuses to {action} {entry}: {error} (see docs/hardware.md)",
                 error.code,
             )
         if isinstance(error, ValueError):
             return DriveError(f"node {self._node_id} sends {error}")
         hint = (
-            "; the adapter refuses what it is told: bitrate, wiring?" if self._link.refused else ""
+            "; the adapter rejects commands: check bitrate and wiring" if self._link.refused else ""
         )
         return DriveError(f"node {self._node_id} does not answer ({action} {entry}){hint}")

@@ -67,7 +67,7 @@ class Entry:
             If bytes are missing.
         """
         if len(data) < self.size:
-            raise ValueError(f"{self}: {len(data)} bytes, wanted {self.size}")
+            raise ValueError(f"{self}: {len(data)} bytes, expected {self.size}")
         value: int = struct.unpack(self.format, data[: self.size])[0]
         return value
 
@@ -193,7 +193,7 @@ class Pdo:
         """
         formats = "<" + "".join(entry.format[-1] for entry in self.entries)
         if len(data) != struct.calcsize(formats):
-            raise ValueError(f"PDO of {len(data)} bytes, wanted {struct.calcsize(formats)}")
+            raise ValueError(f"PDO of {len(data)} bytes, expected {struct.calcsize(formats)}")
         return struct.unpack(formats, data)
 
 

@@ -102,7 +102,7 @@ class SlcanBus(slcanBus):
                 data = data[_write_without_waiting(port, data) :]
                 wait = max(0.0, deadline - time.monotonic())
                 if data and not select.select([], [port], [], wait)[1]:
-                    raise CanOperationError(f"takes nothing for {self._write_timeout:g} s")
+                    raise CanOperationError(f"accepted no data for {self._write_timeout:g} s")
         except (serial.SerialException, OSError, TypeError, ValueError) as error:
             # pyserial raises TypeError if another thread has closed the port.
             raise CanOperationError(str(error)) from error

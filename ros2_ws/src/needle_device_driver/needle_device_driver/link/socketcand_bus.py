@@ -88,13 +88,13 @@ class SocketcandBus(BusABC):
         try:
             self._socket.sendall(message.encode("ascii"))
         except TimeoutError:
-            raise CanOperationError(f"takes nothing for {self._write_timeout:g} s") from None
+            raise CanOperationError(f"accepted no data for {self._write_timeout:g} s") from None
 
     def _expect(self, reply: str) -> None:
         received = self._read_message(_REPLY_TIMEOUT)
         if received != reply:
             got = "nothing" if received is None else repr(received)
-            raise CanInitializationError(f"no socketcand: wanted {reply!r}, got {got}")
+            raise CanInitializationError(f"not a socketcand server: expected {reply!r}, got {got}")
 
     def _read_message(self, timeout: float | None) -> str | None:
         """Return the next message, from < to >; None if none arrives in time."""
@@ -109,7 +109,7 @@ class SocketcandBus(BusABC):
     def _read_block(self) -> None:
         data = self._socket.recv(4096)
         if not data:
-            raise CanOperationError("the server hung up")
+            raise CanOperationError("the server closed the connection")
         # Acknowledge at once: by default, Linux waits for the next frame that is sent.
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         *complete, self._buffer = (self._buffer + data).split(b">")

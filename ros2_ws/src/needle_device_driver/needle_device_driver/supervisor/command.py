@@ -82,7 +82,7 @@ def check_command(
     """
     if context.publishers > 1:
         return Refusal(
-            Rule.COMMAND_ONE_PUBLISHER, f"{context.publishers} nodes publish commands, wanted 1"
+            Rule.COMMAND_ONE_PUBLISHER, f"{context.publishers} nodes publish commands, expected 1"
         )
     refusal = check_form(command) or _check_age(context, limits)
     if refusal is not None:
@@ -109,13 +109,13 @@ def check_form(command: Trajectory) -> Refusal | None:
     if set(names) != {INSERTION_JOINT, ROTATION_JOINT} or len(names) != 2:
         return Refusal(
             Rule.COMMAND_FORM,
-            f"joints {sanitize_list(names)}, wanted {INSERTION_JOINT}, {ROTATION_JOINT}",
+            f"joints {sanitize_list(names)}, expected {INSERTION_JOINT}, {ROTATION_JOINT}",
         )
     if not 0 < len(points) <= MAX_POINTS:
-        return Refusal(Rule.COMMAND_FORM, f"{len(points)} points, wanted 1 to {MAX_POINTS}")
+        return Refusal(Rule.COMMAND_FORM, f"{len(points)} points, expected 1 to {MAX_POINTS}")
     for point in points:
         if len(point.positions) != len(names):
-            return Refusal(Rule.COMMAND_FORM, f"{len(point.positions)} positions, wanted 2")
+            return Refusal(Rule.COMMAND_FORM, f"{len(point.positions)} positions, expected 2")
         if not all(map(math.isfinite, (*point.positions, *point.others, point.time_from_start))):
             return Refusal(Rule.COMMAND_FINITE, "a number is not finite")
     return _check_times(command)
@@ -128,10 +128,10 @@ def _check_times(command: Trajectory) -> Refusal | None:
         wrong = times[0] if times[0] < earliest else times[-1]
         return Refusal(
             Rule.COMMAND_FORM,
-            f"time_from_start {wrong:g} s, wanted > 0 s and at most {HARD_STEP_TIME_CAP:g} s",
+            f"time_from_start {wrong:g} s, expected > 0 s and at most {HARD_STEP_TIME_CAP:g} s",
         )
     if any(after <= before for before, after in itertools.pairwise(times)):
-        return Refusal(Rule.COMMAND_FORM, "time_from_start does not rise from point to point")
+        return Refusal(Rule.COMMAND_FORM, "time_from_start does not increase from point to point")
     return None
 
 

@@ -106,7 +106,7 @@ class CommandHandler:
             state = self._core.state.value
             return Refusal(Rule.COMMAND_STATE, f"the device is {state}, not {State.HOLDING.value}")
         if self._hold.owner is None:
-            return Refusal(Rule.HOLD_TO_RUN, "nobody holds to run")
+            return Refusal(Rule.HOLD_TO_RUN, "the hold is not pressed")
         # Read the axes again: one may have stopped since the last cycle.
         at = self._core.poll(now)
         if at.age(now) > self._limits.reply_age_limit:

@@ -73,7 +73,7 @@ class CommandStamps:
         last = self._last_ns
         if last is not None and stamp_ns <= last:
             went_back = bool(self._ros_ns) and last > self._ros_ns[-1] + _MAX_LEAD_NS
-            hint = "; ROS time went back, device/reset lets commands in again"
+            hint = "; ROS time jumped back: call device/reset to accept commands again"
             return f"stamp {stamp_ns} ns is not newer than the last, {last} ns" + (
                 hint if went_back else ""
             )

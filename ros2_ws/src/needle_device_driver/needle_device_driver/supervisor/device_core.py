@@ -198,7 +198,7 @@ class DeviceCore:
             )
             if problem is not None:
                 return problem[1]
-            trigger, reason = Trigger.RESET, "reset; enable to go on"
+            trigger, reason = Trigger.RESET, "reset; enable to continue"
         self._fault = self._stop_failures = ""
         self.change_state(trigger, reason)
         return ""

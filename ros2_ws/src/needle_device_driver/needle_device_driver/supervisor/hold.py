@@ -207,5 +207,5 @@ class HoldNotices:
         self._rules[key] = rule
         if rule is None:
             return ""
-        hint = "; device/reset ends this" if ignored and not message.session else ""
-        return f"hold of '{sanitize(message.sender)}' does not count ({rule.value}){hint}"
+        hint = "; call device/reset" if ignored and not message.session else ""
+        return f"hold of '{sanitize(message.sender)}' ignored ({rule.value}){hint}"

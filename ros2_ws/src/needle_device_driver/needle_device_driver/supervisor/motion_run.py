@@ -187,7 +187,7 @@ class HomingTimes:
         for k, (name, axis) in enumerate(at.by_name.items()):
             self._times[k] += period * axis.moving * (_OFF_SWITCH if axis.at_home_switch else 1)
             if self._times[k] > self._longest[k]:
-                return f"no home switch of the {name} axis in {self._longest[k]:.0f} s"
+                return f"the {name} axis did not find its home switch in {self._longest[k]:.0f} s"
         return ""
 
 

@@ -59,7 +59,7 @@ class NoticeLimit:
         self._count[rule] = self._count.get(rule, 0) + 1
         if self._count[rule] > MAX_NOTICES:
             return ""
-        return f"{notice} ({dropped} more were not told)" if dropped else str(notice)
+        return f"{notice} ({dropped} more not logged)" if dropped else str(notice)
 
 
 @dataclasses.dataclass(frozen=True)

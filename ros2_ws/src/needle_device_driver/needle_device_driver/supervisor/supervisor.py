@@ -261,13 +261,13 @@ class MotionSupervisor:
         if self._core.state is not State.HOLDING:
             return self._wrong_state(State.HOLDING)
         if self._hold.owner is None:
-            return ServiceResult(False, "press and keep the hold first")
+            return ServiceResult(False, "press the hold first and keep it pressed")
         at = self._core.poll(now)
         if not at.powered:
             return ServiceResult(False, "the axes are not powered yet")
         if not self._axes.insertion.actuated:
             return ServiceResult(
-                False, "the insertion axis is moved by hand: draw the needle out by hand"
+                False, "the insertion axis is moved by hand: withdraw the needle by hand"
             )
         distance = self._core.retraction_distance
         if distance <= self._limits.insertion_tolerance or at.insertion.at_home_switch:

@@ -115,7 +115,7 @@ def test_transition_monitor_reports_unexplained_transitions() -> None:
     for _ in range(6):
         watch.note_command(DriveCommand.ENABLE_OPERATION)
     by_itself = watch.unexplained(DriveState.SWITCH_ON_DISABLED)
-    assert by_itself == "went from OPERATION_ENABLED to SWITCH_ON_DISABLED by itself"
+    assert by_itself == "changed from OPERATION_ENABLED to SWITCH_ON_DISABLED without a command"
     assert watch.unexplained(DriveState.FAULT_REACTION_ACTIVE) == ""
     assert watch.unexplained(DriveState.FAULT) == ""
     assert watch.unexplained(DriveState.OPERATION_ENABLED) == ""

@@ -111,7 +111,7 @@ def test_drive_that_moves_on_in_its_quick_stop_is_switched_off(
         assert given[:9] == [DriveCommand.QUICK_STOP] * 9
         late = DriveCommand.DISABLE_VOLTAGE if off else DriveCommand.QUICK_STOP
         assert given[9:] == [late] * 11
-        assert ("runs on in its quick stop" in machine.problem) is off
+        assert ("keeps moving in its quick stop" in machine.problem) is off
         machine.restart(said(DISABLED))
 
 
@@ -150,7 +150,7 @@ def test_drive_that_ignores_the_stop_is_switched_off(machine: DriveMachine) -> N
     machine.stop()
     given = orders(machine, *(said(ENABLED, 100 * count) for count in range(35)))
     assert given == [DriveCommand.QUICK_STOP] * 34 + [DriveCommand.DISABLE_VOLTAGE]
-    assert "runs on when stopped" in machine.problem
+    assert "keeps moving when stopped" in machine.problem
 
 
 def test_fault_is_not_acknowledged_and_unknown_statusword_is_a_problem(
@@ -160,7 +160,7 @@ def test_fault_is_not_acknowledged_and_unknown_statusword_is_a_problem(
     assert orders(machine, said(FAULT)) == [DriveCommand.DISABLE_VOLTAGE]
     assert machine.problem == ""
     machine.update(said(0x0025))
-    assert machine.problem == "says 0x0025, no statusword of CiA 402"
+    assert machine.problem == "reports 0x0025, not a CiA 402 statusword"
     machine.restart(said(DISABLED, 7))
     assert (machine.problem, machine.target, machine.switching) == ("", 7, False)
 
@@ -184,4 +184,4 @@ def test_drive_without_remote_bit_is_reported(
     assert machine.problem == ""
     machine.update(said(statusword))
     assert "is not on after 2 s: SWITCH_ON_DISABLED, mode 8" in machine.problem
-    assert ("not under the bus's control (bit 9)" in machine.problem) is told
+    assert ("not under remote control (bit 9)" in machine.problem) is told

@@ -26,5 +26,5 @@ def test_supported_homing_methods() -> None:
         if method in methods:
             assert dataclasses.replace(SETTINGS, homing_method=method).homing_method == method
         else:
-            with pytest.raises(UserError, match=f"homing_method = {method} is none"):
+            with pytest.raises(UserError, match=f"homing_method = {method} is not a CiA"):
                 dataclasses.replace(SETTINGS, homing_method=method)

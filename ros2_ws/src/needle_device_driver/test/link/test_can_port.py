@@ -63,7 +63,7 @@ class Port:
 
     def fill(self) -> None:
         """Send until the port is lost."""
-        while "takes nothing for 0.001 s" not in self.changes:
+        while "accepted no data for 0.001 s" not in self.changes:
             self.port.send((CanFrame(0x201, bytes(8)),) * 1000)
 
 
@@ -284,7 +284,7 @@ def test_socketcand_passes_frames_and_detects_a_closed_connection(
     port.until(lambda: port.frames == [b"\x37\x02"])
     daemon.peer.close()
     # Detected without sending.
-    port.until(lambda: "the server hung up" in port.changes)
+    port.until(lambda: "the server closed the connection" in port.changes)
     daemon.close()
     daemon = Daemon(monkeypatch)
     port = Port("socketcand")

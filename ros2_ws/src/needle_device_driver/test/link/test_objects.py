@@ -30,10 +30,10 @@ def test_entries_and_pdos_are_packed_little_endian() -> None:
     assert od.POSITION.unpack(b"\xff\xff\xff\xff\x02\x00\x00\x00") == (-1, 2)
     # Extra bytes of an entry are ignored; missing bytes, and any other PDO length, are errors.
     assert od.STATUSWORD.unpack(b"\x37\x02\x00\x00") == 0x0237
-    with pytest.raises(ValueError, match="2 bytes, wanted 4"):
+    with pytest.raises(ValueError, match="2 bytes, expected 4"):
         od.POSITION_ACTUAL.unpack(b"\x00\x00")
     for data in (b"", b"\x37\x02\x08", bytes(8)):
-        with pytest.raises(ValueError, match="wanted 7"):
+        with pytest.raises(ValueError, match="expected 7"):
             od.STATUS.unpack(data)
     for entry, value in ((od.TARGET_POSITION, 2**31), (od.CONTROLWORD, -1)):
         with pytest.raises(OutOfBoundsError, match="outside"):

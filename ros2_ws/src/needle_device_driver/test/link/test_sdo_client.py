@@ -168,5 +168,5 @@ def test_link_counts_errors_passes_frames_and_reports_refusals() -> None:
     link.receive([*frames, CanFrame(0x181, remote=True), CanErrors(2), CanErrors(0, 1)])
     assert heard == [(b"\x01", 1.5), (b"\x02", 2.0)]
     assert (link.error_frames, link.frames_received) == (3, 3)
-    with pytest.raises(DriveError, match=r"does not answer.*the adapter refuses"):
+    with pytest.raises(DriveError, match=r"does not answer.*the adapter rejects"):
         at_once(ObjectAccess(link, 1).read(DEVICE_TYPE))

@@ -192,13 +192,13 @@ def test_one_device_and_command_one_publisher_count_peers() -> None:
     bench = DriverBench().ready()
     bench.set_peers(commands=2)
     bench.step()
-    assert bench.outcomes == ["aborted: 2 nodes publish commands, wanted 1"]
+    assert bench.outcomes == ["aborted: 2 nodes publish commands, expected 1"]
     bench.set_peers()
     bench.run(1, holding=True)
     bench.step()
     bench.set_peers(others=("/sim_rig",))
     assert bench.status.state == "FAULT"
-    assert "another device is there: /sim_rig publishes device/status" in bench.status.fault
+    assert "another device is running: /sim_rig publishes device/status" in bench.status.fault
     bench.hold(False)
     assert not bench.call("reset").success
     assert bench.exits == []
@@ -265,7 +265,7 @@ def test_slow_procedure_is_cancelled(how: str) -> None:
     number = next(bench.numbers)
     bench.perform(bench.services["device/home"](None, number, bench.at))
     bench.run(2)
-    assert bench.call("reset").text == "another order is under way"
+    assert bench.call("reset").text == "another command is running"
     if how == "stop":
         assert bench.call("stop").success
     elif how == "disable":
@@ -276,7 +276,7 @@ def test_slow_procedure_is_cancelled(how: str) -> None:
         bench.run(60)
     reply = bench.answer(number)
     assert not reply.success
-    assert ("called off" if how != "silence" else "no reply") in reply.text
+    assert ("cancelled" if how != "silence" else "no reply") in reply.text
     bench.bus.sent.clear()
     bench.run(20)
     assert not [cob for cob, _ in bench.bus.sent if cob in (0x601, 0x602)]
@@ -306,7 +306,7 @@ def test_internal_error_stops_both_axes(
     monkeypatch.setattr("needle_device_driver.cia402.cia402_axis.write_homing", _breaks)
     with pytest.raises(ZeroDivisionError):
         bench.call("home")
-    assert bench.of(Reply)[-1].text == "called off: internal error"
+    assert bench.of(Reply)[-1].text == "cancelled: internal error"
 
 
 def test_status_rate_is_limited_for_positions() -> None:

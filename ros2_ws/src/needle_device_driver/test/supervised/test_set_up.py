@@ -62,12 +62,12 @@ def makes(index: int, wanted: int, made: int) -> Change:
 
 
 def kept(index: int, wanted: int, made: int) -> tuple[Change, str]:
-    return makes(index, wanted, made), f"took {wanted} for 0x{index:04X}"
+    return makes(index, wanted, made), f"was set to {wanted} at 0x{index:04X}"
 
 
 def in_unit(index: int, code: int, told: str) -> tuple[Change, str]:
     what = {0x60A8: "positions", 0x60A9: "speeds", 0x60AA: "ramps"}[index]
-    text = f"the drive counts {what} in {told} (0x{index:04X} = 0x{code:08X}), wanted counts"
+    text = f"the drive measures {what} in {told} (0x{index:04X} = 0x{code:08X}), expected counts"
     return tells({**TURN, (index, 0): code}), text
 
 
@@ -82,7 +82,7 @@ def fed(*ratio: int) -> Change:
 
 
 REFUSED: list[tuple[Change, str]] = [
-    (tells({(0x1000, 0): 401}), "node 1 is of device profile 401, wanted 402"),
+    (tells({(0x1000, 0): 401}), "node 1 has device profile 401, expected 402"),
     (tells({(0x6502, 0): 0x205}), "node 1 has no homing mode (0x6502 = 0x00000205)"),
     (
         all_of(tells({(0x6502, 0): 0x225}), has(modes={6})),
@@ -99,7 +99,7 @@ REFUSED: list[tuple[Change, str]] = [
     (all_of(lacks(0x6502), refuses(RANGE, 0x6060, but=b"\x06")), "write 8 to 0x6060:0 mode"),
     (all_of(lacks(0x6502), refuses(RANGE, 0x6060, but=b"\x08")), "write 6 to 0x6060:0 mode"),
     (lacks(0x1016), "refuses to write 0 to 0x1016:1 consumer heartbeat time"),
-    (makes(0x1016, 127 << 16 | 100, 0), "0x1016:1 consumer heartbeat time and has 0"),
+    (makes(0x1016, 127 << 16 | 100, 0), "0x1016:1 consumer heartbeat time but reads back 0"),
     (lacks(0x1017), "refuses to write 30 to 0x1017:0"),
     (all_of(tells({(0x1017, 0): 0}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
     (all_of(tells({(0x1017, 0): 201}), refuses(READ_ONLY, 0x1017)), "30 to 0x1017:0"),
@@ -125,7 +125,7 @@ REFUSED: list[tuple[Change, str]] = [
     kept(0x60C2, 20, 10),
     kept(0x607D, -(2**31), 0),
     kept(0x607D, 2**31 - 1, 0),
-    (all_of(tells(IN_RPM), makes(0x6085, 30_000, 60_001)), "took 30000 for 0x6085:0"),
+    (all_of(tells(IN_RPM), makes(0x6085, 30_000, 60_001)), "was set to 30000 at 0x6085:0"),
     # Neither in counts nor in rpm.
     in_unit(0x60A9, 0x0001_0300, "m/s"),
     in_unit(0x60A9, 0xFD01_0300, "10^-3 m/s"),
@@ -140,19 +140,19 @@ REFUSED: list[tuple[Change, str]] = [
     in_unit(0x60AA, RPM, "rpm"),
     in_unit(0x60A8, 0x00B4_0000, "turns"),
     in_unit(0x60A8, 0xFFB5_0000, "10^-1 counts"),
-    (tells({(0x60A9, 0): 0x0001_0300}), "wanted counts/s or rpm"),
+    (tells({(0x60A9, 0): 0x0001_0300}), "expected counts/s or rpm"),
     # Counts per turn unknown or ambiguous; an invalid factor.
     *(
         (
             tells({(0x60A9, 0): RPM} | turn),
-            "speeds in rpm (0x60A9 = 0x00B44700), wanted counts/s; *_counts_per_turn converts rpm",
+            "speeds in rpm (0x60A9 = 0x00B44700), expected counts/s; *_counts_per_turn converts",
         )
         for turn in ({}, {(0x608F, 1): 0, (0x608F, 2): 1}, {(0x608F, 1): 20_000})
     ),
-    (fed(360, 1), "tells 50000 (0x608F, 0x6091) and 360 (0x6092) counts in a turn"),
+    (fed(360, 1), "reports 50000 (0x608F, 0x6091) and 360 (0x6092) counts per turn"),
     (
         all_of(lacks(0x60A9, 0x60AA), tells({(0x6096, 1): 60, (0x6096, 2): 20_000})),
-        "the drive scales speeds by 0.003 (0x6096), wanted counts/s",
+        "the drive scales speeds by 0.003 (0x6096), expected counts/s",
     ),
     # It answers no SYNC.
     (
@@ -208,7 +208,7 @@ def units(speed: int, ramp: int, more: Values, per_speed: float, per_ramp: float
     return tells({(0x60A9, 0): speed, (0x60AA, 0): ramp, **more}), wanted, ""
 
 
-ASSUMED = "does not tell its units; assumed: "
+ASSUMED = "does not report its units; assumed: "
 UNTOLD = f"{ASSUMED}counts/s (0x60A9), counts/s^2 (0x60AA);"
 WIDTHS = {(0x605A, 0): 1, (0x6066, 0): 4, (0x60C2, 1): 2}
 TAKEN: list[Row] = [
@@ -332,14 +332,14 @@ def test_axis_without_motor_needs_only_position_units() -> None:
     assert bench.drives.missing_optional_objects == ()
     bench = DriveBench(insertion_drive="hand")
     bench.insertion.set_objects({(0x60A8, 0): 0x0001_0000})
-    assert "insertion axis: the drive counts positions in m (0x60A8" in bench.refusal()
+    assert "insertion axis: the drive measures positions in m (0x60A8" in bench.refusal()
 
 
 def test_homing_slower_than_one_speed_unit_is_refused() -> None:
     bench = DriveBench(homing_speed=1e-5)
     bench.insertion.set_objects(IN_RPM)
     bench.configured()
-    assert "homing at 1e-05/s is less than one of the drive's units" in bench.home().message
+    assert "homing at 1e-05/s is less than one speed unit" in bench.home().message
     bench.wait(20)
     assert (bench.state, bench.positions) == ("FAULT", (0, 0))
 

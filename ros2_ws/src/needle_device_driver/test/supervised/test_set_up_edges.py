@@ -64,4 +64,4 @@ def test_drive_may_round_a_bound_but_not_halve_it(
         if is_taken:
             assert bench.configured().insertion.value(index) == made
         else:
-            assert f"took {wanted} for 0x{index:04X}" in bench.refusal()
+            assert f"was set to {wanted} at 0x{index:04X}" in bench.refusal()

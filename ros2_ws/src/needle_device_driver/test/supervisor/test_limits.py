@@ -85,5 +85,5 @@ def test_notices_of_one_rule_are_limited_and_counted() -> None:
     assert limit.admit(Notice("late", Rule.HOLD_AGE), 100.9) == "late [hold_age]"
     assert limit.admit(Notice("stopped", Rule.TIP_AGE, fault=True), 100.9) == "stopped [tip_age]"
     assert limit.admit(Notice("by nobody"), 100.9) == "by nobody"
-    assert limit.admit(refused, 101.0) == "refused [tip_age] (994 more were not told)"
+    assert limit.admit(refused, 101.0) == "refused [tip_age] (994 more not logged)"
     assert limit.admit(refused, 101.1) == "refused [tip_age]"

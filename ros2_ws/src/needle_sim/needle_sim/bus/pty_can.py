@@ -116,7 +116,7 @@ class PtyPort:
         try:
             self._claim = Claim(f"needle_pty_{link.absolute()}", "drive_emulator")
         except UserError as error:
-            raise UserError(f"{link}: another emulator is plugged in there") from error
+            raise UserError(f"{link}: another emulator uses this link") from error
         try:
             if link.is_symlink() and str(link.readlink()).startswith("/dev/pts/"):
                 link.unlink()

@@ -187,7 +187,7 @@ class _Entries:
     def parts(self, key: str) -> list[_Entries]:
         values, name = self.get(key), self.name(key)
         if not isinstance(values, list):
-            raise UserError(f"{name} = {values!r} is no list")
+            raise UserError(f"{name} = {values!r} is not a list")
         return [_Entries(value, f"{name}[{number}]") for number, value in enumerate(values)]
 
     def number(
@@ -200,13 +200,13 @@ class _Entries:
     def pixels(self, key: str) -> int:
         value = self.number(key, 1, _MAX_SIDE_PX, "px")
         if not value.is_integer():
-            raise UserError(f"{self.name(key)} = {value:g} px is no whole number")
+            raise UserError(f"{self.name(key)} = {value:g} px is not a whole number")
         return int(value)
 
     def numbers(self, key: str, count: int) -> FloatArray:
         values, name = self.get(key), self.name(key)
         if not isinstance(values, list) or len(values) != count:
-            raise UserError(f"{name} = {values!r} is no list of {count} numbers")
+            raise UserError(f"{name} = {values!r} is not a list of {count} numbers")
         return np.array([_number(value, name) for value in values])
 
     def matrix(self, key: str, rows: int, columns: int) -> FloatArray:
@@ -219,7 +219,7 @@ class _Entries:
 
 def _number(value: object, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise UserError(f"{name} = {value!r} is no finite number")
+        raise UserError(f"{name} = {value!r} is not a finite number")
     return float(value)
 
 
@@ -243,7 +243,7 @@ def _window_of(top: _Entries, own: _Entries) -> SimulatedWindow:
     if ("phantom" in top) == ("window" in own):
         what = "beside phantom" if "phantom" in top else "is missing, and so phantom is missing"
         raise UserError(
-            f"{own.name('window')} {what}: say either phantom, the surface of both, or a window "
+            f"{own.name('window')} {what}: give either phantom, the surface of both, or a window "
             "for each"
         )
     if "phantom" in top:
@@ -258,7 +258,7 @@ def _window_of(top: _Entries, own: _Entries) -> SimulatedWindow:
         raise UserError(f"{window.name('normal')} has length {length:g}, not 1")
     normal = normal / length
     if np.linalg.norm(normal[:2]) < _MIN_ACROSS:
-        raise UserError(f"{window.name('normal')} = {normal.tolist()} lies along the needle")
+        raise UserError(f"{window.name('normal')} = {normal.tolist()} is parallel to the needle")
     layers = window.parts("layers")
     thicknesses = tuple(layer.number("thickness", ABOVE_0, unit="m") for layer in layers)
     indices = [layer.number("refractive_index", *_INDICES) for layer in layers]
@@ -273,7 +273,7 @@ def _camera(own: _Entries, window: SimulatedWindow) -> SimulatedCamera:
         matrix[[1, 2, 2, 2], [0, 0, 1, 2]] != (0.0, 0.0, 0.0, 1.0)
     ):
         name = own.name("camera_matrix")
-        raise UserError(f"{name} = {matrix.ravel().tolist()} is no pinhole matrix")
+        raise UserError(f"{name} = {matrix.ravel().tolist()} is not a pinhole matrix")
     model = own.get("distortion_model")
     if model != "plumb_bob":
         raise UserError(f"{own.name('distortion_model')} = {model!r} is not 'plumb_bob'")

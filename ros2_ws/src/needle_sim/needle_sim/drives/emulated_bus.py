@@ -196,7 +196,7 @@ def execute_command(line: str, bus: EmulatedBus, now: float) -> PlugCommand | No
         case ["emcy", ("insertion" | "rotation") as axis, text] if code := _error_code(text):
             bus.emergency(axis, code)
         case _:
-            raise UserError(f"{line!r} is no command; there are\n{COMMANDS}")
+            raise UserError(f"{line!r} is not a command; known:\n{COMMANDS}")
     return None
 
 

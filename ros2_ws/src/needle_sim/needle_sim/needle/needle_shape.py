@@ -47,7 +47,7 @@ class NeedleShape:
         """Check the lean."""
         if not (0.0 < self.lean < self.bend_angle or self.lean == self.bend_angle == 0.0):
             raise UserError(
-                f"lean = {self.lean:g} rad, wants above 0 and less than the bend of "
+                f"lean = {self.lean:g} rad, expected above 0 and less than the bend of "
                 f"{self.bend_angle:g} rad, or 0 as that"
             )
 

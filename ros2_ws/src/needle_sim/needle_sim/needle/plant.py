@@ -202,7 +202,7 @@ class NeedlePlant:
             raise ValueError(f"d_insertion = {length}, d_rotation = {turned} must be finite")
         if self._channel is None:
             if np.any(length < 0.0):
-                raise ValueError(f"many needles have no path to return on: d_insertion = {length}")
+                raise ValueError(f"many needles cannot retract: d_insertion = {length}")
             self._cut(length, self._torsion.advance(length, turned))
         else:
             self._advance_one(self._channel, float(length), float(turned))
@@ -226,7 +226,7 @@ class NeedlePlant:
             If `spacing` is not positive, or there are many needles.
         """
         if self._channel is None:
-            raise ValueError("only a single needle keeps its path")
+            raise ValueError("only a single needle records its path")
         if not spacing > 0.0:
             raise ValueError(f"spacing = {spacing} m must be above 0")
         insertion = float(self._insertion)

@@ -60,7 +60,7 @@ def load_mitsuba() -> Mitsuba:
         version = drjit.detail.llvm_version()
     except ImportError:
         raise UserError(
-            f"{os.environ[_LIBRARY_VARIABLE]} is no LLVM library that can be used; {_HINT}"
+            f"{os.environ[_LIBRARY_VARIABLE]} is not a usable LLVM library; {_HINT}"
         ) from None
     if version[0] < _MIN_LLVM:
         raise UserError(

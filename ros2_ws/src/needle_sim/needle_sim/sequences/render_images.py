@@ -140,7 +140,7 @@ def parse(arguments: Sequence[str]) -> RenderOptions:
     if given.frames is not None:
         frames = whole_number("--frames", given.frames, 1, 999_999)
     if given.box and given.calibration is not None:
-        raise UserError("--box draws a calibration of its own: --calibration is not for it")
+        raise UserError("--box generates its own calibration: omit --calibration")
     seed = whole_number("--seed", given.seed, 0, 2**31 - 1)
     return RenderOptions(
         output=Path(given.output).expanduser(),

@@ -169,5 +169,5 @@ def test_a_needle_may_be_straight_but_not_lean_farther_than_it_bends() -> None:
     straight = NeedleShape(bend_angle=0.0, lean=0.0)
     np.testing.assert_array_equal(straight.lateral_offset(np.linspace(0.0, 0.1, 50)), 0.0)
     for bend, lean in ((0.1, 0.1), (0.1, 0.0), (0.1, -0.05), (0.0, 0.05)):
-        with pytest.raises(UserError, match=r"lean = \S+ rad, wants above 0 and less than"):
+        with pytest.raises(UserError, match=r"lean = \S+ rad, expected above 0 and less than"):
             NeedleShape(bend_angle=bend, lean=lean)

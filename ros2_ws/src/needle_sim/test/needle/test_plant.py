@@ -199,7 +199,7 @@ def test_an_invalid_parameter_is_rejected_and_changes_nothing() -> None:
     with pytest.raises(ValueError, match="finite"):
         NeedlePlant(np.eye(4), curvature=np.nan)
     many = NeedlePlant(np.tile(np.eye(4), (3, 1, 1)), curvature=CURVATURE)
-    with pytest.raises(ValueError, match="no path to return"):
+    with pytest.raises(ValueError, match="cannot retract"):
         many.advance([0.0, -0.001, 0.0], 0.0)
     with pytest.raises(ValueError, match="single needle"):
         many.centreline(0.001)

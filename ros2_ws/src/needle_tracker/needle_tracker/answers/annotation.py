@@ -24,13 +24,13 @@ _BY_VIEWS = {
 }
 HELP = {
     _BY_VIEWS[False, False]: "light, floor, focus; swapped cameras; `check_calibration`",
-    _BY_VIEWS[True, False]: "light, floor and focus of the right view; what lies over the end",
-    _BY_VIEWS[False, True]: "light, floor and focus of the left view; what lies over the end",
+    _BY_VIEWS[True, False]: "light, floor and focus of the right view; objects over the end",
+    _BY_VIEWS[False, True]: "light, floor and focus of the left view; objects over the end",
     _BY_VIEWS[True, True]: "swapped cameras; images of one exposure; `check_calibration`",
     NoTip.UNCONFIRMED.value: (
         "the insertion; is zero the needle's tip at the entry? move the needle"
     ),
-    NoTip.UNCERTAIN.value: "what lies over the end; cameras farther apart",
+    NoTip.UNCERTAIN.value: "objects over the end; cameras farther apart",
 }
 """Remedies for the causes that have one, as in docs/own_rig.md."""
 _SCALE = 0.5

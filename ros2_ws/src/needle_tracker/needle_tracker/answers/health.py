@@ -151,7 +151,7 @@ class Health:
         level, message = Level.OK, "insertion known" if len(history) else "no joint states yet"
         if answers.too_early > CLOCKS_DIFFER:
             early = f"exposed {1e-9 * answers.too_early:.1f} s before the first joint state"
-            level, message = Level.WARN, f"no pair is answered: {early}"
+            level, message = Level.WARN, f"no pair is processed: {early}"
         elif answers.joints_silent:
             level, message = Level.WARN, "no joint state follows the images: insertion unknown"
         return Diagnostic(level, message, values)

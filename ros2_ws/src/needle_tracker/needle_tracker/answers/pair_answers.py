@@ -21,7 +21,7 @@ from needle_tracker.filter.settings import Image, TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.sources.pairing import InsertionHistory, Pair, PairMatcher
 
-SUSPICION = "left and right images seem to be swapped: the other way round they show a needle"
+SUSPICION = "left and right images seem to be swapped: exchanged, they show a needle"
 _NEW_RECORDING = 1_000_000_000  # a longer step back in time begins a new recording [ns]
 # Consecutive pairs without a tip before the first check, pairs of a check, period of the checks.
 _BEFORE, _CHECKED, _PERIOD = 5, 10, 20

@@ -54,7 +54,7 @@ class SeenCounts:
         lines += [f"  no tip {n:6d} x  {cause}" for cause, n in self.missing.most_common()]
         for cause, _ in self.missing.most_common():
             if cause in HELP:
-                lines.append(f"  most often `{cause}`, helps: {HELP[cause]} (docs/own_rig.md)")
+                lines.append(f"  most often `{cause}`: check {HELP[cause]} (docs/own_rig.md)")
                 break
         return "\n".join(lines)
 
@@ -128,8 +128,8 @@ class TruthComparison:
                 f"  error  {seen['error_rms_mm']:.3f} mm rms ({axes}), "
                 f"{seen['error_p95_mm']:.3f} mm (95th percentile), "
                 f"{seen['error_max_mm']:.3f} mm at worst",
-                f"  that is {seen['error_sigmas']:.2f} of the claimed standard deviations (1 is as "
-                f"claimed); {seen['inside_95']:.1%} lie within what should hold 95 %",
+                f"  that is {seen['error_sigmas']:.2f} claimed standard deviations (ideal: 1); "
+                f"{seen['inside_95']:.1%} lie within the claimed 95 % region",
             ]
         return "\n".join(lines)
 

@@ -134,9 +134,9 @@ def _run(words: Sequence[str]) -> int:
         print(f"drawn: {overlays}")
     warnings = {
         f"{SUSPICION}; exchange --left and --right": swap.suspected,
-        f"{len(pairs.unpaired)} x without a partner: {_named(pairs.unpaired)}": pairs.unpaired,
-        f"{len(unusable)} x cannot be used: {_named(unusable)}": unusable,
-        f"{pairs.cut_off} pairs that the videos promise cannot be read": pairs.cut_off,
+        f"{len(pairs.unpaired)} images without a partner: {_named(pairs.unpaired)}": pairs.unpaired,
+        f"{len(unusable)} pairs cannot be used: {_named(unusable)}": unusable,
+        f"{pairs.cut_off} pairs listed in the videos cannot be read": pairs.cut_off,
         f"{without} pairs have no insertion": given.insertion and without,
     }
     for text, holds in warnings.items():
@@ -267,7 +267,7 @@ def _new_folder(name: str, text: str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
-            raise UserError(f"{name} {folder}: has something in it; give a new folder")
+            raise UserError(f"{name} {folder}: is not empty; give a new folder")
     except OSError as error:
         raise UserError(f"{name} {folder}: {error.strerror}") from error
     return folder

@@ -36,7 +36,7 @@ def frame_of(message: Any, side: str, camera: Camera) -> Frame:
     """
     if message.encoding not in ENCODINGS:
         encoding = message.encoding[:_QUOTED]
-        return Frame(None, f"{side} image is {encoding!r}, wants {WANTED}")
+        return Frame(None, f"{side} image is {encoding!r}, expected {WANTED}")
     wanted = camera.width, camera.height
     if problem := size_problem(side, (message.width, message.height), wanted):
         return Frame(None, problem)
@@ -45,7 +45,7 @@ def frame_of(message: Any, side: str, camera: Camera) -> Frame:
         return Frame(
             None,
             f"{side} image has {len(message.data)} bytes in rows of {message.step}, "
-            f"{message.height} rows of {least} wanted",
+            f"{message.height} rows of {least} expected",
         )
     rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
     return Frame(grey_image(rows, message.width, message.encoding))

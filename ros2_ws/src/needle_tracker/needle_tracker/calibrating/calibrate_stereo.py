@@ -158,35 +158,35 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
     lines += [f"WARNING: {text}" for view, text in misfits(result) if view.place is None]
     if "left.fx" not in result.parameters:
         pose = " and relative pose" if result.model.tied else ""
-        lines.append(f"lenses{pose}: as given; an error of theirs adds to that of tips below")
+        lines.append(f"lenses{pose}: as given; their error adds to the tip error below")
     for name, found in result.parameters.items():
         scale, unit = unit_of(name)
         value, given, sigma = (scale * v for v in (found.value, found.given, found.sigma))
         unit = unit and f" {unit}"
         result_text = f"{value:.5g}{unit} +- {sigma:.2g}{unit}"
         if found.kept:
-            asked = "not asked of these views"
+            asked = "not estimated from these views"
             if math.isfinite(sigma):
                 asked = f"NOT DETERMINED by these views (+- {sigma:.2g}{unit})"
             result_text = f"{asked}, kept at the given {given:g}{unit}"
         lines.append(f"{name}: {result_text}")
     error, sigma = (100.0 * value for value in size)
     if sigma < _SCALE_KNOWN:
-        lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % beside the session's")
+        lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % relative to the session")
     else:
         lines.append(
-            "size of the squares: not told by these views (a board laid on the surface twice, "
-            "10 mm or more apart, tells it); tips are wrong by as much as it is"
+            "size of the squares: not determined by these views (a board on the surface twice, "
+            "10 mm or more apart, determines it); tip errors scale with it"
         )
     error_mm = 1e3 * result.tip_error_p95
     verdict = "within" if error_mm <= goal_mm else "NOT within"
     lines.append(
-        f"expected error of a tip in the phantom from what was determined, 95 %: {error_mm:.3f} mm "
+        f"expected tip error in the phantom from the determined values, 95 %: {error_mm:.3f} mm "
         f"({verdict} {goal_mm:g} mm)"
     )
     if any(result.parameters[name].kept for name in SURFACE if name in result.parameters):
         lines.append(
-            "an error of a given value comes on top: about 0.14 mm for 0.01 of the index, 0.31 mm "
+            "errors of given values add to it: about 0.14 mm for 0.01 of the index, 0.31 mm "
             "for 1 mm of the surface"
         )
     return "\n".join(lines)

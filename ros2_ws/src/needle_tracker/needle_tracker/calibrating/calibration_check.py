@@ -134,9 +134,9 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     reprojection = float(np.sqrt(np.mean(np.sum(asis**2, axis=-1))))
     if not misfit <= EXPLAINED_PX:
         problem = (
-            f"corners miss by {misfit:.1f} px whatever turned camera, index or surface is assumed: "
-            "another target or place than the session says, left and right exchanged, or other "
-            "cameras"
+            f"corners are off by {misfit:.1f} px, which no turned camera, index or surface "
+            "explains: another target or place than in the session, left and right exchanged, "
+            "or other cameras"
         )
         return CheckResult(causes, [], np.nan, unseen, sigma, reprojection, [problem])
     found = _causes(model, causes, sigma)
@@ -146,8 +146,8 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     problems = []
     if misfit > LARGEST_MISFIT_PX:
         problems.append(
-            f"corners miss by {misfit:.2f} px in a way that no turned camera, index or surface "
-            "explains: another lens setting, or a target that is not flat or not where it is said"
+            f"corners are off by {misfit:.2f} px, which no turned camera, index or surface "
+            "explains: another lens setting, or a target that is not flat or not at its place"
         )
     if shift > limit:
         problems.append(f"tips are off by {1e3 * shift:.2f} mm (95 %), allowed {1e3 * limit:g}")
@@ -158,7 +158,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     ]
     if unseen > limit:
         problems.append(
-            "this target cannot show errors of tips"
+            "this target cannot show tip errors"
             + (f" below {1e3 * unseen:.2f} mm" if unseen < NOTHING_SHOWN else "")
             + ": lay it at known places on and under the surface, tilted"
         )
@@ -216,15 +216,15 @@ def _p95(assumed: StereoCalibration, true: StereoCalibration) -> float:
 def report(result: CheckResult) -> str:
     """Return a check as text."""
     lines = [
-        f"corners miss by {result.reprojection_px:.3f} px rms (expected "
+        f"corners are off by {result.reprojection_px:.3f} px rms (expected "
         f"{math.sqrt(2.0) * result.corner_sigma_px:.3f})"
     ]
     lines += [f"found: {_describe(deviation)}" for deviation in result.deviations]
     explained = math.isfinite(result.tip_error)
     if explained and not result.deviations:
-        lines.append("found: nothing that differs from the calibration")
+        lines.append("no difference from the calibration found")
     if {d.cause for d in result.deviations} >= set(CAMERAS):
-        lines.append("both cameras turned: or the target is not where the session says")
+        lines.append("both cameras turned, or the target is not at the session's place")
     if explained:
         unseen = result.unseen_tip_error
         lines.append(

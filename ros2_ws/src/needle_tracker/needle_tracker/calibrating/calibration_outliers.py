@@ -52,33 +52,33 @@ def contradictions(result: RigCalibration, size: tuple[float, float]) -> list[st
     if "left.fx" not in result.parameters:
         cause = "the lens given with --lenses is for another camera, focus or image size"
     found += [
-        f"{side} camera: corners miss by up to {miss:.2f} px in a pattern of rings: {cause}"
+        f"{side} camera: corners are off by up to {miss:.2f} px in a pattern of rings: {cause}"
         for side, miss in ring_patterns(result).items()
     ]
     misfit = misfit_px(result.model, result.fit)
     if misfit > LARGEST_MISFIT_PX:
         found.append(
-            f"corners miss by {misfit:.2f} px in a way that nothing here explains: a board that is "
+            f"corners are off by {misfit:.2f} px for an unknown reason: a board that is "
             "not flat, another lens, focus or image size than given"
         )
     error, sigma = size
     if abs(error) > max(LARGEST_SCALE_ERROR, LARGEST_PULL * sigma):
         found.append(
-            f"the squares come out {100 * abs(error):.2f} +- {100 * sigma:.2f} % "
-            f"{'larger' if error > 0.0 else 'smaller'} than the session says (tips are wrong by as "
-            "much): measure them again, and the places in air"
+            f"the squares measure {100 * abs(error):.2f} +- {100 * sigma:.2f} % "
+            f"{'larger' if error > 0.0 else 'smaller'} than in the session (tip errors scale with "
+            "it): measure them again, and the places in air"
         )
     for name, distance, pull in place_deviations(result.model, result.fit):
         if pull > LARGEST_PULL:
             found.append(
-                f"{name} comes out {1e3 * distance:.2f} mm ({pull:.0f} standard deviations) from "
-                "where the session says"
+                f"{name} is {1e3 * distance:.2f} mm ({pull:.0f} standard deviations) from "
+                "its place in the session"
             )
     return found
 
 
 def misfits(result: RigCalibration) -> list[tuple[BoardView, str]]:
-    """Return the views whose corners miss by far more than the others', and that in words.
+    """Return the views whose corners are off by far more than the others', and that in words.
 
     Parameters
     ----------
@@ -94,8 +94,8 @@ def misfits(result: RigCalibration) -> list[tuple[BoardView, str]]:
     return [
         (
             view,
-            f"{view.name}, {side} camera: {error:.2f} px rms, the others {typical:.2f}: does its "
-            "place hold, was the board flat?",
+            f"{view.name}, {side} camera: {error:.2f} px rms, the others {typical:.2f}: check its "
+            "place and that the board is flat",
         )
         for view, side, error in errors
         if error > 2.0 * typical + 0.05

@@ -54,10 +54,10 @@ def checked_views(
             )
     if anchor_view(checked, surface) is None:
         raise UserError(
-            "no view of the board at a known place in air: nothing says where `rig` is (give the "
+            "no view of the board at a known place in air: `rig` is undetermined (give the "
             "place of the board on the surface in the session file)"
             if surface
-            else "no view of the board at a known place: nothing says where `rig` is"
+            else "no view of the board at a known place: `rig` is undetermined"
         )
     return checked
 
@@ -76,7 +76,7 @@ def checked_view(view: BoardView, *, alone: bool = False) -> BoardView:
         if side in few:
             view = view.without(side)
         elif np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-6) < 2:
-            raise UserError(f"{view.name}: the {side} camera's corners are all on one line")
+            raise UserError(f"{view.name}: the {side} camera's corners are collinear")
     return view
 
 
@@ -163,9 +163,9 @@ def first_calibration(
         camera = dataclasses.replace(alone, T_optical_rig=transform)
         if camera.window.height(camera.centre) <= 0.0:
             raise UserError(
-                f"the {side} camera comes out below the surface, at "
+                f"the {side} camera is estimated below the surface, at "
                 f"{np.round(camera.centre, 3).tolist()} m: "
-                f"the place given for {anchor.name} cannot be right"
+                f"the place given for {anchor.name} is wrong"
             )
         placed.append(camera)
     calibration = StereoCalibration(*placed)

@@ -64,12 +64,12 @@ class CharucoBoard:
         check_bounds("board.marker", self.marker, 0.3 * self.square, 0.95 * self.square, "m")
         number = getattr(cv2.aruco, self.dictionary, None)
         if not self.dictionary.startswith("DICT_") or not isinstance(number, int):
-            raise UserError(f"board.dictionary = {self.dictionary!r} is none of OpenCV's")
+            raise UserError(f"board.dictionary = {self.dictionary!r} is not one of OpenCV's")
         wanted = self.columns * self.rows // 2
         markers = len(cv2.aruco.getPredefinedDictionary(number).bytesList)
         if markers < wanted:
             raise UserError(
-                f"board of {self.columns} x {self.rows} squares wants {wanted} markers, "
+                f"board of {self.columns} x {self.rows} squares needs {wanted} markers, "
                 f"{self.dictionary} has {markers}"
             )
 
@@ -177,7 +177,7 @@ def write_board(board: CharucoBoard, path: Path) -> None:
         Another ending, or a file that cannot be written.
     """
     if path.suffix.lower() not in (".pdf", ".png"):
-        raise UserError(f"--board {path}: ends neither in .pdf nor in .png")
+        raise UserError(f"--board {path}: must end in .pdf or .png")
     length, height = board.size
     paper = (length + 2 * _MARGIN, height + 2 * _MARGIN)
     figure = Figure(figsize=(paper[0] / _INCH, paper[1] / _INCH))

@@ -194,7 +194,7 @@ def _matrix(content: Any, key: str) -> Array:
 def _transform(rotation: Array, translation: Array) -> Array:
     left, scales, right = np.linalg.svd(rotation)
     if np.abs(scales - 1.0).max() > _LARGEST_SKEW or np.linalg.det(rotation) < 0.0:
-        raise UserError(f"{np.round(rotation, 4).tolist()} is no rotation")
+        raise UserError(f"{np.round(rotation, 4).tolist()} is not a rotation")
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = left @ right, translation
     return transform
@@ -227,7 +227,7 @@ def _plumb_bob(lens: _Lens, size: tuple[int, int]) -> Array:
     miss = float(np.abs(distort(ideal, found) - seen).max() * matrix[0, 0])
     if miss > _LARGEST_MISS_PX:
         raise UserError(
-            f"--lenses {lens.path}: plumb_bob misses its {lens.model} lens by {miss:.2f} px, more "
-            f"than {_LARGEST_MISS_PX} px: {_CURE}"
+            f"--lenses {lens.path}: plumb_bob differs from its {lens.model} lens by {miss:.2f} px, "
+            f"limit {_LARGEST_MISS_PX} px: {_CURE}"
         )
     return np.asarray(found)

@@ -184,7 +184,9 @@ def calibrate(
     _check_cameras(names, result, sizes, centre_limit)
     calibration = model.calibration(result.parameters)
     if np.linalg.norm(calibration.left.centre - calibration.right.centre) < LEAST_BASELINE:
-        raise UserError("both cameras come out in one place: are left and right the same images?")
+        raise UserError(
+            "both cameras are estimated at one place: are left and right the same images?"
+        )
     determined = {
         name: Determined(
             float(result.parameters[i]), float(sigmas[name]), float(given[i]), not free[i]
@@ -207,7 +209,11 @@ def _check_relative_pose(given: Array, seen: Array) -> None:
         raise UserError(
             f"--lenses puts the cameras {1e3 * lengths[0]:.4g} mm apart, the images put them "
             f"{1e3 * lengths[1]:.1f} mm apart"
-            + (": is T in metres?" if alike else ", elsewhere: were left and right exchanged?")
+            + (
+                ": is T in metres?"
+                if alike
+                else ", in another direction: are left and right exchanged?"
+            )
         )
 
 
@@ -232,5 +238,5 @@ def _check_cameras(
             if not result.sigma[i] <= largest:
                 raise UserError(
                     f"{side} camera: {name} is determined to +-{result.sigma[i]:.0f} px only "
-                    f"({result.parameters[i]:.0f} px): more views, tilted by 30 to 45 deg"
+                    f"({result.parameters[i]:.0f} px): add views tilted by 30 to 45 deg"
                 )

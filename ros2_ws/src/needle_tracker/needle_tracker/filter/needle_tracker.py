@@ -353,4 +353,6 @@ class NeedleTracker:
     def _check(self, pair: Pair) -> None:
         for side, image, shape in zip(SIDES, pair, self._shapes, strict=True):
             if image.shape != shape or image.dtype != np.uint8:
-                raise ValueError(f"{side} image is {image.dtype}{image.shape}, wants uint8{shape}")
+                raise ValueError(
+                    f"{side} image is {image.dtype}{image.shape}, expected uint8{shape}"
+                )

@@ -126,7 +126,7 @@ def parse_calibration(content: Any) -> StereoCalibration:
         if height <= 0.0:
             raise UserError(
                 f"{side} camera is not above the surface that it looks through, but "
-                f"{-1e3 * height:.1f} mm beneath: the window's normal points to the camera"
+                f"{-1e3 * height:.1f} mm beneath: the window's normal must point to the camera"
             )
     if np.linalg.norm(left.centre - right.centre) < LEAST_BASELINE:
         raise UserError("left and right camera are in the same place: no depth can be measured")
@@ -175,12 +175,12 @@ def _window(content: Any, side: str) -> Window:
     if math.hypot(normal[0], normal[1]) < _LEAST_ASIDE:
         raise UserError(
             f"{side}.window.normal = {normal.tolist()} lies along z, the needle's axis: a camera "
-            "sees the needle from aside only"
+            "must view the needle from the side"
         )
     name = f"{side}.window.layers"
     layers = value_of(content, side, "window", "layers")
     if not isinstance(layers, list):
-        raise UserError(f"{name} = {layers!r} is not a list (of none: [])")
+        raise UserError(f"{name} = {layers!r} is not a list (no layers: [])")
     found = []
     for i, layer in enumerate(layers):
         entry = {f"{name}[{i}]": layer}
@@ -202,7 +202,7 @@ def _camera(content: Any, side: str, window: Window) -> Camera:
     check_camera_matrix(f"{side}.camera_matrix", matrix)
     model = value_of(content, side, "distortion_model")
     if model != _DISTORTION_MODEL:
-        raise UserError(f"{side}.distortion_model = {model!r}, wants {_DISTORTION_MODEL!r}")
+        raise UserError(f"{side}.distortion_model = {model!r}, expected {_DISTORTION_MODEL!r}")
     distortion = numbers(content, 5, side, "distortion_coefficients", "data")
     translation = numbers(content, 3, side, "T_optical_rig", "translation")
     quaternion = numbers(content, 4, side, "T_optical_rig", "rotation")
@@ -263,7 +263,7 @@ def numbers(content: Any, count: int | None, *keys: str) -> NDArray[np.float64]:
         value = list(itertools.chain.from_iterable(rows))
     if not isinstance(value, list) or len(value) != (len(value) if count is None else count):
         got = f"{len(value)} values" if isinstance(value, list) else repr(value)
-        raise UserError(f"{name} wants {count} numbers, has {got}")
+        raise UserError(f"{name} needs {count} numbers, has {got}")
     if not all(_is_number(item) and math.isfinite(item) for item in value):
         raise UserError(f"{name} = {value} has a value that is not a finite number")
     return np.array(value, dtype=np.float64)

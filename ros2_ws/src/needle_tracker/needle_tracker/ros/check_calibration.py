@@ -77,9 +77,9 @@ def parse(arguments: Sequence[str]) -> Namespace:
     """
     given = _parser().parse_args(arguments)
     if (given.live is None) != (given.left is not None and given.right is not None):
-        raise UserError("wants either --left and --right, or --live; see --help")
+        raise UserError("give either --left and --right, or --live; see --help")
     if given.live is not None and (given.left is not None or given.right is not None):
-        raise UserError("--live takes its images from topics: no --left, no --right")
+        raise UserError("--live takes its images from topics: omit --left and --right")
     for name, lower, upper, unit in (
         ("count", 1, 1000, "pairs"),
         ("timeout", 0.1, 3600.0, "s"),
@@ -117,7 +117,9 @@ def check_calibration(options: Namespace, words: list[str]) -> int:
                 raise UserError(problem)
         free = [view.name for view in views if view.place is None]
         if free:
-            print(f"held freely in air, for the session has no such place: {', '.join(free)}")
+            print(
+                f"treated as held freely in air, the session has no such place: {', '.join(free)}"
+            )
     else:
         views = [_live_view(options, calibration, session, words)]
     result = check(calibration, views, options.limit)

@@ -316,7 +316,7 @@ def read_numbers(
                 where = f"{option} {path}, line {rows.line_num}"
                 name, *texts = ((row[column] or "").strip() for column in ("name", *columns))
                 if name in found:
-                    raise UserError(f"{where}: {name!r} is there already")
+                    raise UserError(f"{where}: {name!r} is a duplicate")
                 values = zip(columns, texts, strict=True)
                 found[name] = (
                     [_number(text, where, c) for c, text in values] if any(texts) else None
@@ -381,7 +381,7 @@ def _read(path: Path) -> Image | None:
 def _frame_count(side: str, path: Path) -> int:
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
-        raise UserError(f"--{side} {path}: neither a folder nor a video that can be read")
+        raise UserError(f"--{side} {path}: not a folder or a readable video")
     return int(video.get(cv2.CAP_PROP_FRAME_COUNT))
 
 

@@ -56,7 +56,7 @@ def test_counts_include_all_processed_pairs() -> None:
     assert said[1].endswith("right: end seen in 1 of 4 pairs, shaft in 4")
     # The commonest is the entry zone, about which nothing needs to be done.
     assert said[2].endswith("5 x  in the entry zone")
-    assert said[-1].startswith("  most often `end seen in the left view only`, helps: light")
+    assert said[-1].startswith("  most often `end seen in the left view only`: check light")
     assert counts.figures()["right_end_seen"] == 1
 
 

@@ -191,7 +191,7 @@ def test_unusable_input_is_reported_in_one_line(track: Track, folder: Path, caps
         ("--calibration", "", "phantom is missing"),
         ("--left", None, "does not exist"),
         ("--insertion", None, "No such file"),
-        ("--overlay", "", "File exists|has something in it|Not a directory"),
+        ("--overlay", "", "File exists|is not empty|Not a directory"),
     ):
         given.unlink(missing_ok=True)
         if text is not None:

@@ -103,7 +103,7 @@ def test_a_target_that_cannot_detect_errors_is_never_ok(
         assert "cannot show" in found.problems[-1]
         assert "cannot be seen" in report(found)
     found = check(calibration, target(rig), 0.01e-3)
-    assert any("cannot show errors of tips below 0.0" in problem for problem in found.problems)
+    assert any("cannot show tip errors below 0.0" in problem for problem in found.problems)
 
 
 def test_other_cameras_or_lenses_are_not_reported_as_a_turned_camera(

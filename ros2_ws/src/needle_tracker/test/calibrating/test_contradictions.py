@@ -41,7 +41,7 @@ def test_wrong_squares_are_found_by_their_size(
     result = calibrate(said_larger(views[4:], 0.003), SIZES, GIVEN, lenses_of(calibration))
     error, sigma = square_error(result)
     assert error == pytest.approx(-0.003, abs=max(4.0 * sigma, 3e-4))
-    assert "smaller than the session says" in contradictions(result, (error, sigma))[0]
+    assert "smaller than in the session" in contradictions(result, (error, sigma))[0]
 
 
 def test_one_place_does_not_determine_the_size_of_the_squares(
@@ -52,15 +52,15 @@ def test_one_place_does_not_determine_the_size_of_the_squares(
     size = square_error(result)
     assert not size[1] < 0.1
     assert contradictions(result, size) == []
-    assert "size of the squares: not told by these views" in report(result, size, 0.06)
+    assert "size of the squares: not determined by these views" in report(result, size, 0.06)
 
 
 @pytest.mark.parametrize(
     ("name", "shift", "says"),
     [
         # Index and surface take most of it, and tips are as wrong.
-        ("under_deep", [1e-3, 0.0, 0.0], "under_deep comes out 0."),
-        ("surface_b", [0.0, 0.0, 2e-3], "does its place hold"),
+        ("under_deep", [1e-3, 0.0, 0.0], "under_deep is 0."),
+        ("surface_b", [0.0, 0.0, 2e-3], "check its place"),
     ],
 )
 def test_a_wrong_place_is_found(
@@ -85,7 +85,7 @@ def test_a_lens_that_plumb_bob_does_not_describe_is_not_ok(result: RigCalibratio
     bent = dataclasses.replace(result, fit=dataclasses.replace(result.fit, residuals=residuals))
     assert 0.03 < ring_patterns(bent)["right"] < 0.06
     (said,) = contradictions(bent, (0.0, np.inf))
-    assert "right camera: corners miss by up to 0.0" in said
+    assert "right camera: corners are off by up to 0.0" in said
     assert "in a pattern of rings: its lens has more" in said
 
 

@@ -162,7 +162,7 @@ def test_an_unusable_chain_is_rejected_with_the_reason(
     fisheye = {"distortion_model": "equidistant", "distortion_coeffs": [-0.02, 0.01, -0.008, 0.002]}
     for camera, changes, says in (
         ("cam0", {"camera_model": "omni"}, "cam0.camera_model 'omni' is not supported"),
-        ("cam0", fisheye | {"intrinsics": [420, 420, 512, 384]}, "plumb_bob misses its"),
+        ("cam0", fisheye | {"intrinsics": [420, 420, 512, 384]}, "plumb_bob differs from its"),
         ("cam0", {"distortion_model": "fov", "distortion_coeffs": [1]}, "fov with 1 coefficients"),
         (
             "cam0",
@@ -170,7 +170,7 @@ def test_an_unusable_chain_is_rejected_with_the_reason(
             "is for images of 2048x1536, the left ones are 1024",
         ),
         ("cam0", {"intrinsics": [0, 0, 512, 384]}, "left camera: focal lengths 0, 0 px"),
-        ("cam1", {"T_cn_cnm1": [[2, 0, 0, 0]] * 4}, "is no rotation"),
+        ("cam1", {"T_cn_cnm1": [[2, 0, 0, 0]] * 4}, "is not a rotation"),
         ("cam1", {"T_cn_cnm1": None}, "cam1.T_cn_cnm1"),
         ("cam1", None, "found 1 of 2 cameras"),
     ):
@@ -224,7 +224,7 @@ def test_lenses_of_other_cameras_or_in_another_unit_are_rejected(
     pose = np.array(far["cam1"]["T_cn_cnm1"])
     far["cam1"]["T_cn_cnm1"] = (pose * [1.0, 1.0, 1.0, 1e3]).tolist()
     swapped["cam1"]["T_cn_cnm1"] = np.linalg.inv(pose).tolist()
-    for chain, says in ((far, "is T in metres"), (swapped, "were left and right exchanged")):
+    for chain, says in ((far, "is T in metres"), (swapped, "are left and right exchanged")):
         with pytest.raises(UserError, match=says):
             calibrate(views[4:7], SIZES, GIVEN, read(written(tmp_path / "chain.yaml", chain)))
     for camera in ("cam0", "cam1"):

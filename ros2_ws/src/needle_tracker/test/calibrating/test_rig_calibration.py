@@ -196,11 +196,11 @@ def test_sets_that_cannot_determine_the_rig_are_rejected(
         (views[1:], GIVEN, "5 views of the board held freely"),
         (without(views, 0, "right", 0), GIVEN, "the right camera sees 0 corners"),
         (without(views, 0, "left", 11), GIVEN, "the left camera sees 11 corners.* 12 are needed"),
-        ([v for v in views if v.place is None], GIVEN, "nothing says where `rig` is"),
+        ([v for v in views if v.place is None], GIVEN, "`rig` is undetermined"),
         ([*level, *views[6:]], GIVEN, "parallel"),
         # Before its window, a board in air counts for the camera that sees it.
         ([v for v in box_views if v not in alone], GIVEN_BOX, "freely in air that the right"),
-        ([v for v in box_views if v.place is not STANDS], GIVEN_BOX, "nothing says where"),
+        ([v for v in box_views if v.place is not STANDS], GIVEN_BOX, "is undetermined"),
         (without(box_views, 13, "right", 0), GIVEN_BOX, "box_00: the right camera sees 0 corners"),
     ):
         with pytest.raises(UserError, match=says) as caught:

@@ -127,13 +127,13 @@ def test_bad_windows_are_named(own_windows: Any) -> None:
         (lambda content: content["right"].pop("window"), "right.window.point is missing"),
         (put("left", "window", "normal", [2.0, 0.0, 0.0]), "length of left.window.normal"),
         (put("left", "window", "normal", [0.0, 0.1, 0.995]), "needle's axis"),
-        (put("left", "window", "normal", [-1.0, 0.0, 0.0]), "normal points to the camera"),
+        (put("left", "window", "normal", [-1.0, 0.0, 0.0]), "normal must point to the camera"),
         (put("left", "window", "layers", None), "layers = None is not a list"),
         (put("left", "window", "layers", [{"thickness": 0.005}]), "layers.0..refractive_index"),
         (put(*LAYER, -1e-3), "layers.0..thickness"),
         (put(*LAYER, 5), "right.window.layers.0..thickness"),
         (put("right", "window", "inside", 0.9), "right.window.inside"),
-        (put("right", "window", "point", [0.0, 0.06]), "right.window.point wants 3 numbers"),
+        (put("right", "window", "point", [0.0, 0.06]), "right.window.point needs 3 numbers"),
     ):
         content = copy.deepcopy(own_windows)
         spoil(content)

@@ -68,5 +68,5 @@ def test_images_without_partners_are_named_or_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="one is a folder, the other is not"):
         open_pairs(folder, folder / "a.png")
     (folder / "text.avi").write_text("no video")
-    with pytest.raises(UserError, match="neither a folder nor a video"):
+    with pytest.raises(UserError, match="not a folder or a readable video"):
         open_pairs(folder / "text.avi", folder / "text.avi")

@@ -29,9 +29,9 @@ def test_loop_heartbeat_is_sent_in_each_cycle_and_before_each_request() -> None:
 
 def test_link_loss_is_reported_and_reset_reopens_the_link() -> None:
     bench = DriveBench().moving()
-    bench.broken = "takes nothing for 0.05 s"
+    bench.broken = "accepted no data for 0.05 s"
     bench.go()
-    bench.failed("link_loss", "link virtual test is lost: takes nothing")
+    bench.failed("link_loss", "link virtual test is lost: accepted no data")
     # Without the computer the drives' watchdogs trip, and their state is unknown.
     bench.insertion.state = bench.rotation.state = "fault"
     bench.insertion.set_objects({(0x1016, 1): 0})
@@ -40,7 +40,7 @@ def test_link_loss_is_reported_and_reset_reopens_the_link() -> None:
     assert "cannot open" in bench.reset().message
     assert bench.state == "FAULT"
     bench.no_adapter = False
-    bench.stopped("link_loss", "takes nothing")
+    bench.stopped("link_loss", "accepted no data")
     assert bench.link.openings == 2
     assert bench.insertion.value(0x1016, 1) == WATCHDOG
 
@@ -166,7 +166,7 @@ def test_reply_age_lost_answers_are_discarded_after_a_pause() -> None:
     assert bench.axes[0].monitor.feedback.syncs == syncs
     count = bench.drives.unanswered
     health = bench.drives.health("")
-    assert health.message == f"{count} SYNCs were not answered in their cycle"
+    assert health.message == f"{count} SYNCs had no reply within their cycle"
     assert health.values["unanswered_syncs"] == str(count)
     assert health.values["late_cycles"] == "0"
     assert bench.drives.health("").message == "connected"
@@ -246,7 +246,7 @@ def test_drive_reboot_voids_its_set_up(monkeypatch: pytest.MonkeyPatch) -> None:
     bench.after(bench.insertion.reboot)
     bench.hold(False)
     # The reboot undoes the first part of the set-up: only a complete one counts.
-    assert "started anew while it was set up" in bench.reset().message
+    assert "rebooted during set-up" in bench.reset().message
     assert bench.reset().success
     bench.wait(5)
     assert bench.state == "DISABLED"

@@ -38,13 +38,13 @@ def test_quick_stop_without_deceleration_switches_both_off() -> None:
     assert bench.insertion.state == bench.rotation.state == "disabled"
     assert bench.insertion.position - at <= 4_400, "0.2 mm: 0.2 s of them"
     bench.insertion.drift = {}
-    bench.stopped("one_fault_stops_both", "runs on in its quick stop (2000 counts in 0.1 s)")
+    bench.stopped("one_fault_stops_both", "keeps moving in its quick stop (2000 counts in 0.1 s)")
     bench = DriveBench().moving()
     bench.insertion.drift = {"quick stop": 400}
     assert bench.enable(False).success
     bench.wait(20)
     assert bench.state == "FAULT"
-    assert "runs on in its quick stop" in bench.status.fault
+    assert "keeps moving in its quick stop" in bench.status.fault
     assert bench.insertion.state == "disabled"
 
 
@@ -173,7 +173,7 @@ def test_drive_watchdog_is_armed_last_and_disarmed_at_exit() -> None:
     # A drive that does not report off keeps its watchdog.
     bench.insertion.syncs = False
     assert not bench.run(bench.supervisor.deconfigure()).success
-    assert "insertion axis: does not say that it is off" in bench.notices[-1].text
+    assert "insertion axis: does not confirm power-off" in bench.notices[-1].text
     assert bench.insertion.value(0x1016, 1) == 127 << 16 | 100
     assert (bench.rotation.value(0x1016, 1), bench.rotation.state) == (0, "disabled")
     with pytest.raises(AxisError, match="insertion axis is not configured"):
@@ -214,7 +214,7 @@ def test_drive_emergency_stops_both_and_is_acknowledged_by_pdo() -> None:
     with pytest.raises(AxisError, match="encoder error"):
         bench.run(bench.axes[0].home(0.001))
     bench.hold(False)
-    stopping = "rotation axis: is still stopping: reset again when it stands"
+    stopping = "rotation axis: is still stopping: reset again after it stops"
     reset = bench.reset()
     assert (reset.success, reset.message) == (False, stopping)
     assert bench.state == "FAULT"
@@ -281,5 +281,5 @@ def test_drive_emergency_between_cycles_refuses_a_retraction() -> None:
 def test_one_fault_stops_both_if_a_drive_switches_itself_off() -> None:
     bench = DriveBench().moving()
     bench.after(lambda: setattr(bench.rotation, "state", "disabled"))
-    bench.failed("one_fault_stops_both", "went from OPERATION_ENABLED to SWITCH_ON_DISABLED by its")
+    bench.failed("one_fault_stops_both", "changed from OPERATION_ENABLED to SWITCH_ON_DISABLED")
     assert bench.insertion.state == "disabled"

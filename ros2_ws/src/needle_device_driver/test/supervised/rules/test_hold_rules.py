@@ -162,7 +162,7 @@ def test_hold_new_press_first_press_counts_only_without_session() -> None:
     bench = enabled()
     assert send_holds(bench, "b/s+") == "-"
     assert bench.rule == "hold_new_press"
-    assert bench.status.reason == "hold of 'b/s' does not count (hold_new_press)"
+    assert bench.status.reason == "hold of 'b/s' ignored (hold_new_press)"
     assert send_holds(bench, "by_hand+") == "by_hand"
 
 
@@ -279,7 +279,7 @@ def test_hold_in_order_reset_accepts_lower_stamps_without_session() -> None:
     bench = enabled()
     send_holds(bench, f"#{10**18}- b/s#10- - +")
     assert bench.rule == "hold_in_order"
-    assert bench.status.reason.endswith("(hold_in_order); device/reset ends this")
+    assert bench.status.reason.endswith("(hold_in_order); call device/reset")
     assert bench.reset().success
     # Earlier messages of a session stay rejected.
     assert send_holds(bench, "- + - b/s#8- b/s#9+") == "- a - - -"
@@ -302,7 +302,7 @@ def test_command_newer_reset_accepts_commands_after_time_went_back(back_ns: int)
     back_to(bench, back_ns)
     bench.step()
     assert bench.rule == "command_newer"
-    assert bench.outcomes[-1].endswith("ROS time went back, device/reset lets commands in again")
+    assert bench.outcomes[-1].endswith("call device/reset to accept commands again")
     assert bench.reset().success
     bench.go()
     bench.press()
@@ -319,7 +319,7 @@ def test_command_newer_hint_on_time_that_went_back() -> None:
         bench.supervisor.note_time(last - back_ns, bench.now)
         bench.step(stamp_ns=last)
         assert bench.rule == "command_newer"
-        assert ("ROS time went back" in bench.outcomes[-1]) is told, back_ns
+        assert ("ROS time jumped back" in bench.outcomes[-1]) is told, back_ns
 
 
 def test_command_newer_stamps_are_used_once() -> None:

@@ -91,7 +91,7 @@ def test_retraction_is_slow_without_rotation_and_needs_the_hold() -> None:
     assert bench.retract().message == "the axes are not powered yet"
     bench.insertion.powered = True
     bench.hold(False)
-    assert bench.retract().message == "press and keep the hold first"
+    assert bench.retract().message == "press the hold first and keep it pressed"
     bench.hold()
     rotation = bench.rotation.position
     bench.rotation.orders.clear()
@@ -218,4 +218,4 @@ def test_homing_time_bound_of_each_axis(which: str, longest: float) -> None:
         assert bench.state == "MOVING"
         bench.wait(3)
         assert (bench.state, bench.rule) == ("FAULT", "homing_time")
-        assert f"no home switch of the {which} axis in" in bench.status.fault
+        assert f"the {which} axis did not find its home switch in" in bench.status.fault

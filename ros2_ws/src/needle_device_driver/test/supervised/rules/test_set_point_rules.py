@@ -23,7 +23,7 @@ def test_look_ahead_refuses_a_farther_set_point() -> None:
     bench = DriveBench().moving()
     # One cycle at 5 mm/s, plus 1 % and a count.
     at = bench.joint()
-    why = "set-point 0.0001011 ahead in a cycle at 0.005/s, at most 0.00010105"
+    why = "set-point step of 0.0001011 in a cycle at 0.005/s, limit 0.00010105"
     assert why in refused(bench, at + 2022 / 20e6, Rule.LOOK_AHEAD)
     bench.axes[0].start_move(at + 2021 / 20e6, 0.005)
     bench.axes[0].start_move(at, 0.005)

@@ -50,7 +50,7 @@ def test_axis_speed_stops_a_fast_homing_in_two_cycles(mm_s: float) -> None:
     bench.wait()
     stops = [cob for cob, data in bench.bus.sent if data[:1] == b"\x02"]
     assert (bench.state, stops) == ("FAULT", [0x201, 0x202])
-    text = f"insertion axis: moves at {abs(mm_s):.4g} mm/s, at most 3.5 mm/s where 2 mm/s are comm"
+    text = f"insertion axis: moves at {abs(mm_s):.4g} mm/s, limit 3.5 mm/s at 2 mm/s comm"
     assert text in until_fault(bench, "axis_speed")
     # Two observed cycles, plus the cycle under way.
     assert abs(bench.insertion.position) == 3 * abs(way)
@@ -91,7 +91,7 @@ def test_axis_speed_of_the_rotation_axis() -> None:
         bench.homing()
         bench.wait(30)
         assert bench.state == state
-    assert "rotation axis: moves at 1.611 rad/s, at most 1.6 rad/s" in bench.status.fault
+    assert "rotation axis: moves at 1.611 rad/s, limit 1.6 rad/s" in bench.status.fault
 
 
 def test_axis_speed_of_a_drifting_axis() -> None:
@@ -198,7 +198,7 @@ def test_homing_time_bounds_the_distance_by_the_travel(
     bench.insertion.set_objects({(0x608F, 1): 20_000, (0x608F, 2): 1})
     bench.insertion.searches(forever=-3 * MM_S)
     bench.homing()
-    text = f"without finding its home, at most {most_mm:.4g} mm"
+    text = f"without finding home, limit {most_mm:.4g} mm"
     assert text in until_fault(bench, "homing_time")
     # One observed cycle, plus the cycle under way.
     assert most_mm < abs(bench.insertion.position) / 2e4 <= most_mm + 2 * 0.06
@@ -240,7 +240,7 @@ def test_homing_time_tolerance_of_the_direction(counts: int, is_away: bool) -> N
     homing = HomingRun(settings, 0.002, has_inputs=True)
     for position in (0, counts):
         homing.update(Feedback(1, 0x0237, 6, 0, position, 0), position)
-    assert ("went 1 mm away from the limit switch" in homing.problem) is is_away
+    assert ("moved 1 mm away from the limit switch" in homing.problem) is is_away
 
 
 def test_homing_time_is_not_the_rule_of_a_reported_failure() -> None:

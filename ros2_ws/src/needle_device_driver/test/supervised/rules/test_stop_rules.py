@@ -25,7 +25,7 @@ def test_estop_latches_until_hold_release_and_reset() -> None:
     assert not bench.enable().success
     assert bench.reset().message == "release the hold first"
     bench.hold(False)
-    assert bench.reset().message == "reset; enable to go on"
+    assert bench.reset().message == "reset; enable to continue"
     assert (bench.state, bench.status.fault) == ("DISABLED", "")
     bench.go(20)
     assert bench.positions == at
@@ -55,7 +55,7 @@ def test_estop_latches_from_every_state(state: str) -> None:
 
 def test_one_device_refuses_everything_until_the_conflict_ends() -> None:
     bench = Bench().moving()
-    supervisor, other = bench.supervisor, "another device is there: /sim_rig"
+    supervisor, other = bench.supervisor, "another device is running: /sim_rig"
     at = bench.positions
     supervisor.report_conflicting_device(other)
     supervisor.report_conflicting_device(other)
