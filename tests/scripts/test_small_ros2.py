@@ -54,8 +54,8 @@ def test_lists_executables(
     [
         (["run", "needle_sin", "sim_rig"], "did you mean needle_sim"),
         (["run", "needle_sim", "simrig"], "did you mean sim_rig?"),
-        (["run", "needle_console", "zzz"], "there is console"),
-        (["pkg", "executables", "zzz"], "there is needle_"),
+        (["run", "needle_console", "zzz"], "known: console"),
+        (["pkg", "executables", "zzz"], "known: needle_"),
     ],
 )
 def test_says_in_one_line_what_is_wrong(

@@ -104,7 +104,7 @@ def test_unchanged_code_gives_unchanged_outputs(
 def test_a_wrong_sign_in_the_projection_is_detected(mirrored: tuple[int, str]) -> None:
     code, said = mirrored
     assert code == 1
-    assert "needle/tip: 1 recorded, missing in the rerun (at 30.0 mm" in said
+    assert "needle/tip: 1 recorded only (at 30.0 mm" in said
 
 
 @pytest.mark.parametrize(
