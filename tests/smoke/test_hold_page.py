@@ -162,7 +162,7 @@ def test_the_page_says_why_a_hold_ended_by_itself(scene: Scene) -> None:
     scene.ends(scene.hold_touch, tab.cancel_touch)
     assert why() == "hold ended: the browser took the pointer away"
     scene.ends(scene.hold_pointer, lambda: tab.run("window.frames[0].focus()"))
-    assert why() == "hold ended: the window lost the focus"
+    assert why() == "hold ended: the window lost focus"
     tab.run("window.focus()")
     scene.hold_pointer()
     stand_still()

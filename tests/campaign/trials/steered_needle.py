@@ -16,8 +16,8 @@ from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sensors import Sensor, TipSensor
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
+from scenario.transport_faults import delay
 from scenario.virtual_rig import FASTEST, Held, VirtualRig
-from transport_faults import delay
 
 OFFSET = 0.003
 TIP_STD = 5e-5

@@ -22,7 +22,7 @@ from needle_core.component import Output
 from needle_core.runners.transport import Arrival, Arrivals, Fault, Link
 from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_sim.sim_rig import SimRig
-from transport_faults import delay, drop, duplicate
+from scenario.transport_faults import delay, drop, duplicate
 
 pytestmark = pytest.mark.usefixtures("compiled")
 SHORT = ("--level", "tip", "--depth-mm", "6")

@@ -30,7 +30,7 @@ from needle_core.messages import EmergencyStop
 from needle_core.runners.timeline import START_NS
 from needle_core.runners.transport import Arrival, Arrivals, Fault, Link
 from needle_core.runners.virtual import DISCOVERY, LEASE, VirtualRunner
-from transport_faults import delay, drop, duplicate, silence
+from scenario.transport_faults import delay, drop, duplicate, silence
 
 from .runner_scene import Once, Receiver, Sender, Server, Wired, run
 
