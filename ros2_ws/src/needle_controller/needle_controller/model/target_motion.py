@@ -14,6 +14,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import logsumexp, softmax
 
 from needle_controller.model.arrays import Array
 
@@ -155,8 +156,7 @@ def _weighted_models(since: Array, samples: Array) -> tuple[Array, Array]:
             rates.append(np.broadcast_to(rate, log.shape))
             coefficients.append(fitted)
     log = np.concatenate(evidence)
-    weights = np.exp(log - np.max(log, axis=0))
-    weights /= np.sum(weights, axis=0)
+    weights = softmax(log, axis=0)
     return np.concatenate(rates), weights[1:, :, None, None] * np.concatenate(coefficients)
 
 
@@ -201,10 +201,10 @@ def _fit(since: Array, rates: Array, samples: Array, std: tuple[float, ...]) -> 
         logs.append(-1.5 * (determinant + count * math.log(2.0 * math.pi)) - 0.5 * rest / variance)
         fits.append(scale[:, None] * (vectors @ (projected / sums[..., None])))
     log = np.stack(logs, axis=-1)
-    weights = np.exp(log - np.max(log, axis=-1, keepdims=True))
-    weights /= np.sum(weights, axis=-1, keepdims=True)
     coefficients = np.zeros((*log.shape[:2], _TERMS, 3))
-    coefficients[:, :, : len(std)] = np.einsum("hns,shntc->hntc", weights, np.array(fits))
+    coefficients[:, :, : len(std)] = np.einsum(
+        "hns,shntc->hntc", softmax(log, axis=-1), np.array(fits)
+    )
     return _log_mean(log), coefficients
 
 
@@ -219,8 +219,7 @@ def _walk_evidence(since: Array, samples: Array) -> Array:
 
 def _log_mean(logs: Array) -> Array:
     """Return the logarithm of the mean of the exponentials along the last axis."""
-    most = np.max(logs, axis=-1)
-    return np.asarray(most + np.log(np.mean(np.exp(logs - most[..., None]), axis=-1)))
+    return np.asarray(logsumexp(logs, axis=-1) - math.log(logs.shape[-1]))
 
 
 def _likeliest_rates(since: Array, samples: Array, rates: Array) -> Array:
