@@ -211,7 +211,8 @@ def _check_modes(link: FrameLink, access: ObjectAccess, node: int) -> Procedure[
     """
     listed = yield from access.read_optional(od.SUPPORTED_MODES)
     if listed is not None and not listed & SUPPORTS_HOMING:
-        raise DriveError(f"node {node} has no homing mode (0x6502 = 0x{listed:08X})")
+        text = f"node {node} has no homing mode (0x6502 = 0x{listed:08X})"
+        raise DriveError(text, od.SUPPORTED_MODES)
     if listed is None:
         yield from _try_mode(link, access, node, Mode.HOMING)
     if listed is None or not listed & SUPPORTS_CYCLIC_POSITION:

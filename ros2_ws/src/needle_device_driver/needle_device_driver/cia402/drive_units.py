@@ -95,7 +95,7 @@ def _counts_in(
         unit_text = f"{scale}{unit} (0x{entry.index:04X} = 0x{code:08X})"
         hint = "; *_counts_per_turn converts rpm without 0x608F" if turns else ""
         raise DriveError(
-            f"the drive measures {what} in {unit_text}, expected {' or '.join(wanted)}{hint}"
+            f"the drive measures {what} in {unit_text}, expected {' or '.join(wanted)}{hint}", entry
         )
     feed = None
     if turns and not settings.counts_per_turn:

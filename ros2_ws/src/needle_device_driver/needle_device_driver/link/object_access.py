@@ -12,7 +12,19 @@ from needle_device_driver.procedure import Procedure
 
 
 class DriveError(Exception):
-    """A drive does not answer, or refuses; the text names the entry and the reason."""
+    """A drive does not answer, or refuses.
+
+    Parameters
+    ----------
+    text : str
+        The entry and the reason.
+    entry : Entry or None
+        The entry; None: the reason is another one.
+    """
+
+    def __init__(self, text: str, entry: Entry | None = None) -> None:
+        super().__init__(text)
+        self.entry = entry
 
 
 class DriveRefusalError(DriveError):
@@ -22,12 +34,14 @@ class DriveRefusalError(DriveError):
     ----------
     text : str
         The entry and the reason.
+    entry : Entry
+        The entry.
     code : int
         SDO abort code.
     """
 
-    def __init__(self, text: str, code: int) -> None:
-        super().__init__(text)
+    def __init__(self, text: str, entry: Entry, code: int) -> None:
+        super().__init__(text, entry)
         self.code = code
 
     @property
@@ -163,6 +177,7 @@ class ObjectAccess:
         if isinstance(error, SdoAbortedError):
             return DriveRefusalError(
                 f"node {self._node_id} refuses to {action} {entry}: {error} (see docs/hardware.md)",
+                entry,
                 error.code,
             )
         if isinstance(error, ValueError):
