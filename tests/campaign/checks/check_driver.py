@@ -10,11 +10,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from campaign.checking import Check, Finding, Workbench, in_own_process
+from needle_device_driver.conformance.rig import FASTEST
 from needle_sim.drive_emulator import COUNTS_PER_RADIAN, DriveEmulatorParameters
 from scenario.faults import Fault, Kind
 from scenario.process_run import PARTS, run_processes
 from scenario.rig_run import RunResult
-from scenario.virtual_rig import FASTEST, VirtualRig
+from scenario.virtual_rig import VirtualRig
 
 STEPS = 10_000
 MOMENTS = 50

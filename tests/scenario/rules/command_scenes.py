@@ -6,8 +6,9 @@ import math
 
 from needle_core import messages as m
 from needle_core.component import Call, Publish
+from needle_device_driver.conformance.rig import AT_REST
 from needle_device_driver.rules import Rule
-from scenario.rules.scene import AT_REST, COMMANDS, HOLD, STATUS, Held, Scene
+from scenario.rules.scene import COMMANDS, HOLD, STATUS, Held, Scene
 
 
 def hold_to_run() -> None:
