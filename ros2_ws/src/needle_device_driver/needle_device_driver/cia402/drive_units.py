@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
+from needle_device_driver.axes.drive_errors import DriveError
 from needle_device_driver.cia402.drive_settings import INDEX_PULSE, DriveSettings
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.object_access import DriveError, ObjectAccess
+from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.procedure import Procedure
 
 # Codes of numerators and denominators. A dimensionless quantity is in counts.

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import contextlib
 
+from needle_device_driver.axes.drive_errors import DriveError
 from needle_device_driver.link.error_codes import NO_SUCH_OBJECT, WRONG_LENGTH
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import Entry
 from needle_device_driver.link.sdo_client import SdoAbortedError, SdoTimeoutError
 from needle_device_driver.procedure import Procedure
-
-
-class DriveError(Exception):
-    """A drive does not answer, or refuses; the text names the entry and the reason."""
 
 
 class DriveRefusalError(DriveError):
