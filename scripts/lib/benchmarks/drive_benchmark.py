@@ -25,8 +25,9 @@ import numpy as np
 
 from figure_rows import Row
 from needle_core.component import PortChange
+from needle_device_driver.cia402.backend import drive_settings
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
-from needle_device_driver.cia402.drive_cycle import DriveCycle
+from needle_device_driver.cia402.drive_cycle import Cia402Drives
 from needle_device_driver.link.can_port import Batch, CanPort
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.link_settings import LinkSettings
@@ -66,10 +67,10 @@ class Driver:
         self._port = CanPort(settings)
         self._port.open(self._arrived.put)
         self._axes = [
-            Cia402Axis(name, values.drive(name), self._link, period=PERIOD, watchdog=0.5)
+            Cia402Axis(name, drive_settings(values, name), self._link, period=PERIOD, watchdog=0.5)
             for name in ("insertion", "rotation")
         ]
-        self._cycle = DriveCycle(self._link, self._axes, PERIOD)
+        self._cycle = Cia402Drives(self._link, self._axes, PERIOD, 0.5)
         for axis in self._axes:
             self._run(axis.configure())
             axis.power(True)
@@ -77,7 +78,7 @@ class Driver:
             self._run(self._cycle.exchange(PERIOD / 2))
             time.sleep(PERIOD)
         self._starts = [axis.poll(0.0).position for axis in self._axes]
-        self._units = [values.drive(axis.name).counts_per_unit for axis in self._axes]
+        self._units = [values.axis(axis.name).counts_per_unit for axis in self._axes]
 
     def cycle(self, number: int) -> None:
         """Run one cycle as the node does."""

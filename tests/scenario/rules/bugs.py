@@ -12,10 +12,10 @@ import pytest
 from needle_core.messages import HoldState
 from needle_device_driver.axes.axis import AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import CoordinatedMotion, Leg
+from needle_device_driver.axes.speed_monitor import SpeedMonitor
 from needle_device_driver.cia402 import cia402_axis
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_settings import DriveSettings
-from needle_device_driver.cia402.drive_watch import SpeedMonitor
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.supervisor import command, command_handler

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_core.commands.options import CommandParser
+from needle_device_driver.axes.cycle_times import PERIOD
+from needle_device_driver.cia402.backend import drive_settings
 from needle_device_driver.cia402.drive_file_check import ObjectRow, check_device_file
-from needle_device_driver.device_driver import PERIOD
 from needle_device_driver.link.device_file import UNKNOWN
 from needle_device_driver.parameters import DeviceDriverParameters
 
@@ -40,8 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _check(path: Path) -> int:
-    parameters = DeviceDriverParameters()
-    settings = dataclasses.replace(parameters.drive("insertion"), counts_per_turn=_COUNTS_PER_TURN)
+    parameters = DeviceDriverParameters(insertion_counts_per_turn=_COUNTS_PER_TURN)
+    settings = drive_settings(parameters, "insertion")
     product, rows, notes = check_device_file(
         path, settings, period=PERIOD, watchdog=parameters.watchdog
     )

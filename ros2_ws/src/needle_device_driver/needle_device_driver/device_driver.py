@@ -1,13 +1,13 @@
-"""device_driver as a component: the `device/...` interface on drives behind a CAN port."""
+"""device_driver as a component: the `device/...` interface on drives behind ports."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
-from needle_core.can_frame import CAN, CanErrors, CanFrame
 from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
 from needle_core.component import (
     Actions,
@@ -22,19 +22,17 @@ from needle_core.component import (
     Send,
     Timer,
 )
-from needle_device_driver.cia402.cia402_axis import Cia402Axis
-from needle_device_driver.cia402.drive_cycle import DriveCycle
-from needle_device_driver.cia402.drive_upkeep import are_emulated
+from needle_device_driver.axes.axis import Axis
+from needle_device_driver.axes.cycle_times import PERIOD, CycleTimes
+from needle_device_driver.axes.drive_errors import LinkError
+from needle_device_driver.axes.drives import Drives
 from needle_device_driver.device import DeviceInterface
-from needle_device_driver.link.frame_link import FrameLink, LinkError
 from needle_device_driver.parameters import DriverParameters
-from needle_device_driver.procedure import Procedure, Running
+from needle_device_driver.procedure import Procedure, Running, side_by_side
 from needle_device_driver.supervisor.reports import ServiceResult
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
-PERIOD = 0.02
-"""Of the cycle: set-points, SYNC, answers [s]."""
 _NO_DRIVES = "waiting for the drives"
 _REPLY_TIMEOUT = 0.75 * PERIOD
 _SEARCH_PERIOD = 0.25
@@ -58,8 +56,6 @@ class DeviceDriver(Component):
     ----------
     supervisor : MotionSupervisor
         The motion supervisor.
-    link : FrameLink
-        The bus.
     waiting : str
         Why services are not ready; empty: they are.
     searches : bool
@@ -78,20 +74,20 @@ class DeviceDriver(Component):
         search_from: float = 0.0,
     ) -> None:
         self.settings = settings
-        self.link = FrameLink(settings.link_name)
-        insertion, rotation = (
-            Cia402Axis(
-                axis, settings.drive(axis), self.link, period=PERIOD, watchdog=settings.watchdog
-            )
-            for axis in ("insertion", "rotation")
+        self._drives: tuple[Drives, ...] = tuple(
+            backend.make(settings, settings.axes_of(backend)) for backend in settings.backends
         )
-        self._drives = DriveCycle(self.link, (insertion, rotation), PERIOD)
+        self._times = CycleTimes(PERIOD)
+        axes: dict[str, Axis] = {}
+        for drives in self._drives:
+            axes |= drives.axes
+        response_time = max(drives.capabilities.response_time for drives in self._drives)
         self.supervisor = MotionSupervisor(
-            insertion,
-            rotation,
+            axes["insertion"],
+            axes["rotation"],
             settings,
-            feedback_delay=1,
-            is_switching=lambda: self._drives.needs_cycles,
+            feedback_delay=math.ceil(response_time / PERIOD),
+            is_switching=lambda: any(drives.needs_cycles for drives in self._drives),
         )
         self._device = DeviceInterface(
             self.supervisor, name, simulated=None, not_ready=lambda: self.waiting
@@ -112,8 +108,13 @@ class DeviceDriver(Component):
             for row in self._device.services
         )
         self.outputs = self._device.outputs
-        self.ports = (
-            Port(CAN, self._guarded(self._on_frames), self._guarded(self._on_port_change)),
+        self.ports = tuple(
+            Port(
+                drives.port,
+                self._guarded(partial(self._on_batch, drives)),
+                self._guarded(partial(self._on_port_change, drives)),
+            )
+            for drives in self._drives
         )
         self.timers = (
             Timer(PERIOD, self._guarded(self._on_cycle, ends=True)),
@@ -133,7 +134,7 @@ class DeviceDriver(Component):
     def _guarded(
         self, handler: Callable[..., Actions], *, ends: bool = False
     ) -> Callable[..., Actions]:
-        """Wrap a handler: send its frames, and stop both axes if it raises an error.
+        """Wrap a handler: send its orders, and stop both axes if it raises an error.
 
         Parameters
         ----------
@@ -145,7 +146,8 @@ class DeviceDriver(Component):
 
         def guarded(*arguments: Any) -> Actions:
             at: Moment = arguments[-1]
-            self.link.now = at.steady
+            for drives in self._drives:
+                drives.now = at.steady
             try:
                 yield from handler(*arguments)
             except Exception as error:
@@ -161,9 +163,9 @@ class DeviceDriver(Component):
         return guarded
 
     def _send(self) -> Actions:
-        frames = self.link.pop_outgoing()
-        if frames:
-            yield Send(CAN, frames)
+        for drives in self._drives:
+            if batch := drives.pop_outgoing():
+                yield Send(drives.port, batch)
 
     # ---- the cycle ----------------------------------------------------------------------------
 
@@ -172,22 +174,24 @@ class DeviceDriver(Component):
         """Whether a procedure or a cycle is under way."""
         return self._device.is_busy or self._cycle is not None
 
-    def _on_frames(self, items: Sequence[CanFrame | CanErrors], at: Moment) -> Actions:
-        self.link.receive(items)
+    def _on_batch(self, drives: Drives, batch: Sequence[Any], at: Moment) -> Actions:
+        drives.receive(batch)
         yield from self._advance(at)
 
-    def _on_port_change(self, change: PortChange, at: Moment) -> Actions:
-        self.link.set_port_error(change.lost)
+    def _on_port_change(self, drives: Drives, change: PortChange, at: Moment) -> Actions:
+        drives.set_port_error(change.lost)
         yield from self._observe(at)
         yield from self._advance(at)
 
     def _on_cycle(self, at: Moment) -> Actions:
-        self._drives.times.begin(at.steady)
+        self._times.begin(at.steady)
         yield from self._advance(at)
         if self._is_ending:
             return
         if self.is_busy:
-            # While a drive is slow, the SDO client sends the heartbeat; supervision must continue.
+            # A procedure feeds the watchdogs of its own drives only. Supervision must continue.
+            if len(self._drives) > 1:
+                self._beat()
             yield from self._observe(at)
             yield from self._device.advance(at)
         elif self.is_set_up:
@@ -203,9 +207,11 @@ class DeviceDriver(Component):
 
     def _begin_cycle(self, at: Moment) -> Actions:
         self.supervisor.note_time(at.stamp_ns, at.steady)
-        self._drives.collect()
+        for drives in self._drives:
+            drives.collect()
         self.supervisor.drive(PERIOD, at.steady)
-        self._cycle = Running(self._drives.exchange(_REPLY_TIMEOUT)), at
+        exchanges = (drives.exchange(_REPLY_TIMEOUT) for drives in self._drives)
+        self._cycle = Running(side_by_side(*exchanges)), at
         yield from self._advance(at)
 
     def _advance(self, at: Moment) -> Actions:
@@ -233,19 +239,23 @@ class DeviceDriver(Component):
         yield from self._device.begin(self._set_up_drives(at.steady), self._after_search, at)
 
     def _set_up_drives(self, now: float) -> Procedure[ServiceResult]:
-        error = yield from self._drives.probe()
-        if error:
-            return ServiceResult(False, error)
+        for drives in self._drives:
+            error = yield from drives.probe()
+            if error:
+                return ServiceResult(False, error)
         if self.supervisor.state is not State.UNCONFIGURED:
             # Clear an earlier fault; an emergency stop that is pressed stays.
             result = yield from self.supervisor.reset(now)
             if not result.success:
                 return result
-        nodes = [self.settings.drive(name).node_id for name in ("insertion", "rotation")]
-        try:
-            self._device.simulated = yield from are_emulated(self.link, nodes)
-        except LinkError as lost:
-            return ServiceResult(False, str(lost))
+        simulated = True
+        for drives in self._drives:
+            try:
+                emulated = yield from drives.are_emulated()
+            except LinkError as lost:
+                return ServiceResult(False, str(lost))
+            simulated = simulated and emulated
+        self._device.simulated = simulated
         result = yield from self.supervisor.configure(now)
         # A drive that refuses its set-up will refuse the next attempt, too.
         self._refusal = "" if result.success else result.message
@@ -254,10 +264,10 @@ class DeviceDriver(Component):
     def _after_search(self, result: ServiceResult, at: Moment) -> Actions:
         if result.success:
             self.is_set_up, self.searches, self.waiting = True, False, ""
-            yield Log("info", f"found both drives on {self.link.name}")
-            for text in self._drives.missing_optional_objects:
+            yield Log("info", f"found both drives on {' and '.join(d.name for d in self._drives)}")
+            for text in (text for drives in self._drives for text in drives.missing_optional_parts):
                 # Feed the watchdogs: logging can be slow.
-                self._drives.beat()
+                self._beat()
                 yield from self._send()
                 yield Log("warning", text)
         elif self._refusal or at.steady > self._give_up_at:
@@ -280,8 +290,17 @@ class DeviceDriver(Component):
         self._device.simulated = None
         yield from self._device.report(at)
         yield from self._send()
-        self.link.close()
+        for drives in self._drives:
+            drives.close()
         yield Exit(EXIT_DONE)
 
+    def _beat(self) -> None:
+        for drives in self._drives:
+            drives.beat()
+
     def _report_health(self, at: Moment) -> Actions:
-        yield Diagnose("can", self._drives.health(self.waiting))
+        times = self._times.take()
+        for drives in self._drives:
+            health = drives.health(self.waiting)
+            values = {**health.values, **times}
+            yield Diagnose(drives.port, dataclasses.replace(health, values=values))

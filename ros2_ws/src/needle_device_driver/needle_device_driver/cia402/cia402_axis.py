@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
-
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
+from needle_device_driver.axes.drive_errors import DriveError, LinkError, raised_as_axis_error
+from needle_device_driver.axes.speed_monitor import SpeedMonitor
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
     POWERED,
@@ -30,12 +29,11 @@ from needle_device_driver.cia402.drive_watch import (
     Fault,
     HomingRun,
     HomingStep,
-    SpeedMonitor,
     drive_fault,
 )
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.frame_link import FrameLink, LinkError
-from needle_device_driver.link.object_access import DriveError, ObjectAccess
+from needle_device_driver.link.frame_link import FrameLink
+from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.procedure import Procedure, Wait
 from needle_device_driver.rules import Rule
 
@@ -89,6 +87,11 @@ class Cia402Axis(Axis):
         self._opening = self._origin = self._zero = 0
         self._velocity = 0.0
 
+    @property
+    def node_id(self) -> int:
+        """CANopen node id of the drive."""
+        return self._settings.node_id
+
     def probe(self) -> Procedure[None]:
         """Request an answer of the drive, in any state of its node.
 
@@ -98,7 +101,7 @@ class Cia402Axis(Axis):
             If it does not answer.
         """
         node = self._settings.node_id
-        with self._as_axis_error():
+        with raised_as_axis_error(self.name):
             # A node in the state "stopped" answers no SDO.
             self._link.send(od.NMT, bytes([od.NMT_PRE_OPERATIONAL, node]))
             yield from ObjectAccess(self._link, node).read(od.DEVICE_TYPE)
@@ -107,7 +110,7 @@ class Cia402Axis(Axis):
 
     def configure(self) -> Procedure[None]:
         """Open the link and set the drive up; moves nothing."""
-        with self._as_axis_error():
+        with raised_as_axis_error(self.name):
             self._link.open()
             yield from self._set_up(survived=False)
         self._configured = True
@@ -133,7 +136,7 @@ class Cia402Axis(Axis):
             self._count_from_home()
             return
         self._homed = self._limits_due = False
-        with self._as_axis_error():
+        with raised_as_axis_error(self.name):
             yield from write_limits(self._access, self._settings, homed=False)
             yield from write_homing(self._access, self._settings, speed)
         self._machine.mode = Mode.HOMING
@@ -172,14 +175,14 @@ class Cia402Axis(Axis):
             return
         self._homing = None
         self._machine.stop()
-        with self._as_axis_error():
+        with raised_as_axis_error(self.name):
             self._send_order()
 
     def reset(self) -> Procedure[None]:
         """Open a lost link, set up a rebooted drive, acknowledge a fault; moves nothing."""
         self._machine.set_goal(Goal.OFF)
         self._homing = None
-        with self._as_axis_error():
+        with raised_as_axis_error(self.name):
             self._link.open()
             self._link.other_master = ""
             operational = yield from await_operational(self._link, self.monitor, self._period)
@@ -231,7 +234,7 @@ class Cia402Axis(Axis):
             return
         self._homing = None
         try:
-            with self._as_axis_error():
+            with raised_as_axis_error(self.name):
                 self._machine.set_goal(Goal.OFF)
                 if not (yield from self._switch_off_now()):
                     raise DriveError("does not confirm power-off; its watchdog will switch it off")
@@ -273,7 +276,9 @@ class Cia402Axis(Axis):
         self._machine.update(at)
         if self._homing is not None:
             self._speed.command(self._homing.speed)
-        plausible = self._speed.check(before, at, powered=self._machine.state in POWERED)
+        periods = at.periods_since(before, self._period)
+        moved = self._settings.position(at.position - before.position)
+        plausible = self._speed.check(moved, periods, powered=self._machine.state in POWERED)
         if self._homing is not None:
             self._homing.update(at, at.position - before.position if plausible else 0)
             if self._homing.step is HomingStep.DONE:
@@ -328,15 +333,6 @@ class Cia402Axis(Axis):
             raise AxisError(f"{self.name} axis is not configured")
         if (fault := self._fault) is not None:
             raise AxisError(f"{self.name} axis: {fault[1]}", fault[0])
-
-    @contextlib.contextmanager
-    def _as_axis_error(self) -> Iterator[None]:
-        """Raise errors of link and drive as `AxisError`."""
-        try:
-            yield
-        except (LinkError, DriveError) as error:
-            rule = Rule.LINK_LOSS if isinstance(error, LinkError) else Rule.ONE_FAULT_STOPS_BOTH
-            raise AxisError(f"{self.name} axis: {error}", rule) from error
 
     # ---- set-up, reset, shut-down -------------------------------------------------------------
 

@@ -1,54 +1,28 @@
-"""Cycle of all drives on a bus: commands and set-points, SYNC, answers; and its health."""
+"""CiA 402 drives on a CAN bus: cycle of commands, set-points, SYNC and answers; health."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from needle_core.can_frame import CAN, CanErrors, CanFrame
 from needle_core.diagnostics import Diagnostic, Level
 from needle_device_driver.axes.axis import AxisError
+from needle_device_driver.axes.capabilities import Capabilities
+from needle_device_driver.axes.drive_errors import LinkError
+from needle_device_driver.axes.drives import Drives
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
-from needle_device_driver.link.frame_link import FrameLink, LinkError
+from needle_device_driver.cia402.drive_upkeep import are_emulated
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import SYNC
 from needle_device_driver.procedure import Procedure, Wait
 
 # A pause for late answers: its length in cycles, and the wait in each of them [s].
 _PAUSE = 2
 _PAUSE_WAIT = 0.015
-# A cycle is late if it begins later by this share of a period.
-_LATE = 0.5
 
 
-class CycleTimes:
-    """Measures whether cycles begin on time.
-
-    Parameters
-    ----------
-    period : float
-        Between cycles [s].
-    """
-
-    def __init__(self, period: float) -> None:
-        self._period = period
-        self._begun: float | None = None
-        self._longest = 0.0
-        self._late = 0
-
-    def begin(self, now: float) -> None:
-        """Note that a cycle begins at steady time `now` [s]."""
-        if self._begun is not None:
-            between = now - self._begun
-            self._longest = max(self._longest, between)
-            self._late += between > (1.0 + _LATE) * self._period
-        self._begun = now
-
-    def take(self) -> dict[str, str]:
-        """Return the number of late cycles, and the longest cycle since the last call."""
-        longest, self._longest = self._longest, 0.0
-        return {"late_cycles": str(self._late), "longest_cycle_s": f"{longest:.4f}"}
-
-
-class DriveCycle:
-    """Sends the frames of each cycle and receives the answers.
+class Cia402Drives(Drives):
+    """CiA 402 drives on one bus.
 
     Parameters
     ----------
@@ -58,26 +32,42 @@ class DriveCycle:
         The axes of all its drives.
     period : float
         Of the cycle [s].
+    watchdog : float
+        A drive stops after this time without the computer's heartbeat [s].
 
     Attributes
     ----------
-    times : CycleTimes
-        Whether the cycles begin on time.
     unanswered : int
         Number of SYNCs that a drive did not answer in their cycle.
     """
 
-    def __init__(self, link: FrameLink, axes: Sequence[Cia402Axis], period: float) -> None:
+    port = CAN
+
+    def __init__(
+        self, link: FrameLink, axes: Sequence[Cia402Axis], period: float, watchdog: float
+    ) -> None:
+        self.name = link.name
+        self.capabilities = Capabilities(
+            streams=True,
+            watchdog=watchdog,
+            longest_order=period,
+            response_time=period,
+            encoder=True,
+            switches=True,
+            limits=True,
+            identity=True,
+            exclusive=True,
+        )
+        self.axes = {axis.name: axis for axis in axes}
         self._link = link
         self._axes = tuple(axes)
-        self.times = CycleTimes(period)
         self.unanswered = 0
         self._outstanding = 0
         self._paused = 0
         self._reported_unanswered = 0
 
     @property
-    def missing_optional_objects(self) -> tuple[str, ...]:
+    def missing_optional_parts(self) -> tuple[str, ...]:
         """Optional objects that the drives lack."""
         return tuple(
             f"{axis.name} drive {text}"
@@ -98,7 +88,6 @@ class DriveCycle:
             "frames_sent": str(link.frames_sent),
             "frames_received": str(link.frames_received),
             "bus_errors": str(link.error_frames),
-            **self.times.take(),
             "unanswered_syncs": str(self.unanswered),
         }
         count = self.unanswered - self._reported_unanswered
@@ -111,6 +100,35 @@ class DriveCycle:
         elif count:
             level, message = Level.WARN, f"{count} SYNCs had no reply within their cycle"
         return Diagnostic(level, message, values)
+
+    @property
+    def now(self) -> float:
+        """Steady time of the running handler [s]."""
+        return self._link.now
+
+    @now.setter
+    def now(self, value: float) -> None:
+        self._link.now = value
+
+    def receive(self, batch: Sequence[CanFrame | CanErrors]) -> None:
+        """Receive frames and error counts from the port."""
+        self._link.receive(batch)
+
+    def set_port_error(self, error: str) -> None:
+        """Note why the port is not open; empty: it is open."""
+        self._link.set_port_error(error)
+
+    def pop_outgoing(self) -> tuple[CanFrame, ...]:
+        """Return the frames that were sent since the last call."""
+        return self._link.pop_outgoing()
+
+    def are_emulated(self) -> Procedure[bool]:
+        """Return whether each drive reports that it is emulated; raises `LinkError`."""
+        return are_emulated(self._link, [axis.node_id for axis in self._axes])
+
+    def close(self) -> None:
+        """Close the link."""
+        self._link.close()
 
     def probe(self) -> Procedure[str]:
         """Open the link and request an answer of every drive; return the error."""

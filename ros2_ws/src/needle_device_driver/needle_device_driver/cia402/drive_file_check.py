@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from needle_core.errors import UserError
+from needle_device_driver.axes.drive_errors import DriveError
 from needle_device_driver.cia402.cia402 import SUPPORTS_CYCLIC_POSITION
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import DriveSettings
@@ -19,7 +20,7 @@ from needle_device_driver.link.device_file import (
     FileLink,
     read_device_file,
 )
-from needle_device_driver.link.object_access import DriveError, DriveRefusalError, ObjectAccess
+from needle_device_driver.link.object_access import DriveRefusalError, ObjectAccess, ObjectError
 from needle_device_driver.procedure import Procedure, run_at_once
 
 _PDOS = {
@@ -91,13 +92,15 @@ def check_device_file(
         device.restart()
         try:
             notes = run_at_once(_whole_set_up(FileLink(device), settings, period, watchdog))
-        except DriveError as error:
-            address = (error.entry.index, error.entry.subindex) if error.entry else None
-            if address is None or address in fatal:
+        except ObjectError as error:
+            address = error.entry.index, error.entry.subindex
+            if address in fatal:
                 raise UserError(f"{path}: {error}") from error
             is_refusal = isinstance(error, DriveRefusalError)
             fatal[address] = device.problems[address] if is_refusal else str(error)
             (device.granted if is_refusal else device.ignored).add(address)
+        except DriveError as error:
+            raise UserError(f"{path}: {error}") from error
         else:
             break
     return product, _rows(device.problems, fatal), () if fatal else notes

@@ -61,6 +61,15 @@ class Feedback:
     syncs: int = 0
     time: float = 0.0
 
+    def periods_since(self, before: Feedback, period: float) -> int:
+        """Return how many SYNC periods of `period` [s] lie between two answers.
+
+        It is the greatest of three counts: SYNCs sent, answers received, and elapsed time. Answers
+        may be lost or late, and after a late SYNC the axis has moved farther.
+        """
+        elapsed = round((self.time - before.time) / period)
+        return max(1, self.syncs - before.syncs, self.number - before.number, elapsed)
+
 
 class DriveMonitor:
     """Receives the frames of one node and measures their age.

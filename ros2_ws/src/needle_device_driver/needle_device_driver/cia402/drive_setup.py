@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from needle_device_driver.axes.axis_settings import HERE
+from needle_device_driver.axes.drive_errors import DriveError
 from needle_device_driver.cia402.cia402 import (
     POWERED,
     SUPPORTS_CYCLIC_POSITION,
@@ -13,11 +15,11 @@ from needle_device_driver.cia402.cia402 import (
     drive_state,
 )
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
-from needle_device_driver.cia402.drive_settings import HERE, DriveSettings
+from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.cia402.drive_units import read_units
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.frame_link import FrameLink
-from needle_device_driver.link.object_access import DriveError, DriveRefusalError, ObjectAccess
+from needle_device_driver.link.object_access import DriveRefusalError, ObjectAccess, ObjectError
 from needle_device_driver.link.objects import Pdo
 from needle_device_driver.procedure import Procedure
 
@@ -212,7 +214,7 @@ def _check_modes(link: FrameLink, access: ObjectAccess, node: int) -> Procedure[
     listed = yield from access.read_optional(od.SUPPORTED_MODES)
     if listed is not None and not listed & SUPPORTS_HOMING:
         text = f"node {node} has no homing mode (0x6502 = 0x{listed:08X})"
-        raise DriveError(text, od.SUPPORTED_MODES)
+        raise ObjectError(text, od.SUPPORTED_MODES)
     if listed is None:
         yield from _try_mode(link, access, node, Mode.HOMING)
     if listed is None or not listed & SUPPORTS_CYCLIC_POSITION:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from needle_device_driver.axes.drive_errors import DriveError
 from needle_device_driver.cia402.cia402 import FAULTS, POWERED, DriveCommand, Mode, drive_state
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.error_codes import describe_error
 from needle_device_driver.link.frame_link import FrameLink
-from needle_device_driver.link.object_access import DriveError, ObjectAccess
+from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.link.sdo_client import SdoAbortedError, SdoTimeoutError
 from needle_device_driver.procedure import Procedure
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import enum
-import math
 
+from needle_device_driver.axes.axis_settings import HERE
+from needle_device_driver.axes.speed_monitor import SpeedMonitor
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
     FOLLOWING_ERROR,
@@ -17,21 +18,12 @@ from needle_device_driver.cia402.cia402 import (
 )
 from needle_device_driver.cia402.drive_machine import DriveMachine
 from needle_device_driver.cia402.drive_monitor import DriveMonitor, Feedback
-from needle_device_driver.cia402.drive_settings import HERE, INDEX_PULSE, DriveSettings
+from needle_device_driver.cia402.drive_settings import INDEX_PULSE, DriveSettings
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.error_codes import HEARTBEAT_LOST, describe_error
 from needle_device_driver.rules import Rule
 
 Fault = tuple[Rule, str]
-
-# Speed bound: this factor times the commanded speed, plus a margin in [m/s] or [rad/s].
-_FACTOR = 1.5
-_MARGINS = {"m": 5e-4, "rad": 0.1}
-# Number of consecutive cycles above the bound that are a fault. A single one is not: a drive that
-# sets its position to 0 at home causes one.
-_MAX_FAST_CYCLES = 2
-# Time constant of a motor that lags behind its set-points [s].
-_LONGEST_LAG = 0.2
 
 # A drive may report that it attained the previous homing. If the new one ends within a cycle, where
 # the axis stands or at the edge of its switch, no change shows. So it counts as ended after this
@@ -41,66 +33,6 @@ _CYCLES_HERE, _CYCLES_AT_SWITCH = 5, 25
 _SEARCH = 1.2
 # Methods that end at a limit switch: its direction in counts, its bit of the digital inputs.
 _TOWARDS = {17: (-1, od.NEGATIVE_LIMIT_SWITCH), 18: (1, od.POSITIVE_LIMIT_SWITCH)}
-
-
-class SpeedMonitor:
-    """Rule `axis_speed`: compares the speed of an axis with its commanded speed.
-
-    Parameters
-    ----------
-    settings : DriveSettings
-        The drive of the axis.
-    period : float
-        Of the SYNC [s].
-
-    Attributes
-    ----------
-    problem : str
-        How the axis is too fast; empty: it is not.
-    """
-
-    def __init__(self, settings: DriveSettings, period: float) -> None:
-        self._settings = settings
-        self._period = period
-        # The commanded speed decays no faster than the axis slows down.
-        self._decay = math.exp(-period / max(settings.stop_time, _LONGEST_LAG))
-        self.reset()
-
-    def reset(self) -> None:
-        """Restart without a commanded speed."""
-        self._commanded = 0.0
-        self._fast_cycles = 0
-        self.problem = ""
-
-    def command(self, speed: float) -> None:
-        """Note the commanded speed of the next cycle [m/s or rad/s]."""
-        self._commanded = max(self._commanded, speed)
-
-    def check(self, before: Feedback, at: Feedback, *, powered: bool) -> bool:
-        """Return whether the axis moved at an allowed speed between two answers.
-
-        The elapsed time is the greatest of three counts of SYNC periods: SYNCs sent, answers
-        received, and time between both answers. Answers may be lost or late, and after a late
-        SYNC the axis has moved farther.
-        """
-        settings, commanded = self._settings, self._commanded
-        periods = max(
-            1,
-            at.syncs - before.syncs,
-            at.number - before.number,
-            round((at.time - before.time) / self._period),
-        )
-        speed = abs(settings.position(at.position - before.position)) / (periods * self._period)
-        bound = _FACTOR * commanded + _MARGINS[settings.unit]
-        self._commanded *= self._decay
-        is_fast = powered and speed > bound
-        self._fast_cycles = self._fast_cycles + 1 if is_fast else 0
-        if self._fast_cycles >= _MAX_FAST_CYCLES and not self.problem:
-            self.problem = (
-                f"moves at {settings.text(speed)}/s, limit {settings.text(bound)}/s at "
-                f"{settings.text(commanded)}/s commanded"
-            )
-        return not is_fast
 
 
 class HomingStep(enum.Enum):

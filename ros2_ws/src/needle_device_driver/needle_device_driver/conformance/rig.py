@@ -26,8 +26,9 @@ from needle_core.messages import HoldSession
 from needle_core.runners.transport import Fault
 from needle_core.runners.virtual import LOG, VirtualRunner
 from needle_core.status_messages import DeviceStatus
+from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.device import COMMANDS, EMERGENCY_STOP, HOLD, JOINTS, RESULT, STATUS
-from needle_device_driver.device_driver import PERIOD, DeviceDriver
+from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.rules import Rule
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from needle_core.can_frame import CanErrors, CanFrame
+from needle_device_driver.axes.drive_errors import LinkError
 from needle_device_driver.link.objects import (
     HEARTBEAT,
     MASTER_NODE_ID,
@@ -25,10 +26,6 @@ _MASTER_FRAMES = {
 }
 
 Callback = Callable[[bytes, float], None]
-
-
-class LinkError(Exception):
-    """The link cannot be opened or is lost; the text names the link and the reason."""
 
 
 class FrameLink:

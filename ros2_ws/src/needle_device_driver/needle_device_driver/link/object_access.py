@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 
+from needle_device_driver.axes.drive_errors import DriveError
 from needle_device_driver.link.error_codes import NO_SUCH_OBJECT, WRONG_LENGTH
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import Entry
@@ -11,23 +12,23 @@ from needle_device_driver.link.sdo_client import SdoAbortedError, SdoTimeoutErro
 from needle_device_driver.procedure import Procedure
 
 
-class DriveError(Exception):
-    """A drive does not answer, or refuses.
+class ObjectError(DriveError):
+    """An entry of a drive is not as the driver needs it.
 
     Parameters
     ----------
     text : str
         The entry and the reason.
-    entry : Entry or None
-        The entry; None: the reason is another one.
+    entry : Entry
+        The entry.
     """
 
-    def __init__(self, text: str, entry: Entry | None = None) -> None:
+    def __init__(self, text: str, entry: Entry) -> None:
         super().__init__(text)
         self.entry = entry
 
 
-class DriveRefusalError(DriveError):
+class DriveRefusalError(ObjectError):
     """A drive refuses to read or write an entry.
 
     Parameters

@@ -6,11 +6,9 @@ import logging
 import sys
 import time
 
-from needle_core.can_frame import CAN
 from needle_core.process.discovery import DISCOVERY, is_network_enabled
 from needle_core.ros.main import run_component
 from needle_device_driver.device_driver import DeviceDriver
-from needle_device_driver.link.can_port import CanPort
 from needle_device_driver.parameters import DeviceDriverParameters, DriverParameters
 
 HELP = """\
@@ -49,7 +47,9 @@ def main() -> int:
         DeviceDriverParameters,
         make_driver,
         help_text=HELP,
-        ports=lambda settings: {CAN: CanPort(settings, settings.write_timeout)},
+        ports=lambda settings: {
+            backend.port: backend.open_port(settings) for backend in settings.backends
+        },
         shared_memory=False,
     )
 

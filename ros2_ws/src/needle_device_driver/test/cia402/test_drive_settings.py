@@ -7,9 +7,10 @@ import dataclasses
 import pytest
 
 from needle_core.errors import OutOfBoundsError, UserError
+from needle_device_driver.cia402.backend import drive_settings
 from needle_device_driver.parameters import DeviceDriverParameters
 
-SETTINGS = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
+SETTINGS = drive_settings(DeviceDriverParameters(link="virtual", channel="test"), "insertion")
 
 
 def test_node_id_range() -> None:

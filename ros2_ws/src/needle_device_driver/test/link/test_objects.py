@@ -13,12 +13,13 @@ import yaml
 from hypothesis import given, settings
 
 from needle_core.errors import OutOfBoundsError, UserError
-from needle_device_driver.cia402.drive_cycle import CycleTimes
+from needle_device_driver.axes.cycle_times import CycleTimes
+from needle_device_driver.cia402.backend import drive_settings
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.error_codes import describe_error
 from needle_device_driver.parameters import DeviceDriverParameters
 
-DRIVE = DeviceDriverParameters().drive("insertion")
+DRIVE = drive_settings(DeviceDriverParameters(), "insertion")
 
 
 def test_entries_and_pdos_are_packed_little_endian() -> None:
@@ -85,13 +86,13 @@ def test_invalid_settings_and_parameters_are_refused() -> None:
 
 def test_drive_bounds_follow_the_limits_and_the_example_is_valid() -> None:
     parameters = DeviceDriverParameters(max_depth=0.1, max_speed=0.002, max_turns=1.0)
-    insertion, rotation = parameters.drive("insertion"), parameters.drive("rotation")
+    insertion, rotation = (drive_settings(parameters, axis) for axis in ("insertion", "rotation"))
     assert (insertion.lower, insertion.upper) == pytest.approx((-0.001, 0.101))
     assert (insertion.speed, rotation.speed) == (0.002, math.pi)
     assert rotation.upper == -rotation.lower == pytest.approx(2 * math.pi + 0.2)
     file = Path(__file__).resolve().parents[2] / "config" / "drives.yaml"
     values = yaml.safe_load(file.read_text("utf-8"))["device_driver"]["ros__parameters"]
-    example = DeviceDriverParameters(**values).drive("rotation")
+    example = drive_settings(DeviceDriverParameters(**values), "rotation")
     link = DeviceDriverParameters(link="socketcand", channel="can0")
     assert link.link_name == "socketcand localhost:29536 can0"
     assert link.write_timeout == 0.05

@@ -11,8 +11,9 @@ from canopen.objectdictionary import ODVariable, datatypes
 from canopen.sdo import client as canopen_client
 
 from needle_core.can_frame import CanErrors, CanFrame
+from needle_device_driver.axes.drive_errors import DriveError
 from needle_device_driver.link.frame_link import FrameLink
-from needle_device_driver.link.object_access import DriveError, ObjectAccess
+from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.link.objects import DEVICE_TYPE
 from needle_device_driver.link.sdo_client import SdoAbortedError, SdoClient, SdoTimeoutError
 from needle_device_driver.procedure import Procedure, T, run

@@ -6,8 +6,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from needle_device_driver.cia402.backend import drive_settings
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
-from needle_device_driver.cia402.drive_cycle import DriveCycle
+from needle_device_driver.cia402.drive_cycle import Cia402Drives
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
@@ -67,10 +68,16 @@ class DriveBench(SupervisorBench):
         self.bus = ScriptedBus([self.insertion, self.rotation], lambda f: self.link.receive([f]))
         watchdog = self.settings.watchdog
         self.axes = [
-            Cia402Axis(name, self.settings.drive(name), self.link, period=PERIOD, watchdog=watchdog)
+            Cia402Axis(
+                name,
+                drive_settings(self.settings, name),
+                self.link,
+                period=PERIOD,
+                watchdog=watchdog,
+            )
             for name in ("insertion", "rotation")
         ]
-        self.drives = DriveCycle(self.link, self.axes, PERIOD)
+        self.drives = Cia402Drives(self.link, self.axes, PERIOD, watchdog)
         self.supervisor = MotionSupervisor(
             self.axes[0],
             self.axes[1],

@@ -281,7 +281,7 @@ def test_drives_of_many_makers_are_set_up_and_move(
     bench.run(bench.drives.probe())
     bench.steps()
     assert {at: bench.insertion.value(*at) for at in wanted} == wanted
-    told = bench.drives.missing_optional_objects
+    told = bench.drives.missing_optional_parts
     assert told[0].startswith(f"insertion drive {missing}") if missing else told == ()
 
 
@@ -329,7 +329,7 @@ def test_axis_without_motor_needs_only_position_units() -> None:
     bench = DriveBench(insertion_drive="hand")
     bench.insertion.set_objects({(0x60A9, 0): 0x0001_0300, (0x60AA, 0): 0})
     bench.configured()
-    assert bench.drives.missing_optional_objects == ()
+    assert bench.drives.missing_optional_parts == ()
     bench = DriveBench(insertion_drive="hand")
     bench.insertion.set_objects({(0x60A8, 0): 0x0001_0000})
     assert "insertion axis: the drive measures positions in m (0x60A8" in bench.refusal()

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
+from needle_device_driver.axes.drive_errors import LinkError
 from needle_device_driver.cia402 import drive_setup
-from needle_device_driver.link.frame_link import LinkError
 from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.procedure import Procedure
 
@@ -168,7 +168,6 @@ def test_reply_age_lost_answers_are_discarded_after_a_pause() -> None:
     health = bench.drives.health("")
     assert health.message == f"{count} SYNCs had no reply within their cycle"
     assert health.values["unanswered_syncs"] == str(count)
-    assert health.values["late_cycles"] == "0"
     assert bench.drives.health("").message == "connected"
 
 

@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 
+from needle_device_driver.axes.speed_monitor import SpeedMonitor
+from needle_device_driver.cia402.backend import drive_settings
 from needle_device_driver.cia402.drive_monitor import Feedback
-from needle_device_driver.cia402.drive_watch import HomingRun, SpeedMonitor
+from needle_device_driver.cia402.drive_watch import HomingRun
 from needle_device_driver.parameters import DeviceDriverParameters
 
 from ..drive_bench import RAD, DriveBench
@@ -105,7 +107,7 @@ def test_axis_speed_of_a_drifting_axis() -> None:
         assert bench.state == state
 
 
-@pytest.mark.parametrize("drive", ["motor", "hand"])
+@pytest.mark.parametrize("drive", ["cia402", "hand"])
 def test_axis_speed_ignores_axes_without_power_or_motor(drive: str) -> None:
     bench = DriveBench(insertion_drive=drive).configured()
     for _ in range(20):
@@ -118,7 +120,7 @@ class Answers:
     """Feedback of an axis at a speed."""
 
     def __init__(self) -> None:
-        settings = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
+        settings = DeviceDriverParameters(link="virtual", channel="test").axis("insertion")
         self.watch = SpeedMonitor(settings, PERIOD)
         self.at = Feedback(0, 0, 0, 0, 0, 0)
 
@@ -135,7 +137,8 @@ class Answers:
             time=before.time + seconds,
         )
         self.watch.command(to)
-        return self.watch.check(before, self.at, powered=True)
+        moved = (self.at.position - before.position) / 20_000_000
+        return self.watch.check(moved, self.at.periods_since(before, PERIOD), powered=True)
 
 
 def test_axis_speed_uses_elapsed_sync_periods() -> None:
@@ -235,7 +238,8 @@ def test_homing_time_stops_a_drive_that_moves_away_from_its_switch(
 
 @pytest.mark.parametrize(("counts", "is_away"), [(1, True), (-1, False)])
 def test_homing_time_tolerance_of_the_direction(counts: int, is_away: bool) -> None:
-    settings = DeviceDriverParameters(link="virtual", channel="test").drive("insertion")
+    parameters = DeviceDriverParameters(link="virtual", channel="test")
+    settings = drive_settings(parameters, "insertion")
     settings = dataclasses.replace(settings, counts_per_unit=1000.0)
     homing = HomingRun(settings, 0.002, has_inputs=True)
     for position in (0, counts):

@@ -1,0 +1,42 @@
+"""Abilities of a kind of drive, on which the bounds of some safety rules depend."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Capabilities:
+    """Abilities of a drive; the motion supervisor does the rest.
+
+    Attributes
+    ----------
+    streams : bool
+        Whether it follows set-points every 20 ms; otherwise it makes point moves only.
+    watchdog : float
+        Time without the computer after which it stops by itself [s]; infinite: it has no watchdog.
+    longest_order : float
+        Longest time that a set-point keeps it moving if no further one follows [s].
+    response_time : float
+        From an order to its effect in the feedback [s].
+    encoder : bool
+        Whether it measures its position; otherwise it counts its own steps.
+    switches : bool
+        Whether it reports its limit switches.
+    limits : bool
+        Whether it has software limits.
+    identity : bool
+        Whether its answers show a restart.
+    exclusive : bool
+        Whether it refuses or reports the orders of another computer.
+    """
+
+    streams: bool
+    watchdog: float
+    longest_order: float
+    response_time: float
+    encoder: bool
+    switches: bool
+    limits: bool
+    identity: bool
+    exclusive: bool

@@ -1,0 +1,1 @@
+"""Kinds of drives, one module each."""

@@ -1,0 +1,221 @@
+"""Drives that answer requests: their cycle, and the backend of a protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from needle_core.diagnostics import Diagnostic, Level
+from needle_device_driver.axes.axis_settings import AxisSettings
+from needle_device_driver.axes.backend import Backend
+from needle_device_driver.axes.cycle_times import PERIOD
+from needle_device_driver.axes.drive_errors import DriveError, LinkError
+from needle_device_driver.axes.drives import Drives
+from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
+from needle_device_driver.polled.polled_axis import PolledAxis
+from needle_device_driver.polled.text_link import TextLink
+from needle_device_driver.ports.stream_port import StreamPort
+from needle_device_driver.procedure import Procedure, Wait
+
+_NUMBERS = 99
+# Largest number of requests without an answer: a slow line must not pile them up.
+_MAX_OUTSTANDING = 2
+# A request that is not answered within this number of cycles is lost.
+_LOST_AFTER = 10
+_REFRESH_TIMEOUT = 0.5
+_EMULATED = "Emulated"
+
+
+class PolledDrives(Drives):
+    """All drives of a protocol behind one connection.
+
+    Parameters
+    ----------
+    port : str
+        Name of the component's port.
+    protocol : DriveProtocol
+        Language of the drives.
+
+    Attributes
+    ----------
+    unanswered : int
+        Number of cycles without an answer.
+    """
+
+    def __init__(self, port: str, protocol: DriveProtocol) -> None:
+        self.port, self.name = port, protocol.link.name
+        self.capabilities = protocol.capabilities
+        self._protocol, self._link = protocol, protocol.link
+        self.axes = self._axes = {
+            name: PolledAxis(name, settings, protocol, PERIOD, self._refresh)
+            for name, settings in protocol.axes.items()
+        }
+        protocol.on_status = self._on_status
+        self._identity = ""
+        self._number = 0
+        # Number of each request without an answer, and when it was sent [s].
+        self._outstanding: dict[int, float] = {}
+        self.unanswered = self._reported_unanswered = 0
+
+    @property
+    def now(self) -> float:
+        """Steady time of the running handler [s]."""
+        return self._link.now
+
+    @now.setter
+    def now(self, value: float) -> None:
+        self._link.now = value
+
+    @property
+    def needs_cycles(self) -> bool:
+        """Whether a drive still executes an order other than a set-point."""
+        return any(axis.needs_cycles for axis in self._axes.values())
+
+    def receive(self, batch: Sequence[bytes]) -> None:
+        """Receive bytes from the port."""
+        for line in self._link.receive(batch):
+            self._protocol.on_line(line)
+
+    def set_port_error(self, error: str) -> None:
+        """Note why the port is not open; empty: it is open."""
+        self._link.set_port_error(error)
+
+    def pop_outgoing(self) -> tuple[bytes, ...]:
+        """Return the bytes that were sent since the last call."""
+        return self._link.pop_outgoing()
+
+    def probe(self) -> Procedure[str]:
+        """Open the link and ask for the names of the drives; return the error."""
+        try:
+            self._link.open()
+            self._outstanding.clear()
+            self._identity = yield from self._protocol.identify()
+        except (DriveError, LinkError) as error:
+            return str(error)
+        return ""
+
+    def are_emulated(self) -> Procedure[bool]:
+        """Return whether the drives report that they are emulated."""
+        yield from ()
+        return self._identity.startswith(_EMULATED)
+
+    def beat(self) -> None:
+        """Feed the watchdogs if the link is open."""
+        if self._link.is_open:
+            self._protocol.beat()
+
+    def collect(self) -> None:
+        """Do nothing: an answer is handled as it arrives."""
+
+    def exchange(self, timeout: float) -> Procedure[None]:
+        """Run one cycle; wait at most `timeout` [s] for the answers."""
+        if not self._link.is_open:
+            return
+        try:
+            self._protocol.beat()
+            for axis in self._axes.values():
+                yield from axis.transmit()
+            self._request()
+        except LinkError:
+            # The axes report the loss.
+            return
+        yield Wait(lambda: bool(self._link.lost) or not self._outstanding, timeout)
+        self.unanswered += bool(self._outstanding)
+
+    def health(self, waiting: str) -> Diagnostic:
+        """Return the health of the link since the last call; `waiting` describes a closed link."""
+        link = self._link
+        values = {
+            "link": link.name,
+            "drive": self._identity,
+            "bytes_sent": str(link.bytes_sent),
+            "lines_received": str(link.lines_received),
+            "garbled_lines": str(link.garbled),
+            "unanswered_cycles": str(self.unanswered),
+        }
+        count = self.unanswered - self._reported_unanswered
+        self._reported_unanswered = self.unanswered
+        level, message = Level.OK, "connected"
+        if link.lost:
+            level, message = Level.ERROR, link.lost
+        elif not link.is_open:
+            level, message = Level.WARN, waiting
+        elif count:
+            level, message = Level.WARN, f"{count} cycles had no answer"
+        return Diagnostic(level, message, values)
+
+    def close(self) -> None:
+        """Close the link."""
+        self._link.close()
+
+    def _request(self) -> None:
+        old = self.now - _LOST_AFTER * PERIOD
+        self._outstanding = {n: sent for n, sent in self._outstanding.items() if sent > old}
+        if len(self._outstanding) < _MAX_OUTSTANDING:
+            self._number = self._number % _NUMBERS + 1
+            self._outstanding[self._number] = self.now
+            self._protocol.request(self._number)
+        self._mark_answered()
+
+    def _on_status(self, number: int, replies: Mapping[str, DriveReply]) -> None:
+        sent = self._outstanding.pop(number, None)
+        if sent is None:
+            # Answers a request from before the link was opened, or one that counts as lost.
+            return
+        for name, reply in replies.items():
+            self._axes[name].update(reply, sent)
+        self._mark_answered()
+
+    def _mark_answered(self) -> None:
+        for axis in self._axes.values():
+            axis.answered = not self._outstanding
+
+    def _refresh(self) -> Procedure[None]:
+        """Request the state of all drives, and wait for it.
+
+        Raises
+        ------
+        DriveError
+            If there is no answer.
+        LinkError
+            If the link is lost.
+        """
+        self._outstanding.clear()
+        self._request()
+        yield Wait(lambda: bool(self._link.lost) or not self._outstanding, _REFRESH_TIMEOUT)
+        if self._link.lost:
+            raise LinkError(self._link.lost)
+        if self._outstanding:
+            raise DriveError(f"{self._link.name}: no state in {_REFRESH_TIMEOUT:g} s")
+
+
+def polled_backend(
+    port: str,
+    settings: type[Any],
+    protocol: type[DriveProtocol],
+    *,
+    address: Callable[[Any], str],
+    baudrate: Callable[[Any], int] = lambda _: 115_200,
+) -> Backend:
+    """Return the backend of a protocol.
+
+    Parameters
+    ----------
+    port : str
+        Name of the backend, and of its port.
+    settings : type
+        Dataclass of its parameters.
+    protocol : type
+        Language of the drives.
+    address, baudrate : callable
+        Return device file or `host:port`, and the speed of a serial line, from the parameters.
+    """
+
+    def make(parameters: Any, axes: Mapping[str, AxisSettings]) -> PolledDrives:
+        link = TextLink(f"{port} {address(parameters)}", protocol.terminators)
+        return PolledDrives(port, protocol(parameters, axes, link))
+
+    def open_port(parameters: Any) -> StreamPort:
+        return StreamPort(address(parameters), baudrate(parameters), parameters.write_timeout)
+
+    return Backend(port, settings, make, open_port)

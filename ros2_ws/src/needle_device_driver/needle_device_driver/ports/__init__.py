@@ -1,0 +1,1 @@
+"""Ports: connections with a thread of their own."""
