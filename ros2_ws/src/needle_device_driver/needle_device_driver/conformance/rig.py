@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -23,9 +24,11 @@ from needle_core.component import (
 )
 from needle_core.errors import UserError
 from needle_core.messages import HoldSession
-from needle_core.runners.transport import Fault
+from needle_core.runners.transport import Arrival, Arrivals, Fault, Link
 from needle_core.runners.virtual import LOG, VirtualRunner
 from needle_core.status_messages import DeviceStatus
+from needle_device_driver.axes.axis import Axis
+from needle_device_driver.axes.capabilities import Capabilities
 from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.device import COMMANDS, EMERGENCY_STOP, HOLD, JOINTS, RESULT, STATUS
 from needle_device_driver.device_driver import DeviceDriver
@@ -131,6 +134,8 @@ class ConformanceRig:
         Of the runner.
     *others : Component
         Further components.
+    axis : str
+        Kind of the drives of both axes.
     hand : RigClient, optional
         The client.
     driver, drives : mapping, optional
@@ -142,12 +147,15 @@ class ConformanceRig:
     ----------
     logged : list of str
         Lines of the log.
+    late : float
+        Additional delay of the drives' replies [s].
     """
 
     def __init__(
         self,
         seed: int,
         *others: Component,
+        axis: str = "cia402",
         hand: RigClient | None = None,
         driver: Mapping[str, Any] | None = None,
         drives: Mapping[str, Any] | None = None,
@@ -157,15 +165,25 @@ class ConformanceRig:
         emulator = import_module("needle_sim.drive_emulator")
         self.hand = hand or RigClient()
         self.logged: list[str] = []
-        self.drives = emulator.DriveEmulator(emulator.DriveEmulatorParameters(**(drives or {})))
+        emulated = {"drives": axis} | dict(drives or {})
+        self.drives = emulator.DriveEmulator(emulator.DriveEmulatorParameters(**emulated))
         parameters = {"link": "virtual", "channel": "can", "retraction_speed": FASTEST}
+        parameters |= {"insertion_drive": axis, "rotation_drive": axis}
         self.settings = DeviceDriverParameters(**parameters | dict(driver or {}))
-        parts = [self.drives, DeviceDriver(self.settings), *others, self.hand]
-        self.runner = VirtualRunner(parts, seed, faults=faults, taps=(self._keep_log,))
+        self.driver = DeviceDriver(self.settings)
+        parts = [self.drives, self.driver, *others, self.hand]
+        self.late = 0.0
+        self.runner = VirtualRunner(
+            parts, seed, faults=(self._delay, *faults), taps=(self._keep_log,)
+        )
 
     def _keep_log(self, _: int, sender: str, message: Any, output: Output) -> None:
         if output.topic == LOG.topic:
             self.logged.append(message.text)
+
+    def _delay(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
+        is_reply = link.receiver == DRIVER and link.topic in self.drives.connections
+        return (Arrival(self.late * is_reply, message),)
 
     # ---- the operator -------------------------------------------------------------------------
 
@@ -261,6 +279,23 @@ class ConformanceRig:
     def behind(self, axis: str) -> Any:
         """Return the emulated drives of an axis; they have the faults."""
         return next(one for one in self.drives.connections.values() if axis in one.motors)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """Abilities of the drives."""
+        return self.driver.drives[0].capabilities
+
+    def axis(self, name: str) -> Axis:
+        """Return an axis of the driver."""
+        return next(drives.axes[name] for drives in self.driver.drives if name in drives.axes)
+
+    def distance(self, begin: tuple[float, float]) -> tuple[float, float]:
+        """Return how far the motors are from places [m], [rad]; 0: at rest."""
+        ways = (abs(here - there) for here, there in zip(self.place, begin, strict=True))
+        insertion, rotation = (
+            0.0 if way <= most else way for way, most in zip(ways, AT_REST, strict=True)
+        )
+        return insertion, rotation
 
     def is_logged(self, rule: Rule) -> bool:
         """Return whether the log names a rule."""
