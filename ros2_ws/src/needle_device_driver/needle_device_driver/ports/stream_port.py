@@ -84,9 +84,14 @@ class StreamPort:
         self._thread = threading.Thread(target=self._run, name="stream-receive", daemon=True)
 
     def open(self, arrive: Callable[[Any], None]) -> None:
-        """Start the thread; it calls `arrive`."""
-        self._arrive = arrive
+        """Try once to open the stream, then start the thread; any thread may call `arrive`."""
+        self.begin(arrive)
         self._thread.start()
+
+    def begin(self, arrive: Callable[[Any], None]) -> None:
+        """Open the stream without the thread; the caller calls `step`."""
+        self._arrive = arrive
+        self._try_to_open()
 
     def send(self, batch: tuple[bytes, ...]) -> None:
         """Send bytes; without a stream they are dropped, and an error loses the stream."""
@@ -108,18 +113,23 @@ class StreamPort:
 
     def _run(self) -> None:
         while not self._closed.is_set():
-            stream = self._stream
-            if stream is None:
+            self.step()
+
+    def step(self) -> None:
+        """Wait a short time for bytes and pass them on; reopen a lost stream."""
+        stream = self._stream
+        if stream is None:
+            if not self._closed.wait(_REOPEN_PERIOD):
                 self._try_to_open()
-                continue
-            try:
-                data = stream.read()
-            # A stream that another thread closes raises TypeError in pyserial.
-            except (OSError, TypeError) as error:
-                self._lose(stream, error)
-                continue
-            if data:
-                self._arrive((data,))
+            return
+        try:
+            data = stream.read()
+        # A stream that another thread closes raises TypeError in pyserial.
+        except (OSError, TypeError) as error:
+            self._lose(stream, error)
+            return
+        if data:
+            self._arrive((data,))
 
     def _try_to_open(self) -> None:
         host, colon, port = self._address.rpartition(":")
@@ -131,7 +141,6 @@ class StreamPort:
             )
         except OSError as error:
             self._report(PortChange(_text(error)))
-            self._closed.wait(_REOPEN_PERIOD)
             return
         self._report(PortChange())
 
