@@ -147,7 +147,7 @@ class DeviceDriver(Component):
         def guarded(*arguments: Any) -> Actions:
             at: Moment = arguments[-1]
             for drives in self._drives:
-                drives.now = at.steady
+                drives.link.now = at.steady
             try:
                 yield from handler(*arguments)
             except Exception as error:
@@ -164,7 +164,7 @@ class DeviceDriver(Component):
 
     def _send(self) -> Actions:
         for drives in self._drives:
-            if batch := drives.pop_outgoing():
+            if batch := drives.link.pop_outgoing():
                 yield Send(drives.port, batch)
 
     # ---- the cycle ----------------------------------------------------------------------------
@@ -179,7 +179,7 @@ class DeviceDriver(Component):
         yield from self._advance(at)
 
     def _on_port_change(self, drives: Drives, change: PortChange, at: Moment) -> Actions:
-        drives.set_port_error(change.lost)
+        drives.link.set_port_error(change.lost)
         yield from self._observe(at)
         yield from self._advance(at)
 
@@ -264,7 +264,10 @@ class DeviceDriver(Component):
     def _after_search(self, result: ServiceResult, at: Moment) -> Actions:
         if result.success:
             self.is_set_up, self.searches, self.waiting = True, False, ""
-            yield Log("info", f"found both drives on {' and '.join(d.name for d in self._drives)}")
+            yield Log(
+                "info",
+                f"found both drives on {' and '.join(drives.link.name for drives in self._drives)}",
+            )
             for text in (text for drives in self._drives for text in drives.missing_optional_parts):
                 # Feed the watchdogs: logging can be slow.
                 self._beat()
@@ -291,7 +294,7 @@ class DeviceDriver(Component):
         yield from self._device.report(at)
         yield from self._send()
         for drives in self._drives:
-            drives.close()
+            drives.link.close()
         yield Exit(EXIT_DONE)
 
     def _beat(self) -> None:

@@ -16,7 +16,7 @@ import pytest
 from needle_core.component import PortChange
 from needle_device_driver.axes.drive_errors import LinkError
 from needle_device_driver.polled.text_link import TextLink
-from needle_device_driver.ports import stream_port
+from needle_device_driver.ports import reopening_port
 from needle_device_driver.ports.stream_port import StreamPort
 
 
@@ -44,7 +44,7 @@ class Port:
 
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
-    monkeypatch.setattr(stream_port, "_REOPEN_PERIOD", 0.0)
+    monkeypatch.setattr(reopening_port, "_REOPEN_PERIOD", 0.0)
     with socket.create_server(("localhost", 0)) as listening:
         listening.settimeout(5.0)
         yield listening
