@@ -149,7 +149,7 @@ class DeviceDriver(Component):
         def guarded(*arguments: Any) -> Actions:
             at: Moment = arguments[-1]
             for drives in self.drives:
-                drives.now = at.steady
+                drives.link.now = at.steady
             try:
                 yield from handler(*arguments)
             except Exception as error:
@@ -166,7 +166,7 @@ class DeviceDriver(Component):
 
     def _send(self) -> Actions:
         for drives in self.drives:
-            if batch := drives.pop_outgoing():
+            if batch := drives.link.pop_outgoing():
                 yield Send(drives.port, batch)
 
     # ---- the cycle ----------------------------------------------------------------------------
@@ -181,7 +181,7 @@ class DeviceDriver(Component):
         yield from self._advance(at)
 
     def _on_port_change(self, drives: Drives, change: PortChange, at: Moment) -> Actions:
-        drives.set_port_error(change.lost)
+        drives.link.set_port_error(change.lost)
         yield from self._observe(at)
         yield from self._advance(at)
 
@@ -266,7 +266,10 @@ class DeviceDriver(Component):
     def _after_search(self, result: ServiceResult, at: Moment) -> Actions:
         if result.success:
             self.is_set_up, self.searches, self.waiting = True, False, ""
-            yield Log("info", f"found both drives on {' and '.join(d.name for d in self.drives)}")
+            yield Log(
+                "info",
+                f"found both drives on {' and '.join(drives.link.name for drives in self.drives)}",
+            )
             for text in (text for drives in self.drives for text in drives.missing_optional_parts):
                 # Feed the watchdogs: logging can be slow.
                 self._beat()
@@ -293,7 +296,7 @@ class DeviceDriver(Component):
         yield from self._device.report(at)
         yield from self._send()
         for drives in self.drives:
-            drives.close()
+            drives.link.close()
         yield Exit(EXIT_DONE)
 
     def _beat(self) -> None:

@@ -6,10 +6,20 @@ import abc
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from needle_core.diagnostics import Diagnostic
+from needle_core.diagnostics import Diagnostic, Level
 from needle_device_driver.axes.axis import Axis
 from needle_device_driver.axes.capabilities import Capabilities
+from needle_device_driver.axes.link import Link
 from needle_device_driver.procedure import Procedure
+
+
+class CyclicAxis(Axis):
+    """Axis whose orders other than set-points take several cycles."""
+
+    @property
+    @abc.abstractmethod
+    def needs_cycles(self) -> bool:
+        """Whether the drive still executes an order other than a set-point."""
 
 
 class Drives(abc.ABC):
@@ -17,25 +27,28 @@ class Drives(abc.ABC):
 
     Each cycle is `collect`, then orders to the axes, then `exchange`.
 
-    Attributes
+    Parameters
     ----------
     port : str
         Name of the component's port.
-    name : str
-        Name of the connection in messages.
+    link : Link
+        The connection.
+    axes : sequence of Axis
+        Insertion, rotation or both, by their names.
+
+    Attributes
+    ----------
     capabilities : Capabilities
-        What the drives can do by themselves.
-    axes : mapping of str to Axis
-        Insertion, rotation or both.
-    now : float
-        Steady time of the running handler [s].
+        Abilities of the drives.
+    unanswered : int
+        Number of cycles without an answer of each drive.
     """
 
-    port: str
-    name: str
     capabilities: Capabilities
-    axes: Mapping[str, Axis]
-    now: float
+
+    def __init__(self, port: str, link: Link, axes: Mapping[str, CyclicAxis]) -> None:
+        self.port, self.link, self.axes = port, link, axes
+        self.unanswered = self._reported_unanswered = 0
 
     @property
     def missing_optional_parts(self) -> tuple[str, ...]:
@@ -43,21 +56,13 @@ class Drives(abc.ABC):
         return ()
 
     @property
-    @abc.abstractmethod
     def needs_cycles(self) -> bool:
         """Whether a drive still executes an order other than a set-point."""
+        return any(axis.needs_cycles for axis in self.axes.values())
 
     @abc.abstractmethod
     def receive(self, batch: Sequence[Any]) -> None:
         """Receive a batch from the port."""
-
-    @abc.abstractmethod
-    def set_port_error(self, error: str) -> None:
-        """Note why the port is not open; empty: it is open."""
-
-    @abc.abstractmethod
-    def pop_outgoing(self) -> tuple[Any, ...]:
-        """Return the batch that was sent since the last call."""
 
     @abc.abstractmethod
     def probe(self) -> Procedure[str]:
@@ -85,10 +90,17 @@ class Drives(abc.ABC):
     def exchange(self, timeout: float) -> Procedure[None]:
         """Run one cycle; wait at most `timeout` [s] for the answers."""
 
-    @abc.abstractmethod
     def health(self, waiting: str) -> Diagnostic:
         """Return the health of the link since the last call; `waiting` describes a closed link."""
-
-    @abc.abstractmethod
-    def close(self) -> None:
-        """Close the link."""
+        link = self.link
+        values = {"link": link.name, **link.counts, "unanswered_cycles": str(self.unanswered)}
+        count = self.unanswered - self._reported_unanswered
+        self._reported_unanswered = self.unanswered
+        level, message = Level.OK, "connected"
+        if link.lost:
+            level, message = Level.ERROR, link.lost
+        elif not link.is_open:
+            level, message = Level.WARN, waiting
+        elif count:
+            level, message = Level.WARN, f"{count} cycles had no answer in time"
+        return Diagnostic(level, message, values)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
+from needle_device_driver.axes.axis import AxisError, AxisSnapshot
 from needle_device_driver.axes.drive_errors import DriveError, LinkError, raised_as_axis_error
+from needle_device_driver.axes.drives import CyclicAxis
 from needle_device_driver.axes.speed_monitor import SpeedMonitor
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
@@ -41,7 +42,7 @@ from needle_device_driver.rules import Rule
 _MAX_SILENT = 15
 
 
-class Cia402Axis(Axis):
+class Cia402Axis(CyclicAxis):
     """Axis on one drive in cyclic synchronous position mode.
 
     Orders return at once. In each cycle, `transmit` sends the next command and set-point before the

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from needle_core.can_frame import CAN, CanErrors, CanFrame
-from needle_core.diagnostics import Diagnostic, Level
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.axes.capabilities import Capabilities
 from needle_device_driver.axes.drive_errors import LinkError
@@ -34,19 +33,12 @@ class Cia402Drives(Drives):
         Of the cycle [s].
     watchdog : float
         A drive stops after this time without the computer's heartbeat [s].
-
-    Attributes
-    ----------
-    unanswered : int
-        Number of SYNCs that a drive did not answer in their cycle.
     """
-
-    port = CAN
 
     def __init__(
         self, link: FrameLink, axes: Sequence[Cia402Axis], period: float, watchdog: float
     ) -> None:
-        self.name = link.name
+        super().__init__(CAN, link, {axis.name: axis for axis in axes})
         self.capabilities = Capabilities(
             streams=True,
             watchdog=watchdog,
@@ -58,13 +50,10 @@ class Cia402Drives(Drives):
             identity=True,
             exclusive=True,
         )
-        self.axes = {axis.name: axis for axis in axes}
         self._link = link
         self._axes = tuple(axes)
-        self.unanswered = 0
         self._outstanding = 0
         self._paused = 0
-        self._reported_unanswered = 0
 
     @property
     def missing_optional_parts(self) -> tuple[str, ...]:
@@ -75,60 +64,13 @@ class Cia402Drives(Drives):
             for text in axis.missing_optional_objects
         )
 
-    @property
-    def needs_cycles(self) -> bool:
-        """Whether a drive still executes an order other than a set-point."""
-        return any(axis.needs_cycles for axis in self._axes)
-
-    def health(self, waiting: str) -> Diagnostic:
-        """Return the health of the bus since the last call; `waiting` describes a closed link."""
-        link = self._link
-        values = {
-            "link": link.name,
-            "frames_sent": str(link.frames_sent),
-            "frames_received": str(link.frames_received),
-            "bus_errors": str(link.error_frames),
-            "unanswered_syncs": str(self.unanswered),
-        }
-        count = self.unanswered - self._reported_unanswered
-        self._reported_unanswered = self.unanswered
-        level, message = Level.OK, "connected"
-        if link.lost:
-            level, message = Level.ERROR, link.lost
-        elif not link.is_open:
-            level, message = Level.WARN, waiting
-        elif count:
-            level, message = Level.WARN, f"{count} SYNCs had no reply within their cycle"
-        return Diagnostic(level, message, values)
-
-    @property
-    def now(self) -> float:
-        """Steady time of the running handler [s]."""
-        return self._link.now
-
-    @now.setter
-    def now(self, value: float) -> None:
-        self._link.now = value
-
     def receive(self, batch: Sequence[CanFrame | CanErrors]) -> None:
         """Receive frames and error counts from the port."""
         self._link.receive(batch)
 
-    def set_port_error(self, error: str) -> None:
-        """Note why the port is not open; empty: it is open."""
-        self._link.set_port_error(error)
-
-    def pop_outgoing(self) -> tuple[CanFrame, ...]:
-        """Return the frames that were sent since the last call."""
-        return self._link.pop_outgoing()
-
     def are_emulated(self) -> Procedure[bool]:
         """Return whether each drive reports that it is emulated; raises `LinkError`."""
         return are_emulated(self._link, [axis.node_id for axis in self._axes])
-
-    def close(self) -> None:
-        """Close the link."""
-        self._link.close()
 
     def probe(self) -> Procedure[str]:
         """Open the link and request an answer of every drive; return the error."""

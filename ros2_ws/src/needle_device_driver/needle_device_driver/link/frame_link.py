@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from needle_core.can_frame import CanErrors, CanFrame
-from needle_device_driver.axes.drive_errors import LinkError
+from needle_device_driver.axes.link import Link
 from needle_device_driver.link.objects import (
     HEARTBEAT,
     MASTER_NODE_ID,
@@ -28,10 +28,8 @@ _MASTER_FRAMES = {
 Callback = Callable[[bytes, float], None]
 
 
-class FrameLink:
-    """One CAN bus, which can be opened, lost and opened again.
-
-    A lost link stays lost until `open` is called: the drives have missed frames.
+class FrameLink(Link):
+    """One CAN bus.
 
     Parameters
     ----------
@@ -40,14 +38,8 @@ class FrameLink:
 
     Attributes
     ----------
-    now : float
-        Steady time of the running handler [s].
-    lost : str
-        Reason why the link was lost; empty: it was not.
     other_master : str
         Frame of another master on the bus; empty: there is none.
-    openings : int
-        How often the link was opened.
     frames_sent, frames_received, error_frames : int
         Counters.
     refused : int
@@ -55,53 +47,24 @@ class FrameLink:
     """
 
     def __init__(self, name: str) -> None:
-        self.name = name
-        self.now = 0.0
-        self.lost = ""
+        super().__init__(name)
         self.other_master = ""
-        self.openings = 0
         self.frames_sent = 0
         self.frames_received = 0
         self.error_frames = 0
         self.refused = 0
-        self._is_open = False
-        self._port_error = ""
         self._outgoing: list[CanFrame] = []
         self._callbacks: dict[int, list[Callback]] = {}
         self._sdo_clients: dict[int, SdoClient] = {}
 
     @property
-    def is_open(self) -> bool:
-        """Whether frames pass."""
-        return self._is_open and not self.lost
-
-    def open(self) -> None:
-        """Open the link, also after a loss.
-
-        Raises
-        ------
-        LinkError
-            If the port is not open.
-        """
-        if self.is_open:
-            return
-        if self._port_error:
-            raise LinkError(f"cannot open {self.name}: {self._port_error}")
-        self._is_open = True
-        # Requests from before get no response.
-        self._sdo_clients = {}
-        self.lost = self.other_master = ""
-        self.openings += 1
-
-    def set_port_error(self, error: str) -> None:
-        """Note why the port is not open; empty: it is open."""
-        self._port_error = error
-        if error and self.is_open:
-            self.lost = f"link {self.name} is lost: {error}"
-
-    def close(self) -> None:
-        """Close the link."""
-        self._is_open = False
+    def counts(self) -> dict[str, str]:
+        """Counters for diagnostics, by name."""
+        return {
+            "frames_sent": str(self.frames_sent),
+            "frames_received": str(self.frames_received),
+            "bus_errors": str(self.error_frames),
+        }
 
     def send(self, cob_id: int, data: bytes = b"") -> None:
         """Add one frame to the outgoing batch of the running handler.
@@ -160,9 +123,10 @@ class FrameLink:
             self._sdo_clients[node_id] = SdoClient(node_id, self.send, self.beat, _HEARTBEAT_PERIOD)
         return self._sdo_clients[node_id]
 
-    def _require_open(self) -> None:
-        if not self.is_open:
-            raise LinkError(self.lost or f"{self.name} is not open")
+    def _restart(self) -> None:
+        # Requests from before get no response.
+        self._sdo_clients = {}
+        self.other_master = ""
 
     def _receive_frame(self, cob_id: int, data: bytes, time: float) -> None:
         self.frames_received += 1

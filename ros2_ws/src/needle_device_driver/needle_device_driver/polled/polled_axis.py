@@ -6,9 +6,10 @@ import enum
 import math
 from collections.abc import Callable
 
-from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
+from needle_device_driver.axes.axis import AxisError, AxisSnapshot
 from needle_device_driver.axes.axis_settings import HERE, AxisSettings
 from needle_device_driver.axes.drive_errors import DriveError, raised_as_axis_error
+from needle_device_driver.axes.drives import CyclicAxis
 from needle_device_driver.axes.speed_monitor import SpeedMonitor
 from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
 from needle_device_driver.procedure import Procedure, Wait
@@ -35,7 +36,7 @@ class _Homing(enum.Enum):
     LEAVE = "leave"
 
 
-class PolledAxis(Axis):
+class PolledAxis(CyclicAxis):
     """Axis on one drive of a `DriveProtocol`.
 
     In each cycle, `transmit` sends the next order, and `update` handles the answer; only a stop is

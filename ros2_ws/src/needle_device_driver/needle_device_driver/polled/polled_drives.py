@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from needle_core.diagnostics import Diagnostic, Level
 from needle_device_driver.axes.axis_settings import AxisSettings
 from needle_device_driver.axes.backend import Backend
 from needle_device_driver.axes.cycle_times import PERIOD
@@ -35,54 +34,26 @@ class PolledDrives(Drives):
         Name of the component's port.
     protocol : DriveProtocol
         Language of the drives.
-
-    Attributes
-    ----------
-    unanswered : int
-        Number of cycles without an answer.
     """
 
     def __init__(self, port: str, protocol: DriveProtocol) -> None:
-        self.port, self.name = port, protocol.link.name
-        self.capabilities = protocol.capabilities
-        self._protocol, self._link = protocol, protocol.link
-        self.axes = self._axes = {
+        axes = {
             name: PolledAxis(name, settings, protocol, PERIOD, self._refresh)
             for name, settings in protocol.axes.items()
         }
+        super().__init__(port, protocol.link, axes)
+        self.capabilities = protocol.capabilities
+        self._protocol, self._link, self._axes = protocol, protocol.link, axes
         protocol.on_status = self._on_status
         self._identity = ""
         self._number = 0
         # Number of each request without an answer, and when it was sent [s].
         self._outstanding: dict[int, float] = {}
-        self.unanswered = self._reported_unanswered = 0
-
-    @property
-    def now(self) -> float:
-        """Steady time of the running handler [s]."""
-        return self._link.now
-
-    @now.setter
-    def now(self, value: float) -> None:
-        self._link.now = value
-
-    @property
-    def needs_cycles(self) -> bool:
-        """Whether a drive still executes an order other than a set-point."""
-        return any(axis.needs_cycles for axis in self._axes.values())
 
     def receive(self, batch: Sequence[bytes]) -> None:
         """Receive bytes from the port."""
         for line in self._link.receive(batch):
             self._protocol.on_line(line)
-
-    def set_port_error(self, error: str) -> None:
-        """Note why the port is not open; empty: it is open."""
-        self._link.set_port_error(error)
-
-    def pop_outgoing(self) -> tuple[bytes, ...]:
-        """Return the bytes that were sent since the last call."""
-        return self._link.pop_outgoing()
 
     def probe(self) -> Procedure[str]:
         """Open the link and ask for the names of the drives; return the error."""
@@ -122,38 +93,12 @@ class PolledDrives(Drives):
         yield Wait(lambda: bool(self._link.lost) or not self._outstanding, timeout)
         self.unanswered += bool(self._outstanding)
 
-    def health(self, waiting: str) -> Diagnostic:
-        """Return the health of the link since the last call; `waiting` describes a closed link."""
-        link = self._link
-        values = {
-            "link": link.name,
-            "drive": self._identity,
-            "bytes_sent": str(link.bytes_sent),
-            "lines_received": str(link.lines_received),
-            "garbled_lines": str(link.garbled),
-            "unanswered_cycles": str(self.unanswered),
-        }
-        count = self.unanswered - self._reported_unanswered
-        self._reported_unanswered = self.unanswered
-        level, message = Level.OK, "connected"
-        if link.lost:
-            level, message = Level.ERROR, link.lost
-        elif not link.is_open:
-            level, message = Level.WARN, waiting
-        elif count:
-            level, message = Level.WARN, f"{count} cycles had no answer"
-        return Diagnostic(level, message, values)
-
-    def close(self) -> None:
-        """Close the link."""
-        self._link.close()
-
     def _request(self) -> None:
-        old = self.now - _LOST_AFTER * PERIOD
+        old = self._link.now - _LOST_AFTER * PERIOD
         self._outstanding = {n: sent for n, sent in self._outstanding.items() if sent > old}
         if len(self._outstanding) < _MAX_OUTSTANDING:
             self._number = self._number % _NUMBERS + 1
-            self._outstanding[self._number] = self.now
+            self._outstanding[self._number] = self._link.now
             self._protocol.request(self._number)
         self._mark_answered()
 

@@ -1,21 +1,15 @@
-"""Port on a stream of bytes, serial or TCP: a thread opens it, reads, and reopens a lost one."""
+"""Port on a stream of bytes, serial or TCP."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 import socket
-import threading
-from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 import serial
 
-from needle_core.component import PortChange
+from needle_device_driver.ports.reopening_port import ReopeningPort
 
 _CONNECT_TIMEOUT, _READ_TIMEOUT = 1.0, 0.05
-_REOPEN_PERIOD = 0.1
-_JOIN_TIMEOUT = 1.0
 _MAX_CHUNK = 4096
 
 
@@ -48,9 +42,9 @@ class _Tcp:
 
 
 class _Serial:
-    def __init__(self, path: str, baudrate: int, write_timeout: float) -> None:
+    def __init__(self, path: str, baudrate: int, timeout: float) -> None:
         self._serial = serial.Serial(
-            path, baudrate, timeout=_READ_TIMEOUT, write_timeout=write_timeout, exclusive=True
+            path, baudrate, timeout=_READ_TIMEOUT, write_timeout=timeout, exclusive=True
         )
 
     def read(self) -> bytes:
@@ -63,7 +57,7 @@ class _Serial:
         self._serial.close()
 
 
-class StreamPort:
+class StreamPort(ReopeningPort[_Stream]):
     """Port on a serial device or a TCP server.
 
     Parameters
@@ -77,78 +71,21 @@ class StreamPort:
     """
 
     def __init__(self, address: str, baudrate: int, write_timeout: float) -> None:
-        self._address, self._baudrate, self._write_timeout = address, baudrate, write_timeout
-        self._closed = threading.Event()
-        self._stream: _Stream | None = None
-        self._reported: PortChange | None = None
-        self._thread = threading.Thread(target=self._run, name="stream-receive", daemon=True)
+        super().__init__((OSError,))
+        self._address, self._baudrate, self._timeout = address, baudrate, write_timeout
 
-    def open(self, arrive: Callable[[Any], None]) -> None:
-        """Start the thread; it calls `arrive`."""
-        self._arrive = arrive
-        self._thread.start()
-
-    def send(self, batch: tuple[bytes, ...]) -> None:
-        """Send bytes; without a stream they are dropped, and an error loses the stream."""
-        stream = self._stream
-        if stream is None:
-            return
-        try:
-            stream.write(b"".join(batch))
-        except OSError as error:
-            self._lose(stream, error)
-
-    def close(self) -> None:
-        """End the thread and close the stream."""
-        self._closed.set()
-        if self._thread.is_alive():
-            self._thread.join(_JOIN_TIMEOUT)
-        if self._stream is not None:
-            self._stream.close()
-
-    def _run(self) -> None:
-        while not self._closed.is_set():
-            stream = self._stream
-            if stream is None:
-                self._try_to_open()
-                continue
-            try:
-                data = stream.read()
-            # A stream that another thread closes raises TypeError in pyserial.
-            except (OSError, TypeError) as error:
-                self._lose(stream, error)
-                continue
-            if data:
-                self._arrive((data,))
-
-    def _try_to_open(self) -> None:
+    def _open_device(self) -> _Stream:
         host, colon, port = self._address.rpartition(":")
-        try:
-            self._stream = (
-                _Tcp(host, int(port), self._write_timeout)
-                if colon and port.isdigit()
-                else _Serial(self._address, self._baudrate, self._write_timeout)
-            )
-        except OSError as error:
-            self._report(PortChange(_text(error)))
-            self._closed.wait(_REOPEN_PERIOD)
-            return
-        self._report(PortChange())
+        if colon and port.isdigit():
+            return _Tcp(host, int(port), self._timeout)
+        return _Serial(self._address, self._baudrate, self._timeout)
 
-    def _lose(self, stream: _Stream, error: Exception) -> None:
-        if self._stream is stream:
-            self._stream = None
-            with contextlib.suppress(OSError):
-                stream.close()
-            self._report(PortChange(_text(error)))
+    def _read(self, device: _Stream) -> tuple[bytes, ...]:
+        data = device.read()
+        return (data,) if data else ()
 
-    def _report(self, change: PortChange) -> None:
-        if change != self._reported:
-            self._reported = change
-            self._arrive(change)
+    def _write(self, device: _Stream, batch: tuple[bytes, ...]) -> None:
+        device.write(b"".join(batch))
 
-
-def _text(error: Exception) -> str:
-    """Return one line on an error: the operating system's text if there is one."""
-    number = getattr(error, "errno", None)
-    return os.strerror(number) if number else str(error).partition("\n")[0]
+    def _close_device(self, device: _Stream) -> None:
+        device.close()

@@ -21,6 +21,7 @@ from needle_device_driver.link import can_port, socketcand_bus
 from needle_device_driver.link.can_port import Batch, CanPort
 from needle_device_driver.link.link_settings import SLCAN_BITRATES, LinkSettings
 from needle_device_driver.link.slcan_bus import SlcanBus
+from needle_device_driver.ports import reopening_port
 
 PORTS: list[CanPort] = []
 CONNECT = socket.create_connection
@@ -69,7 +70,7 @@ class Port:
 
 @pytest.fixture(autouse=True)
 def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(can_port, "_REOPEN_PERIOD", 0.0)
+    monkeypatch.setattr(reopening_port, "_REOPEN_PERIOD", 0.0)
     monkeypatch.setattr(socketcand_bus, "_REPLY_TIMEOUT", 0.05)
     yield
     while PORTS:

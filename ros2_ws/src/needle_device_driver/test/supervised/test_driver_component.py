@@ -157,7 +157,7 @@ def test_driver_sets_up_homes_and_moves_the_drives() -> None:
     assert joints[-1].stamp_ns == 1_000_000_000 + round(round(bench.now / PERIOD) * PERIOD * 1e9)
     bench.perform(bench.driver.timers[1].handler(bench.at))
     health = bench.of(Diagnose)[-1].diagnostic
-    assert (health.message, health.values["unanswered_syncs"]) == ("connected", "0")
+    assert (health.message, health.values["unanswered_cycles"]) == ("connected", "0")
 
 
 def test_estop_and_release_act_between_cycles() -> None:

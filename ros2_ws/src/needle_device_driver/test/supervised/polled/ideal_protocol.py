@@ -130,18 +130,18 @@ class PolledBench(SupervisorBench):
             feedback_delay=1,
             is_switching=lambda: self.drives.needs_cycles,
         )
-        self.drives.now = self.now
+        self.link.now = self.now
         assert not self.run(self.drives.probe())
 
     def run(self, procedure: Procedure[T]) -> T:
         def wait(is_there: Callable[[], bool], seconds: float) -> None:
             self.now += 0.0 if is_there() else seconds
-            self.drives.now = self.now
+            self.link.now = self.now
 
         return run(procedure, wait, lambda: self.now)
 
     def exchange(self) -> None:
-        self.drives.now = self.now
+        self.link.now = self.now
         self.supervisor.drive(PERIOD, self.now)
         self.run(self.drives.exchange(0.0))
         self.supervisor.observe(self.now)

@@ -83,7 +83,7 @@ def _silence(bench: PolledBench, _: Drive) -> None:
 
 
 def _unplug(bench: PolledBench, _: Drive) -> None:
-    bench.drives.set_port_error("unplugged")
+    bench.link.set_port_error("unplugged")
 
 
 def _set(name: str, value: object) -> Callable[[PolledBench, Drive], None]:
@@ -113,7 +113,7 @@ def test_faults_of_a_moving_drive(event: Callable[[PolledBench, Drive], None], r
     bench.go(10)
     assert (bench.insertion.position, bench.rotation.position) == places
     bench.protocol.is_silent, bench.insertion.blocked = False, False
-    bench.drives.set_port_error("")
+    bench.link.set_port_error("")
     bench.hold(False)
     result = bench.reset()
     assert result.success, result.message

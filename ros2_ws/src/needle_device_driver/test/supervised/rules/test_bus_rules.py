@@ -166,8 +166,8 @@ def test_reply_age_lost_answers_are_discarded_after_a_pause() -> None:
     assert bench.axes[0].monitor.feedback.syncs == syncs
     count = bench.drives.unanswered
     health = bench.drives.health("")
-    assert health.message == f"{count} SYNCs had no reply within their cycle"
-    assert health.values["unanswered_syncs"] == str(count)
+    assert health.message == f"{count} cycles had no answer in time"
+    assert health.values["unanswered_cycles"] == str(count)
     assert bench.drives.health("").message == "connected"
 
 

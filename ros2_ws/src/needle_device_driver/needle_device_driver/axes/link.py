@@ -1,0 +1,85 @@
+"""Connection to drives, as a component knows it: a port reports whether it is open."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from needle_device_driver.axes.drive_errors import LinkError
+
+
+class Link:
+    """One connection, which can be opened, lost and opened again.
+
+    A lost link stays lost until `open` is called: the drives have missed orders.
+
+    Parameters
+    ----------
+    name : str
+        Name of the link in messages.
+
+    Attributes
+    ----------
+    now : float
+        Steady time of the running handler [s].
+    lost : str
+        Reason why the link was lost; empty: it was not.
+    openings : int
+        How often the link was opened.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.now = 0.0
+        self.lost = ""
+        self.openings = 0
+        self._is_open = False
+        self._port_error = ""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether data pass."""
+        return self._is_open and not self.lost
+
+    @property
+    def counts(self) -> dict[str, str]:
+        """Counters for diagnostics, by name."""
+        return {}
+
+    def open(self) -> None:
+        """Open the link, also after a loss.
+
+        Raises
+        ------
+        LinkError
+            If the port is not open.
+        """
+        if self.is_open:
+            return
+        if self._port_error:
+            raise LinkError(f"cannot open {self.name}: {self._port_error}")
+        self._is_open = True
+        self.lost = ""
+        self.openings += 1
+        self._restart()
+
+    def set_port_error(self, error: str) -> None:
+        """Note why the port is not open; empty: it is open."""
+        self._port_error = error
+        if error and self.is_open:
+            self.lost = f"link {self.name} is lost: {error}"
+
+    def close(self) -> None:
+        """Close the link."""
+        self._is_open = False
+
+    def pop_outgoing(self) -> tuple[Any, ...]:
+        """Return what was sent since the last call."""
+        raise NotImplementedError
+
+    def _restart(self) -> None:
+        """Forget what belongs to an earlier opening."""
+
+    def _require_open(self) -> None:
+        """Raise `LinkError` if the link is closed or lost."""
+        if not self.is_open:
+            raise LinkError(self.lost or f"{self.name} is not open")
