@@ -133,7 +133,9 @@ class PolledAxis(CyclicAxis):
                 f"cycle at {speed:.6g}/s, limit {bound / settings.counts_per_unit:.6g}",
                 Rule.LOOK_AHEAD,
             )
-        self._move_to(counts + self._zero, step / settings.counts_per_unit / self._period)
+        # A repeated set-point must not slow down a drive that has not reached it yet.
+        if step:
+            self._move_to(counts + self._zero, step / settings.counts_per_unit / self._period)
 
     def stop(self) -> None:
         """Send a stop immediately."""
