@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Mapping
 from typing import Any
 
 from needle_core import messages as m
-from needle_core.can_frame import CAN, CanFrame
 from needle_core.component import (
     BEST_EFFORT,
     LATCHED,
@@ -19,15 +17,12 @@ from needle_core.component import (
     Publish,
     Timer,
 )
-from needle_core.runners.transport import Arrival, Arrivals, Link
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.conformance.rig import AXES, DRIVER, Held
 from needle_device_driver.rules import Rule
 from scenario.virtual_rig import VirtualRig
 
 JOINTS = (m.INSERTION_JOINT, m.ROTATION_JOINT)
-HEARTBEAT = 0x700 + 127
-"""COB-ID of the driver's heartbeat."""
 
 
 class SecondNode(Component):
@@ -64,13 +59,6 @@ class Scene(VirtualRig):
     ----------
     driver, drives : mapping, optional
         Parameters of driver and drives.
-
-    Attributes
-    ----------
-    extra_frames : list of CanFrame
-        Frames of another bus node, sent with the drives' next batch.
-    heartbeats : int
-        Number of the driver's heartbeats.
     """
 
     def __init__(
@@ -78,17 +66,7 @@ class Scene(VirtualRig):
         driver: Mapping[str, Any] | None = None,
         drives: Mapping[str, Any] | None = None,
     ) -> None:
-        self.extra_frames: list[CanFrame] = []
-        self.heartbeats = 0
-        super().__init__(1, driver=driver, drives=drives, faults=(self._tap_frames,))
-
-    def _tap_frames(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
-        if link.topic == CAN:
-            if link.sender == DRIVER:
-                self.heartbeats += sum(frame.identifier == HEARTBEAT for frame in message)
-            else:
-                message, self.extra_frames = (*message, *self.extra_frames), []
-        return (Arrival(0.0, message),)
+        super().__init__(1, driver=driver, drives=drives)
 
     # ---- actions ------------------------------------------------------------------------------
 

@@ -7,18 +7,17 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from needle_core import messages as m
-from needle_core.component import Call, Publish
+from needle_core.component import Action, Call, Publish
 from needle_core.messages import HOLD_LIFETIME
 from needle_device_driver.axes.capabilities import Capabilities
 from needle_device_driver.axes.cycle_times import PERIOD
-from needle_device_driver.conformance.rig import DRIVER, ConformanceRig, Held
+from needle_device_driver.conformance.rig import DRIVER, ConformanceRig
 from needle_device_driver.device import EMERGENCY_STOP
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.limits import SafetyLimits
 
 Travel = tuple[float, float]
 Event = Callable[[ConformanceRig], object]
-Delay = Callable[[Capabilities, SafetyLimits], float]
 Needs = Callable[[Capabilities], bool]
 
 
@@ -52,108 +51,76 @@ class Fault(NamedTuple):
     in_steps: bool = False
 
 
-def _at_once(_: Capabilities, __: SafetyLimits) -> float:
+# ---- delays -------------------------------------------------------------------------------------
+
+Delay = Callable[[Capabilities, SafetyLimits], float]
+
+
+def _none(_: Capabilities, __: SafetyLimits) -> float:
     return 0.0
 
 
-def _next_answer(drive: Capabilities, _: SafetyLimits) -> float:
+def _hold(_: Capabilities, __: SafetyLimits) -> float:
+    return HOLD_LIFETIME + PERIOD
+
+
+def _answer(drive: Capabilities, _: SafetyLimits) -> float:
     return PERIOD + drive.response_time
+
+
+def _error(_: Capabilities, limits: SafetyLimits) -> float:
+    return limits.insertion_following_error / limits.max_speed + PERIOD
 
 
 def _silence(_: Capabilities, limits: SafetyLimits) -> float:
     return limits.reply_age_limit + PERIOD
 
 
-def _by_itself(drive: Capabilities, _: SafetyLimits) -> float:
+def _order(drive: Capabilities, _: SafetyLimits) -> float:
     return min(drive.longest_order, drive.watchdog)
 
 
-def _lose_ports(rig: ConformanceRig) -> None:
+# ---- events -------------------------------------------------------------------------------------
+
+
+def _act(action: Action) -> Event:
+    return lambda rig: rig.hand.actions.append(action)
+
+
+def _of(axis: str, name: str, *values: int) -> Event:
+    return lambda rig: getattr(rig.behind(axis), name)(axis, *values)
+
+
+def _unplug(rig: ConformanceRig) -> None:
     for port in rig.drives.connections:
         rig.runner.lose_port(DRIVER, port, "unplugged")
 
 
+_R = Rule
 FAULTS = (
-    Fault(
-        "release",
-        Rule.HOLD_TO_RUN,
-        lambda rig: setattr(rig.hand, "held", Held(False)),
-        _at_once,
-        in_steps=True,
-    ),
-    Fault(
-        "silent hold",
-        Rule.HOLD_AGE,
-        lambda rig: rig.runner.freeze(rig.hand.name, 0.6),
-        lambda _, __: HOLD_LIFETIME + PERIOD,
-        in_steps=True,
-    ),
-    Fault(
-        "emergency stop",
-        Rule.ESTOP_LATCHES,
-        lambda rig: rig.hand.actions.append(Publish(EMERGENCY_STOP, m.EmergencyStop(True))),
-        _at_once,
-    ),
-    Fault(
-        "device/stop",
-        Rule.QUICK_STOP,
-        lambda rig: rig.hand.actions.append(Call("device/stop")),
-        _at_once,
-    ),
-    Fault(
-        "fault of the insertion drive",
-        Rule.ONE_FAULT_STOPS_BOTH,
-        lambda rig: rig.behind("insertion").fail("insertion", 0x2310),
-        _next_answer,
-        (Rule.DRIVE_EMERGENCY,),
-    ),
-    Fault(
-        "fault of the rotation drive",
-        Rule.DRIVE_EMERGENCY,
-        lambda rig: rig.behind("rotation").fail("rotation", 0x4210),
-        _next_answer,
-    ),
-    Fault(
-        "blocked axis",
-        Rule.FOLLOWING_ERROR,
-        lambda rig: rig.behind("insertion").stall("insertion"),
-        lambda _, limits: limits.insertion_following_error / limits.max_speed + PERIOD,
-        (Rule.SETTLING_TIME,),
-        needs=lambda drive: drive.encoder,
-        in_steps=True,
-    ),
-    Fault(
-        "hanging drive",
-        Rule.REPLY_AGE,
-        lambda rig: rig.behind("rotation").hang("rotation"),
-        _silence,
-    ),
-    Fault(
-        "cut line",
-        Rule.REPLY_AGE,
-        lambda rig: setattr(rig.behind("insertion"), "is_cut", True),
-        _silence,
-    ),
-    Fault("late replies", Rule.REPLY_AGE, lambda rig: setattr(rig, "late", 0.2), _silence),
-    Fault("unplugged adapter", Rule.LINK_LOSS, _lose_ports, _by_itself),
-    Fault(
-        "power loss of a drive",
-        Rule.DRIVE_REBOOT,
-        lambda rig: rig.behind("rotation").reboot("rotation", rig.runner.now),
-        _silence,
-        (Rule.REPLY_AGE,),
-        needs=lambda drive: drive.identity,
-    ),
-    Fault("killed driver", Rule.LOOK_AHEAD, lambda rig: rig.runner.kill(DRIVER), _by_itself),
-    Fault(
-        "frozen driver",
-        Rule.DRIVE_WATCHDOG,
-        lambda rig: rig.runner.freeze(DRIVER, 1.0),
-        _by_itself,
-        (Rule.REPLY_AGE, Rule.HOLD_AGE),
-        needs=lambda drive: math.isfinite(drive.watchdog),
-    ),
-)
+    Fault("release", _R.HOLD_TO_RUN, lambda rig: rig.hold(False), _none, in_steps=True),
+    Fault("silent hold", _R.HOLD_AGE, lambda rig: rig.runner.freeze("hand", 0.6), _hold,
+          in_steps=True),
+    Fault("emergency stop", _R.ESTOP_LATCHES,
+          _act(Publish(EMERGENCY_STOP, m.EmergencyStop(True))), _none),
+    Fault("device/stop", _R.QUICK_STOP, _act(Call("device/stop")), _none),
+    Fault("fault of a drive", _R.ONE_FAULT_STOPS_BOTH, _of("insertion", "fail", 0x2310), _answer,
+          (_R.DRIVE_EMERGENCY,)),
+    Fault("hot drive", _R.DRIVE_EMERGENCY, _of("rotation", "fail", 0x4210), _answer),
+    Fault("blocked axis", _R.FOLLOWING_ERROR, _of("insertion", "stall"), _error,
+          (_R.SETTLING_TIME, _R.DRIVE_EMERGENCY), lambda drive: drive.encoder, in_steps=True),
+    Fault("hanging drive", _R.REPLY_AGE, _of("rotation", "hang"), _silence),
+    Fault("cut line", _R.REPLY_AGE,
+          lambda rig: setattr(rig.behind("insertion"), "is_cut", True), _silence),
+    Fault("late replies", _R.REPLY_AGE, lambda rig: setattr(rig, "late", 0.2), _silence),
+    Fault("unplugged adapter", _R.LINK_LOSS, _unplug, _order),
+    Fault("power loss", _R.DRIVE_REBOOT,
+          lambda rig: rig.behind("rotation").reboot("rotation", rig.runner.now), _silence,
+          (_R.REPLY_AGE,), lambda drive: drive.identity),
+    Fault("killed driver", _R.LOOK_AHEAD, lambda rig: rig.runner.kill(DRIVER), _order),
+    Fault("frozen driver", _R.DRIVE_WATCHDOG, lambda rig: rig.runner.freeze(DRIVER, 1.0), _order,
+          (_R.REPLY_AGE, _R.HOLD_AGE), lambda drive: math.isfinite(drive.watchdog)),
+)  # fmt: skip
 
 
 def largest_travel(fault: Fault, rig: ConformanceRig) -> Travel:

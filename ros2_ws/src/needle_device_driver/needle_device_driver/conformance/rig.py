@@ -41,6 +41,8 @@ DRIVER = DeviceDriver.name
 AXES = ("insertion", "rotation")
 AT_REST = (1e-6, 1e-4)
 """Largest motion of motors at rest [m], [rad]: encoder counts."""
+# Counts per m and rad that every kind of drive can make at the largest speed.
+_COUNTS = {"insertion_counts_per_unit": 2.0e6, "rotation_counts_per_unit": 3000.0}
 _JOINT_NAMES = (m.INSERTION_JOINT, m.ROTATION_JOINT)
 _TIMEOUT = 60.0
 
@@ -147,6 +149,8 @@ class ConformanceRig:
     ----------
     logged : list of str
         Lines of the log.
+    commands : list of int
+        Stamps of the commands.
     late : float
         Additional delay of the drives' replies [s].
     """
@@ -172,7 +176,7 @@ class ConformanceRig:
         self.settings = DeviceDriverParameters(**parameters | dict(driver or {}))
         self.driver = DeviceDriver(self.settings)
         parts = [self.drives, self.driver, *others, self.hand]
-        self.late = 0.0
+        self.late, self.commands = 0.0, list[int]()
         self.runner = VirtualRunner(
             parts, seed, faults=(self._delay, *faults), taps=(self._keep_log,)
         )
@@ -199,15 +203,19 @@ class ConformanceRig:
         self.until(lambda: self.hand.status.homed, "homing")
         self.call("device/enable", True)
 
+    def hold(self, pressed: bool) -> None:
+        """Press or release."""
+        self.hand.held = Held(pressed)
+
     def press(self) -> None:
         """Release, then press until the device reports this hold."""
         self.release()
-        self.hand.held = Held(True)
+        self.hold(True)
         self.until(lambda: self.hand.status.hold_owner == "hand", "the hold")
 
     def release(self) -> None:
         """Release, and run until the device has received it."""
-        self.hand.held = Held(False)
+        self.hold(False)
         self.runner.run(0.1)
 
     def ready(self) -> None:
@@ -231,6 +239,7 @@ class ConformanceRig:
         stamp_ns = self.runner.timeline.stamp_ns
         points = (m.TrajectoryPoint((insertion, rotation), duration),)
         self.hand.actions.append(Publish(COMMANDS, m.Trajectory(stamp_ns, _JOINT_NAMES, points)))
+        self.commands.append(stamp_ns)
         return stamp_ns
 
     def step(self, length: float = 0.002, turn: float = 1.0, duration: float = 1.0) -> int:
@@ -292,8 +301,12 @@ class ConformanceRig:
     def distance(self, begin: tuple[float, float]) -> tuple[float, float]:
         """Return how far the motors are from places [m], [rad]; 0: at rest."""
         ways = (abs(here - there) for here, there in zip(self.place, begin, strict=True))
+        settings = self.settings
+        counts = settings.insertion_counts_per_unit, settings.rotation_counts_per_unit
+        # Switching on moves a motor to the nearest count.
         insertion, rotation = (
-            0.0 if way <= most else way for way, most in zip(ways, AT_REST, strict=True)
+            0.0 if way <= max(most, 1.0 / scale) else way
+            for way, most, scale in zip(ways, AT_REST, counts, strict=True)
         )
         return insertion, rotation
 
@@ -324,3 +337,19 @@ class ConformanceRig:
                 max(farthest[1], abs(here[1] - begin[1])),
             )
         return farthest
+
+
+def rigs_with(axis: str, seed: int = 1) -> Callable[..., ConformanceRig]:
+    """Return what makes a rig with a kind of drives; its keywords are `driver` and `drives`."""
+
+    def make(
+        *, driver: Mapping[str, Any] | None = None, drives: Mapping[str, Any] | None = None
+    ) -> ConformanceRig:
+        return ConformanceRig(
+            seed,
+            axis=axis,
+            driver={**_COUNTS, **(driver or {})},
+            drives={**_COUNTS, **(drives or {})},
+        )
+
+    return make

@@ -11,13 +11,12 @@ import pytest
 from needle_core.component import Call
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.axes.cycle_times import PERIOD
-from needle_device_driver.conformance.faults import Fault, Needs, largest_travel
+from needle_device_driver.conformance.faults import FAULTS, Fault, Needs, largest_travel
 from needle_device_driver.conformance.rig import (
     AT_REST,
     AXES,
     DRIVER,
     ConformanceRig,
-    Held,
 )
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.rules import Rule
@@ -26,49 +25,55 @@ Travel = tuple[float, float]
 MakeRig = Callable[..., ConformanceRig]
 """Makes a rig with the drives under test; keywords `driver` and `drives` are parameters."""
 NO_TRAVEL = (0.0, 0.0)
+IMPOSSIBLE = "not possible"
 # A step of 2 mm at nearly the largest speed [s].
 _STEP_TIME = 0.41
 # Longest time after a fault until nothing moves and the driver has named the cause [s].
 _STOPPED = 1.5
 _DEEP, _SHALLOW = 0.1, 0.02
+_RETRACT_AT = 0.003
+# Motion by another computer until it is noticed [m].
+_INTRUSION = 0.001
 
 
-def any_fault(fault: Fault, make: MakeRig) -> Travel:
-    """Cause a fault in the middle of a fast step; return how far the motors move."""
+def any_fault(fault: Fault, make: MakeRig) -> None:
+    """Cause a fault in the middle of a fast step."""
     rig = make()
     rig.moving(_STEP_TIME)
-    return _stop_by(fault, rig)
+    _stop_by(fault, rig)
 
 
-def random_moment(fault: Fault, make: MakeRig, seed: int) -> Travel:
+def random_moment(fault: Fault, make: MakeRig, seed: int) -> None:
     """Cause a fault at a random moment of set-up, homing, steps or rest."""
     rng, rig = random.Random(seed), make(drives={"insertion_start": 0.002})
     moment = rng.uniform(0.1, 6.0)
-    while rig.runner.now < moment or (fault.in_steps and rig.hand.status.activity != "step"):
+    moves = ("step", "retraction")
+    while rig.runner.now < moment or (fault.in_steps and rig.hand.status.activity not in moves):
         _proceed(rig)
         rig.runner.run(PERIOD * rng.random())
-    return _stop_by(fault, rig)
+    _stop_by(fault, rig)
 
 
 def _proceed(rig: ConformanceRig) -> None:
-    """Do what leads to the next step."""
-    status, calls = rig.hand.status, []
+    """Do what leads to the next step or retraction."""
+    status = rig.hand.status
     match status.state, status.homed, status.activity:
         case "DISABLED", False, _:
-            calls = [Call("device/confirm_needle_out", True), Call("device/home")]
+            rig.hand.actions += [Call("device/confirm_needle_out", True), Call("device/home")]
         case "DISABLED", True, _:
-            calls = [Call("device/enable", True)]
+            rig.hand.actions += [Call("device/enable", True)]
         case "HOLDING", True, _ if status.hold_owner != "hand":
             rig.press()
-        case "HOLDING", True, "none":
+        case "HOLDING", True, _ if (status.insertion_m or 0.0) > _RETRACT_AT:
+            rig.hand.actions += [Call("device/retract")]
+            rig.runner.run(0.1)
+        case "HOLDING", True, _:
             rig.step(duration=_STEP_TIME)
-    rig.hand.actions += calls
 
 
-def _stop_by(fault: Fault, rig: ConformanceRig) -> Travel:
+def _stop_by(fault: Fault, rig: ConformanceRig) -> None:
     """Cause a fault: the motors stop in time, the cause is named, and nothing moves later."""
     activity = rig.hand.status.activity
-    rig.hand.results.clear()
     travel = rig.travel(lambda: fault.event(rig), _STOPPED)
     bound = largest_travel(fault, rig)
     assert travel[0] <= bound[0] and travel[1] <= bound[1], f"{travel} > {bound}, {rig.logged}"
@@ -76,9 +81,8 @@ def _stop_by(fault: Fault, rig: ConformanceRig) -> Travel:
     if activity != "none" and rig.state in ("FAULT", "ESTOPPED"):
         assert any(map(rig.is_logged, (fault.rule, *fault.causes))), rig.logged
     if activity == "step" and rig.runner.runs(DRIVER):
-        assert rig.hand.results
+        assert rig.commands[-1] in rig.hand.results, rig.logged
     assert _later_motion(rig) == NO_TRAVEL, rig.logged
-    return travel
 
 
 def _later_motion(rig: ConformanceRig) -> Travel:
@@ -93,7 +97,7 @@ def _later_motion(rig: ConformanceRig) -> Travel:
     for name, request in ((None, None), ("reset", None), ("enable", True), ("enable", False)):
         rig.hand.actions += [Call(f"device/{name}", request)] if name else []
         for pressed in (False, True):
-            rig.hand.held = Held(pressed)
+            rig.hold(pressed)
             rig.runner.run(0.25)
     return rig.distance(begin)
 
@@ -102,7 +106,7 @@ def _later_motion(rig: ConformanceRig) -> Travel:
 
 
 def no_motion_by_itself(make: MakeRig) -> None:
-    """Set up, connect anew, reset, switch on and off: nothing moves."""
+    """Set up, connect anew, reset, switch on and off, also after a step: nothing moves."""
     rig = make(drives={"insertion_start": 0.01})
     begin = rig.place
     rig.start()
@@ -111,6 +115,24 @@ def no_motion_by_itself(make: MakeRig) -> None:
         rig.runner.lose_port(DRIVER, port, "unplugged")
     rig.runner.run(0.5)
     assert _later_motion(rig) == NO_TRAVEL
+    assert rig.distance(begin) == NO_TRAVEL
+    rig = make()
+    rig.moving(_STEP_TIME)
+    rig.call("device/enable", False)
+    rig.runner.run(0.1)
+    assert _later_motion(rig) == NO_TRAVEL
+
+
+def quick_stop(make: MakeRig) -> None:
+    """Release while an axis is blocked, and free it: it does not move to the old target."""
+    rig = make()
+    rig.moving(_STEP_TIME)
+    rig.behind("insertion").stall("insertion")
+    rig.runner.run(0.04)
+    rig.release()
+    begin = rig.place
+    rig.behind("insertion").restore(rig.runner.now)
+    rig.runner.run(0.5)
     assert rig.distance(begin) == NO_TRAVEL
 
 
@@ -212,6 +234,36 @@ def software_limits(make: MakeRig) -> None:
         assert refused.value.rule is Rule.SOFTWARE_LIMITS
 
 
+def one_master(make: MakeRig) -> None:
+    """Let another computer interfere at rest: the driver notices it."""
+    rig = make()
+    rig.ready()
+    begin = rig.place
+    if rig.behind("insertion").intrude():
+        assert rig.fails(Rule.ONE_MASTER), rig.logged
+        assert abs(rig.place[0] - begin[0]) < _INTRUSION
+
+
+def drive_reboot(make: MakeRig) -> None:
+    """Restart a drive faster than the driver misses a reply: it is no longer homed."""
+    rig = make(drives={"boot_time": 0.05})
+    rig.ready()
+    drives = rig.behind("rotation")
+    drives.boot_time = 0.05
+    drives.reboot("rotation", rig.runner.now)
+    rig.runner.run(0.5)
+    assert rig.fails(Rule.DRIVE_REBOOT) or rig.fails(Rule.REPLY_AGE)
+    assert not rig.hand.status.homed
+
+
+def drive_watchdog(make: MakeRig) -> None:
+    """Kill the driver: the drives fault or switch off."""
+    rig = make()
+    rig.moving(_STEP_TIME)
+    rig.runner.kill(DRIVER)
+    _check_stopped(rig)
+
+
 def loop_heartbeat(make: MakeRig) -> None:
     """Hang the loop of the driver at rest: the drives fault or switch off."""
     rig = make()
@@ -219,6 +271,10 @@ def loop_heartbeat(make: MakeRig) -> None:
     rig.runner.run(1.0)
     assert rig.state == "HOLDING"
     rig.runner.freeze(DRIVER, 0.5)
+    _check_stopped(rig)
+
+
+def _check_stopped(rig: ConformanceRig) -> None:
     rig.runner.run(0.4)
     states = rig.behind("insertion").states().values()
     assert all(state.startswith(("FAULT", "OFF")) for state in states), states
@@ -239,6 +295,35 @@ SCENARIOS: dict[Rule, tuple[Callable[[MakeRig], None], Needs]] = {
     Rule.SETTLING_TIME: (settling_time, lambda drive: drive.encoder),
     Rule.AXIS_SPEED: (axis_speed, lambda drive: drive.encoder),
     Rule.SOFTWARE_LIMITS: (software_limits, lambda drive: drive.limits),
+    Rule.QUICK_STOP: (quick_stop, lambda _: True),
+    Rule.ONE_MASTER: (one_master, lambda _: True),
+    Rule.DRIVE_REBOOT: (drive_reboot, lambda drive: drive.identity),
+    Rule.DRIVE_WATCHDOG: (drive_watchdog, lambda drive: math.isfinite(drive.watchdog)),
     Rule.LOOP_HEARTBEAT: (loop_heartbeat, lambda drive: math.isfinite(drive.watchdog)),
 }
 """Rule to its scenario, and whether a drive is able to keep it."""
+RULES = tuple(dict.fromkeys((*SCENARIOS, *(fault.rule for fault in FAULTS))))
+"""Rules that depend on the drives."""
+
+
+def verdict(rule: Rule, rig: ConformanceRig) -> str:
+    """Return how the drives of a rig keep a rule: enforced, with which bound, or not at all."""
+    faults = [fault for fault in FAULTS if fault.rule is rule]
+    needs = faults[0].needs if faults else SCENARIOS[rule][1]
+    if not needs(rig.capabilities):
+        return IMPOSSIBLE
+    if rule is Rule.ONE_MASTER and not rig.capabilities.exclusive:
+        return f"within {_INTRUSION * 1e3:.2f} mm"
+    if not faults:
+        return "enforced"
+    insertion, _ = max(largest_travel(fault, rig) for fault in faults)
+    return f"within {insertion * 1e3:.2f} mm"
+
+
+def check_rule(rule: Rule, make: MakeRig) -> None:
+    """Run the scenarios of a rule; the motors stay within the stated bounds."""
+    for fault in FAULTS:
+        if fault.rule is rule:
+            any_fault(fault, make)
+    if rule in SCENARIOS:
+        SCENARIOS[rule][0](make)
