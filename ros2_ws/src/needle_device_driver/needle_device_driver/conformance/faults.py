@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from needle_core import messages as m
 from needle_core.component import Action, Call, Publish
@@ -123,9 +123,18 @@ FAULTS = (
 )  # fmt: skip
 
 
-def largest_travel(fault: Fault, rig: ConformanceRig) -> Travel:
-    """Return how far the motors may move after an event [m], [rad], at the largest speeds."""
-    limits, drive = rig.settings, rig.capabilities
+def largest_travel(fault: Fault, drive: Capabilities, limits: Any) -> Travel:
+    """Return how far the motors may move after an event [m], [rad], at the largest speeds.
+
+    Parameters
+    ----------
+    fault : Fault
+        The event.
+    drive : Capabilities
+        Abilities of the drives.
+    limits : DeviceDriverParameters
+        The driver's.
+    """
     seconds = fault.delay(drive, limits) + PERIOD + drive.response_time
     rows = (
         (limits.max_speed, limits.insertion_quick_stop_deceleration),

@@ -34,7 +34,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 def test_rule(axis: str, rule: Rule, record_property: Callable[[str, object], None]) -> None:
     """Check that the drives keep a rule as their abilities say."""
     make = rigs_with(axis)
-    text = verdict(rule, make())
+    rig = make()
+    text = verdict(rule, rig.capabilities, rig.settings)
     record_property(ROW, (axis, rule.value, text))
     if text != IMPOSSIBLE:
         check_rule(rule, make)
