@@ -13,7 +13,6 @@ from needle_device_driver.axes.capabilities import Capabilities
 from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.conformance.faults import FAULTS, Fault, Needs, largest_travel
 from needle_device_driver.conformance.rig import (
-    AT_REST,
     AXES,
     DRIVER,
     ConformanceRig,
@@ -153,7 +152,7 @@ def retraction(make: MakeRig) -> None:
     rig.until(lambda: rig.hand.status.activity == "none", "the end of the retraction")
     rig.runner.run(0.5)
     assert abs(rig.place[0]) < 1e-4
-    assert abs(rig.place[1] - begin[1]) < AT_REST[1]
+    assert rig.distance((rig.place[0], begin[1])) == NO_TRAVEL
 
 
 def unhomed_outward_only(make: MakeRig) -> None:
@@ -243,7 +242,7 @@ def one_master(make: MakeRig) -> None:
     rig.ready()
     begin = rig.place
     if rig.behind("insertion").intrude():
-        assert rig.fails(Rule.ONE_MASTER), rig.logged
+        assert rig.fails(Rule.ONE_MASTER) or rig.fails(Rule.AXIS_SPEED), rig.logged
         assert abs(rig.place[0] - begin[0]) < _INTRUSION
 
 
