@@ -1,6 +1,7 @@
 """The package's executables."""
 
-from needle_core.commands.executables import node
+from needle_core.commands.executables import command, node
 
+commission = command("needle_bringup.commission")
 operator = node("needle_bringup.ros.operator")
 simulated_operator = node("needle_bringup.ros.simulated_operator")
