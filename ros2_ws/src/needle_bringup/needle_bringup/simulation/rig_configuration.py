@@ -16,6 +16,7 @@ import yaml
 from needle_bringup.simulation.simulate_options import SimulateOptions, command_of
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import Parameters
+from needle_sim.drives.emulators import CIA402
 
 # Node -> its package, in the order of starting.
 PACKAGES = {
@@ -59,6 +60,10 @@ OPTIONS = {
 
 # Watchdog of driver and drives if seven processes share the cores [s].
 GRAPH_WATCHDOG = 0.5
+
+# Counts of a board that makes a limited number of steps per second: 8 microsteps of a motor with
+# 200 steps on a screw of 1 mm, 32 microsteps on the needle's shaft.
+_COUNTS = {("stepdir", "insertion"): 1.6e6, ("stepdir", "rotation"): 6400.0 / (2.0 * math.pi)}
 
 # Parameters of the recorder that make the bag incomplete.
 _CHOICES = ("topics", "regex", "exclude_regex", "snapshot_seconds")
@@ -192,8 +197,30 @@ def command_line_parameters(
         None if options.diameter_mm is None else options.diameter_mm * 1e-3,
         None if options.pre_bend_deg is None else math.radians(options.pre_bend_deg),
     )
-    parameters = merge(parameters, needle)
+    parameters = merge(parameters, needle, _of_drives(options))
     return {node: parameters[node] for node in nodes_of(options)}
+
+
+def _of_drives(options: SimulateOptions) -> Parameters:
+    """Return the parameters of driver and drives that depend on the kind of the drives."""
+    if options.drives == CIA402:
+        return {}
+    names = options.drives.split(",")
+    kinds = {"insertion": names[0], "rotation": names[-1]}
+    counts = {
+        f"{axis}_counts_per_unit": _COUNTS[kind, axis]
+        for axis, kind in kinds.items()
+        if (kind, axis) in _COUNTS
+    }
+    emulator: dict[str, Any] = {"drives": options.drives, **counts}
+    driver: dict[str, Any] = {**{f"{axis}_drive": kind for axis, kind in kinds.items()}, **counts}
+    if options.graph:
+        # Below the ports that the system gives to connections.
+        port = emulator["listen"] = 12_000 + 2 * (os.getpid() % 10_000)
+        for index, kind in enumerate(dict.fromkeys(names)):
+            if kind != CIA402:
+                driver[f"{kind}_address"] = f"127.0.0.1:{port + index}"
+    return {"drive_emulator": emulator, "device_driver": driver}
 
 
 def _obstacles(path: Path) -> list[float]:

@@ -17,6 +17,7 @@ from needle_core.commands.options import (
     whole_number,
 )
 from needle_core.errors import UserError
+from needle_sim.drives.emulators import CIA402, known_drives
 
 DESCRIPTION = """\
 Steer a simulated needle into a plane with the rig's components, record the run and report on it.
@@ -37,6 +38,8 @@ examples:
       no images: tips with the noise of the paper, +-1 mm; faster
   scripts/simulate --level drive
       camera images, and the device driver moves two emulated CANopen drives
+  scripts/simulate --level drive --drives stepdir,cia402
+      likewise, with a step/direction board for the insertion
   scripts/simulate --controller open_loop --level tip --noise-mm 0
       no steering: the needle ends 14.6 mm from the plane (exit code 1)
   scripts/simulate --initial=5,-4,30 --depth-mm 80 --bag bags/my_run
@@ -85,6 +88,7 @@ class SimulateOptions:
     law: str = ""
     planner: str = ""
     insertion: str = "stepwise"
+    drives: str = CIA402
     seed: int = 1
     initial_x_mm: float = -3.0
     initial_pitch_deg: float = 2.0
@@ -123,6 +127,13 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         noise = number("--noise-mm", given.noise_mm or "1.0", 0.0, 20.0, "mm")
     elif given.noise_mm is not None:
         raise UserError(f"--noise-mm applies to --level tip only, not with {given.level}")
+    if given.drives is not None and given.level != "drive":
+        raise UserError(f"--drives applies to --level drive only, not with {given.level}")
+    drives = (given.drives or CIA402).split(",")
+    if len(drives) > 2:
+        raise UserError(f"--drives {given.drives!r} is not NAME[,NAME], such as stepdir,cia402")
+    for name in drives:
+        _one_of("--drives", name, known_drives())
     x_mm, pitch_deg, roll_deg = start(given.initial, largest_x=50.0, largest_pitch=45.0)
     target = None if given.target is None else _target(given.target)
     for option in ("planner", "obstacles"):
@@ -142,6 +153,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         law=given.law,
         planner=given.planner,
         insertion=given.insertion,
+        drives=",".join(drives),
         initial_x_mm=x_mm,
         initial_pitch_deg=pitch_deg,
         initial_roll_deg=roll_deg,
@@ -207,7 +219,13 @@ def _parser() -> CommandParser:
         default="camera",
         metavar="tip|camera|drive",
         help="what is simulated: the measured tips; the stereo images; or the images and the "
-        "drives, which the device driver moves over a CAN bus (default: camera)",
+        "drives, which the device driver moves (default: camera)",
+    )
+    add(
+        "--drives",
+        metavar="NAME[,NAME]",
+        help="level drive: drives of both axes, or of insertion and rotation: "
+        f"{', '.join(known_drives())} (default: {CIA402})",
     )
     add(
         "--controller",

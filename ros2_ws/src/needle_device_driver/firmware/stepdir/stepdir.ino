@@ -2,7 +2,8 @@
 // A line is $NUMBER,LETTER[,VALUE...]*HH and a line feed; HH is the XOR of the characters between
 // $ and *, as two hexadecimal digits. NUMBER counts the lines, 0..255, and an answer repeats it.
 //   I                          identify; answer: NAME,VERSION,MAX_RATE [steps/s]
-//   C,AXIS,DECELERATION,OUTER  set up [steps/s^2]; OUTER, 1 or -1, leads to the outer switch
+//   C,AXIS,DECELERATION,OUTER,TIME  set up: ramp [steps/s^2], direction of the outer switch (1, -1)
+//                              and time of the dead-man, 50..500 ms; 100 ms after power-up
 //   P,AXIS,0|1                 motor off or on; no answer, as of M, H and B
 //   M,AXIS,POSITION,TIME       be at a position [steps since power-up] in a time [ms]; stop there
 //   H,AXIS                     brake and forget the target
@@ -10,12 +11,12 @@
 //   R                          reset the fault
 //   S                          answer: FAULT,POSITION,FLAGS,POSITION,FLAGS of axes 0 and 1
 // FLAGS: 1 on, 2 moving, 4 outer switch, 8 inner switch, 16 set up since power-up.
-// FAULT: 1 no valid line for 100 ms, 2 a line was lost or came from elsewhere: NUMBER did not
+// FAULT: 1 no valid line for TIME, 2 a line was lost or came from elsewhere: NUMBER did not
 // follow. With a motor on, either brakes both axes; they hold their place until R. A line that is
 // damaged or unknown is dropped without an answer.
 const char NAME[] = "stepdir,1";
 const long MAX_RATE = 10000;           // steps/s, what an 8-bit board at 16 MHz manages on two axes
-const unsigned long DEAD_MAN = 100000, TICK = 1000;                            // us
+const unsigned long TICK = 1000;       // us
 const uint8_t STEP[] = {2, 5}, DIR[] = {3, 6}, ENABLE[] = {4, 7};  // pins of each axis
 const uint8_t OUTER[] = {8, 10}, INNER[] = {9, 11};
 const bool HAS_SWITCHES[] = {true, false};  // normally closed to ground: a broken cable is active
@@ -28,7 +29,7 @@ struct Axis {
 };
 Axis axes[2];
 int fault = 0, expected = -1;
-unsigned long fed, passed, ticked;
+unsigned long fed, passed, ticked, deadMan = 100000;  // us
 char line[64];
 uint8_t length = 0;
 
@@ -59,8 +60,8 @@ void execute() {  // one line, without its line feed
   *star = 0;
   int number, used = 0, count = 0;
   if (sscanf(line + 1, "%d,%c%n", &number, &letter, &used) != 2 || !used) return;
-  long value[3] = {0, 0, 0};
-  for (char *c = line + 1 + used; *c == ',' && count < 3;) value[count++] = strtol(c + 1, &c, 10);
+  long value[4] = {0, 0, 0, 0};
+  for (char *c = line + 1 + used; *c == ',' && count < 4;) value[count++] = strtol(c + 1, &c, 10);
   if (expected >= 0 && number != expected) fail(2);
   expected = (number + 1) & 255;
   fed = micros();
@@ -70,6 +71,7 @@ void execute() {  // one line, without its line feed
   else if (letter == 'C') {
     if (value[1] <= 0) return;
     axis.ramp = value[1], axis.outer = value[2] > 0 ? 1 : -1;
+    deadMan = constrain(value[3], 50, 500) * 1000UL;
   }
   else if (letter == 'P') {
     bool on = value[1] && axis.ramp && !fault;
@@ -130,7 +132,7 @@ void loop() {
     else if (length < sizeof line - 1) line[length++] = c;
   }
   unsigned long now = micros();
-  if (now - fed > DEAD_MAN) fail(1);
+  if (now - fed > deadMan) fail(1);
   if (now - ticked >= TICK) ticked = now, tick(0), tick(1);
   step(0, now - passed), step(1, now - passed);
   passed = now;

@@ -91,7 +91,8 @@ class StepdirProtocol(DriveProtocol):
         self.power(axis, False)
         yield from self._ask("R")
         ramp = settings.magnitude(settings.quick_stop_deceleration)
-        yield from self._ask("C", _AXES[axis], ramp, -settings.direction)
+        dead_man = round(self.parameters.watchdog * 1e3)
+        yield from self._ask("C", _AXES[axis], ramp, -settings.direction, dead_man)
 
     def clear_fault(self, axis: str) -> Procedure[None]:
         """Reset the fault of the board."""

@@ -13,14 +13,13 @@ from needle_sim.drives.text_drives import TextDrive, TextDrives
 IDENTITY = "Emulated stepdir,1"
 MAX_RATE = 10_000
 """Largest step rate of an axis [1/s]."""
-DEAD_MAN = 0.1
-"""Time without a valid line after which a board that is on stops [s]."""
 SILENT, LINE_LOST = 1, 2
 """Faults: the dead-man, and a line number that does not follow the last one."""
 _AXES = ("insertion", "rotation")
 _LINE = re.compile(r"\$((\d{1,3}),([A-Z])((?:,-?\d{1,10})*))\*([0-9A-F]{2})")
 _ON, _MOVING, _OUTER, _INNER, _SET_UP = 1, 2, 4, 8, 16
 _NUMBERS = 256
+_DEAD_MAN = 0.1
 
 
 class StepdirDrive(TextDrive):
@@ -112,7 +111,6 @@ class StepdirDrives(TextDrives[StepdirDrive]):
     port = "stepdir"
 
     def __init__(self, motors: Mapping[str, MotorSettings], now: float) -> None:
-        self._fed = now
         self._expected = 0
         super().__init__(motors, now, StepdirDrive)
 
@@ -134,8 +132,14 @@ class StepdirDrives(TextDrives[StepdirDrive]):
 
     def watch(self, now: float) -> None:
         """Stop without lines of the computer."""
-        if now - self._fed > DEAD_MAN:
+        if now - self._fed > self._dead_man:
             self._fail(SILENT)
+
+    def reboot(self, axis: str, now: float) -> None:
+        """Interrupt the power of the board."""
+        super().reboot(axis, now)
+        # Time of the last valid line, and time after which its absence stops the motors [s].
+        self._fed, self._dead_man = now, _DEAD_MAN
 
     def fail(self, axis: str, code: int) -> None:
         """Cause a fault of the board, which brakes both axes."""
@@ -153,8 +157,9 @@ class StepdirDrives(TextDrives[StepdirDrive]):
                 return ()
             case "S", ():
                 return self._status()
-            case "C", (deceleration, outer) if drive and deceleration > 0:
+            case "C", (deceleration, outer, milliseconds) if drive and deceleration > 0:
                 drive.deceleration, drive.outer = float(deceleration), 1 if outer > 0 else -1
+                self._dead_man = min(max(milliseconds, 50), 500) * 1e-3
                 return ()
             case "P", (0,) if drive:
                 drive.switch_off()

@@ -41,7 +41,7 @@ class Computer:
 
     def switch_on(self, *axes: int) -> None:
         for axis in axes:
-            self.send(f"C,{axis},800000,-1")
+            self.send(f"C,{axis},800000,-1,100")
             self.send(f"P,{axis},1")
 
     def wait(self, seconds: float) -> list[int]:
@@ -59,7 +59,7 @@ def test_a_transcript() -> None:
     board = StepdirDrives({"insertion": MotorSettings(1.6e6, 1e9)}, -1.0)
     for time, sent, expected in (
         (0.000, b"$0,I*55\n", b"$0,I,Emulated stepdir,1,10000*11\n"),
-        (0.001, b"$1,C,0,800000,-1*56\r\n$2,S*4D\n", b"$1,C*5E\n$2,S,0,0,16,0,0*66\n"),
+        (0.001, b"$1,C,0,800000,-1,100*4B\r\n$2,S*4D\n", b"$1,C*5E\n$2,S,0,0,16,0,0*66\n"),
         (0.002, b"$3,P,0,1*4E\n$4,M,0,100", b""),
         (0.003, b",25*7F\n$5,S*4A\n", b"$5,S,0,0,19,0,0*6E\n"),
         (0.040, b"$6,S*49\n", b"$6,S,0,100,17,0,0*62\n"),
@@ -163,16 +163,16 @@ def test_the_sketch_answers_as_the_emulated_board(tmp_path: Path) -> None:
         emulated.append(computer.send(body, after, skip).strip())
         script.append(f"{round(computer.now * 1e6)} ${text}*{checksum:02X}\n")
 
-    for body in ("S", "C,0,800000,-1", "C,1,100000,1", "P,0,1", "P,1,1", "M,0,100,25", "S"):
+    for body in ("S", "C,0,800000,-1,100", "C,1,100000,1,200", "P,0,1", "P,1,1", "M,0,100,25", "S"):
         send(body, 0.001)
     for body in ("M,0,2000,250", "M,1,-300,100", *["S"] * 12, "H,0", "S", "M,0,50,300"):
         send(body, 0.02)
     for body in (*["S"] * 20, "M,0,9000,1", *["S"] * 3):
         send(body, 0.02)
-    send("S", 0.2)  # The dead-man acts.
+    send("S", 0.4)  # The dead-man acts.
     for body in ("R", "M,1,200,170", "S"):
         send(body, 0.02)
-    for body, skip in (("B", 3), ("S", 0), ("P,0,0", 0), ("S", 0), ("C,0,0,1", 0), ("X", 0)):
+    for body, skip in (("B", 3), ("S", 0), ("P,0,0", 0), ("S", 0), ("C,0,0,1,100", 0), ("X", 0)):
         send(body, 0.02, skip)
     found = subprocess.run(
         [bench], input="".join(script), text=True, capture_output=True, check=True
