@@ -61,10 +61,6 @@ OPTIONS = {
 # Watchdog of driver and drives if seven processes share the cores [s].
 GRAPH_WATCHDOG = 0.5
 
-# Counts of a board that makes a limited number of steps per second: 8 microsteps of a motor with
-# 200 steps on a screw of 1 mm, 32 microsteps on the needle's shaft.
-_COUNTS = {("stepdir", "insertion"): 1.6e6, ("stepdir", "rotation"): 6400.0 / (2.0 * math.pi)}
-
 # Parameters of the recorder that make the bag incomplete.
 _CHOICES = ("topics", "regex", "exclude_regex", "snapshot_seconds")
 
@@ -207,13 +203,8 @@ def _of_drives(options: SimulateOptions) -> Parameters:
         return {}
     names = options.drives.split(",")
     kinds = {"insertion": names[0], "rotation": names[-1]}
-    counts = {
-        f"{axis}_counts_per_unit": _COUNTS[kind, axis]
-        for axis, kind in kinds.items()
-        if (kind, axis) in _COUNTS
-    }
-    emulator: dict[str, Any] = {"drives": options.drives, **counts}
-    driver: dict[str, Any] = {**{f"{axis}_drive": kind for axis, kind in kinds.items()}, **counts}
+    emulator: dict[str, Any] = {"drives": options.drives}
+    driver: dict[str, Any] = {f"{axis}_drive": kind for axis, kind in kinds.items()}
     if options.graph:
         # Below the ports that the system gives to connections.
         port = emulator["listen"] = 12_000 + 2 * (os.getpid() % 10_000)

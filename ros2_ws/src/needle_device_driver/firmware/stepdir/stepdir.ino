@@ -15,7 +15,11 @@
 // follow. With a motor on, either brakes both axes; they hold their place until R. A line that is
 // damaged or unknown is dropped without an answer.
 const char NAME[] = "stepdir,1";
-const long MAX_RATE = 10000;           // steps/s, what an 8-bit board at 16 MHz manages on two axes
+#ifdef __AVR__
+const long MAX_RATE = 10000;           // steps/s of each axis; estimated, not measured
+#else
+const long MAX_RATE = 100000;
+#endif
 const unsigned long TICK = 1000;       // us
 const uint8_t STEP[] = {2, 5}, DIR[] = {3, 6}, ENABLE[] = {4, 7};  // pins of each axis
 const uint8_t OUTER[] = {8, 10}, INNER[] = {9, 11};

@@ -11,8 +11,8 @@ from needle_sim.drives.motor import MotorSettings
 from needle_sim.drives.text_drives import TextDrive, TextDrives
 
 IDENTITY = "Emulated stepdir,1"
-MAX_RATE = 10_000
-"""Largest step rate of an axis [1/s]."""
+MAX_RATE = 100_000
+"""Largest step rate of an axis [1/s]: a 32-bit board."""
 SILENT, LINE_LOST = 1, 2
 """Faults: the dead-man, and a line number that does not follow the last one."""
 _AXES = ("insertion", "rotation")

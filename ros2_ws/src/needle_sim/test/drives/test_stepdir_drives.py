@@ -58,7 +58,7 @@ class Computer:
 def test_a_transcript() -> None:
     board = StepdirDrives({"insertion": MotorSettings(1.6e6, 1e9)}, -1.0)
     for time, sent, expected in (
-        (0.000, b"$0,I*55\n", b"$0,I,Emulated stepdir,1,10000*11\n"),
+        (0.000, b"$0,I*55\n", b"$0,I,Emulated stepdir,1,100000*21\n"),
         (0.001, b"$1,C,0,800000,-1,100*4B\r\n$2,S*4D\n", b"$1,C*5E\n$2,S,0,0,16,0,0*66\n"),
         (0.002, b"$3,P,0,1*4E\n$4,M,0,100", b""),
         (0.003, b",25*7F\n$5,S*4A\n", b"$5,S,0,0,19,0,0*6E\n"),
@@ -139,9 +139,10 @@ def test_orders_need_power_and_power_needs_a_set_up() -> None:
     assert computer.wait(0.1) == [0, 0, 0, 0, 0]
     computer.switch_on(0)
     # The step rate of the board is limited.
+    computer.send("C,0,100000000,-1,100")
     computer.send("M,0,100000,1")
     start = computer.status(after=0.05)[1]
-    assert computer.status(after=0.05)[1] - start == pytest.approx(500, abs=2)
+    assert computer.status(after=0.05)[1] - start == pytest.approx(5000, abs=2)
     computer.board.reboot("insertion", computer.now)
     assert computer.send("S") == ""
     assert computer.status(after=1.0) == [0, 0, 0, 0, 0]
@@ -167,7 +168,7 @@ def test_the_sketch_answers_as_the_emulated_board(tmp_path: Path) -> None:
         send(body, 0.001)
     for body in ("M,0,2000,250", "M,1,-300,100", *["S"] * 12, "H,0", "S", "M,0,50,300"):
         send(body, 0.02)
-    for body in (*["S"] * 20, "M,0,9000,1", *["S"] * 3):
+    for body in (*["S"] * 20, "M,0,3000,150", *["S"] * 3):
         send(body, 0.02)
     send("S", 0.4)  # The dead-man acts.
     for body in ("R", "M,1,200,170", "S"):

@@ -8,7 +8,7 @@ int main() {
   unsigned long at;
   setup();
   while (scanf("%lu %199[^\n]", &at, text) == 2) {
-    for (; now_us < at; now_us += 50) loop();
+    for (; now_us < at; now_us += 10) loop();
     int pin, value;
     if (sscanf(text, "@%d %d", &pin, &value) == 2) pins[pin] = value;
     else snprintf(input, sizeof input, "%s\n", text), unread = 0;
