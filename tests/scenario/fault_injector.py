@@ -141,7 +141,7 @@ class FaultInjector:
             case Kind.OFF:
                 bus.reboot(axis, now)
             case Kind.GARBAGE:
-                bus.emergency(axis, _MOTION_ERROR)
+                bus.fail(axis, _MOTION_ERROR)
             case Kind.STUCK:
                 bus.stall(axis)
                 return partial(setattr, drive.motor, "stalled", False)

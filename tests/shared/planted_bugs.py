@@ -28,7 +28,7 @@ from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.reports import ServiceResult
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
-from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
+from needle_sim.drives.emulated_drives import AxisState, EmulatedDrives
 from scenario import link_faults, rig_run
 from scenario.monitors import limit_monitor
 from scenario.monitors.hold_monitor import HoldMonitor
@@ -71,12 +71,12 @@ def _forgiving(lapses: Any, session: PageSession, now: float) -> bool:
 def _axis_scaled(name: str, scale: float) -> Plant:
     """Return a bug that scales the motion of an emulated axis."""
 
-    def axes(true: Any, bus: EmulatedBus, now: float) -> dict[str, AxisState]:
+    def axes(true: Any, bus: EmulatedDrives, now: float) -> dict[str, AxisState]:
         found: dict[str, AxisState] = true(bus, now)
         at = found[name]
         return found | {name: AxisState(scale * at.position, scale * at.velocity)}
 
-    return wrapped(EmulatedBus, "axes", axes)
+    return wrapped(EmulatedDrives, "axes", axes)
 
 
 def _twice(drive: Any, *given: Any) -> None:

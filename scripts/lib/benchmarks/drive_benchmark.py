@@ -34,7 +34,7 @@ from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
 from needle_sim.bus.pty_can import PtyPort
-from needle_sim.drive_emulator import DriveEmulatorParameters
+from needle_sim.drive_emulator import AXES, DriveEmulatorParameters
 from needle_sim.drives.emulated_bus import EmulatedBus
 
 PERIOD = 0.02
@@ -218,7 +218,7 @@ def serve(channel: str) -> None:
     """Run the drives until a line arrives on stdin, then print when each SYNC arrived."""
     values = DriveEmulatorParameters(boot_time=0.0)
     now = time.monotonic()
-    bus = EmulatedBus(values.insertion, values.rotation, now)
+    bus = EmulatedBus(map(values.cia402, AXES), now)
     bus.poll(now)
     port = PtyPort(Path(channel))
     print("ready", flush=True)
@@ -232,8 +232,7 @@ def serve(channel: str) -> None:
     arrived: list[float] = []
     while not ended.is_set():
         select.select(port.filenos, [], [], 0.005)
-        for frame in port.receive():
-            bus.receive(frame, time.monotonic())
+        port.send(bus.receive(port.receive(), time.monotonic()))
         port.send(bus.poll(time.monotonic()))
         while len(arrived) < bus.syncs:
             arrived.append(time.monotonic())

@@ -79,7 +79,7 @@ def one_fault_stops_both() -> None:
     """The fault of one drive also switches off the other."""
     scene = Scene()
     scene.moving()
-    scene.bus.emergency("insertion", 0x2310)
+    scene.bus.fail("insertion", 0x2310)
     scene.runner.run(0.5)
     assert scene.state == "FAULT"
     assert not set(states(scene)) & set(ON)
@@ -161,7 +161,7 @@ def drive_emergency() -> None:
     """A drive's emergency message stops both."""
     scene = Scene()
     scene.moving()
-    scene.bus.emergency("rotation", 0x4210)
+    scene.bus.fail("rotation", 0x4210)
     assert scene.fails(Rule.DRIVE_EMERGENCY)
 
 

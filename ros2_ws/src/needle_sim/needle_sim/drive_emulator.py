@@ -1,13 +1,14 @@
-"""drive_emulator as a component: two CiA 402 drives behind a CAN port, and its parameters."""
+"""drive_emulator as a component: the drives of both axes behind their ports, and its parameters."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 from needle_core import messages as m
-from needle_core.can_frame import CAN, CanFrame
 from needle_core.component import (
     Actions,
     Component,
@@ -23,10 +24,13 @@ from needle_core.component import (
 )
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
-from needle_sim.drives.cia402 import SERVO, STEPPER, PowerState
+from needle_sim.drives.cia402 import SERVO, STEPPER
 from needle_sim.drives.drive_motion import LimitAction
-from needle_sim.drives.emulated_bus import EmulatedBus, bus_health, execute_command
+from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.drives.emulated_drive import EmulatedDriveSettings
+from needle_sim.drives.emulated_drives import FAULT, AxisState, EmulatedDrives
+from needle_sim.drives.emulators import CIA402, load_emulator
+from needle_sim.drives.fault_commands import execute_command, health
 from needle_sim.drives.motor import MotorSettings
 
 # Encoder of the rotation axis: 16 bits per turn, no gear.
@@ -40,6 +44,19 @@ _LAST_NODE = 127
 class DriveEmulatorParameters:
     """Parameters of drive_emulator, fixed at the start."""
 
+    drives: str = fixed_parameter(
+        CIA402,
+        "-",
+        "Drives of both axes, or of insertion and rotation: cia402, galil, zaber, stepdir, or those"
+        " of another package.",
+    )
+    listen: int = fixed_parameter(
+        5023,
+        "-",
+        "TCP port of drives other than cia402; the second drives use the next one.",
+        1,
+        65534,
+    )
     pty: str = fixed_parameter(
         "", "-", "Symbolic link to the pseudo-terminal; empty: only its own name is logged."
     )
@@ -90,9 +107,11 @@ class DriveEmulatorParameters:
         Raises
         ------
         UserError
-            If a parameter is out of bounds, or both drives have the same node id.
+            If a parameter is out of bounds, a drive is unknown, or both have the same node id.
         """
         check_fields(self)
+        if len(names := self.drives.split(",")) > len(AXES):
+            raise UserError(f"drives = {self.drives!r} has {len(names)} names; at most {len(AXES)}")
         if self.insertion_node_id == self.rotation_node_id:
             raise UserError(f"both drives have node id {self.insertion_node_id}")
         if self.insertion_start > self.insertion_travel:
@@ -102,32 +121,34 @@ class DriveEmulatorParameters:
             )
 
     @property
-    def insertion(self) -> EmulatedDriveSettings:
-        """Insertion axis: a stepper on a screw, with a limit switch at either end."""
-        scale = self.insertion_counts_per_unit
-        ends = {"start": self.insertion_start * scale, "travel": self.insertion_travel * scale}
-        return self._drive("insertion", STEPPER, _LEAD, **ends)
+    def axes_of(self) -> dict[str, tuple[str, ...]]:
+        """Return drives -> their axes."""
+        names = self.drives.split(",")
+        chosen = dict(zip(AXES, (names[0], names[-1]), strict=True))
+        return {
+            name: tuple(axis for axis in AXES if chosen[axis] == name) for name in chosen.values()
+        }
 
-    @property
-    def rotation(self) -> EmulatedDriveSettings:
-        """Rotation axis: a servo with unlimited travel."""
-        return self._drive("rotation", SERVO, 2.0 * math.pi)
-
-    def _drive(
-        self, axis: str, device_type: int, turn: float, **ends: float
-    ) -> EmulatedDriveSettings:
-        scale, node_id, max_speed, lag = (
-            getattr(self, f"{axis}_{name}")
-            for name in ("counts_per_unit", "node_id", "max_speed", "lag")
+    def motor(self, axis: str) -> MotorSettings:
+        """Return the mechanics of an axis: insertion has a limit switch at either end."""
+        scale, max_speed, lag = (
+            getattr(self, f"{axis}_{name}") for name in ("counts_per_unit", "max_speed", "lag")
         )
-        motor = MotorSettings(scale, max_speed * scale, lag, **ends)
+        ends = (self.insertion_start, self.insertion_travel) if axis == "insertion" else ()
+        return MotorSettings(scale, max_speed * scale, lag, *(end * scale for end in ends))
+
+    def cia402(self, axis: str) -> EmulatedDriveSettings:
+        """Return the CiA 402 drive of an axis: a stepper on a screw, or a servo."""
+        device_type, turn = (STEPPER, _LEAD) if axis == "insertion" else (SERVO, 2.0 * math.pi)
+        motor, node_id = self.motor(axis), getattr(self, f"{axis}_node_id")
         action = LimitAction(self.limit_action)
-        rpm = scale * turn / 60.0 if self.rpm else None
+        rpm = motor.counts_per_unit * turn / 60.0 if self.rpm else None
         return EmulatedDriveSettings(axis, node_id, device_type, motor, action, self.boot_time, rpm)
 
 
+AXES = ("insertion", "rotation")
 POSITIONS = "sim/drive_positions"
-ADAPTER, COMMAND_LINES = "adapter", "command lines"
+ADAPTERS, COMMAND_LINES = "adapters", "command lines"
 # Periods of the drives' timers, and of the motor positions [s].
 _TIMER_PERIOD, _POSITION_PERIOD = 0.005, 0.02
 
@@ -146,8 +167,8 @@ class DriveEmulator(Component):
 
     Attributes
     ----------
-    bus : EmulatedBus
-        Bus with the drives; tests inject faults there.
+    connections : dict of str to EmulatedDrives
+        Port to the drives behind it; tests inject faults there.
     """
 
     name = "drive_emulator"
@@ -156,11 +177,16 @@ class DriveEmulator(Component):
         self, settings: DriveEmulatorParameters, name: str = name, now: float = 0.0
     ) -> None:
         self.name, self.settings = name, settings
-        self.bus = EmulatedBus(settings.insertion, settings.rotation, now)
-        self._states = dict.fromkeys(self.bus.drives, PowerState.NOT_READY)
+        self.connections = {
+            drives.port: drives for drives in map(partial(self._make, now), settings.axes_of)
+        }
+        self._states: dict[str, str] = {}
         self._has_subscriber = False
         self.outputs = (Output(POSITIONS, m.JointState),)
-        self.ports = (Port(CAN, self._on_frames), Port(COMMAND_LINES, self._on_commands))
+        self.ports = (
+            *(Port(name, partial(self._on_input, name)) for name in self.connections),
+            Port(COMMAND_LINES, self._on_commands),
+        )
         self.timers = (
             Timer(_TIMER_PERIOD, self._poll),
             Timer(_POSITION_PERIOD, self._publish_positions),
@@ -171,47 +197,65 @@ class DriveEmulator(Component):
         self._has_subscriber = POSITIONS in peers.subscribers
         return ()
 
-    def _on_frames(self, frames: Sequence[CanFrame], at: Moment) -> Actions:
-        for frame in frames:
-            self.bus.receive(frame, at.steady)
-        return self._send(self.bus.drain_outboxes())
+    @property
+    def bus(self) -> EmulatedBus:
+        """CAN bus with the CiA 402 drives."""
+        return next(one for one in self.connections.values() if isinstance(one, EmulatedBus))
+
+    def axes(self, now: float) -> dict[str, AxisState]:
+        """Return the true states of both motors at steady time `now` [s]."""
+        found: dict[str, AxisState] = {}
+        for drives in self.connections.values():
+            found |= drives.axes(now)
+        return {axis: found[axis] for axis in AXES}
+
+    def _make(self, now: float, name: str) -> EmulatedDrives:
+        axes = self.settings.axes_of[name]
+        if name == CIA402:
+            return EmulatedBus(map(self.settings.cia402, axes), now)
+        return load_emulator(name)({axis: self.settings.motor(axis) for axis in axes}, now)
+
+    def _on_input(self, port: str, batch: Sequence[Any], at: Moment) -> Actions:
+        return self._send(port, self.connections[port].receive(batch, at.steady))
 
     def _on_commands(self, lines: Sequence[str], at: Moment) -> Actions:
         """Execute fault commands and log the motor positions; log invalid commands."""
+        connections = tuple(self.connections.values())
         for line in lines:
-            axes = self.bus.axes(at.steady)
+            axes = self.axes(at.steady)
             try:
-                adapter_command = execute_command(line, self.bus, at.steady)
+                adapter_command = execute_command(line, connections, at.steady)
             except UserError as error:
                 yield Log("error", str(error))
                 continue
-            insertion, rotation = (axes[name].position for name in ("insertion", "rotation"))
+            insertion, rotation = (axes[name].position for name in AXES)
             where = f"{insertion * 1e3:.6f} mm, {rotation:.6f} rad"
             yield Log("warning", f"on command: {line.strip()}, at {where}")
             if adapter_command is not None:
-                yield Send(ADAPTER, (adapter_command,))
-            yield Diagnose("drives", bus_health(self.bus))
+                yield Send(ADAPTERS, (adapter_command,))
+            yield Diagnose("drives", health(connections))
 
     def _poll(self, at: Moment) -> Actions:
-        yield from self._send(self.bus.poll(at.steady))
-        states = {name: drive.state for name, drive in self.bus.drives.items()}
+        states: dict[str, str] = {}
+        for port, drives in self.connections.items():
+            yield from self._send(port, drives.poll(at.steady))
+            states |= drives.states()
         if states == self._states:
             return
         for name, state in states.items():
-            if state is PowerState.FAULT and self._states[name] is not state:
-                code = self.bus.drives[name].error_code
-                yield Log("warning", f"{name} drive: fault 0x{code:04X}")
+            if state.startswith(FAULT) and self._states.get(name) != state:
+                yield Log("warning", f"{name} drive: {state.replace(FAULT, 'fault')}")
         self._states = states
-        yield Diagnose("drives", bus_health(self.bus))
+        yield Diagnose("drives", health(tuple(self.connections.values())))
 
-    def _send(self, frames: Sequence[CanFrame]) -> Actions:
-        if frames:
-            yield Send(CAN, tuple(frames))
+    def _send(self, port: str, batch: Sequence[Any]) -> Actions:
+        if batch:
+            yield Send(port, tuple(batch))
 
     def _publish_positions(self, at: Moment) -> Actions:
         if not self._has_subscriber:
             return
-        axes = self.bus.axes(at.steady)
+        axes = self.axes(at.steady)
         positions = tuple(axis.position for axis in axes.values())
         velocities = tuple(axis.velocity for axis in axes.values())
         names = tuple(f"{name}_joint" for name in axes)

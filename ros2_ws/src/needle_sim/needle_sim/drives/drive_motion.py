@@ -12,11 +12,10 @@ from needle_sim.drives.cia402 import (
     PROFILE_POSITION,
     TARGET_POSITION,
 )
+from needle_sim.drives.emulated_drives import MOTION_STEP
 from needle_sim.drives.motion_profile import METHODS, Demand, Homing
 from needle_sim.drives.motor import Motor
 
-# Time step of the motion [s].
-MOTION_STEP = 0.001
 # Mode-specific bits of the controlword and of the statusword.
 NEW_SET_POINT = HOMING_START = 1 << 4
 _AT_ONCE, _RELATIVE = 1 << 5, 1 << 6

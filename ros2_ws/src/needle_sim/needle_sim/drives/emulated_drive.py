@@ -21,12 +21,8 @@ from needle_sim.drives.cia402 import (
     drive_dictionary,
     next_state,
 )
-from needle_sim.drives.drive_motion import (
-    MOTION_STEP,
-    DriveMotion,
-    LimitAction,
-    LimitExceededError,
-)
+from needle_sim.drives.drive_motion import DriveMotion, LimitAction, LimitExceededError
+from needle_sim.drives.emulated_drives import MOTION_STEP
 from needle_sim.drives.motion_profile import METHODS
 from needle_sim.drives.motor import Motor, MotorSettings
 

@@ -48,6 +48,7 @@ class Motor:
 
     def __init__(self, settings: MotorSettings) -> None:
         self._settings = settings
+        self.scale = settings.counts_per_unit
         self.max_speed = settings.max_speed
         self.position = settings.start
         self.velocity = 0.0
@@ -82,7 +83,7 @@ class Motor:
         step = min(max(step, -limit), limit)
         self.position = demand if step == demand - before else before + step
         if self._has_switches:
-            margin = _STOP_DISTANCE * self._settings.counts_per_unit
+            margin = _STOP_DISTANCE * self.scale
             self.position = min(max(self.position, -margin), self._settings.travel + margin)
         self.velocity = (self.position - before) / period
 

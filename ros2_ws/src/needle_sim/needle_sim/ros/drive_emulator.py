@@ -7,7 +7,7 @@ import select
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +15,26 @@ from needle_core.can_frame import CAN
 from needle_core.component import RealPort
 from needle_core.ros.main import run_component
 from needle_sim.bus.pty_can import PtyCan
-from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator, DriveEmulatorParameters
-from needle_sim.drives.emulated_bus import COMMANDS, PlugCommand
+from needle_sim.bus.stream_server import StreamServer
+from needle_sim.drive_emulator import (
+    ADAPTERS,
+    COMMAND_LINES,
+    DriveEmulator,
+    DriveEmulatorParameters,
+)
+from needle_sim.drives.emulators import CIA402
+from needle_sim.drives.fault_commands import COMMANDS, PlugCommand
 
 HELP = f"""\
-drive_emulator: emulates a stepper (insertion) and a servo (rotation), CiA 402 drives on a CAN bus.
+drive_emulator: emulates the drives of insertion and rotation with their motors.
 
-A pseudo-terminal acts as serial adapter (slcan) to the bus. The drives support profile position,
-homing (methods 17, 18, 35, 37) and cyclic synchronous position mode, software limits, following
-errors, emergency messages, and heartbeats in both directions.
+drives = cia402: a stepper and a servo on a CAN bus. A pseudo-terminal acts as serial adapter
+(slcan) to the bus. The drives support profile position, homing (methods 17, 18, 35, 37) and cyclic
+synchronous position mode, software limits, following errors, emergency messages, and heartbeats in
+both directions.
+
+drives = galil, zaber or stepdir: a controller that speaks lines of text at a TCP port. Two names
+(galil,cia402) are those of insertion and rotation.
 
 To run it with a driver:
     ros2 run needle_sim drive_emulator --ros-args -p pty:=/tmp/can
@@ -74,27 +85,34 @@ class _CommandLines:
                 arrive(tuple(line.decode(errors="replace") for line in lines if line.strip()))
 
 
-class _Plug:
-    """Port that plugs and unplugs the adapter."""
+class _Plugs:
+    """Port that plugs and unplugs the adapters."""
 
-    def __init__(self, adapter: PtyCan) -> None:
-        self._adapter = adapter
+    def __init__(self, adapters: Iterable[PtyCan | StreamServer]) -> None:
+        self._adapters = tuple(adapters)
 
     def open(self, arrive: Callable[[Any], None]) -> None:
         """Do nothing: the plug has no input."""
 
     def send(self, batch: tuple[PlugCommand, ...]) -> None:
         for command in batch:
-            self._adapter.plug(plugged_in=command is PlugCommand.IN)
+            for adapter in self._adapters:
+                adapter.plug(plugged_in=command is PlugCommand.IN)
 
     def close(self) -> None:
-        """Do nothing: the CAN port removes the adapter."""
+        """Do nothing: each port removes its own adapter."""
 
 
 def _ports(settings: DriveEmulatorParameters) -> Mapping[str, RealPort]:
-    adapter = PtyCan(Path(settings.pty).expanduser() if settings.pty else None)
-    print(f"slcan adapter at {adapter.path}", file=sys.stderr, flush=True)
-    return {CAN: adapter, ADAPTER: _Plug(adapter), COMMAND_LINES: _CommandLines()}
+    adapters: dict[str, PtyCan | StreamServer] = {}
+    for name in settings.axes_of:
+        if name == CIA402:
+            adapters[CAN] = PtyCan(Path(settings.pty).expanduser() if settings.pty else None)
+            print(f"slcan adapter at {adapters[CAN].path}", file=sys.stderr, flush=True)
+        else:
+            adapters[name] = StreamServer(settings.listen + len(adapters))
+            print(f"{name} at {adapters[name].path}", file=sys.stderr, flush=True)
+    return {**adapters, ADAPTERS: _Plugs(adapters.values()), COMMAND_LINES: _CommandLines()}
 
 
 def main() -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import canopen
@@ -39,9 +40,7 @@ class Master:
         **motor: float,
     ) -> None:
         self.bus = EmulatedBus(
-            settings("insertion", limit_action, **motor),
-            settings("rotation", limit_action),
-            0.0,
+            (settings("insertion", limit_action, **motor), settings("rotation", limit_action)), 0.0
         )
         self.now = 0.0
         self.heard: list[CanFrame] = []
@@ -55,16 +54,15 @@ class Master:
 
     def send(self, message: Any, timeout: float | None = None) -> None:
         data = bytes(message.data)
-        self.bus.receive(
-            CanFrame(message.arbitration_id, data, bool(message.is_remote_frame)), self.now
-        )
-        self._hear()
+        frame = CanFrame(message.arbitration_id, data, bool(message.is_remote_frame))
+        self._hear(self.bus.receive((frame,), self.now))
+        self._hear(self.bus.poll(self.now))
 
     def shutdown(self) -> None:
         """Nothing to shut down."""
 
-    def _hear(self) -> None:
-        for frame in self.bus.poll(self.now):
+    def _hear(self, frames: Sequence[CanFrame]) -> None:
+        for frame in frames:
             self.heard.append(frame)
             self.network.notify(frame.identifier, bytearray(frame.data), self.now)
 
@@ -74,7 +72,7 @@ class Master:
         end = self.now + seconds
         while self.now < end - 1e-9:
             self.now = min(self.now + 0.001, end)
-            self._hear()
+            self._hear(self.bus.poll(self.now))
 
     def frames(self, identifier: int) -> list[bytes]:
         return [frame.data for frame in self.heard if frame.identifier == identifier]

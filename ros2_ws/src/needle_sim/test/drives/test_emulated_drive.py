@@ -191,7 +191,7 @@ def test_a_fault_brakes_and_is_reset_by_a_rising_edge(master: Master) -> None:
     master.write(0x6085, 0, 1_000_000, 4)
     master.enable(CSP)
     before = run_at(master, 800)
-    master.bus.emergency("insertion", 0x5530)
+    master.bus.fail("insertion", 0x5530)
     assert master.state() == 0x0F
     master.sync(5)
     assert master.state() == 0x08
@@ -202,7 +202,7 @@ def test_a_fault_brakes_and_is_reset_by_a_rising_edge(master: Master) -> None:
     master.control(0x80)
     assert master.state() == 0x40
     assert master.frames(0x81) == [bytes(8)]
-    master.bus.emergency("insertion", 0x5530)
+    master.bus.fail("insertion", 0x5530)
     master.control(0x80)
     assert master.state() == 0x08
 

@@ -8,8 +8,14 @@ import pytest
 
 from needle_core.component import Action, Log, Moment, Send
 from needle_core.errors import UserError
-from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator, DriveEmulatorParameters
-from needle_sim.drives.emulated_bus import EmulatedBus, PlugCommand
+from needle_sim.drive_emulator import (
+    ADAPTERS,
+    COMMAND_LINES,
+    DriveEmulator,
+    DriveEmulatorParameters,
+)
+from needle_sim.drives.emulated_bus import EmulatedBus
+from needle_sim.drives.fault_commands import PlugCommand
 
 AT = Moment(1.0, 1_000_000_000)
 
@@ -57,7 +63,7 @@ def test_the_adapter_is_unplugged_and_plugged_in_on_command(drives: DriveEmulato
     said = typed(drives, "unplug", "restore")
     orders = [action.batch for action in said if isinstance(action, Send)]
     assert orders == [(PlugCommand.OUT,), (PlugCommand.IN,)]
-    assert {action.port for action in said if isinstance(action, Send)} == {ADAPTER}
+    assert {action.port for action in said if isinstance(action, Send)} == {ADAPTERS}
 
 
 def test_lines_that_are_no_commands_are_named_and_do_nothing(drives: DriveEmulator) -> None:
