@@ -4,7 +4,7 @@
 //   I                          identify; answer: NAME,VERSION,MAX_RATE [steps/s]
 //   C,AXIS,DECELERATION,OUTER  set up [steps/s^2]; OUTER, 1 or -1, leads to the outer switch
 //   P,AXIS,0|1                 motor off or on; no answer, as of M, H and B
-//   M,AXIS,POSITION,SPEED      move to a position [steps since power-up], and stop there [steps/s]
+//   M,AXIS,POSITION,TIME       be at a position [steps since power-up] in a time [ms]; stop there
 //   H,AXIS                     brake and forget the target
 //   B                          beat, for the dead-man
 //   R                          reset the fault
@@ -20,8 +20,8 @@ const uint8_t STEP[] = {2, 5}, DIR[] = {3, 6}, ENABLE[] = {4, 7};  // pins of ea
 const uint8_t OUTER[] = {8, 10}, INNER[] = {9, 11};
 const bool HAS_SWITCHES[] = {true, false};  // normally closed to ground: a broken cable is active
 struct Axis {
-  long at, target, speed;
-  float rate, ramp;
+  long at, target;
+  float speed, rate, ramp;
   unsigned long phase;
   int outer;
   bool on, go;
@@ -76,7 +76,8 @@ void execute() {  // one line, without its line feed
     if (on != axis.on) axis.on = on, axis.go = false, axis.rate = 0;
     digitalWrite(ENABLE[value[0] == 1], !on);
   } else if (letter == 'M' && axis.on && !fault) {
-    axis.target = value[1], axis.speed = constrain(value[2], 1, MAX_RATE), axis.go = true;
+    axis.target = value[1], axis.go = true;
+    axis.speed = fmin(labs(axis.target - axis.at) * 1000.0 / fmax(value[2], 1), MAX_RATE);
   } else if (letter == 'H') axis.go = false;
   else if (letter == 'S') {
     int n = snprintf(text, sizeof text, ",%d", fault);

@@ -160,9 +160,10 @@ class StepdirDrives(TextDrives[StepdirDrive]):
                 drive.switch_off()
             case "P", (_,) if drive and drive.deceleration and not self._fault:
                 drive.powered = True
-            case "M", (position, speed) if drive and drive.powered and not self._fault:
+            case "M", (position, milliseconds) if drive and drive.powered and not self._fault:
                 drive.target = drive.zero + position
-                drive.speed = float(min(max(speed, 1), MAX_RATE))
+                distance = abs(drive.target - drive.demand.position)
+                drive.speed = min(distance * 1e3 / max(milliseconds, 1), MAX_RATE)
             case "H", () if drive:
                 drive.target = None
         return None

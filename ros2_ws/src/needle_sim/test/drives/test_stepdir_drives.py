@@ -61,7 +61,7 @@ def test_a_transcript() -> None:
         (0.000, b"$0,I*55\n", b"$0,I,Emulated stepdir,1,10000*11\n"),
         (0.001, b"$1,C,0,800000,-1*56\r\n$2,S*4D\n", b"$1,C*5E\n$2,S,0,0,16,0,0*66\n"),
         (0.002, b"$3,P,0,1*4E\n$4,M,0,100", b""),
-        (0.003, b",4000*7C\n$5,S*4A\n", b"$5,S,0,0,19,0,0*6E\n"),
+        (0.003, b",25*7F\n$5,S*4A\n", b"$5,S,0,0,19,0,0*6E\n"),
         (0.040, b"$6,S*49\n", b"$6,S,0,100,17,0,0*62\n"),
     ):
         assert b"".join(board.receive((sent,), time)) == expected
@@ -70,15 +70,15 @@ def test_a_transcript() -> None:
 def test_a_silent_computer_stops_the_board_within_100_ms_and_the_ramp() -> None:
     computer = Computer()
     computer.switch_on(0, 1)
-    computer.send("M,0,100000,8000")
-    computer.send("M,1,100000,8000", after=0.02)
+    computer.send("M,0,100000,12500")
+    computer.send("M,1,100000,12500", after=0.02)
     begin = computer.place
     fault, _, flags, _, other = computer.status(after=1.0)
     assert (fault, flags, other) == (1, ON | SET_UP, ON | SET_UP)
     # 8000 steps/s for at most 100 ms, then the ramp: v^2 / 2 a.
     way = (computer.place - begin) * 1.6e6
     assert way == pytest.approx(8000 * 0.101 + 8000**2 / 1.6e6, abs=20)
-    computer.send("M,0,100000,8000")
+    computer.send("M,0,100000,12500")
     assert computer.wait(0.2)[2] & MOVING == 0
     computer.send("R")
     assert computer.wait(0.2)[0:3:2] == [0, ON | SET_UP]
@@ -88,8 +88,8 @@ def test_a_silent_computer_stops_the_board_within_100_ms_and_the_ramp() -> None:
 def test_a_lost_or_foreign_line_stops_both_axes(skip: int) -> None:
     computer = Computer()
     computer.switch_on(0, 1)
-    computer.send("M,0,100000,8000")
-    computer.send("M,1,100000,8000", after=0.02)
+    computer.send("M,0,100000,12500")
+    computer.send("M,1,100000,12500", after=0.02)
     computer.send("B", after=0.02, skip=skip)
     fault, position, flags, _, other = computer.status(after=0.05)
     assert (fault, flags, other) == (2, ON | SET_UP, ON | SET_UP)
@@ -99,7 +99,7 @@ def test_a_lost_or_foreign_line_stops_both_axes(skip: int) -> None:
 def test_a_damaged_line_is_dropped_and_missed() -> None:
     computer = Computer()
     computer.switch_on(0)
-    damaged = f"${computer.number},M,0,100,4000*00\n".encode()
+    damaged = f"${computer.number},M,0,100,25*00\n".encode()
     computer.number += 1
     assert computer.board.receive((damaged,), computer.now) == []
     assert computer.status() == [2, 0, ON | SET_UP, 0, 0]
@@ -109,11 +109,11 @@ def test_lost_steps_are_counted_and_not_made() -> None:
     computer = Computer()
     computer.switch_on(0)
     computer.board.stall("insertion")
-    computer.send("M,0,800,8000")
+    computer.send("M,0,800,100")
     assert computer.wait(0.2)[1] == 800
     assert computer.place == pytest.approx(1000 / 1.6e6)
     computer.board.restore(computer.now)
-    computer.send("M,0,1600,8000")
+    computer.send("M,0,1600,100")
     assert computer.wait(0.2)[1] == 1600
     assert computer.place == pytest.approx(1800 / 1.6e6)
 
@@ -124,22 +124,22 @@ def test_lost_steps_are_counted_and_not_made() -> None:
 def test_a_switch_blocks_its_direction_only(start: float, target: int, switch: int) -> None:
     computer = Computer(start=start)
     computer.switch_on(0)
-    computer.send(f"M,0,{target},8000")
+    computer.send(f"M,0,{target},625")
     _, position, flags, *_ = computer.wait(0.2)
     assert flags == ON | SET_UP | switch
     assert 100 < abs(position) < 160
-    computer.send("M,0,0,8000")
+    computer.send("M,0,0,25")
     assert computer.wait(0.2)[1:3] == [0, ON | SET_UP]
 
 
 def test_orders_need_power_and_power_needs_a_set_up() -> None:
     computer = Computer()
     computer.send("P,0,1")
-    computer.send("M,0,100,4000")
+    computer.send("M,0,100,25")
     assert computer.wait(0.1) == [0, 0, 0, 0, 0]
     computer.switch_on(0)
     # The step rate of the board is limited.
-    computer.send("M,0,100000,1000000")
+    computer.send("M,0,100000,1")
     start = computer.status(after=0.05)[1]
     assert computer.status(after=0.05)[1] - start == pytest.approx(500, abs=2)
     computer.board.reboot("insertion", computer.now)
@@ -163,14 +163,14 @@ def test_the_sketch_answers_as_the_emulated_board(tmp_path: Path) -> None:
         emulated.append(computer.send(body, after, skip).strip())
         script.append(f"{round(computer.now * 1e6)} ${text}*{checksum:02X}\n")
 
-    for body in ("S", "C,0,800000,-1", "C,1,100000,1", "P,0,1", "P,1,1", "M,0,100,4000", "S"):
+    for body in ("S", "C,0,800000,-1", "C,1,100000,1", "P,0,1", "P,1,1", "M,0,100,25", "S"):
         send(body, 0.001)
-    for body in ("M,0,2000,8000", "M,1,-300,3000", *["S"] * 12, "H,0", "S", "M,0,50,6000"):
+    for body in ("M,0,2000,250", "M,1,-300,100", *["S"] * 12, "H,0", "S", "M,0,50,300"):
         send(body, 0.02)
-    for body in (*["S"] * 20, "M,0,9000,20000", *["S"] * 3):
+    for body in (*["S"] * 20, "M,0,9000,1", *["S"] * 3):
         send(body, 0.02)
     send("S", 0.2)  # The dead-man acts.
-    for body in ("R", "M,1,200,3000", "S"):
+    for body in ("R", "M,1,200,170", "S"):
         send(body, 0.02)
     for body, skip in (("B", 3), ("S", 0), ("P,0,0", 0), ("S", 0), ("C,0,0,1", 0), ("X", 0)):
         send(body, 0.02, skip)
