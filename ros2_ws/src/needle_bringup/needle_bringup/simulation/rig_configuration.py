@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from needle_bringup.simulation.simulate_options import SimulateOptions, command_of
+from needle_bringup.simulation.simulate_options import CIA402, SimulateOptions, command_of
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import Parameters
-from needle_sim.drives.emulators import CIA402
 
 # Node -> its package, in the order of starting.
 PACKAGES = {

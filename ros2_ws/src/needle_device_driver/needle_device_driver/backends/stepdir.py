@@ -24,7 +24,6 @@ _ON, _MOVING, _OUTER, _INNER, _SET_UP = 1, 2, 4, 8, 16
 _DEAD_MAN = 1
 _FAULTS = {2: "missed a line of the computer, or received one of another program"}
 _LINE = re.compile(r"\$((\d+),([A-Z])(.*))\*([0-9A-F]{2})\n")
-_NUMBERS = 256
 _VERSION = "1"
 
 
@@ -150,7 +149,7 @@ class StepdirProtocol(DriveProtocol):
 
     def _line(self, letter: str, *values: int) -> bytes:
         text = ",".join(map(str, (self._next, letter, *values)))
-        self._next = (self._next + 1) % _NUMBERS
+        self._next = (self._next + 1) % 256
         return f"${text}*{_checksum(text):02X}\n".encode()
 
 

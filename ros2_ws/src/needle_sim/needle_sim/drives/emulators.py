@@ -19,11 +19,6 @@ _OWN = {
 }
 
 
-def known_drives() -> tuple[str, ...]:
-    """Return the names of all emulated drives."""
-    return (CIA402, *_entries())
-
-
 def load_emulator(name: str) -> Callable[[Mapping[str, MotorSettings], float], EmulatedDrives]:
     """Return what makes the drives of a name, from their motors and the time of power-up [s].
 
@@ -32,13 +27,9 @@ def load_emulator(name: str) -> Callable[[Mapping[str, MotorSettings], float], E
     UserError
         If no package offers such drives.
     """
-    entries = _entries()
-    if name not in entries:
-        raise UserError(f"drives: {name!r} is unknown; known: {', '.join(known_drives())}")
-    loaded: Callable[[Mapping[str, MotorSettings], float], EmulatedDrives] = entries[name].load()
+    own = (EntryPoint(known, place, GROUP) for known, place in _OWN.items())
+    found = {entry.name: entry for entry in (*own, *entry_points(group=GROUP))}
+    if name not in found:
+        raise UserError(f"drives: {name!r} is unknown; known: {', '.join((CIA402, *found))}")
+    loaded: Callable[[Mapping[str, MotorSettings], float], EmulatedDrives] = found[name].load()
     return loaded
-
-
-def _entries() -> dict[str, EntryPoint]:
-    own = (EntryPoint(name, place, GROUP) for name, place in _OWN.items())
-    return {entry.name: entry for entry in (*own, *entry_points(group=GROUP))}

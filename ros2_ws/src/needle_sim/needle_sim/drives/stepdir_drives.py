@@ -10,7 +10,6 @@ from functools import reduce
 from needle_sim.drives.motor import MotorSettings
 from needle_sim.drives.text_drives import TextDrive, TextDrives
 
-IDENTITY = "Emulated stepdir,1"
 MAX_RATE = 100_000
 """Largest step rate of an axis [1/s]: a 32-bit board."""
 SILENT, LINE_LOST = 1, 2
@@ -18,7 +17,6 @@ SILENT, LINE_LOST = 1, 2
 _AXES = ("insertion", "rotation")
 _LINE = re.compile(r"\$((\d{1,3}),([A-Z])((?:,-?\d{1,10})*))\*([0-9A-F]{2})")
 _ON, _MOVING, _OUTER, _INNER, _SET_UP = 1, 2, 4, 8, 16
-_NUMBERS = 256
 _DEAD_MAN = 0.1
 
 
@@ -122,7 +120,7 @@ class StepdirDrives(TextDrives[StepdirDrive]):
         number, letter = int(match[2]), match[3]
         if number != self._expected:
             self._fail(LINE_LOST)
-        self._expected = (number + 1) % _NUMBERS
+        self._expected = (number + 1) % 256
         self._fed = now
         answer = self._execute(letter, *map(int, match[4].split(",")[1:]))
         if answer is None:
@@ -150,7 +148,7 @@ class StepdirDrives(TextDrives[StepdirDrive]):
         drive = self.drives.get(_AXES[axis]) if axis in (0, 1) else None
         match letter, values:
             case "I", ():
-                return IDENTITY, str(MAX_RATE)
+                return "Emulated stepdir,1", str(MAX_RATE)
             case "R", ():
                 for each in self.drives.values():
                     each.fault = 0
