@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from needle_bringup.simulation.simulate_options import SimulateOptions, command_of
+from needle_bringup.simulation.simulate_options import CIA402, SimulateOptions, command_of
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import Parameters
 
@@ -192,8 +192,25 @@ def command_line_parameters(
         None if options.diameter_mm is None else options.diameter_mm * 1e-3,
         None if options.pre_bend_deg is None else math.radians(options.pre_bend_deg),
     )
-    parameters = merge(parameters, needle)
+    parameters = merge(parameters, needle, _of_drives(options))
     return {node: parameters[node] for node in nodes_of(options)}
+
+
+def _of_drives(options: SimulateOptions) -> Parameters:
+    """Return the parameters of driver and drives that depend on the kind of the drives."""
+    if options.drives == CIA402:
+        return {}
+    names = options.drives.split(",")
+    kinds = {"insertion": names[0], "rotation": names[-1]}
+    emulator: dict[str, Any] = {"drives": options.drives}
+    driver: dict[str, Any] = {f"{axis}_drive": kind for axis, kind in kinds.items()}
+    if options.graph:
+        # Below the ports that the system gives to connections.
+        port = emulator["listen"] = 12_000 + 2 * (os.getpid() % 10_000)
+        for index, kind in enumerate(dict.fromkeys(names)):
+            if kind != CIA402:
+                driver[f"{kind}_address"] = f"127.0.0.1:{port + index}"
+    return {"drive_emulator": emulator, "device_driver": driver}
 
 
 def _obstacles(path: Path) -> list[float]:

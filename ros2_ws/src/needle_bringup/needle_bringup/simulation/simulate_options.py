@@ -61,11 +61,10 @@ missing input; 130 interrupted
 """
 
 LEVELS = ("tip", "camera", "drive")
+CIA402 = "cia402"
+# Presets and insertion modes of plane_controller, whose import takes half a second.
 CONTROLLERS = ("best", "paper", "open_loop")
-"""Presets of plane_controller, repeated here because their import takes half a second."""
 INSERTIONS = ("stepwise", "continuous")
-"""Insertion modes of plane_controller, likewise."""
-
 
 DEPTH_MM, LARGEST_DEPTH_MM = "120", 150.0
 # Options that command_of() omits, or writes in a special form.
@@ -85,6 +84,7 @@ class SimulateOptions:
     law: str = ""
     planner: str = ""
     insertion: str = "stepwise"
+    drives: str = CIA402
     seed: int = 1
     initial_x_mm: float = -3.0
     initial_pitch_deg: float = 2.0
@@ -123,6 +123,8 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         noise = number("--noise-mm", given.noise_mm or "1.0", 0.0, 20.0, "mm")
     elif given.noise_mm is not None:
         raise UserError(f"--noise-mm applies to --level tip only, not with {given.level}")
+    if given.drives is not None and given.level != "drive":
+        raise UserError(f"--drives applies to --level drive only, not with {given.level}")
     x_mm, pitch_deg, roll_deg = start(given.initial, largest_x=50.0, largest_pitch=45.0)
     target = None if given.target is None else _target(given.target)
     for option in ("planner", "obstacles"):
@@ -142,6 +144,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         law=given.law,
         planner=given.planner,
         insertion=given.insertion,
+        drives=given.drives or CIA402,
         initial_x_mm=x_mm,
         initial_pitch_deg=pitch_deg,
         initial_roll_deg=roll_deg,
@@ -207,7 +210,13 @@ def _parser() -> CommandParser:
         default="camera",
         metavar="tip|camera|drive",
         help="what is simulated: the measured tips; the stereo images; or the images and the "
-        "drives, which the device driver moves over a CAN bus (default: camera)",
+        "drives, which the device driver moves (default: camera)",
+    )
+    add(
+        "--drives",
+        metavar="NAME[,NAME]",
+        help="level drive: drives of both axes, or of insertion and rotation, such as "
+        f"galil,cia402; known are cia402, galil, zaber and stepdir (default: {CIA402})",
     )
     add(
         "--controller",

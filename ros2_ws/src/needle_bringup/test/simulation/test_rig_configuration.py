@@ -76,6 +76,14 @@ def test_only_the_nodes_of_the_level_run() -> None:
     found = told("--level drive --graph")
     assert found["device_driver"]["channel"] == found["drive_emulator"]["pty"]
     assert found["simulated_operator"]["wait_for_recorder"]
+    mixed = told("--level drive --graph --drives galil,cia402")
+    assert mixed["drive_emulator"]["drives"] == "galil,cia402"
+    port = mixed["drive_emulator"]["listen"]
+    expected = {"insertion": "galil", "rotation": "cia402"}
+    assert {axis: mixed["device_driver"][f"{axis}_drive"] for axis in expected} == expected
+    assert mixed["device_driver"]["galil_address"] == f"127.0.0.1:{port}"
+    two = told("--level drive --graph --drives galil,zaber")
+    assert two["device_driver"]["zaber_address"] == f"127.0.0.1:{port + 1}"
     # Processes that share the cores wait for each other longer.
     assert found["device_driver"]["watchdog"] > 0.1
     assert set(PACKAGES) <= set(parameter_files.NODES)

@@ -212,10 +212,10 @@ def test_a_rerun_with_late_messages_is_unchanged(
     assert rerun.main([str(late_bag)]) == 0, capsys.readouterr().out
 
 
-@pytest.fixture(scope="module")
-def driven() -> Rig:
+@pytest.fixture(scope="module", params=["cia402", "stepdir", "cia402,stepdir"])
+def driven(request: pytest.FixtureRequest) -> Rig:
     """Return a rig at level drive that has come to its end."""
-    rig = Rig("--level", "drive", "--depth-mm", "1")
+    rig = Rig("--level", "drive", "--depth-mm", "1", "--drives", request.param)
     assert rig.until_end() == 0
     return rig
 

@@ -18,7 +18,9 @@ HAND = "hand"
 """The drive only measures the axis, and a hand moves it."""
 _OWN = {
     "cia402": "needle_device_driver.cia402.backend:BACKEND",
+    "stepdir": "needle_device_driver.backends.stepdir:BACKEND",
     HAND: "needle_device_driver.cia402.backend:BACKEND",
+    "galil": "needle_device_driver.backends.galil:BACKEND",
 }
 _PAGE = "docs/own_drives.md"
 

@@ -28,7 +28,7 @@ def load_emulator(name: str) -> Callable[[Mapping[str, MotorSettings], float], E
         If no package offers such drives.
     """
     own = (EntryPoint(known, place, GROUP) for known, place in _OWN.items())
-    found = {entry.name: entry for entry in (*entry_points(group=GROUP), *own)}
+    found = {entry.name: entry for entry in (*own, *entry_points(group=GROUP))}
     if name not in found:
         raise UserError(f"drives: {name!r} is unknown; known: {', '.join((CIA402, *found))}")
     loaded: Callable[[Mapping[str, MotorSettings], float], EmulatedDrives] = found[name].load()
