@@ -7,13 +7,14 @@ import os
 import random
 import tempfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 from campaign.checking import Check, Finding, Workbench, in_own_process
 from needle_core.errors import UserError
 from needle_device_driver.axes.backend import HAND
 from needle_device_driver.conformance.faults import FAULTS
-from needle_device_driver.conformance.rig import FASTEST, rigs_with
+from needle_device_driver.conformance.rig import FASTEST, ConformanceRig
 from needle_device_driver.conformance.scenarios import random_moment
 from needle_device_driver.parameters import BACKENDS
 from needle_sim.drive_emulator import COUNTS_PER_RADIAN, DriveEmulatorParameters
@@ -130,7 +131,7 @@ def faults_of_all_drives(_: Workbench) -> Iterator[Finding]:
 
 
 def _missed(axis: str, seed: int) -> str:
-    make, fault = rigs_with(axis, seed), FAULTS[seed % len(FAULTS)]
+    make, fault = partial(ConformanceRig, seed, axis=axis), FAULTS[seed % len(FAULTS)]
     try:
         if fault.needs(make().capabilities):
             random_moment(fault, make, seed)

@@ -137,7 +137,7 @@ class ConformanceRig:
     *others : Component
         Further components.
     axis : str
-        Kind of the drives of both axes.
+        Kind of the drives of both axes, with counts that each kind can make; by default cia402.
     hand : RigClient, optional
         The client.
     driver, drives : mapping, optional
@@ -159,7 +159,7 @@ class ConformanceRig:
         self,
         seed: int,
         *others: Component,
-        axis: str = "cia402",
+        axis: str = "",
         hand: RigClient | None = None,
         driver: Mapping[str, Any] | None = None,
         drives: Mapping[str, Any] | None = None,
@@ -169,11 +169,12 @@ class ConformanceRig:
         emulator = import_module("needle_sim.drive_emulator")
         self.hand = hand or RigClient()
         self.logged: list[str] = []
-        emulated = {"drives": axis} | dict(drives or {})
+        counts = _COUNTS if axis else {}
+        kinds = {"insertion_drive": axis, "rotation_drive": axis} if axis else {}
+        emulated = counts | {"drives": axis or "cia402"} | dict(drives or {})
         self.drives = emulator.DriveEmulator(emulator.DriveEmulatorParameters(**emulated))
-        parameters = {"link": "virtual", "channel": "can", "retraction_speed": FASTEST}
-        parameters |= {"insertion_drive": axis, "rotation_drive": axis}
-        self.settings = DeviceDriverParameters(**parameters | dict(driver or {}))
+        virtual = {"link": "virtual", "channel": "can", "retraction_speed": FASTEST}
+        self.settings = DeviceDriverParameters(**virtual | counts | kinds | dict(driver or {}))
         self.driver = DeviceDriver(self.settings)
         parts = [self.drives, self.driver, *others, self.hand]
         self.late, self.commands = 0.0, list[int]()
@@ -337,19 +338,3 @@ class ConformanceRig:
                 max(farthest[1], abs(here[1] - begin[1])),
             )
         return farthest
-
-
-def rigs_with(axis: str, seed: int = 1) -> Callable[..., ConformanceRig]:
-    """Return what makes a rig with a kind of drives; its keywords are `driver` and `drives`."""
-
-    def make(
-        *, driver: Mapping[str, Any] | None = None, drives: Mapping[str, Any] | None = None
-    ) -> ConformanceRig:
-        return ConformanceRig(
-            seed,
-            axis=axis,
-            driver={**_COUNTS, **(driver or {})},
-            drives={**_COUNTS, **(drives or {})},
-        )
-
-    return make

@@ -296,7 +296,7 @@ SCENARIOS: dict[Rule, tuple[Callable[[MakeRig], None], Needs]] = {
     Rule.INNER_LIMIT_SWITCH: (inner_limit_switch, lambda drive: drive.switches),
     Rule.SETTLING_TIME: (settling_time, lambda drive: drive.encoder),
     Rule.AXIS_SPEED: (axis_speed, lambda drive: drive.encoder),
-    Rule.SOFTWARE_LIMITS: (software_limits, lambda drive: drive.limits),
+    Rule.SOFTWARE_LIMITS: (software_limits, lambda _: True),
     Rule.QUICK_STOP: (quick_stop, lambda _: True),
     Rule.ONE_MASTER: (one_master, lambda _: True),
     Rule.DRIVE_REBOOT: (drive_reboot, lambda drive: drive.identity),
@@ -323,6 +323,8 @@ def verdict(rule: Rule, drive: Capabilities, limits: Any) -> str:
     faults = [fault for fault in FAULTS if fault.rule is rule]
     if not (faults[0].needs if faults else SCENARIOS[rule][1])(drive):
         return IMPOSSIBLE
+    if rule is Rule.SOFTWARE_LIMITS and not drive.limits:
+        return "driver only"
     bound = max((largest_travel(fault, drive, limits)[0] for fault in faults), default=0.0)
     if rule is Rule.ONE_MASTER and not drive.exclusive:
         bound = _INTRUSION

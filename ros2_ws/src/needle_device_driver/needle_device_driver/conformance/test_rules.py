@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 
 from needle_device_driver.axes.backend import HAND
 from needle_device_driver.conformance.faults import FAULTS
 from needle_device_driver.conformance.plugin import ROW
-from needle_device_driver.conformance.rig import rigs_with
+from needle_device_driver.conformance.rig import ConformanceRig
 from needle_device_driver.conformance.scenarios import (
     IMPOSSIBLE,
     RULES,
@@ -25,7 +26,10 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run each test with all chosen drives, and random moments as often as chosen."""
     chosen = metafunc.config.getoption("axis")
     known = [name for name in BACKENDS if name != HAND]
-    metafunc.parametrize("axis", chosen.split(",") if chosen else known)
+    axes = chosen.split(",") if chosen else known
+    if unknown := set(axes) - set(known):
+        raise pytest.UsageError(f"--axis {', '.join(unknown)}: known are {', '.join(known)}")
+    metafunc.parametrize("axis", axes)
     if "moment" in metafunc.fixturenames:
         metafunc.parametrize("moment", range(metafunc.config.getoption("moments")))
 
@@ -33,7 +37,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.value)
 def test_rule(axis: str, rule: Rule, record_property: Callable[[str, object], None]) -> None:
     """Check that the drives keep a rule as their abilities say."""
-    make = rigs_with(axis)
+    make = partial(ConformanceRig, 1, axis=axis)
     rig = make()
     text = verdict(rule, rig.capabilities, rig.settings)
     record_property(ROW, (axis, rule.value, text))
@@ -43,7 +47,7 @@ def test_rule(axis: str, rule: Rule, record_property: Callable[[str, object], No
 
 def test_fault_at_a_random_moment(axis: str, moment: int) -> None:
     """Cause each fault in turn at a random moment of set-up, homing, steps or rest."""
-    make = rigs_with(axis, moment)
+    make = partial(ConformanceRig, moment, axis=axis)
     fault = FAULTS[moment % len(FAULTS)]
     if fault.needs(make().capabilities):
         random_moment(fault, make, moment)
