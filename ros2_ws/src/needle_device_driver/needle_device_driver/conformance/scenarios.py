@@ -328,7 +328,8 @@ def verdict(rule: Rule, drive: Capabilities, limits: Any) -> str:
     bound = max((largest_travel(fault, drive, limits)[0] for fault in faults), default=0.0)
     if rule is Rule.ONE_MASTER and not drive.exclusive:
         bound = _INTRUSION
-    return f"within {bound * 1e3:.2f} mm" if bound else "enforced"
+    # Rounded up.
+    return f"within {math.ceil(bound * 1e5 - 1e-6) / 100:.2f} mm" if bound else "enforced"
 
 
 def check_rule(rule: Rule, make: MakeRig) -> None:
