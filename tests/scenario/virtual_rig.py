@@ -12,6 +12,7 @@ from needle_core.runners.transport import Fault
 from needle_core.status_messages import ControllerStatus
 from needle_device_driver.conformance.rig import ConformanceRig, RigClient
 from needle_sim.drive_emulator import POSITIONS
+from needle_sim.drives.emulated_bus import EmulatedBus
 
 
 class VirtualRigClient(RigClient):
@@ -65,4 +66,9 @@ class VirtualRig(ConformanceRig):
     ) -> None:
         hand = VirtualRigClient(steers=not others)
         super().__init__(seed, *others, hand=hand, driver=driver, drives=drives, faults=faults)
-        self.bus = self.drives.bus
+
+    @property
+    def bus(self) -> EmulatedBus:
+        """CAN bus with the CiA 402 drives."""
+        bus: EmulatedBus = self.drives.bus
+        return bus
