@@ -374,11 +374,10 @@ class PolledAxis(CyclicAxis):
         self._was_off = off and not at.powered
         idle = self._ready and self._order_cycles > self._max_stop
         drift = abs(self._settings.position(at.position - self._target))
-        if idle and drift > self._settings.following_error:
+        if idle and (at.moving or drift > self._settings.following_error):
             self._set_problem(
                 Rule.ONE_MASTER,
-                f"moved {self._settings.text(drift)} without an order, limit "
-                f"{self._settings.text(self._settings.following_error)}",
+                f"moves without an order, {self._settings.text(drift)} from its set-point",
             )
 
     def _set_problem(self, rule: Rule, text: str) -> None:
