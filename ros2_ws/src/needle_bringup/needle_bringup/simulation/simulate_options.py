@@ -62,10 +62,9 @@ missing input; 130 interrupted
 
 LEVELS = ("tip", "camera", "drive")
 CIA402 = "cia402"
+# Presets and insertion modes of plane_controller, whose import takes half a second.
 CONTROLLERS = ("best", "paper", "open_loop")
-"""Presets of plane_controller, repeated here because their import takes half a second."""
 INSERTIONS = ("stepwise", "continuous")
-"""Insertion modes of plane_controller, likewise."""
 
 DEPTH_MM, LARGEST_DEPTH_MM = "120", 150.0
 # Options that command_of() omits, or writes in a special form.

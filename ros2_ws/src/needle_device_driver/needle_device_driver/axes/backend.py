@@ -20,6 +20,7 @@ _OWN = {
     "cia402": "needle_device_driver.cia402.backend:BACKEND",
     "stepdir": "needle_device_driver.backends.stepdir:BACKEND",
     HAND: "needle_device_driver.cia402.backend:BACKEND",
+    "galil": "needle_device_driver.backends.galil:BACKEND",
 }
 _PAGE = "docs/own_drives.md"
 

@@ -134,7 +134,9 @@ class PolledAxis(CyclicAxis):
                 f"cycle at {speed:.6g}/s, limit {bound / settings.counts_per_unit:.6g}",
                 Rule.LOOK_AHEAD,
             )
-        self._move_to(counts + self._zero, step / settings.counts_per_unit / self._period)
+        if step:
+            # A repeated set-point would replace the drive's unfinished order by a slower one.
+            self._move_to(counts + self._zero, step / settings.counts_per_unit / self._period)
 
     def stop(self) -> None:
         """Send a stop immediately."""
@@ -220,7 +222,7 @@ class PolledAxis(CyclicAxis):
             return
         if self._limits_due and not self._at.powered and self._homed:
             yield from self._write_limits()
-        wants_power = self._goal_on and not self._released
+        wants_power = self._goal_on and not self._released and self._fault is None
         at_rest = self._still >= _REST or self._order_cycles > self._max_stop
         if wants_power is not self._at.powered and (wants_power or at_rest):
             self._protocol.power(self.name, wants_power)

@@ -20,7 +20,7 @@ _NUMBERS = 99
 # Largest number of requests without an answer: a slow line must not pile them up.
 _MAX_OUTSTANDING = 2
 # A request that is not answered within this number of cycles is lost.
-_LOST_AFTER = 10
+_LOST_AFTER = 4
 _REFRESH_TIMEOUT = 0.5
 _EMULATED = "Emulated"
 
