@@ -27,6 +27,7 @@ _EDGE_SPEED = 0.1
 _SEARCH = 1.2
 # A stopped axis that is farther from its set-point is blocked [cycles at full speed].
 _BLOCKED = 1.5
+_CONFLICT = "the drive missed an order of this computer, or received one of another program"
 _OFF = DriveReply(0, moving=False, powered=False)
 
 
@@ -275,6 +276,7 @@ class PolledAxis(CyclicAxis):
             (Rule.LINK_LOSS, link.lost),
             (Rule.DRIVE_REBOOT, "the drive restarted; its home is lost" if at.rebooted else ""),
             (Rule.DRIVE_WATCHDOG, "the drive's watchdog stopped it" if at.timed_out else ""),
+            (Rule.ONE_MASTER, _CONFLICT if at.conflict else ""),
             (Rule.DRIVE_EMERGENCY, f"the drive {at.fault}" if at.fault else ""),
             (Rule.AXIS_SPEED, self._speed.problem),
         ):
