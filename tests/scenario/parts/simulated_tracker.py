@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from plus_messages import transform_message
 from scipy.spatial.transform import Rotation
 
 from needle_core.component import Actions, Component, Moment, Port, Send, Timer
 from needle_sim.needle.bench import SimulatedBench
+from plus_messages import transform_message
 
 Array = NDArray[np.float64]
 # Pose of the tracker in `rig`: about half a metre away, and turned.

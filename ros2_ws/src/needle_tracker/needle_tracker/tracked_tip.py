@@ -181,6 +181,7 @@ class TrackedTip(Component):
     def _on_bytes(self, batch: Sequence[bytes], at: Moment) -> Actions:
         for received in self._stream.receive(b"".join(batch)):
             if isinstance(received, str):
+                self._received_at = at.steady
                 yield from self._reject(("unreadable", received))
             elif received.name == self.settings.transform:
                 yield from self._on_received(received, at)
@@ -213,8 +214,6 @@ class TrackedTip(Component):
 
     def _on_timer(self, at: Moment) -> Actions:
         if at.steady - self._received_at > _MAX_AGE:
-            # The rest of an incomplete message may never arrive.
-            self._stream.clear()
             silence = f"no {self.settings.transform} for {_MAX_AGE:g} s"
             silence += f", but {self._other}" if self._other else ""
             yield self._diagnose(Level.WARN, self._port_problem or silence)

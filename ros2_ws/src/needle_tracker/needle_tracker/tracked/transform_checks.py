@@ -24,6 +24,7 @@ _LARGEST_CURVATURE = 9.0  # of the needle's path, as for stereo_tracker [1/m]
 _LARGEST_ANGLE = 1.4  # between heading and insertion [rad]
 _MARGIN = 4e-3  # for the errors of registration and entry point, as for plane_controller [m]
 _GATE = 6.0  # for the noise of a change of place [standard deviations]
+_OLDER_GATES = 3.0  # insertion after which an older tip is replaced
 _OUT = 1e-3  # insertion up to which the needle is out [m]
 _ROTATION_TOLERANCE = 1e-3  # of R R^T = 1; single precision has 1e-6
 _AHEAD = 0.05  # tolerated difference of two clocks [s]
@@ -109,7 +110,9 @@ class PlaceCheck:
 
     def __init__(self, noise: float) -> None:
         self._gate = _GATE * noise
-        self._reference: Place | None = None
+        # The last tip reveals a jump, an older one a sensor that does not follow the needle.
+        self._last: Place | None = None
+        self._older: Place | None = None
         self._agreeing = 0
         self._is_steady = False
 
@@ -126,21 +129,25 @@ class PlaceCheck:
         return self._compare(place)
 
     def _compare(self, place: Place) -> Rejection | None:
+        last, older = self._last or place, self._older or place
         self._is_steady &= place.insertion > _OUT
-        reference = self._reference or place
-        inserted = abs(place.insertion - reference.insertion)
-        moved = math.hypot(*(place.position - reference.position))
-        text = _beyond(moved, inserted, inserted, self._gate)
+        text = self._disagreement(last, place) or self._disagreement(older, place)
         self._agreeing = 0 if text else self._agreeing + 1
         is_confirmed = self._agreeing >= CONFIRMED_BY
         self._is_steady |= is_confirmed
-        # A sensor that is stuck does not leave the reference, which lies behind.
-        if not self._is_steady or (is_confirmed and inserted > 1.5 * self._gate):
-            self._reference = place
+        if is_confirmed or not self._is_steady:
+            self._last = place
+            is_far = abs(place.insertion - older.insertion) > _OLDER_GATES * self._gate
+            self._older = place if is_far or not self._is_steady else older
         if text:
             return "jump", f"distance from an earlier tip {text}"
         few = f"{self._agreeing} transforms agree, {CONFIRMED_BY} needed"
         return None if is_confirmed else ("unconfirmed", few)
+
+    def _disagreement(self, earlier: Place, place: Place) -> str:
+        inserted = abs(place.insertion - earlier.insertion)
+        moved = math.hypot(*(place.position - earlier.position))
+        return _beyond(moved, inserted, inserted, self._gate)
 
 
 def _beyond(distance: float, least: float, most: float, margin: float) -> str:

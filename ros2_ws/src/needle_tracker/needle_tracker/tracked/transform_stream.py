@@ -16,7 +16,7 @@ from needle_core.diagnostics import sanitize
 _HEADER = 58  # [bytes]
 _TYPE_AT, _TRANSFORM = 2, b"TRANSFORM\0"
 _VERSIONS = (1, 2, 3)
-_LARGEST_BODY = 1 << 24  # an image of PLUS [bytes]
+_LARGEST_BODY = 1 << 20  # larger ones, such as images, are skipped unread [bytes]
 
 
 @dataclasses.dataclass(frozen=True)
