@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from collections.abc import Mapping
 
 from needle_core.component import RealPort
-from needle_core.errors import UserError
 from needle_core.ros.main import run_component
 from needle_tracker import tracked_tip as node
 from needle_tracker.tracked.transform_port import TransformPort
@@ -28,8 +26,6 @@ def ports(settings: node.TrackedTipParameters) -> Mapping[str, RealPort]:
     """Return the connection to the tracker, unless the source is a topic."""
     if settings.source in (node.POSE, node.TRANSFORM):
         return {}
-    if importlib.util.find_spec("pyigtl") is None:
-        raise UserError("pyigtl is not installed: `scripts/setup slicer` installs it")
     return {node.TRACKER: TransformPort(settings.address, listens=settings.source == node.SERVER)}
 
 

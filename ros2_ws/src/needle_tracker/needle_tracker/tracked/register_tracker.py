@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import math
 import sys
+import warnings
 from itertools import combinations
 from pathlib import Path
 
@@ -62,7 +63,10 @@ class Fit:
 def fit(rig: Array, tracker: Array) -> Fit:
     """Return the transform with the least squared distances of points, (N, 3): Kabsch [m]."""
     to, origin = rig.mean(axis=0), tracker.mean(axis=0)
-    rotation = Rotation.align_vectors(rig - to, tracker - origin)[0].as_matrix()
+    with warnings.catch_warnings():
+        # A trial exchange of points may leave the rotation undetermined; its error tells.
+        warnings.simplefilter("ignore", UserWarning)
+        rotation = Rotation.align_vectors(rig - to, tracker - origin)[0].as_matrix()
     translation = to - rotation @ origin
     return Fit(rotation, translation, rig - tracker @ rotation.T - translation)
 
@@ -142,10 +146,14 @@ def pivot(positions: Array, quaternions: Array) -> tuple[Array, float]:
     solution, _, _, singular = np.linalg.lstsq(rows, -positions.ravel(), rcond=None)
     residual = rows @ solution + positions.ravel()
     std = max(float(np.sqrt(np.sum(residual**2) / (len(residual) - 6))), _LEAST_STD)
-    if std / max(float(singular[-1]), 1e-9) > LARGEST_ERROR or singular[-1] < 0.1:
-        raise UserError("--pivot: the sensor turned too little, or about one axis only")
     if std > LARGEST_ERROR:
         raise UserError(f"--pivot: the tip moved by {_mm(std)}, limit {_mm(LARGEST_ERROR)}")
+    offset_std = std / max(float(singular[-1]), 1e-9)
+    if offset_std > LARGEST_ERROR:
+        raise UserError(
+            "--pivot: the sensor turned too little, or about one axis: the tip's standard "
+            f"deviation is {_mm(offset_std)}, limit {_mm(LARGEST_ERROR)}"
+        )
     return solution[:3], std
 
 

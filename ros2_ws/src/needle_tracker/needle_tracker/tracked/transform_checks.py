@@ -70,7 +70,7 @@ def check_transform(
     if transform.status not in ("", "OK"):
         rejection = "status", f"the tracker reports {transform.status}, expected OK"
     elif not (np.all(np.isfinite(matrix)) and math.isfinite(age)):
-        rejection = "not_finite", "a number is not finite, or there is no stamp"
+        rejection = "not_finite", "a number of the transform or its stamp"
     elif lack := _lack_of_rotation(matrix[:3, :3]):
         rejection = "not_a_rotation", lack
     elif not -_AHEAD <= age <= max_age:
