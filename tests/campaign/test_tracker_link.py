@@ -40,6 +40,7 @@ def transform_of(arrived: list[Any], sender: Any) -> TrackerTransform:
         time.sleep(0.01)
         for batch in arrived[read:]:
             for found in stream.receive(batch[0]) if isinstance(batch, tuple) else ():
+                assert isinstance(found, TrackerTransform)
                 return found
         read = len(arrived)
 

@@ -21,7 +21,7 @@ from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.virtual_run import COMPUTE, make_rig, settings_of
 from needle_core import messages as m
 from needle_core.commands.cli import EXIT_DONE
-from needle_core.component import Output
+from needle_core.component import Output, Port
 from needle_core.runners.virtual import DIAGNOSTICS, VirtualRunner
 from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sensors import Sensor
@@ -49,7 +49,9 @@ BEHIND = dataclasses.replace(EXACT, tip_offset=np.array([0.0, 0.0, 8e-3]))
 
 
 class NoSensor:
-    outputs, ports, half_sizes = (), (), (math.inf, math.inf)
+    outputs: tuple[Output, ...] = ()
+    ports: tuple[Port, ...] = ()
+    half_sizes = (math.inf, math.inf)
 
     def expose(self, number: int, stamp_ns: int) -> tuple[()]:
         return ()

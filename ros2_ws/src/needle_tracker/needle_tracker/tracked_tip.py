@@ -27,6 +27,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.answers.tracker_messages import (
     ROLL_VARIANCE,
@@ -231,4 +232,6 @@ class TrackedTip(Component):
 
 def make_tracked_tip(settings: TrackedTipParameters, name: str = TrackedTip.name) -> TrackedTip:
     """Return the component with the registration of its settings; raises a UserError without it."""
+    if not settings.registration_file:
+        raise UserError("registration_file is not set; register_tracker writes one")
     return TrackedTip(settings, read_registration(Path(settings.registration_file)), name)

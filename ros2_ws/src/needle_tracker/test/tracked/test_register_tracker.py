@@ -27,7 +27,7 @@ FLE = 0.3e-3
 """Standard deviation of a measured coordinate [m]."""
 
 
-def measured(rig: np.ndarray, seed: int = 1, noise: float = FLE) -> np.ndarray:
+def measured(rig: np.ndarray, seed: int = 1, noise: float = FLE) -> Any:
     random = np.random.default_rng(seed)
     return TURN.inv().apply(rig - PLACE) + random.normal(0.0, noise, rig.shape)
 
@@ -73,7 +73,7 @@ def only(*rig: tuple[float, float, float]) -> Callable[[np.ndarray, np.ndarray],
     return lambda *_: (points, measured(points))
 
 
-BAD_POINTS = {
+BAD_POINTS: dict[str, tuple[Callable[[Any, Any], Any], str]] = {
     "two points": (lambda r, t: (r[:2], t[:2]), "number of points = 2 is outside [3, inf]"),
     "on a line": (only((0, 0, 0), (1, 0, 50), (0, 1, 100), (0, 0, 140)), "rig are within 0"),
     "on a line in tracker": (
@@ -117,7 +117,7 @@ BAD_POINTS = {
 def test_bad_points_are_refused_by_name(case: str, tmp_path: Path, monkeypatch: Any) -> None:
     change, text = BAD_POINTS[case]
     rig, tracker = RIG.copy(), measured(RIG)
-    changed = change(rig, tracker)
+    changed: Any = change(rig, tracker)
     points = changed if isinstance(changed, tuple) else (rig, tracker)
     with pytest.raises(UserError) as error:
         run(tmp_path, monkeypatch, *points)
