@@ -51,7 +51,10 @@ from needle_tracker.tracked.transform_stream import TrackerTransform, TransformS
 TRACKER = "tracker"
 """Name of the port; also the part of the diagnostics."""
 CLIENT, SERVER, POSE, TRANSFORM = "openigtlink_client", "openigtlink_server", "pose", "transform"
-_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0), "none": (0.0, 0.0, 0.0)}
+_AXES = {
+    "none": np.zeros(3),
+    **dict(zip(("x", "y", "z", "-x", "-y", "-z"), (*np.eye(3), *-np.eye(3)), strict=True)),
+}
 _UNITS = {"mm": 1e-3, "m": 1.0}
 _MAX_AGE = 1.0
 """Largest age of a transform or joint state; a longer silence is reported [s]."""
@@ -144,7 +147,7 @@ class TrackedTip(Component):
         turn, rotation = registration.rotation, transform.matrix[:3, :3]
         tip = rotation @ registration.tip_offset + _UNITS[settings.unit] * transform.matrix[:3, 3]
         position = turn @ tip + registration.translation
-        heading = turn @ rotation @ np.array(_AXES[settings.heading_axis])
+        heading = turn @ rotation @ _AXES[settings.heading_axis]
         turned = settings.heading_std**2 * np.eye(3) + registration.covariance[3:, 3:]
         if settings.heading_axis == "none":
             heading, turned = np.array([0.0, 0.0, 1.0]), ROLL_VARIANCE * np.eye(3)
