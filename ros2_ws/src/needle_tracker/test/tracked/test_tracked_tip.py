@@ -171,14 +171,15 @@ def test_checksum_is_that_of_the_standard() -> None:
     assert checksum(b"123456789") == 0x6C40DF5F0B497347
 
 
-def test_a_stream_in_pieces_among_other_messages() -> None:
+@pytest.mark.parametrize("garbage", [1, 50, 58, 59, 62, 66, 70])
+def test_a_stream_in_pieces_among_other_messages(garbage: int) -> None:
     """Garbage and a large image before a transform do not lose it; each is named once."""
     pose = sensor(0.02, Rotation.identity(), 1)
     wanted = [transform_message(pose, NOW + k, status="OK" if k % 2 else "") for k in range(4)]
     status = message("STATUS", "Plus", NOW, bytes(30))
     broken = bytearray(transform_message(pose, NOW))
     broken[42:50] = (1 << 40).to_bytes(8, "big")
-    data = wanted[0] + status + b"\7" * 61 + wanted[1] + bytes(broken) + wanted[2] + wanted[3]
+    data = wanted[0] + status + b"\7" * garbage + wanted[1] + bytes(broken) + wanted[2] + wanted[3]
     stream = TransformStream()
     received: list[TrackerTransform | str] = []
     for k in range(0, len(data), 7):
