@@ -36,11 +36,11 @@ from needle_tracker.answers.tracker_messages import (
     tip_pose_message,
 )
 from needle_tracker.optics.calibration import rotation_matrix
+from needle_tracker.sources.pairing import InsertionHistory
 from needle_tracker.stereo.triangulation import SpatialTip
 from needle_tracker.stereo_tracker import TIP, TIP_POSE
 from needle_tracker.tracked.registration import Registration, read_registration
 from needle_tracker.tracked.transform_checks import (
-    InsertionHistory,
     Place,
     PlaceCheck,
     Rejection,
@@ -58,6 +58,7 @@ _AXES = {
 _UNITS = {"mm": 1e-3, "m": 1.0}
 _MAX_AGE = 1.0
 """Largest age of a transform or joint state; a longer silence is reported [s]."""
+_SPEED_SPAN = 0.1  # time over which the speed is averaged [s]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +113,7 @@ class TrackedTip(Component):
         lever = settings.heading_std * float(np.linalg.norm(registration.tip_offset))
         self._noise = math.hypot(registration.sensor_std, lever)
         self._place_check = PlaceCheck(self._noise)
-        self._history, self._stream = InsertionHistory(), TransformStream()
+        self._insertions, self._stream = InsertionHistory(), TransformStream()
         self._last: TrackerTransform | None = None
         self._received_at = -math.inf
         self._counts: Counter[str] = Counter()
@@ -139,10 +140,13 @@ class TrackedTip(Component):
         if rejection := check_transform(transform, self._last, now, _MAX_AGE):
             return rejection
         self._last = transform
-        joints = self._history.at(transform.stamp - settings.latency, _MAX_AGE)
-        if joints is None:
+        measured_ns, latest = self._measured_ns(transform), self._insertions.latest
+        known_ns = min(measured_ns, latest)
+        insertion = self._insertions.at(known_ns)
+        before = self._insertions.at(known_ns - round(_SPEED_SPAN * 1e9))
+        if insertion is None or measured_ns - latest > _MAX_AGE * 1e9:
             return "no_joint_states", f"none within {_MAX_AGE:g} s of the measurement"
-        insertion, speed = joints
+        speed = 0.0 if before is None else (insertion - before) / _SPEED_SPAN
         # p = R_rig_tracker (R_tracker_sensor offset + t) + t_rig_tracker
         turn, rotation = registration.rotation, transform.matrix[:3, :3]
         tip = rotation @ registration.tip_offset + _UNITS[settings.unit] * transform.matrix[:3, 3]
@@ -159,12 +163,15 @@ class TrackedTip(Component):
         across = np.cross(np.eye(3), heading).T
         return SpatialTip(position, static + late, heading, across @ turned @ across.T)
 
+    def _measured_ns(self, transform: TrackerTransform) -> int:
+        return round((transform.stamp - float(self.settings.latency)) * 1e9)
+
     # ---- inputs -------------------------------------------------------------------------------
 
     def _on_joints(self, message: m.JointState, at: Moment) -> Actions:
         insertion = insertion_of(message)
-        if insertion is not None and math.isfinite(insertion):
-            self._history.add(message.stamp_ns * 1e-9, insertion)
+        if insertion is not None:
+            self._insertions.add(message.stamp_ns, insertion)
         return ()
 
     def _on_pose(self, message: m.Pose, at: Moment) -> Actions:
@@ -208,7 +215,7 @@ class TrackedTip(Component):
         if isinstance(tip, tuple):
             yield from self._reject(tip)
             return
-        stamp_ns = round((transform.stamp - self.settings.latency) * 1e9)
+        stamp_ns = self._measured_ns(transform)
         yield Publish(TIP_POSE, tip_pose_message(tip, stamp_ns))
         yield Publish(TIP, tip_message(tip, stamp_ns))
         self._counts["tips"] += 1

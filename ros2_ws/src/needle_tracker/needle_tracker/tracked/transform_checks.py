@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,27 +27,6 @@ _OLDER_GATES = 3.0  # insertion after which an older tip is replaced
 _OUT = 1e-3  # insertion up to which the needle is out [m]
 _ROTATION_TOLERANCE = 1e-3  # of R R^T = 1; single precision has 1e-6
 _AHEAD = 0.05  # tolerated difference of two clocks [s]
-
-
-class InsertionHistory:
-    """Insertion of the last seconds, from joint states."""
-
-    def __init__(self) -> None:
-        self._samples: deque[tuple[float, float]] = deque(maxlen=200)
-
-    def add(self, stamp: float, insertion: float) -> None:
-        """Add a sample: time [s] and insertion [m]; a clock that went back starts over."""
-        if self._samples and stamp <= self._samples[-1][0]:
-            self._samples.clear()
-        self._samples.append((stamp, insertion))
-
-    def at(self, stamp: float, max_age: float) -> tuple[float, float] | None:
-        """Return insertion [m] and speed [m/s] at a time; None if the samples are too old."""
-        if not self._samples or stamp - self._samples[-1][0] > max_age:
-            return None
-        stamps, insertions = zip(*self._samples, strict=True)
-        before, there, after = np.interp([stamp - 0.05, stamp, stamp + 0.05], stamps, insertions)
-        return float(there), float(after - before) / 0.1
 
 
 def check_transform(
