@@ -1,6 +1,7 @@
 """The package's executables."""
 
-from needle_core.commands.executables import node
+from needle_core.commands.executables import command, node
 
 operator = node("needle_bringup.ros.operator")
+robot_model = command("needle_bringup.simulation.robot_model")
 simulated_operator = node("needle_bringup.ros.simulated_operator")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from needle_bags.run.shaft_trail import ShaftTrail
 from needle_controller.model.target_plane import TargetPlane, offset_plane
+from needle_core.messages import JointState
 
 Array = NDArray[np.float64]
 
@@ -70,6 +71,8 @@ class LiveNeedle:
         Whether that answer had a tip.
     target_point : ndarray, shape (3,), or None
         The target point, in `rig` [m].
+    joints : JointState
+        Last positions of the joints; none before the first.
     """
 
     def __init__(self) -> None:
@@ -77,6 +80,7 @@ class LiveNeedle:
         self.answered_ns: int | None = None
         self.tip_found = False
         self.target_point: Array | None = None
+        self.joints = JointState(0, (), ())
         self._estimate: TipEstimate | None = None
         self._requested_plane: TargetPlane | None = None
         self._offset: float | None = None

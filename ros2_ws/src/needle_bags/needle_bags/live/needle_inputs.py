@@ -62,6 +62,7 @@ def _on_joints(needle: LiveNeedle, message: m.JointState, at: Moment) -> Actions
     insertion = insertion_of(message)
     if insertion is None or not _is_plausible(insertion):
         raise UserError(f"no needle has its insertion_joint at {insertion} m")
+    needle.joints = message
     needle.set_insertion(insertion)
     return ()
 
