@@ -82,7 +82,8 @@ class Client:
     def __init__(self, connection: Any) -> None:
         self.received: dict[str, list[bytes]] = defaultdict(list)
         self.count = 0
-        self._connection, self._channels = connection, {}
+        self._connection = connection
+        self._channels: dict[int, dict[str, Any]] = {}
 
     def subscribe(self, wanted: int) -> None:
         while len(self._channels) < wanted:
@@ -208,7 +209,8 @@ def test_the_view_of_the_needle_agrees_with_the_bag(
 
 def test_a_late_client_receives_latched_messages_and_the_end_is_reported() -> None:
     view = LiveView(LiveViewParameters(foxglove_port=1), transforms=False)
-    port, events = FoxglovePort(0, view.channels), []
+    port = FoxglovePort(0, view.channels)
+    events: list[Any] = []
     port.open(events.append)
     with pytest.raises(UserError, match=rf"cannot listen at 127\.0\.0\.1, port {port.port}: "):
         FoxglovePort(port.port, view.channels).open(events.append)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,6 +36,11 @@ def loaded(calibration: StereoCalibration) -> UrdfTransformManager:
     return rig
 
 
+def shape(rig: UrdfTransformManager, link: str) -> Any:
+    (found,) = (one for one in rig.visuals if one.frame.startswith(f"visual:{link}"))
+    return found
+
+
 def test_frames_and_limits_are_those_of_calibration_and_parameters(
     calibration: StereoCalibration,
 ) -> None:
@@ -54,7 +60,7 @@ def test_the_shaft_reaches_from_the_holder_to_the_insertion(calibration: StereoC
     c, s = np.cos(MOVED["rotation_joint"]), np.sin(MOVED["rotation_joint"])
     T_rig_shaft = [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, MOVED["insertion_joint"]], [0, 0, 0, 1]]
     np.testing.assert_allclose(rig.get_transform("shaft", "rig"), T_rig_shaft, atol=1e-12)
-    (shaft,) = (one for one in rig.visuals if one.frame.startswith("visual:shaft"))
+    shaft = shape(rig, "shaft")
     assert (shaft.radius, shaft.length) == (0.00045, 0.2)
     middle = rig.get_transform(shaft.frame, "shaft")[:3, 3]
     np.testing.assert_allclose(middle, [0.0, 0.0, -0.1], atol=1e-12)
@@ -62,7 +68,7 @@ def test_the_shaft_reaches_from_the_holder_to_the_insertion(calibration: StereoC
 
 def test_the_phantom_ends_at_the_windows(calibration: StereoCalibration) -> None:
     rig = loaded(calibration)
-    (phantom,) = (one for one in rig.visuals if one.frame.startswith("visual:phantom"))
+    phantom = shape(rig, "phantom")
     T_rig_phantom = rig.get_transform(phantom.frame, "rig")
     for camera in calibration.cameras.values():
         across = int(np.argmax(np.abs(camera.window.normal)))

@@ -108,8 +108,8 @@ def differences(model: Mapping[str, str], given: Mapping[str, str]) -> list[str]
 
 def _alike(one: str, other: str) -> bool:
     try:
-        numbers = (np.array(text.split(), dtype=float) for text in (one, other))
-        return np.allclose(*numbers, rtol=_SHARE, atol=_DISTANCE)
+        wanted, given = (np.array(text.split(), dtype=float) for text in (one, other))
+        return wanted.shape == given.shape and np.allclose(wanted, given, _SHARE, _DISTANCE)
     except ValueError:
         return one == other
 
