@@ -298,7 +298,7 @@ def test_transforms_are_published_if_the_message_type_is_installed() -> None:
 def test_clients_receive_watched_topics_and_latched_ones_alone(left_view: Projection) -> None:
     scene, clients = Scene(foxglove_port=1), Clients()
     scene.runner.start(clients)
-    scene.runner.run(0.5)
+    scene.look_at(live_view.PATH)
 
     def tell() -> set[str]:
         clients.received.clear()
@@ -318,10 +318,16 @@ def test_clients_receive_watched_topics_and_latched_ones_alone(left_view: Projec
     assert tell() == latched | watched
     (state,) = (one for topic, one, _ in clients.received if topic == "needle/reduced_state")
     assert state == m.Vector(1, "target_plane", TIP)
-    assert {topic for topic, _ in scene.published} == {live_view.ROBOT_DESCRIPTION}
+    on_topics = {topic for topic, _ in scene.published}
+    assert on_topics == {live_view.ROBOT_DESCRIPTION, live_view.PATH}
     clients.todo.append(Send(FOXGLOVE, (Watched(frozenset()),)))
     scene.runner.run(0.1)
     assert tell() == latched
+    # Images are received for clients alone, too.
+    (port,) = scene.view.ports
+    for topics in ({LEFT}, set()):
+        actions = list(port.handler([Watched(frozenset(topics))], Moment(0.0, 0)))
+        assert actions == [Listen(RAW, LEFT in topics), Listen(RAW_RIGHT, False)]
     # Without the port it receives nothing in vain.
     plain = Scene().view
     assert plain.ports == ()
