@@ -130,8 +130,8 @@ class LiveView(Component):
                 (topic, m.CompressedImage, partial(self._picture, s))
                 for s, topic in PICTURES.items()
             ),
+            (TF, m.Transforms, lambda at: to_transforms(needle, at.stamp_ns)),
         ]
-        rows.append((TF, m.Transforms, lambda at: to_transforms(needle, at.stamp_ns)))
         self._makers = {topic: make for topic, _, make in rows}
         shown = (
             *(Output(topic, kind) for topic, kind, _ in rows),
