@@ -18,6 +18,15 @@ def _path_fields(message: m.Path, t: MessageTypes) -> dict[str, Any]:
     return {"header": header, "poses": poses}
 
 
+def _poses_fields(message: m.Poses, t: MessageTypes) -> dict[str, Any]:
+    return {"header": t.header_of(message), "poses": [t.pose(*pose) for pose in message.poses]}
+
+
+def _poses(r: Any) -> m.Poses:
+    pairs = ((xyz(pose.position), xyzw(pose.orientation)) for pose in r.poses)
+    return m.Poses(*head(r), tuple(pairs))
+
+
 def _ros_transform(message: m.Transform, t: MessageTypes) -> Any:
     return t.make("geometry_msgs/msg/TransformStamped")(
         header=t.header_of(message),
@@ -149,6 +158,7 @@ VIEW_ROWS: dict[type[Any], Row] = {
         _path_fields,
         lambda r: m.Path(*head(r), tuple(xyz(pose.pose.position) for pose in r.poses)),
     ),
+    m.Poses: Row("geometry_msgs/msg/PoseArray", _poses_fields, _poses),
     m.Transforms: Row(
         "tf2_msgs/msg/TFMessage",
         lambda message, t: {"transforms": [_ros_transform(one, t) for one in message.transforms]},

@@ -13,6 +13,7 @@ from needle_console.view.advice import Button, advise, usable_buttons
 from needle_console.view.snapshot import Snapshot, stop_reason
 from needle_console.view.targets import plane_pose, target_point
 from needle_core.errors import UserError
+from needle_core.messages import Vector3
 
 _STEPS = (Button.CONFIRM, Button.HOME, Button.ENABLE, Button.START)
 _OTHERS = (Button.RESET, Button.SWITCH_OFF)
@@ -59,6 +60,11 @@ class Controls:
         self._headline.set_text(advice.headline)
         self._text.set_text(advice.text)
         self._answer.set_text(snapshot.answer)
+        self._proposal = snapshot.proposed_point
+        if self._proposal is not None:
+            x, y, z = (1e3 * part for part in self._proposal)
+            self._propose.set_text(f"Set proposed point ({x:.1f}, {y:.1f}, {z:.1f}) mm")
+        self._propose.set_visibility(self._proposal is not None)
         possible = usable_buttons(snapshot)
         device = snapshot.device
         must_release = device is not None and device.press_again == OWNER
@@ -112,12 +118,20 @@ class Controls:
                 "Set point",
                 lambda: self._port.send_point(target_point(_typed(x), _typed(y), _typed(z))),
             )
+        self._proposal: Vector3 | None = None
+        self._propose = self._add_target("", self._send_proposal)
+
+    def _send_proposal(self) -> None:
+        """Set the proposed point as this page shows it."""
+        if self._proposal is not None:
+            x, y, z = (1e3 * part for part in self._proposal)
+            self._port.send_point(target_point(x, y, z))
 
     def _add_button(self, button: Button) -> None:
         element = ui.button(button.value, color=None, on_click=lambda: self._press(button))
         self._buttons[button] = element.props("no-caps unelevated")
 
-    def _add_target(self, name: str, send: Callable[[], None]) -> None:
+    def _add_target(self, name: str, send: Callable[[], None]) -> ui.button:
         def set_target() -> None:
             if self._bar:
                 ui.notify(self._bar)
@@ -127,7 +141,8 @@ class Controls:
             except UserError as error:
                 ui.notify(str(error))
 
-        ui.button(name, color=None, on_click=set_target).props("no-caps unelevated")
+        button = ui.button(name, color=None, on_click=set_target)
+        return button.props("no-caps unelevated")
 
     def _press(self, button: Button) -> None:
         if not self._bar:
