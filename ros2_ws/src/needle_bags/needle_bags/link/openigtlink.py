@@ -100,8 +100,8 @@ class OpenIGTLink(Component):
                     line = f"{count} listening" if count else "nobody listens"
                     if problems:
                         line += f"; input that is no OpenIGTLink is ignored: {', '.join(problems)}"
-                    level = Level.WARN if problems else Level.OK
-                    yield Diagnose("listeners", Diagnostic(level, line, keys))
+                    health = Diagnostic(Level.WARN if problems else Level.OK, line, keys)
+                    yield Diagnose("listeners", health)
                 case ClientMessage(kind="POINT"):
                     yield from self._on_points(event, at)
 

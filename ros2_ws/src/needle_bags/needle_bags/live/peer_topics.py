@@ -25,8 +25,8 @@ from needle_core.settings.parameter_fields import (
     check_fields,
     fixed_parameter,
     from_values,
-    parameter,
 )
+from needle_core.settings.parameter_fields import parameter as column
 from needle_tracker.optics.calibration import transform_of
 
 Array = npt.NDArray[np.float64]
@@ -62,13 +62,13 @@ class PeerTopicsParameters:
 class PeerTopic:
     """A topic of another package, or for it: a row of the file."""
 
-    topic: str = parameter("", "-", "Name.")
-    content: str = parameter("", "-", "What it holds.", choices=tuple(_CONTENTS))
-    stamped: bool = parameter(True, "-", "Whether a point is a PointStamped, not a Point.")
-    unit: str = parameter("m", "-", "Unit of positions, not of joints.", choices=tuple(_UNITS))
-    frame: str = parameter(RIG, "-", "Frame.")
-    translation: tuple[float, ...] = parameter((0.0,) * 3, "m", "Origin of rig in that frame.")
-    rotation: tuple[float, ...] = parameter((0.0, 0.0, 0.0, 1.0), "-", "From rig: qx, qy, qz, qw.")
+    topic: str = column("", "-", "Name.")
+    content: str = column("", "-", "What it holds.", choices=tuple(_CONTENTS))
+    stamped: bool = column(True, "-", "Whether a point is a PointStamped, not a Point.")
+    unit: str = column("m", "-", "Unit of positions, not of joints.", choices=tuple(_UNITS))
+    frame: str = column(RIG, "-", "Frame.")
+    translation: tuple[float, ...] = column((0.0,) * 3, "m", "Origin of rig in that frame.")
+    rotation: tuple[float, ...] = column((0.0, 0.0, 0.0, 1.0), "-", "From rig: qx, qy, qz, qw.")
 
     def __post_init__(self) -> None:
         """Check the fields; raises UserError as `check_fields`."""

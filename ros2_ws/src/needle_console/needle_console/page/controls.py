@@ -39,6 +39,7 @@ class Controls:
         # A page may only watch until its hold is connected.
         self._bar = "no hold: not connected"
         self._buttons: dict[Button, Any] = {}
+        self._proposal: Vector3 | None = None
         with ui.element("section").classes("controls").props('aria-label="Controls"'):
             with ui.element("div").classes("advice").props('role="status" aria-live="polite"'):
                 self._headline = ui.label().classes("headline")
@@ -118,7 +119,6 @@ class Controls:
                 "Set point",
                 lambda: self._port.send_point(target_point(_typed(x), _typed(y), _typed(z))),
             )
-        self._proposal: Vector3 | None = None
         self._propose = self._add_target("", self._send_proposal)
 
     def _send_proposal(self) -> None:
