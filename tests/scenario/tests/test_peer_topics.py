@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import needle_bags
-from needle_bags.live.peer_topics import PeerTopics, PeerTopicsParameters, peer_table
+from needle_bags.live.peer_topics import PeerTopics, PeerTopicsParameters, read_peer_topics
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.virtual_run import make_components
@@ -26,7 +26,6 @@ from needle_core.component import (
     Publish,
     Timer,
 )
-from needle_core.files.yaml_files import read_yaml
 from needle_core.runners.virtual import VirtualRunner
 from needle_core.status_messages import ControllerStatus
 from needle_sim.sim_rig import SimRig
@@ -93,7 +92,7 @@ def steered() -> tuple[Peer, PeerTopics, SimRig]:
     options = parse(["--level", "tip", "--noise-mm", "1.0", "--depth-mm", str(DEPTH_MM)])
     rig, *others = make_components(command_line_parameters(options, Path("unused")))
     assert isinstance(rig, SimRig)
-    peer, topics = Peer(), PeerTopics(PeerTopicsParameters(), peer_table(read_yaml(FILE)))
+    peer, topics = Peer(), PeerTopics(PeerTopicsParameters(), read_peer_topics(FILE))
     runner = VirtualRunner([rig, *others, topics, peer], seed=1)
     runner.run(60.0)
     return peer, topics, rig

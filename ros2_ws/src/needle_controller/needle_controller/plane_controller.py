@@ -14,7 +14,7 @@ from needle_controller.controller_status import ReceptionLog, controller_status
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes
 from needle_controller.model.point_reach import point_from_message
-from needle_controller.model.target_plane import RIG, plane_from_pose
+from needle_controller.model.target_plane import plane_from_pose
 from needle_controller.observers.estimator import Estimate
 from needle_controller.planning.obstacles import obstacles_from_markers
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -85,7 +85,7 @@ class PlaneController(Component):
         self.name, self.settings = name, settings
         self.steering: Steering = make_steering(settings)
         self.problems: dict[str, str] = {}
-        self._proposal: Array | None = None
+        self._proposal: m.Point | None = None
         self._bad_joints = 0
         self._missing: list[str] = [f"subscriber of {COMMANDS}"]
         self._received = ReceptionLog()
@@ -206,12 +206,11 @@ class PlaneController(Component):
     def _on_proposal(self, message: m.Point, at: Moment) -> Iterable[Action]:
         # A rejected proposal withdraws the one before: the planner no longer wants that.
         before, self._proposal = self._proposal, None
-        self._proposal = self._checked_point(message)
-        if before is not None and np.array_equal(before, self._proposal):
+        point = self._checked_point(message)
+        self._proposal = dataclasses.replace(message, stamp_ns=0)
+        if self._proposal == before:
             return []
-        text = (
-            f"proposed target at {_text(self._proposal)}: plane_controller/accept_target applies it"
-        )
+        text = f"proposed target at {_text(point)}: plane_controller/accept_target applies it"
         return [Log("info", text, PROPOSED_TARGET)]
 
     def _checked_point(self, message: m.Point) -> Array:
@@ -248,17 +247,16 @@ class PlaneController(Component):
 
     def _on_accept(self, _: bool | None, number: int, at: Moment) -> Actions:
         """Publish the proposal as the target point, which a bag then contains."""
-        point = self._proposal
+        if self._proposal is None:
+            yield Reply(number, False, f"no target on {PROPOSED_TARGET}")
+            return
         try:
-            if point is None:
-                raise UserError(f"no target on {PROPOSED_TARGET}")
             # The settings may have changed since the proposal.
-            self.steering.settings.check_point(point)
+            point = self._checked_point(self._proposal)
         except UserError as error:
             yield Reply(number, False, str(error))
             return
-        x, y, z = point.tolist()
-        yield Publish(TARGET_POINT, m.Point(0, RIG, (x, y, z)))
+        yield Publish(TARGET_POINT, self._proposal)
         yield Reply(number, True, f"{TARGET_POINT} at {_text(point)}")
 
     def _on_timer(self, at: Moment) -> Actions:

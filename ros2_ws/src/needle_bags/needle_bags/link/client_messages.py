@@ -57,19 +57,17 @@ class MessageStream:
 
     def split(self, data: bytes) -> Iterator[ClientMessage]:
         """Yield the messages that are complete with `data`."""
-        self._received += data
-        while not self.problem and len(self._received) >= _HEADER.size:
+        self._received = b"" if self.problem else self._received + data
+        while len(self._received) >= _HEADER.size:
             version, kind, name, size = _HEADER.unpack_from(self._received)
             if version not in (1, 2, 3) or size > MAX_BODY:
-                self.problem = f"header version {version}, {size} bytes"
-                break
+                self.problem, self._received = f"header version {version}, {size} bytes", b""
+                return
             end = _HEADER.size + size
             if len(self._received) < end:
                 return
             body, self._received = self._received[_HEADER.size : end], self._received[end:]
             yield ClientMessage(version, _text(kind), _text(name), body)
-        if self.problem:
-            self._received = b""
 
 
 def _text(field: bytes) -> str:

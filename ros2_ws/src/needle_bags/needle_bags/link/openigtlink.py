@@ -13,19 +13,9 @@ from numpy.typing import NDArray
 
 from needle_bags.link.client_messages import ClientMessage
 from needle_bags.live.live_needle import LiveNeedle
-from needle_bags.live.needle_inputs import PROPOSED_TARGET, needle_inputs, proposed_target
+from needle_bags.live.needle_inputs import PROPOSALS, needle_inputs, proposed_target
 from needle_core import messages as m
-from needle_core.component import (
-    Actions,
-    Component,
-    Diagnose,
-    Log,
-    Moment,
-    Output,
-    Port,
-    Send,
-    Timer,
-)
+from needle_core.component import Actions, Component, Diagnose, Log, Moment, Port, Send, Timer
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
@@ -85,7 +75,7 @@ class OpenIGTLink(Component):
         self._needle = LiveNeedle()
         self._listeners = 0
         self.inputs = needle_inputs(self._needle)
-        self.outputs = (Output(PROPOSED_TARGET, m.Point),)
+        self.outputs = (PROPOSALS,)
         self.ports = (Port(LINK, self._on_link),)
         self.timers = (Timer(1.0 / settings.rate, self._send),)
 
@@ -98,8 +88,7 @@ class OpenIGTLink(Component):
                     self._listeners = count
                     keys = {"listeners": str(count), "turned away": str(turned_away)}
                     line = f"{count} listening" if count else "nobody listens"
-                    if problems:
-                        line += f"; input that is no OpenIGTLink is ignored: {', '.join(problems)}"
+                    line = ", ignoring ".join((line, *problems))
                     health = Diagnostic(Level.WARN if problems else Level.OK, line, keys)
                     yield Diagnose("listeners", health)
                 case ClientMessage(kind="POINT"):

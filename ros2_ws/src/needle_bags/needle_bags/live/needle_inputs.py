@@ -19,6 +19,7 @@ from needle_core.component import (
     Input,
     Log,
     Moment,
+    Output,
     Publish,
 )
 from needle_core.diagnostics import Diagnostic, Level
@@ -28,7 +29,7 @@ from needle_tracker.answers.tracker_messages import insertion_of, rotation_of
 
 # Larger positions [m] and variances [m^2] are implausible.
 _MAX_PLAUSIBLE = 10.0
-PROPOSED_TARGET = "needle/proposed_target"
+PROPOSALS = Output("needle/proposed_target", m.Point)
 """Target points of planners; the controller waits until a person accepts one."""
 
 
@@ -50,7 +51,7 @@ def proposed_target(position: m.Vector3, stamp_ns: int) -> Publish:
     """Return the proposal of a target point in `rig` [m]; raises UserError if it is implausible."""
     if not _is_plausible(position):
         raise UserError(f"no target is at {position} m")
-    return Publish(PROPOSED_TARGET, m.Point(stamp_ns, RIG, position))
+    return Publish(PROPOSALS.topic, m.Point(stamp_ns, RIG, position))
 
 
 def rejecting(row: Input) -> Input:

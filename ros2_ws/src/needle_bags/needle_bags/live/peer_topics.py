@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,22 +12,13 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from needle_bags.live.live_needle import LiveNeedle
-from needle_bags.live.needle_inputs import (
-    PROPOSED_TARGET,
-    needle_inputs,
-    proposed_target,
-    rejecting,
-)
+from needle_bags.live.needle_inputs import PROPOSALS, needle_inputs, proposed_target, rejecting
 from needle_controller.model.target_plane import RIG
 from needle_core import messages as m
 from needle_core.component import Actions, Component, Input, Moment, Output, Publish, Timer
 from needle_core.errors import UserError
-from needle_core.settings.parameter_fields import (
-    check_fields,
-    fixed_parameter,
-    from_values,
-)
-from needle_core.settings.parameter_fields import parameter as column
+from needle_core.files.yaml_files import read_yaml
+from needle_core.settings import parameter_fields as fields
 from needle_tracker.optics.calibration import transform_of
 
 Array = npt.NDArray[np.float64]
@@ -48,31 +40,29 @@ _CONTENTS: dict[str, type[Any]] = {
 class PeerTopicsParameters:
     """Parameters of peer_topics."""
 
-    file: str = fixed_parameter(
-        "", "-", "File with the topics; empty: config/peers.yaml of needle_bags."
-    )
-    rate: float = fixed_parameter(20.0, "Hz", "Largest rate of each topic.", 0.5, 100.0)
+    file: str = fields.fixed_parameter("", "-", "File with the topics; empty: config/peers.yaml.")
+    rate: float = fields.fixed_parameter(20.0, "Hz", "Largest rate of each topic.", 0.5, 100.0)
 
     def __post_init__(self) -> None:
         """Check the fields; raises UserError as `check_fields`."""
-        check_fields(self)
+        fields.check_fields(self)
 
 
 @dataclasses.dataclass(frozen=True)
 class PeerTopic:
     """A topic of another package, or for it: a row of the file."""
 
-    topic: str = column("", "-", "Name.")
-    content: str = column("", "-", "What it holds.", choices=tuple(_CONTENTS))
-    stamped: bool = column(True, "-", "Whether a point is a PointStamped, not a Point.")
-    unit: str = column("m", "-", "Unit of positions, not of joints.", choices=tuple(_UNITS))
-    frame: str = column(RIG, "-", "Frame.")
-    translation: tuple[float, ...] = column((0.0,) * 3, "m", "Origin of rig in that frame.")
-    rotation: tuple[float, ...] = column((0.0, 0.0, 0.0, 1.0), "-", "From rig: qx, qy, qz, qw.")
+    topic: str = fields.parameter("", "-", "Name.")
+    content: str = fields.parameter("", "-", "What it holds.", choices=tuple(_CONTENTS))
+    stamped: bool = fields.parameter(True, "-", "Whether a point is a PointStamped, not a Point.")
+    unit: str = fields.parameter("m", "-", "Unit of positions.", choices=tuple(_UNITS))
+    frame: str = fields.parameter(RIG, "-", "Frame.")
+    translation: tuple[float, ...] = fields.parameter((0.0,) * 3, "m", "Of rig in that frame.")
+    rotation: tuple[float, ...] = fields.parameter((0.0, 0.0, 0.0, 1.0), "-", "qx, qy, qz, qw.")
 
     def __post_init__(self) -> None:
         """Check the fields; raises UserError as `check_fields`."""
-        check_fields(self)
+        fields.check_fields(self)
         if not self.topic:
             raise UserError("the row has no topic")
         _ = self.T_frame_rig  # checks the numbers
@@ -109,15 +99,18 @@ class PeerTopic:
         return (x, y, z)
 
 
-def peer_table(content: Any) -> tuple[PeerTopic, ...]:
-    """Return the topics of a file's content; raises UserError with the row that is wrong."""
+def read_peer_topics(path: Path) -> tuple[PeerTopic, ...]:
+    """Return the topics of a file; raises UserError with the row that is wrong."""
+    content = read_yaml(path)
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
-        raise UserError("expected a list of {topic: ..., content: ..., ...}")
-    rows = tuple(from_values(PeerTopic, row, str(row.get("topic"))) for row in content)
+        raise UserError(f"{path}: expected a list of {{topic: ..., content: ..., ...}}")
+    rows = tuple(
+        fields.from_values(PeerTopic, row, f"{path}: {row.get('topic')}") for row in content
+    )
     names = [row.topic for row in rows]
     # A topic in both directions would propose the rig's own target.
     if twice := [name for name in names if names.count(name) > 1]:
-        raise UserError(f"{twice[0]} is listed twice")
+        raise UserError(f"{path}: {twice[0]} is listed twice")
     return rows
 
 
@@ -154,7 +147,7 @@ class PeerTopics(Component):
         )
         self.outputs = (
             *(Output(row.topic, row.message) for row in self._published),
-            Output(PROPOSED_TARGET, m.Point),
+            PROPOSALS,
         )
         self.timers = (Timer(1.0 / settings.rate, self._publish),)
 

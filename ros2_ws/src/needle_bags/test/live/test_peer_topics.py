@@ -8,13 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
-from needle_bags.live.peer_topics import PeerTopics, PeerTopicsParameters, peer_table
+from needle_bags.live.peer_topics import (
+    PeerTopic,
+    PeerTopics,
+    PeerTopicsParameters,
+    read_peer_topics,
+)
 from needle_core import messages as m
 from needle_core.component import Actions, Diagnose, Log, Moment, Publish
 from needle_core.errors import UserError
-from needle_core.files.yaml_files import read_yaml
 from needle_core.status_messages import ControllerStatus
 
 FILE = Path(__file__).parents[2] / "config" / "peers.yaml"
@@ -26,8 +31,8 @@ STAMP = 5_250_000_000
 class Bench:
     """The component with a table of topics."""
 
-    def __init__(self, content: Any) -> None:
-        self.component = PeerTopics(PeerTopicsParameters(), peer_table(content))
+    def __init__(self, *rows: PeerTopic) -> None:
+        self.component = PeerTopics(PeerTopicsParameters(), rows)
         self.ticks = 0
 
     def receive(self, topic: str, message: Any) -> list[Any]:
@@ -57,7 +62,7 @@ class Bench:
 
 
 def test_peers_read_the_needle_in_their_units() -> None:
-    bench = Bench(read_yaml(FILE))
+    bench = Bench(*read_peer_topics(FILE))
     assert bench.published() == {"/needle/state/skin_entry": m.BarePoint((0.0, 0.0, 0.0))}
     bench.insert()
     found = bench.published()
@@ -81,7 +86,7 @@ def test_peers_read_the_needle_in_their_units() -> None:
 
 
 def test_a_stamped_message_is_published_once() -> None:
-    bench = Bench(read_yaml(FILE))
+    bench = Bench(*read_peer_topics(FILE))
     bench.insert()
     bench.published()
     assert bench.published().keys() == {"/needle/state/skin_entry"}
@@ -89,25 +94,25 @@ def test_a_stamped_message_is_published_once() -> None:
     assert bench.published()["/needle/state/current_shape"].stamp_ns == STAMP + 1_000_000
 
 
-STAGE = {
+STAGE: dict[str, Any] = {
     "unit": "mm",
     "frame": "stage",
-    "translation": [0.1, 0.02, 0.03],
-    "rotation": [-0.5, -0.5, -0.5, 0.5],
+    "translation": (0.1, 0.02, 0.03),
+    "rotation": (-0.5, -0.5, -0.5, 0.5),
 }
 # Of a point x, y, z in rig: y, z, x, and the translation, in mm.
 STAGE_TARGET = (100.0 - 5.0, 20.0 + 100.0, 30.0 + 10.0)
 
 
 def test_a_target_goes_out_and_comes_in_through_the_frame() -> None:
-    out = Bench([{"topic": "a", "content": "target", **STAGE}])
+    out = Bench(PeerTopic("a", "target", **STAGE))
     out.insert()
     sent = out.published()["a"]
     assert (sent.frame_id, sent.position) == ("stage", pytest.approx(STAGE_TARGET))
     for stamped, frame in ((True, "stage"), (True, ""), (False, "")):
-        row = {"topic": "b", "content": "proposed_target", "stamped": stamped, **STAGE}
+        row = PeerTopic("b", "proposed_target", stamped, **STAGE)
         message = m.Point(3, frame, STAGE_TARGET) if stamped else m.BarePoint(STAGE_TARGET)
-        actions = Bench([row]).receive("b", message)
+        actions = Bench(row).receive("b", message)
         proposal = out.published(actions)["needle/proposed_target"]
         assert (proposal.frame_id, proposal.stamp_ns) == ("rig", AT.stamp_ns)
         assert proposal.position == pytest.approx((0.01, -0.005, 0.1))
@@ -122,7 +127,7 @@ def test_a_target_goes_out_and_comes_in_through_the_frame() -> None:
     ],
 )
 def test_a_bad_target_is_reported_and_not_proposed(frame: str, position: Any, problem: str) -> None:
-    bench = Bench([{"topic": "b", "content": "proposed_target", **STAGE}])
+    bench = Bench(PeerTopic("b", "proposed_target", **STAGE))
     log, health = bench.receive("b", m.Point(3, frame, position))
     assert isinstance(log, Log)
     assert isinstance(health, Diagnose)
@@ -150,6 +155,8 @@ def test_a_bad_target_is_reported_and_not_proposed(frame: str, position: Any, pr
         ),
     ],
 )
-def test_a_wrong_row_is_named(content: Any, problem: str) -> None:
-    with pytest.raises(UserError, match=re.escape(problem)):
-        peer_table(content)
+def test_a_wrong_row_is_named(tmp_path: Path, content: Any, problem: str) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text(yaml.safe_dump(content), "utf-8")
+    with pytest.raises(UserError, match=f"own.yaml: .*{re.escape(problem)}"):
+        read_peer_topics(file)

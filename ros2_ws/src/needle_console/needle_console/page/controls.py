@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from nicegui import events, ui
 
 from needle_console.hold.page_session import OWNER
@@ -13,7 +14,6 @@ from needle_console.view.advice import Button, advise, usable_buttons
 from needle_console.view.snapshot import Snapshot, stop_reason
 from needle_console.view.targets import plane_pose, target_point
 from needle_core.errors import UserError
-from needle_core.messages import Vector3
 
 _STEPS = (Button.CONFIRM, Button.HOME, Button.ENABLE, Button.START)
 _OTHERS = (Button.RESET, Button.SWITCH_OFF)
@@ -39,7 +39,7 @@ class Controls:
         # A page may only watch until its hold is connected.
         self._bar = "no hold: not connected"
         self._buttons: dict[Button, Any] = {}
-        self._proposal: Vector3 | None = None
+        self._proposal = np.zeros(3)  # as shown [mm]
         with ui.element("section").classes("controls").props('aria-label="Controls"'):
             with ui.element("div").classes("advice").props('role="status" aria-live="polite"'):
                 self._headline = ui.label().classes("headline")
@@ -61,11 +61,10 @@ class Controls:
         self._headline.set_text(advice.headline)
         self._text.set_text(advice.text)
         self._answer.set_text(snapshot.answer)
-        self._proposal = snapshot.proposed_point
-        if self._proposal is not None:
-            x, y, z = (1e3 * part for part in self._proposal)
+        if snapshot.proposed_point is not None:
+            x, y, z = self._proposal = 1e3 * np.array(snapshot.proposed_point)
             self._propose.set_text(f"Set proposed point ({x:.1f}, {y:.1f}, {z:.1f}) mm")
-        self._propose.set_visibility(self._proposal is not None)
+        self._propose.set_visibility(snapshot.proposed_point is not None)
         possible = usable_buttons(snapshot)
         device = snapshot.device
         must_release = device is not None and device.press_again == OWNER
@@ -119,13 +118,9 @@ class Controls:
                 "Set point",
                 lambda: self._port.send_point(target_point(_typed(x), _typed(y), _typed(z))),
             )
-        self._propose = self._add_target("", self._send_proposal)
-
-    def _send_proposal(self) -> None:
-        """Set the proposed point as this page shows it."""
-        if self._proposal is not None:
-            x, y, z = (1e3 * part for part in self._proposal)
-            self._port.send_point(target_point(x, y, z))
+        self._propose = self._add_target(
+            "", lambda: self._port.send_point(target_point(*self._proposal))
+        )
 
     def _add_button(self, button: Button) -> None:
         element = ui.button(button.value, color=None, on_click=lambda: self._press(button))
