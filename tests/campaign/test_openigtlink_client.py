@@ -112,5 +112,5 @@ def test_the_shape_is_a_polydata_line_in_mm() -> None:
     counts, data = struct.unpack(">10I", message.body[:40]), message.body[40:]
     assert counts == (2, 0, 0, 1, 12, 0, 0, 0, 0, 0)
     points = np.frombuffer(data[:24], ">f4").reshape(2, 3)
-    np.testing.assert_allclose(points, [[0.0, 0.0, 0.0], np.array(TIP) * 1e3], rtol=1e-6)
+    np.testing.assert_allclose(points, np.array([(0.0, 0.0, 0.0), TIP]) * 1e3, rtol=1e-6)
     assert struct.unpack(">3I", data[24:]) == (2, 0, 1)

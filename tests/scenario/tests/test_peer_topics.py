@@ -133,7 +133,8 @@ def test_an_accepted_proposal_becomes_the_target(steered: tuple[Peer, PeerTopics
 
 
 def bench(rig: SimRig) -> Any:
-    return rig._sensor._bench
+    sensor: Any = rig._sensor
+    return sensor._bench
 
 
 def rig_path(rig: SimRig) -> Any:
