@@ -18,6 +18,15 @@ def _path_fields(message: m.Path, t: MessageTypes) -> dict[str, Any]:
     return {"header": header, "poses": poses}
 
 
+def _poses_fields(message: m.Poses, t: MessageTypes) -> dict[str, Any]:
+    return {"header": t.header_of(message), "poses": [t.pose(*pose) for pose in message.poses]}
+
+
+def _poses(r: Any) -> m.Poses:
+    pairs = ((xyz(pose.position), xyzw(pose.orientation)) for pose in r.poses)
+    return m.Poses(*head(r), tuple(pairs))
+
+
 def _transform_fields(message: m.Transform, t: MessageTypes) -> dict[str, Any]:
     transform = t.make("geometry_msgs/msg/Transform")(
         translation=t.vector(message.translation), rotation=t.quaternion(message.rotation)
@@ -156,6 +165,7 @@ VIEW_ROWS: dict[type[Any], Row] = {
         lambda r: m.Path(*head(r), tuple(xyz(pose.pose.position) for pose in r.poses)),
     ),
     m.Transform: Row("geometry_msgs/msg/TransformStamped", _transform_fields, _transform),
+    m.Poses: Row("geometry_msgs/msg/PoseArray", _poses_fields, _poses),
     m.Transforms: Row(
         "tf2_msgs/msg/TFMessage",
         _transforms_fields,
