@@ -22,6 +22,7 @@ ROSDEP_KEYS = {
     "scipy": "python3-scipy",
     "serial": "python3-serial",
     "tqdm": "python3-tqdm",
+    "pytest": "python3-pytest",
     "yaml": "python3-yaml",
 }
 # Packages without a rosdep key, or of an extra with its own lock.

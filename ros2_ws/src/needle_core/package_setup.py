@@ -34,7 +34,7 @@ def set_up(script: str) -> None:
         maintainer_email=manifest["maintainer"].get("email"),
         description=said["description"],
         license=said["license"],
-        entry_points={"console_scripts": executables(folder)},
+        entry_points={"console_scripts": executables(folder), "pytest11": test_plugins(folder)},
     )
 
 
@@ -62,7 +62,10 @@ def set_up_all(root: Path) -> None:
             files for folder in folders for files in data_files(folder, folder.relative_to(root))
         ],
         zip_safe=False,
-        entry_points={"console_scripts": ["ros2 = needle_core.commands.small_ros2:main", *scripts]},
+        entry_points={
+            "console_scripts": ["ros2 = needle_core.commands.small_ros2:main", *scripts],
+            "pytest11": [line for folder in folders for line in test_plugins(folder)],
+        },
     )
 
 
@@ -102,3 +105,9 @@ def executables(folder: Path) -> list[str]:
         if isinstance(target, ast.Name)
     ]
     return [f"{name} = {folder.name}.executables:{name}" for name in names]
+
+
+def test_plugins(folder: Path) -> list[str]:
+    """Return the entry point of a package's conformance kit for pytest; none where it has none."""
+    kit = folder / folder.name / "conformance" / "plugin.py"
+    return [f"{folder.name} = {folder.name}.conformance.plugin"] if kit.exists() else []

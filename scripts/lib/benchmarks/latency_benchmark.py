@@ -41,11 +41,11 @@ from needle_core.message_types import NANOSECONDS, rclpy_types, to_nanoseconds
 from needle_core.process.ros_domain import reserve_domain_id
 from needle_core.ros.base_node import IMAGES
 from needle_core.settings.parameter_files import Parameters
+from needle_device_driver.conformance.rig import Held
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.cameras import camera_info_message, image_message
 from needle_sim.sensors import TipSensor
-from scenario.virtual_rig import Held
 
 CALIBRATION = Path(needle_tracker.__file__).resolve().parents[1] / "config" / "calibration.yaml"
 FRAME = 1.0 / FRAME_RATE

@@ -10,7 +10,7 @@ import numpy as np
 from campaign.checking import Check, Finding, Workbench
 from campaign.checks.control_studies import Study, run
 from campaign.trials.steered_needle import Hand, changing, constant, pushing, rms_at_end, steer
-from scenario.virtual_rig import FASTEST
+from needle_device_driver.conformance.rig import FASTEST
 
 SEED, NEEDLES = 1400, 12
 HANDS: dict[str, tuple[float, Callable[[np.random.Generator], Hand]]] = {

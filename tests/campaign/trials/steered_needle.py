@@ -12,12 +12,13 @@ import numpy as np
 from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.component import Actions, Moment
+from needle_device_driver.conformance.rig import FASTEST, Held
 from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sensors import Sensor, TipSensor
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
 from scenario.transport_faults import delay
-from scenario.virtual_rig import FASTEST, Held, VirtualRig
+from scenario.virtual_rig import VirtualRig
 
 OFFSET = 0.003
 TIP_STD = 5e-5

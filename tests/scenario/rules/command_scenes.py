@@ -7,29 +7,7 @@ import math
 from needle_core import messages as m
 from needle_core.component import Call, Publish
 from needle_device_driver.rules import Rule
-from scenario.rules.scene import AT_REST, COMMANDS, HOLD, STATUS, Held, Scene
-
-
-def hold_to_run() -> None:
-    """A step without a hold is rejected; a step that loses its hold stops."""
-    scene = Scene()
-    scene.home()
-    scene.step()
-    assert scene.refuses(Rule.HOLD_TO_RUN)
-    scene.press()
-    scene.step()
-    assert not scene.is_at_rest(0.1)
-    scene.release()
-    assert scene.is_at_rest()
-
-
-def hold_age() -> None:
-    """A frozen source stops the needle, and its old press does not count afterwards."""
-    scene = Scene()
-    scene.moving()
-    scene.silence(0.5)
-    assert scene.is_logged(Rule.HOLD_AGE)
-    assert scene.is_at_rest(0.5)
+from scenario.rules.scene import COMMANDS, HOLD, STATUS, Held, Scene
 
 
 def hold_new_press() -> None:
@@ -83,20 +61,6 @@ def one_device() -> None:
     scene.moving()
     scene.start_node(STATUS)
     assert scene.fails(Rule.ONE_DEVICE)
-
-
-def no_motion_by_itself() -> None:
-    """Enabling moves nothing, whatever was executed before and is still pressed."""
-    scene = Scene()
-    scene.home()
-    assert scene.is_at_rest()
-    scene.press()
-    scene.step()
-    scene.call("device/enable", False)
-    scene.runner.run(0.1)
-    assert scene.is_at_rest()
-    scene.call("device/enable", True)
-    assert scene.is_at_rest(1.0)
 
 
 def command_state() -> None:
@@ -241,25 +205,6 @@ def coordinated() -> None:
         assert abs(insertion - rotation) < 0.005
 
 
-def retraction() -> None:
-    """The needle is retracted during the hold, without rotation, up to home."""
-    scene = Scene()
-    scene.ready()
-    scene.until_done(scene.step())
-    scene.runner.run(1.0)
-    deep, turned = scene.place
-    scene.call("device/retract")
-    scene.runner.run(0.1)
-    scene.release()
-    assert scene.is_at_rest()
-    assert 0.0 < scene.place[0] < deep
-    scene.press()
-    scene.call("device/retract")
-    scene.until(lambda: scene.hand.status.activity == "none", "the retraction")
-    assert abs(scene.place[0]) < 1e-4
-    assert abs(scene.place[1] - turned) <= AT_REST[1]
-
-
 def homing_needle_out() -> None:
     """Homing needs the confirmation that the needle is out."""
     scene = Scene()
@@ -271,8 +216,8 @@ def homing_needle_out() -> None:
 
 
 SCENES = (
-    hold_to_run, hold_age, hold_new_press, hold_one_owner, hold_in_order, speed_scale, one_device,
-    no_motion_by_itself, command_state, command_one_publisher, command_form, command_finite,
+    hold_new_press, hold_one_owner, hold_in_order, speed_scale, one_device,
+    command_state, command_one_publisher, command_form, command_finite,
     command_newer, tip_age, homed_first, forward_only, max_depth, max_step_length, max_speed,
-    max_rotation_step, max_rotation_rate, max_turns, coordinated, retraction, homing_needle_out,
+    max_rotation_step, max_rotation_rate, max_turns, coordinated, homing_needle_out,
 )  # fmt: skip

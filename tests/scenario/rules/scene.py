@@ -2,50 +2,27 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Mapping
 from typing import Any
 
 from needle_core import messages as m
-from needle_core.can_frame import CAN, CanFrame
 from needle_core.component import (
     BEST_EFFORT,
     LATCHED,
     Action,
     Actions,
     Component,
-    Input,
     Moment,
     Output,
     Publish,
     Timer,
 )
-from needle_core.runners.transport import Arrival, Arrivals, Link
-from needle_core.runners.virtual import LOG
 from needle_core.status_messages import DeviceStatus
+from needle_device_driver.conformance.rig import AXES, DRIVER, Held
 from needle_device_driver.rules import Rule
-from scenario.virtual_rig import DRIVER, Held, VirtualRig
+from scenario.virtual_rig import VirtualRig
 
 JOINTS = (m.INSERTION_JOINT, m.ROTATION_JOINT)
-AXES = ("insertion", "rotation")
-HEARTBEAT = 0x700 + 127
-"""COB-ID of the driver's heartbeat."""
-AT_REST = (1e-6, 1e-4)
-"""Largest motion of motors at rest [m], [rad]: encoder counts."""
-
-
-class LogCollector(Component):
-    """Collects log lines."""
-
-    name = "log_collector"
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self.inputs = (Input(LOG.topic, m.LogLine, self._keep),)
-
-    def _keep(self, line: m.LogLine, at: Moment) -> Actions:
-        self.lines.append(line.text)
-        return ()
 
 
 class SecondNode(Component):
@@ -82,13 +59,6 @@ class Scene(VirtualRig):
     ----------
     driver, drives : mapping, optional
         Parameters of driver and drives.
-
-    Attributes
-    ----------
-    extra_frames : list of CanFrame
-        Frames of another bus node, sent with the drives' next batch.
-    heartbeats : int
-        Number of the driver's heartbeats.
     """
 
     def __init__(
@@ -96,33 +66,9 @@ class Scene(VirtualRig):
         driver: Mapping[str, Any] | None = None,
         drives: Mapping[str, Any] | None = None,
     ) -> None:
-        self.extra_frames: list[CanFrame] = []
-        self.heartbeats = 0
-        super().__init__(1, driver=driver, drives=drives, faults=(self._tap_frames,))
-        self._log = LogCollector()
-        self.runner.start(self._log)
-
-    def _tap_frames(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
-        if link.topic == CAN:
-            if link.sender == DRIVER:
-                self.heartbeats += sum(frame.identifier == HEARTBEAT for frame in message)
-            else:
-                message, self.extra_frames = (*message, *self.extra_frames), []
-        return (Arrival(0.0, message),)
+        super().__init__(1, driver=driver, drives=drives)
 
     # ---- actions ------------------------------------------------------------------------------
-
-    def ready(self) -> None:
-        """Home, enable, press."""
-        self.home()
-        self.press()
-
-    def step(self, length: float = 0.002, turn: float = 1.0, duration: float = 1.0) -> int:
-        """Send a step from the present position [m], [rad], [s]; return its stamp."""
-        at = self.hand.joints
-        stamp = self.command(at[0] + length, at[1] + turn, duration)
-        self.runner.run(0.1)
-        return stamp
 
     def send(
         self,
@@ -141,14 +87,6 @@ class Scene(VirtualRig):
     def until_done(self, stamp: int) -> None:
         """Run until a step ends."""
         self.until(lambda: stamp in self.hand.results, "the result of a step")
-
-    def moving(self) -> int:
-        """Get ready, and run until a step is under way; return its stamp."""
-        self.ready()
-        begin = self.place[0]
-        stamp = self.step()
-        self.until(lambda: self.place[0] > begin + 0.0005, "a step under way")
-        return stamp
 
     def start_node(self, *outputs: Output) -> SecondNode:
         """Start another node, and run until others have discovered it."""
@@ -169,33 +107,9 @@ class Scene(VirtualRig):
 
     # ---- observations -------------------------------------------------------------------------
 
-    @property
-    def state(self) -> str:
-        """State of the device."""
-        return self.hand.status.state
-
-    def is_logged(self, rule: Rule) -> bool:
-        """Return whether the log names a rule."""
-        return any(f"[{rule.value}]" in line for line in self._log.lines)
-
-    def is_at_rest(self, seconds: float = 0.3) -> bool:
-        """Return whether no motor moves for a time [s]."""
-        before = self.place
-        self.runner.run(seconds)
-        after = self.place
-        return all(
-            abs(there - here) <= most
-            for there, here, most in zip(after, before, AT_REST, strict=True)
-        )
-
     def refuses(self, rule: Rule) -> bool:
         """Return whether the last command was rejected by a rule, and nothing moves."""
         return self.is_at_rest() and self.is_logged(rule) and self.state != "MOVING"
-
-    def fails(self, rule: Rule) -> bool:
-        """Return whether the device is in FAULT by a rule, and nothing moves."""
-        self.runner.run(0.3)
-        return self.is_at_rest() and self.is_logged(rule) and self.state == "FAULT"
 
 
 __all__ = ["AXES", "COMMANDS", "DRIVER", "ESTOP", "HOLD", "STATUS", "Held", "Scene", "SecondNode"]

@@ -13,9 +13,10 @@ from needle_core.can_frame import CAN, CanFrame
 from needle_core.component import Publish
 from needle_core.messages import EmergencyStop
 from needle_core.runners.transport import Arrival, Arrivals, Link
+from needle_device_driver.conformance.rig import DRIVER
 from scenario.rules.scene import ESTOP, Scene
 from scenario.transport_faults import delay
-from scenario.virtual_rig import DRIVER, VirtualRig
+from scenario.virtual_rig import VirtualRig
 
 SYNC, DEVICE_TYPE, LIMITS, HOMING_SPEEDS = 0x080, 0x1000, 0x607D, 0x6099
 

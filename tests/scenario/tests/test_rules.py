@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 
 from needle_core.errors import UserError
+from needle_device_driver.conformance.rig import ConformanceRig
+from needle_device_driver.conformance.scenarios import RULES as DRIVE_RULES
+from needle_device_driver.conformance.scenarios import check_rule
 from needle_device_driver.rules import Rule
 from scenario.rules import command_scenes, drive_scenes
 from scenario.rules.bugs import BUGS
 
+CIA402 = partial(ConformanceRig, 1, axis="cia402")
 SCENES: dict[str, Callable[[], None]] = {
-    scene.__name__: scene for scene in (*command_scenes.SCENES, *drive_scenes.SCENES)
+    **{rule.value: partial(check_rule, rule, CIA402) for rule in DRIVE_RULES},
+    **{scene.__name__: scene for scene in (*command_scenes.SCENES, *drive_scenes.SCENES)},
 }
 RULES = sorted(rule.value for rule in Rule)
 

@@ -56,6 +56,8 @@ class DeviceDriver(Component):
     ----------
     supervisor : MotionSupervisor
         The motion supervisor.
+    drives : tuple of Drives
+        Each kind of drive in use.
     waiting : str
         Why services are not ready; empty: they are.
     searches : bool
@@ -74,20 +76,20 @@ class DeviceDriver(Component):
         search_from: float = 0.0,
     ) -> None:
         self.settings = settings
-        self._drives: tuple[Drives, ...] = tuple(
+        self.drives: tuple[Drives, ...] = tuple(
             backend.make(settings, settings.axes_of(backend)) for backend in settings.backends
         )
         self._times = CycleTimes(PERIOD)
         axes: dict[str, Axis] = {}
-        for drives in self._drives:
+        for drives in self.drives:
             axes |= drives.axes
-        response_time = max(drives.capabilities.response_time for drives in self._drives)
+        response_time = max(drives.capabilities.response_time for drives in self.drives)
         self.supervisor = MotionSupervisor(
             axes["insertion"],
             axes["rotation"],
             settings,
             feedback_delay=math.ceil(response_time / PERIOD),
-            is_switching=lambda: any(drives.needs_cycles for drives in self._drives),
+            is_switching=lambda: any(drives.needs_cycles for drives in self.drives),
         )
         self._device = DeviceInterface(
             self.supervisor, name, simulated=None, not_ready=lambda: self.waiting
@@ -114,7 +116,7 @@ class DeviceDriver(Component):
                 self._guarded(partial(self._on_batch, drives)),
                 self._guarded(partial(self._on_port_change, drives)),
             )
-            for drives in self._drives
+            for drives in self.drives
         )
         self.timers = (
             Timer(PERIOD, self._guarded(self._on_cycle, ends=True)),
@@ -146,7 +148,7 @@ class DeviceDriver(Component):
 
         def guarded(*arguments: Any) -> Actions:
             at: Moment = arguments[-1]
-            for drives in self._drives:
+            for drives in self.drives:
                 drives.link.now = at.steady
             try:
                 yield from handler(*arguments)
@@ -163,7 +165,7 @@ class DeviceDriver(Component):
         return guarded
 
     def _send(self) -> Actions:
-        for drives in self._drives:
+        for drives in self.drives:
             if batch := drives.link.pop_outgoing():
                 yield Send(drives.port, batch)
 
@@ -190,7 +192,7 @@ class DeviceDriver(Component):
             return
         if self.is_busy:
             # A procedure feeds the watchdogs of its own drives only. Supervision must continue.
-            if len(self._drives) > 1:
+            if len(self.drives) > 1:
                 self._beat()
             yield from self._observe(at)
             yield from self._device.advance(at)
@@ -207,10 +209,10 @@ class DeviceDriver(Component):
 
     def _begin_cycle(self, at: Moment) -> Actions:
         self.supervisor.note_time(at.stamp_ns, at.steady)
-        for drives in self._drives:
+        for drives in self.drives:
             drives.collect()
         self.supervisor.drive(PERIOD, at.steady)
-        exchanges = (drives.exchange(_REPLY_TIMEOUT) for drives in self._drives)
+        exchanges = (drives.exchange(_REPLY_TIMEOUT) for drives in self.drives)
         self._cycle = Running(side_by_side(*exchanges)), at
         yield from self._advance(at)
 
@@ -239,7 +241,7 @@ class DeviceDriver(Component):
         yield from self._device.begin(self._set_up_drives(at.steady), self._after_search, at)
 
     def _set_up_drives(self, now: float) -> Procedure[ServiceResult]:
-        for drives in self._drives:
+        for drives in self.drives:
             error = yield from drives.probe()
             if error:
                 return ServiceResult(False, error)
@@ -249,7 +251,7 @@ class DeviceDriver(Component):
             if not result.success:
                 return result
         simulated = True
-        for drives in self._drives:
+        for drives in self.drives:
             try:
                 emulated = yield from drives.are_emulated()
             except LinkError as lost:
@@ -266,9 +268,9 @@ class DeviceDriver(Component):
             self.is_set_up, self.searches, self.waiting = True, False, ""
             yield Log(
                 "info",
-                f"found both drives on {' and '.join(drives.link.name for drives in self._drives)}",
+                f"found both drives on {' and '.join(drives.link.name for drives in self.drives)}",
             )
-            for text in (text for drives in self._drives for text in drives.missing_optional_parts):
+            for text in (text for drives in self.drives for text in drives.missing_optional_parts):
                 # Feed the watchdogs: logging can be slow.
                 self._beat()
                 yield from self._send()
@@ -293,17 +295,17 @@ class DeviceDriver(Component):
         self._device.simulated = None
         yield from self._device.report(at)
         yield from self._send()
-        for drives in self._drives:
+        for drives in self.drives:
             drives.link.close()
         yield Exit(EXIT_DONE)
 
     def _beat(self) -> None:
-        for drives in self._drives:
+        for drives in self.drives:
             drives.beat()
 
     def _report_health(self, at: Moment) -> Actions:
         times = self._times.take()
-        for drives in self._drives:
+        for drives in self.drives:
             health = drives.health(self.waiting)
             values = {**health.values, **times}
             yield Diagnose(drives.port, dataclasses.replace(health, values=values))

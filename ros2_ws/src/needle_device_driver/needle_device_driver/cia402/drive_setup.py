@@ -19,7 +19,7 @@ from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.cia402.drive_units import read_units
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.frame_link import FrameLink
-from needle_device_driver.link.object_access import DriveRefusalError, ObjectAccess
+from needle_device_driver.link.object_access import DriveRefusalError, ObjectAccess, ObjectError
 from needle_device_driver.link.objects import Pdo
 from needle_device_driver.procedure import Procedure
 
@@ -213,7 +213,8 @@ def _check_modes(link: FrameLink, access: ObjectAccess, node: int) -> Procedure[
     """
     listed = yield from access.read_optional(od.SUPPORTED_MODES)
     if listed is not None and not listed & SUPPORTS_HOMING:
-        raise DriveError(f"node {node} has no homing mode (0x6502 = 0x{listed:08X})")
+        text = f"node {node} has no homing mode (0x6502 = 0x{listed:08X})"
+        raise ObjectError(text, od.SUPPORTED_MODES)
     if listed is None:
         yield from _try_mode(link, access, node, Mode.HOMING)
     if listed is None or not listed & SUPPORTS_CYCLIC_POSITION:

@@ -7,7 +7,7 @@ import dataclasses
 from needle_device_driver.axes.drive_errors import DriveError
 from needle_device_driver.cia402.drive_settings import INDEX_PULSE, DriveSettings
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.object_access import ObjectAccess
+from needle_device_driver.link.object_access import ObjectAccess, ObjectError
 from needle_device_driver.procedure import Procedure
 
 # Codes of numerators and denominators. A dimensionless quantity is in counts.
@@ -95,8 +95,8 @@ def _counts_in(
         scale = f"10^{power} " if power else ""
         unit_text = f"{scale}{unit} (0x{entry.index:04X} = 0x{code:08X})"
         hint = "; *_counts_per_turn converts rpm without 0x608F" if turns else ""
-        raise DriveError(
-            f"the drive measures {what} in {unit_text}, expected {' or '.join(wanted)}{hint}"
+        raise ObjectError(
+            f"the drive measures {what} in {unit_text}, expected {' or '.join(wanted)}{hint}", entry
         )
     feed = None
     if turns and not settings.counts_per_turn:

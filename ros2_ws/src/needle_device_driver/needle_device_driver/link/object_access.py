@@ -12,19 +12,37 @@ from needle_device_driver.link.sdo_client import SdoAbortedError, SdoTimeoutErro
 from needle_device_driver.procedure import Procedure
 
 
-class DriveRefusalError(DriveError):
+class ObjectError(DriveError):
+    """An entry of a drive is not as the driver needs it.
+
+    Parameters
+    ----------
+    text : str
+        The entry and the reason.
+    entry : Entry
+        The entry.
+    """
+
+    def __init__(self, text: str, entry: Entry) -> None:
+        super().__init__(text)
+        self.entry = entry
+
+
+class DriveRefusalError(ObjectError):
     """A drive refuses to read or write an entry.
 
     Parameters
     ----------
     text : str
         The entry and the reason.
+    entry : Entry
+        The entry.
     code : int
         SDO abort code.
     """
 
-    def __init__(self, text: str, code: int) -> None:
-        super().__init__(text)
+    def __init__(self, text: str, entry: Entry, code: int) -> None:
+        super().__init__(text, entry)
         self.code = code
 
     @property
@@ -160,6 +178,7 @@ class ObjectAccess:
         if isinstance(error, SdoAbortedError):
             return DriveRefusalError(
                 f"node {self._node_id} refuses to {action} {entry}: {error} (see docs/hardware.md)",
+                entry,
                 error.code,
             )
         if isinstance(error, ValueError):

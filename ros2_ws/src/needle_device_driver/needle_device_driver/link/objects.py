@@ -6,6 +6,7 @@ import dataclasses
 import struct
 
 from needle_core.errors import OutOfBoundsError
+from needle_device_driver.rules import Rule
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,12 +21,15 @@ class Entry:
         `struct` format, little-endian.
     name : str
         As in CiA 301 or CiA 402.
+    rule : Rule or None
+        The safety rule that needs it.
     """
 
     index: int
     subindex: int
     format: str
     name: str
+    rule: Rule | None = None
 
     def __str__(self) -> str:
         """Return address and name, for messages."""
@@ -83,49 +87,49 @@ class Entry:
 U8, U16, U32, I8, I16, I32 = "<B", "<H", "<I", "<b", "<h", "<i"
 
 DEVICE_TYPE = Entry(0x1000, 0, U32, "device type")
-CYCLE_PERIOD = Entry(0x1006, 0, U32, "communication cycle period [us]")
-CONSUMER_HEARTBEAT = Entry(0x1016, 1, U32, "consumer heartbeat time")
-PRODUCER_HEARTBEAT = Entry(0x1017, 0, U16, "producer heartbeat time [ms]")
-ERROR_BEHAVIOUR = Entry(0x1029, 1, U8, "communication error behaviour")
-ABORT_CONNECTION_OPTION = Entry(0x6007, 0, I16, "abort connection option")
+CYCLE_PERIOD = Entry(0x1006, 0, U32, "communication cycle period [us]", Rule.LOOK_AHEAD)
+CONSUMER_HEARTBEAT = Entry(0x1016, 1, U32, "consumer heartbeat time", Rule.DRIVE_WATCHDOG)
+PRODUCER_HEARTBEAT = Entry(0x1017, 0, U16, "producer heartbeat time [ms]", Rule.DRIVE_REBOOT)
+ERROR_BEHAVIOUR = Entry(0x1029, 1, U8, "communication error behaviour", Rule.DRIVE_REBOOT)
+ABORT_CONNECTION_OPTION = Entry(0x6007, 0, I16, "abort connection option", Rule.DRIVE_WATCHDOG)
 ERROR_CODE = Entry(0x603F, 0, U16, "error code")
-CONTROLWORD = Entry(0x6040, 0, U16, "controlword")
-STATUSWORD = Entry(0x6041, 0, U16, "statusword")
-QUICK_STOP_OPTION = Entry(0x605A, 0, I16, "quick stop option")
-SHUTDOWN_OPTION = Entry(0x605B, 0, I16, "shutdown option")
-DISABLE_OPTION = Entry(0x605C, 0, I16, "disable operation option")
-FAULT_REACTION_OPTION = Entry(0x605E, 0, I16, "fault reaction option")
-MODE_OF_OPERATION = Entry(0x6060, 0, I8, "mode of operation")
-MODE_DISPLAY = Entry(0x6061, 0, I8, "mode of operation display")
-POSITION_ACTUAL = Entry(0x6064, 0, I32, "position actual value")
-FOLLOWING_WINDOW = Entry(0x6065, 0, U32, "following error window")
-FOLLOWING_TIMEOUT = Entry(0x6066, 0, U16, "following error time-out [ms]")
-MAX_TORQUE = Entry(0x6072, 0, U16, "max torque [1/1000 of rated]")
-TARGET_POSITION = Entry(0x607A, 0, I32, "target position")
-HOME_OFFSET = Entry(0x607C, 0, I32, "home offset")
-LOWER_LIMIT = Entry(0x607D, 1, I32, "software position limit, lower")
-UPPER_LIMIT = Entry(0x607D, 2, I32, "software position limit, upper")
-MAX_PROFILE_VELOCITY = Entry(0x607F, 0, U32, "max profile velocity")
-PROFILE_VELOCITY = Entry(0x6081, 0, U32, "profile velocity")
-PROFILE_ACCELERATION = Entry(0x6083, 0, U32, "profile acceleration")
-PROFILE_DECELERATION = Entry(0x6084, 0, U32, "profile deceleration")
-QUICK_STOP_DECELERATION = Entry(0x6085, 0, U32, "quick stop deceleration")
+CONTROLWORD = Entry(0x6040, 0, U16, "controlword", Rule.ONE_FAULT_STOPS_BOTH)
+STATUSWORD = Entry(0x6041, 0, U16, "statusword", Rule.ONE_FAULT_STOPS_BOTH)
+QUICK_STOP_OPTION = Entry(0x605A, 0, I16, "quick stop option", Rule.QUICK_STOP)
+SHUTDOWN_OPTION = Entry(0x605B, 0, I16, "shutdown option", Rule.QUICK_STOP)
+DISABLE_OPTION = Entry(0x605C, 0, I16, "disable operation option", Rule.QUICK_STOP)
+FAULT_REACTION_OPTION = Entry(0x605E, 0, I16, "fault reaction option", Rule.DRIVE_WATCHDOG)
+MODE_OF_OPERATION = Entry(0x6060, 0, I8, "mode of operation", Rule.LOOK_AHEAD)
+MODE_DISPLAY = Entry(0x6061, 0, I8, "mode of operation display", Rule.LOOK_AHEAD)
+POSITION_ACTUAL = Entry(0x6064, 0, I32, "position actual value", Rule.FOLLOWING_ERROR)
+FOLLOWING_WINDOW = Entry(0x6065, 0, U32, "following error window", Rule.FOLLOWING_ERROR)
+FOLLOWING_TIMEOUT = Entry(0x6066, 0, U16, "following error time-out [ms]", Rule.FOLLOWING_ERROR)
+MAX_TORQUE = Entry(0x6072, 0, U16, "max torque [1/1000 of rated]", Rule.FOLLOWING_ERROR)
+TARGET_POSITION = Entry(0x607A, 0, I32, "target position", Rule.LOOK_AHEAD)
+HOME_OFFSET = Entry(0x607C, 0, I32, "home offset", Rule.SOFTWARE_LIMITS)
+LOWER_LIMIT = Entry(0x607D, 1, I32, "software position limit, lower", Rule.SOFTWARE_LIMITS)
+UPPER_LIMIT = Entry(0x607D, 2, I32, "software position limit, upper", Rule.SOFTWARE_LIMITS)
+MAX_PROFILE_VELOCITY = Entry(0x607F, 0, U32, "max profile velocity", Rule.AXIS_SPEED)
+PROFILE_VELOCITY = Entry(0x6081, 0, U32, "profile velocity", Rule.AXIS_SPEED)
+PROFILE_ACCELERATION = Entry(0x6083, 0, U32, "profile acceleration", Rule.AXIS_SPEED)
+PROFILE_DECELERATION = Entry(0x6084, 0, U32, "profile deceleration", Rule.QUICK_STOP)
+QUICK_STOP_DECELERATION = Entry(0x6085, 0, U32, "quick stop deceleration", Rule.QUICK_STOP)
 ENCODER_RESOLUTION = Entry(0x608F, 1, U32, "increments"), Entry(0x608F, 2, U32, "motor turns")
 GEAR_RATIO = Entry(0x6091, 1, U32, "motor turns"), Entry(0x6091, 2, U32, "shaft turns")
 FEED_CONSTANT = Entry(0x6092, 1, U32, "feed"), Entry(0x6092, 2, U32, "shaft turns")
 SPEED_FACTOR = Entry(0x6096, 1, U32, "velocity factor"), Entry(0x6096, 2, U32, "divisor")
-HOMING_METHOD = Entry(0x6098, 0, I8, "homing method")
-HOMING_SPEED_SWITCH = Entry(0x6099, 1, U32, "homing speed towards the switch")
-HOMING_SPEED_ZERO = Entry(0x6099, 2, U32, "homing speed towards zero")
-HOMING_ACCELERATION = Entry(0x609A, 0, U32, "homing acceleration")
-POSITION_UNIT = Entry(0x60A8, 0, U32, "SI unit position")
-SPEED_UNIT = Entry(0x60A9, 0, U32, "SI unit velocity")
-RAMP_UNIT = Entry(0x60AA, 0, U32, "SI unit acceleration")
-INTERPOLATION_PERIOD = Entry(0x60C2, 1, U8, "interpolation period")
-INTERPOLATION_EXPONENT = Entry(0x60C2, 2, I8, "interpolation period's power of ten")
-FOLLOWING_ERROR = Entry(0x60F4, 0, I32, "following error actual value")
-DIGITAL_INPUTS = Entry(0x60FD, 0, U32, "digital inputs")
-SUPPORTED_MODES = Entry(0x6502, 0, U32, "supported drive modes")
+HOMING_METHOD = Entry(0x6098, 0, I8, "homing method", Rule.HOMING_TIME)
+HOMING_SPEED_SWITCH = Entry(0x6099, 1, U32, "homing speed towards the switch", Rule.HOMING_TIME)
+HOMING_SPEED_ZERO = Entry(0x6099, 2, U32, "homing speed towards zero", Rule.HOMING_TIME)
+HOMING_ACCELERATION = Entry(0x609A, 0, U32, "homing acceleration", Rule.HOMING_TIME)
+POSITION_UNIT = Entry(0x60A8, 0, U32, "SI unit position", Rule.AXIS_SPEED)
+SPEED_UNIT = Entry(0x60A9, 0, U32, "SI unit velocity", Rule.AXIS_SPEED)
+RAMP_UNIT = Entry(0x60AA, 0, U32, "SI unit acceleration", Rule.AXIS_SPEED)
+INTERPOLATION_PERIOD = Entry(0x60C2, 1, U8, "interpolation period", Rule.LOOK_AHEAD)
+INTERPOLATION_EXPONENT = Entry(0x60C2, 2, I8, "interpolation period's exponent", Rule.LOOK_AHEAD)
+FOLLOWING_ERROR = Entry(0x60F4, 0, I32, "following error actual value", Rule.FOLLOWING_ERROR)
+DIGITAL_INPUTS = Entry(0x60FD, 0, U32, "digital inputs", Rule.INNER_LIMIT_SWITCH)
+SUPPORTED_MODES = Entry(0x6502, 0, U32, "supported drive modes", Rule.LOOK_AHEAD)
 
 CIA402 = 402
 # Bits of the digital inputs.

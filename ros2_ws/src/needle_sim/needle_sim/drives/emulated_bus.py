@@ -81,6 +81,11 @@ class EmulatedBus(EmulatedDrives):
         """Hang the processor of a drive: it is silent, and its motor ends at the set-point."""
         self.drives[axis].hung = True
 
+    def intrude(self) -> bool:
+        """Let another master send a SYNC."""
+        next(iter(self.drives.values())).device.outbox.append(CanFrame(SYNC))
+        return True
+
     def restore(self, now: float) -> None:
         """End cut bus, stalled motors and hung processors; drive faults stay until reset."""
         super().restore(now)

@@ -106,6 +106,10 @@ class EmulatedDrives(abc.ABC):
     def hang(self, axis: str) -> None:
         """Hang the processor of a drive: it is silent, and its motor ends at the set-point."""
 
+    def intrude(self) -> bool:
+        """Let another computer interfere; return False if none can be connected."""
+        return False
+
     def restore(self, now: float) -> None:
         """End cut connection, stalled motors and hung processors; faults stay until reset."""
         self.is_cut = False

@@ -131,6 +131,7 @@ class GalilDrives(TextDrives[GalilAxis]):
     """
 
     port = "galil"
+    intruder = "PTA=1;SPA=10000;PAA=1000000"
     terminators = b"\r"
 
     def __init__(self, motors: Mapping[str, MotorSettings], now: float) -> None:

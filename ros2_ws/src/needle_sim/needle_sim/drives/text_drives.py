@@ -112,6 +112,8 @@ class TextDrives(EmulatedDrives, Generic[Drive]):
 
     terminators = b"\n"
     """Bytes that end a line."""
+    intruder = ""
+    """Line of another client that moves the insertion axis; empty: there is only one client."""
     one_processor = True
     """Whether all axes hang and reboot together."""
     boot_time = 0.3
@@ -164,6 +166,12 @@ class TextDrives(EmulatedDrives, Generic[Drive]):
     def foreign(self, line: str) -> None:
         """Execute a command of another client."""
         self.handle_line(line, self._advanced_to)
+
+    def intrude(self) -> bool:
+        """Let another client move the insertion axis."""
+        if self.intruder:
+            self.foreign(self.intruder)
+        return bool(self.intruder)
 
     def send(self, data: bytes, now: float) -> None:
         """Send a message that is no reply to all clients."""

@@ -65,6 +65,23 @@ def test_late_answers_slow_a_step_down() -> None:
     assert bench.drives.health("").message.endswith("cycles had no answer in time")
 
 
+def test_each_set_point_is_ordered_once() -> None:
+    bench = PolledBench().ready()
+    orders: list[int] = []
+    move_to = bench.protocol.move_to
+
+    def record(axis: str, position: int, speed: int) -> None:
+        orders.append(position)
+        move_to(axis, position, speed)
+
+    bench.protocol.move_to = record  # type: ignore[method-assign]
+    bench.step(0.001, 0.0, 0.21)
+    bench.go(40)
+    # The supervisor repeats the last set-point until the axes are at rest.
+    assert bench.outcomes == ["succeeded"]
+    assert len(orders) == len(set(orders)) == 11
+
+
 def test_a_blocked_axis_is_released_when_it_is_stopped() -> None:
     bench = PolledBench().ready()
     bench.step(0.002, 0.2, 0.4)

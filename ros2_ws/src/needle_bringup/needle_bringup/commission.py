@@ -1,0 +1,255 @@
+"""`ros2 run needle_bringup commission`: measure on a real bench how far each stop takes."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import select
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from needle_bags.recording.bag_tap import BagTap
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
+from needle_core.commands.options import CommandParser, number
+from needle_core.component import Call, Publish, RealPort
+from needle_core.errors import UserError
+from needle_core.messages import EmergencyStop
+from needle_core.runners.paced import PacedRunner
+from needle_core.runners.virtual import DIAGNOSTICS, LOG
+from needle_core.settings.parameter_fields import from_values
+from needle_core.settings.parameter_files import read_parameters
+from needle_device_driver.axes.cycle_times import PERIOD
+from needle_device_driver.conformance.faults import FAULTS, Fault, largest_travel
+from needle_device_driver.conformance.rig import ConformanceRig, RigClient
+from needle_device_driver.device import EMERGENCY_STOP
+from needle_device_driver.device_driver import DeviceDriver
+from needle_device_driver.parameters import DeviceDriverParameters
+
+_DESCRIPTION = """\
+Commission drives on a bench without a needle: home them, move 10 mm, and stop a fast step in each
+possible way, partly by your hand; measure from joint_states how far the axes then move.
+
+Stop device_driver first: this command runs the same driver, with the parameters of FILE. It holds
+to run by itself, so keep a hand on the emergency stop. Writes a bag, and a report to be signed.
+"""
+_EPILOG = """\
+example:
+  ros2 run needle_bringup commission --params drives.yaml --out commissioning
+
+exit codes: 0 all stops within their bounds; 1 some are not; 2 invalid input, or no drives; 130
+interrupted
+"""
+_STEP, _STEP_TIME, _SETTLED = 0.002, 0.41, 1.5
+_WAY = 0.01
+# Of joint_states, by which a measured motion is too long [s].
+_JOINTS_AGE = 2.0 * PERIOD
+# Faults that the command causes by itself, and those that a person causes.
+_OWN = ("release", "silent hold", "emergency stop", "device/stop", "frozen driver")
+_BY_HAND = {
+    "unplugged adapter": "unplug the adapter or cable of the drives",
+    "power loss": "switch the power of one drive off and on",
+    "blocked axis": "block the stage gently",
+}
+Ask = Callable[[str], str]
+
+
+class Row(NamedTuple):
+    """One line of the report.
+
+    Attributes
+    ----------
+    rule, event : str
+        The rule, and what happened.
+    measured, bound : float
+        Motion of the insertion axis [m].
+    """
+
+    rule: str
+    event: str
+    measured: float
+    bound: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the motion stays within its bound."""
+        return not self.measured > self.bound
+
+
+class Bench(ConformanceRig):
+    """Real drives behind the driver, in real time; positions are those that the drives measure.
+
+    Parameters
+    ----------
+    settings : DeviceDriverParameters
+        Of the driver.
+    ports : mapping of str to RealPort
+        Its ports.
+    bag : Path
+        The bag.
+    """
+
+    runner: PacedRunner
+
+    def __init__(self, settings: Any, ports: Mapping[str, RealPort], bag: Path) -> None:
+        self.settings, self.hand, self.driver = settings, RigClient(), DeviceDriver(settings)
+        self.logged, self.commands = [], []
+        components = [self.driver, self.hand]
+        self.tap = BagTap(bag, components, (DIAGNOSTICS, LOG), {"purpose": "commissioning"})
+        self.runner = PacedRunner(components, ports=ports, taps=(self._keep_log, self.tap))
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """Measured positions [m], [rad]."""
+        return self.hand.joints
+
+    def ask(self, text: str) -> str:
+        """Return the person's answer; meanwhile the driver continues."""
+        print(f"{text} [Enter]", flush=True)
+        while not select.select([sys.stdin], [], [], 0.0)[0]:
+            if self.runner.run(PERIOD):
+                raise UserError(self.runner.exits[DeviceDriver.name].text)
+        return sys.stdin.readline().strip()
+
+
+def commission(rig: ConformanceRig, ask: Ask) -> Iterator[Row]:
+    """Run the script; `ask` shows a text to the person and returns the answer."""
+    ask("No needle is mounted, and a hand is on the emergency stop.")
+    rig.start()
+    ask("The stage will move outwards to its switch.")
+    rig.home()
+    begin = rig.place
+    _enable(rig)
+    rig.runner.run(_SETTLED)
+    yield Row("no_motion_by_itself", "switched on", rig.distance(begin)[0], 0.0)
+    for _ in range(round(_WAY / _STEP)):
+        _step(rig, 1.0)
+        rig.until(lambda: rig.commands[-1] in rig.hand.results, "the end of a step")
+    way = (rig.place[0] - begin[0]) * 1e3
+    answer = ask(f"The stage has moved {way:.3f} mm. Measure it, and type your value in mm.")
+    measured = abs(number("value", answer, 0.0, 1e3, "mm") - way) * 1e-3 if answer else math.nan
+    yield Row("counts_per_unit", "10 mm by hand", measured, 0.01 * _WAY)
+    faults = {fault.name: fault for fault in FAULTS if fault.needs(rig.capabilities)}
+    for name in (name for name in (*_OWN, *_BY_HAND) if name in faults):
+        _retract(rig)
+        yield _stop(rig, faults[name], ask)
+    rig.call("device/enable", False)
+
+
+def _stop(rig: ConformanceRig, fault: Fault, ask: Ask) -> Row:
+    """Stop fast steps by a fault."""
+    bound = largest_travel(fault, rig.capabilities, rig.settings)[0]
+    bound += rig.settings.max_speed * _JOINTS_AGE
+    if fault.name in _BY_HAND:
+        ask(f"During the motion, {_BY_HAND[fault.name]}.")
+        before = _steps_until_fault(rig)
+        ask("Undo it.")
+        rig.release()
+        rig.call("device/reset")
+        rig.runner.run(0.5)
+        measured = abs(rig.place[0] - before) if rig.hand.status.homed else math.nan
+        return Row(fault.rule.value, _BY_HAND[fault.name], measured, bound)
+    _step(rig, _STEP_TIME)
+    rig.runner.run(0.5 * _STEP_TIME)
+    measured = rig.travel(lambda: fault.event(rig), _SETTLED)[0]
+    return Row(fault.rule.value, fault.name, measured, bound)
+
+
+def _steps_until_fault(rig: ConformanceRig) -> float:
+    """Step until the driver reports a fault; return the last position before it [m]."""
+    outcome = "succeeded"
+    while outcome == "succeeded":
+        _step(rig, _STEP_TIME)
+        position, outcome = rig.place[0], ""
+        while not outcome and rig.state in ("HOLDING", "MOVING"):
+            position = rig.place[0]
+            rig.runner.run(PERIOD)
+            outcome = rig.hand.results.get(rig.commands[-1], "")
+    rig.until(lambda: rig.state in ("FAULT", "ESTOPPED"), "a fault")
+    return position
+
+
+def _step(rig: ConformanceRig, duration: float) -> None:
+    """Enable and press where needed, and begin a step."""
+    if rig.state != "HOLDING":
+        _enable(rig)
+    if rig.hand.status.hold_owner != rig.hand.name:
+        rig.press()
+    rig.command(rig.place[0] + _STEP, rig.place[1], duration)
+
+
+def _enable(rig: ConformanceRig) -> None:
+    """Reset a fault, home again where needed, and switch on."""
+    rig.release()
+    rig.hand.actions.append(Publish(EMERGENCY_STOP, EmergencyStop(False)))
+    if rig.state in ("FAULT", "ESTOPPED"):
+        rig.call("device/reset")
+    if not rig.hand.status.homed:
+        rig.home()
+    rig.call("device/enable", True)
+
+
+def _retract(rig: ConformanceRig) -> None:
+    """Retract to 0."""
+    _enable(rig)
+    rig.press()
+    rig.hand.actions.append(Call("device/retract"))
+    rig.runner.run(0.5)
+    rig.until(lambda: rig.hand.status.activity == "none", "the end of the retraction")
+
+
+def report(rows: Sequence[Row], person: str, day: datetime.date) -> str:
+    """Return the report as Markdown."""
+    table = "".join(
+        f"| `{row.rule}` | {row.event} | {row.measured * 1e3:.3f} | {row.bound * 1e3:.3f} "
+        f"| {'yes' if row.passed else 'NO'} |\n"
+        for row in rows
+    )
+    return (
+        f"# Commissioning of {day}\n\nMotion of the insertion axis after each event, from the bag "
+        "beside this file; nan: the drive has lost its position.\n\n"
+        f"| rule | event | measured [mm] | bound [mm] | within |\n| --- | --- | --- | --- | --- |\n"
+        f"{table}\nCarried out by {person or '............'}, signature: ............\n"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    parser = CommandParser("commission", _DESCRIPTION, _EPILOG)
+    parser.add_argument(
+        "--params", type=Path, required=True, metavar="FILE", help="parameters of device_driver"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FOLDER", help="new folder for bag and report"
+    )
+    return run_command(lambda: _run(**vars(parser.parse_args(arguments))))
+
+
+def _run(params: Path, out: Path) -> int:
+    name = DeviceDriver.name
+    values = read_parameters(params, [name]).get(name, {})
+    settings = from_values(DeviceDriverParameters, values, name)
+    try:
+        out.mkdir()
+    except OSError as error:
+        raise UserError(f"cannot make {out}: {error.strerror}") from error
+    ports = {backend.port: backend.open_port(settings) for backend in settings.backends}
+    bench = Bench(settings, ports, out / "bag")
+    try:
+        rows = []
+        for row in commission(bench, bench.ask):
+            rows.append(row)
+            print(f"{row.rule}: {row.event}: {row.measured * 1e3:.3f} mm", flush=True)
+        person = bench.ask("Type your name for the report.")
+    finally:
+        bench.runner.stop(name)
+        bench.runner.run(2.0)
+        bench.runner.close()
+        bench.tap.close()
+    (out / "report.md").write_text(report(rows, person, datetime.date.today()), "utf-8")
+    return EXIT_DONE if all(row.passed for row in rows) else EXIT_MISSED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Scenarios of the safety rules that depend on the drives, for any backend with an emulator."""

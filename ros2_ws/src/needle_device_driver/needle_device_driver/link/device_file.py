@@ -1,0 +1,209 @@
+"""A drive as its EDS or DCF file describes it (CiA 306), behind the driver's SDO client."""
+
+from __future__ import annotations
+
+import configparser
+import dataclasses
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from needle_core.errors import UserError
+from needle_device_driver.link.frame_link import FrameLink
+from needle_device_driver.link.sdo_client import SdoAbortedError, SdoClient
+from needle_device_driver.procedure import Procedure
+
+Address = tuple[int, int]
+UNKNOWN = "unknown: read-only, and the file gives no value"
+_MODE_OF_OPERATION, _MODE_DISPLAY, _STATUSWORD = (0x6060, 0), (0x6061, 0), (0x6041, 0)
+# Values if the file gives none: a CiA 402 drive with a homing mode. Others are 0.
+_ASSUMED = {(0x1000, 0): 402, (0x6502, 0): 1 << 5}
+_SECTION = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?", re.IGNORECASE)
+# Size in bytes of the data types, negative if signed; 0: no number.
+_SIZES = {1: 1, 2: -1, 3: -2, 4: -4, 5: 1, 6: 2, 7: 4, 0x15: -8, 0x1B: 8}
+_PDO_MAPPINGS = (range(0x1600, 0x1800), range(0x1A00, 0x1C00))
+_MISSING, _READ_ONLY, _NOT_MAPPABLE = 0x0602_0000, 0x0601_0002, 0x0604_0041
+_WRONG_LENGTH, _RANGE = 0x0607_0010, 0x0609_0030
+
+
+@dataclasses.dataclass(frozen=True)
+class FileObject:
+    """One object of a file.
+
+    Attributes
+    ----------
+    size : int
+        Size in bytes; negative: signed.
+    writable, mappable : bool
+        Whether a client may write it, and whether a PDO may contain it.
+    value : int or None
+        Its default, or in a DCF its configured value; None: the file gives none.
+    lower, upper : int or None
+        Its limits; None: those of its type.
+    """
+
+    size: int
+    writable: bool
+    mappable: bool
+    value: int | None
+    lower: int | None
+    upper: int | None
+
+
+def read_device_file(path: Path, node_id: int) -> tuple[str, dict[Address, FileObject]]:
+    """Return the product's name and all objects of an EDS or DCF file.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be read, or is neither.
+    """
+    parser = configparser.RawConfigParser(
+        strict=False, inline_comment_prefixes=(";",), allow_no_value=True
+    )
+    try:
+        parser.read_string(path.read_text("latin-1"), str(path))
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    except configparser.Error as error:
+        raise UserError(f"{path} is no EDS or DCF file: {' '.join(str(error).split())}") from error
+    objects: dict[Address, FileObject] = {}
+    for name in parser.sections():
+        if match := _SECTION.fullmatch(name):
+            section, index = parser[name], int(match[1], 16)
+            count = _number(section.get("CompactSubObj"), node_id) or 0
+            subindices = range(1, count + 1) if count else (int(match[2] or "0", 16),)
+            # Records have no data type of their own.
+            for subindex in subindices if section.get("DataType") else ():
+                objects[index, subindex] = _file_object(section, node_id)
+    if (0x1000, 0) not in objects:
+        raise UserError(f"{path} is no EDS or DCF file: it has no section [1000]")
+    product = parser.get("DeviceInfo", "ProductName", fallback="") or path.name
+    return product.strip(), objects
+
+
+def _file_object(section: Mapping[str, str | None], node_id: int) -> FileObject:
+    size = _SIZES.get(_number(section.get("DataType"), node_id) or 0, 0)
+
+    def value(key: str) -> int | None:
+        number = _number(section.get(key), node_id)
+        # Hexadecimal text of a negative number.
+        is_wrapped = number is not None and size < 0 and number >> (8 * -size - 1) == 1
+        return number - (1 << 8 * -size) if number is not None and is_wrapped else number
+
+    access = (section.get("AccessType") or "").strip().lower()
+    configured = value("ParameterValue")
+    return FileObject(
+        size,
+        access in ("rw", "wo", "rwr", "rww"),
+        _number(section.get("PDOMapping"), node_id) == 1,
+        value("DefaultValue") if configured is None else configured,
+        value("LowLimit"),
+        value("HighLimit"),
+    )
+
+
+def _number(text: str | None, node_id: int) -> int | None:
+    """Return a number, or the sum of a number and the node id; None for any other text."""
+    total = 0
+    for part in (text or "").upper().split("+"):
+        try:
+            total += node_id if part.strip() == "$NODEID" else int(part.strip(), 0)
+        except ValueError:
+            return None
+    return total
+
+
+class FileDevice(SdoClient):
+    """Answers as a drive whose objects are those of a file; it is switched off.
+
+    Parameters
+    ----------
+    objects : mapping of Address to FileObject
+        The objects.
+
+    Attributes
+    ----------
+    problems : dict of Address to str
+        The accessed objects in their order, each with the last refusal; empty: none.
+    granted : set of Address
+        Objects that accept everything.
+    ignored : set of Address
+        Objects that count as missing.
+    """
+
+    def __init__(self, objects: Mapping[Address, FileObject]) -> None:
+        self.problems: dict[Address, str] = {}
+        self.granted: set[Address] = set()
+        self.ignored: set[Address] = set()
+        self._objects = objects
+        self._values: dict[Address, int] = {}
+
+    def restart(self) -> None:
+        """Restore the values of the file, and forget the accesses."""
+        self.problems, self._values = {}, {_STATUSWORD: 0}
+
+    def upload(self, index: int, subindex: int) -> Procedure[bytes]:
+        """Return the value of an object."""
+        yield from ()
+        address = index, subindex
+        found = self._object(address)
+        value = self._values.get(address, found.value)
+        value = _ASSUMED.get(address, 0) if value is None else value
+        size = abs(found.size)
+        return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
+
+    def download(self, index: int, subindex: int, data: bytes) -> Procedure[None]:
+        """Write an object if the file says that the drive accepts the value."""
+        yield from ()
+        address = index, subindex
+        found = self._object(address)
+        value = int.from_bytes(data, "little", signed=found.size < 0)
+        if address not in self.granted:
+            if not found.writable and found.value is not None:
+                self._refuse(address, _READ_ONLY, f"fixed at {found.value}")
+            if len(data) != abs(found.size):
+                self._refuse(address, _WRONG_LENGTH, f"has {abs(found.size)} bytes")
+            lower, upper = found.lower, found.upper
+            if (lower is not None and value < lower) or (upper is not None and value > upper):
+                self._refuse(address, _RANGE, f"{value} is outside [{lower}, {upper}]")
+            if subindex and any(index in mappings for mappings in _PDO_MAPPINGS):
+                mapped = self._objects.get((value >> 16, value >> 8 & 0xFF))
+                if mapped is None or not mapped.mappable:
+                    text = f"0x{value >> 16:04X} cannot be mapped"
+                    self._refuse(address, _NOT_MAPPABLE, text)
+        self._values[address] = value
+        if address == _MODE_OF_OPERATION:
+            self._values[_MODE_DISPLAY] = value
+        self.problems[address] = "" if found.writable else UNKNOWN
+
+    def _object(self, address: Address) -> FileObject:
+        if address in self.granted:
+            return self._objects.get(address) or FileObject(4, True, True, 0, None, None)
+        if address not in self._objects or address in self.ignored:
+            self._refuse(address, _MISSING, "missing")
+        self.problems.setdefault(address, "")
+        return self._objects[address]
+
+    def _refuse(self, address: Address, code: int, text: str) -> None:
+        self.problems[address] = text
+        raise SdoAbortedError(code)
+
+
+class FileLink(FrameLink):
+    """A bus with one drive, which a file describes.
+
+    Parameters
+    ----------
+    device : FileDevice
+        The drive.
+    """
+
+    def __init__(self, device: FileDevice) -> None:
+        super().__init__("file")
+        self._device = device
+        self.open()
+
+    def sdo_client(self, node_id: int) -> SdoClient:
+        """Return the drive."""
+        return self._device

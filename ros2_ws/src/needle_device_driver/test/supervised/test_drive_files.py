@@ -1,0 +1,214 @@
+"""check_drive on EDS and DCF files: what the set-up would find in such a drive."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import canopen
+import pytest
+
+from needle_device_driver.check_drive import main
+from needle_device_driver.link.device_file import read_device_file
+
+from .drive_bench import DriveBench
+
+Sections = dict[str, dict[str, str]]
+
+# Index, sub-indices and CiA 306 data types of a complete drive; * can be mapped.
+COMPLETE = """
+1000:0:7 1006:0:7 1016:1:7 1017:0:6 1029:1:5 1400:12:75 1401:12:75 1600:012:577 1601:01:57
+1800:1235:7566 1801:1235:7566 1A00:0123:5777 1A01:012:577 6007:0:3 6040:0:6* 6041:0:6* 605A:0:3
+605B:0:3 605C:0:3 605E:0:3 6060:0:2* 6061:0:2* 6064:0:4* 6065:0:7 6066:0:6 607A:0:4* 607C:0:4
+607D:12:44 607F:0:7 6081:0:7 6083:0:7 6084:0:7 6085:0:7 6098:0:2 6099:12:77 609A:0:7 60A8:0:7
+60A9:0:7 60AA:0:7 60C2:12:52 60F4:0:4* 60FD:0:7* 6502:0:7
+"""
+VALUES = {"1000": "0x00020192", "6502": "0xA1", "60A8": "0xB50000", "60A9": "0xB50300"}
+VALUES |= {"60AA": "0xB55700", "1801sub1": "$NODEID+0x40000280"}
+
+
+def complete() -> Sections:
+    sections: Sections = {"DeviceInfo": {"ProductName": "A drive"}}
+    for text in COMPLETE.split():
+        index, subs, types = text.split(":")
+        for sub, kind in zip(subs, types.rstrip("*"), strict=True):
+            name = index if subs == "0" else f"{index}sub{sub}"
+            mapping = str(int(types.endswith("*")))
+            sections.setdefault(index, {"ObjectType": "0x8", "ParameterName": index})
+            sections[name] = {"ParameterName": name, "ObjectType": "0x7", "AccessType": "rw"}
+            sections[name] |= {"DataType": f"0x000{kind}", "PDOMapping": mapping}
+            if name in VALUES:
+                sections[name]["DefaultValue"] = VALUES[name]
+    return sections
+
+
+def checked(
+    sections: Sections, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> tuple[int, str]:
+    """Return exit code and output of check_drive."""
+    text = "".join(
+        f"[{name}]\n" + "".join(f"{key}={value}\n" for key, value in values.items()) + "\n"
+        for name, values in sections.items()
+    )
+    file = folder / "drive.eds"
+    file.write_text(text, "latin-1")
+    code = main(["--eds", str(file)])
+    captured = capsys.readouterr()
+    return code, captured.out + captured.err
+
+
+@pytest.mark.parametrize("index", sorted({text[:4] for text in COMPLETE.split()} - {"1000"}))
+def test_missing_object_has_the_same_effect_in_a_file_and_in_a_drive(
+    index: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sections = {name: rows for name, rows in complete().items() if not name.startswith(index)}
+    code, output = checked(sections, tmp_path, capsys)
+    bench = DriveBench()
+    bench.insertion.missing_objects = {int(index, 16)}
+    bench.insertion.refuses = lambda at, sub, value: (
+        NOT_MAPPABLE * (at & 0xFE00 in (0x1600, 0x1A00) and value[2:].hex() == mapped)
+    )
+    mapped = int(index, 16).to_bytes(2, "little").hex()
+    bench.run(bench.drives.probe())
+    if bench.run(bench.supervisor.configure(bench.now)).success:
+        bench.home()
+        bench.wait(30)
+    assert code == (bench.state == "FAULT"), output
+    assert ("NOT usable" in output) == (code == 1)
+    assert FATAL in output if code else OPTIONAL in output
+
+
+NOT_MAPPABLE = 0x0604_0041
+READ_ONLY = {"AccessType": "ro", "DefaultValue": "2"}
+FATAL, OPTIONAL = "NOT USABLE: ", "optional: "
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "code", "text"),
+    [
+        ("605A", READ_ONLY, 1, FATAL + "fixed at 2"),
+        ("605A", READ_ONLY | {"DefaultValue": "6"}, 0, "ok"),
+        ("605A", READ_ONLY | {"ParameterValue": "0x6"}, 0, "ok"),
+        ("605A", {"AccessType": "const"}, 0, "unknown: read-only"),
+        ("605B", READ_ONLY, 0, OPTIONAL + "fixed at 2"),
+        ("60C2sub2", {"LowLimit": "-0x2"}, 1, FATAL + "-3 is outside [-2, None]"),
+        ("60C2sub2", {"LowLimit": "0xFD"}, 0, "ok"),
+        ("6085", {"HighLimit": "1000"}, 1, FATAL + "10000000 is outside [None, 1000]"),
+        ("6083", {"HighLimit": "1000"}, 0, OPTIONAL + "1000000 is outside [None, 1000]"),
+        ("6060", {"HighLimit": "7"}, 0, "ok"),
+        ("607A", {"PDOMapping": "0"}, 1, FATAL + "0x1601:1 0x607A cannot be mapped"),
+        ("60FD", {"PDOMapping": "0"}, 0, "ok"),
+        ("60A9", {"DefaultValue": "0x10300"}, 1, "the drive measures speeds in m/s"),
+        ("60A9", {"DefaultValue": "0xB44700"}, 0, "set *_counts_per_turn"),
+        ("6502", {"DefaultValue": "0x85"}, 1, FATAL + "node 1 has no homing mode"),
+        ("6502", {"DefaultValue": ""}, 0, "does not list its cyclic synchronous position mode"),
+        ("1000", {"DefaultValue": "401"}, 2, "node 1 has device profile 401, expected 402"),
+        ("1000", {"DefaultValue": ""}, 0, "\nusable"),
+    ],
+)
+def test_restricted_object(
+    name: str,
+    change: dict[str, str],
+    code: int,
+    text: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    sections = complete()
+    sections[name] |= change
+    got, output = checked(sections, tmp_path, capsys)
+    assert (got, text in output) == (code, True), output
+
+
+def test_all_problems_are_listed_with_their_rules(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sections = complete()
+    for name in ("605A", "1016sub1", "607A", "60A9"):
+        sections[name] |= READ_ONLY | {"PDOMapping": "0", "DefaultValue": "0x10300"}
+    code, output = checked(sections, tmp_path, capsys)
+    fatal = {tuple(line.split()[:2]) for line in output.splitlines() if FATAL in line}
+    assert (code, fatal) == (
+        1,
+        {
+            ("quick_stop", "0x605A:0"),
+            ("drive_watchdog", "0x1016:1"),
+            ("look_ahead", "0x1401"),
+            ("axis_speed", "0x60A9:0"),
+        },
+    )
+
+
+@pytest.mark.parametrize("text", ["", "\x00\x01", "[1000", "[DeviceInfo]\n", "x = 1\n"])
+def test_other_files_are_rejected(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "drive.eds"
+    file.write_text(text, "latin-1")
+    assert main(["--eds", str(file)]) == main(["--eds", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 2
+
+
+TRICKY = """
+[DeviceInfo]
+ProductName=Müller 5/7
+[1000]
+ParameterName=Device Type
+ObjectType=0x7
+DataType=0x0007
+AccessType=CONST
+DefaultValue=0x00020192
+PDOMapping=0
+[1003]
+ParameterName=Errors
+ObjectType=0x8
+CompactSubObj=3
+DataType=0x0006
+AccessType=ro
+DefaultValue=7
+PDOMapping=0
+[60c2]
+ParameterName=Interpolation
+ObjectType=0x9
+SubNumber=3
+[60c2Sub2]
+ParameterName=Power ; a comment
+ObjectType=0x7
+DataType=0x2
+AccessType=rww
+DefaultValue=-3
+LowLimit=0x80
+HighLimit=63
+PDOMapping=1
+[1800]
+ParameterName=PDO
+ObjectType=0x9
+SubNumber=2
+[1800sub1]
+ParameterName=COB-ID
+ObjectType=0x7
+DataType=0x7
+AccessType=rw
+DefaultValue=$NODEID+0x180
+ParameterValue=0x190
+PDOMapping=0
+"""
+
+
+def test_objects_are_those_that_canopen_reads(tmp_path: Path) -> None:
+    file = tmp_path / "drive.dcf"
+    file.write_text(TRICKY, "latin-1")
+    product, objects = read_device_file(file, 5)
+    stream = io.StringIO(TRICKY)
+    stream.name = "drive.dcf"
+    oracle: Any = canopen.import_od(stream, 5)
+    assert product == "Müller 5/7"
+    for (index, sub), found in objects.items():
+        variable = oracle[index][sub] if sub else oracle[index]
+        assert (found.lower, found.upper) == (variable.min, variable.max)
+        assert (8 * abs(found.size), found.writable) == (len(variable), variable.writable)
+        assert found.mappable == variable.pdo_mappable
+        assert found.value == (variable.value if variable.value is not None else variable.default)
+    assert set(objects) >= {(0x1000, 0), (0x1003, 3), (0x60C2, 2), (0x1800, 1)}
+    assert objects[0x1800, 1].value == 0x190
