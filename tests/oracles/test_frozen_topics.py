@@ -21,6 +21,7 @@ GONE = {
 """Frozen topics that a virtual run does not have, and why."""
 ADDED = {
     "/stereo_tracker/annotated_image": "every output is announced; nobody looks: it stays empty",
+    "/needle/proposed_target": "the controller receives it; no planner proposes a target",
 }
 """Topics that only a virtual run has, and why."""
 

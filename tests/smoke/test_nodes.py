@@ -21,7 +21,7 @@ from needle_bringup.simulation.node_graph import NodeProcess, stop, wait_for
 from needle_core.commands.cli import EXIT_DONE, EXIT_INTERRUPTED
 from needle_core.files.installed import find_executable
 from needle_tracker.optics.calibration import SIDES
-from reference.rig_nodes import executables
+from reference.rig_nodes import REGISTRATION, executables
 
 PATIENCE = 60.0  # [s]
 # Packages that the environment may lack.
@@ -47,6 +47,7 @@ def words(name: str, folder: Path) -> list[str]:
         "operator": ["source:=joy", "key:=0"],
         "recorder": [f"bag:={folder / 'bag'}"],
         "stereo_camera": [f"{side}:={folder / side}" for side in SIDES] + ["loop:=true"],
+        "tracked_tip": [f"registration_file:={REGISTRATION}"],
     }
     if name == "player":
         return [str(ROOT / "bags" / "regression"), "--loop"]

@@ -31,6 +31,7 @@ FROM_THE_LOCK_ALONE = {
     "distributed",
     "drjit",
     "fastapi",
+    "foxglove",
     "lz4",
     "mcap",
     "mitsuba",

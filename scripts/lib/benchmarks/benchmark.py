@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import drive_benchmark
 import latency_benchmark
+import link_benchmark
 import recording_benchmark
 import study_benchmark
 import tracker_benchmark
@@ -29,6 +30,7 @@ references:
   rosbags Writer   the same messages into an MCAP bag; the disk alone: their bytes into one file;
                    both including fsync
   a frame          period of the exposures at 30 Hz
+  pyigtl           the same OpenIGTLink transforms by pyigtl's server
   one at a time    the code of the study in a loop over needles (few needles, scaled)
 
 exit codes: 0 done; 2 invalid input; 130 interrupted
@@ -42,6 +44,7 @@ BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
     "reception": recording_benchmark.reception_rows,
     "drives": drive_benchmark.rows,
     "latency": latency_benchmark.rows,
+    "link": link_benchmark.rows,
 }
 
 

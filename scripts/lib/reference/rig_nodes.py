@@ -35,6 +35,7 @@ from needle_core.ros.component_node import ComponentNode
 from reference.endpoints import SOURCES, Endpoint, NodeRecord, record_nodes
 
 BAG = ROOT / "bags" / "regression"
+REGISTRATION = ROOT / "ros2_ws/src/needle_tracker/test/data/registration.yaml"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -295,5 +296,13 @@ NODE_VARIANTS: dict[str, tuple[NodeVariant, ...]] = {
     ),
     "stereo_camera": (NodeVariant(make=_camera, then=_run_timers),),
     "stereo_tracker": (NodeVariant(then=_spin),),
+    "tracked_tip": tuple(
+        NodeVariant(
+            f"source {source}",
+            (f"registration_file:={REGISTRATION}", f"source:={source}"),
+            then=_feed_messages,
+        )
+        for source in ("openigtlink_client", "pose", "transform")
+    ),
 }
 """Variants of the nodes that need parameters or have several."""

@@ -60,6 +60,7 @@ CALLS: Mapping[Button, Call] = {
 """Service call of each button."""
 _IMAGES = {side: f"stereo/{side}/image_raw" for side in SIDES}
 _HOLD, _PLANE, _POINT, _RIG = "device/hold", "target_plane", "target_point", "rig"
+_PROPOSED_TARGET = "needle/proposed_target"
 _SHOW_PERIOD, _CHECK_PERIOD = 0.1, 1.0
 _HOLD_SERVER_TIMEOUT = 1.0
 """The hold's server reports at least 12 times a second [s]."""
@@ -134,6 +135,7 @@ class Console(Component):
             Input("needle/tip_pose", m.PoseWithCovariance, self._on_tip),
             Input("needle/estimate", m.PoseWithCovariance, self._on_estimate),
             Input(_PLANE, m.Pose, self._on_plane, LATCHED),
+            Input(_PROPOSED_TARGET, m.Point, self._on_proposal),
             Input("/diagnostics", m.Diagnostics, self._on_health),
             *(
                 Input(topic, m.Image, partial(self._on_image, side), IMAGES_BEST_EFFORT, lazy=True)
@@ -268,6 +270,10 @@ class Console(Component):
             pose[:3, :3] = rotation_matrix(quaternion / norm)
             pose[:3, 3] = message.position
             self._picture.set_plane(pose)
+        return ()
+
+    def _on_proposal(self, message: m.Point, at: Moment) -> Actions:
+        self._picture.set_proposal(message.position if message.frame_id == _RIG else None)
         return ()
 
     def _on_health(self, message: m.Diagnostics, at: Moment) -> Actions:

@@ -216,6 +216,13 @@ def test_targets_and_log_lines_are_passed_on(bench: Bench) -> None:
     assert line == Log("warning", "a line")
 
 
+def test_a_proposed_point_is_shown_until_it_is_withdrawn(bench: Bench) -> None:
+    assert bench.snapshot().proposed_point is None
+    for frame, shown in (("rig", (0.01, -0.005, 0.1)), ("map", None)):
+        assert bench.receive("needle/proposed_target", m.Point(1, frame, (0.01, -0.005, 0.1))) == []
+        assert bench.snapshot().proposed_point == shown
+
+
 def test_newest_waiting_hold_counts_unless_released_or_old(
     bench: Bench,
 ) -> None:

@@ -49,7 +49,9 @@ from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"
 TARGET_PLANE, TARGET_POINT, OBSTACLES = "target_plane", "target_point", "obstacles"
-TARGETS = (TARGET_PLANE, TARGET_POINT, OBSTACLES)
+PROPOSED_TARGET = "needle/proposed_target"
+_CHECKED = ("joint_states", TARGET_PLANE, TARGET_POINT, OBSTACLES, PROPOSED_TARGET)
+_NO_DRIVERS = ("recorder", "peer_topics")
 _KEPT_MESSAGE = {
     TARGET_PLANE: "keeping the last plane",
     TARGET_POINT: "keeping the last target",
@@ -83,6 +85,7 @@ class PlaneController(Component):
         self.name, self.settings = name, settings
         self.steering: Steering = make_steering(settings)
         self.problems: dict[str, str] = {}
+        self._proposal: m.Point | None = None
         self._bad_joints = 0
         self._missing: list[str] = [f"subscriber of {COMMANDS}"]
         self._received = ReceptionLog()
@@ -99,6 +102,7 @@ class PlaneController(Component):
             (TARGET_PLANE, m.Pose, self._on_plane, LATCHED),
             (TARGET_POINT, m.Point, self._on_point, LATCHED),
             (OBSTACLES, m.Markers, self._on_obstacles, LATCHED),
+            (PROPOSED_TARGET, m.Point, self._on_proposal, RELIABLE),
         )
         self.inputs = tuple(
             Input(topic, message, partial(self._receive, topic, handler), delivery)
@@ -111,10 +115,12 @@ class PlaneController(Component):
             Output("needle/linearized_state", m.Vector),
             Output("needle/control_input", m.Vector),
             Output(STATUS, ControllerStatus, LATCHED),
+            Output(TARGET_POINT, m.Point, LATCHED),
         )
         self.services = (
             Service("plane_controller/start", self._on_start),
             Service("plane_controller/stop", self._on_stop_request),
+            Service("plane_controller/accept_target", self._on_accept),
         )
         self.timers = (Timer(0.1, self._on_timer),)
 
@@ -139,7 +145,7 @@ class PlaneController(Component):
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Check that a driver subscribes to commands: without one, the first step would be lost."""
         names = peers.subscribers.get(COMMANDS, ())
-        receivers = [name for name in names if name.rpartition("/")[2] != "recorder"]
+        receivers = [name for name in names if name.rpartition("/")[2] not in _NO_DRIVERS]
         self._missing = [] if receivers else [f"subscriber of {COMMANDS}"]
         return ()
 
@@ -189,15 +195,28 @@ class PlaneController(Component):
         return [Log("info", f"{TARGET_PLANE} at offset {plane.offset:g} m")]
 
     def _on_point(self, message: m.Point, at: Moment) -> Iterable[Action]:
-        point = point_from_message(message.frame_id, message.position)
-        self.steering.settings.check_point(point)
+        point = self._checked_point(message)
         if message.stamp_ns:
             self.steering.control.observe_target_point(point, message.stamp_ns * 1e-9)
         else:
             # Placed by hand: the time of the position is unknown.
             self.steering.control.target_point = point
-        x, y, z = point
-        return [Log("info", f"{TARGET_POINT} at ({x:g}, {y:g}, {z:g}) m", TARGET_POINT)]
+        return [Log("info", f"{TARGET_POINT} at {_text(point)}", TARGET_POINT)]
+
+    def _on_proposal(self, message: m.Point, at: Moment) -> Iterable[Action]:
+        # A rejected proposal withdraws the one before: the planner no longer wants that.
+        before, self._proposal = self._proposal, None
+        point = self._checked_point(message)
+        self._proposal = dataclasses.replace(message, stamp_ns=0)
+        if self._proposal == before:
+            return []
+        text = f"proposed target at {_text(point)}: plane_controller/accept_target applies it"
+        return [Log("info", text, PROPOSED_TARGET)]
+
+    def _checked_point(self, message: m.Point) -> Array:
+        point = point_from_message(message.frame_id, message.position)
+        self.steering.settings.check_point(point)
+        return point
 
     def _on_obstacles(self, message: m.Markers, at: Moment) -> Iterable[Action]:
         obstacles = self.steering.control.obstacles = obstacles_from_markers(message)
@@ -226,6 +245,20 @@ class PlaneController(Component):
         yield from actions
         yield Reply(number, reply.success, reply.message)
 
+    def _on_accept(self, _: bool | None, number: int, at: Moment) -> Actions:
+        """Publish the proposal as the target point, which a bag then contains."""
+        if self._proposal is None:
+            yield Reply(number, False, f"no target on {PROPOSED_TARGET}")
+            return
+        try:
+            # The settings may have changed since the proposal.
+            point = self._checked_point(self._proposal)
+        except UserError as error:
+            yield Reply(number, False, str(error))
+            return
+        yield Publish(TARGET_POINT, self._proposal)
+        yield Reply(number, True, f"{TARGET_POINT} at {_text(point)}")
+
     def _on_timer(self, at: Moment) -> Actions:
         return self.carry_out(self.steering.on_time(at.steady), at)
 
@@ -245,9 +278,9 @@ class PlaneController(Component):
         }
         if (problems, counts) != self._reported_health:
             self._reported_health = problems, counts
-            yield Diagnose("joint_states", _health(problems["joint_states"], counts))
-            for topic in TARGETS:
-                yield Diagnose(topic, _health(problems.get(topic, ""), {}))
+            for topic in _CHECKED:
+                values = counts if topic == "joint_states" else {}
+                yield Diagnose(topic, _health(problems.get(topic, ""), values))
         status = controller_status(self.steering, self.settings.preset, self.name)
         if status != self._published or self._received.is_full:
             self._published = status
@@ -289,6 +322,11 @@ def tip_covariance(message: m.PoseWithCovariance) -> TipCovariance:
     """Return the unchecked covariance of a measured tip."""
     matrix = np.array(message.covariance).reshape(6, 6)[:3, :3]
     return TipCovariance(message.stamp_ns, message.frame_id, matrix)
+
+
+def _text(point: Array) -> str:
+    x, y, z = point
+    return f"({x:g}, {y:g}, {z:g}) m"
 
 
 def _health(problem: str, values: dict[str, str]) -> Diagnostic:

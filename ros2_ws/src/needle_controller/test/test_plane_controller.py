@@ -127,9 +127,10 @@ def test_it_steers_in_steps_and_publishes_its_estimate() -> None:
 
 def test_a_start_requires_a_driver_that_subscribes() -> None:
     assert Bench().call("start") == (False, "no device/status received")
-    bench = Bench(receiver="/recorder")
-    assert bench.call("start") == (False, f"waiting for subscriber of {COMMANDS}")
-    assert bench.component.steering.state.value == "IDLE"
+    for receiver in ("/recorder", "/lab/peer_topics"):
+        bench = Bench(receiver=receiver)
+        assert bench.call("start") == (False, f"waiting for subscriber of {COMMANDS}")
+        assert bench.component.steering.state.value == "IDLE"
 
 
 def test_invalid_joints_are_reported_and_counted() -> None:
@@ -227,6 +228,49 @@ def test_invalid_targets_are_rejected_and_the_last_stays() -> None:
     assert bench.status.obstacles == 1
     bench.receive("obstacles", m.Markers(()))
     assert bench.status.obstacles == 0
+
+
+def test_a_proposed_target_is_applied_when_it_is_accepted() -> None:
+    bench = Bench()
+    assert bench.call("accept_target") == (False, "no target on needle/proposed_target")
+    bench.receive("needle/proposed_target", m.Point(7, "rig", (0.01, -0.005, 0.1)))
+    bench.receive("needle/proposed_target", m.Point(8, "rig", (0.01, -0.005, 0.1)))
+    assert ["proposed" in line for line in bench.logs] == [True]
+    assert bench.status.target_point_m is None
+    assert bench.call("accept_target") == (True, "target_point at (0.01, -0.005, 0.1) m")
+    (point,) = bench.published["target_point"]
+    # Stamp 0: applied as if placed by hand, also when the bag is run again.
+    assert point == m.Point(0, "rig", (0.01, -0.005, 0.1))
+    bench.receive("target_point", point)
+    assert bench.status.target_point_m == point.position
+
+
+@pytest.mark.parametrize(
+    ("frame", "position", "said"),
+    [
+        ("map", (0.01, 0.0, 0.1), "frame 'map', expected 'rig'"),
+        ("rig", (np.nan, 0.0, 0.1), "not finite"),
+        ("rig", (0.09, 0.0, 0.1), "from an entry at"),
+    ],
+)
+def test_a_bad_proposal_withdraws_the_one_before(frame: str, position: Any, said: str) -> None:
+    bench = Bench()
+    bench.receive("needle/proposed_target", m.Point(7, "rig", (0.01, 0.0, 0.1)))
+    bench.receive("needle/proposed_target", m.Point(8, frame, position))
+    assert said in bench.health["needle/proposed_target"].message
+    assert not bench.call("accept_target")[0]
+    assert bench.published["target_point"] == []
+
+
+def test_a_proposal_that_new_settings_forbid_is_not_applied() -> None:
+    bench = Bench()
+    bench.receive("needle/proposed_target", m.Point(7, "rig", (0.01, 0.0, 0.1)))
+    shallow = dataclasses.replace(SETTINGS, depth=0.05)
+    bench.do(bench.component.on_settings(shallow, bench.at))
+    success, text = bench.call("accept_target")
+    assert not success
+    assert "depth is 0.05 m" in text
+    assert bench.published["target_point"] == []
 
 
 def test_the_motion_of_a_stamped_point_is_predicted() -> None:

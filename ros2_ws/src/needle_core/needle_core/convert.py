@@ -54,7 +54,7 @@ def from_ros(kind: type[Any], message: Any) -> Any:
 
 def _joint_state_fields(message: m.JointState, t: MessageTypes) -> dict[str, Any]:
     return {
-        "header": t.header(message.stamp_ns),
+        "header": t.header_of(message),
         "name": list(message.names),
         "position": t.array(np.float64, message.positions),
         "velocity": t.array(np.float64, message.velocities),
@@ -186,7 +186,11 @@ TABLE: dict[type[Any], Row] = {
         "sensor_msgs/msg/JointState",
         _joint_state_fields,
         lambda r: m.JointState(
-            to_nanoseconds(r.header.stamp), tuple(r.name), floats(r.position), floats(r.velocity)
+            to_nanoseconds(r.header.stamp),
+            tuple(r.name),
+            floats(r.position),
+            floats(r.velocity),
+            r.header.frame_id,
         ),
     ),
     m.Trajectory: Row("trajectory_msgs/msg/JointTrajectory", _trajectory_fields, _trajectory),
@@ -206,6 +210,11 @@ TABLE: dict[type[Any], Row] = {
         "geometry_msgs/msg/PointStamped",
         lambda message, t: {"header": t.header_of(message), "point": t.point(message.position)},
         lambda r: m.Point(*head(r), xyz(r.point)),
+    ),
+    m.BarePoint: Row(
+        "geometry_msgs/msg/Point",
+        lambda message, t: dict(zip("xyz", message.position, strict=True)),
+        lambda r: m.BarePoint(xyz(r)),
     ),
     m.Vector: Row(
         "geometry_msgs/msg/Vector3Stamped",

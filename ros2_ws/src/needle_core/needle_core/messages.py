@@ -25,6 +25,7 @@ class JointState:
     names: tuple[str, ...]
     positions: tuple[float, ...]
     velocities: tuple[float, ...] = ()
+    frame_id: str = ""
 
 
 @dataclass(frozen=True)
@@ -130,6 +131,13 @@ class Point:
 
 
 @dataclass(frozen=True)
+class BarePoint:
+    """A point without stamp and frame."""
+
+    position: Vector3
+
+
+@dataclass(frozen=True)
 class Vector:
     """Three numbers."""
 
@@ -146,6 +154,15 @@ class Pose:
     frame_id: str
     position: Vector3
     orientation: Quaternion
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Positions [m] and orientations, such as those along a needle."""
+
+    stamp_ns: int
+    frame_id: str
+    poses: tuple[tuple[Vector3, Quaternion], ...]
 
 
 @dataclass(frozen=True)

@@ -18,14 +18,29 @@ def _path_fields(message: m.Path, t: MessageTypes) -> dict[str, Any]:
     return {"header": header, "poses": poses}
 
 
-def _ros_transform(message: m.Transform, t: MessageTypes) -> Any:
-    return t.make("geometry_msgs/msg/TransformStamped")(
-        header=t.header_of(message),
-        child_frame_id=message.child_frame_id,
-        transform=t.make("geometry_msgs/msg/Transform")(
-            translation=t.vector(message.translation), rotation=t.quaternion(message.rotation)
-        ),
+def _poses_fields(message: m.Poses, t: MessageTypes) -> dict[str, Any]:
+    return {"header": t.header_of(message), "poses": [t.pose(*pose) for pose in message.poses]}
+
+
+def _poses(r: Any) -> m.Poses:
+    pairs = ((xyz(pose.position), xyzw(pose.orientation)) for pose in r.poses)
+    return m.Poses(*head(r), tuple(pairs))
+
+
+def _transform_fields(message: m.Transform, t: MessageTypes) -> dict[str, Any]:
+    transform = t.make("geometry_msgs/msg/Transform")(
+        translation=t.vector(message.translation), rotation=t.quaternion(message.rotation)
     )
+    return {
+        "header": t.header_of(message),
+        "child_frame_id": message.child_frame_id,
+        "transform": transform,
+    }
+
+
+def _transforms_fields(message: m.Transforms, t: MessageTypes) -> dict[str, Any]:
+    make = t.make("geometry_msgs/msg/TransformStamped")
+    return {"transforms": [make(**_transform_fields(one, t)) for one in message.transforms]}
 
 
 def _transform(message: Any) -> m.Transform:
@@ -149,9 +164,11 @@ VIEW_ROWS: dict[type[Any], Row] = {
         _path_fields,
         lambda r: m.Path(*head(r), tuple(xyz(pose.pose.position) for pose in r.poses)),
     ),
+    m.Transform: Row("geometry_msgs/msg/TransformStamped", _transform_fields, _transform),
+    m.Poses: Row("geometry_msgs/msg/PoseArray", _poses_fields, _poses),
     m.Transforms: Row(
         "tf2_msgs/msg/TFMessage",
-        lambda message, t: {"transforms": [_ros_transform(one, t) for one in message.transforms]},
+        _transforms_fields,
         lambda r: m.Transforms(tuple(map(_transform, r.transforms))),
     ),
     m.Image: Row("sensor_msgs/msg/Image", _image_fields, _image),

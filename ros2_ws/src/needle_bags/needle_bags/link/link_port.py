@@ -1,4 +1,4 @@
-"""TCP port of openigtlink: sends the same data to all clients and discards what they send.
+"""TCP port of openigtlink: sends the same data to all clients and receives their messages.
 
 No client delays another or the node: a slow client misses rounds, and a client that has stopped
 reading is disconnected.
@@ -11,6 +11,7 @@ import socket
 import time
 from collections.abc import Callable
 
+from needle_bags.link.client_messages import ClientMessage, MessageStream
 from needle_bags.link.openigtlink import Listeners, OpenIGTLinkParameters
 from needle_core.component import Batch, Log
 from needle_core.errors import UserError
@@ -18,13 +19,14 @@ from needle_core.errors import UserError
 MAX_CLIENTS = 8
 STALL_TIMEOUT = 5.0
 """Time after which a client that does not read is disconnected [s]."""
-_MAX_DISCARDED = 65536
-"""Bytes that are read from a client and discarded at a time."""
+_MAX_READ = 65536
+"""Bytes that are read from a client at a time."""
 
 
 @dataclasses.dataclass
 class _Client:
     connection: socket.socket
+    input: MessageStream = dataclasses.field(default_factory=MessageStream)
     unsent: bytes = b""
     since: float = 0.0
 
@@ -65,18 +67,32 @@ class LinkServer:
         """Number of connected clients."""
         return len(self._clients)
 
-    def poll(self, now: float) -> None:
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Problem of each client whose input is no OpenIGTLink and therefore ignored."""
+        return tuple(client.input.problem for client in self._clients if client.input.problem)
+
+    def poll(self, now: float) -> list[ClientMessage]:
         """Accept clients, read and send, and disconnect clients that are gone or stalled.
 
         Parameters
         ----------
         now : float
             Steady time [s].
+
+        Returns
+        -------
+        list of ClientMessage
+            The received messages.
         """
         self._accept()
+        messages: list[ClientMessage] = []
         for client in tuple(self._clients):
-            if not (self._discard_input(client) and self._send_rest(client, now)):
+            data = self._read(client)
+            messages += client.input.split(data or b"")
+            if data is None or not self._send_rest(client, now):
                 self._disconnect(client)
+        return messages
 
     def send(self, data: bytes, now: float) -> None:
         """Send whole messages to all clients that have read the previous ones.
@@ -116,14 +132,14 @@ class LinkServer:
             self._clients.append(_Client(connection))
 
     @staticmethod
-    def _discard_input(client: _Client) -> bool:
-        """Discard received data; return whether the client is still connected."""
+    def _read(client: _Client) -> bytes | None:
+        """Return received data; None if the client is no longer connected."""
         try:
-            return bool(client.connection.recv(_MAX_DISCARDED))
+            return client.connection.recv(_MAX_READ) or None
         except BlockingIOError:
-            return True
+            return b""
         except OSError:
-            return False
+            return None
 
     @staticmethod
     def _send_rest(client: _Client, now: float) -> bool:
@@ -175,10 +191,12 @@ class LinkPort:
     def send(self, batch: tuple[bytes, ...]) -> None:
         """Send whole messages without blocking."""
         now = time.monotonic()
-        self.server.poll(now)
+        messages = self.server.poll(now)
         for data in batch:
             self.server.send(data, now)
-        self._arrive((Listeners(self.server.clients, self.server.turned_away),))
+        server = self.server
+        clients = Listeners(server.clients, server.turned_away, server.problems)
+        self._arrive((clients, *messages))
 
     def close(self) -> None:
         """Disconnect all clients."""

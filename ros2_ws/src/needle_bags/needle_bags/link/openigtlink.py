@@ -1,28 +1,35 @@
-"""openigtlink as a component: the needle as OpenIGTLink messages, in `rig` and in mm."""
+"""openigtlink as a component: needle out, targets in, as OpenIGTLink messages in mm in `rig`."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+import struct
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from needle_bags.link.client_messages import ClientMessage
 from needle_bags.live.live_needle import LiveNeedle
-from needle_bags.live.needle_inputs import needle_inputs
+from needle_bags.live.needle_inputs import PROPOSALS, needle_inputs, proposed_target
+from needle_core import messages as m
 from needle_core.component import Actions, Component, Diagnose, Log, Moment, Port, Send, Timer
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 
 LINK = "link"
 """Name of the port."""
 TIP, ESTIMATE, PLANE = "NeedleTipToRig", "NeedleEstimateToRig", "TargetPlaneToRig"
 SHAFT, TARGET, STATUS = "NeedleShaft", "NeedleTarget", "NeedleStatus"
+SHAPE = "NeedleShape"
 _MM = 1e3
 # A viewer draws a line through the points of the shaft.
 _MAX_POINTS = 25
+# A planner's entry farther from the rig's means that the registration is wrong [m].
+_ENTRY_TOLERANCE = 2e-3
 
 Array = NDArray[np.float64]
 
@@ -44,14 +51,15 @@ class OpenIGTLinkParameters:
 
 @dataclasses.dataclass(frozen=True)
 class Listeners:
-    """Number of connected clients, and of clients turned away so far."""
+    """Number of connected clients, and of clients turned away so far; problems of their input."""
 
     count: int
     turned_away: int
+    problems: tuple[str, ...] = ()
 
 
 class OpenIGTLink(Component):
-    """Sends a `LiveNeedle` to the clients of a port.
+    """Sends a `LiveNeedle` to the clients of a port, and proposes their targets.
 
     Parameters
     ----------
@@ -67,19 +75,48 @@ class OpenIGTLink(Component):
         self._needle = LiveNeedle()
         self._listeners = 0
         self.inputs = needle_inputs(self._needle)
+        self.outputs = (PROPOSALS,)
         self.ports = (Port(LINK, self._on_link),)
         self.timers = (Timer(1.0 / settings.rate, self._send),)
 
-    def _on_link(self, events: Sequence[Log | Listeners], at: Moment) -> Actions:
+    def _on_link(self, events: Sequence[Log | Listeners | ClientMessage], at: Moment) -> Actions:
         for event in events:
             match event:
                 case Log():
                     yield event
-                case Listeners(count, turned_away):
+                case Listeners(count, turned_away, problems):
                     self._listeners = count
                     keys = {"listeners": str(count), "turned away": str(turned_away)}
                     line = f"{count} listening" if count else "nobody listens"
-                    yield Diagnose("listeners", Diagnostic(Level.OK, line, keys))
+                    line = ", ignoring ".join((line, *problems))
+                    health = Diagnostic(Level.WARN if problems else Level.OK, line, keys)
+                    yield Diagnose("listeners", health)
+                case ClientMessage(kind="POINT"):
+                    yield from self._on_points(event, at)
+
+    def _on_points(self, message: ClientMessage, at: Moment) -> Actions:
+        """Propose the point named target*, and check the one named entry*, of a message.
+
+        The name of the message counts for points that are named otherwise.
+        """
+        level, line = Level.OK, "ok"
+        try:
+            places: dict[str, m.Vector3] = {}
+            for name, position in message.points():
+                role = _role(name) or _role(message.name)
+                if role in places:
+                    raise UserError(f"several points named {role}")
+                if role:
+                    places[role] = position
+            distance = math.hypot(*places.get("entry", (0.0,)))
+            if not distance <= _ENTRY_TOLERANCE:
+                raise UserError(f"the entry is {1e3 * distance:.1f} mm from that of the rig")
+            if "target" in places:
+                yield proposed_target(places["target"], at.stamp_ns)
+        except (UserError, struct.error) as error:
+            level, line = Level.WARN, f"{message.name}: {error}"
+            yield Log("warning", line, "plan")
+        yield Diagnose("plan", Diagnostic(level, line))
 
     def _send(self, at: Moment) -> Actions:
         # Without clients the empty message lets the port accept new ones.
@@ -100,24 +137,34 @@ def packed(needle: LiveNeedle, now: float) -> bytes:
     import pyigtl.messages as igtl  # noqa: PLC0415
 
     messages: list[Any] = [igtl.StringMessage(_status(needle), now, STATUS)]
-    tip, plane, estimate = needle.tip, needle.plane, needle.estimate
+    tip, plane, estimate, shape = needle.tip, needle.plane, needle.estimate, needle.shape
     if tip is not None and needle.tip_found:
-        rotation = Rotation.from_quat(tip.quaternion).as_matrix()
-        transform = _matrix(rotation, tip.position)
-        messages.append(igtl.TransformMessage(transform, tip.stamp_ns * 1e-9, TIP))
+        messages.append(igtl.TransformMessage(_in_mm(tip.pose), tip.stamp_ns * 1e-9, TIP))
     if estimate is not None:
-        transform = _matrix(estimate.rotation, estimate.position)
-        messages.append(igtl.TransformMessage(transform, now, ESTIMATE))
+        messages.append(igtl.TransformMessage(_in_mm(estimate.pose), now, ESTIMATE))
     if plane is not None:
-        transform = _matrix(plane.T_rig_plane[:3, :3], plane.T_rig_plane[:3, 3])
-        messages.append(igtl.TransformMessage(transform, now, PLANE))
+        messages.append(igtl.TransformMessage(_in_mm(plane.T_rig_plane), now, PLANE))
     points = {SHAFT: needle.shaft if needle.tip_found else None, TARGET: needle.target_point}
     for name, positions in points.items():
         if positions is not None:
             at = _thinned(np.atleast_2d(positions)) * _MM
             names = [f"{name}_{number}" for number in range(len(at))]
             messages.append(igtl.PointMessage(at, names, timestamp=now, device_name=name))
+    if shape is not None:
+        stamp_ns, poses = shape
+        line = np.array([len(poses), *range(len(poses))])
+        at = poses[:, :3, 3] * _MM
+        messages.append(
+            igtl.PolyDataMessage(
+                points=at, lines=line, timestamp=stamp_ns * 1e-9, device_name=SHAPE
+            )
+        )
     return b"".join(message.pack() for message in messages)
+
+
+def _role(name: str) -> str:
+    """Return target or entry if a name begins with it, else an empty text."""
+    return next((role for role in ("target", "entry") if name.casefold().startswith(role)), "")
 
 
 def _status(needle: LiveNeedle) -> str:
@@ -126,10 +173,10 @@ def _status(needle: LiveNeedle) -> str:
     return "tip found" if needle.tip_found else "no tip found"
 
 
-def _matrix(rotation: Array, position: Array) -> Array:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, position * _MM
-    return matrix
+def _in_mm(pose: Array) -> Array:
+    pose = pose.copy()
+    pose[:3, 3] *= _MM
+    return pose
 
 
 def _thinned(points: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -11,7 +12,6 @@ from needle_bags.live.live_needle import LiveNeedle, MeasuredTip
 from needle_controller.model.target_plane import RIG
 from needle_core import messages as m
 from needle_core.messages import quaternion_from_rotation
-from needle_tracker.optics.refraction import RefractedCamera
 
 Array = NDArray[np.float64]
 
@@ -94,25 +94,32 @@ def to_markers(needle: LiveNeedle, stamp_ns: int) -> m.Markers:
 
 
 def to_transforms(needle: LiveNeedle, stamp_ns: int) -> m.Transforms | None:
-    """Return the poses of target plane and measured tip in `rig`; None if both are unknown."""
+    """Return the poses of plane, measured tip and the URDF's moved links; None without any."""
     found = []
     if needle.plane is not None:
-        found.append(_transform(needle.plane.T_rig_plane, TARGET_FRAME, stamp_ns))
+        found.append(_transform(needle.plane.T_rig_plane, RIG, TARGET_FRAME, stamp_ns))
     if needle.tip is not None:
         tip = to_tip(needle.tip)
         found.append(m.Transform(tip.stamp_ns, RIG, TIP_FRAME, tip.position, tip.orientation))
+    at = dict(zip(needle.joints.names, needle.joints.positions, strict=False))
+    insertion, half = at.get(m.INSERTION_JOINT, math.nan), 0.5 * at.get(m.ROTATION_JOINT, math.nan)
+    if math.isfinite(insertion + half):
+        turn = (0.0, 0.0, math.sin(half), math.cos(half))
+        stamp_ns = needle.joints.stamp_ns
+        found.append(m.Transform(stamp_ns, "stage", "carriage", (0.0, 0.0, insertion), _UPRIGHT))
+        found.append(m.Transform(stamp_ns, "carriage", "shaft", _ORIGIN, turn))
     return m.Transforms(tuple(found)) if found else None
 
 
-def camera_transforms(cameras: Mapping[str, RefractedCamera], stamp_ns: int) -> m.Transforms:
-    """Return the poses of the cameras, by side, in `rig`."""
-    poses = {side: np.linalg.inv(view.camera.T_optical_rig) for side, view in cameras.items()}
-    return m.Transforms(
-        tuple(
-            _transform(np.asarray(pose), camera_frame(side), stamp_ns)
-            for side, pose in poses.items()
-        )
-    )
+def fixed_transforms(bodies: Mapping[str, Array], stamp_ns: int) -> m.Transforms:
+    """Return the poses of the URDF's fixed links, from those of the cameras' bodies by side."""
+    links = ("phantom", "stage")
+    found = [m.Transform(stamp_ns, RIG, link, _ORIGIN, _UPRIGHT) for link in links]
+    for side, pose in bodies.items():
+        found.append(_transform(pose, RIG, f"{side}_camera", stamp_ns))
+        optical = (f"{side}_camera", camera_frame(side), _ORIGIN, (-0.5, 0.5, -0.5, 0.5))
+        found.append(m.Transform(stamp_ns, *optical))
+    return m.Transforms(tuple(found))
 
 
 def camera_frame(side: str) -> str:
@@ -120,9 +127,9 @@ def camera_frame(side: str) -> str:
     return f"{side}_camera_optical"
 
 
-def _transform(matrix: Array, child: str, stamp_ns: int) -> m.Transform:
+def _transform(matrix: Array, parent: str, child: str, stamp_ns: int) -> m.Transform:
     turn = quaternion_from_rotation(matrix[:3, :3].tolist())
-    return m.Transform(stamp_ns, RIG, child, _xyz(matrix[:3, 3]), turn)
+    return m.Transform(stamp_ns, parent, child, _xyz(matrix[:3, 3]), turn)
 
 
 def _xyz(values: Array) -> m.Vector3:

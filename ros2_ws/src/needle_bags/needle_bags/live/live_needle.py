@@ -9,11 +9,17 @@ from numpy.typing import NDArray
 
 from needle_bags.run.shaft_trail import ShaftTrail
 from needle_controller.model.target_plane import TargetPlane, offset_plane
+from needle_core import messages as m
+from needle_tracker.optics.calibration import rotation_matrix
 
 Array = NDArray[np.float64]
 
 # A requested plane is in force if its offset agrees within this [m].
 _SAME_OFFSET = 1e-6
+# Estimates that end by more than this before the measured tips are outdated [m].
+_OUTDATED = 5e-3
+# A needle withdrawn by more than this has left the place of its last estimate [m].
+_WITHDRAWN = 5e-4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +43,12 @@ class MeasuredTip:
     quaternion: Array
     covariance: Array
 
+    @property
+    def pose(self) -> Array:
+        """Pose in `rig`, shape (4, 4)."""
+        unit = self.quaternion / np.linalg.norm(self.quaternion)
+        return _pose(rotation_matrix(unit), self.position)
+
 
 @dataclasses.dataclass(frozen=True)
 class TipEstimate:
@@ -50,11 +62,19 @@ class TipEstimate:
         Axes of the tip's frame as columns; the third is the heading.
     covariance : ndarray, shape (3, 3)
         Of the position [m^2].
+    stamp_ns : int
+        Time of exposure of the tip behind it [ns].
     """
 
     position: Array
     rotation: Array
     covariance: Array
+    stamp_ns: int = 0
+
+    @property
+    def pose(self) -> Array:
+        """Pose of the tip's frame, shape (4, 4)."""
+        return _pose(self.rotation, self.position)
 
 
 class LiveNeedle:
@@ -70,6 +90,8 @@ class LiveNeedle:
         Whether that answer had a tip.
     target_point : ndarray, shape (3,), or None
         The target point, in `rig` [m].
+    joints : JointState
+        Last positions of the joints; none before the first.
     """
 
     def __init__(self) -> None:
@@ -77,11 +99,13 @@ class LiveNeedle:
         self.answered_ns: int | None = None
         self.tip_found = False
         self.target_point: Array | None = None
+        self.joints = m.JointState(0, (), ())
         self._estimate: TipEstimate | None = None
         self._requested_plane: TargetPlane | None = None
         self._offset: float | None = None
         self._insertion = 0.0
-        self._trail = ShaftTrail()
+        self._trail, self._estimates = ShaftTrail(np.eye(4)), ShaftTrail(np.eye(4))
+        self._estimated_at = 0.0
 
     def set_insertion(self, insertion: float) -> None:
         """Set the insertion depth [m]."""
@@ -90,7 +114,7 @@ class LiveNeedle:
     def add_tip(self, tip: MeasuredTip) -> None:
         """Add a measured tip."""
         self.tip, self.answered_ns, self.tip_found = tip, tip.stamp_ns, True
-        self._trail.add(self._insertion, tip.position)
+        self._trail.add(self._insertion, tip.pose)
 
     def add_missing_tip(self, stamp_ns: int) -> None:
         """Note that an exposure [ns] showed no tip."""
@@ -98,7 +122,9 @@ class LiveNeedle:
 
     def set_estimate(self, estimate: TipEstimate) -> None:
         """Set the controller's estimate, in `target_plane`."""
-        self._estimate = estimate
+        self._estimate, self._estimated_at = estimate, self._insertion
+        if self.estimate is not None:
+            self._estimates.add(self._insertion, self.estimate.pose)
 
     def request_plane(self, plane: TargetPlane) -> None:
         """Note a requested target plane; the controller may reject it."""
@@ -129,16 +155,39 @@ class LiveNeedle:
             position=rotation @ estimate.position + origin,
             rotation=rotation @ estimate.rotation,
             covariance=rotation @ estimate.covariance @ rotation.T,
+            stamp_ns=estimate.stamp_ns,
         )
 
     @property
     def path(self) -> Array:
         """Path of the tip in `rig` [m], shape (n, 3)."""
-        return self._trail.path
+        return self._trail.path[:, :3, 3]
 
     @property
     def shaft(self) -> Array | None:
         """Shaft in `rig`, from the entry to the tip [m], shape (n, 3); None without a tip."""
         if self.tip is None:
             return None
-        return self._trail.shaft(self._insertion, self.tip.position)
+        return self._trail.shaft(self._insertion, self.tip.pose)[:, :3, 3]
+
+    @property
+    def shape(self) -> tuple[int, Array] | None:
+        """Stamp [ns] and poses along the shaft in `rig`, from the entry to the tip, or None.
+
+        Shape (n, 4, 4); z is the tangent. The shaft follows the estimated tips, or the measured
+        ones if there is no estimate; while the needle is withdrawn, its end is measured.
+        """
+        estimate, trail = self.estimate, self._trail
+        if estimate is not None and self._estimates.depth >= trail.depth - _OUTDATED:
+            trail = self._estimates
+            if self._insertion >= self._estimated_at - _WITHDRAWN:
+                return estimate.stamp_ns, trail.shaft(self._insertion, estimate.pose)
+        if self.tip is None or not self.tip_found:
+            return None
+        return self.tip.stamp_ns, trail.shaft(self._insertion, self.tip.pose)
+
+
+def _pose(rotation: Array, position: Array) -> Array:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, position
+    return pose

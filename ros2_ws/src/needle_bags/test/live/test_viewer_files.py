@@ -16,14 +16,16 @@ from needle_core.convert import ros_type
 
 ROOT = Path(__file__).parents[5]
 CONFIG = ROOT / "ros2_ws/src/needle_bags/config"
-VIEW = LiveView(LiveViewParameters(), transforms=False)
+VIEW = LiveView(LiveViewParameters(foxglove_port=1), transforms=False)
 OUTPUTS = {f"/{row.topic}": ros_type(row.message) for row in VIEW.outputs}
+CHANNELS = {f"/{row.topic.lstrip('/')}": ros_type(row.message) for row in VIEW.channels}
 PICTURE = "sensor_msgs/msg/CompressedImage"
 RVIZ = {
     "MarkerArray": "visualization_msgs/msg/MarkerArray",
     "Path": "nav_msgs/msg/Path",
     "Pose": "geometry_msgs/msg/PoseStamped",
     "Image": PICTURE,
+    "RobotModel": "std_msgs/msg/String",
 }
 
 
@@ -34,23 +36,22 @@ def published() -> dict[str, str]:
     recorded = [one["topic_metadata"] for one in topics]
     # Every node publishes its health; the committed bag leaves it out.
     health = {"/diagnostics": ros_type(m.Diagnostics)}
-    return {one["name"]: one["type"] for one in recorded} | OUTPUTS | health
+    obstacles = {"/obstacles": ros_type(m.Markers)}
+    return {one["name"]: one["type"] for one in recorded} | OUTPUTS | health | obstacles
 
 
 def test_the_rviz_configuration_and_the_help_have_the_published_topics() -> None:
     document = yaml.safe_load((CONFIG / "live_view.rviz").read_text("utf-8"))
     manager, there = document["Visualization Manager"], published()
-    kinds = {one["Class"].partition("/")[2]: one for one in manager["Displays"]}
-    assert {name for name, one in kinds.items() if "Topic" not in one} == {"Grid", "TF"}
-    shown = {
-        display["Topic"]["Value"]: RVIZ[display["Class"].partition("/")[2]]
-        for display in manager["Displays"]
-        if "Topic" in display
-    }
+    displays = [(one["Class"].partition("/")[2], one) for one in manager["Displays"]]
+    topics = [(kind, one.get("Topic", one.get("Description Topic"))) for kind, one in displays]
+    assert {kind for kind, topic in topics if topic is None} == {"Grid", "TF"}
+    shown = {topic["Value"]: RVIZ[kind] for kind, topic in topics if topic is not None}
     assert {topic: there.get(topic) for topic in shown} == shown
     assert shown.keys() == OUTPUTS.keys()
     assert manager["Global Options"]["Fixed Frame"] == "rig"
-    assert all(topic.replace("/live_view", "~") in executable.HELP for topic in OUTPUTS)
+    names = (topic.replace("/live_view", "~").replace("/robot", "robot") for topic in OUTPUTS)
+    assert all(name in executable.HELP for name in names)
 
 
 def test_the_foxglove_layout_has_the_published_topics() -> None:
@@ -78,6 +79,8 @@ def test_the_foxglove_layout_has_the_published_topics() -> None:
         assert all(there[topic] in kinds for topic, kinds in wanted.items())
         shown |= wanted.keys()
     assert OUTPUTS.keys() <= shown
+    # Foxglove shows all of it over the port as well.
+    assert {topic: there[topic] for topic in shown} == {topic: CHANNELS[topic] for topic in shown}
 
     def panels(part: Any) -> list[str]:
         return [part] if isinstance(part, str) else panels(part["first"]) + panels(part["second"])

@@ -15,7 +15,9 @@ import yaml
 
 from needle_bringup.simulation.simulate_options import CIA402, SimulateOptions, command_of
 from needle_core.errors import UserError
+from needle_core.settings.parameter_fields import specs
 from needle_core.settings.parameter_files import Parameters
+from needle_device_driver.supervisor.limits import SafetyLimits
 
 # Node -> its package, in the order of starting.
 PACKAGES = {
@@ -101,12 +103,20 @@ _WIDTHS = {
     "sim_rig": "needle_diameter",
     "stereo_tracker": "needle_width",
     "plane_controller": "needle_diameter",
+    "live_view": "needle_diameter",
 }
+_MOVING = ("device_driver", "live_view")
 _FILES = {"sim_rig": "calibration_file", "stereo_tracker": "calibration_file"}
+_JOINT_LIMITS = ("max_depth", "max_speed", "max_turns", "max_rotation_rate")
 SHARED = (
     Shared("curvature", "--curvature", CURVATURE, "1/m", _CURVATURES),
     Shared("diameter", "--diameter-mm", DIAMETER, "m", _WIDTHS),
     Shared("calibration", "--params", "", "", _FILES),
+    *(
+        Shared(name, "--params", default, spec.unit, dict.fromkeys(_MOVING, name))
+        for name, spec, default in specs(SafetyLimits)
+        if name in _JOINT_LIMITS
+    ),
 )
 
 

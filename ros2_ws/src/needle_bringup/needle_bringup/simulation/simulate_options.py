@@ -215,8 +215,7 @@ def _parser() -> CommandParser:
     add(
         "--drives",
         metavar="NAME[,NAME]",
-        help="level drive: drives of both axes, or of insertion and rotation, such as "
-        f"galil,cia402; known are cia402, galil, zaber and stepdir (default: {CIA402})",
+        help="drives of both axes, or of insertion and rotation: cia402, galil, zaber, stepdir",
     )
     add(
         "--controller",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from nicegui import events, ui
 
 from needle_console.hold.page_session import OWNER
@@ -38,6 +39,7 @@ class Controls:
         # A page may only watch until its hold is connected.
         self._bar = "no hold: not connected"
         self._buttons: dict[Button, Any] = {}
+        self._proposal = np.zeros(3)  # as shown [mm]
         with ui.element("section").classes("controls").props('aria-label="Controls"'):
             with ui.element("div").classes("advice").props('role="status" aria-live="polite"'):
                 self._headline = ui.label().classes("headline")
@@ -59,6 +61,10 @@ class Controls:
         self._headline.set_text(advice.headline)
         self._text.set_text(advice.text)
         self._answer.set_text(snapshot.answer)
+        if snapshot.proposed_point is not None:
+            x, y, z = self._proposal = 1e3 * np.array(snapshot.proposed_point)
+            self._propose.set_text(f"Set proposed point ({x:.1f}, {y:.1f}, {z:.1f}) mm")
+        self._propose.set_visibility(snapshot.proposed_point is not None)
         possible = usable_buttons(snapshot)
         device = snapshot.device
         must_release = device is not None and device.press_again == OWNER
@@ -112,12 +118,15 @@ class Controls:
                 "Set point",
                 lambda: self._port.send_point(target_point(_typed(x), _typed(y), _typed(z))),
             )
+        self._propose = self._add_target(
+            "", lambda: self._port.send_point(target_point(*self._proposal))
+        )
 
     def _add_button(self, button: Button) -> None:
         element = ui.button(button.value, color=None, on_click=lambda: self._press(button))
         self._buttons[button] = element.props("no-caps unelevated")
 
-    def _add_target(self, name: str, send: Callable[[], None]) -> None:
+    def _add_target(self, name: str, send: Callable[[], None]) -> ui.button:
         def set_target() -> None:
             if self._bar:
                 ui.notify(self._bar)
@@ -127,7 +136,8 @@ class Controls:
             except UserError as error:
                 ui.notify(str(error))
 
-        ui.button(name, color=None, on_click=set_target).props("no-caps unelevated")
+        button = ui.button(name, color=None, on_click=set_target)
+        return button.props("no-caps unelevated")
 
     def _press(self, button: Button) -> None:
         if not self._bar:

@@ -15,7 +15,8 @@ console: serves a web page with the state of the rig and a hold button to steer 
 
 Publishes   device/hold (always; pressed only while the button is held), target_plane, target_point
 Subscribes  device/status, needle/controller_status, joint_states, needle/tip_pose, needle/estimate,
-            target_plane, /diagnostics; stereo/{left,right}/image_raw (while a page is open)
+            target_plane, needle/proposed_target, /diagnostics; stereo/{left,right}/image_raw (while
+            a page is open)
 Calls       device/{confirm_needle_out,home,enable,stop,retract,reset},
             plane_controller/{start,stop}
 """

@@ -9,6 +9,7 @@ import numpy as np
 
 from needle_console.view.snapshot import Array, MeasuredTip, Snapshot, TrackPoint, stop_reason
 from needle_core.diagnostics import sanitize
+from needle_core.messages import Vector3
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 # Estimates that are closer together are merged [m].
@@ -139,6 +140,10 @@ class RigPicture:
         if state is not None:
             plane = self._plane(state.target_offset_m)
             self._latest = dataclasses.replace(self._latest, T_rig_plane=plane)
+
+    def set_proposal(self, point: Vector3 | None) -> None:
+        """Set the target point that a planner proposes, in `rig` [m]; None: withdrawn."""
+        self._update(proposed_point=point)
 
     def set_health(self, name: str, *, bad: bool, message: str, now: float) -> None:
         """Set one status of /diagnostics: `node: part`, whether it is a warning, and its text."""

@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_core.messages import Vector3
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 Array: TypeAlias = NDArray[np.float64]
@@ -80,6 +81,8 @@ class Snapshot:
         Warnings of nodes in /diagnostics.
     answer : str
         Answer of the last service call.
+    proposed_point : tuple of float, or None
+        Target point that a planner proposes, in `rig` [m].
     """
 
     device: DeviceStatus | None = None
@@ -92,6 +95,7 @@ class Snapshot:
     track: tuple[TrackPoint, ...] = ()
     warnings: tuple[str, ...] = ()
     answer: str = ""
+    proposed_point: Vector3 | None = None
 
     @property
     def shaft(self) -> Array:

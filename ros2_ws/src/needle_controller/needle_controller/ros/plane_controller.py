@@ -13,10 +13,11 @@ plane_controller: steers the needle into the target plane or to the target point
 step, or one new path if it inserts continuously, per measured tip.
 
 Subscribes  needle/tip, needle/tip_pose (its covariance), target_plane, target_point, obstacles,
-            joint_states, device/result, device/status
+            needle/proposed_target, joint_states, device/result, device/status
 Publishes   device/joint_trajectory, needle/estimate, needle/reduced_state, needle/linearized_state,
-            needle/control_input, needle/controller_status, /diagnostics
-Services    ~/start, ~/stop
+            needle/control_input, needle/controller_status, target_point (a proposal that was
+            accepted), /diagnostics
+Services    ~/start, ~/stop, ~/accept_target
 """
 
 

@@ -245,8 +245,10 @@ class VirtualRunner:
             process.latched[topic] = message
         routes = process.routes.get(topic)
         if routes is None:
+            # As in ROS, a component receives its own messages.
+            receivers = (process, *process.known)
             routes = process.routes[topic] = [
-                route for other in process.known for route in _routes(process, topic, other)
+                route for other in receivers for route in _routes(process, topic, other)
             ]
         for route in routes:
             self._send(route, message)

@@ -15,7 +15,7 @@ from needle_core.files.yaml_files import read_yaml
 NODES = (
     *("recorder", "sim_rig", "drive_emulator", "device_driver", "stereo_camera", "stereo_tracker"),
     *("plane_controller", "operator", "simulated_operator", "live_view", "openigtlink", "player"),
-    "console",
+    *("console", "tracked_tip", "peer_topics"),
 )
 """Names of the rig's nodes."""
 _SECTION = "ros__parameters"

@@ -72,6 +72,17 @@ def test_a_message_takes_its_time_and_says_when_it_was_sent() -> None:
     assert all(at.stamp_ns - at.sent_ns >= 400_000_000 for _, at in late.received)
 
 
+def test_a_component_receives_its_own_messages() -> None:
+    class Echo(Sender, Receiver):
+        def __init__(self) -> None:
+            Receiver.__init__(self)
+            Sender.__init__(self, "echo")
+
+    echo = Echo()
+    run([echo])
+    assert echo.numbers == list(range(1, len(echo.numbers) + 1)) != []
+
+
 def test_messages_before_discovery_are_lost_unless_latched() -> None:
     plain, latched = Receiver(), Receiver()
     run([Sender(), plain], seed=3)

@@ -19,6 +19,7 @@ HAND = "hand"
 _OWN = {
     "cia402": "needle_device_driver.cia402.backend:BACKEND",
     "stepdir": "needle_device_driver.backends.stepdir:BACKEND",
+    "zaber": "needle_device_driver.backends.zaber:BACKEND",
     HAND: "needle_device_driver.cia402.backend:BACKEND",
     "galil": "needle_device_driver.backends.galil:BACKEND",
 }

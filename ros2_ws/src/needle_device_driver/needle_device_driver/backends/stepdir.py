@@ -21,8 +21,7 @@ from needle_device_driver.procedure import Procedure, Wait
 # Number of each axis on the board, and fields of an axis in the state.
 _AXES = {"insertion": 0, "rotation": 1}
 _ON, _MOVING, _OUTER, _INNER, _SET_UP = 1, 2, 4, 8, 16
-_DEAD_MAN = 1
-_FAULTS = {2: "missed a line of the computer, or received one of another program"}
+_DEAD_MAN, _LINE_LOST = 1, 2
 _LINE = re.compile(r"\$((\d+),([A-Z])(.*))\*([0-9A-F]{2})\n")
 _VERSION = "1"
 
@@ -160,9 +159,10 @@ def _reply(fault: int, position: int, flags: int) -> DriveReply:
         powered=bool(flags & _ON),
         home_switch=bool(flags & _OUTER),
         inner_switch=bool(flags & _INNER),
-        fault="" if fault in (0, _DEAD_MAN) else _FAULTS.get(fault, f"reports fault {fault}"),
+        fault="" if fault in (0, _DEAD_MAN, _LINE_LOST) else f"reports fault {fault}",
         timed_out=fault == _DEAD_MAN,
         rebooted=not flags & _SET_UP,
+        conflict=fault == _LINE_LOST,
     )
 
 

@@ -37,6 +37,8 @@ class DriveReply:
         Whether its watchdog has stopped it.
     rebooted : bool
         Whether it has lost its set-up.
+    conflict : bool
+        Whether it stopped because an order was lost or came from another program.
     """
 
     position: int
@@ -47,6 +49,7 @@ class DriveReply:
     fault: str = ""
     timed_out: bool = False
     rebooted: bool = False
+    conflict: bool = False
 
 
 class DriveProtocol(abc.ABC):

@@ -27,6 +27,7 @@ _EDGE_SPEED = 0.1
 _SEARCH = 1.2
 # A stopped axis that is farther from its set-point is blocked [cycles at full speed].
 _BLOCKED = 1.5
+_CONFLICT = "the drive missed an order of this computer, or received one of another program"
 _OFF = DriveReply(0, moving=False, powered=False)
 
 
@@ -275,6 +276,7 @@ class PolledAxis(CyclicAxis):
             (Rule.LINK_LOSS, link.lost),
             (Rule.DRIVE_REBOOT, "the drive restarted; its home is lost" if at.rebooted else ""),
             (Rule.DRIVE_WATCHDOG, "the drive's watchdog stopped it" if at.timed_out else ""),
+            (Rule.ONE_MASTER, _CONFLICT if at.conflict else ""),
             (Rule.DRIVE_EMERGENCY, f"the drive {at.fault}" if at.fault else ""),
             (Rule.AXIS_SPEED, self._speed.problem),
         ):
@@ -374,11 +376,10 @@ class PolledAxis(CyclicAxis):
         self._was_off = off and not at.powered
         idle = self._ready and self._order_cycles > self._max_stop
         drift = abs(self._settings.position(at.position - self._target))
-        if idle and drift > self._settings.following_error:
+        if idle and (at.moving or drift > self._settings.following_error):
             self._set_problem(
                 Rule.ONE_MASTER,
-                f"moved {self._settings.text(drift)} without an order, limit "
-                f"{self._settings.text(self._settings.following_error)}",
+                f"moves without an order, {self._settings.text(drift)} from its set-point",
             )
 
     def _set_problem(self, rule: Rule, text: str) -> None:

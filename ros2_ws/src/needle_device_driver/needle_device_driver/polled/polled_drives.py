@@ -17,10 +17,9 @@ from needle_device_driver.ports.stream_port import StreamPort
 from needle_device_driver.procedure import Procedure, Wait
 
 _NUMBERS = 99
-# Largest number of requests without an answer: a slow line must not pile them up.
-_MAX_OUTSTANDING = 2
-# A request that is not answered within this number of cycles is lost.
-_LOST_AFTER = 4
+# A request that is not answered within this number of cycles is lost; until then no other follows,
+# so that a slow line does not pile them up, and one lost answer is not yet a silent drive.
+_LOST_AFTER = 3
 _REFRESH_TIMEOUT = 0.5
 _EMULATED = "Emulated"
 
@@ -47,8 +46,9 @@ class PolledDrives(Drives):
         protocol.on_status = self._on_status
         self._identity = ""
         self._number = 0
-        # Number of each request without an answer, and when it was sent [s].
-        self._outstanding: dict[int, float] = {}
+        # When the last request was sent [s], and whether its answer is missing.
+        self._requested_at = 0.0
+        self._is_waiting = False
 
     def receive(self, batch: Sequence[bytes]) -> None:
         """Receive bytes from the port."""
@@ -59,7 +59,7 @@ class PolledDrives(Drives):
         """Open the link and ask for the names of the drives; return the error."""
         try:
             self._link.open()
-            self._outstanding.clear()
+            self._is_waiting = False
             self._identity = yield from self._protocol.identify()
         except (DriveError, LinkError) as error:
             return str(error)
@@ -90,30 +90,29 @@ class PolledDrives(Drives):
         except LinkError:
             # The axes report the loss.
             return
-        yield Wait(lambda: bool(self._link.lost) or not self._outstanding, timeout)
-        self.unanswered += bool(self._outstanding)
+        yield Wait(lambda: bool(self._link.lost) or not self._is_waiting, timeout)
+        self.unanswered += self._is_waiting
 
     def _request(self) -> None:
-        old = self._link.now - _LOST_AFTER * PERIOD
-        self._outstanding = {n: sent for n, sent in self._outstanding.items() if sent > old}
-        if len(self._outstanding) < _MAX_OUTSTANDING:
+        now = self._link.now
+        if not self._is_waiting or now - self._requested_at > (_LOST_AFTER - 0.5) * PERIOD:
             self._number = self._number % _NUMBERS + 1
-            self._outstanding[self._number] = self._link.now
+            self._requested_at, self._is_waiting = now, True
             self._protocol.request(self._number)
         self._mark_answered()
 
     def _on_status(self, number: int, replies: Mapping[str, DriveReply]) -> None:
-        sent = self._outstanding.pop(number, None)
-        if sent is None:
+        if number != self._number or not self._is_waiting:
             # Answers a request from before the link was opened, or one that counts as lost.
             return
+        self._is_waiting = False
         for name, reply in replies.items():
-            self._axes[name].update(reply, sent)
+            self._axes[name].update(reply, self._requested_at)
         self._mark_answered()
 
     def _mark_answered(self) -> None:
         for axis in self._axes.values():
-            axis.answered = not self._outstanding
+            axis.answered = not self._is_waiting
 
     def _refresh(self) -> Procedure[None]:
         """Request the state of all drives, and wait for it.
@@ -125,12 +124,12 @@ class PolledDrives(Drives):
         LinkError
             If the link is lost.
         """
-        self._outstanding.clear()
+        self._is_waiting = False
         self._request()
-        yield Wait(lambda: bool(self._link.lost) or not self._outstanding, _REFRESH_TIMEOUT)
+        yield Wait(lambda: bool(self._link.lost) or not self._is_waiting, _REFRESH_TIMEOUT)
         if self._link.lost:
             raise LinkError(self._link.lost)
-        if self._outstanding:
+        if self._is_waiting:
             raise DriveError(f"{self._link.name}: no state in {_REFRESH_TIMEOUT:g} s")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 from typing import Protocol
 
@@ -46,6 +47,9 @@ class _Serial:
         self._serial = serial.Serial(
             path, baudrate, timeout=_READ_TIMEOUT, write_timeout=timeout, exclusive=True
         )
+        # Adapters with an FTDI chip otherwise collect answers for 16 ms.
+        with contextlib.suppress(OSError, ValueError):
+            self._serial.set_low_latency_mode(True)
 
     def read(self) -> bytes:
         return bytes(self._serial.read(max(1, min(self._serial.in_waiting, _MAX_CHUNK))))

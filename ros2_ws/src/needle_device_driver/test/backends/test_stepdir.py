@@ -104,15 +104,7 @@ def test_orders_and_a_request_have_these_bytes() -> None:
     [
         (b"1,5,17,0,17", DriveReply(5, moving=False, powered=True, timed_out=True)),
         (b"0,5,0,0,17", DriveReply(5, moving=False, powered=False, rebooted=True)),
-        (
-            b"2,5,17,0,17",
-            DriveReply(
-                5,
-                moving=False,
-                powered=True,
-                fault="missed a line of the computer, or received one of another program",
-            ),
-        ),
+        (b"2,5,17,0,17", DriveReply(5, moving=False, powered=True, conflict=True)),
         (b"9,5,16,0,0", DriveReply(5, moving=False, powered=False, fault="reports fault 9")),
     ],
 )

@@ -107,6 +107,8 @@ class StepdirDrives(TextDrives[StepdirDrive]):
     """
 
     port = "stepdir"
+    intruder = "$7,M,0,10000,1000*7A"
+    """Line of another computer: it moves the insertion axis."""
 
     def __init__(self, motors: Mapping[str, MotorSettings], now: float) -> None:
         self._expected = 0

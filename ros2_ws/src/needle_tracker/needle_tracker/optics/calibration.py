@@ -204,14 +204,23 @@ def _camera(content: Any, side: str, window: Window) -> Camera:
     if model != _DISTORTION_MODEL:
         raise UserError(f"{side}.distortion_model = {model!r}, expected {_DISTORTION_MODEL!r}")
     distortion = numbers(content, 5, side, "distortion_coefficients", "data")
-    translation = numbers(content, 3, side, "T_optical_rig", "translation")
-    quaternion = numbers(content, 4, side, "T_optical_rig", "rotation")
+    transform = transform_of(content, side, "T_optical_rig")
+    return Camera(width, height, matrix, distortion, transform, window)
+
+
+def transform_of(content: Any, *keys: str) -> NDArray[np.float64]:
+    """Return the transform, (4, 4), under a path of keys: `translation` [m] and `rotation`.
+
+    The rotation is a unit quaternion x, y, z, w; anything else raises a `UserError`.
+    """
+    translation = numbers(content, 3, *keys, "translation")
+    quaternion = numbers(content, 4, *keys, "rotation")
     norm = float(np.linalg.norm(quaternion))
-    check_bounds(f"norm of {side}.T_optical_rig.rotation", norm, 0.99, 1.01, "-")
+    check_bounds(f"norm of {'.'.join((*keys, 'rotation'))}", norm, 0.99, 1.01, "-")
     transform = np.eye(4)
     transform[:3, :3] = rotation_matrix(quaternion / norm)
     transform[:3, 3] = translation
-    return Camera(width, height, matrix, distortion, transform, window)
+    return transform
 
 
 def check_camera_matrix(name: str, matrix: NDArray[np.float64]) -> None:

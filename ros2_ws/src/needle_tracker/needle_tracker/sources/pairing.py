@@ -158,6 +158,11 @@ class InsertionHistory:
             self._first = stamp
         self._samples.append((stamp, insertion))
 
+    @property
+    def latest(self) -> int:
+        """Stamp of the last sample [ns]; 0 without any."""
+        return self._samples[-1][0] if self._samples else 0
+
     def time_before(self, stamp: int) -> int:
         """Return the time from `stamp` to the first sample ever [ns]; 0 if that was before."""
         return max(0, self._first - stamp) if self._samples else 0

@@ -55,7 +55,8 @@ class IdealProtocol(DriveProtocol):
         super().__init__(*arguments)
         self.drives = {axis: Drive() for axis in self.axes}
         self.limits: dict[str, tuple[int, int]] = {}
-        self.is_silent = False
+        self.is_silent = self.is_late = False
+        self._late: list[tuple[float, int, dict[str, DriveReply]]] = []
 
     def identify(self) -> Procedure[str]:
         yield from ()
@@ -90,6 +91,10 @@ class IdealProtocol(DriveProtocol):
         if not drive.deaf:
             drive.target = drive.position
 
+    def deliver_late_answers(self) -> None:
+        while self._late and self._late[0][0] <= self.link.now:
+            self.on_status(*self._late.pop(0)[1:])
+
     def request(self, number: int) -> None:
         if self.is_silent:
             return
@@ -105,7 +110,10 @@ class IdealProtocol(DriveProtocol):
                 fault=drive.fault,
                 rebooted=drive.rebooted,
             )
-        self.on_status(number, states)
+        if self.is_late:
+            self._late.append((self.link.now + 0.03, number, states))
+        else:
+            self.on_status(number, states)
 
     def on_line(self, line: str) -> None:
         """Do nothing: this protocol has no lines."""
@@ -142,6 +150,7 @@ class PolledBench(SupervisorBench):
 
     def exchange(self) -> None:
         self.link.now = self.now
+        self.protocol.deliver_late_answers()
         self.supervisor.drive(PERIOD, self.now)
         self.run(self.drives.exchange(0.0))
         self.supervisor.observe(self.now)

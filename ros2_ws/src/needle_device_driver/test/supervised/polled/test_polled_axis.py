@@ -54,6 +54,17 @@ def test_step_moves_both_axes_in_proportion_and_a_release_stops_them() -> None:
     assert bench.outcomes[-1] == "succeeded"
 
 
+def test_late_answers_slow_a_step_down() -> None:
+    bench = PolledBench().ready()
+    bench.protocol.is_late = True
+    bench.step()
+    bench.go(40)
+    assert bench.activity == "step"
+    bench.go(40)
+    assert bench.outcomes == ["succeeded"]
+    assert bench.drives.health("").message.endswith("cycles had no answer in time")
+
+
 def test_each_set_point_is_ordered_once() -> None:
     bench = PolledBench().ready()
     orders: list[int] = []

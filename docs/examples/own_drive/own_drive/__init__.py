@@ -1,0 +1,1 @@
+"""A made-up drive, Tick, and its emulator."""

@@ -1,0 +1,185 @@
+"""Emulated Zaber devices against byte transcripts of public code, and their faults."""
+
+from __future__ import annotations
+
+import pytest
+
+from needle_sim.drives.motor import MotorSettings
+from needle_sim.drives.zaber_drives import ZaberDrives
+
+SCALE = 1e6
+"""Counts per metre."""
+TRAVEL = 0.1
+# Data values of 20 mm/s and of 0.5 m/s^2.
+SPEED, RAMP = 32768, 82
+
+
+class Chain:
+    """A computer on a chain whose insertion device stands 1 mm from its home sensor."""
+
+    def __init__(self, **motor: float) -> None:
+        insertion = MotorSettings(
+            SCALE, 0.05 * SCALE, **{"start": 0.001 * SCALE, "travel": TRAVEL * SCALE, **motor}
+        )
+        motors = {"insertion": insertion, "rotation": MotorSettings(1000.0, 20_000.0)}
+        self.drives = ZaberDrives(motors, -1.0)
+        self.now = 0.0
+
+    def say(self, line: str, after: float = 0.0) -> str:
+        self.now += after
+        sent = f"/{line}\n".encode()
+        return b"".join(self.drives.receive((sent,), self.now)).decode()
+
+    def value(self, name: str, after: float = 0.0) -> float:
+        return float(self.say(f"1 1 get {name}", after).split()[-1])
+
+    def homed(self) -> Chain:
+        self.say("1 set maxspeed 32768")
+        self.say(f"1 set accel {RAMP}")
+        self.say("1 home")
+        self.now += 1.0
+        assert "WR" not in self.say("1 warnings")
+        return self
+
+    @property
+    def place(self) -> float:
+        return self.drives.axes(self.now)["insertion"].position
+
+
+def test_the_transcript_of_public_code() -> None:
+    chain = Chain()
+    for after, sent, expected in (
+        (0.0, "1 0", "@01 0 OK IDLE WR 0"),
+        (0.0, "01 warnings", "@01 0 OK IDLE WR 01 WR"),
+        (0.0, "01 home", "@01 0 OK BUSY WR 0"),
+        (1.0, "1 0", "@01 0 OK IDLE -- 0"),
+        (0.0, "01 warnings", "@01 0 OK IDLE -- 00"),
+        (0.0, "1 1 move abs 10000", "@01 1 OK BUSY -- 0"),
+        (0.1, "01 1 stop", "@01 1 OK BUSY -- 0"),
+        (1.0, "1 0 stop", "@01 0 OK IDLE -- 0"),
+        (0.0, "1 1 move abs 50000", "@01 1 OK BUSY -- 0"),
+        (0.1, "1 1 move abs 20000", "@01 1 OK BUSY NI 0"),
+        (0.1, "01 1 stop", "@01 1 OK BUSY NI 0"),
+        (1.0, "01 warnings", "@01 0 OK IDLE NI 01 NI"),
+        (0.0, "1 1 move abs 0", "@01 1 OK BUSY -- 0"),
+        (3.0, "1 0 get pos", "@01 0 OK IDLE -- 0"),
+        (0.0, "1 0 get limit.cycle.dist", "@01 0 RJ IDLE -- BADCOMMAND"),
+        (0.0, "1 1 move abs far", "@01 1 RJ IDLE -- BADDATA"),
+        (0.0, "1 2 get pos", "@01 2 RJ IDLE -- BADAXIS"),
+        (0.0, "1 0 12", "@01 0 12 OK IDLE -- 0"),
+        (0.0, "get system.serial", "@01 0 OK IDLE -- 0\r\n@02 0 OK IDLE WR 0"),
+        (0.0, "1 set comm.checksum 1", "@01 0 OK IDLE -- 0:8D"),
+        (0.0, "1 0 12:FC", "@01 0 12 OK IDLE -- 0:0A"),
+    ):
+        assert chain.say(sent, after) == f"{expected}\r\n", sent
+
+
+@pytest.mark.parametrize("line", ["1 0 12:FD", "3 get pos"])
+def test_a_wrong_checksum_and_another_address_have_no_answer(line: str) -> None:
+    assert Chain().say(line) == ""
+
+
+def test_speed_and_ramp_have_the_protocols_units() -> None:
+    chain = Chain().homed()
+    chain.say(f"1 1 move abs 50000 {SPEED // 2}")
+    assert chain.drives.axes(chain.now + 0.015)["insertion"].velocity == pytest.approx(
+        0.0075, abs=0.0006
+    )
+    chain.now += 1.0
+    assert chain.drives.axes(chain.now)["insertion"].velocity == pytest.approx(0.01, rel=1e-3)
+
+
+def test_without_a_reference_no_outward_motion_is_accepted() -> None:
+    chain = Chain()
+    assert chain.value("pos") == TRAVEL * SCALE
+    assert chain.say("1 1 move rel 1") == "@01 1 RJ IDLE WR BADDATA\r\n"
+    assert " OK BUSY WR" in chain.say("1 1 move rel -10")
+    chain.say("1 1 set pos 0", 0.1)
+    assert chain.say("1 1 move rel 1") == "@01 1 OK BUSY WH 0\r\n"
+
+
+def test_a_limit_sensor_ends_a_move() -> None:
+    chain = Chain().homed()
+    chain.say("1 set limit.min -9000")
+    chain.say("1 1 move abs -5000")
+    assert chain.say("1 1", 1.0) == "@01 1 OK IDLE WL 0\r\n"
+    assert chain.value("limit.home.state") == 1
+    assert chain.value("limit.away.state") == 0
+    assert abs(chain.place) < 1e-3
+    chain.say("1 1 move abs 5000")
+    assert chain.value("pos", 1.0) == 5000
+    assert chain.value("limit.home.state") == 0
+    assert "01 WL" in chain.say("1 warnings clear")
+    assert chain.say("1 warnings") == "@01 0 OK IDLE -- 00\r\n"
+
+
+def test_a_stall_is_measured_and_acknowledged() -> None:
+    chain = Chain().homed()
+    chain.say("1 1 move abs 50000")
+    chain.now += 0.5
+    blocked = chain.place
+    chain.drives.stall("insertion")
+    assert chain.say("1 1", 0.3) == "@01 1 OK IDLE FS 0\r\n"
+    assert chain.value("pos") == chain.value("encoder.pos") == round(chain.place * SCALE)
+    assert chain.place == pytest.approx(blocked)
+    chain.drives.restore(chain.now)
+    assert chain.say("1 1 move abs 0") == "@01 1 OK BUSY FS 0\r\n"
+    chain.say("1 warnings clear", 3.0)
+    assert chain.say("1 1 get pos") == "@01 1 OK IDLE -- 0\r\n"
+
+
+def test_a_device_without_encoder_does_not_notice_a_stall() -> None:
+    chain = Chain().homed()
+    chain.drives.drives["insertion"].has_encoder = False
+    chain.drives.stall("insertion")
+    chain.say("1 1 move abs 5000")
+    assert chain.value("pos", 1.0) == 5000
+    assert abs(chain.place) < 1e-3
+    assert "RJ" in chain.say("1 1 get encoder.pos")
+
+
+def test_a_loss_of_power_loses_the_reference_but_no_setting() -> None:
+    chain = Chain().homed()
+    chain.say("1 1 move abs 50000")
+    chain.now += 0.5
+    chain.drives.reboot("insertion", chain.now)
+    place = chain.place
+    assert chain.say("get pos", 0.1).startswith("@02 0")
+    assert chain.say("1 1 get maxspeed", 0.4) == "@01 1 OK IDLE WR 32768\r\n"
+    assert chain.place == place
+    assert chain.value("pos") == TRAVEL * SCALE
+    assert "WR" in chain.say("2 warnings")
+
+
+def test_the_knob_moves_the_axis_unless_it_is_disabled() -> None:
+    chain = Chain().homed()
+    knob = chain.drives.drives["insertion"].turn_knob
+    knob(5000.0)
+    assert chain.say("1 1", 0.5) == "@01 1 OK BUSY NC 0\r\n"
+    knob(0.0)
+    assert 0.002 < chain.place < 0.003
+    chain.say("1 set knob.enable 0", 0.5)
+    place = chain.place
+    knob(5000.0)
+    chain.now += 0.5
+    assert chain.place == place
+
+
+def test_a_disabled_driver_refuses_motion() -> None:
+    chain = Chain().homed()
+    chain.say("1 1 move abs 50000")
+    chain.drives.foreign("/1 1 driver disable")
+    assert chain.say("1 1 move abs 0", 0.2) == "@01 1 RJ IDLE FO DRIVERDISABLED\r\n"
+    place = chain.place
+    chain.say("1 1 driver enable", 0.5)
+    assert chain.say("1 1") == "@01 1 OK IDLE -- 0\r\n"
+    assert chain.place == place
+    chain.drives.fail("insertion", 0x3210)
+    assert chain.drives.states()["insertion"] == "FAULT 0x3210"
+    chain.say("1 1 driver enable")
+    assert chain.say("1 1 move abs 0") == "@01 1 RJ IDLE FV DRIVERDISABLED\r\n"
+
+
+def test_a_device_alone_keeps_its_address() -> None:
+    drives = ZaberDrives({"rotation": MotorSettings(1000.0, 20_000.0)}, -1.0)
+    assert drives.receive((b"/1 0\n/2 0\n",), 0.0) == [b"@02 0 OK IDLE WR 0\r\n"]

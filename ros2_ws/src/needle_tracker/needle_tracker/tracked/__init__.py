@@ -1,0 +1,1 @@
+"""Tip from an electromagnetic or optical tracker: registration, link and component."""
