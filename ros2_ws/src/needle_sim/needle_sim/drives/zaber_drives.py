@@ -189,6 +189,7 @@ class ZaberDrives(TextDrives[ZaberDrive]):
     """
 
     port = "zaber"
+    intruder = "/1 1 move vel 16384"
     one_processor = False
     # Line of another computer: it moves the insertion axis at 10000 counts/s.
     intruder = "/1 1 move rel 20000 16384"
