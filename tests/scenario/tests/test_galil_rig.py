@@ -4,30 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from needle_core.runners.virtual import VirtualRunner
-from needle_device_driver.device_driver import DeviceDriver
-from needle_device_driver.parameters import DeviceDriverParameters
-from needle_sim.drive_emulator import DriveEmulator, DriveEmulatorParameters
+from needle_device_driver.conformance.rig import ConformanceRig
 from needle_sim.drives.emulated_drives import AxisState
 
-from ..virtual_rig import VirtualRig, VirtualRigClient
 
-
-class GalilRig(VirtualRig):
+class GalilRig(ConformanceRig):
     def __init__(self, drives: str) -> None:
         insertion, rotation = (drives.split(",") * 2)[:2]
-        self.hand = VirtualRigClient(steers=True)
-        self.drives = DriveEmulator(DriveEmulatorParameters(drives=drives))
-        parameters = DeviceDriverParameters(
-            link="virtual", channel="can", insertion_drive=insertion, rotation_drive=rotation
-        )
-        self.runner = VirtualRunner([self.drives, DeviceDriver(parameters), self.hand], 1)
+        kinds = {"insertion_drive": insertion, "rotation_drive": rotation}
+        super().__init__(1, driver=kinds, drives={"drives": drives})
 
     @property
     def motors(self) -> dict[str, AxisState]:
-        axes: dict[str, AxisState] = {}
-        for drives in self.drives.connections.values():
-            axes |= drives.axes(self.runner.now)
+        axes: dict[str, AxisState] = self.drives.axes(self.runner.now)
         return axes
 
     def begin_step(self) -> tuple[int, float]:

@@ -6,37 +6,23 @@ from collections.abc import Callable
 
 import pytest
 
-from needle_core.runners.virtual import VirtualRunner
-from needle_device_driver.device_driver import DeviceDriver
-from needle_device_driver.parameters import DeviceDriverParameters
-from needle_sim.drive_emulator import DriveEmulator, DriveEmulatorParameters
+from needle_device_driver.conformance.rig import ConformanceRig
 from needle_sim.drives.zaber_drives import ZaberDrives
-from scenario.virtual_rig import VirtualRig, VirtualRigClient
 
 
-class ZaberRig(VirtualRig):
+class ZaberRig(ConformanceRig):
     """Both axes on Zaber devices, with the driver homed and the hold pressed."""
 
     def __init__(self, *, has_encoder: bool = True, late: float = 0.0) -> None:
-        self.hand = VirtualRigClient(steers=True)
-        self.drives = DriveEmulator(DriveEmulatorParameters(drives="zaber"))
+        kinds = {"insertion_drive": "zaber", "rotation_drive": "zaber"}
+        super().__init__(1, driver=kinds, drives={"drives": "zaber"})
         chain = self.drives.connections["zaber"]
         assert isinstance(chain, ZaberDrives)
         self.chain = chain
         for drive in chain.drives.values():
             drive.has_encoder = has_encoder
         chain.late, chain.partial = late, late > 0.0
-        kinds = {"insertion_drive": "zaber", "rotation_drive": "zaber"}
-        self.driver = DeviceDriver(DeviceDriverParameters(**kinds))
-        self.runner = VirtualRunner([self.drives, self.driver, self.hand], 1)
-        self.home()
-        self.press()
-
-    @property
-    def place(self) -> tuple[float, float]:
-        """True position of the motors [m], [rad]."""
-        axes = self.chain.axes(self.runner.now)
-        return axes["insertion"].position, axes["rotation"].position
+        self.ready()
 
 
 @pytest.mark.parametrize(("has_encoder", "late"), [(False, 0.0), (True, 0.015)])
