@@ -25,7 +25,7 @@ def test_pip_installs_the_executables_that_colcon_installs() -> None:
     of_pip = entry_points(group="console_scripts")
     found = {f"{one.name} = {one.value}" for one in of_pip if ".executables:" in one.value}
     assert found == {line for folder in FOLDERS for line in executables(folder)}
-    assert len(found) == 23
+    assert len(found) == 28
 
 
 def test_run_passes_arguments_and_exit_code(
