@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from needle_device_driver.conformance.rig import ConformanceRig
 from needle_sim.drives.emulated_drives import AxisState
 
-from ..virtual_rig import VirtualRig
 
-
-class GalilRig(VirtualRig):
+class GalilRig(ConformanceRig):
     def __init__(self, drives: str) -> None:
         insertion, rotation = (drives.split(",") * 2)[:2]
         kinds = {"insertion_drive": insertion, "rotation_drive": rotation}
@@ -17,9 +16,7 @@ class GalilRig(VirtualRig):
 
     @property
     def motors(self) -> dict[str, AxisState]:
-        axes: dict[str, AxisState] = {}
-        for drives in self.drives.connections.values():
-            axes |= drives.axes(self.runner.now)
+        axes: dict[str, AxisState] = self.drives.axes(self.runner.now)
         return axes
 
     def begin_step(self) -> tuple[int, float]:

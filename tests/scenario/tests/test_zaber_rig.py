@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
+from needle_device_driver.conformance.rig import ConformanceRig
 from needle_sim.drives.zaber_drives import ZaberDrives
-from scenario.virtual_rig import VirtualRig
 
 
-class ZaberRig(VirtualRig):
+class ZaberRig(ConformanceRig):
     """Both axes on Zaber devices, with the driver homed and the hold pressed."""
 
     def __init__(self, *, has_encoder: bool = True, late: float = 0.0) -> None:
@@ -22,8 +22,7 @@ class ZaberRig(VirtualRig):
         for drive in chain.drives.values():
             drive.has_encoder = has_encoder
         chain.late, chain.partial = late, late > 0.0
-        self.home()
-        self.press()
+        self.ready()
 
 
 @pytest.mark.parametrize(("has_encoder", "late"), [(False, 0.0), (True, 0.015)])

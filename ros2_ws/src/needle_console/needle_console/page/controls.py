@@ -118,9 +118,10 @@ class Controls:
                 "Set point",
                 lambda: self._port.send_point(target_point(_typed(x), _typed(y), _typed(z))),
             )
-        self._propose = self._add_target(
-            "", lambda: self._port.send_point(target_point(*self._proposal))
-        )
+        with ui.element("div").classes("targets"):
+            self._propose = self._add_target(
+                "", lambda: self._port.send_point(target_point(*self._proposal))
+            ).style("grid-column: 1 / -1")
 
     def _add_button(self, button: Button) -> None:
         element = ui.button(button.value, color=None, on_click=lambda: self._press(button))
