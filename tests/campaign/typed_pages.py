@@ -28,7 +28,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = (
     "docs/get_started.md", "README.md", "bags/README.md", "docs/hardware.md", "docs/calibration.md",
     "docs/own_controllers.md", "docs/own_drives.md", "docs/drive_galil.md", "docs/drive_zaber.md",
-    "docs/drive_stepdir.md", "docs/examples/README.md", "docs/own_rig.md", "docs/troubleshooting.md",
+    "docs/drive_stepdir.md", "docs/examples/README.md", "docs/own_rig.md",
+    "docs/troubleshooting.md",
 )  # fmt: skip
 COMMAND, PROGRAM, FILE = "command", "python", "file"
 FILES = ("yaml", "toml", "python")
