@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_bags.link.client_messages import MessageStream
 from needle_bags.link.link_port import LinkPort
 from needle_bags.link.openigtlink import OpenIGTLink, OpenIGTLinkParameters, packed
 from needle_bags.live.live_needle import LiveNeedle, MeasuredTip
 from needle_core import messages as m
 from needle_core.component import Moment, Publish, Send
+from needle_core.openigtlink import LinkStream
 from needle_core.status_messages import ControllerStatus
 
 LIMIT = 20.0
@@ -105,9 +105,7 @@ def test_the_shape_is_a_polydata_line_in_mm() -> None:
     needle = LiveNeedle()
     needle.set_insertion(0.04)
     needle.add_tip(MeasuredTip(1, np.array(TIP), TURN.as_quat(), np.eye(3)))
-    (message,) = (
-        one for one in MessageStream().split(packed(needle, 1.0)) if one.kind == "POLYDATA"
-    )
+    (message,) = (one for one in LinkStream().split(packed(needle, 1.0)) if one.kind == "POLYDATA")
     # As in http://openigtlink.org/protocols/v2_polydata.html.
     counts, data = struct.unpack(">10I", message.body[:40]), message.body[40:]
     assert counts == (2, 0, 0, 1, 12, 0, 0, 0, 0, 0)

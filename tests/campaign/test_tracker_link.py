@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from needle_core.component import PortChange
+from needle_core.openigtlink import LinkMessage, LinkStream
 from needle_tracker.tracked.transform_port import TransformPort
-from needle_tracker.tracked.transform_stream import TrackerTransform, TransformStream
 
 pyigtl = pytest.importorskip("pyigtl", reason="the lock is not installed: docs/viewers.md")
 LIMIT = 20.0
@@ -30,17 +30,16 @@ def opened(port: TransformPort) -> Iterator[list[Any]]:
         port.close()
 
 
-def transform_of(arrived: list[Any], sender: Any) -> TrackerTransform:
+def transform_of(arrived: list[Any], sender: Any) -> LinkMessage:
     """Let a pyigtl server or client send a transform until the port receives it."""
-    stream, deadline = TransformStream(), time.monotonic() + LIMIT
+    stream, deadline = LinkStream("TRANSFORM"), time.monotonic() + LIMIT
     pose, read = np.diag([1.0, -1.0, -1.0, 1.0]), 0
     while True:
         assert time.monotonic() < deadline
         sender.send_message(pyigtl.TransformMessage(pose, STAMP, "NeedleToTracker"), wait=False)
         time.sleep(0.01)
         for batch in arrived[read:]:
-            for found in stream.receive(batch[0]) if isinstance(batch, tuple) else ():
-                assert isinstance(found, TrackerTransform)
+            for found in stream.split(batch[0]) if isinstance(batch, tuple) else ():
                 return found
         read = len(arrived)
 
@@ -67,4 +66,4 @@ def test_server_side_receives_from_pyigtls_client() -> None:
         client = pyigtl.OpenIGTLinkClient(*port.address)
         found = transform_of(arrived, client)
         client.stop()
-    np.testing.assert_array_equal(found.matrix, np.diag([1.0, -1.0, -1.0, 1.0]))
+    np.testing.assert_array_equal(found.transform()[0], np.diag([1.0, -1.0, -1.0, 1.0]))

@@ -28,6 +28,7 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
+from needle_core.openigtlink import LinkStream
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.answers.tracker_messages import (
     ROLL_VARIANCE,
@@ -44,9 +45,9 @@ from needle_tracker.tracked.transform_checks import (
     Place,
     PlaceCheck,
     Rejection,
+    TrackerTransform,
     check_transform,
 )
-from needle_tracker.tracked.transform_stream import TrackerTransform, TransformStream
 
 TRACKER = "tracker"
 """Name of the port; also the part of the diagnostics."""
@@ -113,14 +114,14 @@ class TrackedTip(Component):
         lever = settings.heading_std * float(np.linalg.norm(registration.tip_offset))
         self._noise = math.hypot(registration.sensor_std, lever)
         self._place_check = PlaceCheck(self._noise)
-        self._insertions, self._stream = InsertionHistory(), TransformStream()
+        self._insertions, self._stream = InsertionHistory(), LinkStream("TRANSFORM")
         self._last: TrackerTransform | None = None
         self._received_at = -math.inf
         self._counts: Counter[str] = Counter()
         self._port_problem = self._second_source = self._other = ""
         rows = {
-            POSE: Input("tracker/pose", m.Pose, self._on_pose),
-            TRANSFORM: Input("tracker/transform", m.Transform, self._on_transform),
+            POSE: Input("tracker/pose", m.Pose, self._on_topic),
+            TRANSFORM: Input("tracker/transform", m.Transform, self._on_topic),
         }
         own = [row for source, row in rows.items() if source == settings.source]
         self.inputs = (Input("joint_states", m.JointState, self._on_joints, JOINT_STATES), *own)
@@ -134,9 +135,11 @@ class TrackedTip(Component):
         self._second_source = ", ".join(n for n in names if n != self.name.lstrip("/"))
         return ()
 
-    def measure(self, transform: TrackerTransform, now: float) -> SpatialTip | Rejection:
+    def _measure(self, transform: TrackerTransform, now: float) -> SpatialTip | Rejection:
         """Return the tip of a transform that arrives now [s since 1970], or the rejection."""
         registration, settings = self._registration, self.settings
+        if self._second_source:
+            return "two_sources", f"{self._second_source} publishes {TIP}, too"
         if rejection := check_transform(transform, self._last, now, _MAX_AGE):
             return rejection
         self._last = transform
@@ -174,47 +177,47 @@ class TrackedTip(Component):
             self._insertions.add(message.stamp_ns, insertion)
         return ()
 
-    def _on_pose(self, message: m.Pose, at: Moment) -> Actions:
-        return self._on_topic(message.stamp_ns, message.position, message.orientation, at)
-
-    def _on_transform(self, message: m.Transform, at: Moment) -> Actions:
-        return self._on_topic(message.stamp_ns, message.translation, message.rotation, at)
-
-    def _on_topic(
-        self, stamp_ns: int, position: m.Vector3, quaternion: m.Quaternion, at: Moment
-    ) -> Actions:
+    def _on_topic(self, message: m.Pose | m.Transform, at: Moment) -> Actions:
+        if isinstance(message, m.Pose):
+            position, quaternion = message.position, message.orientation
+        else:
+            position, quaternion = message.translation, message.rotation
         matrix, norm = np.eye(4), math.hypot(*quaternion)
         # A quaternion that was not filled in becomes a matrix that is no rotation.
         matrix[:3, :3] = norm * rotation_matrix(np.array(quaternion) / (norm or 1.0))
         matrix[:3, 3] = position
-        return self._on_received(TrackerTransform(TRACKER, stamp_ns * 1e-9, matrix), at)
+        return self._on_received(TrackerTransform(message.stamp_ns * 1e-9, matrix), at)
 
     def _on_bytes(self, batch: Sequence[bytes], at: Moment) -> Actions:
-        for received in self._stream.receive(b"".join(batch)):
-            if isinstance(received, str):
-                self._received_at = at.steady
-                yield from self._reject(("unreadable", received))
-            elif received.name == self.settings.transform:
-                yield from self._on_received(received, at)
+        for message in self._stream.split(b"".join(batch)):
+            if message.kind != "TRANSFORM":
+                continue
+            if message.name != self.settings.transform:
+                self._other = message.name
+                continue
+            try:
+                transform = TrackerTransform(message.stamp, *message.transform())
+            except UserError as error:
+                yield from self._reject(("unreadable", str(error)), at)
             else:
-                self._other = received.name
+                yield from self._on_received(transform, at)
+        if self._stream.problem:
+            yield from self._reject(("unreadable", self._stream.problem), at)
 
     def _on_port(self, change: PortChange, at: Moment) -> Actions:
-        self._stream.clear()
-        self._port_problem = change.lost
+        self._stream = LinkStream("TRANSFORM")
+        self._port_problem = change.lost and f"no connection: {change.lost}"
         return ()
 
     def _on_received(self, transform: TrackerTransform, at: Moment) -> Actions:
-        self._received_at, now = at.steady, at.stamp_ns * 1e-9
+        now = at.stamp_ns * 1e-9
         if self.settings.stamp_on_arrival:
             transform = dataclasses.replace(transform, stamp=now)
-        if self._second_source:
-            yield from self._reject(("two_sources", f"{self._second_source} publishes {TIP}, too"))
-            return
-        tip = self.measure(transform, now)
+        tip = self._measure(transform, now)
         if isinstance(tip, tuple):
-            yield from self._reject(tip)
+            yield from self._reject(tip, at)
             return
+        self._received_at = at.steady
         stamp_ns = self._measured_ns(transform)
         yield Publish(TIP_POSE, tip_pose_message(tip, stamp_ns))
         yield Publish(TIP, tip_message(tip, stamp_ns))
@@ -229,7 +232,8 @@ class TrackedTip(Component):
             silence += f", but {self._other}" if self._other else ""
             yield self._diagnose(Level.WARN, self._port_problem or silence)
 
-    def _reject(self, rejection: Rejection) -> Actions:
+    def _reject(self, rejection: Rejection, at: Moment) -> Actions:
+        self._received_at = at.steady
         fault, text = rejection
         self._counts[fault] += 1
         yield Log("warning", f"no tip: {fault}: {text}", fault)

@@ -11,10 +11,10 @@ import socket
 import time
 from collections.abc import Callable
 
-from needle_bags.link.client_messages import ClientMessage, MessageStream
 from needle_bags.link.openigtlink import Listeners, OpenIGTLinkParameters
 from needle_core.component import Batch, Log
 from needle_core.errors import UserError
+from needle_core.openigtlink import LinkMessage, LinkStream
 
 MAX_CLIENTS = 8
 STALL_TIMEOUT = 5.0
@@ -26,7 +26,7 @@ _MAX_READ = 65536
 @dataclasses.dataclass
 class _Client:
     connection: socket.socket
-    input: MessageStream = dataclasses.field(default_factory=MessageStream)
+    input: LinkStream = dataclasses.field(default_factory=LinkStream)
     unsent: bytes = b""
     since: float = 0.0
 
@@ -72,7 +72,7 @@ class LinkServer:
         """Problem of each client whose input is no OpenIGTLink and therefore ignored."""
         return tuple(client.input.problem for client in self._clients if client.input.problem)
 
-    def poll(self, now: float) -> list[ClientMessage]:
+    def poll(self, now: float) -> list[LinkMessage]:
         """Accept clients, read and send, and disconnect clients that are gone or stalled.
 
         Parameters
@@ -82,11 +82,11 @@ class LinkServer:
 
         Returns
         -------
-        list of ClientMessage
+        list of LinkMessage
             The received messages.
         """
         self._accept()
-        messages: list[ClientMessage] = []
+        messages: list[LinkMessage] = []
         for client in tuple(self._clients):
             data = self._read(client)
             messages += client.input.split(data or b"")

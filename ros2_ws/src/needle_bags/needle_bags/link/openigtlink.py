@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import struct
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_bags.link.client_messages import ClientMessage
 from needle_bags.live.live_needle import LiveNeedle
 from needle_bags.live.needle_inputs import PROPOSALS, needle_inputs, proposed_target
 from needle_core import messages as m
 from needle_core.component import Actions, Component, Diagnose, Log, Moment, Port, Send, Timer
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
+from needle_core.openigtlink import LinkMessage
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 
 LINK = "link"
@@ -79,7 +78,7 @@ class OpenIGTLink(Component):
         self.ports = (Port(LINK, self._on_link),)
         self.timers = (Timer(1.0 / settings.rate, self._send),)
 
-    def _on_link(self, events: Sequence[Log | Listeners | ClientMessage], at: Moment) -> Actions:
+    def _on_link(self, events: Sequence[Log | Listeners | LinkMessage], at: Moment) -> Actions:
         for event in events:
             match event:
                 case Log():
@@ -91,10 +90,10 @@ class OpenIGTLink(Component):
                     line = ", ignoring ".join((line, *problems))
                     health = Diagnostic(Level.WARN if problems else Level.OK, line, keys)
                     yield Diagnose("listeners", health)
-                case ClientMessage(kind="POINT"):
+                case LinkMessage(kind="POINT"):
                     yield from self._on_points(event, at)
 
-    def _on_points(self, message: ClientMessage, at: Moment) -> Actions:
+    def _on_points(self, message: LinkMessage, at: Moment) -> Actions:
         """Propose the point named target*, and check the one named entry*, of a message.
 
         The name of the message counts for points that are named otherwise.
@@ -113,7 +112,7 @@ class OpenIGTLink(Component):
                 raise UserError(f"the entry is {1e3 * distance:.1f} mm from that of the rig")
             if "target" in places:
                 yield proposed_target(places["target"], at.stamp_ns)
-        except (UserError, struct.error) as error:
+        except UserError as error:
             level, line = Level.WARN, f"{message.name}: {error}"
             yield Log("warning", line, "plan")
         yield Diagnose("plan", Diagnostic(level, line))

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from needle_bags.link.client_messages import ClientMessage
 from needle_bags.link.link_port import MAX_CLIENTS, STALL_TIMEOUT, LinkServer
 from needle_core.errors import UserError
+from needle_core.openigtlink import LinkMessage
 
 # A message of 2^64 bytes, of which none comes; another protocol; noise.
 HEADER = struct.pack("> H 12s 20s II Q Q", 1, b"TRANSFORM", b"\xfe" * 20, 0, 0, 2**64 - 1, 0)
@@ -61,13 +61,13 @@ def test_all_clients_receive_the_same_whatever_another_sends(server: LinkServer)
 def test_messages_arrive_and_garbage_of_one_client_ends_its_input_only(server: LinkServer) -> None:
     text = struct.pack("> H 12s 20s II Q Q", 1, b"POINT", b"target", 0, 0, 3, 0) + b"abc"
     with listener(server) as good, listener(server) as bad:
-        found: list[ClientMessage] = []
+        found: list[LinkMessage] = []
         for client, data in ((bad, b"GET / HTTP/1.1\r\n" + bytes(58)), (good, text), (bad, text)):
             client.sendall(data)
         # The order in which the kernel delivers is not that of the sockets.
         while not (found and server.problems):
             found += server.poll(0.0)
-        assert found == [ClientMessage(1, "POINT", "target", b"abc")]
+        assert found == [LinkMessage(1, "POINT", "target", 0.0, b"abc")]
         assert len(server.problems) == 1
         assert server.clients == 2
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_bags.link.client_messages import ClientMessage, MessageStream
 from needle_bags.link.link_port import LinkPort
 from needle_bags.link.openigtlink import (
     LINK,
@@ -25,6 +24,7 @@ from needle_bags.ros import openigtlink as executable
 from needle_core import messages as m
 from needle_core.component import Diagnose, Log, Moment, Publish, Send
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.openigtlink import LinkMessage, LinkStream
 from needle_core.status_messages import ControllerStatus
 
 TIP = (0.001, 0.002, 0.04)
@@ -156,7 +156,7 @@ def test_a_planners_target_is_proposed(name: str, points: Any, expected: Any, ve
         # An extended header, and one pair of metadata.
         head = struct.pack(">HHII", 12, 10, 4, 7)
         body = head + body + struct.pack(">HHHI", 1, 1, 3, 3) + b"kval"
-    (message,) = MessageStream().split(packed_message("POINT", name, body, version))
+    (message,) = LinkStream().split(packed_message("POINT", name, body, version))
     component = OpenIGTLink(OpenIGTLinkParameters(port=0))
     actions = list(component.ports[0].handler((message,), AT))
     health = actions.pop()
@@ -183,10 +183,10 @@ def test_a_damaged_point_is_a_warning() -> None:
         (2, struct.pack(">HHII", 12, 0, 0, 0) + bytes(135)),
     ):
         actions = list(
-            component.ports[0].handler((ClientMessage(version, "POINT", "T", body),), AT)
+            component.ports[0].handler((LinkMessage(version, "POINT", "T", 0.0, body),), AT)
         )
         assert [type(action) for action in actions] == [Log, Diagnose]
-    other = ClientMessage(1, "TRANSFORM", "target", b"")
+    other = LinkMessage(1, "TRANSFORM", "target", 0.0, b"")
     assert not list(component.ports[0].handler((other,), AT))
 
 
@@ -198,7 +198,7 @@ def test_messages_are_split_at_any_byte() -> None:
     ]
     data = b"".join(packed_message(*each) for each in sent)
     for size in (1, 7, 58, 1000):
-        stream = MessageStream()
+        stream = LinkStream()
         parts = (data[at : at + size] for at in range(0, len(data), size))
         found = [message for part in parts for message in stream.split(part)]
         assert [(one.kind, one.name, one.body) for one in found] == sent

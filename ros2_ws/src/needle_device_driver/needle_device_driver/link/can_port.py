@@ -9,10 +9,10 @@ from collections.abc import Callable
 import can
 
 from needle_core.can_frame import CanErrors, CanFrame
+from needle_core.ports.reopening_port import ReopeningPort
 from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.link.slcan_bus import SlcanBus
 from needle_device_driver.link.socketcand_bus import SocketcandBus
-from needle_device_driver.ports.reopening_port import ReopeningPort
 
 _RECEIVE_TIMEOUT = 0.05
 # A silent adapter may have restarted with its channel closed; after this time it is set up again.

@@ -12,8 +12,8 @@ from needle_device_driver.axes.drive_errors import DriveError, LinkError
 from needle_device_driver.axes.drives import Drives
 from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
 from needle_device_driver.polled.polled_axis import PolledAxis
+from needle_device_driver.polled.stream_port import StreamPort
 from needle_device_driver.polled.text_link import TextLink
-from needle_device_driver.ports.stream_port import StreamPort
 from needle_device_driver.procedure import Procedure, Wait
 
 _NUMBERS = 99

@@ -11,8 +11,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.tracked.transform_stream import TrackerTransform
-
 Array = NDArray[np.float64]
 Rejection = tuple[str, str]
 
@@ -27,6 +25,25 @@ _OLDER_GATES = 3.0  # insertion after which an older tip is replaced
 _OUT = 1e-3  # insertion up to which the needle is out [m]
 _ROTATION_TOLERANCE = 1e-3  # of R R^T = 1; single precision has 1e-6
 _AHEAD = 0.05  # tolerated difference of two clocks [s]
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackerTransform:
+    """A transform as received.
+
+    Attributes
+    ----------
+    stamp : float
+        Time of the measurement [s] since 1970; 0 if there is none.
+    matrix : ndarray, shape (4, 4)
+        Pose of the sensor in the tracker's frame; translation in the sender's unit.
+    status : str
+        The tracker's own assessment: OK, MISSING, OUT_OF_VOLUME; empty if it sends none.
+    """
+
+    stamp: float
+    matrix: Array
+    status: str = ""
 
 
 def check_transform(

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from needle_core import messages as m
 from needle_core.component import Diagnose, Moment, Peers, PortChange, Publish
+from needle_core.openigtlink import LinkMessage, LinkStream, checksum
 from needle_tracker.tracked.registration import Registration
-from needle_tracker.tracked.transform_stream import TrackerTransform, TransformStream, checksum
 from needle_tracker.tracked_tip import TrackedTip, TrackedTipParameters
 from plus_messages import message, transform_message
 
@@ -159,7 +159,7 @@ def test_arrival_replaces_the_stamp_of_a_wrong_clock() -> None:
 def test_silence_names_the_lost_connection() -> None:
     scene = Scene()
     (port,) = scene.component.ports
-    list(port.on_change(PortChange("no connection: refused"), scene.at()))
+    list(port.on_change(PortChange("refused"), scene.at()))
     actions = list(scene.component.timers[0].handler(scene.at()))
     assert fault(actions) == "no connection: refused"
 
@@ -180,12 +180,14 @@ def test_a_stream_in_pieces_among_other_messages(garbage: int) -> None:
     broken = bytearray(transform_message(pose, NOW))
     broken[42:50] = (1 << 40).to_bytes(8, "big")
     data = wanted[0] + status + b"\7" * garbage + wanted[1] + bytes(broken) + wanted[2] + wanted[3]
-    stream = TransformStream()
-    received: list[TrackerTransform | str] = []
+    stream, problems = LinkStream("TRANSFORM"), set()
+    received: list[LinkMessage] = []
     for k in range(0, len(data), 7):
-        received += stream.receive(data[k : k + 7])
-    found = [r for r in received if isinstance(r, TrackerTransform)]
+        received += stream.split(data[k : k + 7])
+        problems.add(stream.problem.partition(":")[0])
+    found = [each for each in received if each.kind == "TRANSFORM"]
+    assert [each.name for each in received if each not in found] == ["Plus"]
     assert [t.stamp for t in found] == pytest.approx([NOW + k for k in range(4)], abs=1e-3)
-    assert [t.status for t in found] == ["", "OK", "", "OK"]
-    assert {r for r in received if isinstance(r, str)} == {"unreadable header"}
-    np.testing.assert_allclose(found[0].matrix, pose, atol=1e-7)
+    assert [t.transform()[1] for t in found] == ["", "OK", "", "OK"]
+    assert problems == {"", "unreadable header"}
+    np.testing.assert_allclose(found[0].transform()[0], pose, atol=1e-7)

@@ -25,7 +25,7 @@ class ReopeningPort(abc.ABC, Generic[D]):
         Errors of the device, when it is opened or written to.
     """
 
-    def __init__(self, errors: tuple[type[Exception], ...]) -> None:
+    def __init__(self, errors: tuple[type[Exception], ...] = (OSError,)) -> None:
         self._errors_of_device = errors
         self._closed = threading.Event()
         # Protects the device: the thread may set it up while another thread sends.
