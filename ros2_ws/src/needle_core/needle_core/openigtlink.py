@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import struct
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -130,17 +129,11 @@ def _text(field: bytes) -> str:
     return sanitize(field.partition(b"\0")[0].decode("utf-8", "replace").strip())
 
 
-@functools.cache
-def _checksum_of(byte: int) -> int:
-    value = byte << 56
-    for _ in range(8):
-        value = (value << 1 & _MASK) ^ (_POLYNOMIAL if value >> 63 else 0)
-    return value
-
-
 def checksum(data: bytes) -> int:
     """Return the CRC-64 of ECMA-182."""
     value = 0
     for byte in data:
-        value = (value << 8 & _MASK) ^ _checksum_of(value >> 56 ^ byte)
+        value ^= byte << 56
+        for _ in range(8):
+            value = (value << 1 & _MASK) ^ (_POLYNOMIAL if value >> 63 else 0)
     return value

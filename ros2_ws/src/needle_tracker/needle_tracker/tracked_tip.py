@@ -190,17 +190,15 @@ class TrackedTip(Component):
 
     def _on_bytes(self, batch: Sequence[bytes], at: Moment) -> Actions:
         for message in self._stream.split(b"".join(batch)):
-            if message.kind != "TRANSFORM":
-                continue
-            if message.name != self.settings.transform:
+            if message.kind == "TRANSFORM" and message.name == self.settings.transform:
+                try:
+                    transform = TrackerTransform(message.stamp, *message.transform())
+                except UserError as error:
+                    yield from self._reject(("unreadable", str(error)), at)
+                else:
+                    yield from self._on_received(transform, at)
+            elif message.kind == "TRANSFORM":
                 self._other = message.name
-                continue
-            try:
-                transform = TrackerTransform(message.stamp, *message.transform())
-            except UserError as error:
-                yield from self._reject(("unreadable", str(error)), at)
-            else:
-                yield from self._on_received(transform, at)
         if self._stream.problem:
             yield from self._reject(("unreadable", self._stream.problem), at)
 
@@ -212,7 +210,7 @@ class TrackedTip(Component):
     def _on_received(self, transform: TrackerTransform, at: Moment) -> Actions:
         now = at.stamp_ns * 1e-9
         if self.settings.stamp_on_arrival:
-            transform = dataclasses.replace(transform, stamp=now)
+            transform = transform._replace(stamp=now)
         tip = self._measure(transform, now)
         if isinstance(tip, tuple):
             yield from self._reject(tip, at)

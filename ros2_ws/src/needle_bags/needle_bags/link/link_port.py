@@ -55,7 +55,7 @@ class LinkServer:
             raise UserError(f"cannot listen at {address}, port {port}: {error.strerror}") from error
         self._server.setblocking(False)
         self._clients: list[_Client] = []
-        self.turned_away = 0
+        self._turned_away = 0
 
     @property
     def port(self) -> int:
@@ -63,14 +63,10 @@ class LinkServer:
         return int(self._server.getsockname()[1])
 
     @property
-    def clients(self) -> int:
-        """Number of connected clients."""
-        return len(self._clients)
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """Problem of each client whose input is no OpenIGTLink and therefore ignored."""
-        return tuple(client.input.problem for client in self._clients if client.input.problem)
+    def listeners(self) -> Listeners:
+        """Clients, and the problem of each whose input is no OpenIGTLink and therefore ignored."""
+        problems = (client.input.problem for client in self._clients if client.input.problem)
+        return Listeners(len(self._clients), self._turned_away, tuple(problems))
 
     def poll(self, now: float) -> list[LinkMessage]:
         """Accept clients, read and send, and disconnect clients that are gone or stalled.
@@ -125,7 +121,7 @@ class LinkServer:
             except OSError:
                 continue  # already disconnected
             if len(self._clients) == MAX_CLIENTS:
-                self.turned_away += 1
+                self._turned_away += 1
                 connection.close()
                 continue
             connection.setblocking(False)
@@ -194,9 +190,7 @@ class LinkPort:
         messages = self.server.poll(now)
         for data in batch:
             self.server.send(data, now)
-        server = self.server
-        clients = Listeners(server.clients, server.turned_away, server.problems)
-        self._arrive((clients, *messages))
+        self._arrive((self.server.listeners, *messages))
 
     def close(self) -> None:
         """Disconnect all clients."""

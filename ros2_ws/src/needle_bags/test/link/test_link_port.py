@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from needle_bags.link.link_port import MAX_CLIENTS, STALL_TIMEOUT, LinkServer
+from needle_bags.link.openigtlink import Listeners
 from needle_core.errors import UserError
 from needle_core.openigtlink import LinkMessage
 
@@ -27,8 +28,8 @@ def server() -> Iterator[LinkServer]:
 
 def listener(server: LinkServer) -> socket.socket:
     connection = socket.create_connection(("127.0.0.1", server.port), timeout=5.0)
-    before = server.clients + server.turned_away
-    while server.clients + server.turned_away == before:
+    before = server.listeners
+    while server.listeners == before:
         server.poll(0.0)
     return connection
 
@@ -50,10 +51,10 @@ def test_all_clients_receive_the_same_whatever_another_sends(server: LinkServer)
                 # Half a message, then gone: with a reset.
                 bad.sendall(garbage[:7])
                 bad.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-            while server.clients == 2:
+            while server.listeners.count == 2:
                 server.poll(0.0)
         good.shutdown(socket.SHUT_WR)
-        while server.clients:
+        while server.listeners.count:
             server.poll(0.0)
         assert good.recv(1) == b""
 
@@ -65,11 +66,11 @@ def test_messages_arrive_and_garbage_of_one_client_ends_its_input_only(server: L
         for client, data in ((bad, b"GET / HTTP/1.1\r\n" + bytes(58)), (good, text), (bad, text)):
             client.sendall(data)
         # The order in which the kernel delivers is not that of the sockets.
-        while not (found and server.problems):
+        while not (found and server.listeners.problems):
             found += server.poll(0.0)
         assert found == [LinkMessage(1, "POINT", "target", 0.0, b"abc")]
-        assert len(server.problems) == 1
-        assert server.clients == 2
+        assert len(server.listeners.problems) == 1
+        assert server.listeners.count == 2
 
 
 def test_clients_beyond_the_limit_are_turned_away(server: LinkServer) -> None:
@@ -77,7 +78,7 @@ def test_clients_beyond_the_limit_are_turned_away(server: LinkServer) -> None:
         for _ in range(MAX_CLIENTS + 1):
             last = stack.enter_context(listener(server))
         assert last.recv(1) == b""
-        assert (server.clients, server.turned_away) == (MAX_CLIENTS, 1)
+        assert server.listeners == Listeners(MAX_CLIENTS, 1)
 
 
 def test_a_client_that_does_not_read_delays_no_other_and_is_disconnected(
@@ -91,9 +92,9 @@ def test_a_client_that_does_not_read_delays_no_other_and_is_disconnected(
             server.send(b"needle", 2.0)
             assert read(awake, 6) == b"needle"
             server.poll(1.0 + STALL_TIMEOUT)
-            assert server.clients == 2
+            assert server.listeners.count == 2
             server.poll(1.1 + STALL_TIMEOUT)
-            assert server.clients == 1
+            assert server.listeners.count == 1
         received = b""
         with contextlib.suppress(ConnectionError):
             while part := asleep.recv(1_000_000):

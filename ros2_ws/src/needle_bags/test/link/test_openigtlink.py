@@ -149,13 +149,15 @@ POINTS: tuple[tuple[str, tuple[tuple[str, Any], ...], Any], ...] = (
 
 
 @pytest.mark.parametrize(("name", "points", "expected"), POINTS)
-@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("version", [1, 2, 3])
 def test_a_planners_target_is_proposed(name: str, points: Any, expected: Any, version: int) -> None:
     body = b"".join(point_body(label, *at) for label, at in points)
     if version == 2:
         # An extended header, and one pair of metadata.
         head = struct.pack(">HHII", 12, 10, 4, 7)
         body = head + body + struct.pack(">HHHI", 1, 1, 3, 3) + b"kval"
+    if version == 3:
+        body = struct.pack(">HHII", 12, 0, 0, 7) + body
     (message,) = LinkStream().split(packed_message("POINT", name, body, version))
     component = OpenIGTLink(OpenIGTLinkParameters(port=0))
     actions = list(component.ports[0].handler((message,), AT))

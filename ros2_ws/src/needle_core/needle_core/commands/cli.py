@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from needle_core.errors import UserError
+from needle_core.files.file_access import write_text
 from needle_core.process.shutdown import interruptible
 
 EXIT_DONE = 0
@@ -102,7 +103,4 @@ def write_json(path: Path, values: Mapping[str, JsonValue]) -> None:
     if str(path) == STANDARD_OUTPUT:
         print(text, file=sys.__stdout__)
         return
-    try:
-        path.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    write_text(path, text + "\n")

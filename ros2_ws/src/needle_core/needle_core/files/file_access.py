@@ -10,6 +10,8 @@ import tempfile
 from pathlib import Path
 from typing import BinaryIO
 
+from needle_core.errors import UserError
+
 
 def open_regular(path: Path) -> BinaryIO:
     """Open a regular file for reading, without blocking.
@@ -29,6 +31,14 @@ def open_regular(path: Path) -> BinaryIO:
         os.close(number)
         raise OSError(errno.EINVAL, "it is not a regular file", str(path))
     return os.fdopen(number, "rb")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file; raise a `UserError` with the reason if that fails."""
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
 def replace_file(path: Path, data: bytes) -> None:

@@ -114,9 +114,8 @@ class ReopeningPort(abc.ABC, Generic[D]):
 
     def _lose(self, error: Exception) -> None:
         """Close a device that failed, and report the loss once."""
-        if self._device is not None:
-            self._shut_down()
-            self._report(PortChange(_error_text(error)))
+        self._shut_down()
+        self._report(PortChange(_error_text(error)))
 
     def _shut_down(self) -> None:
         device, self._device = self._device, None
@@ -128,6 +127,7 @@ class ReopeningPort(abc.ABC, Generic[D]):
 def _error_text(error: Exception) -> str:
     """Return one line on an error: the operating system's text if there is one."""
     for cause in (error, error.__cause__, error.__context__):
-        if isinstance(cause, OSError) and cause.errno is not None:
+        # A host name that is not found has a negative number of its own.
+        if isinstance(cause, OSError) and (cause.errno or 0) > 0:
             return os.strerror(cause.errno)
     return str(error).partition("\n")[0]

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
+from needle_core.files.file_access import write_text
 from needle_tracker.calibrating.calibration_outliers import contradictions, misfits, square_error
 from needle_tracker.calibrating.calibration_session import (
     KINDS,
@@ -273,10 +274,7 @@ def save_calibration(path: Path, calibration: StereoCalibration, comments: list[
     UserError
         If it cannot be written.
     """
-    try:
-        path.write_text(calibration_text(calibration, comments), encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    write_text(path, calibration_text(calibration, comments))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import sys
 import warnings
 from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +20,7 @@ from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
 from needle_core.files.yaml_files import read_text
 from needle_core.settings.bounds import check_bounds
-from needle_tracker.tracked.registration import (
-    Registration,
-    check_registration,
-    write_registration,
-)
+from needle_tracker.tracked.registration import Registration, write_registration
 
 Array = NDArray[np.float64]
 
@@ -46,18 +43,12 @@ the needle's tip, which stays in place. Without it, the sensor is at the tip.
 """
 
 
-@dataclasses.dataclass(frozen=True)
-class Fit:
-    """Rigid transform of paired points: T_rig_tracker, and the residuals in `rig`, (N, 3) [m]."""
+class Fit(NamedTuple):
+    """T_rig_tracker of paired points, and their root mean square distance in it [m]."""
 
     rotation: Array
     translation: Array
-    residuals: Array
-
-    @property
-    def error(self) -> float:
-        """Root mean square distance: the fiducial registration error [m]."""
-        return float(np.sqrt(np.sum(self.residuals**2) / len(self.residuals)))
+    error: float
 
 
 def fit(rig: Array, tracker: Array) -> Fit:
@@ -68,7 +59,8 @@ def fit(rig: Array, tracker: Array) -> Fit:
         warnings.simplefilter("ignore", UserWarning)
         rotation = Rotation.align_vectors(rig - to, tracker - origin)[0].as_matrix()
     translation = to - rotation @ origin
-    return Fit(rotation, translation, rig - tracker @ rotation.T - translation)
+    residuals = rig - tracker @ rotation.T - translation
+    return Fit(rotation, translation, math.sqrt(np.sum(residuals**2) / len(rig)))
 
 
 def register(names: list[str], rig: Array, tracker: Array) -> tuple[Registration, Fit, Array]:
@@ -92,10 +84,7 @@ def register(names: list[str], rig: Array, tracker: Array) -> tuple[Registration
     without = [(np.delete(rig, k, 0), np.delete(tracker, k, 0)) for k in range(len(names))]
     fits = {k: fit(*w) for k, w in enumerate(without) if len(names) > 3 and _width(w[0]) > 1e-3}
     left_out = np.array(
-        [
-            np.linalg.norm(rig[k] - other.rotation @ tracker[k] - other.translation)
-            for k, other in fits.items()
-        ]
+        [np.linalg.norm(rig[k] - f.rotation @ tracker[k] - f.translation) for k, f in fits.items()]
     )
     worst = float(np.max(left_out, initial=0.0))
     if found.error > LARGEST_ERROR or worst > LARGEST_TARGET_ERROR:
@@ -105,19 +94,15 @@ def register(names: list[str], rig: Array, tracker: Array) -> tuple[Registration
             f"{_mm(LARGEST_TARGET_ERROR)}"
         )
     # Variance of a coordinate, by Student's t: few points do not determine it well.
-    variance = max(float(np.sum(found.residuals**2)) / (3 * len(names) - 8), _LEAST_STD**2)
-    arms = rig - rig.mean(axis=0)
+    count, centroid = len(names), rig.mean(axis=0)
+    variance = max(count * found.error**2 / (3 * count - 8), _LEAST_STD**2)
+    arms = rig - centroid
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.eye(3) * variance / len(names)
+    covariance[:3, :3] = np.eye(3) * variance / count
     covariance[3:, 3:] = variance * np.linalg.inv(np.sum(arms**2) * np.eye(3) - arms.T @ arms)
     quaternion = Rotation.from_matrix(found.rotation).as_quat()
     registration = Registration(
-        found.translation,
-        quaternion,
-        rig.mean(axis=0),
-        0.5 * (covariance + covariance.T),
-        np.zeros(3),
-        math.sqrt(variance),
+        found.translation, quaternion, centroid, covariance, np.zeros(3), math.sqrt(variance)
     )
     return registration, found, left_out
 
@@ -250,7 +235,7 @@ def _main() -> int:
     }
     lines = [f"{key}: {value:.4g}" for key, value in results.items() if value is not None]
     output = output_file("--output", options.output)
-    write_registration(output, check_registration(found), lines)
+    write_registration(output, found, lines)
     print("\n".join(lines))
     if options.json:
         write_json(output_file("--json", options.json), results)

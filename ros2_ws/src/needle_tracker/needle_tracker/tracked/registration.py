@@ -10,6 +10,7 @@ import yaml
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
+from needle_core.files.file_access import write_text
 from needle_core.files.yaml_files import read_yaml
 from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_tracker.optics.calibration import number, numbers, rotation_matrix
@@ -89,12 +90,12 @@ def read_registration(path: Path) -> Registration:
             numbers(content, 3, "tip_offset"),
             number(content, "sensor_std"),
         )
-        return check_registration(found)
+        return _checked(found)
     except UserError as error:
         raise UserError(f"registration {path}: {error}") from error
 
 
-def check_registration(found: Registration) -> Registration:
+def _checked(found: Registration) -> Registration:
     """Return a registration with a normalised quaternion; raise a `UserError` if it is unusable."""
     norm = float(np.linalg.norm(found.quaternion))
     check_bounds("norm of T_rig_tracker.rotation", norm, 0.99, 1.01, "-")
@@ -111,7 +112,8 @@ def check_registration(found: Registration) -> Registration:
 
 
 def write_registration(path: Path, found: Registration, comments: list[str]) -> None:
-    """Write a file of a registration; raises a `UserError` if that fails."""
+    """Write a file of a registration; raises a `UserError` if that fails or it is unusable."""
+    found = _checked(found)
     content = {
         "T_rig_tracker": {
             "translation": found.translation.tolist(),
@@ -123,7 +125,4 @@ def write_registration(path: Path, found: Registration, comments: list[str]) -> 
         "sensor_std": found.sensor_std,
     }
     text = yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=100)
-    try:
-        path.write_text("".join(f"# {line}\n" for line in comments) + text, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
+    write_text(path, "".join(f"# {line}\n" for line in comments) + text)

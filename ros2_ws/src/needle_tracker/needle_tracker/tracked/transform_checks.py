@@ -5,8 +5,8 @@ A rejection is a pair: the name of the fault, which is counted, and a text with 
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Rejection = tuple[str, str]
 
-CONFIRMED_BY = 3
-"""Consecutive transforms that agree, before the first tip and after a jump."""
+_CONFIRMED_BY = 3  # consecutive transforms that agree, before the first tip and after a jump
 _SMALLEST_SCALE, _LARGEST_SCALE = 0.85, 1.15  # motion of the tip per insertion of the stage
 _LARGEST_CURVATURE = 9.0  # of the needle's path, as for stereo_tracker [1/m]
 _LARGEST_ANGLE = 1.4  # between heading and insertion [rad]
@@ -27,8 +26,7 @@ _ROTATION_TOLERANCE = 1e-3  # of R R^T = 1; single precision has 1e-6
 _AHEAD = 0.05  # tolerated difference of two clocks [s]
 
 
-@dataclasses.dataclass(frozen=True)
-class TrackerTransform:
+class TrackerTransform(NamedTuple):
     """A transform as received.
 
     Attributes
@@ -85,8 +83,7 @@ def _lack_of_rotation(rotation: Array) -> str:
     return f"determinant {determinant:.4g}, expected 1; R R^T differs from 1 by {off:.3g}"
 
 
-@dataclasses.dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """A measured tip [m] and heading in `rig`, and the insertion at its measurement [m]."""
 
     position: Array
@@ -128,7 +125,7 @@ class PlaceCheck:
         self._is_steady &= place.insertion > _OUT
         text = self._disagreement(last, place) or self._disagreement(older, place)
         self._agreeing = 0 if text else self._agreeing + 1
-        is_confirmed = self._agreeing >= CONFIRMED_BY
+        is_confirmed = self._agreeing >= _CONFIRMED_BY
         self._is_steady |= is_confirmed
         if is_confirmed or not self._is_steady:
             self._last = place
@@ -136,7 +133,7 @@ class PlaceCheck:
             self._older = place if is_far or not self._is_steady else older
         if text:
             return "jump", f"distance from an earlier tip {text}"
-        few = f"{self._agreeing} transforms agree, {CONFIRMED_BY} needed"
+        few = f"{self._agreeing} transforms agree, {_CONFIRMED_BY} needed"
         return None if is_confirmed else ("unconfirmed", few)
 
     def _disagreement(self, earlier: Place, place: Place) -> str:
