@@ -31,7 +31,7 @@ def rows() -> Iterator[Row]:
 
         def is_connected() -> bool:
             server.poll(0.0)
-            return server.clients > 0
+            return server.listeners.count > 0
 
         ours = _measured(port, size, is_connected, lambda: server.send(message.pack(), 0.0))
     reference = pyigtl.OpenIGTLinkServer(port)

@@ -128,6 +128,6 @@ def _error_text(error: Exception) -> str:
     """Return one line on an error: the operating system's text if there is one."""
     for cause in (error, error.__cause__, error.__context__):
         # A host name that is not found has a negative number of its own.
-        if isinstance(cause, OSError) and (cause.errno or 0) > 0:
+        if isinstance(cause, OSError) and cause.errno and cause.errno > 0:
             return os.strerror(cause.errno)
     return str(error).partition("\n")[0]
