@@ -224,15 +224,15 @@ class DriveEmulator(Component):
         for line in lines:
             axes = self.axes(at.steady)
             try:
-                adapter_command = execute_command(line, connections, at.steady)
+                plugged_in = execute_command(line, connections, at.steady)
             except UserError as error:
                 yield Log("error", str(error))
                 continue
             insertion, rotation = (axes[name].position for name in AXES)
             where = f"{insertion * 1e3:.6f} mm, {rotation:.6f} rad"
             yield Log("warning", f"on command: {line.strip()}, at {where}")
-            if adapter_command is not None:
-                yield Send(ADAPTERS, (adapter_command,))
+            if plugged_in is not None:
+                yield Send(ADAPTERS, (plugged_in,))
             yield Diagnose("drives", health(connections))
 
     def _poll(self, at: Moment) -> Actions:

@@ -14,7 +14,6 @@ from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.conformance.rig import DRIVER, ConformanceRig
 from needle_device_driver.device import EMERGENCY_STOP
 from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.limits import SafetyLimits
 
 Travel = tuple[float, float]
 Event = Callable[[ConformanceRig], object]
@@ -32,8 +31,8 @@ class Fault(NamedTuple):
         The rule that stops the needle.
     event : callable
         Causes it.
-    delay : callable
-        Returns the longest time until the drives are ordered to stop, or stop by themselves [s].
+    delay : str
+        What passes until the drives are ordered to stop, or stop by themselves; a key of `_delays`.
     causes : tuple of Rule
         Other rules that may name the cause in the log.
     needs : callable
@@ -45,39 +44,10 @@ class Fault(NamedTuple):
     name: str
     rule: Rule
     event: Event
-    delay: Delay
+    delay: str
     causes: tuple[Rule, ...] = ()
     needs: Needs = lambda _: True
     in_steps: bool = False
-
-
-# ---- delays -------------------------------------------------------------------------------------
-
-Delay = Callable[[Capabilities, SafetyLimits], float]
-
-
-def _none(_: Capabilities, __: SafetyLimits) -> float:
-    return 0.0
-
-
-def _hold(_: Capabilities, __: SafetyLimits) -> float:
-    return HOLD_LIFETIME + PERIOD
-
-
-def _answer(drive: Capabilities, _: SafetyLimits) -> float:
-    return PERIOD + drive.response_time
-
-
-def _error(_: Capabilities, limits: SafetyLimits) -> float:
-    return limits.insertion_following_error / limits.max_speed + PERIOD
-
-
-def _silence(_: Capabilities, limits: SafetyLimits) -> float:
-    return limits.reply_age_limit + PERIOD
-
-
-def _order(drive: Capabilities, _: SafetyLimits) -> float:
-    return min(drive.longest_order, drive.watchdog)
 
 
 # ---- events -------------------------------------------------------------------------------------
@@ -98,29 +68,41 @@ def _unplug(rig: ConformanceRig) -> None:
 
 _R = Rule
 FAULTS = (
-    Fault("release", _R.HOLD_TO_RUN, lambda rig: rig.hold(False), _none, in_steps=True),
-    Fault("silent hold", _R.HOLD_AGE, lambda rig: rig.runner.freeze("hand", 0.6), _hold,
+    Fault("release", _R.HOLD_TO_RUN, lambda rig: rig.hold(False), "none", in_steps=True),
+    Fault("silent hold", _R.HOLD_AGE, lambda rig: rig.runner.freeze("hand", 0.6), "hold",
           in_steps=True),
     Fault("emergency stop", _R.ESTOP_LATCHES,
-          _act(Publish(EMERGENCY_STOP, m.EmergencyStop(True))), _none),
-    Fault("device/stop", _R.QUICK_STOP, _act(Call("device/stop")), _none),
-    Fault("fault of a drive", _R.ONE_FAULT_STOPS_BOTH, _of("insertion", "fail", 0x2310), _answer,
+          _act(Publish(EMERGENCY_STOP, m.EmergencyStop(True))), "none"),
+    Fault("device/stop", _R.QUICK_STOP, _act(Call("device/stop")), "none"),
+    Fault("fault of a drive", _R.ONE_FAULT_STOPS_BOTH, _of("insertion", "fail", 0x2310), "answer",
           (_R.DRIVE_EMERGENCY,)),
-    Fault("hot drive", _R.DRIVE_EMERGENCY, _of("rotation", "fail", 0x4210), _answer),
-    Fault("blocked axis", _R.FOLLOWING_ERROR, _of("insertion", "stall"), _error,
+    Fault("hot drive", _R.DRIVE_EMERGENCY, _of("rotation", "fail", 0x4210), "answer"),
+    Fault("blocked axis", _R.FOLLOWING_ERROR, _of("insertion", "stall"), "error",
           (_R.SETTLING_TIME, _R.DRIVE_EMERGENCY), lambda drive: drive.encoder, in_steps=True),
-    Fault("hanging drive", _R.REPLY_AGE, _of("rotation", "hang"), _silence),
+    Fault("hanging drive", _R.REPLY_AGE, _of("rotation", "hang"), "silence"),
     Fault("cut line", _R.REPLY_AGE,
-          lambda rig: setattr(rig.behind("insertion"), "is_cut", True), _silence),
-    Fault("late replies", _R.REPLY_AGE, lambda rig: setattr(rig, "late", 0.2), _silence),
-    Fault("unplugged adapter", _R.LINK_LOSS, _unplug, _order),
+          lambda rig: setattr(rig.behind("insertion"), "is_cut", True), "silence"),
+    Fault("late replies", _R.REPLY_AGE, lambda rig: setattr(rig, "late", 0.2), "silence"),
+    Fault("unplugged adapter", _R.LINK_LOSS, _unplug, "order"),
     Fault("power loss", _R.DRIVE_REBOOT,
-          lambda rig: rig.behind("rotation").reboot("rotation", rig.runner.now), _silence,
+          lambda rig: rig.behind("rotation").reboot("rotation", rig.runner.now), "silence",
           (_R.REPLY_AGE,), lambda drive: drive.identity),
-    Fault("killed driver", _R.LOOK_AHEAD, lambda rig: rig.runner.kill(DRIVER), _order),
-    Fault("frozen driver", _R.DRIVE_WATCHDOG, lambda rig: rig.runner.freeze(DRIVER, 1.0), _order,
+    Fault("killed driver", _R.LOOK_AHEAD, lambda rig: rig.runner.kill(DRIVER), "order"),
+    Fault("frozen driver", _R.DRIVE_WATCHDOG, lambda rig: rig.runner.freeze(DRIVER, 1.0), "order",
           (_R.REPLY_AGE, _R.HOLD_AGE), lambda drive: math.isfinite(drive.watchdog)),
 )  # fmt: skip
+
+
+def _delays(drive: Capabilities, limits: Any) -> dict[str, float]:
+    """Return the longest times [s]."""
+    return {
+        "none": 0.0,
+        "hold": HOLD_LIFETIME + PERIOD,
+        "answer": PERIOD + drive.response_time,
+        "error": limits.insertion_following_error / limits.max_speed + PERIOD,
+        "silence": limits.reply_age_limit + PERIOD,
+        "order": min(drive.longest_order, drive.watchdog),
+    }
 
 
 def largest_travel(fault: Fault, drive: Capabilities, limits: Any) -> Travel:
@@ -135,7 +117,7 @@ def largest_travel(fault: Fault, drive: Capabilities, limits: Any) -> Travel:
     limits : DeviceDriverParameters
         The driver's.
     """
-    seconds = fault.delay(drive, limits) + PERIOD + drive.response_time
+    seconds = _delays(drive, limits)[fault.delay] + PERIOD + drive.response_time
     rows = (
         (limits.max_speed, limits.insertion_quick_stop_deceleration),
         (limits.max_rotation_rate, limits.rotation_quick_stop_deceleration),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import select
 import socket
 import threading
 from collections.abc import Callable, Sequence
+from socketserver import ThreadingTCPServer
 from typing import Any
 
 from needle_core.errors import UserError
@@ -18,8 +18,12 @@ _READ_SIZE = 4096
 _WAKE_UP_PERIOD = 0.05  # [s]
 
 
+class _Server(ThreadingTCPServer):
+    allow_reuse_address = daemon_threads = True
+
+
 class StreamServer:
-    """Port of a component: bytes from and for any number of clients, with a reader thread.
+    """Port of a component: bytes from and for any number of clients, each with a reader thread.
 
     Parameters
     ----------
@@ -36,10 +40,8 @@ class StreamServer:
         self._address = (_HOST, port)
         self._numbers = itertools.count()
         self._clients: dict[int, socket.socket] = {}
-        self._listener: socket.socket | None = None
-        self._lock = threading.Lock()
-        self._is_closed = False
-        self._thread: threading.Thread | None = None
+        self._server: _Server | None = None
+        self._arrive: Callable[[Any], None] = lambda _: None
         self.plug(plugged_in=True)
 
     @property
@@ -48,81 +50,53 @@ class StreamServer:
         return "{}:{}".format(*self._address)
 
     def open(self, arrive: Callable[[Any], None]) -> None:
-        """Start the reader thread."""
-        self._thread = threading.Thread(target=self._read, args=(arrive,), daemon=True)
-        self._thread.start()
+        """Begin to deliver the clients' bytes."""
+        self._arrive = arrive
 
     def send(self, batch: Sequence[bytes]) -> None:
         """Send bytes to their client, or to all; drop a client that does not read."""
-        with self._lock:
-            for data in batch:
-                number = getattr(data, "client", None)
-                for client in list(self._clients) if number is None else (number,):
-                    self._send(client, data)
+        for data in batch:
+            for number, client in list(self._clients.items()):
+                if getattr(data, "client", number) == number:
+                    try:
+                        is_full = client.send(data, socket.MSG_DONTWAIT) < len(data)
+                    except OSError:
+                        is_full = True
+                    if is_full:
+                        _drop(client)
 
     def plug(self, *, plugged_in: bool) -> None:
         """Listen, or close all connections and stop listening."""
-        with self._lock:
-            if plugged_in and self._listener is None:
-                try:
-                    self._listener = socket.create_server(self._address)
-                except OSError as error:
-                    raise UserError(f"cannot listen at {self.path}: {error.strerror}") from error
-            elif not plugged_in and self._listener is not None:
-                for client in list(self._clients):
-                    self._drop(client)
-                self._listener.close()
-                self._listener = None
+        if plugged_in and self._server is None:
+            serve: Any = lambda client, *_: self._serve(client)  # noqa: E731
+            try:
+                self._server = _Server(self._address, serve)
+            except OSError as error:
+                raise UserError(f"cannot listen at {self.path}: {error.strerror}") from error
+            serve_forever = self._server.serve_forever
+            threading.Thread(target=serve_forever, args=(_WAKE_UP_PERIOD,), daemon=True).start()
+        elif not plugged_in and self._server is not None:
+            self._server.shutdown()
+            self._server.server_close()
+            self._server = None
+            for client in list(self._clients.values()):
+                _drop(client)
 
     def close(self) -> None:
-        """Stop the reader thread and close all connections."""
-        self._is_closed = True
-        if self._thread is not None:
-            self._thread.join()
+        """Close all connections."""
         self.plug(plugged_in=False)
 
-    def _read(self, arrive: Callable[[Any], None]) -> None:
-        while not self._is_closed:
-            with self._lock:
-                sockets = [*self._clients.values(), *([self._listener] if self._listener else ())]
-            try:
-                select.select(sockets, [], [], _WAKE_UP_PERIOD)
-            except (OSError, ValueError):
-                # A socket was closed meanwhile.
-                continue
-            with self._lock:
-                chunks = self._receive()
-            if chunks:
-                arrive(chunks)
+    def _serve(self, client: socket.socket) -> None:
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        number = next(self._numbers)
+        self._clients[number] = client
+        with contextlib.suppress(OSError):
+            while data := client.recv(_READ_SIZE):
+                self._arrive((ClientBytes(data, number),))
+        del self._clients[number]
 
-    def _receive(self) -> tuple[ClientBytes, ...]:
-        """Accept new clients; return the bytes of all; never block."""
-        if self._listener is not None and select.select([self._listener], [], [], 0.0)[0]:
-            with contextlib.suppress(OSError):
-                client, _ = self._listener.accept()
-                client.setblocking(False)
-                client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._clients[next(self._numbers)] = client
-        chunks = []
-        for number, client in list(self._clients.items()):
-            try:
-                data = client.recv(_READ_SIZE)
-            except BlockingIOError:
-                continue
-            except OSError:
-                data = b""
-            if data:
-                chunks.append(ClientBytes(data, number))
-            else:
-                self._drop(number)
-        return tuple(chunks)
 
-    def _send(self, number: int, data: bytes) -> None:
-        if client := self._clients.get(number):
-            try:
-                client.sendall(data)
-            except OSError:
-                self._drop(number)
-
-    def _drop(self, number: int) -> None:
-        self._clients.pop(number).close()
+def _drop(client: socket.socket) -> None:
+    """End the connection; its thread ends with it."""
+    with contextlib.suppress(OSError):
+        client.shutdown(socket.SHUT_RDWR)

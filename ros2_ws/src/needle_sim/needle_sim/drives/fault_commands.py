@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import enum
 from collections.abc import Sequence
 
 from needle_core.diagnostics import Diagnostic, Level
@@ -36,16 +35,7 @@ hang AXIS           hang the drive's processor: it is silent, the motor ends at 
 restore             end cut_bus, unplug, stall and hang; AXIS is insertion or rotation"""
 
 
-class PlugCommand(enum.Enum):
-    """Commands to the adapters."""
-
-    OUT = "out"
-    IN = "in"
-
-
-def execute_command(
-    line: str, connections: Sequence[EmulatedDrives], now: float
-) -> PlugCommand | None:
+def execute_command(line: str, connections: Sequence[EmulatedDrives], now: float) -> bool | None:
     """Execute a fault command at steady time `now` [s].
 
     Parameters
@@ -59,8 +49,8 @@ def execute_command(
 
     Returns
     -------
-    PlugCommand or None
-        Remaining command to the adapters.
+    bool or None
+        Whether to plug the adapters in or out; None: neither.
 
     Raises
     ------
@@ -73,11 +63,11 @@ def execute_command(
             for drives in drives_of.values():
                 drives.is_cut = True
         case ["unplug"]:
-            return PlugCommand.OUT
+            return False
         case ["restore"]:
             for drives in connections:
                 drives.restore(now)
-            return PlugCommand.IN
+            return True
         case ["stall", axis] if axis in drives_of:
             drives_of[axis].stall(axis)
         case ["reboot", axis] if axis in drives_of:

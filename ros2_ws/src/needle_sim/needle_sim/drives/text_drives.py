@@ -173,10 +173,6 @@ class TextDrives(EmulatedDrives, Generic[Drive]):
             self.foreign(self.intruder)
         return bool(self.intruder)
 
-    def send(self, data: bytes, now: float) -> None:
-        """Send a message that is no reply to all clients."""
-        self._outbox.append((now, data))
-
     def _reply(self, client: int, reply: bytes, now: float) -> None:
         if not reply or self.lost:
             self.lost = self.lost and not reply

@@ -16,7 +16,7 @@ _STALL_TIME = 0.05
 # Code of a stall in the diagnostics: following error.
 _STALLED = 0x8611
 # Flags in the order of their priority.
-_FLAGS = ("FV", "FO", "FS", "WL", "WR", "WH", "NC", "NI")
+_FLAGS = ("FV", "FO", "FS", "WL", "WR", "WH", "NI")
 _ADDRESSES = {"insertion": 1, "rotation": 2}
 # The serial number 0 tells that the devices are emulated.
 _IDENTITY = {"device.id": 50952, "system.serial": 0, "version": 7.38}
@@ -113,15 +113,9 @@ class ZaberDrive(TextDrive):
         lower, upper = self.settings["limit.min"], self.settings["limit.max"]
         if target is not None and not lower <= target <= upper:
             raise RejectedError("BADDATA")
-        self.flags = self.flags - {"NC", "NI"} | ({"NI"} if self.is_busy else set())
+        self.flags = self.flags - {"NI"} | ({"NI"} if self.is_busy else set())
         self._target = None if target is None else target + self.zero
         self._speed, self._velocity, self._homing = speed, velocity, False
-
-    def turn_knob(self, velocity: float) -> None:
-        """Turn the knob: the axis moves at a velocity [counts/s]; 0 ends it."""
-        if self.settings["knob.enable"] and self.powered:
-            self.move(None, 0.0, velocity)
-            self.flags.add("NC")
 
     def order(self, words: list[str]) -> bool:
         """Execute an order; return whether it is one."""

@@ -23,7 +23,7 @@ from needle_sim.drive_emulator import (
     DriveEmulatorParameters,
 )
 from needle_sim.drives.emulators import CIA402
-from needle_sim.drives.fault_commands import COMMANDS, PlugCommand
+from needle_sim.drives.fault_commands import COMMANDS
 
 HELP = f"""\
 drive_emulator: emulates the drives of insertion and rotation with their motors.
@@ -94,10 +94,10 @@ class _Plugs:
     def open(self, arrive: Callable[[Any], None]) -> None:
         """Do nothing: the plug has no input."""
 
-    def send(self, batch: tuple[PlugCommand, ...]) -> None:
-        for command in batch:
+    def send(self, batch: tuple[bool, ...]) -> None:
+        for plugged_in in batch:
             for adapter in self._adapters:
-                adapter.plug(plugged_in=command is PlugCommand.IN)
+                adapter.plug(plugged_in=plugged_in)
 
     def close(self) -> None:
         """Do nothing: each port removes its own adapter."""

@@ -15,7 +15,6 @@ from needle_sim.drive_emulator import (
     DriveEmulatorParameters,
 )
 from needle_sim.drives.emulated_bus import EmulatedBus
-from needle_sim.drives.fault_commands import PlugCommand
 
 AT = Moment(1.0, 1_000_000_000)
 
@@ -62,7 +61,7 @@ def test_a_reboot_on_command_is_logged(drives: DriveEmulator) -> None:
 def test_the_adapter_is_unplugged_and_plugged_in_on_command(drives: DriveEmulator) -> None:
     said = typed(drives, "unplug", "restore")
     orders = [action.batch for action in said if isinstance(action, Send)]
-    assert orders == [(PlugCommand.OUT,), (PlugCommand.IN,)]
+    assert orders == [(False,), (True,)]
     assert {action.port for action in said if isinstance(action, Send)} == {ADAPTERS}
 
 

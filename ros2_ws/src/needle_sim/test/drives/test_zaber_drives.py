@@ -151,20 +151,6 @@ def test_a_loss_of_power_loses_the_reference_but_no_setting() -> None:
     assert "WR" in chain.say("2 warnings")
 
 
-def test_the_knob_moves_the_axis_unless_it_is_disabled() -> None:
-    chain = Chain().homed()
-    knob = chain.drives.drives["insertion"].turn_knob
-    knob(5000.0)
-    assert chain.say("1 1", 0.5) == "@01 1 OK BUSY NC 0\r\n"
-    knob(0.0)
-    assert 0.002 < chain.place < 0.003
-    chain.say("1 set knob.enable 0", 0.5)
-    place = chain.place
-    knob(5000.0)
-    chain.now += 0.5
-    assert chain.place == place
-
-
 def test_a_disabled_driver_refuses_motion() -> None:
     chain = Chain().homed()
     chain.say("1 1 move abs 50000")
