@@ -6,26 +6,24 @@ import datetime
 import math
 import select
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from needle_bags.recording.bag_tap import BagTap
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_core.commands.options import CommandParser, number
-from needle_core.component import Call, Publish, RealPort
+from needle_core.component import Call, Publish
 from needle_core.errors import UserError
 from needle_core.messages import EmergencyStop
 from needle_core.runners.paced import PacedRunner
 from needle_core.runners.virtual import DIAGNOSTICS, LOG
-from needle_core.settings.parameter_fields import from_values
-from needle_core.settings.parameter_files import read_parameters
 from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.conformance.faults import FAULTS, Fault, largest_travel
-from needle_device_driver.conformance.rig import ConformanceRig, RigClient
+from needle_device_driver.conformance.rig import DRIVER, ConformanceRig, RigClient
 from needle_device_driver.device import EMERGENCY_STOP
 from needle_device_driver.device_driver import DeviceDriver
-from needle_device_driver.parameters import DeviceDriverParameters
+from needle_device_driver.parameters import read_driver_parameters
 
 _DESCRIPTION = """\
 Commission drives on a bench without a needle: home them, move 10 mm, and stop a fast step in each
@@ -84,20 +82,19 @@ class Bench(ConformanceRig):
     ----------
     settings : DeviceDriverParameters
         Of the driver.
-    ports : mapping of str to RealPort
-        Its ports.
     bag : Path
         The bag.
     """
 
     runner: PacedRunner
 
-    def __init__(self, settings: Any, ports: Mapping[str, RealPort], bag: Path) -> None:
+    def __init__(self, settings: Any, bag: Path) -> None:
         self.settings, self.hand, self.driver = settings, RigClient(), DeviceDriver(settings)
         self.logged, self.commands = [], []
         components = [self.driver, self.hand]
         self.tap = BagTap(bag, components, (DIAGNOSTICS, LOG), {"purpose": "commissioning"})
-        self.runner = PacedRunner(components, ports=ports, taps=(self._keep_log, self.tap))
+        taps = (self._keep_log, self.tap)
+        self.runner = PacedRunner(components, ports=settings.ports(), taps=taps)
 
     @property
     def place(self) -> tuple[float, float]:
@@ -109,7 +106,7 @@ class Bench(ConformanceRig):
         print(f"{text} [Enter]", flush=True)
         while not select.select([sys.stdin], [], [], 0.0)[0]:
             if self.runner.run(PERIOD):
-                raise UserError(self.runner.exits[DeviceDriver.name].text)
+                raise UserError(self.runner.exits[DRIVER].text)
         return sys.stdin.readline().strip()
 
 
@@ -227,15 +224,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(params: Path, out: Path) -> int:
-    name = DeviceDriver.name
-    values = read_parameters(params, [name]).get(name, {})
-    settings = from_values(DeviceDriverParameters, values, name)
+    settings = read_driver_parameters(params)
     try:
         out.mkdir()
     except OSError as error:
         raise UserError(f"cannot make {out}: {error.strerror}") from error
-    ports = {backend.port: backend.open_port(settings) for backend in settings.backends}
-    bench = Bench(settings, ports, out / "bag")
+    bench = Bench(settings, out / "bag")
     try:
         rows = []
         for row in commission(bench, bench.ask):
@@ -243,7 +237,7 @@ def _run(params: Path, out: Path) -> int:
             print(f"{row.rule}: {row.event}: {row.measured * 1e3:.3f} mm", flush=True)
         person = bench.ask("Type your name for the report.")
     finally:
-        bench.runner.stop(name)
+        bench.runner.stop(DRIVER)
         bench.runner.run(2.0)
         bench.runner.close()
         bench.tap.close()

@@ -10,15 +10,13 @@ from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
 from needle_core.runners.paced import PacedRunner
-from needle_core.settings.parameter_fields import from_values
-from needle_core.settings.parameter_files import read_parameters
 from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.cia402.backend import drive_settings
 from needle_device_driver.cia402.drive_file_check import ObjectRow, check_device_file
 from needle_device_driver.conformance.scenarios import RULES, verdict
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.link.device_file import UNKNOWN
-from needle_device_driver.parameters import DeviceDriverParameters
+from needle_device_driver.parameters import DeviceDriverParameters, read_driver_parameters
 
 _DESCRIPTION = """\
 Check what a drive supports of the safety rules, without moving it.
@@ -60,16 +58,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _check_drives(path: Path) -> int:
-    name = DeviceDriver.name
-    values = read_parameters(path, [name]).get(name, {})
-    settings = from_values(DeviceDriverParameters, values, name)
+    settings = read_driver_parameters(path)
     driver = DeviceDriver(settings)
-    ports = {backend.port: backend.open_port(settings) for backend in settings.backends}
-    runner = PacedRunner([driver], ports=ports)
+    runner = PacedRunner([driver], ports=settings.ports())
     try:
         while not driver.is_set_up:
             if runner.run(PERIOD):
-                raise UserError(runner.exits[name].text)
+                raise UserError(runner.exits[driver.name].text)
         for drives in driver.drives:
             print(f"{drives.link.name}: {' and '.join(drives.axes)}\n")
             for rule in RULES:
@@ -77,7 +72,7 @@ def _check_drives(path: Path) -> int:
             for text in drives.missing_optional_parts:
                 print(f"\nThe {text}.")
             print()
-        runner.stop(name)
+        runner.stop(driver.name)
         runner.run(_END)
     finally:
         runner.close()

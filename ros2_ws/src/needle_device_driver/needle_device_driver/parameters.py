@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from needle_core.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.component import RealPort
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter, from_values
+from needle_core.settings.parameter_files import read_parameters
 from needle_device_driver.axes.axis_settings import AxisSettings
 from needle_device_driver.axes.backend import HAND, Backend, backends, parameters_of
 from needle_device_driver.supervisor.limits import SafetyLimits, limit_parameter
@@ -130,6 +133,10 @@ class DriverParameters(SafetyLimits):
         """
         return self.reply_age_limit / 2.0
 
+    def ports(self) -> dict[str, RealPort]:
+        """Return the ports to the drives by name."""
+        return {backend.port: backend.open_port(self) for backend in self.backends}
+
     def axes_of(self, backend: Backend) -> dict[str, AxisSettings]:
         """Return the settings of the axes with this kind of drive."""
         return {
@@ -162,3 +169,9 @@ else:
         frozen=True,
     )
     DeviceDriverParameters.__doc__ = "Parameters of device_driver, fixed at start."
+
+
+def read_driver_parameters(path: Path) -> Any:
+    """Return the parameters of device_driver from a parameter file; raises `UserError`."""
+    values = read_parameters(path, ["device_driver"]).get("device_driver", {})
+    return from_values(DeviceDriverParameters, values, "device_driver")

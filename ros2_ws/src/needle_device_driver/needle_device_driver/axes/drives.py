@@ -7,19 +7,55 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from needle_core.diagnostics import Diagnostic, Level
-from needle_device_driver.axes.axis import Axis
+from needle_device_driver.axes.axis import Axis, AxisError
+from needle_device_driver.axes.axis_settings import AxisSettings
 from needle_device_driver.axes.capabilities import Capabilities
+from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.axes.link import Link
 from needle_device_driver.procedure import Procedure
+from needle_device_driver.rules import Rule
+
+Fault = tuple[Rule, str]
+"""Rule behind a fault, and its text."""
 
 
 class CyclicAxis(Axis):
-    """Axis whose orders other than set-points take several cycles."""
+    """Axis whose orders other than set-points take several cycles.
+
+    Attributes
+    ----------
+    name : str
+        Insertion or rotation.
+    """
+
+    name: str
+    _configured = False
 
     @property
     @abc.abstractmethod
     def needs_cycles(self) -> bool:
         """Whether the drive still executes an order other than a set-point."""
+
+    @property
+    @abc.abstractmethod
+    def _fault(self) -> Fault | None:
+        """Why the axis refuses to move."""
+
+    def _refuse_fault(self) -> None:
+        if not self._configured:
+            raise AxisError(f"{self.name} axis is not configured")
+        if (fault := self._fault) is not None:
+            raise AxisError(f"{self.name} axis: {fault[1]}", fault[0])
+
+    def _check_step(self, settings: AxisSettings, step: int, speed: float) -> None:
+        """Refuse a set-point that is farther from the last one than the greatest speed allows."""
+        bound = settings.magnitude(settings.speed * PERIOD * 1.01) + 1
+        if step > bound:
+            raise AxisError(
+                f"{self.name} axis: set-point step of {step / settings.counts_per_unit:.6g} in a "
+                f"cycle at {speed:.6g}/s, limit {bound / settings.counts_per_unit:.6g}",
+                Rule.LOOK_AHEAD,
+            )
 
 
 class Drives(abc.ABC):

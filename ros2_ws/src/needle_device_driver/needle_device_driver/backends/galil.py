@@ -119,6 +119,8 @@ class GalilProtocol(DriveProtocol):
     def __init__(self, parameters: Any, axes: Mapping[str, AxisSettings], link: TextLink) -> None:
         super().__init__(parameters, axes, link)
         self._channels = {axis: getattr(parameters, f"galil_{axis}_channel") for axis in axes}
+        if parameters.galil_insertion_channel == parameters.galil_rotation_channel:
+            raise UserError("galil_insertion_channel and galil_rotation_channel are the same")
         self._last = list(axes)[-1]
         # The program stops the axes one or two of its periods before the watchdog's time is over.
         self._beat = f"nsbeat={round(parameters.watchdog / _COUNTDOWN) - 2}"
@@ -335,12 +337,4 @@ class GalilProtocol(DriveProtocol):
         self._expected += [_Expected(command, axis=axis, number=number) for command in commands]
 
 
-def _check(parameters: Any) -> None:
-    if parameters.galil_insertion_channel == parameters.galil_rotation_channel:
-        raise UserError("galil_insertion_channel and galil_rotation_channel are the same")
-
-
-BACKEND = dataclasses.replace(
-    polled_backend("galil", GalilSettings, GalilProtocol, address=lambda at: at.galil_address),
-    check=_check,
-)
+BACKEND = polled_backend("galil", GalilSettings, GalilProtocol, address=lambda at: at.galil_address)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from needle_device_driver.axes.axis import AxisError, AxisSnapshot
 from needle_device_driver.axes.drive_errors import DriveError, LinkError, raised_as_axis_error
-from needle_device_driver.axes.drives import CyclicAxis
+from needle_device_driver.axes.drives import CyclicAxis, Fault
 from needle_device_driver.axes.speed_monitor import SpeedMonitor
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
@@ -26,12 +26,7 @@ from needle_device_driver.cia402.drive_upkeep import (
     disarm_watchdog,
     reset_fault,
 )
-from needle_device_driver.cia402.drive_watch import (
-    Fault,
-    HomingRun,
-    HomingStep,
-    drive_fault,
-)
+from needle_device_driver.cia402.drive_watch import HomingRun, HomingStep, drive_fault
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.object_access import ObjectAccess
@@ -160,13 +155,7 @@ class Cia402Axis(CyclicAxis):
                 Rule.SOFTWARE_LIMITS,
             )
         step = abs(counts - self._machine.target)
-        bound = settings.magnitude(settings.speed * self._period * 1.01) + 1
-        if step > bound:
-            raise AxisError(
-                f"{self.name} axis: set-point step of {step / settings.counts_per_unit:.6g} in a "
-                f"cycle at {speed:.6g}/s, limit {bound / settings.counts_per_unit:.6g}",
-                Rule.LOOK_AHEAD,
-            )
+        self._check_step(settings, step, speed)
         self._machine.target = counts
         self._speed.command(step / settings.counts_per_unit / self._period)
 
@@ -328,12 +317,6 @@ class Cia402Axis(CyclicAxis):
             return Rule.ONE_MASTER, self._link.other_master
         watched = self.monitor, self._machine, self._speed, self._homing
         return drive_fault(*watched, actuated=self.actuated)
-
-    def _refuse_fault(self) -> None:
-        if not self._configured:
-            raise AxisError(f"{self.name} axis is not configured")
-        if (fault := self._fault) is not None:
-            raise AxisError(f"{self.name} axis: {fault[1]}", fault[0])
 
     # ---- set-up, reset, shut-down -------------------------------------------------------------
 

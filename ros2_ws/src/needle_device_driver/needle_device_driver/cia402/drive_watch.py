@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 
 from needle_device_driver.axes.axis_settings import HERE
+from needle_device_driver.axes.drives import Fault
 from needle_device_driver.axes.speed_monitor import SpeedMonitor
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
@@ -22,8 +23,6 @@ from needle_device_driver.cia402.drive_settings import INDEX_PULSE, DriveSetting
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.error_codes import HEARTBEAT_LOST, describe_error
 from needle_device_driver.rules import Rule
-
-Fault = tuple[Rule, str]
 
 # A drive may report that it attained the previous homing. If the new one ends within a cycle, where
 # the axis stands or at the edge of its switch, no change shows. So it counts as ended after this

@@ -8,8 +8,9 @@ from collections.abc import Callable
 
 from needle_device_driver.axes.axis import AxisError, AxisSnapshot
 from needle_device_driver.axes.axis_settings import HERE, AxisSettings
+from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.axes.drive_errors import DriveError, raised_as_axis_error
-from needle_device_driver.axes.drives import CyclicAxis
+from needle_device_driver.axes.drives import CyclicAxis, Fault
 from needle_device_driver.axes.speed_monitor import SpeedMonitor
 from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
 from needle_device_driver.procedure import Procedure, Wait
@@ -52,8 +53,6 @@ class PolledAxis(CyclicAxis):
         The axis.
     protocol : DriveProtocol
         Language of the drive.
-    period : float
-        Of the cycle [s].
     refresh : callable
         Returns a procedure that requests the state of the drive and waits for it.
     """
@@ -63,15 +62,13 @@ class PolledAxis(CyclicAxis):
         name: str,
         settings: AxisSettings,
         protocol: DriveProtocol,
-        period: float,
         refresh: Callable[[], Procedure[None]],
     ) -> None:
         self.name = name
-        self._settings, self._protocol, self._period = settings, protocol, period
-        self._refresh = refresh
-        self._speed = SpeedMonitor(settings, period)
-        response = math.ceil(protocol.capabilities.response_time / period)
-        self._max_stop = math.ceil(settings.stop_time / period) + response + _STOP_MARGIN
+        self._settings, self._protocol, self._refresh = settings, protocol, refresh
+        self._speed = SpeedMonitor(settings, PERIOD)
+        response = math.ceil(protocol.capabilities.response_time / PERIOD)
+        self._max_stop = math.ceil(settings.stop_time / PERIOD) + response + _STOP_MARGIN
         self._at = _OFF
         self._time = -math.inf
         self._velocity = 0.0
@@ -83,7 +80,7 @@ class PolledAxis(CyclicAxis):
         self._homing: _Homing | None = None
         self._homing_speed = self._travelled = 0.0
         self._still = self._cycles = self._order_cycles = 0
-        self._problem: tuple[Rule, str] | None = None
+        self._problem: Fault | None = None
         self.answered = True
 
     # ---- orders -------------------------------------------------------------------------------
@@ -127,16 +124,10 @@ class PolledAxis(CyclicAxis):
                 Rule.SOFTWARE_LIMITS,
             )
         step = abs(counts + self._zero - self._target)
-        bound = settings.magnitude(settings.speed * self._period * 1.01) + 1
-        if step > bound:
-            raise AxisError(
-                f"{self.name} axis: set-point step of {step / settings.counts_per_unit:.6g} in a "
-                f"cycle at {speed:.6g}/s, limit {bound / settings.counts_per_unit:.6g}",
-                Rule.LOOK_AHEAD,
-            )
+        self._check_step(settings, step, speed)
         if step:
             # A repeated set-point would replace the drive's unfinished order by a slower one.
-            self._move_to(counts + self._zero, step / settings.counts_per_unit / self._period)
+            self._move_to(counts + self._zero, step / settings.counts_per_unit / PERIOD)
 
     def stop(self) -> None:
         """Send a stop immediately."""
@@ -180,7 +171,7 @@ class PolledAxis(CyclicAxis):
                 yield from self._refresh()
                 if not self._at.moving:
                     break
-                yield Wait(lambda: bool(self._protocol.link.lost), self._period)
+                yield Wait(lambda: bool(self._protocol.link.lost), PERIOD)
             yield from self._protocol.release(self.name)
 
     # ---- feedback -----------------------------------------------------------------------------
@@ -235,10 +226,10 @@ class PolledAxis(CyclicAxis):
     def update(self, at: DriveReply, time: float) -> None:
         """Handle the drive's state, which was requested at steady time `time` [s]."""
         before, self._at = self._at, at
-        periods = max(1, round((time - self._time) / self._period)) if self._time > 0.0 else 1
+        periods = max(1, round((time - self._time) / PERIOD)) if self._time > 0.0 else 1
         self._time = time
         moved = self._settings.position(at.position - before.position)
-        self._velocity = moved / (periods * self._period)
+        self._velocity = moved / (periods * PERIOD)
         self._cycles += 1
         self._order_cycles += 1
         still = not at.moving and abs(moved) <= self._settings.tolerance
@@ -268,7 +259,7 @@ class PolledAxis(CyclicAxis):
         return self._ready_for_orders and self._homing is None
 
     @property
-    def _fault(self) -> tuple[Rule, str] | None:
+    def _fault(self) -> Fault | None:
         at, link = self._at, self._protocol.link
         if not self._configured:
             return None
@@ -283,12 +274,6 @@ class PolledAxis(CyclicAxis):
             if text:
                 return rule, text
         return self._problem
-
-    def _refuse_fault(self) -> None:
-        if not self._configured:
-            raise AxisError(f"{self.name} axis is not configured")
-        if (fault := self._fault) is not None:
-            raise AxisError(f"{self.name} axis: {fault[1]}", fault[0])
 
     def _move_to(self, target: int, speed: float) -> None:
         self._target = target
@@ -339,7 +324,7 @@ class PolledAxis(CyclicAxis):
         elif self._homing is not _Homing.SETTLE:
             search = self._homing is _Homing.SEARCH
             speed = self._homing_speed * (1.0 if search else _EDGE_SPEED)
-            step = settings.magnitude(speed * self._period) * settings.direction
+            step = settings.magnitude(speed * PERIOD) * settings.direction
             self._move_to(self._target + (-step if search else step), speed)
 
     def _end_homing(self) -> None:
@@ -362,14 +347,14 @@ class PolledAxis(CyclicAxis):
 
     @property
     def _blocked_distance(self) -> float:
-        return _BLOCKED * self._settings.speed * self._period
+        return _BLOCKED * self._settings.speed * PERIOD
 
     def _check_power(self, at: DriveReply) -> None:
         off = not self._goal_on or self._released
         if self._goal_on and not at.powered and not off and self._cycles > _MAX_SWITCHING:
             self._set_problem(
                 Rule.ONE_FAULT_STOPS_BOTH,
-                f"the drive is not on after {_MAX_SWITCHING * self._period:g} s",
+                f"the drive is not on after {_MAX_SWITCHING * PERIOD:g} s",
             )
         if self._was_off and off and at.powered:
             self._set_problem(Rule.ONE_MASTER, "another program has switched the drive on")

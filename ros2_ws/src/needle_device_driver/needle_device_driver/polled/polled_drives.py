@@ -37,7 +37,7 @@ class PolledDrives(Drives):
 
     def __init__(self, port: str, protocol: DriveProtocol) -> None:
         axes = {
-            name: PolledAxis(name, settings, protocol, PERIOD, self._refresh)
+            name: PolledAxis(name, settings, protocol, self._refresh)
             for name, settings in protocol.axes.items()
         }
         super().__init__(port, protocol.link, axes)

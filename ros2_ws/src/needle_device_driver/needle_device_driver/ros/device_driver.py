@@ -47,9 +47,7 @@ def main() -> int:
         DeviceDriverParameters,
         make_driver,
         help_text=HELP,
-        ports=lambda settings: {
-            backend.port: backend.open_port(settings) for backend in settings.backends
-        },
+        ports=lambda settings: settings.ports(),
         shared_memory=False,
     )
 
