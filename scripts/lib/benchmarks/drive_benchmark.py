@@ -67,10 +67,10 @@ class Driver:
         self._port = CanPort(settings)
         self._port.open(self._arrived.put)
         self._axes = [
-            Cia402Axis(name, drive_settings(values, name), self._link, period=PERIOD, watchdog=0.5)
+            Cia402Axis(name, drive_settings(values, name), self._link, watchdog=0.5)
             for name in ("insertion", "rotation")
         ]
-        self._cycle = Cia402Drives(self._link, self._axes, PERIOD, 0.5)
+        self._cycle = Cia402Drives(self._link, self._axes, 0.5)
         for axis in self._axes:
             self._run(axis.configure())
             axis.power(True)

@@ -23,28 +23,20 @@ BACKENDS = backends()
 AXES = ("insertion", "rotation")
 
 
-def _axis(
-    axis: str,
-    unit: str,
-    *,
-    counts_per_unit: float,
-    acceleration: float,
-    quick_stop: float,
-    homing_method: int,
-    tolerance: float,
-) -> dict[str, Any]:
+def _axis(axis: str, unit: str, *defaults: float) -> dict[str, Any]:
+    scale, acceleration, stop, home, tolerance = defaults
     ramp = f"{unit}/s^2"
     fields = {
         "counts_per_unit": fixed_parameter(
-            counts_per_unit, f"counts/{unit}", "Position counts per unit of the axis.", 1.0, 1e12
+            scale, f"counts/{unit}", "Position counts per unit of the axis.", 1.0, 1e12
         ),
         "reverse": fixed_parameter(False, "-", "The drive counts in the opposite direction."),
         "acceleration": fixed_parameter(acceleration, ramp, "Ramp of homing.", 1e-4, 1e4),
         "quick_stop_deceleration": fixed_parameter(
-            quick_stop, ramp, "Deceleration of a quick stop.", 1e-4, 1e4
+            stop, ramp, "Deceleration of a quick stop.", 1e-4, 1e4
         ),
         "homing_method": fixed_parameter(
-            homing_method, "-", "CiA 402 method: 17, 18 limit switch; 37 current position.", 1, 37
+            int(home), "-", "CiA 402 method: 17, 18 limit switch; 37 current position.", 1, 37
         ),
         "following_error": limit_parameter(f"{axis}_following_error"),
         "tolerance": fixed_parameter(
@@ -54,27 +46,11 @@ def _axis(
     return {f"{axis}_{name}": field for name, field in fields.items()}
 
 
+# Counts, ramps, homing method, tolerance. Insertion: a lead screw of 1 mm, 20000 counts per turn.
+# Rotation: an encoder of 16384 lines, four counts per line, on the needle's own shaft.
 _AXIS_FIELDS = {
-    # A lead screw of 1 mm, 20000 counts per turn.
-    **_axis(
-        "insertion",
-        "m",
-        counts_per_unit=20_000_000.0,
-        acceleration=0.05,
-        quick_stop=0.5,
-        homing_method=17,
-        tolerance=5e-6,
-    ),
-    # An encoder of 16384 lines, four counts per line, on the needle's own shaft.
-    **_axis(
-        "rotation",
-        "rad",
-        counts_per_unit=65536.0 / (2.0 * math.pi),
-        acceleration=20.0,
-        quick_stop=100.0,
-        homing_method=37,
-        tolerance=1e-3,
-    ),
+    **_axis("insertion", "m", 20_000_000.0, 0.05, 0.5, 17, 5e-6),
+    **_axis("rotation", "rad", 65536.0 / (2.0 * math.pi), 20.0, 100.0, 37, 1e-3),
 }
 _OF_AXIS = tuple(name.removeprefix("insertion_") for name in _AXIS_FIELDS if "insertion_" in name)
 

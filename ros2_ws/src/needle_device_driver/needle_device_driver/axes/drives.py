@@ -11,8 +11,9 @@ from needle_device_driver.axes.axis import Axis, AxisError
 from needle_device_driver.axes.axis_settings import AxisSettings
 from needle_device_driver.axes.capabilities import Capabilities
 from needle_device_driver.axes.cycle_times import PERIOD
+from needle_device_driver.axes.drive_errors import DriveError, LinkError
 from needle_device_driver.axes.link import Link
-from needle_device_driver.procedure import Procedure
+from needle_device_driver.procedure import Procedure, Wait
 from needle_device_driver.rules import Rule
 
 Fault = tuple[Rule, str]
@@ -35,6 +36,10 @@ class CyclicAxis(Axis):
     @abc.abstractmethod
     def needs_cycles(self) -> bool:
         """Whether the drive still executes an order other than a set-point."""
+
+    @abc.abstractmethod
+    def transmit(self) -> Procedure[None]:
+        """Send this cycle's order; raises `LinkError` if the link is lost."""
 
     @property
     @abc.abstractmethod
@@ -100,9 +105,14 @@ class Drives(abc.ABC):
     def receive(self, batch: Sequence[Any]) -> None:
         """Receive a batch from the port."""
 
-    @abc.abstractmethod
     def probe(self) -> Procedure[str]:
         """Open the link and request an answer of every drive; return the error."""
+        try:
+            self.link.open()
+            yield from self._identify()
+        except (AxisError, DriveError, LinkError) as error:
+            return str(error)
+        return ""
 
     @abc.abstractmethod
     def are_emulated(self) -> Procedure[bool]:
@@ -118,13 +128,37 @@ class Drives(abc.ABC):
     def beat(self) -> None:
         """Report to the drives' watchdogs that the control loop runs, if the link is open."""
 
-    @abc.abstractmethod
     def collect(self) -> None:
         """Process answers that arrived after the end of the last cycle."""
+        return
 
-    @abc.abstractmethod
     def exchange(self, timeout: float) -> Procedure[None]:
         """Run one cycle; wait at most `timeout` [s] for the answers."""
+        if not self.link.is_open:
+            return
+        try:
+            self.beat()
+            for axis in self.axes.values():
+                yield from axis.transmit()
+            timeout = self._request(timeout)
+        except LinkError:
+            # The axes report the loss.
+            return
+        yield Wait(lambda: bool(self.link.lost) or self._answered(), timeout)
+        self.unanswered += not self._answered()
+        self.collect()
+
+    @abc.abstractmethod
+    def _identify(self) -> Procedure[None]:
+        """Request an answer of every drive."""
+
+    @abc.abstractmethod
+    def _request(self, timeout: float) -> float:
+        """Request the feedback of all drives; return how long to wait for it [s]."""
+
+    @abc.abstractmethod
+    def _answered(self) -> bool:
+        """Return whether all drives have answered."""
 
     def health(self, waiting: str) -> Diagnostic:
         """Return the health of the link since the last call; `waiting` describes a closed link."""

@@ -11,7 +11,6 @@ from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import fixed_parameter
 from needle_device_driver.axes.axis_settings import AxisSettings
 from needle_device_driver.axes.backend import Backend
-from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import Cia402Drives
 from needle_device_driver.cia402.drive_settings import DriveSettings
@@ -54,17 +53,8 @@ def drive_settings(parameters: Any, axis: str) -> DriveSettings:
 
 def _make(parameters: Any, axes: Mapping[str, AxisSettings]) -> Cia402Drives:
     link, watchdog = FrameLink(parameters.link_name), parameters.watchdog
-    made = [
-        Cia402Axis(
-            name,
-            drive_settings(parameters, name),
-            link,
-            period=PERIOD,
-            watchdog=watchdog,
-        )
-        for name in axes
-    ]
-    return Cia402Drives(link, made, PERIOD, watchdog)
+    made = [Cia402Axis(name, drive_settings(parameters, name), link, watchdog) for name in axes]
+    return Cia402Drives(link, made, watchdog)
 
 
 def _check(parameters: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from needle_device_driver.axes.axis import AxisError, AxisSnapshot
+from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.axes.drive_errors import DriveError, LinkError, raised_as_axis_error
 from needle_device_driver.axes.drives import CyclicAxis, Fault
 from needle_device_driver.axes.speed_monitor import SpeedMonitor
@@ -52,8 +53,6 @@ class Cia402Axis(CyclicAxis):
         The drive.
     link : FrameLink
         The bus, shared by all axes.
-    period : float
-        Of the SYNC [s].
     watchdog : float
         The drive stops after this time without the computer's heartbeat [s].
 
@@ -66,18 +65,18 @@ class Cia402Axis(CyclicAxis):
     """
 
     def __init__(
-        self, name: str, settings: DriveSettings, link: FrameLink, *, period: float, watchdog: float
+        self, name: str, settings: DriveSettings, link: FrameLink, watchdog: float
     ) -> None:
         self.name = name
         # As given, and with the units of the drive.
         self._given = self._settings = settings
         self.actuated = settings.actuated
-        self._link, self._period, self._watchdog = link, period, watchdog
+        self._link, self._watchdog = link, watchdog
         self.monitor = DriveMonitor(link, settings.node_id)
         self.missing_optional_objects: tuple[str, ...] = ()
         rest, stop_time = settings.magnitude(settings.tolerance), settings.stop_time
-        self._machine = DriveMachine(rest, period, stop_time, self.monitor.feedback)
-        self._speed = SpeedMonitor(settings, period)
+        self._machine = DriveMachine(rest, PERIOD, stop_time, self.monitor.feedback)
+        self._speed = SpeedMonitor(settings, PERIOD)
         self._homing: HomingRun | None = None
         self._configured = self._homed = self._limits_due = False
         self._opening = self._origin = self._zero = 0
@@ -157,7 +156,7 @@ class Cia402Axis(CyclicAxis):
         step = abs(counts - self._machine.target)
         self._check_step(settings, step, speed)
         self._machine.target = counts
-        self._speed.command(step / settings.counts_per_unit / self._period)
+        self._speed.command(step / settings.counts_per_unit / PERIOD)
 
     def stop(self) -> None:
         """Send a quick stop immediately."""
@@ -175,7 +174,7 @@ class Cia402Axis(CyclicAxis):
         with raised_as_axis_error(self.name):
             self._link.open()
             self._link.other_master = ""
-            operational = yield from await_operational(self._link, self.monitor, self._period)
+            operational = yield from await_operational(self._link, self.monitor, PERIOD)
             survived = operational and not self.monitor.rebooted
             if not survived or self._opening != self._link.openings:
                 yield from self._set_up(survived=survived)
@@ -259,14 +258,14 @@ class Cia402Axis(CyclicAxis):
         before, at = self._machine.at, self.monitor.feedback
         if at.number == before.number or not self._configured:
             return
-        self._velocity = self._settings.position(at.position - before.position) / self._period
+        self._velocity = self._settings.position(at.position - before.position) / PERIOD
         if not self.actuated:
             self._machine.at = at
             return
         self._machine.update(at)
         if self._homing is not None:
             self._speed.command(self._homing.speed)
-        periods = at.periods_since(before, self._period)
+        periods = at.periods_since(before, PERIOD)
         moved = self._settings.position(at.position - before.position)
         plausible = self._speed.check(moved, periods, powered=self._machine.state in POWERED)
         if self._homing is not None:
@@ -324,10 +323,10 @@ class Cia402Axis(CyclicAxis):
         self._homed = self._homed and survived
         self.monitor.begin_set_up()
         self._settings, self.missing_optional_objects = yield from set_up(
-            self._link, self.monitor, self._given, period=self._period, homed=self._homed
+            self._link, self.monitor, self._given, period=PERIOD, homed=self._homed
         )
         self._limits_due = False
-        yield from await_start(self._link, self.monitor, self._settings, self._period)
+        yield from await_start(self._link, self.monitor, self._settings, PERIOD)
         yield from arm_watchdog(self._link, self._settings, self._watchdog)
         if self.monitor.rebooted:
             # The reboot has undone the first part of the set-up.
@@ -364,10 +363,10 @@ class Cia402Axis(CyclicAxis):
             self._send_order()
             self.monitor.expect_answer()
             self._link.send(od.SYNC)
-            yield Wait(self.monitor.answered, self._period)
+            yield Wait(self.monitor.answered, PERIOD)
             answered = self.monitor.answered()
             # A drive needs about one period between two SYNCs.
-            yield Wait(lambda: bool(self._link.lost), self._period / 2.0)
+            yield Wait(lambda: bool(self._link.lost), PERIOD / 2.0)
             self.update()
             silent = 0 if answered else silent + 1
             if silent > _MAX_SILENT:

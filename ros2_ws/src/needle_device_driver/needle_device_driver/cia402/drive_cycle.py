@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from needle_core.can_frame import CAN, CanErrors, CanFrame
-from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.axes.capabilities import Capabilities
-from needle_device_driver.axes.drive_errors import LinkError
+from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.axes.drives import Drives
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_upkeep import are_emulated
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import SYNC
-from needle_device_driver.procedure import Procedure, Wait
+from needle_device_driver.procedure import Procedure
 
 # A pause for late answers: its length in cycles, and the wait in each of them [s].
 _PAUSE = 2
@@ -29,21 +28,17 @@ class Cia402Drives(Drives):
         The bus.
     axes : sequence of Cia402Axis
         The axes of all its drives.
-    period : float
-        Of the cycle [s].
     watchdog : float
         A drive stops after this time without the computer's heartbeat [s].
     """
 
-    def __init__(
-        self, link: FrameLink, axes: Sequence[Cia402Axis], period: float, watchdog: float
-    ) -> None:
+    def __init__(self, link: FrameLink, axes: Sequence[Cia402Axis], watchdog: float) -> None:
         super().__init__(CAN, link, {axis.name: axis for axis in axes})
         self.capabilities = Capabilities(
             streams=True,
             watchdog=watchdog,
-            longest_order=period,
-            response_time=period,
+            longest_order=PERIOD,
+            response_time=PERIOD,
             encoder=True,
             switches=True,
             limits=True,
@@ -72,15 +67,9 @@ class Cia402Drives(Drives):
         """Return whether each drive reports that it is emulated; raises `LinkError`."""
         return are_emulated(self._link, [axis.node_id for axis in self._axes])
 
-    def probe(self) -> Procedure[str]:
-        """Open the link and request an answer of every drive; return the error."""
-        try:
-            self._link.open()
-            for axis in self._axes:
-                yield from axis.probe()
-        except (AxisError, LinkError) as error:
-            return str(error)
-        return ""
+    def _identify(self) -> Procedure[None]:
+        for axis in self._axes:
+            yield from axis.probe()
 
     def beat(self) -> None:
         """Send the computer's heartbeat if the link is open."""
@@ -92,26 +81,13 @@ class Cia402Drives(Drives):
         for axis in self._axes:
             axis.update()
 
-    def exchange(self, timeout: float) -> Procedure[None]:
-        """Run one cycle; wait at most `timeout` [s] for the answers."""
-        if not self._link.is_open:
-            return
-        try:
-            self._link.beat()
-            for axis in self._axes:
-                yield from axis.transmit()
-            if self._must_pause():
-                timeout = min(timeout, _PAUSE_WAIT)
-            else:
-                for axis in self._axes:
-                    axis.monitor.expect_answer()
-                self._link.send(SYNC)
-        except LinkError:
-            # The axes report the loss.
-            return
-        yield Wait(lambda: bool(self._link.lost) or self._answered(), timeout)
-        self.unanswered += not self._answered()
-        self.collect()
+    def _request(self, timeout: float) -> float:
+        if self._must_pause():
+            return min(timeout, _PAUSE_WAIT)
+        for axis in self._axes:
+            axis.monitor.expect_answer()
+        self._link.send(SYNC)
+        return timeout
 
     def _must_pause(self) -> bool:
         """Return whether answers are so late that another SYNC would mix them up.

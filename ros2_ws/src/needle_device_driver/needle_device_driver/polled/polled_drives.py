@@ -55,15 +55,9 @@ class PolledDrives(Drives):
         for line in self._link.receive(batch):
             self._protocol.on_line(line)
 
-    def probe(self) -> Procedure[str]:
-        """Open the link and ask for the names of the drives; return the error."""
-        try:
-            self._link.open()
-            self._is_waiting = False
-            self._identity = yield from self._protocol.identify()
-        except (DriveError, LinkError) as error:
-            return str(error)
-        return ""
+    def _identify(self) -> Procedure[None]:
+        self._is_waiting = False
+        self._identity = yield from self._protocol.identify()
 
     def are_emulated(self) -> Procedure[bool]:
         """Return whether the drives report that they are emulated."""
@@ -75,31 +69,17 @@ class PolledDrives(Drives):
         if self._link.is_open:
             self._protocol.beat()
 
-    def collect(self) -> None:
-        """Do nothing: an answer is handled as it arrives."""
+    def _answered(self) -> bool:
+        return not self._is_waiting
 
-    def exchange(self, timeout: float) -> Procedure[None]:
-        """Run one cycle; wait at most `timeout` [s] for the answers."""
-        if not self._link.is_open:
-            return
-        try:
-            self._protocol.beat()
-            for axis in self._axes.values():
-                yield from axis.transmit()
-            self._request()
-        except LinkError:
-            # The axes report the loss.
-            return
-        yield Wait(lambda: bool(self._link.lost) or not self._is_waiting, timeout)
-        self.unanswered += self._is_waiting
-
-    def _request(self) -> None:
+    def _request(self, timeout: float) -> float:
         now = self._link.now
         if not self._is_waiting or now - self._requested_at > (_LOST_AFTER - 0.5) * PERIOD:
             self._number = self._number % _NUMBERS + 1
             self._requested_at, self._is_waiting = now, True
             self._protocol.request(self._number)
         self._mark_answered()
+        return timeout
 
     def _on_status(self, number: int, replies: Mapping[str, DriveReply]) -> None:
         if number != self._number or not self._is_waiting:
@@ -125,8 +105,9 @@ class PolledDrives(Drives):
             If the link is lost.
         """
         self._is_waiting = False
-        self._request()
-        yield Wait(lambda: bool(self._link.lost) or not self._is_waiting, _REFRESH_TIMEOUT)
+        yield Wait(
+            lambda: bool(self._link.lost) or self._answered(), self._request(_REFRESH_TIMEOUT)
+        )
         if self._link.lost:
             raise LinkError(self._link.lost)
         if self._is_waiting:

@@ -72,12 +72,11 @@ class DriveBench(SupervisorBench):
                 name,
                 drive_settings(self.settings, name),
                 self.link,
-                period=PERIOD,
                 watchdog=watchdog,
             )
             for name in ("insertion", "rotation")
         ]
-        self.drives = Cia402Drives(self.link, self.axes, PERIOD, watchdog)
+        self.drives = Cia402Drives(self.link, self.axes, watchdog)
         self.supervisor = MotionSupervisor(
             self.axes[0],
             self.axes[1],
