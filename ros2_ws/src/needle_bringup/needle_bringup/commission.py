@@ -19,7 +19,7 @@ from needle_core.messages import EmergencyStop
 from needle_core.runners.paced import PacedRunner
 from needle_core.runners.virtual import DIAGNOSTICS, LOG
 from needle_device_driver.axes.cycle_times import PERIOD
-from needle_device_driver.conformance.faults import FAULTS, Fault, largest_travel
+from needle_device_driver.conformance.faults import FAULTS, Fault, can_keep, largest_travel
 from needle_device_driver.conformance.rig import DRIVER, ConformanceRig, RigClient
 from needle_device_driver.device import EMERGENCY_STOP
 from needle_device_driver.device_driver import DeviceDriver
@@ -127,7 +127,7 @@ def commission(rig: ConformanceRig, ask: Ask) -> Iterator[Row]:
     answer = ask(f"The stage has moved {way:.3f} mm. Measure it, and type your value in mm.")
     measured = abs(number("value", answer, 0.0, 1e3, "mm") - way) * 1e-3 if answer else math.nan
     yield Row("counts_per_unit", "10 mm by hand", measured, 0.01 * _WAY)
-    faults = {fault.name: fault for fault in FAULTS if fault.needs(rig.capabilities)}
+    faults = {fault.name: fault for fault in FAULTS if can_keep(fault.rule, rig.capabilities)}
     for name in (name for name in (*_OWN, *_BY_HAND) if name in faults):
         _retract(rig)
         yield _stop(rig, faults[name], ask)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,3 +41,8 @@ class Capabilities:
     limits: bool
     identity: bool
     exclusive: bool
+
+    @property
+    def has_watchdog(self) -> bool:
+        """Whether it stops by itself without the computer."""
+        return math.isfinite(self.watchdog)

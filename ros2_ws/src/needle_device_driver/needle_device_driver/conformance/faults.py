@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,7 +16,6 @@ from needle_device_driver.rules import Rule
 
 Travel = tuple[float, float]
 Event = Callable[[ConformanceRig], object]
-Needs = Callable[[Capabilities], bool]
 
 
 class Fault(NamedTuple):
@@ -35,8 +33,6 @@ class Fault(NamedTuple):
         What passes until the drives are ordered to stop, or stop by themselves; a key of `_delays`.
     causes : tuple of Rule
         Other rules that may name the cause in the log.
-    needs : callable
-        Returns whether a drive is able to keep the rule.
     in_steps : bool
         Whether the rule counts in steps only, not in a homing.
     """
@@ -46,7 +42,6 @@ class Fault(NamedTuple):
     event: Event
     delay: str
     causes: tuple[Rule, ...] = ()
-    needs: Needs = lambda _: True
     in_steps: bool = False
 
 
@@ -78,7 +73,7 @@ FAULTS = (
           (_R.DRIVE_EMERGENCY,)),
     Fault("hot drive", _R.DRIVE_EMERGENCY, _of("rotation", "fail", 0x4210), "answer"),
     Fault("blocked axis", _R.FOLLOWING_ERROR, _of("insertion", "stall"), "error",
-          (_R.SETTLING_TIME, _R.DRIVE_EMERGENCY), lambda drive: drive.encoder, in_steps=True),
+          (_R.SETTLING_TIME, _R.DRIVE_EMERGENCY), in_steps=True),
     Fault("hanging drive", _R.REPLY_AGE, _of("rotation", "hang"), "silence"),
     Fault("cut line", _R.REPLY_AGE,
           lambda rig: setattr(rig.behind("insertion"), "is_cut", True), "silence"),
@@ -86,11 +81,24 @@ FAULTS = (
     Fault("unplugged adapter", _R.LINK_LOSS, _unplug, "order"),
     Fault("power loss", _R.DRIVE_REBOOT,
           lambda rig: rig.behind("rotation").reboot("rotation", rig.runner.now), "silence",
-          (_R.REPLY_AGE,), lambda drive: drive.identity),
+          (_R.REPLY_AGE,)),
     Fault("killed driver", _R.LOOK_AHEAD, lambda rig: rig.runner.kill(DRIVER), "order"),
     Fault("frozen driver", _R.DRIVE_WATCHDOG, lambda rig: rig.runner.freeze(DRIVER, 1.0), "order",
-          (_R.REPLY_AGE, _R.HOLD_AGE), lambda drive: math.isfinite(drive.watchdog)),
+          (_R.REPLY_AGE, _R.HOLD_AGE)),
 )  # fmt: skip
+
+
+_NEEDS = {
+    "encoder": (_R.FOLLOWING_ERROR, _R.SETTLING_TIME, _R.AXIS_SPEED),
+    "identity": (_R.UNHOMED_OUTWARD_ONLY, _R.DRIVE_REBOOT),
+    "switches": (_R.INNER_LIMIT_SWITCH,),
+    "has_watchdog": (_R.DRIVE_WATCHDOG, _R.LOOP_HEARTBEAT),
+}
+
+
+def can_keep(rule: Rule, drive: Capabilities) -> bool:
+    """Return whether drives are able to keep a rule."""
+    return all(getattr(drive, need) for need, rules in _NEEDS.items() if rule in rules)
 
 
 def _delays(drive: Capabilities, limits: Any) -> dict[str, float]:

@@ -11,12 +11,8 @@ from needle_core.component import Call
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.axes.capabilities import Capabilities
 from needle_device_driver.axes.cycle_times import PERIOD
-from needle_device_driver.conformance.faults import FAULTS, Fault, Needs, largest_travel
-from needle_device_driver.conformance.rig import (
-    AXES,
-    DRIVER,
-    ConformanceRig,
-)
+from needle_device_driver.conformance.faults import FAULTS, Fault, can_keep, largest_travel
+from needle_device_driver.conformance.rig import AXES, DRIVER, ConformanceRig
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.rules import Rule
 
@@ -288,22 +284,15 @@ def _home(rig: ConformanceRig) -> None:
     rig.call("device/home")
 
 
-SCENARIOS: dict[Rule, tuple[Callable[[MakeRig], None], Needs]] = {
-    Rule.NO_MOTION_BY_ITSELF: (no_motion_by_itself, lambda _: True),
-    Rule.RETRACTION: (retraction, lambda _: True),
-    Rule.UNHOMED_OUTWARD_ONLY: (unhomed_outward_only, lambda drive: drive.identity),
-    Rule.HOMING_TIME: (homing_time, lambda _: True),
-    Rule.INNER_LIMIT_SWITCH: (inner_limit_switch, lambda drive: drive.switches),
-    Rule.SETTLING_TIME: (settling_time, lambda drive: drive.encoder),
-    Rule.AXIS_SPEED: (axis_speed, lambda drive: drive.encoder),
-    Rule.SOFTWARE_LIMITS: (software_limits, lambda _: True),
-    Rule.QUICK_STOP: (quick_stop, lambda _: True),
-    Rule.ONE_MASTER: (one_master, lambda _: True),
-    Rule.DRIVE_REBOOT: (drive_reboot, lambda drive: drive.identity),
-    Rule.DRIVE_WATCHDOG: (drive_watchdog, lambda drive: math.isfinite(drive.watchdog)),
-    Rule.LOOP_HEARTBEAT: (loop_heartbeat, lambda drive: math.isfinite(drive.watchdog)),
+SCENARIOS: dict[Rule, Callable[[MakeRig], None]] = {
+    Rule(scenario.__name__): scenario
+    for scenario in (
+        *(no_motion_by_itself, retraction, unhomed_outward_only, homing_time, inner_limit_switch),
+        *(settling_time, axis_speed, software_limits, quick_stop, one_master, drive_reboot),
+        *(drive_watchdog, loop_heartbeat),
+    )
 }
-"""Rule to its scenario, and whether a drive is able to keep it."""
+"""Rule to its scenario."""
 RULES = tuple(rule for rule in Rule if rule in {*SCENARIOS, *(fault.rule for fault in FAULTS)})
 """Rules that depend on the drives."""
 
@@ -320,8 +309,8 @@ def verdict(rule: Rule, drive: Capabilities, limits: Any) -> str:
     limits : DeviceDriverParameters
         The driver's.
     """
-    faults = [fault for fault in FAULTS if fault.rule is rule]
-    if not (faults[0].needs if faults else SCENARIOS[rule][1])(drive):
+    faults = (fault for fault in FAULTS if fault.rule is rule)
+    if not can_keep(rule, drive):
         return IMPOSSIBLE
     if rule is Rule.SOFTWARE_LIMITS and not drive.limits:
         return "driver only"
@@ -338,4 +327,4 @@ def check_rule(rule: Rule, make: MakeRig) -> None:
         if fault.rule is rule:
             any_fault(fault, make)
     if rule in SCENARIOS:
-        SCENARIOS[rule][0](make)
+        SCENARIOS[rule](make)

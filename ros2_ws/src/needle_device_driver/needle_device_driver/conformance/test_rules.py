@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 
 from needle_device_driver.axes.backend import HAND
-from needle_device_driver.conformance.faults import FAULTS
+from needle_device_driver.conformance.faults import FAULTS, can_keep
 from needle_device_driver.conformance.plugin import ROW
 from needle_device_driver.conformance.rig import ConformanceRig
 from needle_device_driver.conformance.scenarios import (
@@ -49,5 +49,5 @@ def test_fault_at_a_random_moment(axis: str, moment: int) -> None:
     """Cause each fault in turn at a random moment of set-up, homing, steps or rest."""
     make = partial(ConformanceRig, moment, axis=axis)
     fault = FAULTS[moment % len(FAULTS)]
-    if fault.needs(make().capabilities):
+    if can_keep(fault.rule, make().capabilities):
         random_moment(fault, make, moment)
