@@ -14,12 +14,7 @@ from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.cia402.drive_setup import set_up, write_homing, write_limits
 from needle_device_driver.cia402.drive_upkeep import arm_watchdog
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.device_file import (
-    Address,
-    FileDevice,
-    FileLink,
-    read_device_file,
-)
+from needle_device_driver.link.device_file import Address, FileDevice, FileLink, read_device_file
 from needle_device_driver.link.object_access import DriveRefusalError, ObjectAccess, ObjectError
 from needle_device_driver.procedure import Procedure, run_at_once
 
@@ -87,11 +82,11 @@ def check_device_file(
     product, objects = read_device_file(path, settings.node_id)
     device = FileDevice(objects)
     fatal: dict[Address, str] = {}
-    notes: tuple[str, ...] = ()
     while True:
         device.restart()
         try:
             notes = run_at_once(_whole_set_up(FileLink(device), settings, period, watchdog))
+            return product, _rows(device.problems, fatal), () if fatal else notes
         except ObjectError as error:
             address = error.entry.index, error.entry.subindex
             if address in fatal:
@@ -101,9 +96,6 @@ def check_device_file(
             (device.granted if is_refusal else device.ignored).add(address)
         except DriveError as error:
             raise UserError(f"{path}: {error}") from error
-        else:
-            break
-    return product, _rows(device.problems, fatal), () if fatal else notes
 
 
 def _whole_set_up(

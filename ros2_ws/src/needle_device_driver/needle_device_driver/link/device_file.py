@@ -21,7 +21,8 @@ _ASSUMED = {(0x1000, 0): 402, (0x6502, 0): 1 << 5}
 _SECTION = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?", re.IGNORECASE)
 # Size in bytes of the data types, negative if signed; 0: no number.
 _SIZES = {1: 1, 2: -1, 3: -2, 4: -4, 5: 1, 6: 2, 7: 4, 0x15: -8, 0x1B: 8}
-_PDO_MAPPINGS = (range(0x1600, 0x1800), range(0x1A00, 0x1C00))
+# Without their number of at most 512.
+_PDO_MAPPINGS = (0x1600, 0x1A00)
 _MISSING, _READ_ONLY, _NOT_MAPPABLE = 0x0602_0000, 0x0601_0002, 0x0604_0041
 _WRONG_LENGTH, _RANGE = 0x0607_0010, 0x0609_0030
 
@@ -87,31 +88,25 @@ def _file_object(section: Mapping[str, str | None], node_id: int) -> FileObject:
 
     def value(key: str) -> int | None:
         number = _number(section.get(key), node_id)
-        # Hexadecimal text of a negative number.
-        is_wrapped = number is not None and size < 0 and number >> (8 * -size - 1) == 1
-        return number - (1 << 8 * -size) if number is not None and is_wrapped else number
+        if number is not None and size < 0 and number >> (8 * -size - 1) == 1:
+            # Hexadecimal text of a negative number.
+            number -= 1 << 8 * -size
+        return number
 
-    access = (section.get("AccessType") or "").strip().lower()
-    configured = value("ParameterValue")
-    return FileObject(
-        size,
-        access in ("rw", "wo", "rwr", "rww"),
-        _number(section.get("PDOMapping"), node_id) == 1,
-        value("DefaultValue") if configured is None else configured,
-        value("LowLimit"),
-        value("HighLimit"),
-    )
+    writable = (section.get("AccessType") or "").strip().lower() in ("rw", "wo", "rwr", "rww")
+    mappable = _number(section.get("PDOMapping"), node_id) == 1
+    configured, default = value("ParameterValue"), value("DefaultValue")
+    given = default if configured is None else configured
+    return FileObject(size, writable, mappable, given, value("LowLimit"), value("HighLimit"))
 
 
 def _number(text: str | None, node_id: int) -> int | None:
     """Return a number, or the sum of a number and the node id; None for any other text."""
-    total = 0
-    for part in (text or "").upper().split("+"):
-        try:
-            total += node_id if part.strip() == "$NODEID" else int(part.strip(), 0)
-        except ValueError:
-            return None
-    return total
+    parts = (text or "").upper().replace("$NODEID", str(node_id)).split("+")
+    try:
+        return sum(int(part, 0) for part in parts)
+    except ValueError:
+        return None
 
 
 class FileDevice(SdoClient):
@@ -150,8 +145,7 @@ class FileDevice(SdoClient):
         found = self._object(address)
         value = self._values.get(address, found.value)
         value = _ASSUMED.get(address, 0) if value is None else value
-        size = abs(found.size)
-        return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
+        return value.to_bytes(9, "little", signed=True)[: abs(found.size)]
 
     def download(self, index: int, subindex: int, data: bytes) -> Procedure[None]:
         """Write an object if the file says that the drive accepts the value."""
@@ -167,11 +161,10 @@ class FileDevice(SdoClient):
             lower, upper = found.lower, found.upper
             if (lower is not None and value < lower) or (upper is not None and value > upper):
                 self._refuse(address, _RANGE, f"{value} is outside [{lower}, {upper}]")
-            if subindex and any(index in mappings for mappings in _PDO_MAPPINGS):
+            if subindex and index & ~0x1FF in _PDO_MAPPINGS:
                 mapped = self._objects.get((value >> 16, value >> 8 & 0xFF))
                 if mapped is None or not mapped.mappable:
-                    text = f"0x{value >> 16:04X} cannot be mapped"
-                    self._refuse(address, _NOT_MAPPABLE, text)
+                    self._refuse(address, _NOT_MAPPABLE, f"0x{value >> 16:04X} cannot be mapped")
         self._values[address] = value
         if address == _MODE_OF_OPERATION:
             self._values[_MODE_DISPLAY] = value
