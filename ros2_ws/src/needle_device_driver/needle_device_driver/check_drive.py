@@ -82,9 +82,7 @@ def _check_drives(path: Path) -> int:
 def _check_file(path: Path) -> int:
     parameters = DeviceDriverParameters(insertion_counts_per_turn=_COUNTS_PER_TURN)
     settings = drive_settings(parameters, "insertion")
-    product, rows, notes = check_device_file(
-        path, settings, period=PERIOD, watchdog=parameters.watchdog
-    )
+    product, rows, notes = check_device_file(path, settings, parameters.watchdog)
     names = max(len(row.name) for row in rows)
     print(f"{product}\n")
     for row in rows:

@@ -79,7 +79,7 @@ class DeviceDriver(Component):
         self.drives: tuple[Drives, ...] = tuple(
             backend.make(settings, settings.axes_of(backend)) for backend in settings.backends
         )
-        self._times = CycleTimes(PERIOD)
+        self._times = CycleTimes()
         axes: dict[str, Axis] = {}
         for drives in self.drives:
             axes |= drives.axes

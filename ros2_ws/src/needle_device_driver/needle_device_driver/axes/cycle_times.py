@@ -9,16 +9,9 @@ _LATE = 0.5
 
 
 class CycleTimes:
-    """Measures whether cycles begin on time.
+    """Measures whether cycles begin on time."""
 
-    Parameters
-    ----------
-    period : float
-        Between cycles [s].
-    """
-
-    def __init__(self, period: float) -> None:
-        self._period = period
+    def __init__(self) -> None:
         self._begun: float | None = None
         self._longest = 0.0
         self._late = 0
@@ -28,7 +21,7 @@ class CycleTimes:
         if self._begun is not None:
             between = now - self._begun
             self._longest = max(self._longest, between)
-            self._late += between > (1.0 + _LATE) * self._period
+            self._late += between > (1.0 + _LATE) * PERIOD
         self._begun = now
 
     def take(self) -> dict[str, str]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from needle_core.errors import UserError
+from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.axes.drive_errors import DriveError
 from needle_device_driver.cia402.cia402 import SUPPORTS_CYCLIC_POSITION
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
@@ -52,7 +53,7 @@ class ObjectRow:
 
 
 def check_device_file(
-    path: Path, settings: DriveSettings, *, period: float, watchdog: float
+    path: Path, settings: DriveSettings, watchdog: float
 ) -> tuple[str, list[ObjectRow], tuple[str, ...]]:
     """Run the driver's set-up against a file; after a refusal, assume consent and run it again.
 
@@ -62,7 +63,7 @@ def check_device_file(
         The EDS or DCF file.
     settings : DriveSettings
         Settings of the drive.
-    period, watchdog : float
+    watchdog : float
         Of the driver [s].
 
     Returns
@@ -85,7 +86,7 @@ def check_device_file(
     while True:
         device.restart()
         try:
-            notes = run_at_once(_whole_set_up(FileLink(device), settings, period, watchdog))
+            notes = run_at_once(_whole_set_up(FileLink(device), settings, watchdog))
             return product, _rows(device.problems, fatal), () if fatal else notes
         except ObjectError as error:
             address = error.entry.index, error.entry.subindex
@@ -99,11 +100,11 @@ def check_device_file(
 
 
 def _whole_set_up(
-    link: FileLink, settings: DriveSettings, period: float, watchdog: float
+    link: FileLink, settings: DriveSettings, watchdog: float
 ) -> Procedure[tuple[str, ...]]:
     monitor = DriveMonitor(link, settings.node_id)
     access = ObjectAccess(link, settings.node_id)
-    settings, notes = yield from set_up(link, monitor, settings, period=period, homed=False)
+    settings, notes = yield from set_up(link, monitor, settings, period=PERIOD, homed=False)
     yield from write_homing(access, settings, settings.speed)
     yield from write_limits(access, settings, homed=True)
     yield from arm_watchdog(link, settings, watchdog)

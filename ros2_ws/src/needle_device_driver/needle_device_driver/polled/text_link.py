@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from needle_device_driver.axes.link import Link
@@ -23,13 +24,14 @@ class TextLink(Link):
     Attributes
     ----------
     bytes_sent, lines_received, garbled : int
-        Counters; garbled are lines that are no ASCII text.
+        Counters; garbled are lines that are no ASCII text, or too long.
     """
 
     def __init__(self, name: str, terminators: bytes) -> None:
         super().__init__(name)
         self.bytes_sent = self.lines_received = self.garbled = 0
-        self._terminators = terminators
+        # Behind a terminator.
+        self._line_end = re.compile(b"(?<=[" + re.escape(terminators) + b"])")
         self._rest = b""
         self._outgoing = b""
 
@@ -60,21 +62,15 @@ class TextLink(Link):
         """Return the lines that are complete with these chunks, each with its terminator."""
         if not self.is_open:
             return []
-        lines = []
-        for byte in b"".join(chunks):
-            self._rest += bytes([byte])
-            if byte in self._terminators:
-                lines.append(self._rest)
-                self._rest = b""
-            elif len(self._rest) > _LONGEST_LINE:
-                self._rest = b""
-                self.garbled += 1
-        texts = []
-        for line in lines:
-            if line.isascii():
-                texts.append(line[:-1].decode().strip() + chr(line[-1]))
-            else:
-                self.garbled += 1
+        *lines, self._rest = self._line_end.split(self._rest + b"".join(chunks))
+        if len(self._rest) > _LONGEST_LINE:
+            lines, self._rest = [*lines, self._rest], b""
+        texts = [
+            line[:-1].decode().strip() + chr(line[-1])
+            for line in lines
+            if line.isascii() and len(line) <= _LONGEST_LINE
+        ]
+        self.garbled += len(lines) - len(texts)
         self.lines_received += len(texts)
         return texts
 

@@ -10,7 +10,7 @@ import pytest
 
 from needle_core.errors import UserError
 from needle_device_driver.axes.drive_errors import DriveError
-from needle_device_driver.backends.zaber import BACKEND, ZaberProtocol
+from needle_device_driver.backends.zaber import ZaberProtocol
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.polled.drive_protocol import DriveReply
 from needle_device_driver.polled.text_link import TextLink
@@ -308,16 +308,6 @@ def test_an_incomplete_or_wrong_answer_is_none(lost: int, instead: bytes) -> Non
     assert len(line.statuses) == 1
 
 
-def test_bytes_may_arrive_one_by_one() -> None:
-    line = Line().ready()
-    line.protocol.request(7)
-    whole = "".join(f"{t}:{-sum(t[1:].encode()) % 256:02X}\r\n" for t in COMPLETE).encode()
-    for index in range(len(whole)):
-        assert line.statuses == []
-        line.receive_bytes(whole[index : index + 1])
-    assert len(line.statuses) == 1
-
-
 def test_a_rejected_order_is_a_fault_until_it_is_acknowledged() -> None:
     line = Line().ready()
     line.receive("@02 1 00 RJ IDLE -- BADDATA", "@02 1 00 OK BUSY -- 0")
@@ -354,8 +344,3 @@ def test_two_axes_of_one_device() -> None:
     assert line.sent().startswith(b"/1 2 0 stop")
     with pytest.raises(UserError, match="same axis"):
         Line(zaber_rotation_device="1 1")
-
-
-def test_the_backend_is_installed() -> None:
-    settings = DeviceDriverParameters(insertion_drive="zaber", rotation_drive="zaber")
-    assert settings.backends == (BACKEND,)

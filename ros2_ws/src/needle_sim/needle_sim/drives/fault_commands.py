@@ -68,12 +68,10 @@ def execute_command(line: str, connections: Sequence[EmulatedDrives], now: float
             for drives in connections:
                 drives.restore(now)
             return True
-        case ["stall", axis] if axis in drives_of:
-            drives_of[axis].stall(axis)
+        case ["stall" | "hang" as fault, axis] if axis in drives_of:
+            getattr(drives_of[axis], fault)(axis)
         case ["reboot", axis] if axis in drives_of:
             drives_of[axis].reboot(axis, now)
-        case ["hang", axis] if axis in drives_of:
-            drives_of[axis].hang(axis)
         case ["emcy", axis, text] if axis in drives_of and (code := _error_code(text)):
             drives_of[axis].fail(axis, code)
         case _:
