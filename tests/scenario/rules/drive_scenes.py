@@ -17,9 +17,7 @@ def axis_speed() -> None:
         for key in [key for key in drive._objects._entries if key[0] in UNITS]:
             del drive._objects._entries[key]
         drive._objects._indices.difference_update(UNITS)
-    scene.until(lambda: scene.state == "DISABLED", "the driver")
-    scene.call("device/confirm_needle_out", True)
-    scene.call("device/home")
+    scene.begin_homing()
     scene.runner.run(1.0)
     assert scene.fails(Rule.AXIS_SPEED)
     assert DEEP - scene.place[0] < 0.008

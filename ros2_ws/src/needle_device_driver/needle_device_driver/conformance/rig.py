@@ -196,11 +196,15 @@ class ConformanceRig:
         """Run until the driver has found its drives."""
         self.until(lambda: self.state == "DISABLED", "the driver")
 
-    def home(self) -> None:
-        """Home both axes, the needle being out, and enable them."""
+    def begin_homing(self) -> None:
+        """Begin to home both axes, the needle being out."""
         self.start()
         self.call("device/confirm_needle_out", True)
         self.call("device/home")
+
+    def home(self) -> None:
+        """Home both axes, and enable them."""
+        self.begin_homing()
         self.until(lambda: self.hand.status.homed, "homing")
         self.call("device/enable", True)
 

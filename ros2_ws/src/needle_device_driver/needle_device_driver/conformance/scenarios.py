@@ -31,13 +31,6 @@ _RETRACT_AT = 0.003
 _INTRUSION = 0.001
 
 
-def any_fault(fault: Fault, make: MakeRig) -> None:
-    """Cause a fault in the middle of a fast step."""
-    rig = make()
-    rig.moving(_STEP_TIME)
-    _stop_by(fault, rig)
-
-
 def random_moment(fault: Fault, make: MakeRig, seed: int) -> None:
     """Cause a fault at a random moment of set-up, homing, steps or rest."""
     rng, rig = random.Random(seed), make(drives={"insertion_start": 0.002})
@@ -175,7 +168,7 @@ def unhomed_outward_only(make: MakeRig) -> None:
 def homing_time(make: MakeRig) -> None:
     """Home towards a switch that is too far away: the homing ends."""
     rig = make(driver={"max_depth": _SHALLOW}, drives={"insertion_start": _DEEP})
-    _home(rig)
+    rig.begin_homing()
     rig.until(lambda: rig.state == "FAULT", "the end of a homing")
     assert _DEEP - rig.place[0] < 1.25 * _SHALLOW
     assert rig.fails(Rule.HOMING_TIME)
@@ -203,7 +196,6 @@ def settling_time(make: MakeRig) -> None:
 def axis_speed(make: MakeRig) -> None:
     """Home with a motor three times as fast as ordered: it stops within 8 mm."""
     rig = make(drives={"insertion_start": _DEEP, "insertion_max_speed": 0.15})
-    rig.start()
     motor = rig.behind("insertion").motors["insertion"]
     follow, last = motor.follow, [motor.position]
 
@@ -212,7 +204,7 @@ def axis_speed(make: MakeRig) -> None:
         follow(motor.position + 3.0 * ordered, period)
 
     motor.follow = follow_too_fast
-    _home(rig)
+    rig.begin_homing()
     rig.runner.run(2.0)
     assert rig.fails(Rule.AXIS_SPEED) or rig.fails(Rule.FOLLOWING_ERROR)
     assert abs(_DEEP - rig.place[0]) < 0.008
@@ -278,12 +270,6 @@ def _check_stopped(rig: ConformanceRig) -> None:
     assert all(state.startswith(("FAULT", "OFF")) for state in states), states
 
 
-def _home(rig: ConformanceRig) -> None:
-    rig.start()
-    rig.call("device/confirm_needle_out", True)
-    rig.call("device/home")
-
-
 SCENARIOS: dict[Rule, Callable[[MakeRig], None]] = {
     Rule(scenario.__name__): scenario
     for scenario in (
@@ -325,6 +311,8 @@ def check_rule(rule: Rule, make: MakeRig) -> None:
     """Run the scenarios of a rule; the motors stay within the stated bounds."""
     for fault in FAULTS:
         if fault.rule is rule:
-            any_fault(fault, make)
+            rig = make()
+            rig.moving(_STEP_TIME)
+            _stop_by(fault, rig)
     if rule in SCENARIOS:
         SCENARIOS[rule](make)

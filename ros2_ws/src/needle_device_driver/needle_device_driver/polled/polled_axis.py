@@ -337,17 +337,13 @@ class PolledAxis(CyclicAxis):
             self._stopping = False
             gap = abs(self._settings.position(self._last_target - at.position))
             # The drive would move a blocked axis as soon as it comes free.
-            self._released = self._goal_on and gap > self._blocked_distance
+            self._released = self._goal_on and gap > _BLOCKED * self._settings.speed * PERIOD
         ends = self._stopping or not self._goal_on
         if ends and at.powered and at.moving and self._order_cycles > self._max_stop:
             self._protocol.power(self.name, False)
             self._set_problem(
                 Rule.QUICK_STOP, "the drive keeps moving after a stop and is switched off"
             )
-
-    @property
-    def _blocked_distance(self) -> float:
-        return _BLOCKED * self._settings.speed * PERIOD
 
     def _check_power(self, at: DriveReply) -> None:
         off = not self._goal_on or self._released
