@@ -44,7 +44,7 @@ class CyclicAxis(Axis):
     @property
     @abc.abstractmethod
     def _fault(self) -> Fault | None:
-        """Why the axis refuses to move."""
+        """Reason why the axis refuses to move; None: it does not."""
 
     def _refuse_fault(self) -> None:
         if not self._configured:
