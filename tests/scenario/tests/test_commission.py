@@ -8,11 +8,15 @@ from functools import partial
 
 import pytest
 
-from needle_bringup.commission import _BY_HAND, Row, commission, report
+from needle_bringup.commission import _BY_HAND, _WITH_PEDAL, Row, commission, report
+from needle_core.errors import UserError
+from needle_device_driver.cia402 import drive_cycle
 from needle_device_driver.conformance.faults import FAULTS
 from needle_device_driver.conformance.rig import DRIVER, ConformanceRig
+from needle_device_driver.procedure import Procedure
 
-EVENTS = {_BY_HAND[fault.name]: fault.event for fault in FAULTS if fault.name in _BY_HAND}
+BY_HAND = _BY_HAND | _WITH_PEDAL
+EVENTS = {BY_HAND[fault.name]: fault.event for fault in FAULTS if fault.name in BY_HAND}
 
 
 class Person:
@@ -53,6 +57,27 @@ def test_each_stop_is_measured_within_its_bound() -> None:
     assert all(0.0 < measured[rule] < 0.3e-3 for rule in ("hold_to_run", "quick_stop", "link_loss"))
     assert rig.state == "DISABLED"
     assert sum("During the motion" in text for text in person.asked) == 3
+
+
+def test_a_person_with_a_pedal_also_releases_and_unplugs_it() -> None:
+    rig = ConformanceRig(1, drives={"insertion_start": 0.001})
+    person = Person(rig)
+    rows = list(commission(rig, person, has_pedal=True))
+    assert [row for row in rows if not row.passed] == []
+    assert sum("During the motion" in text for text in person.asked) == 5
+
+
+def test_real_drives_move_only_while_a_person_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    def are_emulated(*_: object) -> Procedure[bool]:
+        yield from ()
+        return False
+
+    monkeypatch.setattr(drive_cycle, "are_emulated", are_emulated)
+    rig = ConformanceRig(1)
+    begin = rig.place
+    with pytest.raises(UserError, match="only while a person holds"):
+        list(commission(rig, Person(rig)))
+    assert rig.place == begin
 
 
 def test_a_wrong_scale_and_a_long_way_are_not_passed() -> None:

@@ -11,13 +11,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from needle_bags.recording.bag_tap import BagTap
+from needle_bringup.operator.component import INPUT_DEVICE, Operator
+from needle_bringup.operator.input_port import InputPort
+from needle_bringup.operator.parameters import OperatorParameters
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_core.commands.options import CommandParser, number
-from needle_core.component import Call, Publish
+from needle_core.component import Call, Component, Publish
 from needle_core.errors import UserError
 from needle_core.messages import EmergencyStop
 from needle_core.runners.paced import PacedRunner
 from needle_core.runners.virtual import DIAGNOSTICS, LOG
+from needle_core.settings.parameter_fields import from_values
+from needle_core.settings.parameter_files import read_parameters
 from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.conformance.faults import FAULTS, Fault, can_keep, largest_travel
 from needle_device_driver.conformance.rig import DRIVER, ConformanceRig, RigClient
@@ -29,8 +34,9 @@ _DESCRIPTION = """\
 Commission drives on a bench without a needle: home them, move 10 mm, and stop a fast step in each
 possible way, partly by your hand; measure from joint_states how far the axes then move.
 
-Stop device_driver first: this command runs the same driver, with the parameters of FILE. It holds
-to run by itself, so keep a hand on the emergency stop. Writes a bag, and a report to be signed.
+Stop device_driver first: this command runs the same driver, with the parameters of FILE. Its
+section `operator` names the pedal: real drives move only while you hold it, emulated ones also
+without. Keep a hand on the emergency stop. Writes a bag, and a report to be signed.
 """
 _EPILOG = """\
 example:
@@ -50,6 +56,7 @@ _BY_HAND = {
     "power loss": "switch the power of one drive off and on",
     "blocked axis": "block the stage gently",
 }
+_WITH_PEDAL = {"release": "release the pedal", "silent hold": "unplug the pedal"}
 Ask = Callable[[str], str]
 
 
@@ -82,24 +89,46 @@ class Bench(ConformanceRig):
     ----------
     settings : DeviceDriverParameters
         Of the driver.
+    pedal : OperatorParameters or None
+        Of the person's hold; None: emulated drives, which this command holds by itself.
     bag : Path
         The bag.
     """
 
     runner: PacedRunner
 
-    def __init__(self, settings: Any, bag: Path) -> None:
+    def __init__(self, settings: Any, pedal: OperatorParameters | None, bag: Path) -> None:
         self.settings, self.hand, self.driver = settings, RigClient(), DeviceDriver(settings)
         self.logged, self.commands = [], []
-        components = [self.driver, self.hand]
+        components: list[Component] = [self.driver, self.hand]
+        ports = settings.ports()
+        self.has_pedal = pedal is not None
+        if pedal is not None:
+            components.append(Operator(pedal))
+            ports = {**ports, INPUT_DEVICE: InputPort(pedal)}
         self.tap = BagTap(bag, components, (DIAGNOSTICS, LOG), {"purpose": "commissioning"})
         taps = (self._keep_log, self.tap)
-        self.runner = PacedRunner(components, ports=settings.ports(), taps=taps)
+        self.runner = PacedRunner(components, ports=ports, taps=taps)
 
     @property
     def place(self) -> tuple[float, float]:
         """Measured positions [m], [rad]."""
         return self.hand.joints
+
+    def press(self) -> None:
+        """Wait until the person presses; without a pedal, press."""
+        if not self.has_pedal:
+            super().press()
+            return
+        print("Press the pedal, and keep it pressed.", flush=True)
+        self.until(lambda: bool(self.hand.status.hold_owner), "the pedal")
+
+    def release(self) -> None:
+        """Wait until the person has released; without a pedal, release."""
+        super().release()
+        if self.hand.status.hold_owner:
+            print("Release the pedal.", flush=True)
+            self.until(lambda: not self.hand.status.hold_owner, "the release of the pedal")
 
     def ask(self, text: str) -> str:
         """Return the person's answer; meanwhile the driver continues."""
@@ -110,10 +139,18 @@ class Bench(ConformanceRig):
         return sys.stdin.readline().strip()
 
 
-def commission(rig: ConformanceRig, ask: Ask) -> Iterator[Row]:
-    """Run the script; `ask` shows a text to the person and returns the answer."""
+def commission(rig: ConformanceRig, ask: Ask, *, has_pedal: bool = False) -> Iterator[Row]:
+    """Run the script; `ask` shows a text to the person and returns the answer.
+
+    Raises
+    ------
+    UserError
+        If the drives are real and no person holds.
+    """
     ask("No needle is mounted, and a hand is on the emergency stop.")
     rig.start()
+    if not (has_pedal or rig.hand.status.simulated):
+        raise UserError("real drives move only while a person holds: add a section `operator`")
     ask("The stage will move outwards to its switch.")
     rig.home()
     begin = rig.place
@@ -128,33 +165,34 @@ def commission(rig: ConformanceRig, ask: Ask) -> Iterator[Row]:
     measured = abs(number("value", answer, 0.0, 1e3, "mm") - way) * 1e-3 if answer else math.nan
     yield Row("counts_per_unit", "10 mm by hand", measured, 0.01 * _WAY)
     faults = {fault.name: fault for fault in FAULTS if can_keep(fault.rule, rig.capabilities)}
+    by_hand = _BY_HAND | (_WITH_PEDAL if has_pedal else {})
     for name in (name for name in (*_OWN, *_BY_HAND) if name in faults):
         _retract(rig)
-        yield _stop(rig, faults[name], ask)
+        yield _stop(rig, faults[name], ask, by_hand.get(name, ""))
     rig.call("device/enable", False)
 
 
-def _stop(rig: ConformanceRig, fault: Fault, ask: Ask) -> Row:
-    """Stop fast steps by a fault."""
+def _stop(rig: ConformanceRig, fault: Fault, ask: Ask, by_hand: str) -> Row:
+    """Stop fast steps by a fault, or by what a person does."""
     bound = largest_travel(fault, rig.capabilities, rig.settings)[0]
     bound += rig.settings.max_speed * _JOINTS_AGE
-    if fault.name in _BY_HAND:
-        ask(f"During the motion, {_BY_HAND[fault.name]}.")
-        before = _steps_until_fault(rig)
+    if by_hand:
+        ask(f"During the motion, {by_hand}.")
+        before = _steps_until_stop(rig)
         ask("Undo it.")
         rig.release()
         rig.call("device/reset")
         rig.runner.run(0.5)
         measured = abs(rig.place[0] - before) if rig.hand.status.homed else math.nan
-        return Row(fault.rule.value, _BY_HAND[fault.name], measured, bound)
+        return Row(fault.rule.value, by_hand, measured, bound)
     _step(rig, _STEP_TIME)
     rig.runner.run(0.5 * _STEP_TIME)
     measured = rig.travel(lambda: fault.event(rig), _SETTLED)[0]
     return Row(fault.rule.value, fault.name, measured, bound)
 
 
-def _steps_until_fault(rig: ConformanceRig) -> float:
-    """Step until the driver reports a fault; return the last position before it [m]."""
+def _steps_until_stop(rig: ConformanceRig) -> float:
+    """Step until a step fails; return the last position before that [m]."""
     outcome = "succeeded"
     while outcome == "succeeded":
         _step(rig, _STEP_TIME)
@@ -163,7 +201,7 @@ def _steps_until_fault(rig: ConformanceRig) -> float:
             position = rig.place[0]
             rig.runner.run(PERIOD)
             outcome = rig.hand.results.get(rig.commands[-1], "")
-    rig.until(lambda: rig.state in ("FAULT", "ESTOPPED"), "a fault")
+    rig.runner.run(_SETTLED)
     return position
 
 
@@ -171,7 +209,7 @@ def _step(rig: ConformanceRig, duration: float) -> None:
     """Enable and press where needed, and begin a step."""
     if rig.state != "HOLDING":
         _enable(rig)
-    if rig.hand.status.hold_owner != rig.hand.name:
+    if not rig.hand.status.hold_owner:
         rig.press()
     rig.command(rig.place[0] + _STEP, rig.place[1], duration)
 
@@ -225,14 +263,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(params: Path, out: Path) -> int:
     settings = read_driver_parameters(params)
+    given = read_parameters(params, ["operator"]).get("operator")
+    pedal = None if given is None else from_values(OperatorParameters, given, "operator")
     try:
         out.mkdir()
     except OSError as error:
         raise UserError(f"cannot make {out}: {error.strerror}") from error
-    bench = Bench(settings, out / "bag")
+    bench = Bench(settings, pedal, out / "bag")
     try:
         rows = []
-        for row in commission(bench, bench.ask):
+        for row in commission(bench, bench.ask, has_pedal=bench.has_pedal):
             rows.append(row)
             print(f"{row.rule}: {row.event}: {row.measured * 1e3:.3f} mm", flush=True)
         person = bench.ask("Type your name for the report.")
