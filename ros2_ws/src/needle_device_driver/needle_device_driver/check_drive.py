@@ -22,7 +22,7 @@ _DESCRIPTION = """\
 Check what a drive supports of the safety rules, without moving it.
 
 --params FILE connects to the drives as device_driver would with this parameter file, sets them up
-without switching them on, and prints how they keep each rule that depends on them. Stop
+without switching them on, and prints what they can do and how they keep each rule. Stop
 device_driver first.
 
 --eds FILE needs no drive: the set-up of device_driver runs against the EDS or DCF file of a CiA 402
@@ -67,6 +67,10 @@ def _check_drives(path: Path) -> int:
                 raise UserError(runner.exits[driver.name].text)
         for drives in driver.drives:
             print(f"{drives.link.name}: {' and '.join(drives.axes)}\n")
+            for name, value in vars(drives.capabilities).items():
+                text = ("no", "yes")[value] if isinstance(value, bool) else f"{value:g} s"
+                print(f"{name:22}{text}")
+            print()
             for rule in RULES:
                 print(f"{rule.value:22}{verdict(rule, drives.capabilities, settings)}")
             for text in drives.missing_optional_parts:
