@@ -14,6 +14,7 @@ from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.conformance.faults import FAULTS, Fault, can_keep, largest_travel
 from needle_device_driver.conformance.rig import AXES, DRIVER, ConformanceRig
 from needle_device_driver.device_driver import DeviceDriver
+from needle_device_driver.procedure import Procedure
 from needle_device_driver.rules import Rule
 
 Travel = tuple[float, float]
@@ -29,6 +30,11 @@ _DEEP, _SHALLOW = 0.1, 0.02
 _RETRACT_AT = 0.003
 # Motion by another computer until it is noticed [m].
 _INTRUSION = 0.001
+# Constant delay of replies that only slows a motion down [s].
+_LATE = 0.03
+# Software limits around home for an order beyond them, and that order [m].
+_TIGHT, _BEYOND = 50e-6, 0.01
+_OFF = ("OFF", "SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON", "SWITCHED_ON")
 
 
 def random_moment(fault: Fault, make: MakeRig, seed: int) -> None:
@@ -94,7 +100,10 @@ def _later_motion(rig: ConformanceRig) -> Travel:
 
 
 def no_motion_by_itself(make: MakeRig) -> None:
-    """Set up, connect anew, reset, switch on and off, also after a step: nothing moves."""
+    """Set up, connect anew, reset, switch on and off, also after a step: nothing moves.
+
+    Set-up and the end of the driver leave the drives off.
+    """
     rig = make(drives={"insertion_start": 0.01})
     begin = rig.place
     rig.start()
@@ -109,10 +118,54 @@ def no_motion_by_itself(make: MakeRig) -> None:
     rig.call("device/enable", False)
     rig.runner.run(0.1)
     assert _later_motion(rig) == NO_TRAVEL
+    rig = make()
+    rig.ready()
+    rig.runner.kill(DRIVER)
+    rig.runner.start(DeviceDriver(rig.settings))
+    rig.runner.run(2.0)
+    _check_states(rig, "FAULT", *_OFF)
+    rig = make()
+    rig.ready()
+    rig.runner.stop(DRIVER)
+    # The first run ends with the driver.
+    rig.until(lambda: not rig.runner.runs(DRIVER), "the end of the driver")
+    rig.runner.run(1.0)
+    _check_states(rig, *_OFF)
+
+
+def drive_emergency(make: MakeRig) -> None:
+    """Reset a drive after a fault: the next step ends at its target."""
+    rig = make()
+    rig.ready()
+    rig.behind("insertion").fail("insertion", 0x2310)
+    assert rig.fails(Rule.DRIVE_EMERGENCY)
+    rig.release()
+    rig.call("device/reset")
+    rig.call("device/enable", True)
+    rig.press()
+    _check_step(rig)
+
+
+def reply_age(make: MakeRig) -> None:
+    """Step at nearly the largest speed, also with late replies: it ends at its target."""
+    rig = make()
+    rig.ready()
+    for rig.late in (0.0, _LATE):
+        _check_step(rig)
+
+
+def _check_step(rig: ConformanceRig) -> None:
+    stamp = rig.step(duration=_STEP_TIME)
+    rig.runner.run(2.0 * _STEP_TIME)
+    assert rig.hand.results.get(stamp) == "succeeded", (rig.hand.results, rig.logged)
 
 
 def quick_stop(make: MakeRig) -> None:
-    """Release while an axis is blocked, and free it: it does not move to the old target."""
+    """Release while an axis is blocked, and free it: it does not move to the old target.
+
+    A stop ends an order that lasts longer than a cycle.
+    """
+    assert _order_directly(make, stops=True) < _TIGHT
     rig = make()
     rig.moving(_STEP_TIME)
     rig.behind("insertion").stall("insertion")
@@ -211,8 +264,10 @@ def axis_speed(make: MakeRig) -> None:
 
 
 def software_limits(make: MakeRig) -> None:
-    """Order a set-point beyond the limits: the driver refuses it."""
+    """Order a set-point beyond the limits: the driver refuses it, and so does the drive."""
     rig = make()
+    if rig.capabilities.limits:
+        assert _order_directly(make, stops=False) < 2.0 * _TIGHT
     rig.home()
     rig.runner.run(0.5)
     for axis, beyond in zip(AXES, (-0.002, 100.0), strict=True):
@@ -222,6 +277,37 @@ def software_limits(make: MakeRig) -> None:
             assert refused.rule is Rule.SOFTWARE_LIMITS
         else:
             raise AssertionError(f"{axis} axis accepts {beyond:g}")
+
+
+def _order_directly(make: MakeRig, *, stops: bool) -> float:
+    """Order a long motion past the driver, which then hangs; return the travel [m].
+
+    The order is stopped at once, or goes beyond tight software limits. CiA 402 has no such order.
+    """
+    rig = make()
+    protocol = rig.insertion_protocol
+    if protocol is None:
+        return 0.0
+    write, settings, home = protocol.write_limits, protocol.axes["insertion"], dict[str, int]()
+    near = settings.magnitude(_TIGHT)
+
+    def write_tight(axis: str, lower: int, upper: int) -> Procedure[None]:
+        home[axis] = lower - protocol.axes[axis].limits_counts[0]
+        limits = (lower, upper) if stops else (home[axis] - near, home[axis] + near)
+        return write(axis, *limits)
+
+    rig.start()
+    protocol.write_limits = write_tight
+    rig.ready()
+    begin = rig.place[0]
+    target = home["insertion"] + settings.direction * settings.magnitude(_BEYOND)
+    protocol.move_to("insertion", target, settings.magnitude(settings.speed))
+    if stops:
+        protocol.stop("insertion")
+    rig.runner.run(PERIOD)
+    rig.runner.freeze(DRIVER, 0.5)
+    rig.runner.run(0.08)
+    return abs(rig.place[0] - begin)
 
 
 def one_master(make: MakeRig) -> None:
@@ -266,8 +352,12 @@ def loop_heartbeat(make: MakeRig) -> None:
 
 def _check_stopped(rig: ConformanceRig) -> None:
     rig.runner.run(0.4)
+    _check_states(rig, "FAULT", "OFF")
+
+
+def _check_states(rig: ConformanceRig, *begins: str) -> None:
     states = rig.behind("insertion").states().values()
-    assert all(state.startswith(("FAULT", "OFF")) for state in states), states
+    assert all(state.startswith(begins) for state in states), states
 
 
 SCENARIOS: dict[Rule, Callable[[MakeRig], None]] = {
@@ -275,6 +365,7 @@ SCENARIOS: dict[Rule, Callable[[MakeRig], None]] = {
     for scenario in (
         *(no_motion_by_itself, retraction, unhomed_outward_only, homing_time, inner_limit_switch),
         *(settling_time, axis_speed, software_limits, quick_stop, one_master, drive_reboot),
+        *(drive_emergency, reply_age),
         *(drive_watchdog, loop_heartbeat),
     )
 }
