@@ -11,10 +11,18 @@ from needle_core.component import Call
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.axes.capabilities import Capabilities
 from needle_device_driver.axes.cycle_times import PERIOD
+from needle_device_driver.conformance.checks import (
+    OFF,
+    STEP_TIME,
+    TIGHT,
+    check_states,
+    check_step,
+    order_directly,
+    states,
+)
 from needle_device_driver.conformance.faults import FAULTS, Fault, can_keep, largest_travel
 from needle_device_driver.conformance.rig import AXES, DRIVER, ConformanceRig
 from needle_device_driver.device_driver import DeviceDriver
-from needle_device_driver.procedure import Procedure
 from needle_device_driver.rules import Rule
 
 Travel = tuple[float, float]
@@ -22,8 +30,6 @@ MakeRig = Callable[..., ConformanceRig]
 """Makes a rig with the drives under test; keywords `driver` and `drives` are parameters."""
 NO_TRAVEL = (0.0, 0.0)
 IMPOSSIBLE = "not possible"
-# A step of 2 mm at nearly the largest speed [s].
-_STEP_TIME = 0.41
 # Longest time after a fault until nothing moves and the driver has named the cause [s].
 _STOPPED = 1.5
 _DEEP, _SHALLOW = 0.1, 0.02
@@ -32,11 +38,8 @@ _RETRACT_AT = 0.003
 _INTRUSION = 0.001
 # Constant delay of replies that only slows a motion down [s].
 _LATE = 0.03
-# Software limits around home for an order beyond them, and that order [m].
-_TIGHT, _BEYOND = 50e-6, 0.01
 # Shortest time between two looks at the drives [s].
 _BRIEF = 0.005
-_OFF = ("OFF", "SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON", "SWITCHED_ON")
 
 
 def random_moment(fault: Fault, make: MakeRig, seed: int) -> None:
@@ -64,7 +67,7 @@ def _proceed(rig: ConformanceRig) -> None:
             rig.hand.actions += [Call("device/retract")]
             rig.runner.run(0.1)
         case "HOLDING", True, _:
-            rig.step(duration=_STEP_TIME)
+            rig.step(duration=STEP_TIME)
 
 
 def _stop_by(fault: Fault, rig: ConformanceRig) -> None:
@@ -112,9 +115,9 @@ def no_motion_by_itself(make: MakeRig) -> None:
     while rig.state != "DISABLED":
         rig.runner.run(_BRIEF)
         # A drive may be on when it gets power, until its set-up.
-        was_off = was_off or all(state.startswith(_OFF) for state in _states(rig))
+        was_off = was_off or all(state.startswith(OFF) for state in states(rig))
         if was_off:
-            _check_states(rig, *_OFF)
+            check_states(rig, *OFF)
     rig.call("device/confirm_needle_out", True)
     for port in rig.drives.connections:
         rig.runner.lose_port(DRIVER, port, "unplugged")
@@ -122,7 +125,7 @@ def no_motion_by_itself(make: MakeRig) -> None:
     assert _later_motion(rig) == NO_TRAVEL
     assert rig.distance(begin) == NO_TRAVEL
     rig = make()
-    rig.moving(_STEP_TIME)
+    rig.moving(STEP_TIME)
     rig.call("device/enable", False)
     rig.runner.run(0.1)
     assert _later_motion(rig) == NO_TRAVEL
@@ -131,14 +134,14 @@ def no_motion_by_itself(make: MakeRig) -> None:
     rig.runner.kill(DRIVER)
     rig.runner.start(DeviceDriver(rig.settings))
     rig.runner.run(2.0)
-    _check_states(rig, "FAULT", *_OFF)
+    check_states(rig, "FAULT", *OFF)
     rig = make()
     rig.ready()
     rig.runner.stop(DRIVER)
     # The first run ends with the driver.
     rig.until(lambda: not rig.runner.runs(DRIVER), "the end of the driver")
     rig.runner.run(1.0)
-    _check_states(rig, *_OFF)
+    check_states(rig, *OFF)
 
 
 def drive_emergency(make: MakeRig) -> None:
@@ -151,7 +154,7 @@ def drive_emergency(make: MakeRig) -> None:
     rig.call("device/reset")
     rig.call("device/enable", True)
     rig.press()
-    _check_step(rig)
+    check_step(rig)
 
 
 def reply_age(make: MakeRig) -> None:
@@ -159,13 +162,7 @@ def reply_age(make: MakeRig) -> None:
     rig = make()
     rig.ready()
     for rig.late in (0.0, _LATE):
-        _check_step(rig)
-
-
-def _check_step(rig: ConformanceRig) -> None:
-    stamp = rig.step(duration=_STEP_TIME)
-    rig.runner.run(2.0 * _STEP_TIME)
-    assert rig.hand.results.get(stamp) == "succeeded", (rig.hand.results, rig.logged)
+        check_step(rig)
 
 
 def quick_stop(make: MakeRig) -> None:
@@ -173,9 +170,9 @@ def quick_stop(make: MakeRig) -> None:
 
     A stop ends an order that lasts longer than a cycle.
     """
-    assert _order_directly(make, stops=True) < _TIGHT
+    assert order_directly(make, stops=True) < TIGHT
     rig = make()
-    rig.moving(_STEP_TIME)
+    rig.moving(STEP_TIME)
     rig.behind("insertion").stall("insertion")
     rig.runner.run(0.04)
     rig.release()
@@ -188,7 +185,7 @@ def quick_stop(make: MakeRig) -> None:
 def retraction(make: MakeRig) -> None:
     """Retract: it needs the hold, moves the insertion axis only, and ends at 0."""
     rig = make()
-    stamp = rig.moving(_STEP_TIME)
+    stamp = rig.moving(STEP_TIME)
     rig.until(lambda: stamp in rig.hand.results, "the end of the step")
     begin = rig.place
     rig.call("device/retract")
@@ -208,7 +205,7 @@ def retraction(make: MakeRig) -> None:
 def unhomed_outward_only(make: MakeRig) -> None:
     """Restart a drive: the needle moves outwards only, by its last insertion."""
     rig = make()
-    stamp = rig.moving(_STEP_TIME)
+    stamp = rig.moving(STEP_TIME)
     rig.until(lambda: stamp in rig.hand.results, "the end of the step")
     deep = rig.place[0]
     rig.behind("insertion").reboot("insertion", rig.runner.now)
@@ -238,7 +235,7 @@ def homing_time(make: MakeRig) -> None:
 def inner_limit_switch(make: MakeRig) -> None:
     """Step onto the inner limit switch: the step ends."""
     rig = make(drives={"insertion_travel": 0.0015})
-    rig.moving(_STEP_TIME)
+    rig.moving(STEP_TIME)
     rig.runner.run(1.0)
     assert rig.fails(Rule.INNER_LIMIT_SWITCH)
     assert rig.place[0] < 0.0015 + 0.0005
@@ -247,7 +244,7 @@ def inner_limit_switch(make: MakeRig) -> None:
 def settling_time(make: MakeRig) -> None:
     """Block the axis shortly before its target: the step ends."""
     rig = make()
-    rig.moving(_STEP_TIME)
+    rig.moving(STEP_TIME)
     rig.until(lambda: rig.place[0] > 0.0018, "the step's end")
     rig.behind("insertion").stall("insertion")
     rig.runner.run(1.5)
@@ -275,7 +272,7 @@ def software_limits(make: MakeRig) -> None:
     """Order a set-point beyond the limits: the driver refuses it, and so does the drive."""
     rig = make()
     if rig.capabilities.limits:
-        assert _order_directly(make, stops=False) < 2.0 * _TIGHT
+        assert order_directly(make, stops=False) < 2.0 * TIGHT
     rig.home()
     rig.runner.run(0.5)
     for axis, beyond in zip(AXES, (-0.002, 100.0), strict=True):
@@ -285,37 +282,6 @@ def software_limits(make: MakeRig) -> None:
             assert refused.rule is Rule.SOFTWARE_LIMITS
         else:
             raise AssertionError(f"{axis} axis accepts {beyond:g}")
-
-
-def _order_directly(make: MakeRig, *, stops: bool) -> float:
-    """Order a long motion past the driver, which then hangs; return the travel [m].
-
-    The order is stopped at once, or goes beyond tight software limits. CiA 402 has no such order.
-    """
-    rig = make()
-    protocol = rig.insertion_protocol
-    if protocol is None:
-        return 0.0
-    write, settings, home = protocol.write_limits, protocol.axes["insertion"], dict[str, int]()
-    near = settings.magnitude(_TIGHT)
-
-    def write_tight(axis: str, lower: int, upper: int) -> Procedure[None]:
-        home[axis] = lower - protocol.axes[axis].limits_counts[0]
-        limits = (lower, upper) if stops else (home[axis] - near, home[axis] + near)
-        return write(axis, *limits)
-
-    rig.start()
-    protocol.write_limits = write_tight
-    rig.ready()
-    begin = rig.place[0]
-    target = home["insertion"] + settings.direction * settings.magnitude(_BEYOND)
-    protocol.move_to("insertion", target, settings.magnitude(settings.speed))
-    if stops:
-        protocol.stop("insertion")
-    rig.runner.run(PERIOD)
-    rig.runner.freeze(DRIVER, 0.5)
-    rig.runner.run(0.08)
-    return abs(rig.place[0] - begin)
 
 
 def one_master(make: MakeRig) -> None:
@@ -343,7 +309,7 @@ def drive_reboot(make: MakeRig) -> None:
 def drive_watchdog(make: MakeRig) -> None:
     """Kill the driver: the drives fault or switch off."""
     rig = make()
-    rig.moving(_STEP_TIME)
+    rig.moving(STEP_TIME)
     rig.runner.kill(DRIVER)
     _check_stopped(rig)
 
@@ -360,17 +326,7 @@ def loop_heartbeat(make: MakeRig) -> None:
 
 def _check_stopped(rig: ConformanceRig) -> None:
     rig.runner.run(0.4)
-    _check_states(rig, "FAULT", "OFF")
-
-
-def _states(rig: ConformanceRig) -> list[str]:
-    return [
-        state for drives in rig.drives.connections.values() for state in drives.states().values()
-    ]
-
-
-def _check_states(rig: ConformanceRig, *begins: str) -> None:
-    assert all(state.startswith(begins) for state in _states(rig)), _states(rig)
+    check_states(rig, "FAULT", "OFF")
 
 
 SCENARIOS: dict[Rule, Callable[[MakeRig], None]] = {
@@ -416,7 +372,7 @@ def check_rule(rule: Rule, make: MakeRig) -> None:
     for fault in FAULTS:
         if fault.rule is rule:
             rig = make()
-            rig.moving(_STEP_TIME)
+            rig.moving(STEP_TIME)
             _stop_by(fault, rig)
     if rule in SCENARIOS:
         SCENARIOS[rule](make)
