@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.conformance.rig import DRIVER, ConformanceRig
 from needle_device_driver.procedure import Procedure
 
@@ -18,7 +17,7 @@ OFF = ("OFF", "SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON", "SWITCHED_ON")
 
 
 def order_directly(make: Callable[..., ConformanceRig], *, stops: bool) -> float:
-    """Order a long motion past the driver, which then hangs; return the travel [m].
+    """Order a long motion while the driver hangs; return the travel [m].
 
     The order is stopped at once, or goes beyond tight software limits. CiA 402 has no such order.
     """
@@ -32,19 +31,20 @@ def order_directly(make: Callable[..., ConformanceRig], *, stops: bool) -> float
     def write_tight(axis: str, lower: int, upper: int) -> Procedure[None]:
         home[axis] = lower - protocol.axes[axis].limits_counts[0]
         limits = (lower, upper) if stops else (home[axis] - near, home[axis] + near)
-        return write(axis, *limits)
+        yield from write(axis, *limits)
 
     rig.start()
     protocol.write_limits = write_tight
     rig.ready()
+    rig.runner.freeze(DRIVER, 0.5)
     begin = rig.place[0]
     target = home["insertion"] + settings.direction * settings.magnitude(_BEYOND)
     protocol.move_to("insertion", target, settings.magnitude(settings.speed))
     if stops:
         protocol.stop("insertion")
-    rig.runner.run(PERIOD)
-    rig.runner.freeze(DRIVER, 0.5)
-    rig.runner.run(0.08)
+    rig.behind("insertion").receive(protocol.link.pop_outgoing(), rig.runner.now)
+    # No watchdog acts earlier.
+    rig.runner.run(0.07)
     return abs(rig.place[0] - begin)
 
 
