@@ -11,9 +11,7 @@ STEP_TIME = 0.41
 """Duration of a step of 2 mm at nearly the largest speed [s]."""
 TIGHT = 50e-6
 """Software limits around home for an order beyond them [m]."""
-_BEYOND = 0.01
-OFF = ("OFF", "SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON", "SWITCHED_ON")
-"""How the state of a drive begins that is off."""
+_OFF = ("OFF", "SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON", "SWITCHED_ON")
 
 
 def order_directly(make: Callable[..., ConformanceRig], *, stops: bool) -> float:
@@ -38,7 +36,7 @@ def order_directly(make: Callable[..., ConformanceRig], *, stops: bool) -> float
     rig.ready()
     rig.runner.freeze(DRIVER, 0.5)
     begin = rig.place[0]
-    target = home["insertion"] + settings.direction * settings.magnitude(_BEYOND)
+    target = home["insertion"] + settings.direction * settings.magnitude(200.0 * TIGHT)
     protocol.move_to("insertion", target, settings.magnitude(settings.speed))
     if stops:
         protocol.stop("insertion")
@@ -55,13 +53,7 @@ def check_step(rig: ConformanceRig) -> None:
     assert rig.hand.results.get(stamp) == "succeeded", (rig.hand.results, rig.logged)
 
 
-def states(rig: ConformanceRig) -> list[str]:
-    """Return the states of all emulated drives."""
-    return [
-        state for drives in rig.drives.connections.values() for state in drives.states().values()
-    ]
-
-
-def check_states(rig: ConformanceRig, *begins: str) -> None:
-    """Check that the state of each drive begins with one of these texts."""
-    assert all(state.startswith(begins) for state in states(rig)), states(rig)
+def are_off(rig: ConformanceRig, *others: str) -> bool:
+    """Return whether the state of each emulated drive begins as `_OFF` or another text."""
+    states = [s for drives in rig.drives.connections.values() for s in drives.states().values()]
+    return all(state.startswith((*_OFF, *others)) for state in states)
