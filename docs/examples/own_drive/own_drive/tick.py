@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from typing import ClassVar
 
 from needle_core.settings.parameter_fields import fixed_parameter
@@ -23,6 +24,8 @@ from needle_device_driver.polled.polled_drives import polled_backend
 from needle_device_driver.procedure import Procedure
 
 AXES = {"insertion": 0, "rotation": 1}
+# A line with a flipped bit must not raise.
+STATE = re.compile(r"Q \d+( -?\d+ \d+){2}\s*")
 MOVING, ON, OUTER, INNER, FAULT, SET_UP = 1, 2, 4, 8, 16, 32
 
 
@@ -89,7 +92,7 @@ class TickProtocol(DriveProtocol):
         words = line.split()
         if words and words[0] in ("I", "Z"):
             self.answer(words[0], " ".join(words[1:]))
-        elif len(words) == 6 and words[0] == "Q":
+        elif STATE.fullmatch(line):
             number, *state = map(int, words[1:])
             self.on_status(
                 number, {name: _reply(*state[2 * AXES[name] :][:2]) for name in self.axes}

@@ -215,7 +215,8 @@ def _parser() -> CommandParser:
     add(
         "--drives",
         metavar="NAME[,NAME]",
-        help="drives of both axes, or of insertion and rotation: cia402, galil, zaber, stepdir",
+        help="drives of both axes, or of insertion and rotation: cia402, galil, zaber, stepdir, "
+        "or those of another package",
     )
     add(
         "--controller",

@@ -15,11 +15,14 @@ class Capabilities:
     streams : bool
         Whether it follows set-points every 20 ms; otherwise it makes point moves only.
     watchdog : float
-        Time without the computer after which it stops by itself [s]; infinite: it has no watchdog.
+        Time without the computer after which it stops by itself, with the default parameter
+        `watchdog` [s]; infinite: it has no watchdog.
     longest_order : float
-        Longest time that a set-point keeps it moving if no further one follows [s].
+        Longest time that a set-point keeps it moving if no further one follows [s]; for a drive
+        with trapezoidal profiles 0.02 s + speed / deceleration.
     response_time : float
-        From an order to its effect in the feedback [s].
+        From an order to its effect in the feedback [s]; at least one cycle of 0.02 s, and more if
+        the drive filters its motion or its answers are old.
     encoder : bool
         Whether it measures its position; otherwise it counts its own steps.
     switches : bool

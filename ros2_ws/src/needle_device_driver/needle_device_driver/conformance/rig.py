@@ -303,6 +303,12 @@ class ConformanceRig:
         """Return an axis of the driver."""
         return next(drives.axes[name] for drives in self.driver.drives if name in drives.axes)
 
+    @property
+    def insertion_protocol(self) -> Any:
+        """Language of the insertion drive; None for CiA 402."""
+        drives = next(one for one in self.driver.drives if "insertion" in one.axes)
+        return getattr(drives, "protocol", None)
+
     def distance(self, begin: tuple[float, float]) -> tuple[float, float]:
         """Return how far the motors are from places [m], [rad]; 0: at rest."""
         ways = (abs(here - there) for here, there in zip(self.place, begin, strict=True))

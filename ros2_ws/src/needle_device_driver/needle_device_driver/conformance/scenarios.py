@@ -11,6 +11,7 @@ from needle_core.component import Call
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.axes.capabilities import Capabilities
 from needle_device_driver.axes.cycle_times import PERIOD
+from needle_device_driver.conformance import checks
 from needle_device_driver.conformance.faults import FAULTS, Fault, can_keep, largest_travel
 from needle_device_driver.conformance.rig import AXES, DRIVER, ConformanceRig
 from needle_device_driver.device_driver import DeviceDriver
@@ -21,14 +22,14 @@ MakeRig = Callable[..., ConformanceRig]
 """Makes a rig with the drives under test; keywords `driver` and `drives` are parameters."""
 NO_TRAVEL = (0.0, 0.0)
 IMPOSSIBLE = "not possible"
-# A step of 2 mm at nearly the largest speed [s].
-_STEP_TIME = 0.41
 # Longest time after a fault until nothing moves and the driver has named the cause [s].
 _STOPPED = 1.5
 _DEEP, _SHALLOW = 0.1, 0.02
 _RETRACT_AT = 0.003
 # Motion by another computer until it is noticed [m].
 _INTRUSION = 0.001
+# Constant delay of replies that only slows a motion down [s].
+_LATE = 0.03
 
 
 def random_moment(fault: Fault, make: MakeRig, seed: int) -> None:
@@ -56,7 +57,7 @@ def _proceed(rig: ConformanceRig) -> None:
             rig.hand.actions += [Call("device/retract")]
             rig.runner.run(0.1)
         case "HOLDING", True, _:
-            rig.step(duration=_STEP_TIME)
+            rig.step(duration=checks.STEP_TIME)
 
 
 def _stop_by(fault: Fault, rig: ConformanceRig) -> None:
@@ -94,10 +95,19 @@ def _later_motion(rig: ConformanceRig) -> Travel:
 
 
 def no_motion_by_itself(make: MakeRig) -> None:
-    """Set up, connect anew, reset, switch on and off, also after a step: nothing moves."""
+    """Set up, connect anew, reset, switch on and off, also after a step: nothing moves.
+
+    Set-up and the end of the driver leave the drives off.
+    """
     rig = make(drives={"insertion_start": 0.01})
     begin = rig.place
-    rig.start()
+    was_off = False
+    while rig.state != "DISABLED":
+        rig.runner.run(PERIOD / 4.0)
+        # A drive may be on when it gets power, until its set-up.
+        is_off = checks.are_off(rig)
+        assert is_off or not was_off
+        was_off = is_off
     rig.call("device/confirm_needle_out", True)
     for port in rig.drives.connections:
         rig.runner.lose_port(DRIVER, port, "unplugged")
@@ -105,16 +115,54 @@ def no_motion_by_itself(make: MakeRig) -> None:
     assert _later_motion(rig) == NO_TRAVEL
     assert rig.distance(begin) == NO_TRAVEL
     rig = make()
-    rig.moving(_STEP_TIME)
+    rig.moving(checks.STEP_TIME)
     rig.call("device/enable", False)
     rig.runner.run(0.1)
     assert _later_motion(rig) == NO_TRAVEL
+    rig = make()
+    rig.ready()
+    rig.runner.kill(DRIVER)
+    rig.runner.start(DeviceDriver(rig.settings))
+    rig.runner.run(2.0)
+    assert checks.are_off(rig, "FAULT")
+    rig = make()
+    rig.ready()
+    rig.runner.stop(DRIVER)
+    # The first run ends with the driver.
+    rig.until(lambda: not rig.runner.runs(DRIVER), "the end of the driver")
+    rig.runner.run(1.0)
+    assert checks.are_off(rig)
+
+
+def drive_emergency(make: MakeRig) -> None:
+    """Reset a drive after a fault: the next step ends at its target."""
+    rig = make()
+    rig.ready()
+    rig.behind("insertion").fail("insertion", 0x2310)
+    assert rig.fails(Rule.DRIVE_EMERGENCY)
+    rig.release()
+    rig.call("device/reset")
+    rig.call("device/enable", True)
+    rig.press()
+    checks.check_step(rig)
+
+
+def reply_age(make: MakeRig) -> None:
+    """Step at nearly the largest speed, also with late replies: it ends at its target."""
+    rig = make()
+    rig.ready()
+    for rig.late in (0.0, _LATE):
+        checks.check_step(rig)
 
 
 def quick_stop(make: MakeRig) -> None:
-    """Release while an axis is blocked, and free it: it does not move to the old target."""
+    """Release while an axis is blocked, and free it: it does not move to the old target.
+
+    A stop ends an order that lasts longer than a cycle.
+    """
+    assert checks.order_directly(make, stops=True) < checks.TIGHT
     rig = make()
-    rig.moving(_STEP_TIME)
+    rig.moving(checks.STEP_TIME)
     rig.behind("insertion").stall("insertion")
     rig.runner.run(0.04)
     rig.release()
@@ -127,7 +175,7 @@ def quick_stop(make: MakeRig) -> None:
 def retraction(make: MakeRig) -> None:
     """Retract: it needs the hold, moves the insertion axis only, and ends at 0."""
     rig = make()
-    stamp = rig.moving(_STEP_TIME)
+    stamp = rig.moving(checks.STEP_TIME)
     rig.until(lambda: stamp in rig.hand.results, "the end of the step")
     begin = rig.place
     rig.call("device/retract")
@@ -147,7 +195,7 @@ def retraction(make: MakeRig) -> None:
 def unhomed_outward_only(make: MakeRig) -> None:
     """Restart a drive: the needle moves outwards only, by its last insertion."""
     rig = make()
-    stamp = rig.moving(_STEP_TIME)
+    stamp = rig.moving(checks.STEP_TIME)
     rig.until(lambda: stamp in rig.hand.results, "the end of the step")
     deep = rig.place[0]
     rig.behind("insertion").reboot("insertion", rig.runner.now)
@@ -177,7 +225,7 @@ def homing_time(make: MakeRig) -> None:
 def inner_limit_switch(make: MakeRig) -> None:
     """Step onto the inner limit switch: the step ends."""
     rig = make(drives={"insertion_travel": 0.0015})
-    rig.moving(_STEP_TIME)
+    rig.moving(checks.STEP_TIME)
     rig.runner.run(1.0)
     assert rig.fails(Rule.INNER_LIMIT_SWITCH)
     assert rig.place[0] < 0.0015 + 0.0005
@@ -186,7 +234,7 @@ def inner_limit_switch(make: MakeRig) -> None:
 def settling_time(make: MakeRig) -> None:
     """Block the axis shortly before its target: the step ends."""
     rig = make()
-    rig.moving(_STEP_TIME)
+    rig.moving(checks.STEP_TIME)
     rig.until(lambda: rig.place[0] > 0.0018, "the step's end")
     rig.behind("insertion").stall("insertion")
     rig.runner.run(1.5)
@@ -211,8 +259,10 @@ def axis_speed(make: MakeRig) -> None:
 
 
 def software_limits(make: MakeRig) -> None:
-    """Order a set-point beyond the limits: the driver refuses it."""
+    """Order a set-point beyond the limits: the driver refuses it, and so does the drive."""
     rig = make()
+    if rig.capabilities.limits:
+        assert checks.order_directly(make, stops=False) < 2.0 * checks.TIGHT
     rig.home()
     rig.runner.run(0.5)
     for axis, beyond in zip(AXES, (-0.002, 100.0), strict=True):
@@ -249,7 +299,7 @@ def drive_reboot(make: MakeRig) -> None:
 def drive_watchdog(make: MakeRig) -> None:
     """Kill the driver: the drives fault or switch off."""
     rig = make()
-    rig.moving(_STEP_TIME)
+    rig.moving(checks.STEP_TIME)
     rig.runner.kill(DRIVER)
     _check_stopped(rig)
 
@@ -266,8 +316,7 @@ def loop_heartbeat(make: MakeRig) -> None:
 
 def _check_stopped(rig: ConformanceRig) -> None:
     rig.runner.run(0.4)
-    states = rig.behind("insertion").states().values()
-    assert all(state.startswith(("FAULT", "OFF")) for state in states), states
+    assert checks.are_off(rig, "FAULT")
 
 
 SCENARIOS: dict[Rule, Callable[[MakeRig], None]] = {
@@ -275,6 +324,7 @@ SCENARIOS: dict[Rule, Callable[[MakeRig], None]] = {
     for scenario in (
         *(no_motion_by_itself, retraction, unhomed_outward_only, homing_time, inner_limit_switch),
         *(settling_time, axis_speed, software_limits, quick_stop, one_master, drive_reboot),
+        *(drive_emergency, reply_age),
         *(drive_watchdog, loop_heartbeat),
     )
 }
@@ -312,7 +362,7 @@ def check_rule(rule: Rule, make: MakeRig) -> None:
     for fault in FAULTS:
         if fault.rule is rule:
             rig = make()
-            rig.moving(_STEP_TIME)
+            rig.moving(checks.STEP_TIME)
             _stop_by(fault, rig)
     if rule in SCENARIOS:
         SCENARIOS[rule](make)

@@ -32,7 +32,8 @@ class DriveReply:
     home_switch, inner_switch : bool
         Whether the outer and the inner limit switch are active.
     fault : str
-        Why it refuses to move; empty: no fault.
+        Why it refuses to move, as a fragment after "the drive", also for a refused order; empty: no
+        fault, or its watchdog has stopped it.
     timed_out : bool
         Whether its watchdog has stopped it.
     rebooted : bool
@@ -56,7 +57,8 @@ class DriveProtocol(abc.ABC):
     """The language of all drives behind one connection.
 
     Orders are queued on the link and return at once; procedures wait for answers and raise
-    `DriveError` and `LinkError`.
+    `DriveError` and `LinkError`. The procedures of both axes run side by side, and their asks one
+    after the other, so that both may use the same key.
 
     Parameters
     ----------
@@ -69,8 +71,15 @@ class DriveProtocol(abc.ABC):
 
     Attributes
     ----------
+    capabilities : Capabilities
+        Abilities of the drives.
+    terminators : bytes
+        Each of these bytes ends a line.
+    parameters, axes, link
+        The arguments.
     on_status : callable
-        To be called with number and states by axis when a request is answered.
+        To be called once with number and states by axis when all answers of a request are there,
+        however late.
     """
 
     capabilities: ClassVar[Capabilities]
@@ -88,12 +97,17 @@ class DriveProtocol(abc.ABC):
     def identify(self) -> Procedure[str]:
         """Return name and version; it also resynchronises a connection that was opened again.
 
-        The name of an emulator begins with "Emulated".
+        Half a line may be in the drive: end it so that the drive refuses it. The name of an
+        emulator begins with "Emulated".
         """
 
     @abc.abstractmethod
     def set_up(self, axis: str) -> Procedure[None]:
-        """Tell the drive all that it must know; it is off afterwards, and moves nothing."""
+        """Write all settings and a mark of this set-up; the drive is off afterwards.
+
+        It moves nothing. A drive that has lost its mark has restarted: the state is read before a
+        new set-up. For a setting that the drive cannot have, raise `DriveError` with its bound.
+        """
 
     @abc.abstractmethod
     def clear_fault(self, axis: str) -> Procedure[None]:
@@ -105,7 +119,7 @@ class DriveProtocol(abc.ABC):
 
     @abc.abstractmethod
     def release(self, axis: str) -> Procedure[None]:
-        """Switch the drive and its watchdog off."""
+        """Switch the drive off, and with the last axis the watchdog that both share."""
 
     # ---- orders -------------------------------------------------------------------------------
 
@@ -122,17 +136,23 @@ class DriveProtocol(abc.ABC):
         """Stop as fast as possible and discard the set-point."""
 
     def beat(self) -> None:  # noqa: B027 - a drive without a watchdog needs none
-        """Feed the watchdog, if there is one."""
+        """Feed the watchdog, if there is one: in each cycle of 20 ms, and while an ask waits."""
 
     @abc.abstractmethod
     def request(self, number: int) -> None:
-        """Ask for the state of all drives; the answer has this number, 1..99."""
+        """Ask for the state of all drives; the answer has this number, 1..99.
+
+        The next request follows when this one is answered, or lost after three cycles.
+        """
 
     # ---- answers ------------------------------------------------------------------------------
 
     @abc.abstractmethod
     def on_line(self, line: str) -> None:
-        """Handle a line, which ends with its terminator; ignore any other text."""
+        """Handle a line, which ends with its terminator; ignore any other text.
+
+        An exception is an internal error and stops both axes.
+        """
 
     def ask(self, key: Hashable, data: bytes, timeout: float = 0.5) -> Procedure[str]:
         """Send a request, wait for its `answer`, and return it.
@@ -174,5 +194,5 @@ class DriveProtocol(abc.ABC):
             self._is_asking = False
 
     def answer(self, key: Hashable, text: str) -> None:
-        """Pass an answer to the `ask` with this key."""
+        """Pass an answer to the `ask` with this key; any other is ignored."""
         self._answers[key] = text

@@ -42,7 +42,7 @@ class PolledDrives(Drives):
         }
         super().__init__(port, protocol.link, axes)
         self.capabilities = protocol.capabilities
-        self._protocol, self._link, self._axes = protocol, protocol.link, axes
+        self.protocol, self._link, self._axes = protocol, protocol.link, axes
         protocol.on_status = self._on_status
         self._identity = ""
         self._number = 0
@@ -53,11 +53,11 @@ class PolledDrives(Drives):
     def receive(self, batch: Sequence[bytes]) -> None:
         """Receive bytes from the port."""
         for line in self._link.receive(batch):
-            self._protocol.on_line(line)
+            self.protocol.on_line(line)
 
     def _identify(self) -> Procedure[None]:
         self._is_waiting = False
-        self._identity = yield from self._protocol.identify()
+        self._identity = yield from self.protocol.identify()
 
     def are_emulated(self) -> Procedure[bool]:
         """Return whether the drives report that they are emulated."""
@@ -67,7 +67,7 @@ class PolledDrives(Drives):
     def beat(self) -> None:
         """Feed the watchdogs if the link is open."""
         if self._link.is_open:
-            self._protocol.beat()
+            self.protocol.beat()
 
     def _answered(self) -> bool:
         return not self._is_waiting
@@ -77,7 +77,7 @@ class PolledDrives(Drives):
         if not self._is_waiting or now - self._requested_at > (_LOST_AFTER - 0.5) * PERIOD:
             self._number = self._number % _NUMBERS + 1
             self._requested_at, self._is_waiting = now, True
-            self._protocol.request(self._number)
+            self.protocol.request(self._number)
         self._mark_answered()
         return timeout
 
