@@ -63,18 +63,24 @@ class TrackedRig:
     """The rig of level `tip` with a tracker as its sensor."""
 
     def __init__(
-        self, tracker: SimulatedTracker, registration: Registration = EXACT, **settings: Any
+        self,
+        tracker: SimulatedTracker,
+        registration: Registration = EXACT,
+        steering: Any = None,
+        **settings: Any,
     ) -> None:
         def see(bench: SimulatedBench, _: SimRigParameters) -> Sensor:
             tracker.bench = bench
             return NoSensor()
 
         parameters = command_line_parameters(parse(["--level", "tip"]), Path("none"))
+        parameters["plane_controller"] |= steering or {}
         rig = make_rig(parameters, see=see)
         operator = settings_of(SimulatedOperatorParameters, parameters, OPERATOR)
         tracked = TrackedTip(TrackedTipParameters(**settings), registration)
         self.tracker, self.target = tracker, rig[-1].settings.target_offset
         self.tips: list[m.PoseWithCovariance] = []
+        self.estimates: list[m.PoseWithCovariance] = []
         self.health: dict[str, str] = {}
         parts = [*rig, SimulatedOperator(operator), tracker, tracked]
         self.runner = VirtualRunner(parts, 3, compute=COMPUTE, taps=(self._note,))
@@ -82,6 +88,8 @@ class TrackedRig:
     def _note(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
         if output.topic == "needle/tip_pose":
             self.tips.append(message)
+        elif output.topic == "needle/estimate":
+            self.estimates.append(message)
         elif output == DIAGNOSTICS and sender == TrackedTip.name:
             (status,) = message.statuses
             self.health = {**status.values, "message": status.text}
@@ -111,6 +119,18 @@ class TrackedRig:
             errors.append([error @ np.linalg.solve(claim, error) for error, claim in pairs])
         return tuple(np.array(errors).T)
 
+    def estimate_errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the errors of x over their claimed sigmas, and those of the heading [rad]."""
+        times = np.array(sorted(self.tracker.truth))
+        of_x, of_heading = [], []
+        for estimate in self.estimates:
+            truth = self.tracker.truth[times[np.argmin(np.abs(times - estimate.stamp_ns))]]
+            off = estimate.position[0] - (truth[0, 3] - self.target)
+            of_x.append(off / math.sqrt(estimate.covariance[0]))
+            heading = Rotation.from_quat(estimate.orientation).as_matrix()[:, 2]
+            of_heading.append(np.linalg.norm(heading - truth[:3, 2]))
+        return np.array(of_x), np.array(of_heading)
+
 
 CASES = {
     "40 Hz": (TrackerModel(), EXACT, {}),
@@ -132,6 +152,23 @@ def test_a_tracker_steers_the_needle_into_the_plane(case: str) -> None:
     # Mean of chi-squared with three and two degrees of freedom, 1 by 1.
     assert 0.7 < np.mean(of_position) / 3.0 < 1.1
     assert 0.7 < np.mean(of_heading) / 2.0 < 1.2
+
+
+def test_a_measured_heading_makes_the_estimate_better() -> None:
+    early = []
+    for measured in (False, True):
+        steering = {
+            "tip_covariance": "from_tip_pose",
+            "measurement_std": 1e-4,
+            "measured_heading": measured,
+        }
+        rig = TrackedRig(SimulatedTracker(TrackerModel(rate=4.0), 1), steering=steering)
+        assert rig.run(400.0) == EXIT_DONE
+        assert abs(rig.tracker.bench.tip[0] - rig.target) < 5e-4
+        of_x, of_heading = rig.estimate_errors()
+        assert np.mean(of_x**2) < 1.1
+        early.append(np.sqrt(np.mean(of_heading[1:30] ** 2)))
+    assert early[1] < 0.5 * early[0]
 
 
 def of_matrix(change: Callable[[int, np.ndarray], Any]) -> Spoil:

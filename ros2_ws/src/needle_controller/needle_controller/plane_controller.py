@@ -12,7 +12,7 @@ import numpy as np
 
 from needle_controller.controller_status import ReceptionLog, controller_status
 from needle_controller.model.arrays import Array
-from needle_controller.model.kinematics import angle_axes
+from needle_controller.model.kinematics import angle_axes, rotation_from_quaternion
 from needle_controller.model.point_reach import point_from_message
 from needle_controller.model.target_plane import plane_from_pose
 from needle_controller.observers.estimator import Estimate
@@ -22,7 +22,7 @@ from needle_controller.protocol.actions import Action, PublishUpdate, SendPath, 
 from needle_controller.protocol.continuous import make_steering
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.tip_checks import TipCovariance, TipMeasurement
+from needle_controller.protocol.tip_checks import Heading, TipCovariance, TipMeasurement
 from needle_core import messages as m
 from needle_core.component import (
     JOINT_STATES,
@@ -59,6 +59,8 @@ _KEPT_MESSAGE = {
 }
 _LOG_PERIOD = 2.0
 """Shortest time between two log messages of one kind [s]."""
+_UNKNOWN_HEADING = 0.25
+"""Variance of a heading above which it counts as not measured [rad^2]."""
 
 
 class PlaneController(Component):
@@ -185,7 +187,8 @@ class PlaneController(Component):
         return self.steering.on_tip(TipMeasurement(message.stamp_ns, message.frame_id, position))
 
     def _on_tip_pose(self, message: m.PoseWithCovariance, at: Moment) -> Iterable[Action]:
-        return self.steering.on_tip_pose(tip_covariance(message))
+        heading = measured_heading(message) if self.settings.measured_heading else None
+        return self.steering.on_tip_pose(tip_covariance(message, heading))
 
     def _on_plane(self, message: m.Pose, at: Moment) -> Iterable[Action]:
         plane = plane_from_pose(message.frame_id, message.position, message.orientation)
@@ -318,10 +321,21 @@ def joint_sample(message: m.JointState, sent_ns: int) -> JointSample:
     return JointSample(message.stamp_ns, insertion, rotation, sent_ns)
 
 
-def tip_covariance(message: m.PoseWithCovariance) -> TipCovariance:
-    """Return the unchecked covariance of a measured tip."""
+def tip_covariance(message: m.PoseWithCovariance, heading: Heading | None = None) -> TipCovariance:
+    """Return the unchecked covariance of a measured tip, and its heading."""
     matrix = np.array(message.covariance).reshape(6, 6)[:3, :3]
-    return TipCovariance(message.stamp_ns, message.frame_id, matrix)
+    return TipCovariance(message.stamp_ns, message.frame_id, matrix, heading)
+
+
+def measured_heading(message: m.PoseWithCovariance) -> Heading | None:
+    """Return the unchecked z axis of a tip and the variance of its angle; None if unknown."""
+    direction = rotation_from_quaternion(message.orientation)[:, 2]
+    turn = np.array(message.covariance).reshape(6, 6)[3:, 3:]
+    if not np.all(np.isfinite(turn)):
+        return None
+    # The mean variance of the two turns across the heading.
+    variance = 0.5 * float(np.trace(turn) - direction @ turn @ direction)
+    return None if variance > _UNKNOWN_HEADING else (direction, variance)
 
 
 def _text(point: Array) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import defaultdict
 from typing import Any
 
@@ -86,9 +87,11 @@ class Bench:
         assert self.call("start") == (True, "steering")
         return self
 
-    def step(self) -> m.Trajectory:
+    def step(self, pose: m.PoseWithCovariance | None = None) -> m.Trajectory:
         """Send a tip, execute the resulting command, and answer."""
         self.tip()
+        if pose is not None:
+            self.receive("needle/tip_pose", dataclasses.replace(pose, stamp_ns=self.now))
         command: m.Trajectory = self.published[COMMANDS][-1]
         assert command.stamp_ns == self.now
         insertion, rotation = command.points[0].positions
@@ -185,6 +188,39 @@ def test_the_covariance_of_a_tip_pose_is_used() -> None:
         "needle/tip_pose", dataclasses.replace(pose, stamp_ns=bench.now, covariance=noise)
     )
     assert len(bench.published[COMMANDS]) == 1
+
+
+@pytest.mark.parametrize("is_used", [False, True])
+def test_a_measured_heading_reaches_the_estimator_in_the_target_plane(
+    is_used: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As an independent direction and its variance across; ten steps count as one."""
+    settings = dataclasses.replace(
+        SETTINGS, tip_covariance="from_tip_pose", measured_heading=is_used
+    )
+    bench, told = Bench(settings).started(), list[tuple[float, ...]]()
+    plane = (0.0, 0.0, math.sin(0.2), math.cos(0.2))
+    bench.receive("target_plane", m.Pose(0, "rig", (0.0, 0.0, 0.0), plane))
+    monkeypatch.setattr(
+        bench.component.steering.control._estimator,
+        "correct_heading",
+        lambda direction, variance: told.append((*direction, variance)),
+    )
+    half, std = 0.05, 0.02
+    # A turn about y; the roll is unknown.
+    direction = np.array([math.sin(2.0 * half), 0.0, math.cos(2.0 * half)])
+    covariance = np.eye(6) * 1e-8
+    covariance[3:, 3:] = std**2 * np.eye(3) + 9.0 * np.outer(direction, direction)
+    pose = m.PoseWithCovariance(
+        0, "rig", (0.0,) * 3, (0.0, math.sin(half), 0.0, math.cos(half)), tuple(covariance.ravel())
+    )
+    unknown = dataclasses.replace(pose, covariance=tuple((9.0 * np.eye(6)).ravel()))
+    for message in (pose, pose, unknown):
+        bench.step(message)
+    wanted = [direction[0] * math.cos(0.4), -direction[0] * math.sin(0.4), direction[2]]
+    assert len(told) == is_used
+    for row in told:
+        np.testing.assert_allclose(row, [*wanted, 10.0 * std**2], atol=1e-9)
 
 
 def test_the_covariance_follows_the_messages_convention(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from needle_controller.filter.heading_update import update_by_heading
 from needle_controller.filter.late_tips import FIRST, LAST, hidden_age
 from needle_controller.filter.merging import copy_hypothesis, merge
 from needle_controller.filter.motion import LARGEST_TURN, advance_hypothesis
@@ -234,6 +235,8 @@ def correct_needle(
     """
     reading = new_reading()
     _set_reading(reading, tip, covariance, has_covariance, assumed)
+    reading.heading[:] = needle.heading
+    needle.heading[3] = 0.0
     _apply_tip(needle, hypotheses, reading, age + needle.late, assumed)
     if needle.events < 0:
         return
@@ -247,6 +250,7 @@ def correct_needle(
         event.tip[i] = tip[i]
         for j in range(3):
             event.covariance[i, j] = covariance[i, j]
+    event.heading[:] = reading.heading
     if needle.inserted < LAST:
         return
     count, needle.events = needle.events, -1
@@ -259,6 +263,7 @@ def correct_needle(
             _queue(needle, hypotheses, event.length, event.turn, assumed)
             if event.is_tip:
                 _set_reading(reading, event.tip, event.covariance, event.has_covariance, assumed)
+                reading.heading[:] = event.heading
                 _apply_tip(needle, hypotheses, reading, event.age + needle.late, assumed)
 
 
@@ -308,7 +313,11 @@ def _apply_tip(
             needle.claimed[i] = reading.covariance[i, i]
         work = new_workspace()
         for n in range(needle.count):
+            seen = 1.0
+            if reading.heading[3] > 0.0:
+                seen = update_by_heading(hypotheses[n], reading.heading, assumed, work)
             update_hypothesis(hypotheses[n], reading, assumed, work)
+            hypotheses[n].evidence *= seen
         _reweight(needle, hypotheses, reading, assumed)
     if needle.tips % MERGE_EVERY == 0:
         merge(needle, hypotheses, assumed.merge_angle)

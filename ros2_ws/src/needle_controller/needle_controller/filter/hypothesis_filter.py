@@ -110,6 +110,18 @@ class HypothesisFilter:
             self._assumed,
         )
 
+    def correct_heading(self, direction: npt.ArrayLike, variance: float) -> None:
+        """Use a measured heading in the next `correct`.
+
+        Parameters
+        ----------
+        direction : array_like, shape (3,)
+            Unit vector in `target_plane`, measured at the exposure of that tip.
+        variance : float
+            Of its angle in each direction [rad^2].
+        """
+        self.needle["heading"] = [*np.asarray(direction, dtype=float), variance]
+
     def estimate(self) -> Estimate:
         """Return the present estimate; see `Estimator.estimate`."""
         record = np.zeros(1, ESTIMATE)[0]
@@ -134,6 +146,7 @@ class HypothesisFilter:
         events = self._events[: max(needle["events"], 0)]
         events["tip"] = events["tip"] @ turn.T + shift
         events["covariance"] = turn @ events["covariance"] @ turn.T
+        events["heading"][:, :3] = events["heading"][:, :3] @ turn.T
 
     def _warnings(self, ambiguous: float) -> tuple[str, ...]:
         warnings = []

@@ -67,6 +67,8 @@ NEEDLE = np.dtype(
         ("inserted", np.float64),  # since the start [m]
         ("events", np.int64),  # number of recorded events; -1 after the first centimetres
         ("late", np.float64),  # hidden age of the tips [m]
+        ("heading", np.float64, 4),  # measured with the next tip: unit vector and variance
+        # [rad^2]; 0: not measured
     ]
 )
 EVENT = np.dtype(
@@ -78,6 +80,7 @@ EVENT = np.dtype(
         ("has_covariance", np.bool_),
         ("covariance", np.float64, (3, 3)),  # [m^2]
         ("age", np.float64),  # [m]
+        ("heading", np.float64, 4),  # as of a needle
     ]
 )
 ESTIMATE = np.dtype(

@@ -41,7 +41,8 @@ _NO_MASS = 1e-30
 _GIVEN_UP = 1e-3
 _REOPENED = 0.2
 _FAR = 5.5
-_DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
+DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
+"""Of a standard normal variable at 0."""
 
 
 class Reading(NamedTuple):
@@ -49,6 +50,7 @@ class Reading(NamedTuple):
 
     tip: Array  # shape (3,) [m]
     covariance: Array  # (3, 3) [m^2]
+    heading: Array  # (4,): measured heading, and its variance [rad^2]; 0: not measured
     directions: Array  # rows, (3, 3): those of L^-1, covariance = L D L^T
     values: Array  # components of the tip, (3,) [m]
     bounds: Array  # claimed bounds, (3,): sqrt(3) standard deviations [m]
@@ -79,7 +81,8 @@ def new_workspace() -> Workspace:
 @compiled
 def new_reading() -> Reading:
     """Return an uninitialised reading."""
-    return Reading(np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3))
+    tip, values, bounds = np.empty(3), np.empty(3), np.empty(3)
+    return Reading(tip, np.empty((3, 3)), np.empty(4), np.empty((3, 3)), values, bounds)
 
 
 @compiled
@@ -147,8 +150,10 @@ def update_hypothesis(h: Any, reading: Reading, assumed: Any, work: Workspace) -
     evidence = outlier + (1.0 - assumed.outlier_share) * likelihood
     h.evidence, h.outlier = evidence, outlier / evidence
     _update_noise_weights(h, assumed, work)
-    _reduce_covariance(h.covariance, h.outlier, work)
-    _apply_change(h, reading, assumed, work)
+    reduce_covariance(h.covariance, h.outlier, work)
+    apply_change(h, h.outlier, assumed, work)
+    for k in range(3):
+        h.residual[k] += (1.0 - h.outlier) * (reading.tip[k] - h.position[k] - h.residual[k])
 
 
 @compiled
@@ -222,7 +227,7 @@ def _weigh_noises(
             total = new + (1.0 - c * c) * measured
             difference = innovation - c * (last - moved_by * old * per_variance)
             per_total = 1.0 / total
-            likely = 2.0 * bound * _DENSITY * math.sqrt(per_total)
+            likely = 2.0 * bound * DENSITY * math.sqrt(per_total)
             likely *= math.exp(-0.5 * difference * difference * per_total)
             # Noise smaller than claimed is possible, but the gain does not rely on it.
             if measured < claimed:
@@ -275,7 +280,7 @@ def truncated_moments(lower: float, upper: float) -> tuple[float, float, float]:
     bell_lower = math.exp(-0.5 * below * below) if below < _FAR else 0.0
     bell_upper = math.exp(-0.5 * above * above) if above < _FAR else 0.0
     tail_lower, tail_upper = bell_lower * tail_ratio(below), bell_upper * tail_ratio(above)
-    bell_lower, bell_upper = _DENSITY * bell_lower, _DENSITY * bell_upper
+    bell_lower, bell_upper = DENSITY * bell_lower, DENSITY * bell_upper
     # Differences of small tails are more accurate than of numbers near 1.
     if lower > 0.0:
         mass = tail_lower - tail_upper
@@ -307,7 +312,7 @@ def _update_noise_weights(h: Any, assumed: Any, work: Workspace) -> None:
 
 
 @compiled
-def _reduce_covariance(p: Array, outlier: float, work: Workspace) -> None:
+def reduce_covariance(p: Array, outlier: float, work: Workspace) -> None:
     """Reduce the covariance; mix it with the old one by the probability of an outlier.
 
     P <- P - (1 - o) sum_i n_i c_i c_i^T + o (1 - o) e e^T
@@ -322,14 +327,13 @@ def _reduce_covariance(p: Array, outlier: float, work: Workspace) -> None:
 
 
 @compiled
-def _apply_change(h: Any, reading: Reading, assumed: Any, work: Workspace) -> None:
+def apply_change(h: Any, outlier: float, assumed: Any, work: Workspace) -> None:
     """Apply the change of the error; a torsion parameter has affected the tip's angle so far."""
-    inside, change = 1.0 - h.outlier, work.change
+    inside, change = 1.0 - outlier, work.change
     for k in range(ERROR):
         change[k] *= inside
     for k in range(3):
         h.position[k] += change[k]
-        h.residual[k] += inside * (reading.tip[k] - h.position[k] - h.residual[k])
     kappa = h.curvature + change[E_KAPPA]
     h.curvature = min(max(kappa, assumed.smallest_curvature), assumed.largest_curvature)
     h.scale += change[E_SCALE]

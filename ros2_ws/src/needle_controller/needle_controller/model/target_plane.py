@@ -13,7 +13,7 @@ from needle_controller.model.kinematics import rotation_from_quaternion
 from needle_controller.model.reachability import check_offset
 from needle_core.errors import UserError
 
-_UNIT_TOLERANCE = 1e-3
+UNIT_TOLERANCE = 1e-3
 RIG = "rig"
 SHORTEST_CHECKED_DEPTH = 0.12
 """Depth of the insertions of [KC09] IV-B [m]; shorter runs count as parts of one."""
@@ -88,7 +88,7 @@ def plane_from_pose(
     if not (np.all(np.isfinite(origin)) and np.all(np.isfinite(q))):
         raise UserError(f"target_plane is not finite: position {origin}, orientation {q}")
     norm = math.hypot(*q)
-    if abs(norm - 1.0) > _UNIT_TOLERANCE:
+    if abs(norm - 1.0) > UNIT_TOLERANCE:
         raise UserError(f"target_plane's quaternion has length {norm:g}, expected 1")
     transform = np.eye(4)
     transform[:3, :3] = rotation_from_quaternion(q / norm)

@@ -75,6 +75,12 @@ class OwnEstimator:
         with self._part.errors_in("correct"):
             self._own.correct(np.array(tip, dtype=float), matrix, float(age))
 
+    def correct_heading(self, direction: npt.ArrayLike, variance: float) -> None:
+        """Pass a heading measured with the tip of the next `correct`, if the estimator takes it."""
+        if method := getattr(self._own, "correct_heading", None):
+            with self._part.errors_in("correct_heading"):
+                method(np.array(direction, dtype=float), float(variance))
+
     def estimate(self) -> Estimate:
         """Return the present estimate; see `Estimator.estimate`."""
         part = self._part
@@ -113,8 +119,10 @@ def tried_estimator(name: str) -> OwnPart:
     estimator.reset(np.zeros(3), np.zeros(2))
     tip: Array = np.zeros(3)
     for k in range(1, _TRIAL_STEPS + 1):
-        tip = arc(k * _STEP, 0.0, settings.curvature).shift
+        pose = arc(k * _STEP, 0.0, settings.curvature)
+        tip = pose.shift
         estimator.advance(_STEP, 0.0)
+        estimator.correct_heading(pose.rotation[:, 2], 1e-4)
         estimator.correct(tip, None if k % 2 else covariance, 0.0)
         estimator.estimate()
     error = float(np.linalg.norm(estimator.estimate().position - tip))

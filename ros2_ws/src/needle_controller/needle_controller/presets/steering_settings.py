@@ -27,6 +27,7 @@ INSERTIONS = ("stepwise", "continuous")
 TIP_NOISES = ("bounded", "normal")
 TIP_COVARIANCES = ("configured", "from_tip_pose")
 """Sources of a tip's covariance."""
+_HEADING_NEEDS = "tip_covariance from_tip_pose, and preset best or an own estimator"
 PAPER_NOISE: dict[str, Any] = {
     "tip_covariance": "configured",
     "tip_noise": "bounded",
@@ -152,6 +153,12 @@ class SteeringSettings:
         "tip_noise, for a source that only publishes needle/tip.",
         choices=TIP_COVARIANCES,
     )
+    measured_heading: bool = fixed_parameter(
+        False,
+        "-",
+        "Also use the heading of needle/tip_pose: of a sensor in the tip, not of stereo_tracker, "
+        f"whose heading is that of the pre-bent end. Needs {_HEADING_NEEDS}.",
+    )
     result_timeout: float = parameter(
         10.0,
         "s",
@@ -272,6 +279,9 @@ class SteeringSettings:
                 f"flip_depths: preset {self.preset} cannot steer with the bevel flipped (its "
                 "coordinates end at roll +-90 deg); best can"
             )
+        uses_heading = self.estimator or self.preset not in ONE_SIDED_PRESETS
+        if self.measured_heading and not (uses_heading and self.tip_covariance == "from_tip_pose"):
+            raise UserError(f"measured_heading needs {_HEADING_NEEDS}")
         if self.preset in ONE_SIDED_PRESETS:
             self.gains()
 

@@ -29,6 +29,9 @@ from needle_controller.protocol.tip_checks import TipCovariance
 
 LARGEST_START_ROLL = np.deg2rad(80.0)
 """For presets whose coordinates are limited to roll +-90 deg [rad]."""
+HEADING_CORRELATION = 0.01
+"""Inserted length over which measured headings count as one, because errors of the sensor's
+alignment and registration repeat [m]: harmless up to 10 mrad (60 needles each)."""
 _FAR_AWAY = Obstacles([Obstacle((0.5, 0.0, 0.01), (0.5, 0.0, 0.02), 0.001)])
 
 
@@ -216,10 +219,11 @@ class PlaneControl:
             self._first_joints = joints
             self._estimator.reset(position, np.array([joints.insertion, joints.rotation]))
         else:
+            inserted = joints.insertion - self._joints.insertion
             for sample in (*intermediate, joints):
                 self._advance(self._joints, sample)
                 self._joints = sample
-            self._correct(position, covariance)
+            self._correct(position, covariance, inserted)
         self._joints = joints
         estimate = self._estimator.estimate()
         command = self._command(estimate, joints)
@@ -239,12 +243,17 @@ class PlaneControl:
         self._rotation += abs(rotation)
         self._estimator.advance(inserted, rotation)
 
-    def _correct(self, position: Array, covariance: TipCovariance | None) -> None:
+    def _correct(self, position: Array, covariance: TipCovariance | None, inserted: float) -> None:
         settings = self._settings
         if covariance is None:
             self._estimator.correct(position, settings.configured_covariance())
             return
         turn = self._plane.T_plane_rig[:3, :3]
+        correct_heading = getattr(self._estimator, "correct_heading", None)
+        if covariance.heading is not None and correct_heading is not None:
+            direction, variance = covariance.heading
+            repeats = max(1.0, HEADING_CORRELATION / max(inserted, 1e-5))
+            correct_heading(turn @ direction, repeats * variance)
         matrix = turn @ covariance.matrix @ turn.T + np.eye(3) * settings.measurement_std**2
         self._estimator.correct(position, matrix)
 

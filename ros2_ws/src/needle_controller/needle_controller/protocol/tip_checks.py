@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from needle_controller.model.arrays import Array
-from needle_controller.model.target_plane import RIG
+from needle_controller.model.target_plane import RIG, UNIT_TOLERANCE
 from needle_controller.protocol.joint_history import JointSample
 
 LARGEST_SCALE = 1.15
@@ -33,6 +33,10 @@ class TipFault(enum.Enum):
     NO_JOINTS = "no_joints"
     NO_COVARIANCE = "no_covariance"
     BAD_COVARIANCE = "bad_covariance"
+
+
+Heading = tuple[Array, float]
+"""Direction of the tip in `rig`, shape (3,), and the variance of its angle [rad^2]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,11 +70,14 @@ class TipCovariance:
         Frame of the covariance; must be `rig`.
     matrix : ndarray, shape (3, 3)
         Of the position [m^2]; infinite if no tip was found.
+    heading : Heading, optional
+        None if it is not measured.
     """
 
     stamp_ns: int
     frame_id: str
     matrix: Array
+    heading: Heading | None = None
 
     def problem(self) -> str:
         """Return why the covariance cannot be used; empty if it can."""
@@ -89,7 +96,14 @@ class TipCovariance:
                 "covariance of needle/tip_pose is not positive definite (its smallest variance is "
                 f"{least:.3g} m^2)"
             )
-        return ""
+        return self._heading_problem()
+
+    def _heading_problem(self) -> str:
+        direction, variance = self.heading or (np.array([0.0, 0.0, 1.0]), 1.0)
+        length = math.hypot(*direction)
+        if abs(length - 1.0) < UNIT_TOLERANCE and 0.0 < variance < math.inf:
+            return ""
+        return f"heading of needle/tip_pose: length {length:.3g}, variance {variance:.3g} rad^2"
 
 
 @dataclasses.dataclass(frozen=True)

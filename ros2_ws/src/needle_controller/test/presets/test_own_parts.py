@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+import math
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -131,6 +133,26 @@ def test_an_own_estimator_replaces_the_presets(offer: Offer) -> None:
     found = estimator.estimate()
     np.testing.assert_allclose(found.position, [0.0028, 0.0, 0.001])
     assert float(law(found, 0.001).rotation_rate) != 0.0
+
+
+HEADING = """
+    def correct_heading(self, direction, variance):
+        self.turn = self.turn @ rotation_exp(np.cross([0, 0, 1.0], self.turn.T @ direction))
+"""
+
+
+def test_an_own_estimator_may_use_a_measured_heading(offer: Offer) -> None:
+    own = ESTIMATOR.replace("import arc", "import arc, rotation_exp") + HEADING
+    for source, z in ((own, math.cos(0.1)), (ESTIMATOR, 1.0)):
+        settings = SteeringSettings(estimator=offer("estimator", source), preset="paper")
+        settings = dataclasses.replace(settings, measured_heading=True)
+        estimator, _ = make_controller(settings, np.eye(3))
+        estimator.reset([0.0, 0.0, 0.0], [0.0, 0.0])
+        estimator.correct_heading([0.0, math.sin(0.1), math.cos(0.1)], 1e-4)  # type: ignore[attr-defined]
+        assert estimator.estimate().rotation[2, 2] == pytest.approx(z, abs=1e-4)
+    wrong = offer("estimator", own.replace("(self, direction, variance)", "(self, direction)"))
+    with pytest.raises(OwnPartError, match="correct_heading raised TypeError"):
+        tried_estimator(wrong)
 
 
 def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:

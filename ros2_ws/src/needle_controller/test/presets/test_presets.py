@@ -33,6 +33,8 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
     ("best_of_all", {"preset": "best_of_all"}),
     ("'pink'", {"tip_noise": "pink"}),
     ("'none'", {"tip_covariance": "none"}),
+    ("measured_heading", {"measured_heading": True, "tip_covariance": "configured"}),
+    ("measured_heading", {"measured_heading": True, "preset": "paper"}),
     ("tip_noise_bound", {"tip_noise_bound": 0.0}),
     ("obstacles has 6 numbers", {"obstacles": (0.0,) * 6}),
     ("x, y and z", {"target_point": (0.0, 0.1)}),

@@ -101,3 +101,12 @@ def test_invalid_covariances_are_rejected() -> None:
         problem = TipCovariance(0, "rig", matrix).problem()
         assert (said in problem) if said else not problem, matrix
     assert "frame 'map'" in TipCovariance(0, "map", np.eye(3)).problem()
+    for z, variance, said in (
+        (1.0, 1e-4, ""),
+        (0.9, 1e-4, "length 0.9"),
+        (NAN, 1e-4, "length nan"),
+        (1.0, 0.0, "variance 0 rad^2"),
+        (1.0, NAN, "variance nan"),
+    ):
+        problem = TipCovariance(0, "rig", np.eye(3), (np.array([0.0, 0.0, z]), variance)).problem()
+        assert (said in problem) if said else not problem, (z, variance)

@@ -1,0 +1,200 @@
+"""Updates by a measured heading: Jacobian, batch least squares, outliers, late tips, frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime, least_squares
+from scipy.spatial.transform import Rotation
+
+from needle_controller.filter.filter_settings import (
+    NORMAL,
+    FilterSettings,
+    NoiseHypothesis,
+    RollHypothesis,
+    TorsionHypothesis,
+)
+from needle_controller.filter.heading_update import update_by_heading
+from needle_controller.filter.hypothesis_filter import HypothesisFilter
+from needle_controller.filter.mixture import LATE
+from needle_controller.filter.records import E_TURN, ERROR, HYPOTHESIS
+from needle_controller.filter.tip_update import new_workspace
+from needle_controller.model.arc_motion import arc, rotation_exp
+from needle_controller.model.arrays import Array
+from needle_controller.observers.estimator import Estimate
+
+from .needles import CURVATURE, STEP, noisy, path, turns_for
+
+PLAIN = FilterSettings(outlier_share=1e-6, curvature_range=(0.01, 100.0))
+STD = 0.01
+NOISE = 3e-4
+
+
+def hypothesis(seed: int) -> Any:
+    """Return a hypothesis with a correlated error, and a gain that is estimated."""
+    h, rng = np.zeros(1, HYPOTHESIS)[0], np.random.default_rng(seed)
+    scales = np.array([3e-4, 3e-4, 3e-4, 0.05, 0.05, 0.1, 1.0, 0.1, 0.05])
+    factor = rng.normal(size=(ERROR, ERROR)) * scales[:, None]
+    h["covariance"] = factor @ factor.T
+    h["rotation"] = Rotation.random(random_state=seed).as_matrix()
+    h["curvature"], h["scale"], h["gain"], h["torsion_kind"] = 8.0, 1.0, 1.0, 2
+    return h
+
+
+def across(rotation: Array, heading: Array) -> Array:
+    """Return the turn from the z axis of a rotation to a heading, along its x and y axes."""
+    turn, _ = Rotation.align_vectors(heading[None], rotation[:, 2][None])
+    vector: Array = turn.as_rotvec() @ rotation[:, :2]
+    return vector
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_update_is_that_of_a_kalman_filter_with_a_numerical_jacobian(seed: int) -> None:
+    h, before = hypothesis(seed), hypothesis(seed)
+    rotation, p = np.array(before["rotation"]), np.array(before["covariance"])
+    heading = rotation @ rotation_exp([0.03, -0.02, 0.0])[:, 2]
+    jacobian = np.zeros((2, ERROR))
+    for i in range(2):
+        jacobian[i, E_TURN : E_TURN + 3] = approx_fprime(
+            np.zeros(3), lambda w, i=i: across(rotation, rotation_exp(w) @ rotation[:, 2])[i], 1e-6
+        )
+    total = jacobian @ p @ jacobian.T + STD**2 * np.eye(2)
+    gain = p @ jacobian.T @ np.linalg.inv(total)
+    change = gain @ across(rotation, heading)
+    seen = update_by_heading(h, np.array([*heading, STD**2]), PLAIN.assumptions(), new_workspace())
+    turned = Rotation.from_matrix(h["rotation"] @ rotation.T).as_rotvec()
+    scale = np.sqrt(np.diag(p))
+    np.testing.assert_allclose(h["position"] / scale[:3], change[:3] / scale[:3], atol=1e-4)
+    np.testing.assert_allclose(turned / scale[3:6], change[3:6] / scale[3:6], atol=1e-4)
+    np.testing.assert_allclose(h["curvature"], 8.0 + change[6], atol=1e-4)
+    after = (p - gain @ jacobian @ p) / np.outer(scale, scale)
+    np.testing.assert_allclose(h["covariance"] / np.outer(scale, scale), after, atol=1e-4)
+    # The likelihood is relative to noise within the bound, a density of 1 / (12 STD^2).
+    off = across(rotation, heading)
+    density = np.exp(-0.5 * off @ np.linalg.solve(total, off)) / (2.0 * np.pi)
+    density /= np.sqrt(np.linalg.det(total))
+    np.testing.assert_allclose(seen, 12.0 * STD**2 * density, rtol=1e-3)
+
+
+def test_a_heading_that_cannot_be_true_changes_nothing() -> None:
+    h, before = hypothesis(1), hypothesis(1)
+    heading = -np.array(h["rotation"])[:, 2]
+    settings = FilterSettings()
+    seen = update_by_heading(
+        h, np.array([*heading, STD**2]), settings.assumptions(), new_workspace()
+    )
+    assert 0.0 < seen < settings.outlier_share
+    for name in ("position", "rotation", "covariance"):
+        np.testing.assert_allclose(h[name], before[name], atol=1e-12)
+
+
+def test_a_heading_decides_between_hypotheses() -> None:
+    """A tip that is hardly known, 10 mm deep, and its heading: only the true roll remains."""
+    rolls = tuple(RollHypothesis(np.deg2rad(roll), 0.05, 1.0) for roll in (0.0, 90.0))
+    settings = FilterSettings(roll_hypotheses=rolls, initial_angle_std=STD)
+    pose = path(np.zeros(10), roll=np.deg2rad(90.0))[-1]
+    estimator = HypothesisFilter(settings)
+    estimator.reset(np.zeros(3), np.zeros(2))
+    estimator.advance(10 * STEP, 0.0)
+    estimator.correct_heading(pose[:3, 2], STD**2)
+    estimator.correct(pose[:3, 3], np.eye(3))
+    weights, turned = estimator.hypotheses["weight"], estimator.hypotheses["rotation"][:, 0, 0]
+    assert np.sum(weights[turned > 0.7]) < 0.01 * np.sum(weights)
+
+
+def followed(
+    settings: FilterSettings, poses: Array, tips: Array, turns: Array, *, std: float
+) -> Estimate:
+    """Return the estimate from tips and headings; without headings if `std` is 0."""
+    rng, estimator = np.random.default_rng(3), HypothesisFilter(settings)
+    estimator.reset(tips[0], np.zeros(2))
+    for turn, tip, pose in zip(turns, tips[1:], poses[1:], strict=True):
+        estimator.advance(STEP, turn)
+        if std > 0.0:
+            estimator.correct_heading(measured(pose, rng), std**2)
+        estimator.correct(tip, np.eye(3) * NOISE**2)
+    return estimator.estimate()
+
+
+def measured(pose: Array, rng: np.random.Generator) -> Array:
+    tilt = rotation_exp([*rng.normal(0.0, STD, 2), 0.0])
+    heading: Array = pose[:3, :3] @ tilt[:, 2]
+    return heading
+
+
+def test_the_estimate_is_that_of_a_batch_least_squares_fit() -> None:
+    """On an arc of 15 mm: positions, headings and the prior, without noise of the process."""
+    roll_std, angle_std = np.deg2rad(5.0), np.deg2rad(8.0)
+    settings = FilterSettings(
+        torsion_hypotheses=(TorsionHypothesis(0.0, 0.0, 0.0, 1.0, 0.0, 0.0),),
+        roll_hypotheses=(RollHypothesis(0.0, roll_std, 1.0),),
+        noise_hypotheses=(NoiseHypothesis(NORMAL, (1.0,), (1.0,), 1.0),),
+        tip_noise_bound=np.sqrt(3.0) * NOISE,
+        curvature_drift=0.0,
+        scale_spread=0.0,
+        scale_drift=0.0,
+        model_error=0.0,
+        outlier_share=1e-6,
+        initial_angle_std=angle_std,
+    )
+    turns = turns_for(15)
+    poses = path(turns, np.deg2rad(1.5), np.deg2rad(2.0), 1.1 * CURVATURE)
+    tips = poses[:, :3, 3] + np.random.default_rng(2).normal(0.0, NOISE, (16, 3))
+    estimate = followed(settings, poses, tips, turns, std=STD)
+    rng = np.random.default_rng(3)
+    headings = [measured(pose, rng) for pose in poses[1:]]
+    prior = np.array([angle_std, angle_std, roll_std, 0.22 * CURVATURE])
+
+    def at(values: Array) -> list[tuple[Array, Array]]:
+        motion = arc(STEP, turns, values[6])
+        place, turn = values[:3], rotation_exp(values[3:6])
+        way = []
+        for shift, step in zip(motion.shift, motion.rotation, strict=True):
+            place, turn = place + turn @ shift, turn @ step
+            way.append((place, turn))
+        return way
+
+    def residuals(values: Array) -> Array:
+        parts = [(values[:3] - tips[0]) / NOISE, (values[3:] - [0, 0, 0, CURVATURE]) / prior]
+        for (place, turn), tip, heading in zip(at(values), tips[1:], headings, strict=True):
+            parts += [(place - tip) / NOISE, (turn.T @ heading)[:2] / STD]
+        return np.concatenate(parts)
+
+    fit = least_squares(residuals, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, CURVATURE], x_scale="jac")
+    place, turn = at(fit.x)[-1]
+    std = np.sqrt(np.diag(estimate.covariance))
+    assert np.all(np.abs(estimate.position - place) < 0.1 * std[:3])
+    heading_off = estimate.rotation[:, 2] - turn[:, 2]
+    assert np.linalg.norm(heading_off) < 0.1 * std[4]
+    curvature_std = np.sqrt(np.linalg.inv(fit.jac.T @ fit.jac)[6, 6])
+    assert abs(estimate.curvature - fit.x[6]) < 0.1 * curvature_std
+    # The heading is known far better than from the tips alone.
+    alone = followed(settings, poses, tips, turns, std=0.0)
+    assert std[4] < 0.4 * np.sqrt(alone.covariance[4, 4])
+
+
+def test_late_headings_are_replayed_and_the_frame_may_change() -> None:
+    """Headings of the first centimetres serve the replay; their axes follow the plane."""
+    turns = turns_for(24, size=0.1)
+    poses, at = path(turns, np.deg2rad(3.0)), np.eye(4)
+    at[:3] = [[0.0, 1.0, 0.0, 0.01], [-1.0, 0.0, 0.0, -0.02], [0.0, 0.0, 1.0, 0.03]]
+    tips, told = noisy(poses, bound=2e-4), []
+    for has_heading, frame in ((True, np.eye(4)), (True, at), (False, np.eye(4))):
+        estimator = HypothesisFilter(FilterSettings(), None, np.zeros(3))
+        estimator.reset(tips[0], np.zeros(2))
+        for k in range(1, 21):
+            if k == 10:
+                estimator.change_frame(frame)
+            now = frame if k >= 10 else np.eye(4)
+            exposed = max(k - 3, 0)
+            estimator.advance(STEP, turns[k - 1])
+            if has_heading:
+                estimator.correct_heading(now[:3, :3] @ poses[exposed, :3, 2], 1e-4)
+            estimator.correct(now[:3, :3] @ tips[exposed] + now[:3, 3], np.eye(3) * 1e-7)
+        told.append((estimator.estimate(), frame[:3, :3] @ poses[20, :3, 2]))
+    assert LATE in told[0][0].warnings
+    off = [float(np.linalg.norm(found.rotation[:, 2] - true)) for found, true in told]
+    assert max(off[:2]) < 0.01
+    assert off[2] > 2.0 * max(off[:2])
