@@ -37,7 +37,7 @@ class AxisSettings:
     unit : str
         Of the axis: m or rad.
     travel : float
-        Greatest distance from home; homing searches a fifth farther.
+        Greatest distance from home.
     actuated : bool
         Whether the drive has a motor; otherwise a hand moves the axis.
     """
@@ -91,6 +91,11 @@ class AxisSettings:
     def text(self, value: float) -> str:
         """Return a distance for messages."""
         return f"{value * 1e3:.4g} mm" if self.unit == "m" else f"{value:.4g} rad"
+
+    @property
+    def longest_search(self) -> float:
+        """Farthest that homing searches for the switch: a fifth beyond the travel."""
+        return 1.2 * self.travel
 
     @property
     def stop_time(self) -> float:

@@ -28,8 +28,6 @@ from needle_device_driver.rules import Rule
 # the axis stands or at the edge of its switch, no change shows. So it counts as ended after this
 # number of cycles at its home: for a homing where it stands, and for one to a switch.
 _CYCLES_HERE, _CYCLES_AT_SWITCH = 5, 25
-# An axis searches for its home over this share of its travel.
-_SEARCH = 1.2
 # Methods that end at a limit switch: its direction in counts, its bit of the digital inputs.
 _TOWARDS = {17: (-1, od.NEGATIVE_LIMIT_SWITCH), 18: (1, od.POSITIVE_LIMIT_SWITCH)}
 
@@ -69,7 +67,7 @@ class HomingRun:
         method = settings.homing_method
         # An index pulse lies within one turn beyond the switch.
         turn = (method in INDEX_PULSE) * settings.counts_per_turn
-        self._longest = _SEARCH * settings.travel + turn / settings.counts_per_unit
+        self._longest = settings.longest_search + turn / settings.counts_per_unit
         self._towards, self._switch = _TOWARDS.get(method * has_inputs, (0, 0))
         self._travelled = self._cycles_at_home = 0
         self.problem = ""

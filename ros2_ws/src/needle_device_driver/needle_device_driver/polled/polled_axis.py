@@ -24,8 +24,6 @@ _STOP_MARGIN = 8
 _MAX_SWITCHING = 100
 # An axis leaves its switch at this share of the homing speed: its edge is the home.
 _EDGE_SPEED = 0.1
-# An axis searches for its switch over this share of its travel.
-_SEARCH = 1.2
 # A stopped axis that is farther from its set-point is blocked [cycles at full speed].
 _BLOCKED = 1.5
 _CONFLICT = "the drive missed an order of this computer, or received one of another program"
@@ -315,11 +313,11 @@ class PolledAxis(CyclicAxis):
             self._homing, self._target = _Homing.LEAVE, at.position
         elif self._homing is _Homing.LEAVE and not at.home_switch:
             self._end_homing()
-        elif self._travelled > _SEARCH * settings.travel:
+        elif self._travelled > settings.longest_search:
             self._problem = (
                 Rule.HOMING_TIME,
                 f"moved {settings.text(self._travelled)} without finding home, limit "
-                f"{settings.text(_SEARCH * settings.travel)}",
+                f"{settings.text(settings.longest_search)}",
             )
         elif self._homing is not _Homing.SETTLE:
             search = self._homing is _Homing.SEARCH
