@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from needle_bags.run.shaft_trail import ShaftTrail
 from needle_controller.model.target_plane import TargetPlane, offset_plane
 from needle_core import messages as m
-from needle_tracker.optics.calibration import rotation_matrix
+from needle_tracker.optics.calibration import pose_matrix, rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class MeasuredTip:
     def pose(self) -> Array:
         """Pose in `rig`, shape (4, 4)."""
         unit = self.quaternion / np.linalg.norm(self.quaternion)
-        return _pose(rotation_matrix(unit), self.position)
+        return pose_matrix(rotation_matrix(unit), self.position)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +74,7 @@ class TipEstimate:
     @property
     def pose(self) -> Array:
         """Pose of the tip's frame, shape (4, 4)."""
-        return _pose(self.rotation, self.position)
+        return pose_matrix(self.rotation, self.position)
 
 
 class LiveNeedle:
@@ -185,9 +185,3 @@ class LiveNeedle:
         if self.tip is None or not self.tip_found:
             return None
         return self.tip.stamp_ns, trail.shaft(self._insertion, self.tip.pose)
-
-
-def _pose(rotation: Array, position: Array) -> Array:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, position
-    return pose

@@ -19,7 +19,7 @@ from needle_core.component import Actions, Component, Input, Moment, Output, Pub
 from needle_core.errors import UserError
 from needle_core.files.yaml_files import read_yaml
 from needle_core.settings import parameter_fields as fields
-from needle_tracker.optics.calibration import transform_of
+from needle_tracker.optics.calibration import pose_matrix, transform_of
 
 Array = npt.NDArray[np.float64]
 
@@ -186,16 +186,12 @@ class PeerTopics(Component):
                 return tip.stamp_ns, tip.pose[None]
             case "base" if joints.names:
                 places = dict(zip(joints.names, joints.positions, strict=False))
-                turn = Rotation.from_euler("z", places.get(m.ROTATION_JOINT, 0.0))
-                return joints.stamp_ns, _pose(turn, (0.0, 0.0, places[m.INSERTION_JOINT]))
+                turn = Rotation.from_euler("z", places.get(m.ROTATION_JOINT, 0.0)).as_matrix()
+                return joints.stamp_ns, pose_matrix(turn, (0.0, 0.0, places[m.INSERTION_JOINT]))[
+                    None
+                ]
             case "entry":
-                return now, _pose(Rotation.identity(), (0.0, 0.0, 0.0))
+                return now, np.eye(4)[None]
             case "target" if target is not None:
-                return now, _pose(Rotation.identity(), target)
+                return now, pose_matrix(np.eye(3), target)[None]
         return None
-
-
-def _pose(rotation: Rotation, position: npt.ArrayLike) -> Array:
-    pose = np.eye(4)[None]
-    pose[0, :3, :3], pose[0, :3, 3] = rotation.as_matrix(), position
-    return pose

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from needle_core.errors import UserError
 from needle_core.files.installed import find_shared_file
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.optics.calibration import StereoCalibration, pose_matrix
 
 Array = NDArray[np.float64]
 
@@ -26,9 +26,8 @@ def camera_bodies(calibration: StereoCalibration) -> dict[str, Array]:
     """Return the pose of each camera's body in `rig` by side, shape (4, 4) [m]."""
     poses = {}
     for side, camera in calibration.cameras.items():
-        poses[side] = np.eye(4)
-        poses[side][:3, :3] = camera.T_optical_rig[:3, :3].T @ _R_OPTICAL_BODY
-        poses[side][:3, 3] = camera.centre
+        rotation = camera.T_optical_rig[:3, :3].T @ _R_OPTICAL_BODY
+        poses[side] = pose_matrix(rotation, camera.centre)
     return poses
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from numpy.typing import NDArray
 
 from needle_core.errors import UserError
@@ -217,10 +218,7 @@ def transform_of(content: Any, *keys: str) -> NDArray[np.float64]:
     quaternion = numbers(content, 4, *keys, "rotation")
     norm = float(np.linalg.norm(quaternion))
     check_bounds(f"norm of {'.'.join((*keys, 'rotation'))}", norm, 0.99, 1.01, "-")
-    transform = np.eye(4)
-    transform[:3, :3] = rotation_matrix(quaternion / norm)
-    transform[:3, 3] = translation
-    return transform
+    return pose_matrix(rotation_matrix(quaternion / norm), translation)
 
 
 def check_camera_matrix(name: str, matrix: NDArray[np.float64]) -> None:
@@ -229,6 +227,13 @@ def check_camera_matrix(name: str, matrix: NDArray[np.float64]) -> None:
         raise UserError(f"{name}: focal lengths {matrix[0, 0]:g}, {matrix[1, 1]:g} px not positive")
     if np.any(matrix[[0, 1, 2, 2], [1, 0, 0, 1]] != 0.0) or matrix[2, 2] != 1.0:
         raise UserError(f"{name} is not [fx 0 cx; 0 fy cy; 0 0 1]")
+
+
+def pose_matrix(rotation: NDArray[np.float64], position: npt.ArrayLike) -> NDArray[np.float64]:
+    """Return the transform, (4, 4), with a rotation, (3, 3), and a position, (3,) [m]."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, position
+    return pose
 
 
 def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
