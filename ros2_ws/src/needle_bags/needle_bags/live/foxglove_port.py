@@ -14,6 +14,7 @@ from needle_core.component import Batch, Log, Output
 from needle_core.convert import Converter, ros_type
 from needle_core.errors import UserError
 from needle_core.message_types import rosbags_types
+from needle_core.settings.parameter_files import absolute_name
 
 _LOOPBACK = "127.0.0.1"
 
@@ -84,7 +85,7 @@ class FoxglovePort(ServerListener):
         self._report()
         name = channel.topic
         for topic, (data, stamp_ns) in tuple(self._latched.items()):
-            if _absolute(topic) == name:
+            if absolute_name(topic) == name:
                 self._channels[topic].log(data, log_time=stamp_ns)
 
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
@@ -100,9 +101,5 @@ class FoxglovePort(ServerListener):
         definition, _ = self._store.generate_msgdef(name, ros_version=2)
         schema = foxglove.Schema(name=name, encoding="ros2msg", data=definition.encode())
         return foxglove.Channel(
-            _absolute(row.topic), schema=schema, message_encoding="cdr", context=self._context
+            absolute_name(row.topic), schema=schema, message_encoding="cdr", context=self._context
         )
-
-
-def _absolute(topic: str) -> str:
-    return topic if topic.startswith("/") else f"/{topic}"

@@ -12,6 +12,7 @@ from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
 from needle_core.files.bag_directory import BagDirectory
 from needle_core.settings.bounds import check_bounds
+from needle_core.settings.parameter_files import absolute_name
 
 _DESCRIPTION = """\
 Play a bag: publish its messages with their recorded order, timing and quality of service. Late
@@ -127,7 +128,7 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
         given.start,
         given.end,
         TopicChoice(
-            tuple(_absolute(name) for name in given.topics), given.regex, given.exclude_regex
+            tuple(absolute_name(name) for name in given.topics), given.regex, given.exclude_regex
         ),
         dict(_remap(text) for text in given.remap),
         given.loop,
@@ -151,8 +152,4 @@ def _remap(text: str) -> tuple[str, str]:
     before, mark, after = text.partition(":=")
     if not (before and mark and after):
         raise UserError(f"--remap {text!r} is not of the form A:=B; see --help")
-    return _absolute(before), _absolute(after)
-
-
-def _absolute(name: str) -> str:
-    return name if name.startswith("/") else f"/{name}"
+    return absolute_name(before), absolute_name(after)

@@ -25,6 +25,7 @@ from needle_core.convert import Converter, ros_type
 from needle_core.files.bag_topic import BagTopic
 from needle_core.files.mcap_file import RUN_RECORD
 from needle_core.message_types import rosbags_types
+from needle_core.settings.parameter_files import absolute_name
 
 
 class BagTap:
@@ -83,7 +84,7 @@ class BagTap:
         type_name = ros_type(row.message)
         definition, _ = self._store.generate_msgdef(type_name, ros_version=2)
         return BagTopic(
-            row.topic if row.topic.startswith("/") else f"/{row.topic}",
+            absolute_name(row.topic),
             type_name,
             definition,
             self._store.hash_rihs01(type_name),

@@ -10,6 +10,7 @@ from needle_bags.recording.recent_messages import RecentMessages
 from needle_bags.recording.recording import RESERVE
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.settings.parameter_files import absolute_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,8 +80,7 @@ class RecorderParameters:
     @property
     def choice(self) -> TopicChoice:
         """The topics to record."""
-        names = (name if name.startswith("/") else f"/{name}" for name in self.topics)
-        return TopicChoice(tuple(names), self.regex, self.exclude_regex)
+        return TopicChoice(tuple(map(absolute_name, self.topics)), self.regex, self.exclude_regex)
 
     @property
     def recent(self) -> RecentMessages | None:

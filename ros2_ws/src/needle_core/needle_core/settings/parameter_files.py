@@ -43,7 +43,7 @@ def read_sections(path: Path) -> Sections:
     if not isinstance(document or {}, Mapping):
         raise UserError(f"{path}: not a ROS parameter file ({_FORM})")
     sections = list(_sections(path, document or {}))
-    _unique(path, ((_absolute(name), None) for name, _ in sections))
+    _unique(path, ((absolute_name(name), None) for name, _ in sections))
     return {name: _unique(f"{path}: {name}", _flat(values)) for name, values in sections}
 
 
@@ -78,8 +78,8 @@ def matching_sections(source: object, sections: Sections, node: str, kind: str) 
     reached = {name: values for name, values in sections.items() if _matches(name, node)}
     if meant and reached.keys().isdisjoint(meant):
         raise UserError(
-            f"{source}: section '{meant[0]}' is for {_absolute(meant[0])}, this node is {node}: "
-            f"write '{node}', '/**/{_last(node)}' or '/**'"
+            f"{source}: section '{meant[0]}' is for {absolute_name(meant[0])}, this node is "
+            f"{node}: write '{node}', '/**/{_last(node)}' or '/**'"
         )
     return reached
 
@@ -232,12 +232,13 @@ def _unique(where: object, pairs: Iterable[tuple[str, T]]) -> dict[str, T]:
 
 def _matches(section: str, node: str) -> bool:
     # Pattern of rcl: /* is one name, /** is any number of names.
-    pattern = re.escape(_absolute(section)).replace(r"/\*", r"(/\w+)").replace(r"\*", "*")
+    pattern = re.escape(absolute_name(section)).replace(r"/\*", r"(/\w+)").replace(r"\*", "*")
     return re.fullmatch(pattern, node) is not None
 
 
-def _absolute(section: str) -> str:
-    return section if section.startswith("/") else f"/{section}"
+def absolute_name(name: str) -> str:
+    """Return the name of a node or topic with a slash in front."""
+    return name if name.startswith("/") else f"/{name}"
 
 
 def _last(name: str) -> str:
