@@ -187,9 +187,8 @@ class PeerTopics(Component):
             case "base" if joints.names:
                 places = dict(zip(joints.names, joints.positions, strict=False))
                 turn = Rotation.from_euler("z", places.get(m.ROTATION_JOINT, 0.0)).as_matrix()
-                return joints.stamp_ns, pose_matrix(turn, (0.0, 0.0, places[m.INSERTION_JOINT]))[
-                    None
-                ]
+                place = (0.0, 0.0, places[m.INSERTION_JOINT])
+                return joints.stamp_ns, pose_matrix(turn, place)[None]
             case "entry":
                 return now, np.eye(4)[None]
             case "target" if target is not None:
