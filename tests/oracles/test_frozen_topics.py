@@ -22,6 +22,7 @@ GONE = {
 ADDED = {
     "/stereo_tracker/annotated_image": "every output is announced; nobody looks: it stays empty",
     "/needle/proposed_target": "the controller receives it; no planner proposes a target",
+    "/needle/planned_path": "the controller plans a path past obstacles only",
 }
 """Topics that only a virtual run has, and why."""
 

@@ -14,7 +14,7 @@ from needle_controller.controller_status import ReceptionLog, controller_status
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes, rotation_from_quaternion
 from needle_controller.model.point_reach import point_from_message
-from needle_controller.model.target_plane import plane_from_pose
+from needle_controller.model.target_plane import RIG, plane_from_pose
 from needle_controller.observers.estimator import Estimate
 from needle_controller.planning.obstacles import obstacles_from_markers
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -49,7 +49,7 @@ from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"
 TARGET_PLANE, TARGET_POINT, OBSTACLES = "target_plane", "target_point", "obstacles"
-PROPOSED_TARGET = "needle/proposed_target"
+PROPOSED_TARGET, PLANNED_PATH = "needle/proposed_target", "needle/planned_path"
 _CHECKED = ("joint_states", TARGET_PLANE, TARGET_POINT, OBSTACLES, PROPOSED_TARGET)
 _NO_DRIVERS = ("recorder", "peer_topics")
 _KEPT_MESSAGE = {
@@ -116,6 +116,7 @@ class PlaneController(Component):
             Output("needle/reduced_state", m.Vector),
             Output("needle/linearized_state", m.Vector),
             Output("needle/control_input", m.Vector),
+            Output(PLANNED_PATH, m.Path),
             Output(STATUS, ControllerStatus, LATCHED),
             Output(TARGET_POINT, m.Point, LATCHED),
         )
@@ -354,6 +355,9 @@ def _update(action: PublishUpdate) -> Actions:
     yield Publish("needle/reduced_state", _vector(estimate.reduced, stamp_ns))
     yield Publish("needle/linearized_state", _vector(estimate.linearized, stamp_ns))
     yield Publish("needle/control_input", _vector(np.array(control), stamp_ns))
+    if action.update.route is not None:
+        points = action.update.route.points.tolist()
+        yield Publish(PLANNED_PATH, m.Path(stamp_ns, RIG, tuple(map(tuple, points))))
 
 
 def _pose(estimate: Estimate, stamp_ns: int) -> m.PoseWithCovariance:

@@ -266,6 +266,19 @@ def test_invalid_targets_are_rejected_and_the_last_stays() -> None:
     assert bench.status.obstacles == 0
 
 
+def test_a_path_past_obstacles_is_published_with_its_estimate() -> None:
+    bench, target = Bench(), (0.0, 0.0, 0.1)
+    ball = m.Marker("rig", "bone", 1, 2, 0, (0.0, 0.0, 0.06), STRAIGHT, (0.004, 0.004, 0.004))
+    bench.receive("target_point", m.Point(0, "rig", target))
+    bench.started().step()
+    assert "needle/planned_path" not in bench.published
+    bench.receive("obstacles", m.Markers((ball,)))
+    bench.step()
+    path = bench.published["needle/planned_path"][-1]
+    assert path.stamp_ns == bench.published["needle/estimate"][-1].stamp_ns
+    assert (path.frame_id, path.positions[-1]) == ("rig", target)
+
+
 def test_a_proposed_target_is_applied_when_it_is_accepted() -> None:
     bench = Bench()
     assert bench.call("accept_target") == (False, "no target on needle/proposed_target")

@@ -57,11 +57,6 @@ class NeedlePath:
     violation: float
     cost: float
 
-    @property
-    def aim(self) -> Array:
-        """Aim of the first leg, shape (3,) [m]."""
-        return np.asarray(self.legs[0, :3])
-
     def remaining_legs(self, insertion: float) -> Array:
         """Return the remaining legs at an insertion [m]; at least the last one."""
         done = insertion - self.insertion

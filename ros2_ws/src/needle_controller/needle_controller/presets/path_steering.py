@@ -31,14 +31,20 @@ class Route:
 
     Attributes
     ----------
-    aim : ndarray, shape (3,)
-        Point in `rig` towards which the needle is steered first [m].
+    points : ndarray, shape (K, 3)
+        Points in `rig` towards which the needle is steered, one after the other, the target last
+        [m].
     length : float or None
-        Length of the whole path [m]; None if `aim` is the target.
+        Length of the whole path [m]; None if the target is the only point.
     """
 
-    aim: Array
+    points: Array
     length: float | None
+
+    @property
+    def aim(self) -> Array:
+        """Point towards which the needle is steered first, shape (3,) [m]."""
+        return np.asarray(self.points[0])
 
 
 class OwnPlanner:
@@ -74,9 +80,9 @@ class OwnPlanner:
         if count < 1 or float(np.linalg.norm(points[-1] - target)) > _TARGET_TOLERANCE:
             raise part.error(f"via_points() does not end at the target {target.tolist()} m")
         if count == 1:
-            return Route(target, None)
+            return Route(target[None], None)
         legs = np.diff(np.vstack([tip.position, points]), axis=0)
-        return Route(points[0], float(np.sum(np.linalg.norm(legs, axis=1))))
+        return Route(points, float(np.sum(np.linalg.norm(legs, axis=1))))
 
 
 @cache
@@ -125,6 +131,8 @@ class PathSteering:
     ----------
     path : NeedlePath or None
         Present path; None with another package's planner, which plans again at every step.
+    last_route : Route or None
+        Route of the last command; None if no path was clear.
     """
 
     def __init__(self, settings: SteeringSettings) -> None:
@@ -135,6 +143,7 @@ class PathSteering:
             self._own = OwnPlanner(tried_planner(settings.planner), settings)
         self._law = prompt_point_law(settings)
         self.path: NeedlePath | None = None
+        self.last_route: Route | None = None
 
     def find_first(self, target: Array, obstacles: Obstacles, rotation: float) -> str:
         """Find the first path of a needle that is out; return why there is none, empty if found.
@@ -187,6 +196,7 @@ class PathSteering:
             Present insertion [m].
         """
         route = self.route(tip_state(estimate, plane), target, obstacles, insertion)
+        self.last_route = route
         if route is None:
             return None
         command = self._law(estimate, plane.from_rig(route.aim))
@@ -205,7 +215,7 @@ class PathSteering:
         )
         if path is None:
             return None
-        return Route(path.aim, None if len(path.legs) == 1 else path.length)
+        return Route(path.legs[:, :3], None if len(path.legs) == 1 else path.length)
 
 
 def tip_state(estimate: Estimate, plane: TargetPlane) -> TipState:

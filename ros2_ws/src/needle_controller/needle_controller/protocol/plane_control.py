@@ -19,7 +19,12 @@ from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate, Estimator
 from needle_controller.planning.obstacles import Obstacle, Obstacles
-from needle_controller.presets.path_steering import PathSteering, configured_obstacles, path_planner
+from needle_controller.presets.path_steering import (
+    PathSteering,
+    Route,
+    configured_obstacles,
+    path_planner,
+)
 from needle_controller.presets.point_steering import PointSteering, point_law
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import ONE_SIDED_PRESETS, SteeringSettings
@@ -54,6 +59,8 @@ class ControlUpdate:
         of the point; None if the estimator reports none.
     blocked : bool
         Whether no path is clear of the obstacles, so that there is no further step.
+    route : Route, optional
+        Planned route; None if none is planned, or none is clear.
     """
 
     estimate: Estimate
@@ -62,6 +69,7 @@ class ControlUpdate:
     reach: Reachability
     miss_probability: float | None
     blocked: bool = False
+    route: Route | None = None
 
 
 class PlaneControl:
@@ -234,6 +242,7 @@ class PlaneControl:
             reach=self._reach(estimate, joints),
             miss_probability=self._miss_probability(estimate),
             blocked=command is None,
+            route=None if self._points is None or not self._is_planned else self._path.last_route,
         )
 
     def _advance(self, before: JointSample, joints: JointSample) -> None:

@@ -15,8 +15,8 @@ step, or one new path if it inserts continuously, per measured tip.
 Subscribes  needle/tip, needle/tip_pose (its covariance), target_plane, target_point, obstacles,
             needle/proposed_target, joint_states, device/result, device/status
 Publishes   device/joint_trajectory, needle/estimate, needle/reduced_state, needle/linearized_state,
-            needle/control_input, needle/controller_status, target_point (a proposal that was
-            accepted), /diagnostics
+            needle/control_input, needle/planned_path (with obstacles or an own planner),
+            needle/controller_status, target_point (a proposal that was accepted), /diagnostics
 Services    ~/start, ~/stop, ~/accept_target
 """
 
