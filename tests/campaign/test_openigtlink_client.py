@@ -32,10 +32,10 @@ class Scene:
 
     def __init__(self, client: Any) -> None:
         self.component = OpenIGTLink(OpenIGTLinkParameters(port=0))
-        self.port = LinkPort(self.component.settings)
+        self.port = LinkPort("127.0.0.1", 0)
         self.arrived: deque[Any] = deque()
         self.port.open(self.arrived.append)
-        self.client = client("127.0.0.1", self.port.server.port)
+        self.client = client("127.0.0.1", self.port.port)
         self.proposals: list[Any] = []
 
     def say(self, topic: str, message: Any) -> None:
@@ -82,8 +82,6 @@ def test_pyigtls_client_hears_the_needle_in_mm() -> None:
         assert tip.timestamp == pytest.approx(5.25)
         (target,) = scene.hears("NeedleTarget").positions
         assert target == pytest.approx((10.0, 0.0, 100.0))
-        shaft = scene.hears("NeedleShaft").positions
-        assert shaft[-1] == pytest.approx(np.array(TIP) * 1e3)
 
 
 def test_a_target_of_pyigtls_client_is_proposed_in_m() -> None:

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from figure_rows import Row
-from needle_bags.link.link_port import LinkServer
+from needle_bags.link.link_port import LinkPort
 
 _LOOPBACK = "127.0.0.1"
 # pyigtl's server keeps this many unsent messages, and drops older ones.
@@ -26,14 +26,14 @@ def rows() -> Iterator[Row]:
 
     message = pyigtl.TransformMessage(np.eye(4), 1.0, "NeedleTipToRig")
     size = len(message.pack())
-    with closing(LinkServer(_LOOPBACK, 0)) as server:
-        port = server.port
+    with closing(LinkPort(_LOOPBACK, 0)) as link:
+        port = link.port
 
         def is_connected() -> bool:
-            server.poll(0.0)
-            return server.listeners.count > 0
+            link.exchange(b"")
+            return link.listeners.count > 0
 
-        ours = _measured(port, size, is_connected, lambda: server.send(message.pack(), 0.0))
+        ours = _measured(port, size, is_connected, lambda: link.exchange(message.pack()))
     reference = pyigtl.OpenIGTLinkServer(port)
     try:
         send = partial(reference.send_message, message, wait=False)

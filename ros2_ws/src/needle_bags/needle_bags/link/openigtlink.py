@@ -13,7 +13,17 @@ from numpy.typing import NDArray
 from needle_bags.live.live_needle import LiveNeedle
 from needle_bags.live.needle_inputs import PROPOSALS, needle_inputs, proposed_target
 from needle_core import messages as m
-from needle_core.component import Actions, Component, Diagnose, Log, Moment, Port, Send, Timer
+from needle_core.component import (
+    Actions,
+    Component,
+    Diagnose,
+    Input,
+    Log,
+    Moment,
+    Port,
+    Send,
+    Timer,
+)
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.openigtlink import LinkMessage
@@ -23,7 +33,7 @@ LINK = "link"
 """Name of the port."""
 TIP, ESTIMATE, PLANE = "NeedleTipToRig", "NeedleEstimateToRig", "TargetPlaneToRig"
 SHAFT, TARGET, STATUS = "NeedleShaft", "NeedleTarget", "NeedleStatus"
-SHAPE = "NeedleShape"
+SHAPE, PLAN = "NeedleShape", "NeedlePlan"
 _MM = 1e3
 # A viewer draws a line through the points of the shaft.
 _MAX_POINTS = 25
@@ -50,10 +60,9 @@ class OpenIGTLinkParameters:
 
 @dataclasses.dataclass(frozen=True)
 class Listeners:
-    """Number of connected clients, and of clients turned away so far; problems of their input."""
+    """Number of connected clients, and the problems of their input."""
 
     count: int
-    turned_away: int
     problems: tuple[str, ...] = ()
 
 
@@ -73,22 +82,25 @@ class OpenIGTLink(Component):
         self.settings = settings
         self._needle = LiveNeedle()
         self._listeners = 0
-        self.inputs = needle_inputs(self._needle)
+        path = Input("needle/planned_path", m.Path, self._on_path)
+        self.inputs = (*needle_inputs(self._needle), path)
         self.outputs = (PROPOSALS,)
         self.ports = (Port(LINK, self._on_link),)
         self.timers = (Timer(1.0 / settings.rate, self._send),)
+
+    def _on_path(self, message: m.Path, at: Moment) -> Actions:
+        self._needle.planned_path = message
+        return ()
 
     def _on_link(self, events: Sequence[Log | Listeners | LinkMessage], at: Moment) -> Actions:
         for event in events:
             match event:
                 case Log():
                     yield event
-                case Listeners(count, turned_away, problems):
+                case Listeners(count, problems):
                     self._listeners = count
-                    keys = {"listeners": str(count), "turned away": str(turned_away)}
-                    line = f"{count} listening" if count else "nobody listens"
-                    line = ", ignoring ".join((line, *problems))
-                    health = Diagnostic(Level.WARN if problems else Level.OK, line, keys)
+                    line = ", ignoring ".join((f"{count} clients", *problems))
+                    health = Diagnostic(Level.WARN if problems else Level.OK, line)
                     yield Diagnose("listeners", health)
                 case LinkMessage(kind="POINT"):
                     yield from self._on_points(event, at)
@@ -96,13 +108,17 @@ class OpenIGTLink(Component):
     def _on_points(self, message: LinkMessage, at: Moment) -> Actions:
         """Propose the point named target*, and check the one named entry*, of a message.
 
-        The name of the message counts for points that are named otherwise.
+        The name of the message counts for points that are named otherwise; two such points are
+        entry and target.
         """
         level, line = Level.OK, "ok"
         try:
+            points, common = message.points(), _role(message.name)
+            roles = [_role(name) or common for name, _ in points]
+            if common and len(points) == 2 and not any(_role(name) for name, _ in points):
+                roles = ["entry", "target"]
             places: dict[str, m.Vector3] = {}
-            for name, position in message.points():
-                role = _role(name) or _role(message.name)
+            for role, (_, position) in zip(roles, points, strict=True):
                 if role in places:
                     raise UserError(f"several points named {role}")
                 if role:
@@ -149,13 +165,17 @@ def packed(needle: LiveNeedle, now: float) -> bytes:
             at = _thinned(np.atleast_2d(positions)) * _MM
             names = [f"{name}_{number}" for number in range(len(at))]
             messages.append(igtl.PointMessage(at, names, timestamp=now, device_name=name))
+    lines: dict[str, tuple[int, Array]] = {}
     if shape is not None:
-        stamp_ns, poses = shape
-        line = np.array([len(poses), *range(len(poses))])
-        at = poses[:, :3, 3] * _MM
+        lines[SHAPE] = shape[0], shape[1][:, :3, 3]
+    plan = needle.planned_path
+    if plan is not None and estimate is not None and plan.stamp_ns == estimate.stamp_ns:
+        lines[PLAN] = plan.stamp_ns, np.vstack([estimate.position, plan.positions])
+    for name, (stamp_ns, positions) in lines.items():
+        line, stamp = np.array([len(positions), *range(len(positions))]), stamp_ns * 1e-9
         messages.append(
             igtl.PolyDataMessage(
-                points=at, lines=line, timestamp=stamp_ns * 1e-9, device_name=SHAPE
+                points=positions * _MM, lines=line, timestamp=stamp, device_name=name
             )
         )
     return b"".join(message.pack() for message in messages)

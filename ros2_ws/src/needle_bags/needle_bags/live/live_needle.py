@@ -92,6 +92,9 @@ class LiveNeedle:
         The target point, in `rig` [m].
     joints : JointState
         Last positions of the joints; none before the first.
+    planned_path : Path or None
+        Points towards which the controller steers past obstacles, the target last; it belongs to
+        the estimate with the same stamp.
     """
 
     def __init__(self) -> None:
@@ -100,6 +103,7 @@ class LiveNeedle:
         self.tip_found = False
         self.target_point: Array | None = None
         self.joints = m.JointState(0, (), ())
+        self.planned_path: m.Path | None = None
         self._estimate: TipEstimate | None = None
         self._requested_plane: TargetPlane | None = None
         self._offset: float | None = None

@@ -14,11 +14,13 @@ HELP = """
 openigtlink: sends the needle to 3D Slicer and other OpenIGTLink clients, and proposes the targets
 that they send to the controller. It commands no motion and never delays another node.
 
-Subscribes  needle/tip_pose, needle/estimate, needle/controller_status, target_plane, joint_states
+Subscribes  needle/tip_pose, needle/estimate, needle/planned_path, needle/controller_status,
+            target_plane, joint_states
 Publishes   needle/proposed_target
 Sends       TRANSFORM NeedleTipToRig, NeedleEstimateToRig, TargetPlaneToRig; POINT NeedleShaft,
-            NeedleTarget; POLYDATA NeedleShape; STRING NeedleStatus
-Receives    POINT with names target..., entry...; all in mm, in rig (docs/viewers.md)
+            NeedleTarget; POLYDATA NeedleShape, NeedlePlan; STRING NeedleStatus
+Receives    POINT with names target..., entry..., or entry and target in one message named so;
+            all in mm, in rig (docs/viewers.md)
 """
 
 
@@ -35,7 +37,7 @@ def main() -> int:
         OpenIGTLinkParameters,
         lambda settings, _: OpenIGTLink(settings),
         help_text=HELP,
-        ports=lambda settings: {LINK: LinkPort(settings)},
+        ports=lambda settings: {LINK: LinkPort(settings.address, settings.port)},
     )
 
 

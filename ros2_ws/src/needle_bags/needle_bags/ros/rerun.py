@@ -289,7 +289,7 @@ def _viewers(
     if importlib.util.find_spec("pyigtl") is not None:
         link = OpenIGTLink(settings(OpenIGTLink.name, OpenIGTLinkParameters))
         viewers[link.name] = BagStage(link, ())
-        viewers[link.name].runner.arrive(LINK, (Listeners(1, 0),), begin)
+        viewers[link.name].runner.arrive(LINK, (Listeners(1),), begin)
     return viewers
 
 

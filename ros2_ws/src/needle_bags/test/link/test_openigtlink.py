@@ -54,7 +54,7 @@ def component(monkeypatch: pytest.MonkeyPatch) -> OpenIGTLink:
     monkeypatch.setitem(sys.modules, "pyigtl", SimpleNamespace(messages=played))
     monkeypatch.setitem(sys.modules, "pyigtl.messages", played)
     one = OpenIGTLink(OpenIGTLinkParameters(port=0))
-    list(one.ports[0].handler((Listeners(1, 0),), AT))
+    list(one.ports[0].handler((Listeners(1),), AT))
     return one
 
 
@@ -104,6 +104,13 @@ def test_messages_are_in_mm(component: OpenIGTLink) -> None:
     shape, time = said["NeedleShape"]
     assert (shape[0], shape[-1]) == ([0.0] * 3, pytest.approx([4.0, 2.0, 40.0]))
     assert time == pytest.approx(5.25)
+    # A plan belongs to one estimate.
+    hear(component, "needle/planned_path", m.Path(4, "rig", ((0.0, 0.0, 0.1),)))
+    assert "NeedlePlan" not in says(component)
+    path = m.Path(5_250_000_000, "rig", ((0.01, 0.0, 0.08), (0.01, 0.0, 0.1)))
+    hear(component, "needle/planned_path", path)
+    plan = np.array(says(component)["NeedlePlan"][0])
+    np.testing.assert_allclose(plan, [[4.0, 2.0, 40.0], [10.0, 0.0, 80.0], [10.0, 0.0, 100.0]])
     # A tip that is not seen any longer is not shown.
     for unseen in (
         pose(2_000_000_000, np.inf),
@@ -119,25 +126,26 @@ def test_the_port_reports_clients_and_without_any_nothing_is_packed() -> None:
     component = OpenIGTLink(OpenIGTLinkParameters(port=0))
     (timer,), (row,) = component.timers, component.ports
     assert list(timer.handler(AT)) == [Send(LINK, (b"",))]
-    keys = {"listeners": "0", "turned away": "2"}
-    told = Diagnose("listeners", Diagnostic(Level.OK, "nobody listens", keys))
-    assert list(row.handler((Listeners(0, 2),), AT)) == [told]
-    (warned,) = row.handler((Listeners(1, 0, ("header version 9, 1 bytes",)),), AT)
+    told = Diagnose("listeners", Diagnostic(Level.OK, "0 clients"))
+    assert list(row.handler((Listeners(0),), AT)) == [told]
+    (warned,) = row.handler((Listeners(1, ("header version 9, 1 bytes",)),), AT)
     assert isinstance(warned, Diagnose)
     assert warned.diagnostic.level is Level.WARN
     assert "header version 9" in warned.diagnostic.message
     arrived: list[Any] = []
-    with contextlib.closing(LinkPort(component.settings)) as port:
+    with contextlib.closing(LinkPort("127.0.0.1", 0)) as port:
         port.open(arrived.append)
         port.send((b"needle",))
-        log = Log("info", f"shows the needle at 127.0.0.1, port {port.server.port}")
-        assert arrived == [(log,), (Listeners(0, 0),)]
+        log = Log("info", f"shows the needle at 127.0.0.1, port {port.port}")
+        assert arrived == [(log,), (Listeners(0),)]
 
 
 # Name of the message, its points in mm, and the proposed target in mm or the warning.
 POINTS: tuple[tuple[str, tuple[tuple[str, Any], ...], Any], ...] = (
     ("Plan", (("Target-1", (10.0, -5.0, 100.0)), ("Entry-1", (0.1, 0.2, 0.3))), (10, -5, 100)),
     ("TARGET_POINT-1", (("F-1", (10.0, -5.0, 100.0)),), (10, -5, 100)),
+    ("ENTRY", (("", (0.1, 0.2, 0.3)), ("", (10.0, -5.0, 100.0))), (10, -5, 100)),
+    ("TARGET", (("F-1", (0.0, 30.0, 0.0)), ("F-2", (10.0, 0.0, 100.0))), "30.0 mm from that"),
     ("Fiducials", (("F-1", (10.0, -5.0, 100.0)),), None),
     ("NeedleTarget", (("NeedleTarget_0", (10.0, -5.0, 100.0)),), None),
     ("Plan", (("target a", (1.0, 1.0, 90.0)), ("target b", (1.0, 1.0, 80.0))), "several points"),
