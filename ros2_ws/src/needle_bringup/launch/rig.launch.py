@@ -1,11 +1,13 @@
 """Nodes of a real rig, without its cameras; for ROS 2 Jazzy with `ros2 launch`.
 
     ros2 launch needle_bringup rig.launch.py calibration:=FILE drives:=FILE bag:=DIR
+    ros2 launch needle_bringup rig.launch.py registration:=FILE drives:=FILE bag:=DIR
 
-Starts tracker and controller, the recorder if `bag` is given, and the driver if `drives` is given
-(docs/hardware.md). Start the cameras and the hold-to-run switch (`ros2 run needle_bringup
-operator`) separately: no node of this launch moves a needle without the hold. A missing file ends
-the launch before a node starts; if a node exits, the others end.
+Starts the controller, stereo_tracker or, if `registration` is given, tracked_tip, the recorder if
+`bag` is given, and the driver if `drives` is given (docs/hardware.md). Start the cameras and the
+hold-to-run switch (`ros2 run needle_bringup operator`) separately: no node of this launch moves a
+needle without the hold. A missing file ends the launch before a node starts; if a node exits, the
+others end.
 """
 
 from launch import LaunchDescription
@@ -19,6 +21,7 @@ def generate_launch_description() -> LaunchDescription:
     calibration = str(find_shared_file("needle_tracker", "config/calibration.yaml"))
     arguments = {
         "calibration": (calibration, "calibration file of the stereo rig"),
+        "registration": ("", "file of register_tracker, for a tracker instead of cameras"),
         "drives": ("", "parameter file of the drives; empty: no driver"),
         "bag": ("", "new bag; empty: no recording"),
         "params": ("", "parameter file for any node; empty: none"),

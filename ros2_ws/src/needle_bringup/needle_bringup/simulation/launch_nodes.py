@@ -18,7 +18,12 @@ from needle_bringup.simulation.simulate_options import existing_file, parse
 from needle_core.errors import UserError
 from needle_core.settings.parameter_files import Parameters, read_parameters
 
-LAUNCHED_PACKAGES = {**PACKAGES, "player": "needle_bags", "live_view": "needle_bags"}
+LAUNCHED_PACKAGES = {
+    **PACKAGES,
+    "tracked_tip": "needle_tracker",
+    "player": "needle_bags",
+    "live_view": "needle_bags",
+}
 """Package of each node in a launch file."""
 # Topics of the live view that the player publishes under /replay only.
 _NOT_FOR_RIGS = ("target_plane", "target_point")
@@ -33,7 +38,7 @@ _OF_SIMULATION = {
     "channel": "can",
 }
 _CLOSE = 0.84  # similarity of a misspelt name; that of ros_namespace is lower
-_OF_RIG = {"calibration_file": "calibration", "bag": "bag"}
+_OF_RIG = {"calibration_file": "calibration", "registration_file": "registration", "bag": "bag"}
 
 
 def refuse_misspelt(given: Iterable[str], declared: Sequence[str]) -> None:
@@ -102,7 +107,7 @@ def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
     Parameters
     ----------
     arguments : mapping
-        Launch argument -> text: calibration, drives, bag, params and namespace.
+        Launch argument -> text: calibration, registration, drives, bag, params and namespace.
 
     Returns
     -------
@@ -114,13 +119,15 @@ def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
     UserError
         If a file is missing or invalid, or the bag exists.
     """
-    calibration = existing_file("calibration:=", arguments["calibration"]).absolute()
+    name = "registration" if arguments["registration"] else "calibration"
+    file = str(existing_file(f"{name}:=", arguments[name]).absolute())
     bag = _new_bag(arguments["bag"])
-    parameters: Parameters = {
+    parameters: Parameters = {"plane_controller": {}}
+    if arguments["registration"]:
+        parameters["tracked_tip"] = {"registration_file": file}
+    else:
         # Best effort receives cameras of either reliability.
-        "stereo_tracker": {"calibration_file": str(calibration), "reliable_images": False},
-        "plane_controller": {},
-    }
+        parameters["stereo_tracker"] = {"calibration_file": file, "reliable_images": False}
     if bag is not None:
         parameters["recorder"] = {"bag": str(bag), "run_info": json.dumps(dict(arguments))}
     if arguments["drives"]:

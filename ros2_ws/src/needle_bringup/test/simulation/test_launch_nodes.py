@@ -28,9 +28,8 @@ def simulated(**arguments: str) -> Parameters:
 
 def beside_rig(**arguments: str) -> Parameters:
     calibration = str(find_shared_file("needle_tracker", "config/calibration.yaml"))
-    return nodes_beside_rig(
-        {"calibration": calibration, "drives": "", "bag": "", "params": "", **arguments}
-    )
+    default = dict.fromkeys(("registration", "drives", "bag", "params"), "")
+    return nodes_beside_rig({**default, "calibration": calibration, **arguments})
 
 
 def file_of(folder: Path, node: str, **values: Any) -> str:
@@ -49,6 +48,7 @@ def test_invalid_launch_arguments_start_nothing(tmp_path: Path) -> None:
         (beside_rig, {"params": typo}, "params:=.*typo.yaml: no such file"),
         (simulated, {"params": typo}, "params:=.*typo.yaml: no such file"),
         (beside_rig, {"calibration": bag}, "calibration:=.*: a folder, not a file"),
+        (beside_rig, {"registration": typo}, "registration:=.*typo.yaml: no such file"),
         (beside_rig, {"bag": bag}, "already contains a bag"),
         (simulated, {"bag": bag}, "already contains a bag"),
         (simulated, {"seed": "-1"}, "--seed = -1"),
@@ -70,6 +70,9 @@ def test_a_rig_has_the_nodes_of_its_files(tmp_path: Path) -> None:
     assert set(plain) == {"stereo_tracker", "plane_controller"}
     # Images that are sent best effort are heard.
     assert plain["stereo_tracker"]["reliable_images"] is False
+    registration = file_of(tmp_path, "registration")
+    tracked = beside_rig(registration=registration)
+    assert tracked == {"plane_controller": {}, "tracked_tip": {"registration_file": registration}}
     drives = file_of(tmp_path, "device_driver", channel="can7")
     assert beside_rig(drives=drives)["device_driver"] == {"channel": "can7"}
     depth = file_of(tmp_path, "plane_controller", depth=0.05)
