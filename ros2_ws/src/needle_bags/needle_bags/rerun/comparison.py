@@ -92,6 +92,9 @@ FIELDS: Mapping[str, tuple[Field, ...]] = {
         Field("u", ("vector.y",), ROTATION_RATE),
         Field("rotation", ("vector.z",), ANGLE),
     ),
+    "needle/planned_path": tuple(
+        Field(f"point {k}", _members(f"poses.{k}.pose.position"), LENGTH) for k in range(4)
+    ),
     "device/joint_trajectory": (
         # A step is one point, a path ahead two or three.
         Field("insertion", tuple(f"points.{k}.positions.0" for k in range(3)), LENGTH),
