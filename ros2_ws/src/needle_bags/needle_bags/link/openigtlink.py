@@ -170,7 +170,7 @@ def packed(needle: LiveNeedle, now: float) -> bytes:
         lines[SHAPE] = shape[0], shape[1][:, :3, 3]
     plan = needle.planned_path
     if plan is not None and estimate is not None and plan.stamp_ns == estimate.stamp_ns:
-        lines[PLAN] = plan.stamp_ns, np.vstack([estimate.position, plan.positions])
+        lines[PLAN] = plan.stamp_ns, np.array(plan.positions)
     for name, (stamp_ns, positions) in lines.items():
         line, stamp = np.array([len(positions), *range(len(positions))]), stamp_ns * 1e-9
         messages.append(

@@ -93,8 +93,8 @@ class LiveNeedle:
     joints : JointState
         Last positions of the joints; none before the first.
     planned_path : Path or None
-        Points towards which the controller steers past obstacles, the target last; it belongs to
-        the estimate with the same stamp.
+        Path that the controller has planned past obstacles, from the tip to the target; it belongs
+        to the estimate with the same stamp.
     """
 
     def __init__(self) -> None:

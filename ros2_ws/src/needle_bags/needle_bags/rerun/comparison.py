@@ -73,6 +73,8 @@ _POSE = (
     Field("covariance", ("pose.covariance",), COVARIANCE),
 )
 
+_PATH_POINTS = tuple(path for k in range(300) for path in _members(f"poses.{k}.pose.position"))
+
 FIELDS: Mapping[str, tuple[Field, ...]] = {
     "needle/tip": (Field("point", _members("point"), LENGTH),),
     "needle/tip_pose": _POSE,
@@ -92,9 +94,7 @@ FIELDS: Mapping[str, tuple[Field, ...]] = {
         Field("u", ("vector.y",), ROTATION_RATE),
         Field("rotation", ("vector.z",), ANGLE),
     ),
-    "needle/planned_path": tuple(
-        Field(f"point {k}", _members(f"poses.{k}.pose.position"), LENGTH) for k in range(4)
-    ),
+    "needle/planned_path": (Field("points", _PATH_POINTS, LENGTH),),
     "device/joint_trajectory": (
         # A step is one point, a path ahead two or three.
         Field("insertion", tuple(f"points.{k}.positions.0" for k in range(3)), LENGTH),

@@ -110,7 +110,7 @@ def test_messages_are_in_mm(component: OpenIGTLink) -> None:
     path = m.Path(5_250_000_000, "rig", ((0.01, 0.0, 0.08), (0.01, 0.0, 0.1)))
     hear(component, "needle/planned_path", path)
     plan = np.array(says(component)["NeedlePlan"][0])
-    np.testing.assert_allclose(plan, [[4.0, 2.0, 40.0], [10.0, 0.0, 80.0], [10.0, 0.0, 100.0]])
+    np.testing.assert_allclose(plan, [[10.0, 0.0, 80.0], [10.0, 0.0, 100.0]])
     # A tip that is not seen any longer is not shown.
     for unseen in (
         pose(2_000_000_000, np.inf),

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
 from needle_controller.planning.flood_fill import may_have_path
+from needle_controller.planning.legs import MOST_POINTS, leg_towards, trace_leg, truncated
 from needle_controller.planning.obstacles import Obstacles
 from needle_controller.planning.path_evaluation import (
     PathProblem,
@@ -56,6 +57,11 @@ class NeedlePath:
     gentle_miss: float
     violation: float
     cost: float
+
+    @property
+    def aim(self) -> Array:
+        """Aim of the first leg, shape (3,) [m]."""
+        return np.asarray(self.legs[0, :3])
 
     def remaining_legs(self, insertion: float) -> Array:
         """Return the remaining legs at an insertion [m]; at least the last one."""
@@ -182,6 +188,18 @@ class PathPlanner:
         clear = [path for path in (kept, best) if path.near_margin >= self._least_near_margin]
         return min(clear, key=lambda path: path.cost - bonus * (path is kept), default=None)
 
+    def trace(self, path: NeedlePath, tip: TipState) -> Array:
+        """Return the corners of a chain along a path from a tip, shape (N, 3) [m]."""
+        settings, pose, corners = self.settings, tip.pose, np.empty((MOST_POINTS, 4))
+        curvature = settings.curvature_share * tip.curvature
+        share = settings.gentle_share / settings.curvature_share
+        parts = []
+        for row in path.legs:
+            leg = leg_towards(pose, row, curvature, share, settings.max_rotation_per_length)
+            count = trace_leg(pose, truncated(leg, row[3]), curvature, 0.0, corners, pose)
+            parts.append(corners[:count, :3].copy())
+        return np.concatenate(parts)
+
     def warm_up(self) -> None:
         """Compile the code that planning runs, which would delay the first steps otherwise."""
         tip, target = TipState(np.zeros(3), np.eye(3), 1.0), np.array([0.0, 0.0, 0.01])
@@ -189,6 +207,7 @@ class PathPlanner:
         may_have_path(problem)
         legs, draws = initial_legs(tip.position, target, 0)
         optimize_legs(legs, problem, draws[:1])
+        self.trace(_evaluated(legs, problem, 0.0), tip)
 
     def may_have_path(self, tip: TipState, target: npt.ArrayLike, obstacles: Obstacles) -> bool:
         """Return False if there is certainly no path, even for a known pose.

@@ -31,20 +31,17 @@ class Route:
 
     Attributes
     ----------
-    points : ndarray, shape (K, 3)
-        Points in `rig` towards which the needle is steered, one after the other, the target last
-        [m].
+    aim : ndarray, shape (3,)
+        Point in `rig` towards which the needle is steered first [m].
     length : float or None
-        Length of the whole path [m]; None if the target is the only point.
+        Length of the whole path [m]; None if `aim` is the target.
+    points : ndarray, shape (N, 3)
+        Corners of a chain along the path in `rig`, from the tip to its end [m].
     """
 
-    points: Array
+    aim: Array
     length: float | None
-
-    @property
-    def aim(self) -> Array:
-        """Point towards which the needle is steered first, shape (3,) [m]."""
-        return np.asarray(self.points[0])
+    points: Array
 
 
 class OwnPlanner:
@@ -79,10 +76,11 @@ class OwnPlanner:
         points = part.checked("via_points()", result, (count, 3), _VIA_POINTS)
         if count < 1 or float(np.linalg.norm(points[-1] - target)) > _TARGET_TOLERANCE:
             raise part.error(f"via_points() does not end at the target {target.tolist()} m")
+        corners = np.vstack([tip.position, points])
         if count == 1:
-            return Route(target[None], None)
-        legs = np.diff(np.vstack([tip.position, points]), axis=0)
-        return Route(points, float(np.sum(np.linalg.norm(legs, axis=1))))
+            return Route(target, None, corners)
+        legs = np.diff(corners, axis=0)
+        return Route(points[0], float(np.sum(np.linalg.norm(legs, axis=1))), corners)
 
 
 @cache
@@ -215,7 +213,8 @@ class PathSteering:
         )
         if path is None:
             return None
-        return Route(path.legs[:, :3], None if len(path.legs) == 1 else path.length)
+        length = None if len(path.legs) == 1 else path.length
+        return Route(path.aim, length, self._planner.trace(path, tip))
 
 
 def tip_state(estimate: Estimate, plane: TargetPlane) -> TipState:

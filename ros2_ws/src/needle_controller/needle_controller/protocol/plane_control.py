@@ -60,7 +60,7 @@ class ControlUpdate:
     blocked : bool
         Whether no path is clear of the obstacles, so that there is no further step.
     route : Route, optional
-        Planned route; None if none is planned, or none is clear.
+        Planned route; None if no path is planned or clear.
     """
 
     estimate: Estimate

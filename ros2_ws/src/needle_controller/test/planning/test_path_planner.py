@@ -132,7 +132,7 @@ def test_a_plan_depends_on_the_problem_alone() -> None:
 def test_without_obstacles_the_path_is_one_leg_to_the_target() -> None:
     path = found(planner().path(ENTRY, TARGET, Obstacles()))
     assert path.legs.shape == (1, 4)
-    np.testing.assert_allclose(path.legs[0, :3], TARGET)
+    np.testing.assert_allclose(path.aim, TARGET)
     assert path.margin == math.inf
     assert path.length == pytest.approx(np.linalg.norm(TARGET), rel=0.01)
 
@@ -146,7 +146,7 @@ def test_a_needle_with_known_pose_passes_an_obstacle() -> None:
         path = plans.path(tip, TARGET, IN_THE_WAY, insertion=insertion, previous=previous)
         paths.append(found(path))
         length = min(0.002, ahead)
-        x, y, _ = in_tip_axes(pose, paths[-1].legs[0, :3])
+        x, y, _ = in_tip_axes(pose, paths[-1].aim)
         turn = min(max(math.atan2(x, -y), -RATE * length), RATE * length)
         for _ in range(4):
             advance_pose(pose, length / 4, turn / 4, CURVATURE, pose)
