@@ -25,12 +25,10 @@ import numpy as np
 
 from figure_rows import Row
 from needle_core.component import PortChange
-from needle_device_driver.cia402.backend import drive_settings
+from needle_device_driver.cia402.backend import Cia402Drives, drive_settings
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
-from needle_device_driver.cia402.drive_cycle import Cia402Drives
-from needle_device_driver.link.can_port import Batch, CanPort
+from needle_device_driver.link.can_port import Batch, CanPort, LinkSettings
 from needle_device_driver.link.frame_link import FrameLink
-from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
 from needle_sim.bus.pty_can import PtyPort

@@ -18,8 +18,8 @@ from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.link.frame_link import FrameLink
-from needle_device_driver.supervisor import command, command_handler
-from needle_device_driver.supervisor.command_handler import CommandHandler
+from needle_device_driver.supervisor import command
+from needle_device_driver.supervisor.command import CommandHandler
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold
 from needle_device_driver.supervisor.motion_run import HomingTimes, MotionRun, RetractionBound
@@ -60,7 +60,7 @@ def _of_context(**wrong: Any) -> Plant:
     def checked(check: Any, asked: Any, context: Any, limits: Any) -> Any:
         return check(asked, dataclasses.replace(context, **wrong), limits)
 
-    return wrapped(command_handler, "check_command", checked)
+    return wrapped(command, "check_command", checked)
 
 
 def _of_messages(change: Callable[[Hold, HoldState], HoldState]) -> Plant:

@@ -10,7 +10,7 @@ import pytest
 
 from needle_bringup.commission import _BY_HAND, _WITH_PEDAL, Row, commission, report
 from needle_core.errors import UserError
-from needle_device_driver.cia402 import drive_cycle
+from needle_device_driver.cia402 import backend
 from needle_device_driver.conformance.faults import FAULTS
 from needle_device_driver.conformance.rig import DRIVER, ConformanceRig
 from needle_device_driver.procedure import Procedure
@@ -72,7 +72,7 @@ def test_real_drives_move_only_while_a_person_holds(monkeypatch: pytest.MonkeyPa
         yield from ()
         return False
 
-    monkeypatch.setattr(drive_cycle, "are_emulated", are_emulated)
+    monkeypatch.setattr(backend, "are_emulated", are_emulated)
     rig = ConformanceRig(1)
     begin = rig.place
     with pytest.raises(UserError, match="only while a person holds"):

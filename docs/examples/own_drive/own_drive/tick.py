@@ -42,7 +42,6 @@ class TickProtocol(DriveProtocol):
     """The lines of the drive; it ends each move at its target and has no watchdog."""
 
     capabilities: ClassVar[Capabilities] = Capabilities(
-        streams=True,
         watchdog=math.inf,
         longest_order=0.02,
         response_time=0.02,

@@ -23,7 +23,7 @@ from needle_core.runners.paced import PacedRunner
 from needle_core.runners.virtual import DIAGNOSTICS, LOG
 from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import read_parameters
-from needle_device_driver.axes.cycle_times import PERIOD
+from needle_device_driver.axes.axis import PERIOD
 from needle_device_driver.conformance.faults import FAULTS, Fault, can_keep, largest_travel
 from needle_device_driver.conformance.rig import DRIVER, ConformanceRig, RigClient
 from needle_device_driver.device import EMERGENCY_STOP

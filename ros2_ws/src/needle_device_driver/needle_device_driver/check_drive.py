@@ -10,12 +10,11 @@ from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
 from needle_core.runners.paced import PacedRunner
-from needle_device_driver.axes.cycle_times import PERIOD
+from needle_device_driver.axes.axis import PERIOD
 from needle_device_driver.cia402.backend import drive_settings
-from needle_device_driver.cia402.drive_file_check import ObjectRow, check_device_file
+from needle_device_driver.cia402.drive_file import UNKNOWN, ObjectRow, check_device_file
 from needle_device_driver.conformance.scenarios import RULES, verdict
 from needle_device_driver.device_driver import DeviceDriver
-from needle_device_driver.link.device_file import UNKNOWN
 from needle_device_driver.parameters import DeviceDriverParameters, read_driver_parameters
 
 _DESCRIPTION = """\

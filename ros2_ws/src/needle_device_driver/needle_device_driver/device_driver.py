@@ -22,10 +22,9 @@ from needle_core.component import (
     Send,
     Timer,
 )
-from needle_device_driver.axes.axis import Axis
-from needle_device_driver.axes.cycle_times import PERIOD, CycleTimes
-from needle_device_driver.axes.drive_errors import LinkError
+from needle_device_driver.axes.axis import PERIOD, Axis
 from needle_device_driver.axes.drives import Drives
+from needle_device_driver.axes.link import LinkError
 from needle_device_driver.device import DeviceInterface
 from needle_device_driver.parameters import DriverParameters
 from needle_device_driver.procedure import Procedure, Running, side_by_side
@@ -38,6 +37,30 @@ _REPLY_TIMEOUT = 0.75 * PERIOD
 _SEARCH_PERIOD = 0.25
 EXIT_BROKEN = 3
 """The cycle raised an error: the axes are no longer controlled."""
+# A cycle is late if it begins later by this share of a period.
+_LATE = 0.5
+
+
+class CycleTimes:
+    """Measures whether cycles begin on time."""
+
+    def __init__(self) -> None:
+        self._begun: float | None = None
+        self._longest = 0.0
+        self._late = 0
+
+    def begin(self, now: float) -> None:
+        """Note that a cycle begins at steady time `now` [s]."""
+        if self._begun is not None:
+            between = now - self._begun
+            self._longest = max(self._longest, between)
+            self._late += between > (1.0 + _LATE) * PERIOD
+        self._begun = now
+
+    def take(self) -> dict[str, str]:
+        """Return the number of late cycles, and the longest cycle since the last call."""
+        longest, self._longest = self._longest, 0.0
+        return {"late_cycles": str(self._late), "longest_cycle_s": f"{longest:.4f}"}
 
 
 class DeviceDriver(Component):

@@ -55,15 +55,6 @@ def test_procedure_resumes_by_condition_or_time_out() -> None:
     assert script.steps == ["first", "second"]
 
 
-def test_cancelled_procedure_does_nothing_more() -> None:
-    script = Script()
-    running = Running(script.procedure())
-    running.advance(0.0)
-    running.cancel()
-    assert script.steps == ["first", "end"]
-    assert running.result == []
-
-
 def test_run_waits_and_run_at_once_refuses_to() -> None:
     waits: list[float] = []
 

@@ -9,6 +9,9 @@ from collections.abc import Callable
 from needle_device_driver.procedure import Procedure, side_by_side
 from needle_device_driver.rules import Rule
 
+PERIOD = 0.02
+"""Of the cycle: set-points, answers [s]."""
+
 
 class AxisError(Exception):
     """An axis cannot execute an order; the text names the axis and the reason.

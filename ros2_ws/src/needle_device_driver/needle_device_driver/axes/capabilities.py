@@ -12,8 +12,6 @@ class Capabilities:
 
     Attributes
     ----------
-    streams : bool
-        Whether it follows set-points every 20 ms; otherwise it makes point moves only.
     watchdog : float
         Time without the computer after which it stops by itself, with the default parameter
         `watchdog` [s]; infinite: it has no watchdog.
@@ -35,7 +33,6 @@ class Capabilities:
         Whether it refuses or reports the orders of another computer.
     """
 
-    streams: bool
     watchdog: float
     longest_order: float
     response_time: float

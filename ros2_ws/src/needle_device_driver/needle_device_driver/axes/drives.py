@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from needle_core.diagnostics import Diagnostic, Level
-from needle_device_driver.axes.axis import Axis, AxisError
+from needle_device_driver.axes.axis import PERIOD, Axis, AxisError, AxisSnapshot
 from needle_device_driver.axes.axis_settings import AxisSettings
 from needle_device_driver.axes.capabilities import Capabilities
-from needle_device_driver.axes.cycle_times import PERIOD
-from needle_device_driver.axes.drive_errors import DriveError, LinkError
-from needle_device_driver.axes.link import Link
+from needle_device_driver.axes.link import DriveError, Link, LinkError, raised_as_axis_error
+from needle_device_driver.axes.speed_monitor import SpeedMonitor
 from needle_device_driver.procedure import Procedure, Wait
 from needle_device_driver.rules import Rule
 
@@ -21,7 +21,19 @@ Fault = tuple[Rule, str]
 
 
 class CyclicAxis(Axis):
-    """Axis whose orders other than set-points take several cycles.
+    """Axis of a drive, in whose cycles the orders are sent.
+
+    Orders return at once, and `transmit` sends them in the next cycle; only a stop is sent
+    immediately. The drive ends at the last set-point if no further one arrives.
+
+    Parameters
+    ----------
+    name : str
+        Insertion or rotation.
+    settings : AxisSettings
+        The axis.
+    link : Link
+        Connection to the drive.
 
     Attributes
     ----------
@@ -29,8 +41,18 @@ class CyclicAxis(Axis):
         Insertion or rotation.
     """
 
-    name: str
-    _configured = False
+    # Bounds of the set-points of an axis without home [counts].
+    _counter = (-math.inf, math.inf)
+
+    def __init__(self, name: str, settings: AxisSettings, link: Link) -> None:
+        self.name = name
+        self.actuated = settings.actuated
+        self._settings, self._link = settings, link
+        self._speed = SpeedMonitor(settings, PERIOD)
+        self._configured = self._homed = self._limits_due = False
+        self._opening = self._origin = self._zero = 0
+        self._velocity = 0.0
+        self._homing: Any = None
 
     @property
     @abc.abstractmethod
@@ -41,10 +63,20 @@ class CyclicAxis(Axis):
     def transmit(self) -> Procedure[None]:
         """Send this cycle's order; raises `LinkError` if the link is lost."""
 
+    def configure(self) -> Procedure[None]:
+        """Set the drive up; moves nothing."""
+        with raised_as_axis_error(self.name):
+            yield from self._set_up()
+        self._configured = True
+
     @property
     @abc.abstractmethod
     def _fault(self) -> Fault | None:
         """Reason why the axis refuses to move; None: it does not."""
+
+    @abc.abstractmethod
+    def _set_up(self) -> Procedure[None]:
+        """Set the drive up."""
 
     def _refuse_fault(self) -> None:
         if not self._configured:
@@ -52,8 +84,26 @@ class CyclicAxis(Axis):
         if (fault := self._fault) is not None:
             raise AxisError(f"{self.name} axis: {fault[1]}", fault[0])
 
-    def _check_step(self, settings: AxisSettings, step: int, speed: float) -> None:
-        """Refuse a set-point that is farther from the last one than the greatest speed allows."""
+    def _refuse_power(self) -> None:
+        self._refuse_fault()
+        if self._limits_due:
+            raise AxisError(f"{self.name} axis has no software limits yet")
+
+    def _check_move(self, target: float, speed: float, last: int, *, ready: bool) -> int:
+        """Return the counts of a set-point that may follow the `last` one [counts]."""
+        self._refuse_fault()
+        if not ready:
+            raise AxisError(f"{self.name} axis is not ready to move")
+        settings, counts = self._settings, self._settings.counts(target)
+        lower, upper = settings.limits_counts if self._homed else self._counter
+        if not lower <= counts <= upper:
+            # Beyond its last count a drive may continue, stop, or return all the way.
+            raise AxisError(
+                f"{self.name} axis: target {target:.6g} is outside the drive's "
+                f"{settings.limits if self._homed else 'counter; home it, or set it nearer 0'}",
+                Rule.SOFTWARE_LIMITS,
+            )
+        step = abs(counts + self._zero - last)
         bound = settings.magnitude(settings.speed * PERIOD * 1.01) + 1
         if step > bound:
             raise AxisError(
@@ -61,6 +111,34 @@ class CyclicAxis(Axis):
                 f"cycle at {speed:.6g}/s, limit {bound / settings.counts_per_unit:.6g}",
                 Rule.LOOK_AHEAD,
             )
+        return counts + self._zero
+
+    def _count_from_home(self, zero: int = 0) -> None:
+        """End a homing: positions count from `zero` [counts], as the drive's limits will."""
+        self._homing, self._homed, self._zero = None, True, zero
+        # The limits are written when the drive is off.
+        self._limits_due = self.actuated
+        self._origin += 1
+
+    def _restart_feedback(self) -> None:
+        """Forget the motion before a set-up or reset, which may change the zero of positions."""
+        self._origin += 1
+        self._speed.reset()
+        self._velocity = 0.0
+
+    def _snapshot(self, position: int, set_point: int, **state: Any) -> AxisSnapshot:
+        """Return the feedback with both places [counts]; `state` has what the drive reports."""
+        rule, fault = self._fault or (Rule.ONE_FAULT_STOPS_BOTH, "")
+        return AxisSnapshot(
+            position=self._settings.position(position - self._zero),
+            set_point=self._settings.position(set_point - self._zero),
+            velocity=self._velocity,
+            moving=self._homing is not None,
+            fault=fault,
+            fault_rule=rule,
+            origin=self._origin,
+            **state,
+        )
 
 
 class Drives(abc.ABC):

@@ -1,10 +1,31 @@
-"""Connection to drives, as a component knows it: a port reports whether it is open."""
+"""Connection to drives, as a component knows it, and its errors."""
 
 from __future__ import annotations
 
-from typing import Any
+import contextlib
+from collections.abc import Iterator
+from typing import Any, ClassVar
 
-from needle_device_driver.axes.drive_errors import LinkError
+from needle_device_driver.axes.axis import AxisError
+from needle_device_driver.rules import Rule
+
+
+class LinkError(Exception):
+    """The link cannot be opened or is lost; the text names the link and the reason."""
+
+
+class DriveError(Exception):
+    """A drive does not answer, or refuses; the text names the entry and the reason."""
+
+
+@contextlib.contextmanager
+def raised_as_axis_error(axis: str) -> Iterator[None]:
+    """Raise errors of link and drive as an `AxisError` of this axis."""
+    try:
+        yield
+    except (LinkError, DriveError) as error:
+        rule = Rule.LINK_LOSS if isinstance(error, LinkError) else Rule.ONE_FAULT_STOPS_BOTH
+        raise AxisError(f"{axis} axis: {error}", rule) from error
 
 
 class Link:
@@ -27,6 +48,8 @@ class Link:
         How often the link was opened.
     """
 
+    _counters: ClassVar[tuple[str, ...]] = ()
+
     def __init__(self, name: str) -> None:
         self.name = name
         self.now = 0.0
@@ -43,7 +66,7 @@ class Link:
     @property
     def counts(self) -> dict[str, str]:
         """Counters for diagnostics, by name."""
-        return {}
+        return {name: str(getattr(self, name)) for name in self._counters}
 
     def open(self) -> None:
         """Open the link, also after a loss.

@@ -11,10 +11,10 @@ from typing import Any
 
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import fixed_parameter
+from needle_device_driver.axes.axis import PERIOD
 from needle_device_driver.axes.axis_settings import AxisSettings
 from needle_device_driver.axes.capabilities import Capabilities
-from needle_device_driver.axes.cycle_times import PERIOD
-from needle_device_driver.axes.drive_errors import DriveError
+from needle_device_driver.axes.link import DriveError
 from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
 from needle_device_driver.polled.polled_drives import polled_backend
 from needle_device_driver.polled.text_link import TextLink
@@ -105,7 +105,6 @@ class GalilProtocol(DriveProtocol):
 
     terminators = b":?"
     capabilities = Capabilities(
-        streams=True,
         watchdog=0.1,
         longest_order=2.0 * PERIOD,
         response_time=PERIOD,

@@ -9,10 +9,10 @@ from functools import reduce
 from typing import Any
 
 from needle_core.settings.parameter_fields import fixed_parameter
+from needle_device_driver.axes.axis import PERIOD
 from needle_device_driver.axes.axis_settings import AxisSettings
 from needle_device_driver.axes.capabilities import Capabilities
-from needle_device_driver.axes.cycle_times import PERIOD
-from needle_device_driver.axes.drive_errors import DriveError
+from needle_device_driver.axes.link import DriveError
 from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
 from needle_device_driver.polled.polled_drives import polled_backend
 from needle_device_driver.polled.text_link import TextLink
@@ -45,7 +45,6 @@ class StepdirProtocol(DriveProtocol):
     """
 
     capabilities = Capabilities(
-        streams=True,
         watchdog=0.1,
         longest_order=0.05,
         response_time=0.02,

@@ -12,7 +12,7 @@ from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import fixed_parameter
 from needle_device_driver.axes.axis_settings import HERE, AxisSettings
 from needle_device_driver.axes.capabilities import Capabilities
-from needle_device_driver.axes.drive_errors import DriveError
+from needle_device_driver.axes.link import DriveError
 from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
 from needle_device_driver.polled.polled_drives import polled_backend
 from needle_device_driver.polled.text_link import TextLink
@@ -123,7 +123,6 @@ class ZaberProtocol(DriveProtocol):
     """
 
     capabilities = Capabilities(
-        streams=True,
         watchdog=math.inf,
         longest_order=0.06,
         response_time=0.04,

@@ -92,7 +92,6 @@ _STATES = {
 
 # The next command towards a goal. It never acknowledges a fault.
 _ON = {
-    DriveState.NOT_READY_TO_SWITCH_ON: DriveCommand.DISABLE_VOLTAGE,
     DriveState.SWITCH_ON_DISABLED: DriveCommand.SHUTDOWN,
     DriveState.READY_TO_SWITCH_ON: DriveCommand.SWITCH_ON,
     DriveState.SWITCHED_ON: DriveCommand.ENABLE_OPERATION,

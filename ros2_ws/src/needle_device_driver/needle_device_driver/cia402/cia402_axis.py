@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from needle_device_driver.axes.axis import AxisError, AxisSnapshot
-from needle_device_driver.axes.cycle_times import PERIOD
-from needle_device_driver.axes.drive_errors import DriveError, LinkError, raised_as_axis_error
+from needle_device_driver.axes.axis import PERIOD, AxisSnapshot
 from needle_device_driver.axes.drives import CyclicAxis, Fault
-from needle_device_driver.axes.speed_monitor import SpeedMonitor
+from needle_device_driver.axes.link import DriveError, LinkError, raised_as_axis_error
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
+    FOLLOWING_ERROR,
     POWERED,
     START_HOMING,
     DriveCommand,
@@ -27,8 +26,9 @@ from needle_device_driver.cia402.drive_upkeep import (
     disarm_watchdog,
     reset_fault,
 )
-from needle_device_driver.cia402.drive_watch import HomingRun, HomingStep, drive_fault
+from needle_device_driver.cia402.homing_run import HomingRun, HomingStep
 from needle_device_driver.link import objects as od
+from needle_device_driver.link.error_codes import HEARTBEAT_LOST, describe_error
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.procedure import Procedure, Wait
@@ -41,9 +41,8 @@ _MAX_SILENT = 15
 class Cia402Axis(CyclicAxis):
     """Axis on one drive in cyclic synchronous position mode.
 
-    Orders return at once. In each cycle, `transmit` sends the next command and set-point before the
-    SYNC, and `update` handles the answer; only a stop is sent immediately. The drive stops at the
-    last set-point if no further one arrives.
+    In each cycle, `transmit` sends the next command and set-point before the SYNC, and `update`
+    handles the answer.
 
     Parameters
     ----------
@@ -64,23 +63,21 @@ class Cia402Axis(CyclicAxis):
         Optional objects that the drive lacks.
     """
 
+    # With the units of the drive, after its set-up.
+    _settings: DriveSettings
+    _link: FrameLink
+    _homing: HomingRun | None
+    _counter = od.NO_LIMITS[0]
+
     def __init__(
         self, name: str, settings: DriveSettings, link: FrameLink, watchdog: float
     ) -> None:
-        self.name = name
-        # As given, and with the units of the drive.
-        self._given = self._settings = settings
-        self.actuated = settings.actuated
-        self._link, self._watchdog = link, watchdog
+        super().__init__(name, settings, link)
+        self._given, self._watchdog = settings, watchdog
         self.monitor = DriveMonitor(link, settings.node_id)
         self.missing_optional_objects: tuple[str, ...] = ()
         rest, stop_time = settings.magnitude(settings.tolerance), settings.stop_time
         self._machine = DriveMachine(rest, PERIOD, stop_time, self.monitor.feedback)
-        self._speed = SpeedMonitor(settings, PERIOD)
-        self._homing: HomingRun | None = None
-        self._configured = self._homed = self._limits_due = False
-        self._opening = self._origin = self._zero = 0
-        self._velocity = 0.0
 
     @property
     def node_id(self) -> int:
@@ -103,21 +100,12 @@ class Cia402Axis(CyclicAxis):
 
     # ---- orders -------------------------------------------------------------------------------
 
-    def configure(self) -> Procedure[None]:
-        """Open the link and set the drive up; moves nothing."""
-        with raised_as_axis_error(self.name):
-            self._link.open()
-            yield from self._set_up(survived=False)
-        self._configured = True
-
     def power(self, on: bool) -> None:
         """Begin to switch the drive on, without motion, or off."""
         if not self.actuated:
             return
         if on:
-            self._refuse_fault()
-            if self._limits_due:
-                raise AxisError(f"{self.name} axis has no software limits yet")
+            self._refuse_power()
         else:
             self._homing = None
             self._machine.mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
@@ -127,8 +115,7 @@ class Cia402Axis(CyclicAxis):
         """Begin to home; without a motor, the present position becomes 0."""
         self._refuse_fault()
         if not self.actuated:
-            self._zero = self._machine.at.position
-            self._count_from_home()
+            self._count_from_home(self._machine.at.position)
             return
         self._homed = self._limits_due = False
         with raised_as_axis_error(self.name):
@@ -140,23 +127,10 @@ class Cia402Axis(CyclicAxis):
 
     def start_move(self, target: float, speed: float) -> None:
         """Set the set-point of the next cycle; it implies the speed."""
-        self._refuse_fault()
-        if not self._machine.ready:
-            raise AxisError(f"{self.name} axis is not ready to move")
-        settings = self._settings
-        counts = settings.counts(target)
-        lower, upper = settings.limits_counts if self._homed else od.NO_LIMITS[0]
-        if not lower <= counts <= upper:
-            # Beyond its last count a drive may continue, stop, or return all the way.
-            raise AxisError(
-                f"{self.name} axis: target {target:.6g} is outside the drive's "
-                f"{settings.limits if self._homed else 'counter; home it, or set it nearer 0'}",
-                Rule.SOFTWARE_LIMITS,
-            )
-        step = abs(counts - self._machine.target)
-        self._check_step(settings, step, speed)
-        self._machine.target = counts
-        self._speed.command(step / settings.counts_per_unit / PERIOD)
+        machine = self._machine
+        counts = self._check_move(target, speed, machine.target, ready=machine.ready)
+        step, machine.target = abs(counts - machine.target), counts
+        self._speed.command(step / self._settings.counts_per_unit / PERIOD)
 
     def stop(self) -> None:
         """Send a quick stop immediately."""
@@ -189,26 +163,19 @@ class Cia402Axis(CyclicAxis):
 
     def poll(self, now: float) -> AxisSnapshot:
         """Return the newest feedback."""
-        machine, fault = self._machine, self._fault
-        position = self._settings.position(machine.at.position - self._zero)
-        set_point = self._settings.position(machine.target - self._zero)
-        return AxisSnapshot(
+        machine = self._machine
+        return self._snapshot(
+            machine.at.position,
+            machine.target if self.actuated else machine.at.position,
             time=self.monitor.fresh_since,
-            position=position,
-            set_point=set_point if self.actuated else position,
-            velocity=self._velocity,
             powered=not self.actuated or machine.powered,
             homed=self._homed and not self.monitor.rebooted,
-            moving=self._homing is not None,
             at_home_switch=bool(machine.at.inputs & self._settings.outer_switches),
             at_inner_switch=bool(machine.at.inputs & self._settings.inner_switch),
-            fault="" if fault is None else fault[1],
-            fault_rule=Rule.ONE_FAULT_STOPS_BOTH if fault is None else fault[0],
             ready=not self.actuated or machine.ready,
             answered=self.monitor.answered(),
             released_after_block=machine.released_after_block,
             stop_failure=machine.stop_failure,
-            origin=self._origin,
         )
 
     def close(self) -> Procedure[None]:
@@ -271,8 +238,6 @@ class Cia402Axis(CyclicAxis):
         if self._homing is not None:
             self._homing.update(at, at.position - before.position if plausible else 0)
             if self._homing.step is HomingStep.DONE:
-                # The drive's software limits count from home; they are written when it is off.
-                self._limits_due = True
                 self._count_from_home()
 
     def _send_order(self) -> None:
@@ -296,30 +261,46 @@ class Cia402Axis(CyclicAxis):
             return
         self._limits_due = False
 
-    def _count_from_home(self) -> None:
-        self._homing, self._homed = None, True
-        self._origin += 1
-
-    # ---- faults ---------------------------------------------------------------------------------
-
     @property
     def _access(self) -> ObjectAccess:
         return ObjectAccess(self._link, self._settings.node_id)
 
     @property
-    def _fault(self) -> Fault | None:
+    def _fault(self) -> Fault | None:  # noqa: PLR0911 - each return is a fault
+        monitor, machine, homing = self.monitor, self._machine, self._homing
         if not self._configured:
             return None
         if self._link.lost:
             return Rule.LINK_LOSS, self._link.lost
         if self._link.other_master:
             return Rule.ONE_MASTER, self._link.other_master
-        watched = self.monitor, self._machine, self._speed, self._homing
-        return drive_fault(*watched, actuated=self.actuated)
+        if self._speed.problem:
+            return Rule.AXIS_SPEED, self._speed.problem
+        if monitor.rebooted:
+            return Rule.DRIVE_REBOOT, "the drive rebooted; its home position is lost"
+        if (code := monitor.emergency) is not None:
+            rule = Rule.DRIVE_WATCHDOG if code == HEARTBEAT_LOST else Rule.DRIVE_EMERGENCY
+            return rule, f"the drive reports {describe_error(code)}"
+        state = machine.state
+        # Without a motor the drive may be in any state.
+        if self.actuated and state is not None and state in FAULTS:
+            return Rule.DRIVE_EMERGENCY, f"the drive is in {state.name}"
+        if monitor.left_operational:
+            return Rule.DRIVE_REBOOT, "the drive left the operational state"
+        if machine.problem:
+            return Rule.ONE_FAULT_STOPS_BOTH, f"the drive {machine.problem}"
+        if homing is not None and homing.problem:
+            failed = homing.step is HomingStep.FAILED
+            rule = Rule.ONE_FAULT_STOPS_BOTH if failed else Rule.HOMING_TIME
+            return rule, f"the drive {homing.problem}"
+        if machine.ready and machine.at.statusword & FOLLOWING_ERROR:
+            return Rule.FOLLOWING_ERROR, "the drive reports a following error"
+        return None
 
     # ---- set-up, reset, shut-down -------------------------------------------------------------
 
-    def _set_up(self, *, survived: bool) -> Procedure[None]:
+    def _set_up(self, *, survived: bool = False) -> Procedure[None]:
+        self._link.open()
         self._homed = self._homed and survived
         self.monitor.begin_set_up()
         self._settings, self.missing_optional_objects = yield from set_up(
@@ -345,10 +326,7 @@ class Cia402Axis(CyclicAxis):
             (yield from access.read(od.POSITION_ACTUAL)),
         )
         self._machine.restart(self.monitor.feedback)
-        # The zero of the position may have changed.
-        self._origin += 1
-        self._speed.reset()
-        self._velocity = 0.0
+        self._restart_feedback()
         if self._machine.state in FAULTS:
             # The emergency message of an earlier fault was not received.
             self.monitor.emergency = (yield from access.read_optional(od.ERROR_CODE)) or None

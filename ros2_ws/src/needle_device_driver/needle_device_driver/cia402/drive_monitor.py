@@ -15,9 +15,8 @@ from needle_device_driver.link.objects import (
     NMT_BOOT_UP,
     NMT_OPERATIONAL,
     POSITION,
-    POSITION_ALONE,
     STATUS,
-    STATUS_WITHOUT_INPUTS,
+    Pdo,
 )
 from needle_device_driver.procedure import Procedure, Wait
 
@@ -26,9 +25,7 @@ _ANSWER = (STATUS.function_code, POSITION.function_code)
 _MAX_MISSING = 1
 # Number of SYNCs after which an earlier loss is forgotten.
 _FORGET_AFTER = 25
-
-_LENGTH_WITHOUT_INPUTS = len(STATUS_WITHOUT_INPUTS.pack(0, 0))
-_LENGTH_ALONE = len(POSITION_ALONE.pack(0))
+_STATUS_NAMES, _POSITION_NAMES = ("statusword", "mode", "inputs"), ("position", "following_error")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,8 +113,8 @@ class DriveMonitor:
         self.rebooted = False
         self.emergency: int | None = None
         for function_code, handler in (
-            (STATUS.function_code, self._on_status),
-            (POSITION.function_code, self._on_position),
+            (STATUS.function_code, partial(self._on_answer, STATUS, _STATUS_NAMES)),
+            (POSITION.function_code, partial(self._on_answer, POSITION, _POSITION_NAMES)),
             (HEARTBEAT, self._on_heartbeat),
             (EMCY, self._on_emergency),
         ):
@@ -220,25 +217,11 @@ class DriveMonitor:
             handler(data, time)
         except ValueError:
             # The frame has a wrong length.
-            self._link.error_frames += 1
+            self._link.bus_errors += 1
 
-    def _on_status(self, data: bytes, time: float) -> None:
-        if len(data) == _LENGTH_WITHOUT_INPUTS:
-            statusword, mode = STATUS_WITHOUT_INPUTS.unpack(data)
-            self._update(statusword=statusword, mode=mode)
-        else:
-            statusword, mode, inputs = STATUS.unpack(data)
-            self._update(statusword=statusword, mode=mode, inputs=inputs)
-        self._answer(STATUS.function_code, time)
-
-    def _on_position(self, data: bytes, time: float) -> None:
-        if len(data) == _LENGTH_ALONE:
-            (position,) = POSITION_ALONE.unpack(data)
-            self._update(position=position)
-        else:
-            position, following_error = POSITION.unpack(data)
-            self._update(position=position, following_error=following_error)
-        self._answer(POSITION.function_code, time)
+    def _on_answer(self, pdo: Pdo, names: tuple[str, ...], data: bytes, time: float) -> None:
+        self._update(**dict(zip(names, pdo.unpack(data), strict=False)))
+        self._answer(pdo.function_code, time)
 
     def _on_heartbeat(self, data: bytes, time: float) -> None:
         (state,) = data

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from needle_device_driver.axes.axis_settings import HERE
-from needle_device_driver.axes.drive_errors import DriveError
+from needle_device_driver.axes.link import DriveError
 from needle_device_driver.cia402.cia402 import (
     POWERED,
     SUPPORTS_CYCLIC_POSITION,
@@ -15,8 +15,7 @@ from needle_device_driver.cia402.cia402 import (
     drive_state,
 )
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
-from needle_device_driver.cia402.drive_settings import DriveSettings
-from needle_device_driver.cia402.drive_units import read_units
+from needle_device_driver.cia402.drive_settings import DriveSettings, read_units
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.object_access import DriveRefusalError, ObjectAccess, ObjectError

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 from needle_core import messages as m
 from needle_core.component import Action, Call, Publish
 from needle_core.messages import HOLD_LIFETIME
+from needle_device_driver.axes.axis import PERIOD
 from needle_device_driver.axes.capabilities import Capabilities
-from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.conformance.rig import DRIVER, ConformanceRig
 from needle_device_driver.device import EMERGENCY_STOP
 from needle_device_driver.rules import Rule

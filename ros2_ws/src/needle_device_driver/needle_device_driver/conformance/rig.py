@@ -27,9 +27,8 @@ from needle_core.messages import HoldSession
 from needle_core.runners.transport import Arrival, Arrivals, Fault, Link
 from needle_core.runners.virtual import LOG, VirtualRunner
 from needle_core.status_messages import DeviceStatus
-from needle_device_driver.axes.axis import Axis
+from needle_device_driver.axes.axis import PERIOD, Axis
 from needle_device_driver.axes.capabilities import Capabilities
-from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.device import COMMANDS, EMERGENCY_STOP, HOLD, JOINTS, RESULT, STATUS
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.parameters import DeviceDriverParameters

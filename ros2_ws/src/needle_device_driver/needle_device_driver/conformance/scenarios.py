@@ -8,9 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 from needle_core.component import Call
-from needle_device_driver.axes.axis import AxisError
+from needle_device_driver.axes.axis import PERIOD, AxisError
 from needle_device_driver.axes.capabilities import Capabilities
-from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.conformance import checks
 from needle_device_driver.conformance.faults import FAULTS, Fault, can_keep, largest_travel
 from needle_device_driver.conformance.rig import AXES, DRIVER, ConformanceRig

@@ -40,31 +40,24 @@ class FrameLink(Link):
     ----------
     other_master : str
         Frame of another master on the bus; empty: there is none.
-    frames_sent, frames_received, error_frames : int
+    frames_sent, frames_received, bus_errors : int
         Counters.
     refused : int
         Number of commands and frames that the adapter refused.
     """
+
+    _counters = ("frames_sent", "frames_received", "bus_errors")
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.other_master = ""
         self.frames_sent = 0
         self.frames_received = 0
-        self.error_frames = 0
+        self.bus_errors = 0
         self.refused = 0
         self._outgoing: list[CanFrame] = []
         self._callbacks: dict[int, list[Callback]] = {}
         self._sdo_clients: dict[int, SdoClient] = {}
-
-    @property
-    def counts(self) -> dict[str, str]:
-        """Counters for diagnostics, by name."""
-        return {
-            "frames_sent": str(self.frames_sent),
-            "frames_received": str(self.frames_received),
-            "bus_errors": str(self.error_frames),
-        }
 
     def send(self, cob_id: int, data: bytes = b"") -> None:
         """Add one frame to the outgoing batch of the running handler.
@@ -88,7 +81,7 @@ class FrameLink(Link):
         """Receive frames and error counts from the port."""
         for item in items:
             if isinstance(item, CanErrors):
-                self.error_frames += item.frames + item.refusals
+                self.bus_errors += item.frames + item.refusals
                 self.refused += item.refusals
             elif self.is_open and not item.remote:
                 time = self.now if item.time is None else item.time

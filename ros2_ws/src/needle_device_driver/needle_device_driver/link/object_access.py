@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 
-from needle_device_driver.axes.drive_errors import DriveError
+from needle_device_driver.axes.link import DriveError
 from needle_device_driver.link.error_codes import NO_SUCH_OBJECT, WRONG_LENGTH
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import Entry

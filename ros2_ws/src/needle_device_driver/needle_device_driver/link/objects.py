@@ -188,17 +188,18 @@ class Pdo:
         return b"".join(e.pack(v) for e, v in zip(self.entries, values, strict=True))
 
     def unpack(self, data: bytes) -> tuple[int, ...]:
-        """Decode the values.
+        """Decode the values; a drive may lack the last entry.
 
         Raises
         ------
         ValueError
             If the length is wrong.
         """
-        formats = "<" + "".join(entry.format[-1] for entry in self.entries)
-        if len(data) != struct.calcsize(formats):
-            raise ValueError(f"PDO of {len(data)} bytes, expected {struct.calcsize(formats)}")
-        return struct.unpack(formats, data)
+        for entries in (self.entries, self.entries[:-1]):
+            formats = "<" + "".join(entry.format[-1] for entry in entries)
+            if len(data) == struct.calcsize(formats):
+                return struct.unpack(formats, data)
+        raise ValueError(f"PDO of {len(data)} bytes, not of {self.entries}")
 
 
 # A command takes effect on arrival, so that a stop does not wait; set-points at the SYNC.

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from needle_device_driver.axes.axis_settings import AxisSettings
 from needle_device_driver.axes.capabilities import Capabilities
-from needle_device_driver.axes.drive_errors import DriveError, LinkError
+from needle_device_driver.axes.link import DriveError, LinkError
 from needle_device_driver.polled.text_link import TextLink
 from needle_device_driver.procedure import Procedure, Wait
 

@@ -6,12 +6,10 @@ import enum
 import math
 from collections.abc import Callable
 
-from needle_device_driver.axes.axis import AxisError, AxisSnapshot
+from needle_device_driver.axes.axis import PERIOD, AxisSnapshot
 from needle_device_driver.axes.axis_settings import HERE, AxisSettings
-from needle_device_driver.axes.cycle_times import PERIOD
-from needle_device_driver.axes.drive_errors import DriveError, raised_as_axis_error
 from needle_device_driver.axes.drives import CyclicAxis, Fault
-from needle_device_driver.axes.speed_monitor import SpeedMonitor
+from needle_device_driver.axes.link import DriveError, raised_as_axis_error
 from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
 from needle_device_driver.procedure import Procedure, Wait
 from needle_device_driver.rules import Rule
@@ -39,9 +37,8 @@ class _Homing(enum.Enum):
 class PolledAxis(CyclicAxis):
     """Axis on one drive of a `DriveProtocol`.
 
-    In each cycle, `transmit` sends the next order, and `update` handles the answer; only a stop is
-    sent immediately. The drive stops at the last set-point if no further one arrives; homing
-    consists of such set-points, too.
+    In each cycle, `transmit` sends the next order, and `update` handles the answer. Homing consists
+    of set-points, too.
 
     Parameters
     ----------
@@ -55,6 +52,8 @@ class PolledAxis(CyclicAxis):
         Returns a procedure that requests the state of the drive and waits for it.
     """
 
+    _homing: _Homing | None
+
     def __init__(
         self,
         name: str,
@@ -62,20 +61,16 @@ class PolledAxis(CyclicAxis):
         protocol: DriveProtocol,
         refresh: Callable[[], Procedure[None]],
     ) -> None:
-        self.name = name
-        self._settings, self._protocol, self._refresh = settings, protocol, refresh
-        self._speed = SpeedMonitor(settings, PERIOD)
+        super().__init__(name, settings, protocol.link)
+        self._protocol, self._refresh = protocol, refresh
         response = math.ceil(protocol.capabilities.response_time / PERIOD)
         self._max_stop = math.ceil(settings.stop_time / PERIOD) + response + _STOP_MARGIN
         self._at = _OFF
         self._time = -math.inf
-        self._velocity = 0.0
-        self._zero = self._target = self._last_target = self._origin = self._opening = 0
-        self._configured = self._homed = self._limits_due = False
+        self._target = self._last_target = 0
         self._goal_on = self._stopping = self._released = False
         self._was_off = self._was_ready = False
         self._set_point_speed: int | None = None
-        self._homing: _Homing | None = None
         self._homing_speed = self._travelled = 0.0
         self._still = self._cycles = self._order_cycles = 0
         self._problem: Fault | None = None
@@ -83,18 +78,10 @@ class PolledAxis(CyclicAxis):
 
     # ---- orders -------------------------------------------------------------------------------
 
-    def configure(self) -> Procedure[None]:
-        """Set the drive up; moves nothing."""
-        with raised_as_axis_error(self.name):
-            yield from self._set_up()
-        self._configured = True
-
     def power(self, on: bool) -> None:
         """Begin to switch the drive on, without motion, or off as soon as it is at rest."""
         if on:
-            self._refuse_fault()
-            if self._limits_due:
-                raise AxisError(f"{self.name} axis has no software limits yet")
+            self._refuse_power()
         else:
             self._homing = None
         if on is not self._goal_on or self._released:
@@ -104,28 +91,17 @@ class PolledAxis(CyclicAxis):
     def home(self, speed: float) -> Procedure[None]:
         """Begin to home: search the outer switch, and leave it slowly."""
         self._refuse_fault()
-        self._homed = False
+        self._homed = self._limits_due = False
         self._homing, self._homing_speed, self._travelled = _Homing.SEARCH, speed, 0.0
         yield from ()
 
     def start_move(self, target: float, speed: float) -> None:
         """Set the set-point of the next cycle; it implies the speed."""
-        self._refuse_fault()
-        settings = self._settings
-        if not self._ready:
-            raise AxisError(f"{self.name} axis is not ready to move")
-        counts = settings.counts(target)
-        lower, upper = settings.limits_counts
-        if self._homed and not lower <= counts <= upper:
-            raise AxisError(
-                f"{self.name} axis: target {target:.6g} is outside the {settings.limits}",
-                Rule.SOFTWARE_LIMITS,
-            )
-        step = abs(counts + self._zero - self._target)
-        self._check_step(settings, step, speed)
-        if step:
+        counts = self._check_move(target, speed, self._target, ready=self._ready)
+        if counts != self._target:
             # A repeated set-point would replace the drive's unfinished order by a slower one.
-            self._move_to(counts + self._zero, step / settings.counts_per_unit / PERIOD)
+            step = abs(counts - self._target)
+            self._move_to(counts, step / self._settings.counts_per_unit / PERIOD)
 
     def stop(self) -> None:
         """Send a stop immediately."""
@@ -140,7 +116,7 @@ class PolledAxis(CyclicAxis):
     def reset(self) -> Procedure[None]:
         """Open a lost link, set up a drive that has restarted, acknowledge a fault."""
         self._goal_on, self._homing = False, None
-        link = self._protocol.link
+        link = self._link
         with raised_as_axis_error(self.name):
             link.open()
             if self._opening != link.openings:
@@ -169,32 +145,26 @@ class PolledAxis(CyclicAxis):
                 yield from self._refresh()
                 if not self._at.moving:
                     break
-                yield Wait(lambda: bool(self._protocol.link.lost), PERIOD)
+                yield Wait(lambda: bool(self._link.lost), PERIOD)
             yield from self._protocol.release(self.name)
 
     # ---- feedback -----------------------------------------------------------------------------
 
     def poll(self, now: float) -> AxisSnapshot:
         """Return the newest feedback."""
-        at, fault, settings = self._at, self._fault, self._settings
-        position = settings.position(at.position - self._zero)
-        return AxisSnapshot(
+        at = self._at
+        return self._snapshot(
+            at.position,
+            self._target,
             time=self._time,
-            position=position,
-            set_point=settings.position(self._target - self._zero),
-            velocity=self._velocity,
             powered=(at.powered and self._goal_on) or self._released,
             homed=self._homed and not at.rebooted,
-            moving=self._homing is not None,
             at_home_switch=at.home_switch,
             at_inner_switch=at.inner_switch,
-            fault="" if fault is None else fault[1],
-            fault_rule=Rule.ONE_FAULT_STOPS_BOTH if fault is None else fault[0],
             ready=self._ready,
             answered=self.answered,
             released_after_block=self._released,
             stop_failure=self._stop_failure,
-            origin=self._origin,
         )
 
     @property
@@ -258,11 +228,11 @@ class PolledAxis(CyclicAxis):
 
     @property
     def _fault(self) -> Fault | None:
-        at, link = self._at, self._protocol.link
+        at = self._at
         if not self._configured:
             return None
         for rule, text in (
-            (Rule.LINK_LOSS, link.lost),
+            (Rule.LINK_LOSS, self._link.lost),
             (Rule.DRIVE_REBOOT, "the drive restarted; its home is lost" if at.rebooted else ""),
             (Rule.DRIVE_WATCHDOG, "the drive's watchdog stopped it" if at.timed_out else ""),
             (Rule.ONE_MASTER, _CONFLICT if at.conflict else ""),
@@ -284,35 +254,35 @@ class PolledAxis(CyclicAxis):
         self._problem = None
         self._stopping = self._released = self._was_off = False
         self._cycles = self._order_cycles = 0
-        self._origin += 1
-        self._speed.reset()
+        self._restart_feedback()
 
     def _set_up(self) -> Procedure[None]:
         yield from self._protocol.set_up(self.name)
-        self._opening = self._protocol.link.openings
+        self._opening = self._link.openings
         self._limits_due = False
         self._begin()
         yield from self._refresh()
 
     def _write_limits(self) -> Procedure[None]:
         lower, upper = (count + self._zero for count in self._settings.limits_counts)
-        self._limits_due = False
         try:
             yield from self._protocol.write_limits(self.name, lower, upper)
         except DriveError as error:
             self._problem = Rule.ONE_FAULT_STOPS_BOTH, str(error)
+            return
+        self._limits_due = False
 
     def _advance_homing(self) -> None:
         settings, at = self._settings, self._at
         if settings.homing_method in HERE:
-            self._end_homing()
+            self._count_from_home(at.position)
             return
         if self._homing is _Homing.SEARCH and at.home_switch:
             self._homing = _Homing.SETTLE
         elif self._homing is _Homing.SETTLE and self._still >= _REST:
             self._homing, self._target = _Homing.LEAVE, at.position
         elif self._homing is _Homing.LEAVE and not at.home_switch:
-            self._end_homing()
+            self._count_from_home(at.position)
         elif self._travelled > settings.longest_search:
             self._problem = (
                 Rule.HOMING_TIME,
@@ -324,11 +294,6 @@ class PolledAxis(CyclicAxis):
             speed = self._homing_speed * (1.0 if search else _EDGE_SPEED)
             step = settings.magnitude(speed * PERIOD) * settings.direction
             self._move_to(self._target + (-step if search else step), speed)
-
-    def _end_homing(self) -> None:
-        self._homing, self._zero = None, self._at.position
-        self._homed = self._limits_due = True
-        self._origin += 1
 
     def _check_stop(self, at: DriveReply) -> None:
         if self._stopping and self._still >= _REST:

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from needle_device_driver.axes.axis import PERIOD
 from needle_device_driver.axes.axis_settings import AxisSettings
 from needle_device_driver.axes.backend import Backend
-from needle_device_driver.axes.cycle_times import PERIOD
-from needle_device_driver.axes.drive_errors import DriveError, LinkError
 from needle_device_driver.axes.drives import Drives
+from needle_device_driver.axes.link import DriveError, LinkError
 from needle_device_driver.polled.drive_protocol import DriveProtocol, DriveReply
 from needle_device_driver.polled.polled_axis import PolledAxis
-from needle_device_driver.polled.stream_port import StreamPort
-from needle_device_driver.polled.text_link import TextLink
+from needle_device_driver.polled.text_link import StreamPort, TextLink
 from needle_device_driver.procedure import Procedure, Wait
 
 _NUMBERS = 99

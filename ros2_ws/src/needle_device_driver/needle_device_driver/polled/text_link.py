@@ -1,11 +1,58 @@
-"""Connection that carries lines of text: a component passes its bytes in batches."""
+"""Connection that carries lines of text: port, and link of the component."""
 
 from __future__ import annotations
 
+import contextlib
 import re
+import socket
 from collections.abc import Sequence
 
+import serial
+
+from needle_core.ports.byte_port import MAX_CHUNK, BytePort, ByteStream, TcpStream
 from needle_device_driver.axes.link import Link
+
+_CONNECT_TIMEOUT, _READ_TIMEOUT = 1.0, 0.05
+
+
+class _Serial:
+    def __init__(self, path: str, baudrate: int, timeout: float) -> None:
+        self._serial = serial.Serial(
+            path, baudrate, timeout=_READ_TIMEOUT, write_timeout=timeout, exclusive=True
+        )
+        # Adapters with an FTDI chip otherwise collect answers for 16 ms.
+        with contextlib.suppress(OSError, ValueError):
+            self._serial.set_low_latency_mode(True)
+        self.write, self.close = self._serial.write, self._serial.close
+
+    def read(self) -> bytes:
+        return bytes(self._serial.read(max(1, min(self._serial.in_waiting, MAX_CHUNK))))
+
+
+class StreamPort(BytePort):
+    """Port on a serial device or a TCP server.
+
+    Parameters
+    ----------
+    address : str
+        Device file, or `host:port`.
+    baudrate : int
+        Of a serial device [bit/s].
+    write_timeout : float
+        A stream that accepts no bytes for this time is lost [s].
+    """
+
+    def __init__(self, address: str, baudrate: int, write_timeout: float) -> None:
+        super().__init__()
+        self._address, self._baudrate, self._timeout = address, baudrate, write_timeout
+
+    def _open_device(self) -> ByteStream:
+        host, colon, port = self._address.rpartition(":")
+        if colon and port.isdigit():
+            connection = socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT)
+            return TcpStream(connection, self._timeout)
+        return _Serial(self._address, self._baudrate, self._timeout)
+
 
 # A longer line is none: the bytes are noise, or of another program [bytes].
 _LONGEST_LINE = 1024
@@ -27,6 +74,8 @@ class TextLink(Link):
         Counters; garbled are lines that are no ASCII text, or too long.
     """
 
+    _counters = ("bytes_sent", "lines_received", "garbled")
+
     def __init__(self, name: str, terminators: bytes) -> None:
         super().__init__(name)
         self.bytes_sent = self.lines_received = self.garbled = 0
@@ -34,12 +83,6 @@ class TextLink(Link):
         self._line_end = re.compile(b"(?<=[" + re.escape(terminators) + b"])")
         self._rest = b""
         self._outgoing = b""
-
-    @property
-    def counts(self) -> dict[str, str]:
-        """Counters for diagnostics, by name."""
-        names = ("bytes_sent", "lines_received", "garbled")
-        return {name: str(getattr(self, name)) for name in names}
 
     def send(self, data: bytes) -> None:
         """Add bytes to the outgoing batch of the running handler.

@@ -11,7 +11,7 @@ from needle_device_driver.axes.axis import Axis, AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import Leg
 from needle_device_driver.procedure import Procedure
 from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.command_handler import CommandHandler
+from needle_device_driver.supervisor.command import CommandHandler
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold, HoldNotices
 from needle_device_driver.supervisor.limits import SafetyLimits
@@ -73,19 +73,9 @@ class MotionSupervisor:
         return self._core.state
 
     @property
-    def activity(self) -> Activity:
-        """Kind of the motion under way."""
-        return self._core.activity
-
-    @property
     def stops(self) -> int:
         """Number of faults and emergency stops, including those in FAULT and ESTOPPED."""
         return self._core.stops
-
-    @property
-    def command_ns(self) -> int:
-        """Stamp of the newest command, accepted or refused [ns]; 0: none yet."""
-        return self._commands.newest_ns
 
     @property
     def fault(self) -> str:
@@ -134,7 +124,7 @@ class MotionSupervisor:
             watchdog_trips=self._core.watchdog_trips,
             commands_refused=self._commands.refused,
             holds_ignored=self._hold.ignored,
-            command_ns=self.command_ns,
+            command_ns=self._commands.newest_ns,
             rotation_owed_rad=self._core.rotation_lag,
             simulated=simulated,
         )

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from needle_core.errors import UserError
-from needle_device_driver.axes.drive_errors import DriveError
+from needle_device_driver.axes.link import DriveError
 from needle_device_driver.backends.galil import GalilProtocol
 from needle_device_driver.parameters import BACKENDS, DeviceDriverParameters
 from needle_device_driver.polled.drive_protocol import DriveReply

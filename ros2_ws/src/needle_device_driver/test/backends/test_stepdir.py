@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from needle_device_driver.axes.drive_errors import DriveError
+from needle_device_driver.axes.link import DriveError
 from needle_device_driver.backends.stepdir import StepdirProtocol
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.polled.drive_protocol import DriveReply

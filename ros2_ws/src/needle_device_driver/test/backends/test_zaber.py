@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from needle_core.errors import UserError
-from needle_device_driver.axes.drive_errors import DriveError
+from needle_device_driver.axes.link import DriveError
 from needle_device_driver.backends.zaber import ZaberProtocol
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.polled.drive_protocol import DriveReply

@@ -19,8 +19,7 @@ from needle_core.can_frame import CanErrors, CanFrame
 from needle_core.component import PortChange
 from needle_core.ports import reopening_port
 from needle_device_driver.link import can_port, socketcand_bus
-from needle_device_driver.link.can_port import Batch, CanPort
-from needle_device_driver.link.link_settings import SLCAN_BITRATES, LinkSettings
+from needle_device_driver.link.can_port import SLCAN_BITRATES, Batch, CanPort, LinkSettings
 from needle_device_driver.link.slcan_bus import SlcanBus
 
 PORTS: list[CanPort] = []

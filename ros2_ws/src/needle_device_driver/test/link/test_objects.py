@@ -13,8 +13,8 @@ import yaml
 from hypothesis import given, settings
 
 from needle_core.errors import OutOfBoundsError, UserError
-from needle_device_driver.axes.cycle_times import CycleTimes
 from needle_device_driver.cia402.backend import drive_settings
+from needle_device_driver.device_driver import CycleTimes
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.error_codes import describe_error
 from needle_device_driver.parameters import DeviceDriverParameters
@@ -29,12 +29,13 @@ def test_entries_and_pdos_are_packed_little_endian() -> None:
     assert od.SET_POINT.pack(-2) == b"\xfe\xff\xff\xff"
     assert od.STATUS.unpack(b"\x37\x02\x08\x01\x00\x00\x00") == (0x0237, 8, 1)
     assert od.POSITION.unpack(b"\xff\xff\xff\xff\x02\x00\x00\x00") == (-1, 2)
-    # Extra bytes of an entry are ignored; missing bytes, and any other PDO length, are errors.
+    # Extra bytes of an entry are ignored; missing bytes are errors. A PDO may lack its last entry.
+    assert od.STATUS.unpack(b"\x37\x02\x08") == (0x0237, 8)
     assert od.STATUSWORD.unpack(b"\x37\x02\x00\x00") == 0x0237
     with pytest.raises(ValueError, match="2 bytes, expected 4"):
         od.POSITION_ACTUAL.unpack(b"\x00\x00")
-    for data in (b"", b"\x37\x02\x08", bytes(8)):
-        with pytest.raises(ValueError, match="expected 7"):
+    for data in (b"", b"\x37\x02", bytes(6), bytes(8)):
+        with pytest.raises(ValueError, match="PDO of"):
             od.STATUS.unpack(data)
     for entry, value in ((od.TARGET_POSITION, 2**31), (od.CONTROLWORD, -1)):
         with pytest.raises(OutOfBoundsError, match="outside"):
@@ -65,6 +66,8 @@ def test_invalid_settings_and_parameters_are_refused() -> None:
         {"speed": -1.0},
         {"quick_stop_deceleration": math.inf},
         {"lower": 0.201},
+        *({"node_id": node_id} for node_id in (0, 127)),
+        *({"homing_method": method} for method in (0, 15, 16, 31, 36, 38)),
     ]
     for changes in values:
         with pytest.raises(UserError):

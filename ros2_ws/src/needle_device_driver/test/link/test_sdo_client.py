@@ -11,7 +11,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 from canopen.sdo import client as canopen_client
 
 from needle_core.can_frame import CanErrors, CanFrame
-from needle_device_driver.axes.drive_errors import DriveError
+from needle_device_driver.axes.link import DriveError
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.link.objects import DEVICE_TYPE
@@ -168,6 +168,6 @@ def test_link_counts_errors_passes_frames_and_reports_refusals() -> None:
     frames = [CanFrame(0x181, b"\x01", time=1.5), CanFrame(0x181, b"\x02"), CanFrame(0x182)]
     link.receive([*frames, CanFrame(0x181, remote=True), CanErrors(2), CanErrors(0, 1)])
     assert heard == [(b"\x01", 1.5), (b"\x02", 2.0)]
-    assert (link.error_frames, link.frames_received) == (3, 3)
+    assert (link.bus_errors, link.frames_received) == (3, 3)
     with pytest.raises(DriveError, match=r"does not answer.*the adapter rejects"):
         at_once(ObjectAccess(link, 1).read(DEVICE_TYPE))

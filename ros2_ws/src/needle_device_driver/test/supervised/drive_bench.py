@@ -6,9 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from needle_device_driver.cia402.backend import drive_settings
+from needle_device_driver.cia402.backend import Cia402Drives, drive_settings
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
-from needle_device_driver.cia402.drive_cycle import Cia402Drives
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run

@@ -48,7 +48,7 @@ class SupervisorBench(abc.ABC):
 
     @property
     def activity(self) -> str:
-        return self.supervisor.activity.value
+        return self.status.activity
 
     @property
     def status(self) -> DeviceStatus:

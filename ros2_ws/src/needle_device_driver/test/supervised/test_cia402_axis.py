@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
-
-from needle_device_driver.cia402.drive_monitor import Feedback
 
 from .drive_bench import RAD, DriveBench
 
@@ -65,12 +61,6 @@ def test_outer_end_is_negative_limit_or_home_switch() -> None:
             at = bench.axes[0].poll(bench.now)
             assert at.at_home_switch is any(inputs & bits for bits in outer)
             assert at.at_inner_switch is any(inputs & bits for bits in inner)
-
-
-def test_drive_without_feedback_has_no_joints_and_needs_no_cycles() -> None:
-    bench = DriveBench()
-    assert bench.axes[0].monitor.feedback == Feedback(0, 0, 0, 0, 0, 0)
-    assert bench.axes[0].monitor.fresh_since == -math.inf
 
 
 # ---- homing -------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import canopen
 import pytest
 
 from needle_device_driver.check_drive import main
-from needle_device_driver.link.device_file import read_device_file
+from needle_device_driver.cia402.drive_file import read_device_file
 
 from .drive_bench import DriveBench
 

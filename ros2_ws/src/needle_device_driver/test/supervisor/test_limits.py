@@ -14,44 +14,27 @@ from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.reports import Notice, NoticeLimit
 
-BOUNDS = {
-    "max_depth": 0.2,
-    "max_step_length": 0.002,
-    "max_speed": 0.005,
-    "max_rotation_step": 1.2,
-    "max_rotation_rate": math.pi,
-    "max_turns": 10.0,
-    "hold_timeout": 0.25,
-    "tip_age_limit": 2.0,
-    "reply_age_limit": 0.1,
-    "retraction_speed": 0.002,
-    "homing_speed": 0.002,
-    "homing_rotation_rate": 1.0,
-    "insertion_following_error": 0.0005,
-    "rotation_following_error": 0.1,
-    "insertion_tolerance": 5e-6,
-    "rotation_tolerance": 1e-3,
-    "settling_time": 1.0,
+# Default, and hard bound.
+LIMITS = {
+    "max_depth": (0.2, 0.5),
+    "max_step_length": (0.002, 0.005),
+    "max_speed": (0.005, 0.005),
+    "max_rotation_step": (1.2, 2.0 * math.pi),
+    "max_rotation_rate": (math.pi, 20.0),
+    "max_turns": (10.0, 1000.0),
+    "hold_timeout": (0.25, 0.5),
+    "tip_age_limit": (2.0, 60.0),
+    "reply_age_limit": (0.1, 0.5),
+    "retraction_speed": (0.002, 0.005),
+    "homing_speed": (0.002, 0.005),
+    "homing_rotation_rate": (1.0, 20.0),
+    "insertion_following_error": (0.0005, 10.0),
+    "rotation_following_error": (0.1, 10.0),
+    "insertion_tolerance": (5e-6, 1.0),
+    "rotation_tolerance": (1e-3, 1.0),
+    "settling_time": (1.0, 10.0),
 }
-HARD = {
-    "max_depth": 0.5,
-    "max_step_length": 0.005,
-    "max_speed": 0.005,
-    "max_rotation_step": 2.0 * math.pi,
-    "max_rotation_rate": 20.0,
-    "max_turns": 1000.0,
-    "tip_age_limit": 60.0,
-    "settling_time": 10.0,
-    "homing_rotation_rate": 20.0,
-    "insertion_following_error": 10.0,
-    "rotation_following_error": 10.0,
-    "insertion_tolerance": 1.0,
-    "rotation_tolerance": 1.0,
-    "retraction_speed": 0.005,
-    "homing_speed": 0.005,
-    "hold_timeout": 0.5,
-    "reply_age_limit": 0.5,
-}
+BOUNDS = {name: default for name, (default, _) in LIMITS.items()}
 
 
 def test_default_limits_and_their_parameters() -> None:
@@ -67,11 +50,10 @@ def test_default_limits_and_their_parameters() -> None:
 
 
 def test_limits_are_finite_positive_and_capped() -> None:
-    for name, bound in HARD.items():
+    for name, (_, bound) in LIMITS.items():
         assert getattr(SafetyLimits(**{name: bound}), name) == bound
         with pytest.raises(OutOfBoundsError, match=name):
             SafetyLimits(**{name: bound * 1.001})
-    assert HARD.keys() == BOUNDS.keys()
     for name in BOUNDS:
         for bad in (0.0, -1.0, math.nan, math.inf):
             with pytest.raises(UserError, match=name):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from needle_device_driver.axes.drive_errors import LinkError
+from needle_device_driver.axes.link import LinkError
 from needle_device_driver.cia402 import drive_setup
 from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.procedure import Procedure
@@ -59,21 +59,6 @@ def test_link_loss_while_idle_and_before_the_set_up() -> None:
 
 
 # ---- answers that do not come, or late ----------------------------------------------------------
-
-
-def test_reply_age_detects_a_cut_bus() -> None:
-    bench = DriveBench().moving()
-    bench.bus.cut = True
-    bench.go()
-    assert bench.state == "MOVING"
-    bench.now += 0.1
-    bench.go()
-    bench.failed("reply_age", "no reply from an axis")
-    assert bench.supervisor.joints(bench.now) is None
-    assert not bench.reset().success
-    bench.bus.cut = False
-    bench.insertion.state = bench.rotation.state = "fault"
-    bench.stopped("reply_age", "no reply")
 
 
 def test_reply_age_heartbeats_renew_only_answered_positions() -> None:

@@ -150,17 +150,6 @@ def test_command_finite() -> None:
 # ---- stamps -------------------------------------------------------------------------------------
 
 
-def test_command_newer_than_the_last() -> None:
-    bench = Bench().ready()
-    stamp = bench.step()
-    bench.go(25)
-    for older_by in (0, 1):
-        bench.step(stamp_ns=stamp - older_by)
-        assert (bench.rule, bench.state) == ("command_newer", "HOLDING")
-    bench.step(stamp_ns=stamp + 1)
-    assert bench.state == "MOVING"
-
-
 def test_command_newer_reset_rejects_no_valid_stamp() -> None:
     bench = Bench().ready()
     bench.step()
@@ -172,16 +161,9 @@ def test_command_newer_reset_rejects_no_valid_stamp() -> None:
 
 
 def test_tip_age_is_independent_of_ros_time() -> None:
-    bench = Bench().ready()
-    # ROS time stands still.
-    stamp = bench.ros_ns
-    bench.now += 2.1
-    bench.press()
-    bench.supervisor.note_time(stamp, bench.now)
-    bench.step(stamp_ns=stamp)
-    assert "2.100 s old, limit 2 s" in bench.outcomes[-1]
     # ROS time runs fast.
     bench = Bench().ready()
+    stamp = bench.ros_ns
     for second in range(100):
         bench.supervisor.note_time(stamp + second * 1000 * MS, bench.now + second * 0.002)
     bench.now += 0.2

@@ -129,21 +129,6 @@ def test_quick_stop_ignored_after_a_fault_is_reported() -> None:
     assert bench.status.fault == f"{reports}; insertion axis still moving"
 
 
-def test_quick_stop_report_ends_when_the_drive_answers_a_reset() -> None:
-    bench = DriveBench().moving()
-    bench.rotation.silent = True
-    bench.supervisor.receive_estop(True)
-    bench.wait(8)
-    assert bench.status.fault == "emergency stop; rotation axis silent"
-    bench.supervisor.receive_estop(False)
-    bench.hold(False)
-    # No cycle runs before the reset.
-    bench.rotation.silent, bench.rotation.state = False, "disabled"
-    assert bench.reset().success
-    bench.wait(2)
-    assert (bench.state, bench.status.fault) == ("DISABLED", "")
-
-
 def test_quick_stop_at_exit_leaves_time_for_answers() -> None:
     bench = DriveBench().moving()
     sync, times = bench.insertion.sync, []
@@ -254,18 +239,6 @@ def test_drive_emergency_reset_may_take_a_second(seconds: float, leaves: bool) -
     bench.sdo_time = 0.02
     bench.obeys_late(bench.insertion, seconds)
     assert bench.reset().success is leaves
-
-
-def test_drive_emergency_in_an_outdated_answer_is_ignored() -> None:
-    bench = DriveBench().homed()
-    # The drive answers with samples of the previous SYNC.
-    bench.insertion.answers_previous_sample = True
-    bench.after(lambda: bench.insertion.fail(0x7305))
-    bench.hold(False)
-    bench.wait(5)
-    assert bench.reset().success
-    bench.wait(5)
-    assert bench.state == "DISABLED", bench.status.fault
 
 
 def test_drive_emergency_between_cycles_refuses_a_retraction() -> None:

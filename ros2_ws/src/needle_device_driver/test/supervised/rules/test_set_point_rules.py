@@ -32,14 +32,6 @@ def test_look_ahead_refuses_a_farther_set_point() -> None:
     bench.axes[1].start_move(bench.joint(1) + (most - 1) / RAD, 0.005)
 
 
-@pytest.mark.parametrize(("speed", "counts"), [(0.0025, 1010), (0.0025025, 1011)])
-def test_look_ahead_tolerates_rounding_by_one_count(speed: float, counts: int) -> None:
-    bench = DriveBench(max_speed=speed).moving()
-    at = bench.joint()
-    refused(bench, at + (counts + 2) / 20e6, Rule.LOOK_AHEAD)
-    bench.axes[0].start_move(at + (counts + 1) / 20e6, 0.005)
-
-
 @pytest.mark.parametrize("left_over", [-90, 90])
 def test_look_ahead_counts_from_the_last_set_point(
     left_over: int,
@@ -57,15 +49,6 @@ def test_look_ahead_counts_from_the_last_set_point(
     bench.go(60)
     assert bench.state != "FAULT", bench.status.reason
     assert abs(bench.insertion.position) <= 100
-
-
-def test_look_ahead_drive_stops_without_new_set_points() -> None:
-    bench = DriveBench().moving()
-    last = bench.insertion.next_target
-    for _ in range(10):
-        # The computer fails while another device sends SYNC.
-        bench.insertion.sync()
-    assert bench.insertion.position == last
 
 
 def test_look_ahead_no_set_point_without_an_answer() -> None:
@@ -93,18 +76,6 @@ def test_following_error_uses_the_set_point_of_the_answer(
         bench.go()
         bench.bus.flush()
     assert bench.outcomes == ["succeeded"]
-
-
-def test_following_error_of_a_blocked_motor() -> None:
-    bench = DriveBench().moving()
-    bench.insertion.blocked = True
-    while bench.state == "MOVING":
-        bench.go()
-    assert bench.insertion.next_target - bench.insertion.position <= 0.7e-3 * 20e6
-    bench.failed("following_error", "mm off its set-point")
-    bench.insertion.blocked = False
-    # A released motor has no power.
-    bench.stopped("following_error", "mm off its set-point")
 
 
 def test_following_error_of_a_motor_released_after_the_stop() -> None:

@@ -163,23 +163,6 @@ def test_reply_age_silent_axis_is_a_fault_without_joints(which: str) -> None:
     assert bench.reset().success
 
 
-def test_no_motion_by_itself_on_configure_enable_reset() -> None:
-    bench = Bench().moving()
-    bench.insertion.fault = "stalled"
-    bench.go()
-    at = bench.positions
-    assert bench.state == "FAULT"
-    bench.insertion.orders.clear()
-    bench.rotation.orders.clear()
-    bench.hold(False)
-    assert bench.reset().success
-    assert bench.enable().success
-    bench.wait(5)
-    bench.go(20)
-    assert bench.positions == at
-    assert bench.insertion.orders == bench.rotation.orders == ["reset", "off", "on"]
-
-
 def test_disable_and_close_end_a_motion() -> None:
     bench = Bench().moving()
     assert bench.enable(False).message == "disabled"

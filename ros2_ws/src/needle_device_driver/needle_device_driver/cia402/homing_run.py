@@ -1,15 +1,11 @@
-"""Supervision of one drive: its speed, its homing, and its faults."""
+"""Homing of one drive."""
 
 from __future__ import annotations
 
 import enum
 
 from needle_device_driver.axes.axis_settings import HERE
-from needle_device_driver.axes.drives import Fault
-from needle_device_driver.axes.speed_monitor import SpeedMonitor
 from needle_device_driver.cia402.cia402 import (
-    FAULTS,
-    FOLLOWING_ERROR,
     HOMING_ATTAINED,
     HOMING_ERROR,
     TARGET_REACHED,
@@ -17,12 +13,9 @@ from needle_device_driver.cia402.cia402 import (
     Mode,
     drive_state,
 )
-from needle_device_driver.cia402.drive_machine import DriveMachine
-from needle_device_driver.cia402.drive_monitor import DriveMonitor, Feedback
+from needle_device_driver.cia402.drive_monitor import Feedback
 from needle_device_driver.cia402.drive_settings import INDEX_PULSE, DriveSettings
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.error_codes import HEARTBEAT_LOST, describe_error
-from needle_device_driver.rules import Rule
 
 # A drive may report that it attained the previous homing. If the new one ends within a cycle, where
 # the axis stands or at the edge of its switch, no change shows. So it counts as ended after this
@@ -119,50 +112,3 @@ class HomingRun:
                 f"moved {settings.text(distance)} away from the limit switch of homing method "
                 f"{settings.homing_method}: check the directions of motor and switches"
             )
-
-
-def drive_fault(  # noqa: PLR0911 - each return is a fault
-    monitor: DriveMonitor,
-    machine: DriveMachine,
-    speed: SpeedMonitor,
-    homing: HomingRun | None,
-    *,
-    actuated: bool,
-) -> Fault | None:
-    """Return the first fault of a drive, with its rule.
-
-    Parameters
-    ----------
-    monitor : DriveMonitor
-        Frames from the drive.
-    machine : DriveMachine
-        State of the drive.
-    speed : SpeedMonitor
-        Speed of its axis.
-    homing : HomingRun or None
-        A homing under way.
-    actuated : bool
-        Whether the drive has a motor; otherwise it may be in any state.
-    """
-    if speed.problem:
-        return Rule.AXIS_SPEED, speed.problem
-    if monitor.rebooted:
-        return Rule.DRIVE_REBOOT, "the drive rebooted; its home position is lost"
-    code = monitor.emergency
-    if code is not None:
-        rule = Rule.DRIVE_WATCHDOG if code == HEARTBEAT_LOST else Rule.DRIVE_EMERGENCY
-        return rule, f"the drive reports {describe_error(code)}"
-    state = machine.state
-    if actuated and state is not None and state in FAULTS:
-        return Rule.DRIVE_EMERGENCY, f"the drive is in {state.name}"
-    if monitor.left_operational:
-        return Rule.DRIVE_REBOOT, "the drive left the operational state"
-    if machine.problem:
-        return Rule.ONE_FAULT_STOPS_BOTH, f"the drive {machine.problem}"
-    if homing is not None and homing.problem:
-        failed = homing.step is HomingStep.FAILED
-        rule = Rule.ONE_FAULT_STOPS_BOTH if failed else Rule.HOMING_TIME
-        return rule, f"the drive {homing.problem}"
-    if machine.ready and machine.at.statusword & FOLLOWING_ERROR:
-        return Rule.FOLLOWING_ERROR, "the drive reports a following error"
-    return None
