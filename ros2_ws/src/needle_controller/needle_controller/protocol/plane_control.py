@@ -13,8 +13,7 @@ from needle_controller.filter.records import NEAR
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
-from needle_controller.model.point_reach import point_reachability
-from needle_controller.model.reachability import Reachability, reachability
+from needle_controller.model.reachability import Reachability, point_reachability, reachability
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate, Estimator
