@@ -101,7 +101,3 @@ def test_an_accurate_sensor_does_not_cause_overconfidence(
     end = steered(13, noise=noise, settings=settings, covariance=covariance, play_deg=play_deg)
     assert np.mean(np.abs(end[-20:]) <= 0.001) >= 0.995
     assert np.sqrt(np.mean(end[-20:] ** 2)) <= 0.00025
-
-
-def test_the_same_tips_give_the_same_commands() -> None:
-    np.testing.assert_array_equal(steered(12, count=8), steered(12, count=8))
