@@ -83,13 +83,9 @@ def _needle_reason(joints: JointSample, control: PlaneControl, settings: Steerin
             f"the needle is {joints.insertion:g} m in, on an unknown path: "
             f"withdraw it first (<= {settings.needle_out_insertion:g} m)"
         )
-    roll = control.start_roll(joints.rotation)
-    if abs(roll) > control.largest_start_roll:
-        return (
-            f"the needle's roll in target_plane is {roll:.3g} rad (rotation_joint "
-            f"{joints.rotation:.4g} rad), must be within {control.largest_start_roll:.3g} rad"
-        )
     try:
-        return control.reason_without_path(joints.rotation)
+        return control.reason_of_roll(joints.rotation) or control.reason_without_path(
+            joints.rotation
+        )
     except OwnPartError as error:
         return str(error)
