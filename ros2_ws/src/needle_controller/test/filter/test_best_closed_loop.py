@@ -17,11 +17,13 @@ from .needles import CURVATURE, STEP
 STARTS = GRIDS["random"](StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)), 1, 4)[:40]
 
 
-def steered(claimed: float, trouble: dict[str, Any], flips: int = 0, **claim: float) -> Array:
+def steered(
+    claimed: float, trouble: dict[str, Any], flips: int = 0, sigma_scale: float = 1.0
+) -> Array:
     """Return true x over the last 20 mm, shape (40, 20) [m]."""
     depths = tuple(np.linspace(0.0, 0.12, flips + 2)[1:-1].tolist())
     study = StudySettings(CURVATURE, 0.12, STEP, Disturbances(**trouble), seed=11)
-    controller = controller_factory("best", claimed, depths, **claim)
+    controller = controller_factory("best", claimed, depths, sigma_scale=sigma_scale)
     return np.asarray(run_study(STARTS, controller, study).x_last[:, -20:])
 
 

@@ -20,7 +20,7 @@ from needle_controller.observers.luenberger import (
 )
 from needle_controller.presets.presets import make_law, observer_settings
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
-from needle_sim.needle.plant import NeedlePlant
+from needle_sim.needle.plant import NeedlePlant, initial_pose
 
 SETTINGS = SteeringSettings(**PAPER_NOISE)
 CURVATURE = SETTINGS.curvature
@@ -39,14 +39,10 @@ def law(**changes: Any) -> LinearizingLaw:
     return made
 
 
-def poses(reduced: Array) -> Array:
-    reduced = np.asarray(reduced, dtype=float)
-    pose = np.zeros((*reduced.shape[:-1], 4, 4))
-    angles = np.concatenate([np.zeros_like(reduced[..., :1]), reduced[..., 1:]], axis=-1)
-    pose[..., :3, :3] = rotation_from_angles(angles)
-    pose[..., 0, 3] = reduced[..., 0]
-    pose[..., 3, 3] = 1.0
-    return pose
+def plant_at(x: float, pitch: float, roll: float) -> NeedlePlant:
+    pose = initial_pose(pitch, roll)
+    pose[0, 3] = x
+    return NeedlePlant(pose, curvature=CURVATURE)
 
 
 def true_reduced(plant: NeedlePlant) -> Array:
@@ -75,7 +71,7 @@ def test_starts_at_the_measurement_with_the_roll_of_the_base() -> None:
 
 def test_prediction_follows_the_plant_from_a_known_state() -> None:
     """Prediction alone against SE(3): its error is that of a constant v in a step."""
-    plant, one = NeedlePlant(poses(np.zeros(3)), curvature=CURVATURE), observer()
+    plant, one = plant_at(0.0, 0.0, 0.0), observer()
     one.reset(np.zeros(3), [0.0, 0.0])
     rng = default_rng(7)
     for _ in range(60):
@@ -89,8 +85,7 @@ def test_prediction_follows_the_plant_from_a_known_state() -> None:
 
 
 def test_converges_without_noise_to_the_whole_reduced_state() -> None:
-    start = np.array([-0.003, 0.05, 0.3])
-    plant, one, steer = NeedlePlant(poses(start), curvature=CURVATURE), observer(), law()
+    plant, one, steer = plant_at(-0.003, 0.05, 0.3), observer(), law()
     one.reset(plant.T_rig_tip[:3, 3], [0.0, 0.0])
     errors = []
     for _ in range(500):
@@ -207,10 +202,7 @@ def test_covariance_is_honest() -> None:
     for _ in range(count):
         pitch = rng.normal(0.0, SETTINGS.initial_pitch_std / 2)
         roll = rng.normal(0.0, SETTINGS.initial_roll_std / 2)
-        plant, one = (
-            NeedlePlant(poses(np.array([0.0, pitch, roll])), curvature=CURVATURE),
-            observer(),
-        )
+        plant, one = plant_at(0.0, pitch, roll), observer()
         one.reset(plant.T_rig_tip[:3, 3] + rng.uniform(-1e-3, 1e-3, 3), np.zeros(2))
         for _ in range(20):
             plant.advance(STEP, 0.0)
