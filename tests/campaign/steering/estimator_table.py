@@ -1,7 +1,6 @@
 """Table of estimators under all disturbances of `control_studies`.
 
 python -m campaign.steering.estimator_table --needles 10000 --table table.md --json now.json
-    --before before.json
 """
 
 from __future__ import annotations
@@ -13,11 +12,9 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from campaign.checks.control_studies import COMPARED, SEED, Study
 from campaign.steering.ekf_needles import EkfNeedles
@@ -130,28 +127,6 @@ def _bins(stated: Any, missed: Any) -> Bins:
     ]
 
 
-def agrees(needles: int, stated: float, misses: int) -> bool:
-    """Return whether the stated probability is in the 95 % interval of the share of misses.
-
-    Parameters
-    ----------
-    needles, misses : int
-        Of a bin.
-    stated : float
-        The mean of what they stated.
-    """
-    if needles == 0:
-        return True
-    found = stats.binomtest(misses, needles).proportion_ci(0.95)
-    return bool(found.low <= stated <= found.high)
-
-
-def disagreeing(bins: Bins) -> tuple[int, int]:
-    """Return how many bins with needles disagree, and how many there are."""
-    filled = [(n, stated / n, misses) for n, stated, misses in bins if n]
-    return sum(not agrees(*one) for one in filled), len(filled)
-
-
 def together(rows: Sequence[Row]) -> Bins:
     """Return the bins of some rows as one."""
     said = [row.bins for row in rows if row.bins]
@@ -180,8 +155,8 @@ def markdown(table: Table, estimators: Sequence[str]) -> str:
         f"Each cell: {', '.join(estimators)}; what is stated: {', '.join(states)}.",
         "",
         "| what happens | within 1 mm, % | RMS of the last 20 mm | x within 3 sigma, % | misses "
-        "| of them called, % | false alarms, % | bins that disagree | rotation, deg |",
-        "|" + " --- |" * 9,
+        "| of them called, % | false alarms, % | rotation, deg |",
+        "|" + " --- |" * 8,
     ]
     for key, rows in table.items():
         cells = (
@@ -191,7 +166,6 @@ def markdown(table: Table, estimators: Sequence[str]) -> str:
             _cell(rows, states, lambda row: str(row.misses)),
             _cell(rows, states, lambda row: _percent(row.called)),
             _cell(rows, states, lambda row: _percent(row.false_alarms)),
-            _cell(rows, states, lambda row: "{} of {}".format(*disagreeing(row.bins))),
             _cell(rows, estimators, lambda row: f"{row.rotation_deg:.0f}"),
         )
         lines.append(f"| {key} | {' | '.join(cells)} |")
@@ -199,20 +173,17 @@ def markdown(table: Table, estimators: Sequence[str]) -> str:
         "",
         "Stated probability of a miss, and the share of misses in all rows together:",
         "",
-        "| estimator | stated | needles | mean | missed | 95 % interval | agrees |",
-        "|" + " --- |" * 7,
+        "| estimator | stated | needles | mean | missed |",
+        "|" + " --- |" * 5,
     ]
     for name in states:
         bins = together([rows[name] for rows in table.values() if name in rows])
         for (low, high), (needles, stated, misses) in zip(pairwise(EDGES), bins, strict=True):
-            if needles == 0:
-                continue
-            found = stats.binomtest(misses, needles).proportion_ci(0.95)
-            lines.append(
-                f"| {name} | {low:g} to {high:g} | {needles} | {stated / needles:.4f} "
-                f"| {misses / needles:.4f} | {found.low:.4f} to {found.high:.4f} "
-                f"| {'yes' if agrees(needles, stated / needles, misses) else 'no'} |"
-            )
+            if needles:
+                lines.append(
+                    f"| {name} | {low:g} to {high:g} | {needles} | {stated / needles:.4f} "
+                    f"| {misses / needles:.4f} |"
+                )
     return "\n".join(lines) + "\n"
 
 
@@ -222,17 +193,6 @@ def _cell(rows: Mapping[str, Row], names: Sequence[str], text: Callable[[Row], s
 
 def _percent(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.1f}"
-
-
-def read(path: Path) -> Table:
-    """Return a table that `main` wrote as JSON; raises UserError."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return {
-            key: {name: Row(**row) for name, row in rows.items()} for key, rows in content.items()
-        }
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise UserError(f"cannot read {path}: {error}") from error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -247,20 +207,18 @@ def _run(words: Sequence[str]) -> int:
     add("--needles", default="10000", metavar="N", help="of each row (10000)")
     add("--only", default="", metavar="KEYS", help="rows, separated by commas (default: all)")
     add("--estimators", default=",".join(ESTIMATORS), metavar="NAMES", help="names (default: all)")
-    add("--before", type=Path, metavar="FILE", help="earlier --json; adds its best as `before`")
     add("--json", metavar="FILE", help="write all figures as JSON")
     add("--table", metavar="FILE", help="write the table as Markdown")
     given = parser.parse_args(words)
     needles = whole_number("--needles", given.needles, _STARTS, 1_000_000)
     json_file, table_file = output_file("--json", given.json), output_file("--table", given.table)
-    before = read(given.before) if given.before else {}
     estimators = given.estimators.split(",")
     keys = given.only.split(",") if given.only else list(COMPARED)
     if unknown := {*keys} - {*COMPARED} or {*estimators} - {*ESTIMATORS}:
         raise UserError(f"no such row or estimator: {', '.join(sorted(unknown))}")
     table: Table = {}
     for key in keys:
-        table[key] = {"before": before[key]["best"]} if key in before else {}
+        table[key] = {}
         for name in estimators:
             # The paper's law cannot flip, and is unstable with steps of 2 mm.
             if name == "paper" and {"--flips", "--step-mm"} & set(COMPARED[key].options):
@@ -275,7 +233,7 @@ def _run(words: Sequence[str]) -> int:
         if json_file is not None:
             # Write after each row, so that an interruption loses one row only.
             json_file.write_text(json.dumps(table, default=dataclasses.asdict), encoding="utf-8")
-    text = markdown(table, ["before", *estimators] if before else estimators)
+    text = markdown(table, estimators)
     print(text)
     if table_file is not None:
         table_file.write_text(text, encoding="utf-8")

@@ -10,8 +10,7 @@ import itertools
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -39,15 +38,9 @@ Drive = Callable[[FloatArray, JointSample], SteeringCommand | None]
 LABELS = {
     "scenes": "scenes",
     "solvable": "solvable with 90 % of the curvature, 0.75 mm clear",
-    "solvable_taken": "  taken on",
     "solvable_reached": "  reached within 1 mm, of those solvable",
-    "roomy": "solvable with 85 % of the curvature, 1.25 mm clear",
-    "roomy_reached": "  reached within 1 mm, of those",
     "unsolvable": "no way found with all the curvature, 0.35 mm clear",
     "unsolvable_refused": "  refused before insertion, of those",
-    "taken": "taken on of all",
-    "reached_of_taken": "  reached within 1 mm, of those",
-    "stopped": "  stopped on the way",
     "contacts": "needles that touched an obstacle",
     "update_p95_ms": "estimate, plan and law, 95 % [ms of one core]",
 }
@@ -59,11 +52,11 @@ class SceneOutcome:
 
     Attributes
     ----------
-    bare, solvable, roomy : bool
-        Whether the search finds a path with all, 90 % or 85 % of the curvature, 0.35, 0.75 or
-        1.25 mm clear of everything.
-    taken, stopped : bool
-        Whether the controller started, and whether it stopped for lack of a path.
+    bare, solvable : bool
+        Whether the search finds a path with all or 90 % of the curvature, 0.35 or 0.75 mm clear of
+        everything.
+    taken : bool
+        Whether the controller started.
     miss : float
         True distance from the target at the end [m]; inf if it did not start.
     least : float
@@ -72,16 +65,14 @@ class SceneOutcome:
 
     bare: bool
     solvable: bool
-    roomy: bool
     taken: bool = False
-    stopped: bool = False
     miss: float = math.inf
     least: float = math.inf
 
 
 def solvability(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcome:
     """Return whether a scene has a path, as the outcome of a needle that was not started."""
-    bare, solvable, roomy = (
+    bare, solvable = (
         find_path(
             scene.target,
             scene.obstacles,
@@ -92,9 +83,9 @@ def solvability(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcom
             1,
         )
         >= 0
-        for share, clear in ((1.0, NEEDLE_RADIUS), (0.9, 0.00075), (0.85, 0.00125))
+        for share, clear in ((1.0, NEEDLE_RADIUS), (0.9, 0.00075))
     )
-    return SceneOutcome(bare, solvable, roomy)
+    return SceneOutcome(bare, solvable)
 
 
 def steer(
@@ -133,9 +124,7 @@ def steer(
             step = next_step(k, joints, command, settings, slowly=False)
         if step is None:
             miss = float(np.linalg.norm(_tip(plant) - scene.target))
-            return dataclasses.replace(
-                solved, taken=True, stopped=command is None, miss=miss, least=least
-            )
+            return dataclasses.replace(solved, taken=True, miss=miss, least=least)
         length, turn = step.insertion - joints.insertion, step.rotation - joints.rotation
         for _ in range(_SUBSTEPS):
             plant.advance(length / _SUBSTEPS, turn / _SUBSTEPS)
@@ -210,27 +199,19 @@ def figures(outcomes: Sequence[SceneOutcome], times: Sequence[float]) -> dict[st
         return one.miss <= 1e-3
 
     solvable = [one for one in outcomes if one.solvable]
-    roomy = [one for one in outcomes if one.roomy]
     # The search misses some paths: a scene whose needle arrived is solvable.
     unsolvable = [
         one
         for one in outcomes
-        if not (one.bare or one.solvable or one.roomy or (reached(one) and one.least >= 0.0))
+        if not (one.bare or one.solvable or (reached(one) and one.least >= 0.0))
     ]
-    taken = [one for one in outcomes if one.taken]
     return {
         "scenes": len(outcomes),
         "solvable": len(solvable),
-        "solvable_taken": share(solvable, lambda one: one.taken),
         "solvable_reached": share(solvable, reached),
-        "roomy": len(roomy),
-        "roomy_reached": share(roomy, reached),
         "unsolvable": len(unsolvable),
         "unsolvable_refused": share(unsolvable, lambda one: not one.taken),
-        "taken": len(taken),
-        "reached_of_taken": share(taken, reached),
-        "stopped": sum(one.stopped for one in taken),
-        "contacts": sum(one.least < 0.0 for one in taken),
+        "contacts": sum(one.least < 0.0 for one in outcomes),
         "update_p95_ms": 1e3 * float(np.percentile(times, 95.0)) if times else None,
     }
 
@@ -250,7 +231,12 @@ def _run(words: Sequence[str]) -> int:
         ("--told-deg", "2", "S", "standard deviation of the pitch that the controller assumes"),
         ("--noise-mm", "1", "A", "maximum error of each coordinate, known to the controller"),
     )
-    parser = study_parser("obstacle_study", "Steer needles around generated obstacles.", options)
+    parser = CommandParser("obstacle_study", "Steer needles around generated obstacles.", "")
+    for option, default, metavar, text in options:
+        parser.add_argument(
+            option, default=default, metavar=metavar, help=f"{text} (default: {default})"
+        )
+    parser.add_argument("--json", metavar="FILE", help="also write the figures as flat JSON")
     given = parser.parse_args(words)
     path = output_file("--json", given.json)
     seen = study(
@@ -261,32 +247,12 @@ def _run(words: Sequence[str]) -> int:
         entry_angle_std=math.radians(number("--told-deg", given.told_deg, 0.1, 45.0, "deg")),
         noise=number("--noise-mm", given.noise_mm, 0.01, 10.0, "mm") * 1e-3,
     )
-    print_figures(LABELS, seen, path)
-    return EXIT_DONE
-
-
-def study_parser(
-    name: str, what: str, options: Sequence[tuple[str, str, str, str]]
-) -> CommandParser:
-    """Return a study's parser: options as (name, default, metavar, help), and --json."""
-    parser = CommandParser(name, what, "")
-    for option, default, metavar, text in options:
-        parser.add_argument(
-            option, default=default, metavar=metavar, help=f"{text} (default: {default})"
-        )
-    parser.add_argument("--json", metavar="FILE", help="also write the figures as flat JSON")
-    return parser
-
-
-def print_figures(
-    labels: Mapping[str, str], seen: Mapping[str, float | None], path: Path | None
-) -> None:
-    """Print a study's figures, and write them where --json says."""
-    for name, label in labels.items():
+    for name, label in LABELS.items():
         value = seen[name]
         print(f"{label:55s}", "-" if value is None else f"{value:.4g}")
     if path is not None:
         write_json(path, {**seen})
+    return EXIT_DONE
 
 
 def _tip(plant: NeedlePlant) -> FloatArray:

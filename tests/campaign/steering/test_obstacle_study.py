@@ -41,8 +41,8 @@ def test_a_scene_is_what_its_key_says_and_lies_within_its_bounds() -> None:
 
 
 def test_the_judge_finds_a_way_where_there_is_one_and_none_through_a_wall() -> None:
-    assert solvability(FREE, SETTINGS) == SceneOutcome(True, True, True)
-    assert solvability(WALLED, SETTINGS) == SceneOutcome(False, False, False)
+    assert solvability(FREE, SETTINGS) == SceneOutcome(True, True)
+    assert solvability(WALLED, SETTINGS) == SceneOutcome(False, False)
     # Farther to the side than the needle bends, by a millimetre: (1 - cos) of an arc of 122 mm.
     angle = math.asin(0.08 * CURVATURE)
     aside = (1.0 - math.cos(angle)) / CURVATURE + 0.001

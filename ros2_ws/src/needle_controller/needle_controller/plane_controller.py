@@ -13,8 +13,7 @@ import numpy as np
 from needle_controller.controller_status import ReceptionLog, controller_status
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes, rotation_from_quaternion
-from needle_controller.model.point_reach import point_from_message
-from needle_controller.model.target_plane import RIG, plane_from_pose
+from needle_controller.model.target_plane import RIG, plane_from_pose, point_from_message
 from needle_controller.observers.estimator import Estimate
 from needle_controller.planning.obstacles import obstacles_from_markers
 from needle_controller.presets.steering_settings import SteeringSettings

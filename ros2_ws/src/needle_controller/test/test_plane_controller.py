@@ -167,14 +167,6 @@ def test_each_reason_to_reject_a_tip_is_logged_once_in_two_seconds() -> None:
     assert bench.status.state == "WAITING_FOR_TIP"
 
 
-def test_a_lasting_reason_is_logged_every_two_seconds() -> None:
-    bench = Bench().started()
-    for _ in range(5):
-        bench.tip(float("nan"))
-        bench.later += 1.0
-    assert sum("not finite" in line for line in bench.logs) == 3
-
-
 def test_the_covariance_of_a_tip_pose_is_used() -> None:
     pose = m.PoseWithCovariance(5, "rig", (0.0, 0.0, 0.0), STRAIGHT, tuple(map(float, range(36))))
     known = tip_covariance(pose)

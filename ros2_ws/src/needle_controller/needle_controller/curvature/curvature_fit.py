@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +33,6 @@ from needle_controller.curvature.insertion_arc import (
 )
 from needle_controller.model.arrays import Array
 from needle_core.errors import UserError
-from needle_core.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
 
 FEWEST_TIPS = 8
 SHORTEST_ARC = 0.01
@@ -80,21 +78,13 @@ class CurvatureFitSettings:
     """
 
     heading: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    heading_std: Annotated[float, Bounds(ABOVE_0, math.inf, "rad", unlimited=True)] = _HEADING_STD
+    heading_std: float = _HEADING_STD
     entry: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    entry_std: Annotated[float, Bounds(ABOVE_0, math.inf, "m", unlimited=True)] = 0.0005
-    measurement_std: Annotated[float | None, Bounds(ABOVE_0, math.inf, "m", unlimited=True)] = None
-    outlier_limit: Annotated[float, Bounds(ABOVE_0, math.inf, "-", unlimited=True)] = 4.0
-    slip_std: Annotated[float, Bounds(ABOVE_0, 1.0, "-")] = 0.1
-    repeating_error: Annotated[float, Bounds(0.0, math.inf, "m")] = 0.0
-
-    def __post_init__(self) -> None:
-        """Check every field; raises OutOfBoundsError or UserError with the value."""
-        check_bounded_fields(self)
-        if not abs(float(np.linalg.norm(self.heading)) - 1.0) < 1e-6:
-            raise UserError(f"heading = {self.heading} is not a unit vector")
-        if not np.all(np.isfinite(self.entry)):
-            raise UserError(f"entry = {self.entry} is not finite")
+    entry_std: float = 0.0005
+    measurement_std: float | None = None
+    outlier_limit: float = 4.0
+    slip_std: float = 0.1
+    repeating_error: float = 0.0
 
     def precision(self) -> Array:
         """Return the priors of `CurvatureFit.unknowns` as inverse variances, (8,)."""

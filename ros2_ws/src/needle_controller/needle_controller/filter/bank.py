@@ -37,8 +37,16 @@ MERGE_EVERY = 8
 AGE_TOLERANCE = 1e-9
 UNKNOWN_POSITION_STD = 0.02
 """Standard deviation of the position of a needle that starts without a tip [m]."""
+_LONGEST_STEP = 0.002
+"""Longer advances are divided [m]."""
+_ENTRY_STD = 0.0005
+"""Standard deviation of the tip's position along the needle with the stage at 0 [m]."""
+_SMALLEST_WEIGHT = 1.0 / 1000.0
+"""A hypothesis with a smaller weight, relative to the likeliest one, is removed."""
 _NEWEST_SHARE = 0.1
 _SURVIVORS_PER_JUMP = 4
+_JUMP_TURN_VARIANCE = math.radians(2.0) ** 2
+"""Of the rotation in a displacement of phantom or tracker [rad^2]."""
 
 
 @compiled
@@ -155,7 +163,7 @@ def _advance_all(
 ) -> None:
     """Advance all hypotheses by a motion of the base."""
     gain = np.empty((6, 6))
-    parts = max(1, math.ceil(max(length / assumed.longest_step, abs(turn) / LARGEST_TURN) - 1e-9))
+    parts = max(1, math.ceil(max(length / _LONGEST_STEP, abs(turn) / LARGEST_TURN) - 1e-9))
     for n in range(needle.count):
         for part in range(parts):
             base = needle.base + part * turn / parts
@@ -279,7 +287,7 @@ def _estimated_age(needle: Any, events: Records, assumed: Any) -> float:
             ways[k, i] = event.tip[i] - needle.start[i] if event.is_tip else math.nan
     too_deep, entry_std = 0.0, math.inf
     if needle.has_entry and needle.start_insertion <= FIRST:
-        too_deep, entry_std = -needle.start_insertion, assumed.entry_std
+        too_deep, entry_std = -needle.start_insertion, _ENTRY_STD
         for i in range(3):
             too_deep += (needle.start[i] - needle.entry[i]) * needle.initial_rotation[i, 2]
     return hidden_age(
@@ -320,7 +328,7 @@ def _apply_tip(
             hypotheses[n].evidence *= seen
         _reweight(needle, hypotheses, reading, assumed)
     if needle.tips % MERGE_EVERY == 0:
-        merge(needle, hypotheses, assumed.merge_angle)
+        merge(needle, hypotheses)
 
 
 @compiled
@@ -338,7 +346,7 @@ def _reweight(needle: Any, hypotheses: Records, reading: Reading, assumed: Any) 
     kept = 0
     for n in range(needle.count):
         weight = hypotheses[n].weight / largest
-        if weight > assumed.smallest_weight:
+        if weight > _SMALLEST_WEIGHT:
             if kept != n:
                 copy_hypothesis(hypotheses, n, hypotheses, kept)
             hypotheses[kept].weight = weight
@@ -360,7 +368,7 @@ def _add_jump_hypotheses(needle: Any, hypotheses: Records, reading: Reading, ass
     survivors = needle.count
     room = min(hypotheses.size - survivors, 1 + survivors // _SURVIVORS_PER_JUMP)
     for _ in range(room):
-        likeliest, most = -1, assumed.smallest_weight
+        likeliest, most = -1, _SMALLEST_WEIGHT
         for n in range(survivors):
             weight = assumed.jump_share * hypotheses[n].weight * hypotheses[n].outlier
             if weight > most:
@@ -377,4 +385,4 @@ def _add_jump_hypotheses(needle: Any, hypotheses: Records, reading: Reading, ass
             h.position[i], h.residual[i] = reading.tip[i], 0.0
             for j in range(ERROR):
                 h.covariance[i, j] = h.covariance[j, i] = reading.covariance[i, j] if j < 3 else 0.0
-            h.covariance[E_TURN + i, E_TURN + i] += assumed.jump_turn_variance
+            h.covariance[E_TURN + i, E_TURN + i] += _JUMP_TURN_VARIANCE

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Annotated, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -20,16 +20,13 @@ from needle_controller.filter.records import (
 )
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
-from needle_core.errors import UserError
-from needle_core.settings.bounds import Bounds, check_bounded_fields
 
 # Read by compiled code.
 PLAY, LAG, GAIN = range(3)
 """Parameters of a torsion, of which each hypothesis estimates one."""
 
 
-@dataclasses.dataclass(frozen=True)
-class TorsionHypothesis:
+class TorsionHypothesis(NamedTuple):
     """Model of how the tip's roll follows the base; one parameter is estimated.
 
     Attributes
@@ -49,16 +46,12 @@ class TorsionHypothesis:
         that turns by itself [rad/sqrt(m)].
     """
 
-    play: Annotated[float, Bounds(0.0, math.pi, "rad")]
-    lag_length: Annotated[float, Bounds(0.0, 0.1, "m")]
-    parameter_std: Annotated[float, Bounds(0.0, math.pi, "m or rad")]
-    weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
-    heading_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.05
-    roll_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.05
-
-    def __post_init__(self) -> None:
-        """Check every field; raises OutOfBoundsError."""
-        check_bounded_fields(self)
+    play: float
+    lag_length: float
+    parameter_std: float
+    weight: float
+    heading_drift: float = 0.05
+    roll_drift: float = 0.05
 
     @property
     def kind(self) -> int:
@@ -68,8 +61,7 @@ class TorsionHypothesis:
         return PLAY if self.play > 0.0 else GAIN
 
 
-@dataclasses.dataclass(frozen=True)
-class RollHypothesis:
+class RollHypothesis(NamedTuple):
     """Possible roll of the tip at the entry, relative to the base.
 
     Attributes
@@ -82,13 +74,9 @@ class RollHypothesis:
         Prior weight, relative to the others'.
     """
 
-    roll: Annotated[float, Bounds(-math.pi, math.pi, "rad")]
-    std: Annotated[float, Bounds(1e-6, math.pi, "rad")]
-    weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
-
-    def __post_init__(self) -> None:
-        """Check every field; raises OutOfBoundsError."""
-        check_bounded_fields(self)
+    roll: float
+    std: float
+    weight: float
 
 
 # Read by compiled code.
@@ -97,8 +85,7 @@ NORMAL, UNIFORM, CORRELATED = range(3)
 between tips; or normal with a size for each coordinate and correlated between tips."""
 
 
-@dataclasses.dataclass(frozen=True)
-class NoiseHypothesis:
+class NoiseHypothesis(NamedTuple):
     """Possible noise of a measured coordinate, relative to the claimed noise.
 
     Attributes
@@ -120,22 +107,8 @@ class NoiseHypothesis:
     shape: int
     multiples: tuple[float, ...]
     shares: tuple[float, ...]
-    weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
+    weight: float
     correlations: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        """Check every field; raises UserError."""
-        check_bounded_fields(self)
-        text = f"multiples = {self.multiples}, shares = {self.shares}"
-        if not 0 < len(self.multiples) == len(self.shares) <= NOISES:
-            raise UserError(f"{text}: expected 1 to {NOISES} of each")
-        if min(self.multiples + self.shares) <= 0.0 or abs(sum(self.shares) - 1.0) > 1e-9:
-            raise UserError(f"{text}: expected multiples > 0, and shares > 0 whose sum is 1")
-        wanted = len(self.multiples) if self.shape == CORRELATED else 0
-        if len(self.correlations) != wanted or not all(
-            0.0 <= each < 1.0 for each in self.correlations
-        ):
-            raise UserError(f"correlations = {self.correlations}, needs {wanted} numbers in [0, 1)")
 
 
 TORSION_HYPOTHESES = (
@@ -178,6 +151,9 @@ BOUNDED_NOISE = (
 """For a claimed bound: most likely it holds; otherwise a larger one, or none. Without hypotheses of
 small normal noise, small errors would look like correlated ones."""
 
+_CURVATURE_SPREAD = 0.22
+"""Initial standard deviation of the curvature, relative to it."""
+
 
 @dataclasses.dataclass(frozen=True)
 class FilterSettings:
@@ -187,8 +163,6 @@ class FilterSettings:
     ----------
     curvature : float
         Curvature of the needle's path, kappa [1/m].
-    curvature_spread : float
-        Initial standard deviation of the curvature, relative to it.
     curvature_range : tuple of float
         Smallest and largest estimated curvature, relative to `curvature`.
     curvature_drift : float
@@ -202,9 +176,6 @@ class FilterSettings:
         Claimed largest error of a measured coordinate of tips without covariance [m].
     outlier_share : float
         Share of tips that are outliers.
-    outlier_reach : float
-        Size of the region of outliers, relative to the claimed bound (to sqrt(3) standard
-        deviations).
     model_error : float
         Error of the model's tip position [m]. Its square is added to a tip's covariance, and a
         bound is at least twice as large: with a more accurate sensor, a filter that is linear in
@@ -212,72 +183,30 @@ class FilterSettings:
     jump_share : float
         Probability that an apparent outlier is a displacement of phantom or tracker, relative to
         that of an outlier.
-    jump_turn_std : float
-        Standard deviation of the rotation in such a displacement [rad].
     initial_angle_std : float
         Standard deviation of pitch and yaw at the entry [rad].
-    entry_std : float
-        Standard deviation of the tip's position along the needle with the stage at 0 [m].
     play_drift, lag_drift : float
         Growth of the standard deviations of play [rad/sqrt(m)] and lag length [sqrt(m)] over a
         metre if they are estimated, which allows for effects beyond the model.
-    prune_ratio : float
-        A hypothesis that is less likely than the likeliest one by this factor is removed.
-    merge_angle : float
-        Hypotheses of the same torsion whose rolls differ by less are merged [rad].
-    longest_step : float
-        Longer advances are divided [m].
-    play_limit : float
-        Largest estimated play [rad].
-    lag_range : tuple of float
-        Smallest and largest estimated lag length [m].
     torsion_hypotheses, roll_hypotheses, noise_hypotheses : tuple
         All combinations are tried; at most one noise hypothesis of each shape.
     """
 
-    curvature: Annotated[float, Bounds(0.1, 100.0, "1/m")] = 1.0 / 0.122
-    curvature_spread: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.22
+    curvature: float = 1.0 / 0.122
     curvature_range: tuple[float, float] = (0.2, 1.6)
-    curvature_drift: Annotated[float, Bounds(0.0, 100.0, "1/sqrt(m)")] = 0.02 * math.sqrt(1000.0)
-    scale_spread: Annotated[float, Bounds(0.0, 0.3, "-")] = 0.04
-    scale_drift: Annotated[float, Bounds(0.0, 10.0, "1/sqrt(m)")] = 0.01
-    tip_noise_bound: Annotated[float, Bounds(1e-6, 0.1, "m")] = 0.001
-    outlier_share: Annotated[float, Bounds(1e-6, 0.5, "-")] = 0.1
-    outlier_reach: Annotated[float, Bounds(1.0, 1000.0, "-")] = 4.0
-    model_error: Annotated[float, Bounds(0.0, 0.1, "m")] = 0.0001
-    jump_share: Annotated[float, Bounds(1e-6, 1.0, "-")] = 0.2
-    jump_turn_std: Annotated[float, Bounds(0.0, 1.0, "rad")] = math.radians(2.0)
-    initial_angle_std: Annotated[float, Bounds(1e-6, math.pi, "rad")] = math.radians(8.0)
-    entry_std: Annotated[float, Bounds(1e-6, 0.1, "m")] = 0.0005
-    play_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.2
-    lag_drift: Annotated[float, Bounds(0.0, 1.0, "sqrt(m)")] = 0.003
-    prune_ratio: Annotated[float, Bounds(1.0, 1e30, "-")] = 1000.0
-    merge_angle: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.35
-    longest_step: Annotated[float, Bounds(1e-5, 1.0, "m")] = 0.002
-    play_limit: Annotated[float, Bounds(0.0, math.pi, "rad")] = 1.0
-    lag_range: tuple[float, float] = (0.001, 0.016)
+    curvature_drift: float = 0.02 * math.sqrt(1000.0)
+    scale_spread: float = 0.04
+    scale_drift: float = 0.01
+    tip_noise_bound: float = 0.001
+    outlier_share: float = 0.1
+    model_error: float = 0.0001
+    jump_share: float = 0.2
+    initial_angle_std: float = math.radians(8.0)
+    play_drift: float = 0.2
+    lag_drift: float = 0.003
     torsion_hypotheses: tuple[TorsionHypothesis, ...] = TORSION_HYPOTHESES
     roll_hypotheses: tuple[RollHypothesis, ...] = ROLL_HYPOTHESES
     noise_hypotheses: tuple[NoiseHypothesis, ...] = BOUNDED_NOISE
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises
-        ------
-        UserError
-            A value out of bounds, an invalid range, or no hypotheses.
-        """
-        check_bounded_fields(self)
-        for name, (least, most) in (
-            ("curvature_range", self.curvature_range),
-            ("lag_range", self.lag_range),
-        ):
-            if not (0.0 < least <= most < math.inf):
-                raise UserError(f"{name} = ({least:g}, {most:g}), expected 0 < least <= most")
-        for name in ("torsion_hypotheses", "roll_hypotheses", "noise_hypotheses"):
-            if not getattr(self, name):
-                raise UserError(f"{name} = (), expected at least one")
 
     @property
     def effective_bound(self) -> float:
@@ -295,19 +224,10 @@ class FilterSettings:
         assumed["scale_spread"] = self.scale_spread
         assumed["scale_drift"] = self.scale_drift**2
         assumed["torsion_drift"] = self.play_drift**2, self.lag_drift**2, 0.0
-        assumed["largest_play"] = self.play_limit
-        assumed["smallest_lag"] = self.lag_range[0]
-        assumed["largest_lag"] = self.lag_range[1]
-        assumed["longest_step"] = self.longest_step
         assumed["effective_bound"] = self.effective_bound
-        assumed["entry_std"] = self.entry_std
         assumed["model_error"] = self.model_error**2
         assumed["outlier_share"] = self.outlier_share
-        assumed["outlier_density"] = self.outlier_reach**-3
         assumed["jump_share"] = self.jump_share
-        assumed["jump_turn_variance"] = self.jump_turn_std**2
-        assumed["smallest_weight"] = 1.0 / self.prune_ratio
-        assumed["merge_angle"] = self.merge_angle
         return cast(np.void, assumed)
 
     def noises(self) -> Array:
@@ -342,7 +262,7 @@ class FilterSettings:
             for k in range(2):
                 covariance[E_TURN + k, E_TURN + k] = self.initial_angle_std**2
             covariance[E_TURN + 2, E_TURN + 2] = roll.std**2
-            covariance[E_KAPPA, E_KAPPA] = (self.curvature_spread * self.curvature) ** 2
+            covariance[E_KAPPA, E_KAPPA] = (_CURVATURE_SPREAD * self.curvature) ** 2
             covariance[E_TORSION, E_TORSION] = torsion.parameter_std**2
             covariance[E_SCALE, E_SCALE] = self.scale_spread**2
         prior["weight"] /= np.max(prior["weight"])

@@ -10,7 +10,13 @@ import math
 from typing import Any
 
 from needle_controller.filter.records import E_TURN, ERROR
-from needle_controller.filter.tip_update import DENSITY, Workspace, apply_change, reduce_covariance
+from needle_controller.filter.tip_update import (
+    DENSITY,
+    OUTLIER_DENSITY,
+    Workspace,
+    apply_change,
+    reduce_covariance,
+)
 from needle_controller.model.arrays import Array
 from needle_core.compiled import compiled
 
@@ -36,7 +42,7 @@ def update_by_heading(h: Any, heading: Array, assumed: Any, work: Workspace) -> 
         Working memory.
     """
     p, r, c, change = h.covariance, h.rotation, work.cross_covariance, work.change
-    variance, likelihood, spread = heading[3], 1.0, assumed.outlier_density ** (2.0 / 3.0)
+    variance, likelihood, spread = heading[3], 1.0, OUTLIER_DENSITY ** (2.0 / 3.0)
     work.change[:], work.reduction[:], c[:] = 0.0, 0.0, 0.0
     # m in the axes of the tip: v = angle (d x m) / |d x m|, its components along x and y
     x = r[0, 0] * heading[0] + r[1, 0] * heading[1] + r[2, 0] * heading[2]

@@ -36,7 +36,7 @@ class HypothesisFilter:
         identity by default.
     entry : array_like, shape (3,), optional
         Entry point in `target_plane` [m]: position of the tip with the stage at 0, along the needle
-        to within `FilterSettings.entry_std`; unknown by default.
+        to within 0.5 mm; unknown by default.
     """
 
     def __init__(

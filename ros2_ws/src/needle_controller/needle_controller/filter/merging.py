@@ -15,6 +15,9 @@ from needle_core.compiled import compiled
 
 Records = npt.NDArray[np.void]
 
+_SAME_ANGLE = 0.35
+"""Largest difference of rolls that count as equal [rad]."""
+_SAME_COSINE = math.cos(_SAME_ANGLE)
 _SAME_LAG = 0.001
 _SAME_GAIN = 0.1
 _NUMBERS = HYPOTHESIS.itemsize // 8
@@ -30,21 +33,19 @@ def copy_hypothesis(source: Records, n: int, target: Records, m: int) -> None:
 
 
 @compiled
-def merge(needle: Any, hypotheses: Records, angle: float) -> None:
+def merge(needle: Any, hypotheses: Records) -> None:
     """Merge equal hypotheses of the same torsion and noise.
 
     Parameters
     ----------
     needle, hypotheses : NEEDLE, ndarray of HYPOTHESIS, changed
         See `start_needle`.
-    angle : float
-        Angle between rolls that count as equal [rad].
     """
-    difference, cosine = np.empty(ERROR), math.cos(angle)
+    difference = np.empty(ERROR)
     for first in range(needle.count):
         for second in range(first + 1, needle.count):
             a, b = hypotheses[first], hypotheses[second]
-            if a.weight > 0.0 and b.weight > 0.0 and _are_same(a, b, angle, cosine):
+            if a.weight > 0.0 and b.weight > 0.0 and _are_same(a, b):
                 _join(a, b, difference)
     kept = 0
     for n in range(needle.count):
@@ -56,16 +57,16 @@ def merge(needle: Any, hypotheses: Records, angle: float) -> None:
 
 
 @compiled
-def _are_same(a: Any, b: Any, angle: float, cosine: float) -> bool:
+def _are_same(a: Any, b: Any) -> bool:
     """Return whether rolls, pitches and torsion parameters of two hypotheses are close."""
     if a.torsion != b.torsion or a.shape != b.shape:
         return False
     p, q = a.rotation, b.rotation
     along = p[0, 0] * q[0, 0] + p[0, 1] * q[0, 1] + p[0, 2] * q[0, 2]
     return bool(
-        along > cosine
-        and abs(p[0, 2] - q[0, 2]) < 0.25 * angle
-        and abs(a.play - b.play) < 0.5 * angle
+        along > _SAME_COSINE
+        and abs(p[0, 2] - q[0, 2]) < 0.25 * _SAME_ANGLE
+        and abs(a.play - b.play) < 0.5 * _SAME_ANGLE
         and abs(a.lag - b.lag) < _SAME_LAG
         and abs(a.gain - b.gain) < _SAME_GAIN
         # Otherwise one of them has jumped.

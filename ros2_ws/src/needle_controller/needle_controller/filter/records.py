@@ -123,19 +123,10 @@ ASSUMPTIONS = np.dtype(
         ("scale_spread", np.float64),
         ("scale_drift", np.float64),
         ("torsion_drift", np.float64, 3),  # of play, lag and gain
-        ("largest_play", np.float64),
-        ("smallest_lag", np.float64),
-        ("largest_lag", np.float64),
-        ("longest_step", np.float64),
         ("effective_bound", np.float64),
-        ("entry_std", np.float64),
         ("model_error", np.float64),
         ("outlier_share", np.float64),
-        ("outlier_density", np.float64),
         ("jump_share", np.float64),
-        ("jump_turn_variance", np.float64),
-        ("smallest_weight", np.float64),
-        ("merge_angle", np.float64),
     ]
 )
 """`FilterSettings` for compiled code; standard deviations and drifts are squared if only their

@@ -37,6 +37,10 @@ SMALLEST_VARIANCE = 1e-18
 """Smallest variance of a measured coordinate [m^2], which avoids a division by 0."""
 _SMALLEST_SHARE = 0.02
 _SMALLEST_GAIN, _LARGEST_GAIN = 0.3, 1.5
+_LARGEST_PLAY = 1.0
+_SMALLEST_LAG, _LARGEST_LAG = 0.001, 0.016
+OUTLIER_DENSITY = 4.0**-3
+"""Outliers are spread over four times the claimed bound (sqrt(3) standard deviations)."""
 _NO_MASS = 1e-30
 _GIVEN_UP = 1e-3
 _REOPENED = 0.2
@@ -133,7 +137,7 @@ def update_hypothesis(h: Any, reading: Reading, assumed: Any, work: Workspace) -
     for i in range(3):
         for m in range(NOISES):
             work.shares[i, m] = h.noise_weights[i, m]
-    likelihood, spread = 1.0, assumed.outlier_density
+    likelihood, spread = 1.0, OUTLIER_DENSITY
     for i in range(3):
         innovation, variance = _innovation(h, reading, i, work)
         bound = reading.bounds[i]
@@ -342,11 +346,11 @@ def apply_change(h: Any, outlier: float, assumed: Any, work: Workspace) -> None:
         h.tip_angle += h.dtip_dtorsion * (gain - h.gain)
         h.gain, h.behind_play = gain, h.tip_angle
     elif change[E_TORSION] != 0.0 and h.torsion_kind == LAG:
-        lag = min(max(h.lag + change[E_TORSION], assumed.smallest_lag), assumed.largest_lag)
+        lag = min(max(h.lag + change[E_TORSION], _SMALLEST_LAG), _LARGEST_LAG)
         h.tip_angle += h.dtip_dtorsion * (lag - h.lag)
         h.lag = lag
     elif change[E_TORSION] != 0.0:
-        play = min(max(h.play + change[E_TORSION], 0.0), assumed.largest_play)
+        play = min(max(h.play + change[E_TORSION], 0.0), _LARGEST_PLAY)
         h.tip_angle += h.dtip_dtorsion * (play - h.play)
         h.play, h.behind_play = play, h.tip_angle
     rotate(h.rotation, change[E_TURN], change[E_TURN + 1], change[E_TURN + 2])

@@ -8,7 +8,6 @@ image-guided control for planar needle steering, BioRob 2008), while the law kee
 from __future__ import annotations
 
 import dataclasses
-import math
 
 from needle_core.errors import OutOfBoundsError, UserError
 
@@ -21,30 +20,23 @@ class FlipPlan:
     ----------
     depths : tuple of float
         Increasing, above 0 [m]; none by default.
-    first_sign : float
-        Sign of cos(roll) before the first flip, +1 or -1.
 
     Raises
     ------
     UserError
-        Depths that are not finite, not above 0 or not increasing.
+        Depths that are not above 0 or not increasing.
     """
 
     depths: tuple[float, ...] = ()
-    first_sign: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the depths."""
         before = 0.0
         for number, depth in enumerate(self.depths, start=1):
-            if not math.isfinite(depth):
-                raise UserError(f"flip {number} at {depth:g} m is not finite")
             if depth <= before:
                 bound = f"> {before:g} m" + (", the flip before it" if number > 1 else "")
                 raise UserError(f"flip {number} at {depth:g} m, expected {bound}")
             before = depth
-        if self.first_sign not in (1.0, -1.0):
-            raise UserError(f"first_sign = {self.first_sign:g}, expected 1 or -1")
 
     def check_within(self, depth: float) -> None:
         """Check that every flip comes before the needle's end.
@@ -72,7 +64,7 @@ class FlipPlan:
             Insertion depth [m]; at a flip's own depth the sign is that after it, to 1 um.
         """
         done = sum(depth <= insertion + DEPTH_TOLERANCE for depth in self.depths)
-        return self.first_sign if done % 2 == 0 else -self.first_sign
+        return 1.0 if done % 2 == 0 else -1.0
 
 
 DEPTH_TOLERANCE = 1e-6

@@ -31,8 +31,6 @@ from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.model.kinematics import ROLL
 from needle_controller.observers.estimator import Estimate
 from needle_core.compiled import compiled
-from needle_core.errors import OutOfBoundsError
-from needle_core.settings.bounds import check_bounded_fields
 
 Records = npt.NDArray[np.void]
 
@@ -44,18 +42,9 @@ class PointLaw:
     ----------
     settings : PointLawSettings
         Limits, reserve and dead bands.
-
-    Raises
-    ------
-    OutOfBoundsError
-        A setting is outside its bounds, or `last_turns_from` is not above `last_turn`.
     """
 
     def __init__(self, settings: PointLawSettings) -> None:
-        check_bounded_fields(settings)
-        if settings.last_turns_from <= settings.last_turn:
-            least = math.nextafter(settings.last_turn, math.inf)
-            raise OutOfBoundsError("last_turns_from", settings.last_turns_from, least, 1.0, "m")
         self.settings = settings
 
     def __call__(

@@ -5,14 +5,13 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
 from needle_core.compiled import compiled
-from needle_core.settings.bounds import Bounds
 
 Records = npt.NDArray[np.void]
 
@@ -55,20 +54,18 @@ class PointLawSettings(NamedTuple):
         Hypotheses with a weight below this share of the largest are ignored.
     """
 
-    step_length: Annotated[float, Bounds(1e-5, 0.1, "m")] = 0.001
-    max_rotation_per_length: Annotated[float, Bounds(0.0, 1e5, "rad/m")] = (
-        math.radians(30.0) / 0.001
-    )
-    max_winding: Annotated[float, Bounds(2.0 * math.pi, 1e6, "rad")] = 6.0 * math.pi
-    reserve: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.4
-    doubt: Annotated[float, Bounds(0.0, 10.0, "-")] = 2.0
-    last_turn: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.010
-    last_turns_from: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.03
-    close_enough: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.00005
-    dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.3
-    scatter_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 2.0
-    largest_turn: Annotated[float, Bounds(0.01, 100.0, "rad")] = 2.0
-    smallest_weight: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.02
+    step_length: float = 0.001
+    max_rotation_per_length: float = math.radians(30.0) / 0.001
+    max_winding: float = 6.0 * math.pi
+    reserve: float = 0.4
+    doubt: float = 2.0
+    last_turn: float = 0.010
+    last_turns_from: float = 0.03
+    close_enough: float = 0.00005
+    dead_band: float = 0.3
+    scatter_dead_band: float = 2.0
+    largest_turn: float = 2.0
+    smallest_weight: float = 0.02
 
 
 @compiled

@@ -12,7 +12,7 @@ rotation of the base that turns the tip through play and lag; the mean over all 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,6 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import PITCH, ROLL, X
 from needle_controller.observers.estimator import Estimate, Hypotheses
 from needle_core.compiled import compiled
-from needle_core.settings.bounds import Bounds, check_bounded_fields
 
 Records = npt.NDArray[np.void]
 
@@ -74,26 +73,24 @@ class RollLawSettings(NamedTuple):
         Torsions with a smaller weight, relative to the heaviest, are ignored.
     """
 
-    step_length: Annotated[float, Bounds(1e-5, 0.1, "m")] = 0.001
-    max_rotation_per_length: Annotated[float, Bounds(0.0, 1e5, "rad/m")] = (
-        math.radians(30.0) / 0.001
-    )
-    max_winding: Annotated[float, Bounds(2.0 * math.pi, 1e6, "rad")] = 6.0 * math.pi
-    plane_gain: Annotated[float, Bounds(0.0, 1e5, "1/m")] = 150.0
-    pitch_gain: Annotated[float, Bounds(0.0, 1e5, "1/m")] = 200.0
-    braking_share: Annotated[float, Bounds(0.01, 2.0, "-")] = 0.5
-    braking_share_added: Annotated[float, Bounds(0.0, 2.0, "-")] = 0.5
-    braking_from: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.0025
-    braking_over: Annotated[float, Bounds(1e-6, 1.0, "m")] = 0.003
-    lag_caution: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.45
-    braking_caution: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.5
-    uncertainty_weight: Annotated[float, Bounds(0.0, 10.0, "-")] = 0.4
-    scatter_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 1.0
-    near: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.0005
-    near_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.35
-    far_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.2
-    largest_turn: Annotated[float, Bounds(0.01, 100.0, "rad")] = 2.0
-    smallest_weight: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.02
+    step_length: float = 0.001
+    max_rotation_per_length: float = math.radians(30.0) / 0.001
+    max_winding: float = 6.0 * math.pi
+    plane_gain: float = 150.0
+    pitch_gain: float = 200.0
+    braking_share: float = 0.5
+    braking_share_added: float = 0.5
+    braking_from: float = 0.0025
+    braking_over: float = 0.003
+    lag_caution: float = 0.45
+    braking_caution: float = 0.5
+    uncertainty_weight: float = 0.4
+    scatter_dead_band: float = 1.0
+    near: float = 0.0005
+    near_dead_band: float = 0.35
+    far_dead_band: float = 0.2
+    largest_turn: float = 2.0
+    smallest_weight: float = 0.02
 
 
 class RollLaw:
@@ -103,15 +100,9 @@ class RollLaw:
     ----------
     settings : RollLawSettings
         Gains and limits.
-
-    Raises
-    ------
-    OutOfBoundsError
-        A setting that is outside its bounds.
     """
 
     def __init__(self, settings: RollLawSettings) -> None:
-        check_bounded_fields(settings)
         self.settings = settings
 
     def __call__(self, estimate: Estimate, bend_sign: float = 0.0) -> SteeringCommand:

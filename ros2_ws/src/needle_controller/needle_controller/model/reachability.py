@@ -1,12 +1,18 @@
-"""Reachability of the target plane, and the smallest depth at which the needle can lie in it.
+"""Whether a needle can reach a plane or a point, and the smallest depth at which it can.
 
 In the reduced model (5) of [KC09], with a free choice of the roll, the pitch changes by at most
 kappa per inserted length, and x by sin(pitch): a double integrator with |x''| <= kappa to first
 order. The shortest path into the plane is an arc at roll +90 deg, then one at -90 deg (or vice
 versa), with a straight part at the largest pitch between them if that limit is met. Arcs at roll
 +-90 deg have a closed form: over a length l the pitch changes by kappa l, and from pitch b0 to b1 x
-changes by +-(cos b0 - cos b1) / kappa. This neglects the insertion during which the roll turns, so
-the depths are lower bounds for every law.
+changes by +-(cos b0 - cos b1) / kappa.
+
+A needle bends with a curvature from 0 (the bevel turns continuously) to kappa. So it reaches the
+points outside the circles of radius 1 / kappa that touch its heading; the shortest path to one is
+an arc of kappa in the plane of heading and point, then a straight line.
+
+All this neglects the insertion during which the roll turns, so the depths are lower bounds for
+every law.
 """
 
 from __future__ import annotations
@@ -18,10 +24,13 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
-from needle_core.errors import OutOfBoundsError, UserError
+from needle_controller.model.target_plane import TargetPlane
+from needle_core.errors import UserError
 
 LARGEST_PITCH = math.radians(80.0)
 """Largest pitch on the way: beyond it the coordinates (3) fail, and no needle should go there."""
+SHORTEST_CHECKED_DEPTH = 0.12
+"""Depth of the insertions of [KC09] IV-B [m]; shorter runs count as parts of one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,11 +74,6 @@ def reachability(
     -------
     Reachability
         Whether it can, and the smallest insertion at which it can.
-
-    Raises
-    ------
-    OutOfBoundsError
-        A curvature, pitch or tolerance out of bounds.
     """
     insertion = np.asarray(insertion, dtype=float)
     depth = insertion + least_insertion(reduced, curvature, tolerance=tolerance)
@@ -94,21 +98,9 @@ def least_insertion(
     -------
     ndarray, shape (...)
         [m]; NaN where the state is.
-
-    Raises
-    ------
-    OutOfBoundsError
-        A curvature, pitch or tolerance out of bounds.
     """
     reduced, curvature = np.asarray(reduced, dtype=float), np.asarray(curvature, dtype=float)
-    _check_curvature(curvature)
-    if not 0.0 <= tolerance < math.inf:
-        raise OutOfBoundsError("tolerance", tolerance, 0.0, math.inf, "m")
     x, pitch = reduced[..., 0], reduced[..., 1]
-    steepest = np.abs(pitch[np.isfinite(pitch)])
-    if np.any(steepest >= 0.5 * np.pi):
-        worst = float(np.max(steepest))
-        raise OutOfBoundsError("|pitch|", worst, 0.0, 0.5 * math.pi, "rad")
     # Position after levelling out at once.
     level_x = x + np.sign(pitch) * (1.0 - np.cos(pitch)) / curvature
     # Distance to the band around the plane; below it, the needle goes up first (+x).
@@ -146,32 +138,24 @@ def farthest_offsets(
     lowest, highest : ndarray, shape (...)
         Offsets of planes from the tip along their x axis [m]; NaN if the length is too short for
         levelling out.
-
-    Raises
-    ------
-    OutOfBoundsError
-        A curvature out of bounds.
     """
     pitch, curvature = np.asarray(pitch, dtype=float), np.asarray(curvature, dtype=float)
     length = np.asarray(length, dtype=float)
-    _check_curvature(curvature)
     highest = _highest(pitch, curvature, length)
     return -_highest(-pitch, curvature, length), highest
 
 
-def check_offset(offset: float, curvature: float, depth: float, pitch: float = 0.0) -> None:
-    """Check that a needle that is still out can reach a plane.
+def check_plane(plane: TargetPlane, curvature: float, depth: float) -> None:
+    """Check that a needle that is still out can be steered into a plane.
 
     Parameters
     ----------
-    offset : float
-        Signed distance of the plane from the entry point, along its x axis [m].
+    plane : TargetPlane
+        The target plane.
     curvature : float
         kappa [1/m].
     depth : float
-        Insertion at which the needle ends [m].
-    pitch : float
-        Pitch at the entry in the plane's coordinates [rad].
+        Insertion at which steering ends [m]; at least `SHORTEST_CHECKED_DEPTH` is assumed.
 
     Raises
     ------
@@ -179,6 +163,8 @@ def check_offset(offset: float, curvature: float, depth: float, pitch: float = 0
         The plane is out of reach; the message gives the range of reachable planes and the insertion
         that this one needs.
     """
+    offset, depth = plane.offset, max(depth, SHORTEST_CHECKED_DEPTH)
+    pitch = float(np.arcsin(np.clip(plane.T_plane_rig[0, 2], -1.0, 1.0)))
     lowest, highest = (float(limit) for limit in farthest_offsets(pitch, curvature, depth))
     if lowest <= offset <= highest:
         return
@@ -202,8 +188,96 @@ def _highest(pitch: Array, curvature: Array, length: Array) -> Array:
     return np.asarray(np.where(possible, offset, np.nan))
 
 
-def _check_curvature(curvature: Array) -> None:
-    bad = ~(np.isfinite(curvature) & (curvature > 0.0))
-    if np.any(bad):
-        value = float(np.asarray(curvature)[bad].ravel()[0])
-        raise OutOfBoundsError("curvature", value, float(np.nextafter(0.0, 1.0)), math.inf, "1/m")
+def point_reachability(
+    target: npt.ArrayLike,
+    curvature: npt.ArrayLike,
+    *,
+    insertion: npt.ArrayLike,
+    end: npt.ArrayLike,
+    tolerance: float = 0.0,
+) -> Reachability:
+    """Return whether a point can still be reached in the insertion that is left.
+
+    Parameters
+    ----------
+    target : array_like, shape (..., 3)
+        In the tip's frame [m].
+    curvature : array_like, shape (...)
+        kappa [1/m].
+    insertion, end : array_like, shape (...)
+        Present insertion, and the one at which steering ends at the latest [m].
+    tolerance : float
+        Distance from the point that counts as there, small beside 1 / kappa [m].
+
+    Returns
+    -------
+    Reachability
+        The answer, and the least insertion at which the tip can be there; NaN where it never can.
+    """
+    depth = np.asarray(insertion, dtype=float) + least_insertion_to_point(
+        target, curvature, tolerance=tolerance
+    )
+    return Reachability(np.asarray(depth <= np.asarray(end, dtype=float) + tolerance), depth)
+
+
+def least_insertion_to_point(
+    target: npt.ArrayLike, curvature: npt.ArrayLike, *, tolerance: float = 0.0
+) -> Array:
+    """Return the least insertion that brings a tip to a point, shape (...) [m]; NaN: none does.
+
+    A point beside or behind the tip, or one for which the needle would have to turn by more than
+    `LARGEST_PITCH`, counts as one that it cannot reach. Parameters as of `point_reachability`.
+    """
+    target = np.asarray(target, dtype=float)
+    radius = 1.0 / np.asarray(curvature, dtype=float)
+    ahead = target[..., 2]
+    inwards = radius - np.hypot(target[..., 0], target[..., 1])
+    from_center = np.hypot(inwards, ahead)
+    bend = np.arctan2(ahead, inwards) - np.arccos(np.minimum(radius / from_center, 1.0))
+    straight = np.sqrt(np.maximum(from_center - radius, 0.0)) * np.sqrt(from_center + radius)
+    near = np.hypot(ahead, inwards - radius) <= tolerance
+    reached = (ahead > 0.0) & (from_center >= radius - tolerance) & (bend <= LARGEST_PITCH)
+    length = np.where(reached, radius * bend + straight, np.nan)
+    return np.asarray(np.where(near, np.maximum(ahead, 0.0), length))
+
+
+def check_point(point: npt.ArrayLike, curvature: float, depth: float) -> None:
+    """Check that a needle that is still out could be steered to a point.
+
+    Parameters
+    ----------
+    point : array_like, shape (3,)
+        In `rig` [m]: the needle enters at its origin, along z.
+    curvature : float
+        kappa [1/m].
+    depth : float
+        Insertion at which steering ends at the latest [m].
+
+    Raises
+    ------
+    UserError
+        The needle cannot come there: says why, and from where it could.
+    """
+    x, y, z = (float(value) for value in np.asarray(point, dtype=float))
+    named = f"target point ({x:.4g}, {y:.4g}, {z:.4g}) m cannot be reached"
+    if z <= 0.0:
+        raise UserError(f"{named}: it is not ahead of the entry (+z)")
+    needed = float(least_insertion_to_point([x, y, z], curvature))
+    if math.isnan(needed):
+        across, widest = math.hypot(x, y), widest_at(z, curvature)
+        share = 1.0 - widest / across
+        raise UserError(
+            f"{named}: at this depth a needle of curvature {curvature:.4g} 1/m reaches "
+            f"{widest:.4g} m sideways, not {across:.4g} m; from an entry at ({x * share:.4g}, "
+            f"{y * share:.4g}) m instead of (0, 0) it can"
+        )
+    if needed > depth:
+        raise UserError(f"{named}: it takes {needed:.4g} m of insertion, depth is {depth:.4g} m")
+
+
+def widest_at(ahead: float, curvature: float) -> float:
+    """Return how far to the side a needle gets at a distance > 0 ahead of it [m]."""
+    radius = 1.0 / curvature
+    widest_arc = min(math.asin(min(ahead / radius, 1.0)), LARGEST_PITCH)
+    straight = ahead - radius * math.sin(widest_arc)
+    return radius * (1.0 - math.cos(widest_arc)) + straight * math.tan(widest_arc)

@@ -10,13 +10,10 @@ import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_quaternion
-from needle_controller.model.reachability import check_offset
 from needle_core.errors import UserError
 
 UNIT_TOLERANCE = 1e-3
 RIG = "rig"
-SHORTEST_CHECKED_DEPTH = 0.12
-"""Depth of the insertions of [KC09] IV-B [m]; shorter runs count as parts of one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,22 +98,17 @@ def plane_from_pose(
     return plane
 
 
-def check_within_reach(plane: TargetPlane, curvature: float, depth: float) -> None:
-    """Check that a needle that is still out can be steered into a plane.
-
-    Parameters
-    ----------
-    plane : TargetPlane
-        The target plane.
-    curvature : float
-        kappa [1/m].
-    depth : float
-        Insertion at which steering ends [m]; at least `SHORTEST_CHECKED_DEPTH` is assumed.
+def point_from_message(frame_id: str, position: npt.ArrayLike) -> Array:
+    """Return a target point, shape (3,), of `rig` [m].
 
     Raises
     ------
     UserError
-        The plane is out of reach.
+        Another frame, or numbers that are not finite.
     """
-    pitch = float(np.arcsin(np.clip(plane.T_plane_rig[0, 2], -1.0, 1.0)))
-    check_offset(plane.offset, curvature, max(depth, SHORTEST_CHECKED_DEPTH), pitch)
+    point = np.asarray(position, dtype=float)
+    if frame_id != RIG:
+        raise UserError(f"target_point is given in frame '{frame_id}', expected '{RIG}'")
+    if not np.all(np.isfinite(point)):
+        raise UserError(f"target_point is not finite: {point}")
+    return point

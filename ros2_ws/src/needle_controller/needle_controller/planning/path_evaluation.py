@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from needle_controller.planning.legs import (
 )
 from needle_controller.planning.obstacles import segment_distance
 from needle_core.compiled import compiled
-from needle_core.settings.bounds import Bounds
 
 _MARGIN_PRICE, _MISS_PRICE, _VIOLATION_PRICE = 4.0, 5.0, 100.0
 """Additional path length that is worth a unit of clearance up to `preferred_margin`, of distance
@@ -56,17 +55,17 @@ class PathSettings(NamedTuple):
         Largest length of a path from the entry on [m].
     """
 
-    max_rotation_per_length: Annotated[float, Bounds(1.0, 1e5, "rad/m")]
-    curvature_share: Annotated[float, Bounds(0.5, 1.0, "-")] = 0.9
-    gentle_share: Annotated[float, Bounds(0.5, 1.0, "-")] = 0.8
-    needle_radius: Annotated[float, Bounds(0.0, 0.01, "m")] = 0.00035
-    sigmas: Annotated[float, Bounds(0.0, 10.0, "-")] = 2.0
-    tracking_std: Annotated[float, Bounds(0.0, 0.01, "m")] = 0.0002
-    correction_length: Annotated[float, Bounds(1e-3, 0.2, "m")] = 0.03
-    committed_length: Annotated[float, Bounds(1e-3, 0.2, "m")] = 0.01
-    preferred_margin: Annotated[float, Bounds(0.0, 0.02, "m")] = 0.0015
-    goal_tolerance: Annotated[float, Bounds(0.0, 0.01, "m")] = 0.001
-    longest: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.2
+    max_rotation_per_length: float
+    curvature_share: float = 0.9
+    gentle_share: float = 0.8
+    needle_radius: float = 0.00035
+    sigmas: float = 2.0
+    tracking_std: float = 0.0002
+    correction_length: float = 0.03
+    committed_length: float = 0.01
+    preferred_margin: float = 0.0015
+    goal_tolerance: float = 0.001
+    longest: float = 0.2
 
     @property
     def least_clearance(self) -> float:

@@ -25,7 +25,7 @@ from needle_controller.planning.path_evaluation import (
     evaluate_path,
 )
 from needle_controller.planning.path_search import QUICK_STARTS, initial_legs, optimize_legs
-from needle_core.settings.bounds import check_bounded_fields, check_bounds
+from needle_core.settings.bounds import check_bounds
 
 _BETTER_BY = 0.004
 """Least advantage in cost for which the previous path is abandoned [m]."""
@@ -112,11 +112,12 @@ class PathPlanner:
     Raises
     ------
     OutOfBoundsError
-        A setting that is outside its bounds.
+        A rotation rate that is too small for plans.
     """
 
     def __init__(self, settings: PathSettings) -> None:
-        check_bounded_fields(settings)
+        rate = settings.max_rotation_per_length
+        check_bounds("max_rotation_per_length", rate, 1.0, 1e5, "rad/m")
         self.settings = settings
         self._least_near_margin = -_NEAR_SHARE * settings.sigmas * settings.tracking_std
 

@@ -93,6 +93,8 @@ class OwnEstimator:
             )
         for name, shape, meaning in _CHECKS:
             part.checked(f"estimate().{name}", getattr(estimate, name), shape, meaning)
+        if not estimate.curvature > 0.0:
+            raise part.error(f"estimate().curvature is {estimate.curvature:g} 1/m, expected > 0")
         return estimate
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.laws.point_law import PointLaw
@@ -28,13 +26,8 @@ _CLOCK_DIFFERENCE = 1.0
 """Target stamps later than the tip's by more than this come from another clock [s]."""
 
 
-class LawToPoint(Protocol):
-    """Law for points: `PointLaw`, or a plug-in."""
-
-    def __call__(
-        self, estimate: Estimate, target: npt.ArrayLike, rotation_left: float = np.inf
-    ) -> SteeringCommand:
-        """Return the command for the next step; see `PointLaw`."""
+LawToPoint = Callable[..., SteeringCommand]
+"""Law for points, called as `PointLaw`; it may be a plug-in."""
 
 
 class ArrivalPrediction:
@@ -100,7 +93,7 @@ class ArrivalPrediction:
         return (insertion - first) / (time - first_time) if insertion > first else None
 
 
-class PointSteering:
+class PointSteering(ArrivalPrediction):
     """Steers to the predicted position of a target at the arrival of the needle.
 
     Parameters
@@ -109,18 +102,11 @@ class PointSteering:
         Settings of the law; `SteeringSettings.check_steers_to_points` accepts them.
     motion : TargetMotion
         Observed motion of the target, in `rig`; times are seconds of the tips' clock.
-
     """
 
     def __init__(self, settings: SteeringSettings, motion: TargetMotion) -> None:
+        super().__init__(motion)
         self._law = point_law(settings)
-        self._prediction = ArrivalPrediction(motion)
-        self.motion = motion
-
-    @property
-    def aim(self) -> Array:
-        """Predicted position of the target at the arrival, in `rig`, shape (3,) [m]."""
-        return self._prediction.aim
 
     def command(
         self,
@@ -149,7 +135,7 @@ class PointSteering:
             assert command.insertion_left is not None
             return command.insertion_left
 
-        aim = self._prediction.predict(time, insertion, left)
+        aim = self.predict(time, insertion, left)
         return self._law(estimate, from_rig(aim), rotation_left)
 
 

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.model.arrays import Array
 from needle_controller.model.gains import Gains, design_gains
-from needle_controller.model.point_reach import check_point
-from needle_controller.model.target_plane import TargetPlane, check_within_reach, offset_plane
+from needle_controller.model.reachability import check_plane, check_point
+from needle_controller.model.target_plane import TargetPlane, offset_plane
 from needle_controller.presets.own_parts import GROUPS, check_registered, own_part
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter, parameter
@@ -350,4 +350,4 @@ class SteeringSettings:
 
     def check_plane(self, plane: TargetPlane) -> None:
         """Check that a target plane can be reached; raises UserError."""
-        check_within_reach(plane, self.curvature, self.depth)
+        check_plane(plane, self.curvature, self.depth)

@@ -13,8 +13,7 @@ from needle_controller.filter.records import NEAR
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
-from needle_controller.model.point_reach import point_reachability
-from needle_controller.model.reachability import Reachability, reachability
+from needle_controller.model.reachability import Reachability, point_reachability, reachability
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate, Estimator
@@ -32,7 +31,7 @@ from needle_controller.protocol.confidence import point_miss_probability
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.tip_checks import TipCovariance
 
-LARGEST_START_ROLL = np.deg2rad(80.0)
+LARGEST_START_ROLL = math.radians(80.0)
 """For presets whose coordinates are limited to roll +-90 deg [rad]."""
 HEADING_CORRELATION = 0.01
 """Inserted length over which measured headings count as one, because errors of the sensor's
@@ -184,16 +183,16 @@ class PlaneControl:
         """Whether a tip was used since the last restart."""
         return self._joints is not None
 
-    @property
-    def largest_start_roll(self) -> float:
-        """Largest roll in the plane at which the preset can start [rad]."""
-        one_sided = self._settings.preset in ONE_SIDED_PRESETS
-        return float(LARGEST_START_ROLL) if one_sided else math.inf
-
-    def start_roll(self, rotation: float) -> float:
-        """Return the roll in the plane of a needle entering with its base at `rotation` [rad]."""
+    def reason_of_roll(self, rotation: float) -> str:
+        """Return why a needle cannot enter with its base at `rotation` [rad]; empty if it can."""
         start = self._plane.T_plane_rig[:3, :3] @ rotation_from_angles([0.0, 0.0, rotation])
-        return float(np.arctan2(-start[0, 1], start[0, 0]))
+        roll = float(np.arctan2(-start[0, 1], start[0, 0]))
+        if self._settings.preset not in ONE_SIDED_PRESETS or abs(roll) <= LARGEST_START_ROLL:
+            return ""
+        return (
+            f"the needle's roll in target_plane is {roll:.3g} rad (rotation_joint "
+            f"{rotation:.4g} rad), must be within {LARGEST_START_ROLL:.3g} rad"
+        )
 
     def update(
         self,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from needle_controller.presets.own_parts import OwnPartError
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import DEPTH_TOLERANCE
@@ -14,61 +12,47 @@ from needle_core.status_messages import DeviceStatus
 _SAME_INSERTION, _SAME_ROTATION = 5e-5, 2e-2
 
 
-@dataclasses.dataclass(frozen=True)
-class RigState:
-    """State of the rig at a request to start.
+def is_out(joints: JointSample, settings: SteeringSettings) -> bool:
+    """Return whether the needle counts as out of the tissue."""
+    return joints.insertion <= settings.needle_out_insertion
 
-    Attributes
+
+def reason_not_to_start(
+    device: DeviceStatus | None,
+    joints: JointSample | None,
+    withdrawal: str,
+    control: PlaneControl,
+    settings: SteeringSettings,
+) -> str:
+    """Return why steering cannot start; empty if it can.
+
+    Parameters
     ----------
-    steering : bool
-        Whether the needle is being steered already.
     device : DeviceStatus or None
         Last status of the driver.
     joints : JointSample or None
         Present joint positions.
     withdrawal : str
         Why the needle must be drawn out first; empty if it need not be.
-    """
-
-    steering: bool
-    device: DeviceStatus | None
-    joints: JointSample | None
-    withdrawal: str
-
-
-def is_out(joints: JointSample, settings: SteeringSettings) -> bool:
-    """Return whether the needle counts as out of the tissue."""
-    return joints.insertion <= settings.needle_out_insertion
-
-
-def reason_not_to_start(rig: RigState, control: PlaneControl, settings: SteeringSettings) -> str:
-    """Return why steering cannot start; empty if it can.
-
-    Parameters
-    ----------
-    rig : RigState
-        State of the rig.
     control : PlaneControl
         Estimator and law, for the roll at the entry and the path past obstacles.
     settings : SteeringSettings
         Settings of the protocol.
     """
-    if rig.steering:
-        return "already steering"
-    if rig.device is None:
+    if device is None:
         return "no device/status received"
-    reason = _device_reason(rig.device)
+    reason = _device_reason(device)
     if reason:
         return reason
-    if rig.joints is None:
+    if joints is None:
         return "no joint_states received"
-    if not _agree(rig.device, rig.joints):
+    if not _agree(device, joints):
         return (
-            f"waiting for joint_states to agree with device/status ({rig.joints.insertion:.4g} m, "
-            f"{rig.joints.rotation:.4g} rad; the device {rig.device.insertion_m:.4g} m, "
-            f"{rig.device.rotation_rad:.4g} rad)"
+            f"waiting for joint_states to agree with device/status ({joints.insertion:.4g} m, "
+            f"{joints.rotation:.4g} rad; the device {device.insertion_m:.4g} m, "
+            f"{device.rotation_rad:.4g} rad)"
         )
-    return rig.withdrawal or _needle_reason(rig.joints, control, settings)
+    return withdrawal or _needle_reason(joints, control, settings)
 
 
 def _device_reason(device: DeviceStatus) -> str:
@@ -99,13 +83,9 @@ def _needle_reason(joints: JointSample, control: PlaneControl, settings: Steerin
             f"the needle is {joints.insertion:g} m in, on an unknown path: "
             f"withdraw it first (<= {settings.needle_out_insertion:g} m)"
         )
-    roll = control.start_roll(joints.rotation)
-    if abs(roll) > control.largest_start_roll:
-        return (
-            f"the needle's roll in target_plane is {roll:.3g} rad (rotation_joint "
-            f"{joints.rotation:.4g} rad), must be within {control.largest_start_roll:.3g} rad"
-        )
     try:
-        return control.reason_without_path(joints.rotation)
+        return control.reason_of_roll(joints.rotation) or control.reason_without_path(
+            joints.rotation
+        )
     except OwnPartError as error:
         return str(error)

@@ -31,7 +31,7 @@ from needle_controller.protocol.motion_monitors import (
     Watchdog,
 )
 from needle_controller.protocol.plane_control import ControlUpdate, PlaneControl
-from needle_controller.protocol.start_conditions import RigState, is_out, reason_not_to_start
+from needle_controller.protocol.start_conditions import is_out, reason_not_to_start
 from needle_controller.protocol.tip_checks import (
     AcceptedTip,
     RejectedTip,
@@ -104,9 +104,10 @@ class Steering:
 
     def on_start(self) -> tuple[StartReply, list[Action]]:
         """Start steering, or reply why it cannot start."""
-        joints = self.tips.joints.latest
-        rig = RigState(self._steering, self._device, joints, self._retraction.reason)
-        why = reason_not_to_start(rig, self.control, self.settings)
+        joints, why = self.tips.joints.latest, "already steering"
+        if not self._steering:
+            withdrawal = self._retraction.reason
+            why = reason_not_to_start(self._device, joints, withdrawal, self.control, self.settings)
         if why:
             return StartReply(False, why), [Log("warning", f"not started: {why}")]
         if joints is not None and is_out(joints, self.settings):

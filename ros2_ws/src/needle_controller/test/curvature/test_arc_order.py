@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from numpy.random import Generator, default_rng
-from scipy.spatial.transform import Rotation
 
 from needle_controller.curvature.curvature_checks import (
     check_independent_residuals,
@@ -17,27 +16,11 @@ from needle_controller.curvature.curvature_checks import (
 from needle_controller.curvature.curvature_fit import CurvatureFitSettings
 from needle_controller.model.arrays import Array
 from needle_core.errors import UserError
-from needle_sim.needle.plant import NeedlePlant
 
-RADIUS = 0.122
-STEP = 0.001
+from .insertions import insertion_tips
+
 REPEATING = 2e-5
 TRACKER = 3e-5  # standard deviation of stereo_tracker's tips [m]
-
-
-def insertions(count: int, arc: float, turn: float, rng: Generator) -> tuple[Array, Array]:
-    """Return exact tips (count, K, 3) of needles that turn once, half-way."""
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    tilted = Rotation.from_rotvec(rng.normal(0.0, math.radians(5.0), (count, 3)) * [1.0, 1.0, 0.0])
-    rolled = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi, (count, 1)))
-    poses[:, :3, :3] = (tilted * rolled).as_matrix()
-    plant = NeedlePlant(poses, curvature=1.0 / RADIUS)
-    insertion = np.arange(0.0, arc + 1e-9, STEP)
-    tips = [plant.T_rig_tip[:, :3, 3]]
-    for k in range(1, len(insertion)):
-        plant.advance(STEP, turn if k == len(insertion) // 2 else 0.0)
-        tips.append(plant.T_rig_tip[:, :3, 3])
-    return np.stack(tips, axis=1), insertion
 
 
 def noise(shape: tuple[int, ...], size: float | None, rng: Generator) -> Array:
@@ -65,14 +48,14 @@ def refused(tips: Array, insertion: Array | None) -> int:
 )
 def test_pure_insertions_are_accepted(size: float | None, known: bool) -> None:
     rng = default_rng(5)
-    tips, insertion = insertions(20, 0.06, 0.0, rng)
+    tips, insertion = insertion_tips(20, 0.06, rng)
     tips = tips + noise(tips.shape, size, rng)
     assert refused(tips, insertion if known else None) == 0
 
 
 def test_outliers_are_not_correlated_residuals() -> None:
     rng = default_rng(6)
-    tips, insertion = insertions(30, 0.06, 0.0, rng)
+    tips, insertion = insertion_tips(30, 0.06, rng)
     tips = tips + noise(tips.shape, TRACKER, rng)
     # Two consecutive outliers in the same direction.
     tips[:, 20:22] += [5e-3, 0.0, 0.0]
@@ -82,7 +65,7 @@ def test_outliers_are_not_correlated_residuals() -> None:
 def test_repeating_errors_are_tolerated() -> None:
     """All tips bowed along the arc, three times, as by a calibration's error."""
     rng = default_rng(7)
-    tips, insertion = insertions(1, 0.12, 0.0, rng)
+    tips, insertion = insertion_tips(1, 0.12, rng)
     bowed = tips[0] + noise(tips[0].shape, 2e-6, rng)
     bowed[:, 1] += REPEATING * np.sin(6.0 * np.pi * insertion / 0.12)
     assert refused(bowed[None], insertion) == 0
@@ -106,7 +89,7 @@ def test_repeating_errors_are_tolerated() -> None:
 )
 def test_steered_insertions_are_rejected(arc: float, size: float | None, degrees: float) -> None:
     rng = default_rng(8)
-    tips, insertion = insertions(10, arc, math.radians(degrees), rng)
+    tips, insertion = insertion_tips(10, arc, rng, turn=math.radians(degrees))
     tips = tips + noise(tips.shape, size, rng)
     assert refused(tips, insertion) == 10
     assert refused(tips[:3], None) == 3

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -133,23 +132,6 @@ def test_a_straight_path_has_no_upper_bound() -> None:
     tips = uniform(insertion[:, None] * np.array([0.0, 0.0, 1.0]), rng)
     fit = fit_curvature(tips, insertion, CurvatureFitSettings(entry_std=math.inf))
     assert math.isinf(float(fit.radius_interval()[1]))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"heading_std": 0.0}, "heading_std"),
-        ({"entry_std": -1.0}, "entry_std"),
-        ({"measurement_std": math.nan}, "measurement_std"),
-        ({"outlier_limit": 0.0}, "outlier_limit"),
-        ({"slip_std": 0.0}, "slip_std"),
-        ({"heading": (0.0, 0.0, 2.0)}, "unit vector"),
-        ({"entry": (0.0, math.inf, 0.0)}, "entry"),
-    ],
-)
-def test_bad_settings_are_named(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(UserError, match=message):
-        CurvatureFitSettings(**change)
 
 
 def test_bad_tips_are_refused() -> None:

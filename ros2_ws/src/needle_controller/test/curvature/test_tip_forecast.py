@@ -64,19 +64,6 @@ def paths(count: int, rng: np.random.Generator) -> Array:
     return np.asarray(whole - whole[:, :1])
 
 
-def test_95_of_100_tips_are_in_the_interval() -> None:
-    rng = np.random.default_rng(8)
-    inside = []
-    for path in paths(30, rng):
-        seen = path[: len(INSERTION)] + rng.normal(0.0, NOISE, (len(INSERTION), 3))
-        ahead = forecast(seen, insertion_known=False)
-        # Length of the path to the same depth
-        off = path[-1] - ahead.tip
-        off -= ahead.tip / ahead.tip[2] * off[2]
-        inside.append(np.abs(off[:2]) <= ahead.interval()[:2])
-    assert np.mean(inside) > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / 60)
-
-
 def test_the_forecast_of_a_straight_needle_is_gaussian_process_regression(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -176,11 +176,11 @@ def test_the_estimate_is_that_of_a_batch_least_squares_fit() -> None:
 
 
 def test_late_headings_are_replayed_and_the_frame_may_change() -> None:
-    """Headings of the first centimetres serve the replay; their axes follow the plane."""
+    """Tips, covariances and headings of the first centimetres are replayed in the new axes."""
     turns = turns_for(24, size=0.1)
     poses, at = path(turns, np.deg2rad(3.0)), np.eye(4)
     at[:3] = [[0.0, 1.0, 0.0, 0.01], [-1.0, 0.0, 0.0, -0.02], [0.0, 0.0, 1.0, 0.03]]
-    tips, told = noisy(poses, bound=2e-4), []
+    tips, known, told = noisy(poses, bound=2e-4), np.diag([1e-7, 2e-7, 3e-7]), []
     for has_heading, frame in ((True, np.eye(4)), (True, at), (False, np.eye(4))):
         estimator = HypothesisFilter(FilterSettings(), None, np.zeros(3))
         estimator.reset(tips[0], np.zeros(2))
@@ -188,13 +188,18 @@ def test_late_headings_are_replayed_and_the_frame_may_change() -> None:
             if k == 10:
                 estimator.change_frame(frame)
             now = frame if k >= 10 else np.eye(4)
+            turn, shift = now[:3, :3], now[:3, 3]
             exposed = max(k - 3, 0)
             estimator.advance(STEP, turns[k - 1])
             if has_heading:
-                estimator.correct_heading(now[:3, :3] @ poses[exposed, :3, 2], 1e-4)
-            estimator.correct(now[:3, :3] @ tips[exposed] + now[:3, 3], np.eye(3) * 1e-7)
+                estimator.correct_heading(turn @ poses[exposed, :3, 2], 1e-4)
+            estimator.correct(turn @ tips[exposed] + shift, turn @ known @ turn.T)
         told.append((estimator.estimate(), frame[:3, :3] @ poses[20, :3, 2]))
-    assert LATE in told[0][0].warnings
+    here, there = told[0][0], told[1][0]
+    assert LATE in here.warnings
+    assert LATE in there.warnings
+    wanted = at[:3, :3] @ here.position + at[:3, 3]
+    np.testing.assert_allclose(there.position, wanted, atol=2e-4)
     off = [float(np.linalg.norm(found.rotation[:, 2] - true)) for found, true in told]
     assert max(off[:2]) < 0.01
     assert off[2] > 2.0 * max(off[:2])

@@ -16,14 +16,12 @@ from needle_controller.filter.filter_settings import (
     FilterSettings,
     NoiseHypothesis,
     RollHypothesis,
-    TorsionHypothesis,
 )
 from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.filter.mixture import estimate_needle
 from needle_controller.laws.roll_law import RollLaw, RollLawSettings
 from needle_controller.many_needles import ManyFilters
 from needle_controller.model.kinematics import rotation_from_angles
-from needle_core.errors import OutOfBoundsError, UserError
 
 from .needles import (
     CURVATURE,
@@ -259,33 +257,6 @@ def test_warns_of_an_ambiguous_roll() -> None:
 def test_invalid_advances_raise_errors(length: float, turn: float) -> None:
     with pytest.raises(ValueError, match="expected finite"):
         HypothesisFilter(FilterSettings()).advance(length, turn)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"curvature": 0.0},
-        {"curvature": -8.0},
-        {"curvature": np.nan},
-        {"tip_noise_bound": 0.0},
-        {"curvature_range": (1.2, 0.8)},
-        {"lag_range": (0.0, 0.1)},
-        {"roll_hypotheses": ()},
-    ],
-)
-def test_settings_out_of_bounds_are_rejected(change: dict[str, Any]) -> None:
-    with pytest.raises(UserError, match=next(iter(change))):
-        FilterSettings(**change)
-
-
-def test_hypotheses_out_of_bounds_are_rejected() -> None:
-    with pytest.raises(OutOfBoundsError, match="play"):
-        TorsionHypothesis(-0.1, 0.0, 0.1, 1.0)
-    with pytest.raises(OutOfBoundsError, match="std"):
-        RollHypothesis(0.0, 0.0, 1.0)
-    for multiples, shares in (((), ()), ((1.0,), (0.5,)), ((1.0, 0.0), (0.5, 0.5))):
-        with pytest.raises(UserError, match="multiples"):
-            NoiseHypothesis(True, multiples, shares, 1.0)
 
 
 def test_nothing_is_compiled_twice() -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from needle_controller.filter.filter_settings import FilterSettings
-from needle_controller.filter.hypothesis_filter import HypothesisFilter
 from needle_controller.filter.late_tips import FIRST, hidden_age
 from needle_controller.filter.mixture import LATE, WARNINGS
 from needle_controller.many_needles import ManyFilters
@@ -26,24 +25,6 @@ def arc(inserted: Array | float) -> Array:
     return np.stack([x, np.zeros_like(x), RADIUS * np.sin(angle)], axis=-1)
 
 
-def inserted_by(steps: int, *, late: int = 0, frame: Array | None = None) -> HypothesisFilter:
-    """Return a filter after a pure insertion with +-1 mm noise.
-
-    Half-way, everything may be transformed into another frame, (4, 4).
-    """
-    rng = np.random.default_rng(7)
-    turn, offset = (np.eye(3), np.zeros(3)) if frame is None else (frame[:3, :3], frame[:3, 3])
-    estimator = HypothesisFilter(FilterSettings(), None, np.zeros(3))
-    estimator.reset(rng.uniform(-STEP, STEP, 3), np.zeros(2))
-    for k in range(1, steps + 1):
-        estimator.advance(STEP, 0.0)
-        tip = arc(max(k - late, 0) * STEP) + rng.uniform(-STEP, STEP, 3)
-        if frame is not None and k == 10:
-            estimator.change_frame(frame)
-        estimator.correct(tip @ turn.T + offset if k >= 10 else tip)
-    return estimator
-
-
 def many_inserted_by(
     steps: int,
     *,
@@ -53,7 +34,7 @@ def many_inserted_by(
     bump: float = 0.0,
     outliers: float = 0.0,
 ) -> ManyFilters:
-    """Return twenty such filters."""
+    """Return twenty filters after a pure insertion with +-1 mm noise."""
     rng = np.random.default_rng(7)
     filters = ManyFilters(FilterSettings(), NEEDLES, STEP)
     filters.start(rng.uniform(-STEP, STEP, (NEEDLES, 3)))
@@ -78,41 +59,6 @@ def test_late_tips_are_detected_and_reported(late: int) -> None:
     # The estimate is at the present position.
     off = filters.estimates["coordinates"][:, 2] - arc(40 * STEP)[2]
     assert np.sqrt(np.mean(off**2)) < 0.6 * STEP
-
-
-def test_late_tips_are_the_same_in_another_frame() -> None:
-    at = np.eye(4)
-    # Axes are only permuted, because the noise is bounded along each.
-    at[:3] = [[0.0, 1.0, 0.0, 0.01], [-1.0, 0.0, 0.0, -0.02], [0.0, 0.0, 1.0, 0.03]]
-    elsewhere, here = (
-        inserted_by(30, late=3, frame=at).estimate(),
-        inserted_by(30, late=3).estimate(),
-    )
-    assert LATE in elsewhere.warnings
-    np.testing.assert_allclose(
-        elsewhere.position, here.position @ at[:3, :3].T + at[:3, 3], atol=2e-4
-    )
-
-
-def test_replayed_tips_have_their_covariance_in_the_new_frame() -> None:
-    at, known = np.eye(4), np.diag([1e-7, 2e-7, 3e-7])
-    at[:3, :3] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
-    turn, stays = at[:3, :3], HypothesisFilter(FilterSettings(), None, np.zeros(3))
-    goes = HypothesisFilter(FilterSettings(), None, np.zeros(3))
-    for estimator in (stays, goes):
-        estimator.reset(np.zeros(3), np.zeros(2))
-    for k in range(1, 21):
-        if k == 20:
-            goes.change_frame(at)
-        tip = arc(max(k - 3, 0) * STEP)
-        for estimator, r in ((stays, np.eye(3)), (goes, turn if k == 20 else np.eye(3))):
-            estimator.advance(STEP, 0.0)
-            estimator.correct(r @ tip, r @ known @ r.T)
-    here, there = stays.estimate(), goes.estimate()
-    assert LATE in here.warnings
-    assert LATE in there.warnings
-    # Only the order of the coordinates differs.
-    np.testing.assert_allclose(there.position, turn @ here.position, atol=2e-4)
 
 
 @pytest.mark.parametrize(

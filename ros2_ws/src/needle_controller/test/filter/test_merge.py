@@ -28,7 +28,7 @@ def hypotheses(rolls: Array) -> Records:
 def merged(h: Records) -> Records:
     needle = np.zeros(1, NEEDLE)[0]
     needle["count"] = len(h)
-    merge(needle, h, ANGLE)
+    merge(needle, h)
     return h[: needle["count"]]
 
 

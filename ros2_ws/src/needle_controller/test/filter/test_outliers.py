@@ -46,7 +46,7 @@ def test_outliers_add_displaced_hypotheses_with_their_weight() -> None:
     settings = FilterSettings()
     without = hypotheses(1e-6)
     wanted = settings.jump_share * without["weight"] * without["outlier"]
-    wanted = np.sort(wanted[wanted > 1.0 / settings.prune_ratio])
+    wanted = np.sort(wanted[wanted > 1e-3])
     known = hypotheses(settings.jump_share)
     displaced = np.isclose(known["position"][:, 0], tips[9, 0], rtol=0.0, atol=1e-12)
     seen = np.sort(known["weight"][displaced])

@@ -36,21 +36,6 @@ def test_against_fine_integration(play: float, lag: float) -> None:
     np.testing.assert_allclose(tips(play, lag)[:, 0], wanted, atol=3e-5)
 
 
-@pytest.mark.parametrize(("play", "lag"), [(0.3, 0.0), (0.0, 0.008), (0.2, 0.004)])
-def test_sensitivity_is_the_derivative(play: float, lag: float) -> None:
-    step = 1e-7
-    if lag > 0.0:
-        ahead, behind = tips(play, lag + step), tips(play, lag - step)
-    else:
-        ahead, behind = tips(play + step, lag), tips(play - step, lag)
-    wanted = (ahead[:, 0] - behind[:, 0]) / (2.0 * step)
-    np.testing.assert_allclose(tips(play, lag)[:, 1], wanted, rtol=1e-4, atol=1e-4)
-
-
-def test_a_stiff_shaft_turns_the_tip_with_the_base() -> None:
-    np.testing.assert_allclose(tips(0.0, 0.0)[:, 0], np.cumsum(TURNS))
-
-
 def test_with_lag_a_needle_at_rest_does_not_turn() -> None:
     assert tips(0.0, 0.008, length=0.0)[-1, 0] == 0.0
 

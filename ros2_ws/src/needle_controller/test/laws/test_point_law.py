@@ -23,7 +23,6 @@ from needle_controller.laws.point_turns import (
 from needle_controller.many_needles import ManyFilters
 from needle_controller.model.arrays import Array
 from needle_controller.observers.estimator import Estimate
-from needle_core.errors import OutOfBoundsError
 
 from .estimates import CAP, CURVATURE, STEP, known, mixture
 
@@ -204,10 +203,3 @@ def test_many_needles_are_steered_as_each_alone() -> None:
         alone = law()(one, targets[k])
         assert alone.rotation_rate == rates[k]
         assert alone.insertion_left == left[k]
-
-
-def test_settings_out_of_bounds_are_refused() -> None:
-    with pytest.raises(OutOfBoundsError, match="reserve"):
-        law(reserve=1.5)
-    with pytest.raises(OutOfBoundsError, match="last_turns_from"):
-        law(last_turn=0.01, last_turns_from=0.01)

@@ -11,7 +11,7 @@ from needle_controller.filter.records import TORSION
 from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.laws.roll_law import RollLaw, RollLawSettings, base_turn, nearest_turn
 from needle_controller.observers.estimator import Estimate
-from needle_core.errors import OutOfBoundsError, UserError
+from needle_core.errors import UserError
 
 from .estimates import CAP, STEP, known, mixture
 
@@ -108,9 +108,3 @@ def test_play_and_lag_are_compensated() -> None:
     assert base_turn(torsion(0.3, 0.3, gain=0.5), 0.1, 0.6, STEP) == pytest.approx(0.2)
     # Without a further turn, the base returns to the angle of the tip.
     assert base_turn(torsion(0.2, 0.9, lag=0.008), 0.0, 0.9, STEP) == pytest.approx(-0.7)
-
-
-def test_settings_out_of_bounds_are_rejected() -> None:
-    for name in ("step_length", "max_rotation_per_length", "pitch_gain"):
-        with pytest.raises(OutOfBoundsError, match=name):
-            law(**{name: -1.0})

@@ -15,7 +15,6 @@ from needle_controller.model.gains import (
     held_input_response,
     sampled_observer_gain,
 )
-from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.errors import UserError
 
 STD = 0.001 / np.sqrt(3.0)
@@ -72,14 +71,6 @@ def test_held_input_is_the_integral() -> None:
         return float(value)
 
     np.testing.assert_allclose(held_input_response(0.02), [column(i) for i in range(3)], rtol=1e-10)
-
-
-def test_the_defaults_are_stable_in_steps() -> None:
-    parameters = SteeringSettings()
-    design, length = parameters.gains(), parameters.step_length
-    law = transition(length) - np.outer(held_input_response(length), design.feedback)
-    assert np.max(np.abs(np.linalg.eigvals(law))) < 1.0
-    assert np.max(design.observer_poles.real) < 0.0
 
 
 def test_weights_without_gains_are_rejected() -> None:

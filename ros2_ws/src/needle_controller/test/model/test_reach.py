@@ -10,20 +10,17 @@ import pytest
 from numpy.random import default_rng
 
 from needle_controller.model.arrays import Array
-from needle_controller.model.point_reach import (
-    check_point,
-    least_insertion_to_point,
-    point_from_message,
-    point_reachability,
-    widest_at,
-)
 from needle_controller.model.reachability import (
     LARGEST_PITCH,
-    check_offset,
+    check_point,
     farthest_offsets,
     least_insertion,
+    least_insertion_to_point,
+    point_reachability,
     reachability,
+    widest_at,
 )
+from needle_controller.model.target_plane import point_from_message
 from needle_core.errors import UserError
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 
@@ -89,21 +86,6 @@ def test_the_remaining_depth_decides_reachability() -> None:
         assert (bool(plane.reachable), bool(point.reachable)) == (expected, expected)
         assert float(plane.depth) == pytest.approx(0.05 + needed)
         assert float(point.depth) == pytest.approx(0.1)
-
-
-def test_invalid_arguments_raise_errors_with_the_value() -> None:
-    check_offset(0.028, CURVATURE, 0.12)
-    with pytest.raises(UserError, match=r"0\.03 m cannot be reached.*-0\.0289.* to 0\.0289"):
-        check_offset(0.03, CURVATURE, 0.12)
-    with pytest.raises(UserError, match="no plane"):
-        check_offset(0.0, CURVATURE, 0.01, pitch=0.5)
-    for curvature in (0.0, -1.0, math.nan, math.inf):
-        with pytest.raises(UserError, match="curvature"):
-            least_insertion([0.0, 0.0, 0.0], curvature)
-    with pytest.raises(UserError, match="pitch"):
-        least_insertion([0.0, 1.6, 0.0], CURVATURE)
-    with pytest.raises(UserError, match="tolerance"):
-        least_insertion([0.0, 0.0, 0.0], CURVATURE, tolerance=-1.0)
 
 
 def path(curvatures: Array, length: float) -> Array:

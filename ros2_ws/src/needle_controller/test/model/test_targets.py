@@ -10,8 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from needle_controller.model.arrays import Array
+from needle_controller.model.reachability import check_plane
 from needle_controller.model.target_motion import SHORTEST, TargetMotion
-from needle_controller.model.target_plane import check_within_reach, offset_plane, plane_from_pose
+from needle_controller.model.target_plane import offset_plane, plane_from_pose
 from needle_core.errors import UserError
 
 PLACE = np.array([0.004, -0.006, 0.09])
@@ -71,10 +72,13 @@ def test_planes_nothing_can_reach_are_refused() -> None:
             plane_from_pose(frame, position, quaternion)
     for offset, depth in ((0.05, 0.12), (-0.05, 0.12), (3.0, 0.12), (0.05, 0.15)):
         with pytest.raises(UserError, match=r"cannot be reached.*reaches planes from .* to "):
-            check_within_reach(offset_plane(offset), 1 / 0.122, depth)
+            check_plane(offset_plane(offset), 1 / 0.122, depth)
+    steep = plane_from_pose("rig", [0.0] * 3, [0.0, np.sin(0.6), 0.0, np.cos(0.6)])
+    with pytest.raises(UserError, match="reaches no plane"):
+        check_plane(steep, 1 / 0.122, 0.12)
     # Of a part of an insertion nothing is said.
     for offset, depth in ((0.02, 0.12), (0.02, 0.01), (0.05, 0.19)):
-        check_within_reach(offset_plane(offset), 1 / 0.122, depth)
+        check_plane(offset_plane(offset), 1 / 0.122, depth)
 
 
 def test_a_target_at_rest_or_hardly_observed_is_expected_where_it_was_to_the_bit() -> None:

@@ -77,9 +77,6 @@ def test_curvature_and_tolerance_bound_the_reachable_targets() -> None:
         target = turned @ [0.6 * (aside + beyond), 0.8 * (aside + beyond), 0.1]
         tip = TipState(np.array([0.01, 0.02, 0.0]), turned, CURVATURE)
         assert may(Obstacles(), tip, tip.position + target) is reached
-
-
-def test_a_target_behind_the_needle_has_no_path() -> None:
     assert not may(Obstacles(), target=np.array([0.0, 0.0, -0.01]))
 
 

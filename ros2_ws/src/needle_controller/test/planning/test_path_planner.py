@@ -119,16 +119,6 @@ def test_the_goal_tolerance_limits_the_distance_from_the_target() -> None:
             assert np.linalg.norm(end - target) == pytest.approx(0.0006, abs=2e-5)
 
 
-def test_a_plan_depends_on_the_problem_alone() -> None:
-    first, other = planner(), planner()
-    other.path(ENTRY, [0.0, 0.01, 0.08], IN_THE_WAY)
-    for _ in range(2):
-        np.testing.assert_array_equal(
-            found(first.path(ENTRY, TARGET, IN_THE_WAY)).legs,
-            found(other.path(ENTRY, TARGET, IN_THE_WAY)).legs,
-        )
-
-
 def test_without_obstacles_the_path_is_one_leg_to_the_target() -> None:
     path = found(planner().path(ENTRY, TARGET, Obstacles()))
     assert path.legs.shape == (1, 4)
@@ -203,8 +193,8 @@ def test_the_previous_path_continues_unless_it_is_blocked() -> None:
 
 
 def test_invalid_calls_raise_errors_with_the_value() -> None:
-    with pytest.raises(UserError, match="sigmas = -1"):
-        planner(sigmas=-1.0)
+    with pytest.raises(UserError, match="max_rotation_per_length = 0"):
+        PathPlanner(PathSettings(0.0))
     bent = TipState(np.zeros(3), np.eye(3), math.nan)
     with pytest.raises(UserError, match="curvature = nan"):
         planner().path(bent, TARGET, Obstacles())

@@ -166,6 +166,7 @@ def test_invalid_estimators_are_rejected_with_the_reason(offer: Offer) -> None:
         ("(self.place, self.turn", "(self.place * np.nan, self.turn", "contains nan"),
         ("(self.place, self.turn", "(1e3 * self.place, self.turn", "expected m, in"),
         ("(self.place, self.turn", "(0 * self.place, self.turn", "0.02 m off"),
+        ("curvature, np.eye", "curvature * 0, np.eye", "curvature is 0 1/m, expected > 0"),
         ("np.eye(6) * 1e-6)", "[[1, 2], [3]])", "estimate() raised ValueError"),
         ("reset(self, tip, joints)", "reset(self, tip)", "reset(tip, joints) raised TypeError"),
         ("np.eye(6) * 1e-6)", "np.full((6, 6), np.inf))", "covariance contains inf"),

@@ -72,10 +72,6 @@ class ContinuousRig(Rig):
             self.steering.on_result(path_in(self.see()).stamp_ns, "aborted: no")
 
 
-def test_the_same_tip_leads_to_the_same_path() -> None:
-    assert len({path_in(ContinuousRig().see()) for _ in range(2)}) == 1
-
-
 def test_a_tip_leads_to_the_rotation_of_a_step_and_a_path_beyond(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -187,14 +183,6 @@ def test_aborts_in_a_row_are_a_fault() -> None:
         assert heard == 1 + (MAX_ABORTS_AT_REST - 1) * (late + 1)
         assert rig.steering.state is SteeringState.FAULT
         assert "without motion" in rig.steering.reason
-
-
-def test_aborts_delayed_by_a_cut_cable_count_once() -> None:
-    rig = ContinuousRig()
-    stamps = [path_in(rig.see()).stamp_ns for _ in range(3 * MAX_ABORTS_AT_REST)]
-    for stamp in stamps:
-        rig.steering.on_result(stamp, "aborted: the hold is not pressed")
-    assert where(rig) == AT_WORK
 
 
 def test_paths_are_sent_again_after_the_clock_went_back() -> None:

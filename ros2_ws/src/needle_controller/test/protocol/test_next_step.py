@@ -15,7 +15,6 @@ from needle_controller.laws.law import SteeringCommand
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.actions import next_step
 from needle_controller.protocol.confidence import (
-    Confidence,
     assess_confidence,
     point_miss_probability,
 )
@@ -87,12 +86,6 @@ def test_the_miss_probability_of_a_point_is_its_frequency() -> None:
         drawn = off + rng.normal(size=(40_000, 3)) @ root.T
         share = float(np.mean(np.linalg.norm(drawn, axis=1) > 1e-3))
         assert float(point_miss_probability(off, root @ root.T)) == pytest.approx(share, abs=0.03)
-
-
-def test_the_summary_contains_distance_interval_and_verdict() -> None:
-    said = Confidence("trusted", False, 0.001, -0.001, 0.003).summary
-    assert said == "r1 = 0.00100 m +- 0.00200 m (95 %), trusted"
-    assert Confidence(r1=0.0, low=-1.0, high=1.0).summary.endswith("(95 %)")
 
 
 def test_the_reception_log_round_trips_once_in_order() -> None:
