@@ -6,11 +6,19 @@ import math
 from collections.abc import Sequence
 
 from needle_core.settings.parameter_fields import ParameterSpec, specs
-from reference.endpoints import CALLS, OPEN_ENDED, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
+from reference.endpoints import CALLS, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from reference.markdown import block, code, node_link, table
 from reference.rig_nodes import RigNode
 
 NODES = "nodes/"
+OPEN_TOPICS = {
+    "recorder": "`recorder` subscribes to every topic that it records.\n\n",
+    "player": "`player` publishes the topics of its bag; commands, holds and targets only below "
+    "`/replay`.\n\n",
+}
+"""Notes on topics that depend on the graph or a bag, by node."""
+OPEN_SERVICES = {"recorder": "`recorder` asks every node for its parameters.\n\n"}
+"""Likewise, on services."""
 _EVERY_NODE = """\
 Every node also publishes `/diagnostics` and `/rosout`, and has ROS's own services and
 `/parameter_events` for parameters.
@@ -30,9 +38,7 @@ def node_page(node: RigNode) -> str:
         ("serves" if end.role == SERVES else "calls", code(end.name), code(end.type_name), when)
         for end, when in sorted(calls, key=lambda each: (each[0].role != SERVES, each[0].name))
     ]
-    note = "".join(
-        f"{text}\n\n" for text in OPEN_ENDED.values() if text.startswith(f"`{node.name}")
-    )
+    note = OPEN_TOPICS.get(node.name, "") + OPEN_SERVICES.get(node.name, "")
     parts = [(code(part), ", ".join(map(code, keys))) for part, keys in node.parts.items()]
     return "".join(
         (
@@ -116,7 +122,7 @@ def topics_page(nodes: Sequence[RigNode]) -> str:
         "rig. The number is the queue depth; latched messages also reach later subscribers."
         "\n\n"
         + table(("topic", "type", "publishers", "subscribers"), rows)
-        + "".join(f"{text}\n\n" for text in OPEN_ENDED.values() if "ask" not in text)
+        + "".join(OPEN_TOPICS.values())
         + _EVERY_NODE
     )
 
@@ -135,7 +141,7 @@ def services_page(nodes: Sequence[RigNode]) -> str:
     return (
         "# Services\n\n"
         + table(("service", "type", "servers", "clients"), rows)
-        + "".join(f"{text}\n\n" for text in OPEN_ENDED.values() if "ask" in text)
+        + "".join(OPEN_SERVICES.values())
         + _EVERY_NODE
     )
 
