@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from needle_device_driver.conformance.rig import AXES
 from needle_device_driver.rules import Rule
-from scenario.rules.scene import AXES, Scene
+from scenario.virtual_rig import VirtualRig
 
 # Objects with the units of a drive's speeds.
 UNITS = {0x608F, 0x60A8, 0x60A9, 0x60AA}
@@ -12,7 +13,9 @@ DEEP = 0.1
 
 def axis_speed() -> None:
     """A drive with another unit of speed is stopped within 8 mm."""
-    scene = Scene(drives={"rpm": True, "insertion_start": DEEP, "insertion_max_speed": 0.15})
+    scene = VirtualRig(
+        1, drives={"rpm": True, "insertion_start": DEEP, "insertion_max_speed": 0.15}
+    )
     for drive in scene.bus.drives.values():
         for key in [key for key in drive._objects._entries if key[0] in UNITS]:
             del drive._objects._entries[key]
@@ -25,7 +28,7 @@ def axis_speed() -> None:
 
 def software_limits() -> None:
     """The drive itself enforces the limits of travel."""
-    scene = Scene()
+    scene = VirtualRig(1)
     scene.home()
     for axis in AXES:
         objects = scene.bus.drives[axis]._objects
@@ -37,7 +40,7 @@ def software_limits() -> None:
 
 def drive_reboot() -> None:
     """A reboot of a drive is a fault, and named."""
-    scene = Scene(drives={"boot_time": 0.05})
+    scene = VirtualRig(1, drives={"boot_time": 0.05})
     scene.ready()
     scene.bus.reboot("rotation", scene.runner.now)
     scene.runner.run(1.0)

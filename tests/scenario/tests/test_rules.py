@@ -18,7 +18,8 @@ from scenario.rules.bugs import BUGS
 CIA402 = partial(ConformanceRig, 1, axis="cia402")
 SCENES: dict[str, Callable[[], None]] = {
     **{rule.value: partial(check_rule, rule, CIA402) for rule in DRIVE_RULES},
-    **{scene.__name__: scene for scene in (*command_scenes.SCENES, *drive_scenes.SCENES)},
+    **command_scenes.SCENES,
+    **{scene.__name__: scene for scene in drive_scenes.SCENES},
 }
 RULES = sorted(rule.value for rule in Rule)
 
