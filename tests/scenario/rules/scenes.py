@@ -1,4 +1,4 @@
-"""Scenes for the rules of holds and commands, each with the name of its rule."""
+"""Scenes for the rules that the conformance kit leaves out, each with the name of its rule."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import partial
 
 from needle_core import messages as m
 from needle_core.component import Call, Publish
-from needle_device_driver.conformance.rig import Held
+from needle_device_driver.conformance.rig import AXES, Held
 from needle_device_driver.rules import Rule
 from scenario.virtual_rig import COMMANDS, HOLD, STATUS, VirtualRig
 
@@ -26,6 +26,9 @@ _REFUSED_STEPS: Mapping[Rule, tuple[float, float, float]] = {
 }
 _LIMITS = {Rule.MAX_DEPTH: {"max_depth": 0.003}, Rule.MAX_TURNS: {"max_turns": 0.25}}
 """Parameters of the driver with which the step is beyond a limit."""
+# Objects with the units of a drive's speeds.
+UNITS = {0x608F, 0x60A8, 0x60A9, 0x60AA}
+DEEP = 0.1
 
 
 def hold_new_press() -> None:
@@ -157,6 +160,42 @@ def homing_needle_out() -> None:
     assert [answer.success for answer in scene.hand.answers] == [False]
 
 
+def axis_speed() -> None:
+    """A drive with another unit of speed is stopped within 8 mm."""
+    scene = VirtualRig(
+        1, drives={"rpm": True, "insertion_start": DEEP, "insertion_max_speed": 0.15}
+    )
+    for drive in scene.bus.drives.values():
+        for key in [key for key in drive._objects._entries if key[0] in UNITS]:
+            del drive._objects._entries[key]
+        drive._objects._indices.difference_update(UNITS)
+    scene.begin_homing()
+    scene.runner.run(1.0)
+    assert scene.fails(Rule.AXIS_SPEED)
+    assert DEEP - scene.place[0] < 0.008
+
+
+def software_limits() -> None:
+    """The drive itself enforces the limits of travel."""
+    scene = VirtualRig(1)
+    scene.home()
+    for axis in AXES:
+        objects = scene.bus.drives[axis]._objects
+        lower, upper = (
+            int.from_bytes(objects.read(0x607D, sub), "little", signed=True) for sub in (1, 2)
+        )
+        assert -(2**31) < lower < 0 < upper < 2**31 - 1
+
+
+def drive_reboot() -> None:
+    """A reboot of a drive is a fault, and named."""
+    scene = VirtualRig(1, drives={"boot_time": 0.05})
+    scene.ready()
+    scene.bus.reboot("rotation", scene.runner.now)
+    scene.runner.run(1.0)
+    assert scene.fails(Rule.DRIVE_REBOOT)
+
+
 def _refuse_step(rule: Rule) -> None:
     """Check that the step of `_REFUSED_STEPS` is rejected by its rule."""
     scene = VirtualRig(1, driver=_LIMITS.get(rule))
@@ -172,7 +211,7 @@ SCENES: Mapping[str, Callable[[], None]] = {
         for scene in (
             *(hold_new_press, hold_one_owner, hold_in_order, speed_scale, one_device),
             *(command_state, command_one_publisher, command_newer, tip_age, homed_first),
-            *(coordinated, homing_needle_out),
+            *(coordinated, homing_needle_out, axis_speed, software_limits, drive_reboot),
         )
     },
     **{rule.value: partial(_refuse_step, rule) for rule in _REFUSED_STEPS},
