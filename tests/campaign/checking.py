@@ -51,6 +51,22 @@ class Finding:
     passed: bool
 
 
+def at_least(
+    key: str, what: str, bound: float, value: float, unit: str = "", form: str = ".4g"
+) -> Finding:
+    """Return a finding that passes if a value reaches a bound; both are shown in a format."""
+    wanted, seen = (f"{number:{form}}{unit}" for number in (bound, value))
+    return Finding(key, what, f">= {wanted}", seen, value >= bound)
+
+
+def at_most(
+    key: str, what: str, bound: float, value: float, unit: str = "", form: str = ".4g"
+) -> Finding:
+    """Return a finding that passes if a value does not exceed a bound; see `at_least`."""
+    wanted, seen = (f"{number:{form}}{unit}" for number in (bound, value))
+    return Finding(key, what, f"<= {wanted}", seen, value <= bound)
+
+
 Check = Callable[["Workbench"], Iterator[Finding]]
 
 

@@ -327,9 +327,6 @@ def fresh_clone() -> Iterator[Path]:
 
 def main(pages: list[str]) -> int:
     """Type pages in a fresh clone; return 1 if a page fails, 130 on an interrupt."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        # Remove the clone and end its processes on these signals too.
-        signal.signal(number, signal.default_int_handler)
     try:
         return _type_all(pages)
     except KeyboardInterrupt:
