@@ -107,21 +107,11 @@ def _first_sentence(node: RigNode) -> str:
 
 def topics_page(nodes: Sequence[RigNode]) -> str:
     """Return the page of topics, with publishers and subscribers."""
-    found: dict[tuple[str, str], dict[str, list[str]]] = {}
-    for node in nodes:
-        for end, when in node.endpoints(PUBLISHES, SUBSCRIBES):
-            if not _is_of_every_node(end):
-                sides = found.setdefault((end.name, end.type_name), {PUBLISHES: [], SUBSCRIBES: []})
-                sides[end.role].append(_at_end(node, end.qos, when))
-    rows = [
-        (code(name), code(kind), "<br>".join(ends[PUBLISHES]), "<br>".join(ends[SUBSCRIBES]))
-        for (name, kind), ends in sorted(found.items(), key=lambda each: each[0][0].lstrip("/"))
-    ]
     return (
         "# Topics\n\nNames are relative unless they begin with `/`, so a namespace moves the whole "
         "rig. The number is the queue depth; latched messages also reach later subscribers."
         "\n\n"
-        + table(("topic", "type", "publishers", "subscribers"), rows)
+        + _both_ends(nodes, PUBLISHES, SUBSCRIBES, ("topic", "type", "publishers", "subscribers"))
         + "".join(OPEN_TOPICS.values())
         + _EVERY_NODE
     )
@@ -129,21 +119,27 @@ def topics_page(nodes: Sequence[RigNode]) -> str:
 
 def services_page(nodes: Sequence[RigNode]) -> str:
     """Return the page of services, with servers and clients."""
-    found: dict[tuple[str, str], dict[str, list[str]]] = {}
-    for node in nodes:
-        for end, when in node.endpoints(SERVES, CALLS):
-            sides = found.setdefault((end.name, end.type_name), {SERVES: [], CALLS: []})
-            sides[end.role].append(_at_end(node, "", when))
-    rows = [
-        (code(name), code(kind), "<br>".join(ends[SERVES]), "<br>".join(ends[CALLS]))
-        for (name, kind), ends in sorted(found.items())
-    ]
     return (
         "# Services\n\n"
-        + table(("service", "type", "servers", "clients"), rows)
+        + _both_ends(nodes, SERVES, CALLS, ("service", "type", "servers", "clients"))
         + "".join(OPEN_SERVICES.values())
         + _EVERY_NODE
     )
+
+
+def _both_ends(nodes: Sequence[RigNode], near: str, far: str, head: Sequence[str]) -> str:
+    """Return a table of topics or services, with the nodes that have either role."""
+    found: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for node in nodes:
+        for end, when in node.endpoints(near, far):
+            if not _is_of_every_node(end):
+                sides = found.setdefault((end.name, end.type_name), {near: [], far: []})
+                sides[end.role].append(_at_end(node, end.qos, when))
+    rows = [
+        (code(name), code(kind), "<br>".join(ends[near]), "<br>".join(ends[far]))
+        for (name, kind), ends in sorted(found.items(), key=lambda each: each[0][0].lstrip("/"))
+    ]
+    return table(head, rows)
 
 
 def _at_end(node: RigNode, qos: str, when: str) -> str:
