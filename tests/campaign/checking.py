@@ -21,7 +21,6 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from needle_bringup.workplace import processes_with
-from needle_core.errors import UserError
 
 T = TypeVar("T")
 # Environment variable that marks every process of a check.
@@ -167,24 +166,6 @@ def busy(count: int) -> Iterator[None]:
         for process in processes:
             process.kill()
             process.wait()
-
-
-def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:
-    """Return the serialized messages of some topics.
-
-    Raises
-    ------
-    UserError
-        If there is no bag.
-    """
-    found: dict[str, list[bytes]] = {topic: [] for topic in topics}
-    files = list(bag.glob("*.mcap"))
-    if not files:
-        raise UserError(f"{bag}: there is no bag")
-    with files[0].open("rb") as stream:
-        for _, channel, message in make_reader(stream).iter_messages(topics=list(topics)):
-            found[channel.topic].append(message.data)
-    return found
 
 
 def bag_read_error(bag: Path) -> str:
