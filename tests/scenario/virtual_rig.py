@@ -22,7 +22,6 @@ from needle_core.runners.transport import Fault
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 from needle_device_driver.conformance.rig import ConformanceRig, RigClient
 from needle_device_driver.rules import Rule
-from needle_sim.drive_emulator import POSITIONS
 from needle_sim.drives.emulated_bus import EmulatedBus
 
 HOLD = Output("device/hold", m.HoldState, BEST_EFFORT)
@@ -32,30 +31,16 @@ STATUS = Output("device/status", DeviceStatus, LATCHED)
 
 
 class VirtualRigClient(RigClient):
-    """Also keeps the controller's status and the positions of the drives.
-
-    Attributes
-    ----------
-    places : list of tuple of float
-        Positions of the drives.
-    """
+    """Also keeps the controller's status."""
 
     def __init__(self, *, steers: bool) -> None:
         super().__init__(steers=steers)
         self.controller = ControllerStatus()
-        self.places: list[tuple[float, float]] = []
-        self.inputs = (
-            *self.inputs,
-            Input("needle/controller_status", ControllerStatus, self._on_controller, LATCHED),
-            Input(POSITIONS, m.JointState, self._on_positions),
-        )
+        row = Input("needle/controller_status", ControllerStatus, self._on_controller, LATCHED)
+        self.inputs = (*self.inputs, row)
 
     def _on_controller(self, message: ControllerStatus, _: Moment) -> Actions:
         self.controller = message
-        return ()
-
-    def _on_positions(self, message: m.JointState, _: Moment) -> Actions:
-        self.places.append((message.positions[0], message.positions[1]))
         return ()
 
 

@@ -78,8 +78,6 @@ def random_steps(count: int) -> tuple[list[float], list[str], float]:
         duration = max(length / FASTEST, abs(turn) / 3.0) * rng.uniform(1.01, 1.5)
         stamp = rig.command(at[0], at[1], duration)
         rig.until(lambda stamp=stamp: stamp in rig.hand.results, "a result")  # type: ignore[misc]
-        # Recorded positions would count as growth of memory.
-        rig.hand.places.clear()
         if number in (count // 10, count - 1):
             memory.append(_memory())
     rig.runner.run(0.1)

@@ -8,6 +8,7 @@ from functools import partial
 
 from needle_core import messages as m
 from needle_core.component import Call, Publish
+from needle_device_driver.axes.cycle_times import PERIOD
 from needle_device_driver.conformance.rig import AXES, Held
 from needle_device_driver.rules import Rule
 from scenario.virtual_rig import COMMANDS, HOLD, STATUS, VirtualRig
@@ -137,13 +138,14 @@ def coordinated() -> None:
     """Rotation follows insertion in proportion, also while the speed scale changes."""
     scene = VirtualRig(1)
     scene.ready()
-    scene.hand.places.clear()
+    places = [scene.place]
     stamp = scene.step()
-    scene.runner.run(0.2)
-    scene.hand.held = Held(True, 0.3)
-    scene.until_done(stamp)
-    begin, end = scene.hand.places[0], scene.hand.places[-1]
-    for at in scene.hand.places:
+    while stamp not in scene.hand.results:
+        scene.hand.held = Held(True, 1.0 if len(places) < 10 else 0.3)
+        scene.runner.run(PERIOD)
+        places.append(scene.place)
+    begin, end = places[0], places[-1]
+    for at in places:
         insertion, rotation = (
             (now - first) / (last - first) for now, first, last in zip(at, begin, end, strict=True)
         )
