@@ -9,7 +9,6 @@ from pathlib import Path
 
 from reference.endpoints import SOURCES
 from reference.markdown import code, node_link, table
-from reference.node_pages import NODES
 from reference.rig_nodes import IN_EVERY_NODE, RigNode
 
 LEVELS = ("WARN", "ERROR")
@@ -91,7 +90,7 @@ def _text(words: ast.expr | None) -> str:
 def diagnostics_page(nodes: Sequence[RigNode]) -> str:
     """Return the page."""
     parts = [
-        (node_link(node.name, NODES), code(part), ", ".join(map(code, keys)))
+        (node_link(node.name), code(part), ", ".join(map(code, keys)))
         for node in nodes
         for part, keys in node.parts.items()
     ]

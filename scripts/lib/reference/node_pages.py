@@ -10,7 +10,6 @@ from reference.endpoints import CALLS, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from reference.markdown import block, code, node_link, table
 from reference.rig_nodes import RigNode
 
-NODES = "nodes/"
 OPEN_TOPICS = {
     "recorder": "`recorder` subscribes to every topic that it records.\n\n",
     "player": "`player` publishes the topics of its bag; commands, holds and targets only below "
@@ -93,9 +92,7 @@ def _is_of_every_node(end: Endpoint) -> bool:
 
 def nodes_index(nodes: Sequence[RigNode]) -> str:
     """Return the index of the node pages."""
-    rows = [
-        (node_link(node.name, NODES), code(node.package), _first_sentence(node)) for node in nodes
-    ]
+    rows = [(node_link(node.name), code(node.package), _first_sentence(node)) for node in nodes]
     return f"# Nodes\n\n{_EVERY_NODE}\n{table(('node', 'package', 'purpose'), rows)}"
 
 
@@ -144,4 +141,4 @@ def _both_ends(nodes: Sequence[RigNode], near: str, far: str, head: Sequence[str
 
 def _at_end(node: RigNode, qos: str, when: str) -> str:
     more = "; ".join(text for text in (qos, when) if text)
-    return f"{node_link(node.name, NODES)}{f' ({more})' if more else ''}"
+    return f"{node_link(node.name)}{f' ({more})' if more else ''}"
