@@ -21,7 +21,6 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from needle_bringup.workplace import processes_with
-from needle_core.errors import UserError
 
 T = TypeVar("T")
 # Environment variable that marks every process of a check.
@@ -49,6 +48,22 @@ class Finding:
     wanted: str
     seen: str
     passed: bool
+
+
+def at_least(
+    key: str, what: str, bound: float, value: float, unit: str = "", form: str = ".4g"
+) -> Finding:
+    """Return a finding that passes if a value reaches a bound; both are shown in a format."""
+    wanted, seen = (f"{number:{form}}{unit}" for number in (bound, value))
+    return Finding(key, what, f">= {wanted}", seen, value >= bound)
+
+
+def at_most(
+    key: str, what: str, bound: float, value: float, unit: str = "", form: str = ".4g"
+) -> Finding:
+    """Return a finding that passes if a value does not exceed a bound; see `at_least`."""
+    wanted, seen = (f"{number:{form}}{unit}" for number in (bound, value))
+    return Finding(key, what, f"<= {wanted}", seen, value <= bound)
 
 
 Check = Callable[["Workbench"], Iterator[Finding]]
@@ -151,24 +166,6 @@ def busy(count: int) -> Iterator[None]:
         for process in processes:
             process.kill()
             process.wait()
-
-
-def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:
-    """Return the serialized messages of some topics.
-
-    Raises
-    ------
-    UserError
-        If there is no bag.
-    """
-    found: dict[str, list[bytes]] = {topic: [] for topic in topics}
-    files = list(bag.glob("*.mcap"))
-    if not files:
-        raise UserError(f"{bag}: there is no bag")
-    with files[0].open("rb") as stream:
-        for _, channel, message in make_reader(stream).iter_messages(topics=list(topics)):
-            found[channel.topic].append(message.data)
-    return found
 
 
 def bag_read_error(bag: Path) -> str:

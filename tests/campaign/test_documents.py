@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
@@ -187,26 +183,3 @@ print(1)
     ]
     with pytest.raises(PageError, match="line 1"):
         blocks("```yaml\na: 1\n```\n")
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_leaves_neither_a_clone_nor_what_was_typed(tmp_path: Path, number: int) -> None:
-    folder, started = tmp_path / "tmp", tmp_path / "started"
-    folder.mkdir()
-    page = tmp_path / "page.md"
-    page.write_text(
-        f"Type:\n\n    echo $$ > {started}.new; mv {started}.new {started}; exec sleep 600\n"
-    )
-    typing = subprocess.Popen(
-        [sys.executable, ROOT / "tests" / "campaign" / "typed_pages.py", page],
-        env={**os.environ, "TMPDIR": str(folder)},
-        stdout=subprocess.DEVNULL,
-    )
-    end = time.monotonic() + 60.0
-    while not started.exists():
-        assert typing.poll() is None
-        assert time.monotonic() < end
-    typing.send_signal(number)
-    assert typing.wait(60.0) == 130
-    assert not list(folder.iterdir())
-    assert not Path("/proc", started.read_text().strip()).exists()

@@ -23,6 +23,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import IO, Any
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (
@@ -217,24 +218,25 @@ class Session:
                 raise PageError(f"{command}\n{said}")
             said = self._run(command)
 
-    def _shell(self, command: str) -> list[str]:
+    def _open(self, command: str, stdin: int, output: IO[Any]) -> subprocess.Popen[bytes]:
+        """Start a command in a shell with the environment of this checkout."""
         self._say(command)
         before = "" if "scripts/setup" in command else "source scripts/env.sh\n"
-        return ["bash", "-c", f"{before}{command}"]
+        return subprocess.Popen(
+            ["bash", "-c", f"{before}{command}"],
+            cwd=self._folder,
+            env=self._environment,
+            stdin=stdin,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
 
     def _run(self, command: str) -> str:
         command = self._change(command)
         wanted = re.search(r"exit code (\d+)", command)
         with tempfile.TemporaryFile("w+") as output:
-            process = subprocess.Popen(
-                self._shell(command),
-                cwd=self._folder,
-                env=self._environment,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+            process = self._open(command, subprocess.DEVNULL, output)
             try:
                 code = self._end_of(process, command)
             except BaseException:
@@ -262,17 +264,9 @@ class Session:
 
     def _start_node(self, name: str, command: str) -> None:
         log = self._logs / name
-        # exec: a background job of a shell without job control ignores SIGINT.
-        shell = self._shell(f"exec {self._change(command)}")
         with log.open("wb") as output:
-            process = subprocess.Popen(
-                shell,
-                cwd=self._folder,
-                env=self._environment,
-                stdin=subprocess.PIPE,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-            )
+            # exec: a background job of a shell without job control ignores SIGINT.
+            process = self._open(f"exec {self._change(command)}", subprocess.PIPE, output)
         self._nodes[name] = process, log
         end = time.monotonic() + READY
         listing = ["bash", "-c", "source scripts/env.sh; ros2 node list"]
@@ -327,9 +321,6 @@ def fresh_clone() -> Iterator[Path]:
 
 def main(pages: list[str]) -> int:
     """Type pages in a fresh clone; return 1 if a page fails, 130 on an interrupt."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        # Remove the clone and end its processes on these signals too.
-        signal.signal(number, signal.default_int_handler)
     try:
         return _type_all(pages)
     except KeyboardInterrupt:

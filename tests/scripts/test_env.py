@@ -14,7 +14,6 @@ SHELLS = [
     pytest.param(shell, marks=pytest.mark.skipif(not shutil.which(shell), reason=f"no {shell}"))
     for shell in ("bash", "zsh")
 ]
-OURS = ("AMENT_PREFIX_PATH", "PYTHONPATH", "ROS_", "RMW_", "FASTRTPS_", "VIRTUAL_ENV", "PATH=")
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Project files of other tools: named files exist, and versions agree."""
+"""Project files: files and tests that they name exist, and versions agree."""
 
 from __future__ import annotations
 
@@ -98,3 +98,19 @@ def test_a_citation_has_what_the_format_wants() -> None:
     assert {"cff-version", "title", "message", "authors"} <= set(citation)
     assert citation["license"] == "Apache-2.0"
     assert Path(ROOT / "LICENSE").is_file()
+
+
+def test_every_known_failure_names_an_existing_test() -> None:
+    page = (ROOT / "docs/troubleshooting.md").read_text("utf-8")
+    rows = re.findall(r"^\| .* \| `(test_\w+)` \|$", page, re.MULTILINE)
+    folders = [ROOT / "tests", *ROOT.glob("ros2_ws/src/*/test")]
+    there = {
+        name
+        for folder in folders
+        for path in folder.rglob("test_*.py")
+        for name in re.findall(
+            r"^\s*(?:async )?def (test_\w+)", path.read_text("utf-8"), re.MULTILINE
+        )
+    }
+    assert len(rows) == page.count("`test_") > 0
+    assert [name for name in rows if name not in there] == []

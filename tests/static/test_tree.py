@@ -1,4 +1,4 @@
-"""Size of modules and folders, first words of docstrings, and the counter of code lines."""
+"""Size of modules and folders, docstrings, base classes of nodes, and the counter of code lines."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ LONGEST_MODULE = 400
 MOST_MODULES = 15
 # Docstrings begin with a noun or a verb, not with a clause.
 CLAUSES = {"How", "Nobody", "What", "When", "Where", "Who", "Whoever", "Whose", "Why"}
+RCLPY = {"Node", "LifecycleNode"}
 SOURCE = '''"""A docstring.
 
 Of three lines.
@@ -68,3 +69,17 @@ def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
         if (text := (ast.get_docstring(node) or "").partition("\n")[0]).partition(" ")[0] in CLAUSES
     ]
     assert clauses == []
+
+
+def test_no_node_is_rclpys_own() -> None:
+    # Its own base class destroys a node whose construction fails.
+    found = []
+    for path in sorted((ROOT / "ros2_ws" / "src").glob("*/*/ros/*.py")):
+        if "test" in path.parts or path.name == "base_node.py":
+            continue
+        for part in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(part, ast.ClassDef):
+                bases = {base.id for base in part.bases if isinstance(base, ast.Name)}
+                if bases & RCLPY:
+                    found.append(f"{path.relative_to(ROOT)}: {part.name}")
+    assert found == []

@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import can
 import numpy as np
@@ -42,16 +42,6 @@ NODES = (1, 2)
 BITRATE = 500_000
 # 2 mm/s and 1 rad/s.
 COUNTS_PER_CYCLE = (800, 209)
-
-
-class Client(Protocol):
-    """Moves both axes."""
-
-    def cycle(self, number: int) -> None:
-        """Send set-points number `number` and SYNC, receive the answers."""
-
-    def close(self) -> None:
-        """Switch off and close the port."""
 
 
 class Driver:
@@ -152,6 +142,7 @@ class PlainSlcan:
         self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
 
+Client = Driver | PlainSlcan
 CLIENTS: dict[str, Callable[[str], Client]] = {
     "device_driver": Driver,
     "python-can slcan": PlainSlcan,

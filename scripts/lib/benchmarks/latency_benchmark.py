@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 import rclpy
 from sensor_msgs.msg import CameraInfo, Image, JointState
-from std_srvs.srv import Trigger
 
 import needle_tracker
 from campaign.trials.ros_rig_client import CONTROLLER_START, RosRigClient
@@ -203,36 +202,29 @@ class LatencyRig(RosRigClient):
     def insert(self, depth: float) -> None:
         """Prepare the rig, then hold until the needle reaches a depth [m]."""
         self.prepare()
-        self._publish_until(lambda: self.published >= _PAIRS_BEFORE_START, "images")
-        start = self._clients_of[CONTROLLER_START]
-        self._publish_until(start.service_is_ready, "the controller")
-        while not self._has_started(start):
-            published = self.published
-            self._publish_until(lambda least=published: self.published > least, "another image")
+        self._publish_pairs(_PAIRS_BEFORE_START)
+        self.call_until_success(CONTROLLER_START)
         self.send_hold()
-        self._publish_until(lambda least=self.published: self.published > least, "a release")
+        # The release precedes the press.
+        self._publish_pairs(1)
         self.pressed = True
-        self._publish_until(lambda: self._joints[-1][1] >= depth, "the depth")
+        self.until(lambda: self._joints[-1][1] >= depth, "the depth", _TIMEOUT)
         self.pressed = False
         self.send_hold()
 
-    def _has_started(self, start: Any) -> bool:
-        future = start.call_async(Trigger.Request())
-        self._publish_until(future.done, "an answer of the controller")
-        return bool(future.result().success)
+    def spin(self, timeout: float = 0.0) -> None:
+        """Run one callback, and publish a pair of images if it is due."""
+        super().spin(min(timeout, max(self._due - time.monotonic(), 0.0)))
+        if time.monotonic() >= self._due:
+            self._publish_pair()
+            # A late camera does not catch up.
+            self._due = max(self._due, time.monotonic() - FRAME)
+            self._due += FRAME + self._random.uniform(-_JITTER, _JITTER)
 
-    def _publish_until(self, condition: Any, what: str) -> None:
-        end = time.monotonic() + _TIMEOUT
-        while not condition():
-            if time.monotonic() > end:
-                raise UserError(f"timed out after {_TIMEOUT:g} s: {what}; device: {self.status}")
-            wait = self._due - time.monotonic()
-            self.spin(max(wait, 0.0))
-            if time.monotonic() >= self._due:
-                self._publish_pair()
-                # A late camera does not catch up.
-                self._due = max(self._due, time.monotonic() - FRAME)
-                self._due += FRAME + self._random.uniform(-_JITTER, _JITTER)
+    def _publish_pairs(self, count: int) -> None:
+        """Run until a number of further pairs is published."""
+        enough = self.published + count
+        self.until(lambda: self.published >= enough, "images")
 
     def _publish_pair(self) -> None:
         exposed_ns = time.time_ns() - round(_TRANSFER * NANOSECONDS)

@@ -19,7 +19,6 @@ from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import PlaneControl
-from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.disturbances import NOISE, Disturbances, uniform_numbers
 from needle_sim.studies.needles import NeedleBatch
@@ -113,9 +112,6 @@ def _plain_study() -> float:
     chosen = range(0, NEEDLES, NEEDLES // PLAIN_NEEDLES)
     needles = [(STARTS[k].tolist(), noise_of(k)) for k in chosen]
     seconds = _least_time(lambda: [reference_loop.steer(*needle, d) for needle in needles], 2)
-    ends = [reference_loop.steer(*needle, d) for needle in needles]
-    seen = run_study(STARTS, controller_factory("paper", TIP_NOISE), STUDY).x_end[list(chosen)]
-    _require_agreement("plain Python", seen.tolist(), ends)
     return seconds * NEEDLES / len(needles)
 
 
@@ -124,19 +120,9 @@ def _control_study() -> float:
     system = reference_loop.control_system(d)
     needles = [(STARTS[k].tolist(), noise_of(k)) for k in range(CONTROL_NEEDLES)]
     begin = time.process_time()
-    ends = [reference_loop.control_steer(system, *needle) for needle in needles]
-    seconds = time.process_time() - begin
-    _require_agreement(
-        "python-control", ends, [reference_loop.steer(*needle, d) for needle in needles]
-    )
-    return seconds * NEEDLES / len(needles)
-
-
-def _require_agreement(name: str, one: Sequence[float], other: Sequence[float]) -> None:
-    """Raise UserError unless both loops compute the same."""
-    off = max(abs(a - b) for a, b in zip(one, other, strict=True))
-    if off > 1e-6:
-        raise UserError(f"the loop in {name} ends up to {off:g} m elsewhere: not the same loop")
+    for needle in needles:
+        reference_loop.control_steer(system, *needle)
+    return (time.process_time() - begin) * NEEDLES / len(needles)
 
 
 def _peak_memory(name: str, depth: float) -> float:

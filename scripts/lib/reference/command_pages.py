@@ -14,7 +14,6 @@ from unittest import mock
 
 from code_lines import ROOT
 from reference.markdown import block, node_link
-from reference.node_pages import NODES
 from reference.rig_nodes import RigNode, executables
 
 SCRIPTS = ROOT / "scripts"
@@ -68,7 +67,7 @@ def help_of_script(name: str) -> str:
 
 def commands_page(nodes: Sequence[RigNode]) -> str:
     """Return the page."""
-    links = ", ".join(node_link(node.name, NODES) for node in nodes)
+    links = ", ".join(node_link(node.name) for node in nodes)
     page = [
         "# Command lines\n\nExit codes are the same for all "
         f"([architecture](../architecture.md#exit-codes)). Nodes: {links}.\n\n## Scripts\n\n"

@@ -9,15 +9,9 @@ from pathlib import Path
 
 from reference.endpoints import SOURCES
 from reference.markdown import code, node_link, table
-from reference.node_pages import NODES
-from reference.rig_nodes import RigNode
+from reference.rig_nodes import IN_EVERY_NODE, RigNode
 
 LEVELS = ("WARN", "ERROR")
-IN_EVERY_NODE = {
-    "input": "a message or request was rejected, or its handler failed; counted by topic",
-    "duplicates": "another node publishes on a topic of this node",
-}
-"""Parts that any node may report, by `needle_core.ros`."""
 _FILLED_IN = "..."
 
 
@@ -96,7 +90,7 @@ def _text(words: ast.expr | None) -> str:
 def diagnostics_page(nodes: Sequence[RigNode]) -> str:
     """Return the page."""
     parts = [
-        (node_link(node.name, NODES), code(part), ", ".join(map(code, keys)))
+        (node_link(node.name), code(part), ", ".join(map(code, keys)))
         for node in nodes
         for part, keys in node.parts.items()
     ]
@@ -105,7 +99,7 @@ def diagnostics_page(nodes: Sequence[RigNode]) -> str:
     }
     rows = [
         (
-            f"{code(each.package)}",
+            code(each.package),
             code(each.module.removesuffix(".py")),
             each.level,
             code(each.text),

@@ -1,43 +1,21 @@
-"""Records topics, services, parameters and diagnostics of nodes while they are constructed."""
+"""Topics and services of a constructed node."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import sys
-from collections.abc import Iterator
-from types import FrameType
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from code_lines import ROOT
-from needle_core.diagnostics import Diagnostic
-from needle_core.ros.base_node import DiagnosticsPublisher
-from needle_core.ros.parameters import NodeParameters
 
 PUBLISHES, SUBSCRIBES, SERVES, CALLS = "publishes", "subscribes", "serves", "calls"
-MAKERS = {
-    "create_publisher": PUBLISHES,
-    "create_subscription": SUBSCRIBES,
-    "create_service": SERVES,
-    "create_client": CALLS,
-}
-"""Roles by the method of rclpy's Node that creates the endpoint."""
-OPEN_ENDED = {
-    "needle_bags/ros/graph_topics.py:_subscribe": "`recorder` subscribes to every topic "
-    "that it records.",
-    "needle_bags/ros/player.py:_publisher": "`player` publishes the topics of its bag; "
-    "commands, holds and targets only below `/replay`.",
-    "needle_bags/ros/parameter_snapshots.py:__init__": "`recorder` asks every node for its "
-    "parameters.",
-}
-"""Functions whose endpoints depend on the graph or a bag, with a note for the reader."""
+NAMESPACE = "/of_the_reference"
+"""Namespace of the constructed nodes: other names are absolute."""
 SOURCES = ROOT / "ros2_ws" / "src"
-
-Place = tuple[str, int]
-"""File below a package's folder in `SOURCES`, and line."""
+# Packages of the types of rclpy's own endpoints.
+_RCLPY = ("rcl_interfaces", "type_description_interfaces")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,42 +40,23 @@ class Endpoint:
     qos: str
 
 
-@dataclasses.dataclass
-class NodeRecord:
-    """Record of one node in one of its variants.
-
-    Attributes
-    ----------
-    endpoints : list of Endpoint
-        In order, each once.
-    parameters : list of type
-        Declared parameter dataclasses.
-    parts : dict of str to list of str
-        Parts of its diagnostics, with the keys of their values.
-    places : set of Place
-        Lines of code that created an endpoint.
-    """
-
-    endpoints: list[Endpoint] = dataclasses.field(default_factory=list)
-    parameters: list[type] = dataclasses.field(default_factory=list)
-    parts: dict[str, list[str]] = dataclasses.field(default_factory=dict)
-    places: set[Place] = dataclasses.field(default_factory=set)
-
-    def add(
-        self, role: str, node: Any, kind: type, name: str, qos: QoSProfile | int | None
-    ) -> None:
-        """Record an endpoint, unless rclpy itself creates it."""
-        maker = sys._getframe(2)
-        if not _place(maker)[0]:
-            return
-        self.places |= _places(maker)
-        if f"{_place(maker)[0]}:{maker.f_code.co_name}" in OPEN_ENDED:
-            return
-        endpoint = Endpoint(
-            role, _plain_name(name, node.get_name()), type_name(kind), in_words(qos)
-        )
-        if endpoint not in self.endpoints:
-            self.endpoints.append(endpoint)
+def endpoints_of(node: Node) -> list[Endpoint]:
+    """Return the endpoints of a node, each once, without those of every ROS node."""
+    found: list[tuple[str, str, type[Any], str]] = [
+        *((PUBLISHES, p.topic_name, p.msg_type, in_words(p.qos_profile)) for p in node.publishers),
+        *(
+            (SUBSCRIBES, s.topic_name, s.msg_type, in_words(s.qos_profile))
+            for s in node.subscriptions
+        ),
+        *((SERVES, s.service_name, s.srv_type, "") for s in node.services),
+        *((CALLS, c.service_name, c.srv_type, "") for c in node.clients),
+    ]
+    ends = (
+        Endpoint(role, name.removeprefix(f"{NAMESPACE}/"), type_name(kind), qos)
+        for role, name, kind, qos in found
+        if type_name(kind).partition("/")[0] not in _RCLPY
+    )
+    return list(dict.fromkeys(ends))
 
 
 def type_name(kind: type) -> str:
@@ -105,80 +64,9 @@ def type_name(kind: type) -> str:
     return f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
 
 
-def in_words(qos: QoSProfile | int | None) -> str:
+def in_words(qos: QoSProfile) -> str:
     """Return a quality of service as text: `reliable, 10`, `reliable, latched, 1`."""
-    if not isinstance(qos, QoSProfile):
-        return ""
     words = ["reliable" if qos.reliability == ReliabilityPolicy.RELIABLE else "best effort"]
     if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
         words.append("latched")
     return ", ".join([*words, str(qos.depth)])
-
-
-def _plain_name(name: str, node: str) -> str:
-    return name.replace("~", node, 1)
-
-
-def _place(frame: FrameType) -> Place:
-    """Return file and line of a stack frame; an empty file outside of the packages."""
-    file = frame.f_code.co_filename
-    path = file.partition("/ros2_ws/src/")[2]
-    return (path.partition("/")[2], frame.f_lineno) if path else ("", 0)
-
-
-def _places(frame: FrameType | None) -> set[Place]:
-    """Return the lines of the packages on the call stack."""
-    found: set[Place] = set()
-    while frame is not None:
-        found.add(_place(frame))
-        frame = frame.f_back
-    return found - {("", 0)}
-
-
-@contextlib.contextmanager
-def record_nodes() -> Iterator[NodeRecord]:
-    """Record the nodes that are constructed within the context.
-
-    It patches rclpy and two classes of this project, so the process should do nothing else.
-    """
-    record = NodeRecord()
-
-    def patched_maker(name: str, role: str) -> Any:
-        make = getattr(Node, name)
-
-        def record_and_make(self: Node, kind: type, topic: str, *rest: Any, **more: Any) -> Any:
-            # A subscription's third argument is the callback.
-            at = {PUBLISHES: 0, SUBSCRIBES: 1}.get(role)
-            qos = None if at is None else more.get("qos_profile", (*rest, None, None)[at])
-            record.add(role, self, kind, topic, qos)
-            return make(self, kind, topic, *rest, **more)
-
-        return record_and_make
-
-    declare, report = NodeParameters.__init__, DiagnosticsPublisher.set
-
-    def record_and_declare(self: Any, node: Node, parameters: type, *rest: Any) -> None:
-        record.parameters.append(parameters)
-        declare(self, node, parameters, *rest)
-
-    def record_and_report(self: Any, part: str, diagnostic: Diagnostic) -> None:
-        keys = record.parts.setdefault(part, [])
-        keys += [key for key in diagnostic.values if key not in keys]
-        report(self, part, diagnostic)
-
-    with contextlib.ExitStack() as stack:
-        for name, role in MAKERS.items():
-            stack.enter_context(_patched(Node, name, patched_maker(name, role)))
-        stack.enter_context(_patched(NodeParameters, "__init__", record_and_declare))
-        stack.enter_context(_patched(DiagnosticsPublisher, "set", record_and_report))
-        yield record
-
-
-@contextlib.contextmanager
-def _patched(owner: Any, name: str, value: Any) -> Iterator[None]:
-    before = getattr(owner, name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        setattr(owner, name, before)

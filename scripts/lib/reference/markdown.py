@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
+NODES = "nodes/"
+"""Folder of the nodes' pages, beside the other pages."""
+
 
 def cell(text: str) -> str:
     """Return text escaped for a table cell."""
@@ -33,6 +36,6 @@ def block(text: str, language: str = "text") -> str:
     return f"{fence}{language}\n{text.rstrip()}\n{fence}\n\n"
 
 
-def node_link(name: str, folder: str = "") -> str:
+def node_link(name: str) -> str:
     """Return a link to a node's page."""
-    return f"[`{name}`]({folder}{name}.md)"
+    return f"[`{name}`]({NODES}{name}.md)"

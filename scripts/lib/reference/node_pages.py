@@ -6,11 +6,18 @@ import math
 from collections.abc import Sequence
 
 from needle_core.settings.parameter_fields import ParameterSpec, specs
-from reference.endpoints import CALLS, OPEN_ENDED, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
+from reference.endpoints import CALLS, PUBLISHES, SERVES, SUBSCRIBES, Endpoint
 from reference.markdown import block, code, node_link, table
 from reference.rig_nodes import RigNode
 
-NODES = "nodes/"
+OPEN_TOPICS = {
+    "recorder": "`recorder` subscribes to every topic that it records.\n\n",
+    "player": "`player` publishes the topics of its bag; commands, holds and targets only below "
+    "`/replay`.\n\n",
+}
+"""Notes on topics that depend on the graph or a bag, by node."""
+OPEN_SERVICES = {"recorder": "`recorder` asks every node for its parameters.\n\n"}
+"""Likewise, on services."""
 _EVERY_NODE = """\
 Every node also publishes `/diagnostics` and `/rosout`, and has ROS's own services and
 `/parameter_events` for parameters.
@@ -30,9 +37,7 @@ def node_page(node: RigNode) -> str:
         ("serves" if end.role == SERVES else "calls", code(end.name), code(end.type_name), when)
         for end, when in sorted(calls, key=lambda each: (each[0].role != SERVES, each[0].name))
     ]
-    note = "".join(
-        f"{text}\n\n" for text in OPEN_ENDED.values() if text.startswith(f"`{node.name}")
-    )
+    note = OPEN_TOPICS.get(node.name, "") + OPEN_SERVICES.get(node.name, "")
     parts = [(code(part), ", ".join(map(code, keys))) for part, keys in node.parts.items()]
     return "".join(
         (
@@ -87,9 +92,7 @@ def _is_of_every_node(end: Endpoint) -> bool:
 
 def nodes_index(nodes: Sequence[RigNode]) -> str:
     """Return the index of the node pages."""
-    rows = [
-        (node_link(node.name, NODES), code(node.package), _first_sentence(node)) for node in nodes
-    ]
+    rows = [(node_link(node.name), code(node.package), _first_sentence(node)) for node in nodes]
     return f"# Nodes\n\n{_EVERY_NODE}\n{table(('node', 'package', 'purpose'), rows)}"
 
 
@@ -101,45 +104,41 @@ def _first_sentence(node: RigNode) -> str:
 
 def topics_page(nodes: Sequence[RigNode]) -> str:
     """Return the page of topics, with publishers and subscribers."""
-    found: dict[tuple[str, str], dict[str, list[str]]] = {}
-    for node in nodes:
-        for end, when in node.endpoints(PUBLISHES, SUBSCRIBES):
-            if not _is_of_every_node(end):
-                sides = found.setdefault((end.name, end.type_name), {PUBLISHES: [], SUBSCRIBES: []})
-                sides[end.role].append(_at_end(node, end.qos, when))
-    rows = [
-        (code(name), code(kind), "<br>".join(ends[PUBLISHES]), "<br>".join(ends[SUBSCRIBES]))
-        for (name, kind), ends in sorted(found.items(), key=lambda each: each[0][0].lstrip("/"))
-    ]
     return (
         "# Topics\n\nNames are relative unless they begin with `/`, so a namespace moves the whole "
         "rig. The number is the queue depth; latched messages also reach later subscribers."
         "\n\n"
-        + table(("topic", "type", "publishers", "subscribers"), rows)
-        + "".join(f"{text}\n\n" for text in OPEN_ENDED.values() if "ask" not in text)
+        + _both_ends(nodes, PUBLISHES, SUBSCRIBES, ("topic", "type", "publishers", "subscribers"))
+        + "".join(OPEN_TOPICS.values())
         + _EVERY_NODE
     )
 
 
 def services_page(nodes: Sequence[RigNode]) -> str:
     """Return the page of services, with servers and clients."""
-    found: dict[tuple[str, str], dict[str, list[str]]] = {}
-    for node in nodes:
-        for end, when in node.endpoints(SERVES, CALLS):
-            sides = found.setdefault((end.name, end.type_name), {SERVES: [], CALLS: []})
-            sides[end.role].append(_at_end(node, "", when))
-    rows = [
-        (code(name), code(kind), "<br>".join(ends[SERVES]), "<br>".join(ends[CALLS]))
-        for (name, kind), ends in sorted(found.items())
-    ]
     return (
         "# Services\n\n"
-        + table(("service", "type", "servers", "clients"), rows)
-        + "".join(f"{text}\n\n" for text in OPEN_ENDED.values() if "ask" in text)
+        + _both_ends(nodes, SERVES, CALLS, ("service", "type", "servers", "clients"))
+        + "".join(OPEN_SERVICES.values())
         + _EVERY_NODE
     )
 
 
+def _both_ends(nodes: Sequence[RigNode], near: str, far: str, head: Sequence[str]) -> str:
+    """Return a table of topics or services, with the nodes that have either role."""
+    found: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for node in nodes:
+        for end, when in node.endpoints(near, far):
+            if not _is_of_every_node(end):
+                sides = found.setdefault((end.name, end.type_name), {near: [], far: []})
+                sides[end.role].append(_at_end(node, end.qos, when))
+    rows = [
+        (code(name), code(kind), "<br>".join(ends[near]), "<br>".join(ends[far]))
+        for (name, kind), ends in sorted(found.items(), key=lambda each: each[0][0].lstrip("/"))
+    ]
+    return table(head, rows)
+
+
 def _at_end(node: RigNode, qos: str, when: str) -> str:
     more = "; ".join(text for text in (qos, when) if text)
-    return f"{node_link(node.name, NODES)}{f' ({more})' if more else ''}"
+    return f"{node_link(node.name)}{f' ({more})' if more else ''}"

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from reference.command_pages import commands_page
 from reference.diagnostic_pages import diagnostics_page
-from reference.node_pages import NODES, node_page, nodes_index, services_page, topics_page
+from reference.markdown import NODES
+from reference.node_pages import node_page, nodes_index, services_page, topics_page
 from reference.rig_nodes import rig_nodes
 
 

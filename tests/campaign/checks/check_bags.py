@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 
-from campaign.checking import Check, Finding, Workbench, bag_read_error
+from campaign.checking import Check, Finding, Workbench, at_most, bag_read_error
 from campaign.trials.recording_trials import record_and_kill, record_full_rate
 from campaign.trials.signal_trials import signal_trials
 
@@ -30,16 +30,10 @@ def full_rate(bench: Workbench) -> Iterator[Finding]:
         f"{missing or 0}, {counted or 0} ({seen['MB_per_s']:.0f} MB/s)",
         not missing and not counted and seen["code"] == 0,
     )
-    share = seen["share"]
-    what, wanted = "the recorder's processor time", f"<= {PROCESSOR_SHARE:.0%} of a core"
-    yield Finding("full_rate_processor", what, wanted, f"{share:.1%}", share <= PROCESSOR_SHARE)
-    yield Finding(
-        "full_rate_memory",
-        "the recorder's memory",
-        f"grows <= {MEMORY_GROWTH_MB:g} MB in the second half",
-        f"{seen['grew']:+.1f} MB, {seen['memory']:.0f} MB at the end",
-        seen["grew"] <= MEMORY_GROWTH_MB,
-    )
+    what = "the recorder's processor time, of a core"
+    yield at_most("full_rate_processor", what, PROCESSOR_SHARE, seen["share"], form=".1%")
+    what = f"growth of the recorder's memory ({seen['memory']:.0f} MB) in the second half"
+    yield at_most("full_rate_memory", what, MEMORY_GROWTH_MB, seen["grew"], " MB")
     why = bag_read_error(bench.folder / "full_rate")
     yield Finding("full_rate_readers", "rosbags and mcap", "read all", why or "read all", not why)
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from campaign.checking import Check, Finding, Workbench, in_own_process
+from campaign.checking import Check, Finding, Workbench, at_most, in_own_process
 from needle_core.errors import UserError
 from needle_device_driver.axes.backend import HAND
 from needle_device_driver.conformance.faults import FAULTS, can_keep
@@ -34,13 +34,8 @@ _COUNTS = DriveEmulatorParameters().insertion_counts_per_unit, COUNTS_PER_RADIAN
 def many_steps(_: Workbench) -> Iterator[Finding]:
     """Make random steps: exact to a count, all succeed, without growth of memory."""
     off, outcomes, growth = in_own_process(random_steps, STEPS)
-    yield Finding(
-        "steps_position",
-        f"{STEPS:,} random steps: the motors' place against the sum of commands",
-        "within one count",
-        f"{off[0]:+.2f} and {off[1]:+.2f} counts",
-        max(map(abs, off)) <= 1.0,
-    )
+    what = f"{STEPS:,} random steps: the motors' place against the sum of commands"
+    yield at_most("steps_position", what, 1.0, max(map(abs, off)), " counts")
     failures = [outcome for outcome in outcomes if outcome != "succeeded"]
     yield Finding(
         "steps_results",
@@ -49,8 +44,8 @@ def many_steps(_: Workbench) -> Iterator[Finding]:
         f"{len(outcomes)} results, {len(failures)} other {failures[:1]}",
         len(outcomes) == STEPS and not failures,
     )
-    what, wanted = "memory, from a tenth of the steps on", f"at most {MEMORY_SLACK:g} MB more"
-    yield Finding("steps_memory", what, wanted, f"{growth:+.2f} MB", growth <= MEMORY_SLACK)
+    what = "growth of memory, from a tenth of the steps on"
+    yield at_most("steps_memory", what, MEMORY_SLACK, growth, " MB")
 
 
 def random_steps(count: int) -> tuple[list[float], list[str], float]:
@@ -83,8 +78,6 @@ def random_steps(count: int) -> tuple[list[float], list[str], float]:
         duration = max(length / FASTEST, abs(turn) / 3.0) * rng.uniform(1.01, 1.5)
         stamp = rig.command(at[0], at[1], duration)
         rig.until(lambda stamp=stamp: stamp in rig.hand.results, "a result")  # type: ignore[misc]
-        # Recorded positions would count as growth of memory.
-        rig.hand.places.clear()
         if number in (count // 10, count - 1):
             memory.append(_memory())
     rig.runner.run(0.1)

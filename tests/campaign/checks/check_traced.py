@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from campaign.checking import Check, Finding, Workbench
+from campaign.checking import Check, Finding, Workbench, at_least, at_most
 from campaign.tracking.traced_set import HELD_BACK, RIGS, drawn, scenes
 from campaign.tracking.traced_study import VARIATIONS, KnownInput, TrackedPair, tracked_pairs
 from campaign.tracking.tracker_study import WRONG
@@ -35,7 +35,7 @@ def path_traced(_: Workbench) -> Iterator[Finding]:
         found = _found([look for look in needles if look.known is known])
         key = f"path_traced_found_{known.name.lower()}"
         what = f"path-traced, {known.value} insertion, {_pairs(needles)} pairs: a tip"
-        yield Finding(key, what, f">= {least:.0%}", f"{found:.1%}", found >= least)
+        yield at_least(key, what, least, found, form=".1%")
     yield from _kinds(needles)
     for rig in RIGS:
         yield from _errors(rig, [look for look in needles if look.scene.rig == rig])
@@ -46,9 +46,7 @@ def path_traced(_: Workbench) -> Iterator[Finding]:
     yield Finding("path_traced_consistency", what, "85 to 99.5 %", f"{inside:.1%}", passed)
     empty = [look for look in looks if look.truth is None]
     false = sum(look.tip is not None for look in empty)
-    yield Finding(
-        "path_traced_absent", f"no needle, {len(empty)} looks: tips", "0", str(false), false == 0
-    )
+    yield at_most("path_traced_absent", f"no needle, {len(empty)} looks: tips", 0, false)
 
 
 def path_traced_variations(_: Workbench) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from ament_index_python.packages import get_package_share_directory
 
-from campaign.checking import Check, Finding, Workbench
+from campaign.checking import Check, Finding, Workbench, at_most
 from campaign.tracking.calibration_study import calibrated_tip_errors
 from campaign.tracking.tracker_study import (
     WRONG,
@@ -50,9 +50,8 @@ def heavy_clutter(_: Workbench) -> Iterator[Finding]:
     runs = run_scenario(_calibration(), "heavy_clutter", range(1, 16), 130)
     yield from _errors("heavy_clutter", runs, 0.5, 0.4)
     states = [state for run in runs for state in run.states]
-    lost = states.count(TrackState.LOST)
     what = f"heavy clutter, {len(states)} pairs: track lost"
-    yield Finding("heavy_clutter_lost", what, "0", str(lost), lost == 0)
+    yield at_most("heavy_clutter_lost", what, 0, states.count(TrackState.LOST))
     yield from _consistency("heavy_clutter", runs)
 
 
@@ -60,17 +59,12 @@ def occlusion(_: Workbench) -> Iterator[Finding]:
     """Report no wrong tip while hands and covers block the view, and find the needle again."""
     runs = run_scenario(_calibration(), "occlusion", range(1, 31), 130)
     wrong = sum(int(np.count_nonzero(run.distances > WRONG)) for run in runs)
-    count = sum(len(run.states) for run in runs)
-    yield Finding(
-        "occlusion_wrong",
-        f"occlusions, {count} pairs: tips wrong by more than 1.5 mm",
-        "0",
-        f"{wrong} of {sum(int(run.found.sum()) for run in runs)} tips",
-        wrong == 0,
-    )
+    tips = sum(int(run.found.sum()) for run in runs)
+    what = f"occlusions, {tips} tips: wrong by more than 1.5 mm"
+    yield at_most("occlusion_wrong", what, 0, wrong)
     slowest = max(run.slowest_recovery() for run in runs)
     what = "occlusions: pairs until a needle in full view of both cameras is found"
-    yield Finding("occlusion_recovery", what, "<= 3", f"at most {slowest}", slowest <= 3)
+    yield at_most("occlusion_recovery", what, 3, slowest)
 
 
 def absent(_: Workbench) -> Iterator[Finding]:
@@ -78,15 +72,15 @@ def absent(_: Workbench) -> Iterator[Finding]:
     runs = run_scenario(_calibration(), "absent", range(1, 7), STEPS)
     found = sum(int(run.found.sum()) for run in runs)
     count = sum(len(run.states) for run in runs)
-    yield Finding("absent_found", f"absent, {count} pairs: tips", "0", str(found), found == 0)
+    yield at_most("absent_found", f"absent, {count} pairs: tips", 0, found)
 
 
 def calibration(_: Workbench) -> Iterator[Finding]:
     """Calibrate a rig from board corners with errors of 0.1 px."""
     runs = [calibrated_tip_errors(_calibration(), seed, 0.1) for seed in range(1, SETS + 1)]
     p95 = float(np.percentile(runs, 95)) * 1e3
-    what = f"calibration at 0.1 px corners, {SETS} sets: 95 % error of tips"
-    yield Finding("calibration_errors", what, "3D <= 0.06 mm", f"{p95:.3f} mm", p95 <= 0.06)
+    what = f"calibration at 0.1 px corners, {SETS} sets: 95 % error of tips, 3D"
+    yield at_most("calibration_errors", what, 0.06, p95, " mm")
 
 
 def closed_loop(bench: Workbench) -> Iterator[Finding]:
@@ -117,13 +111,8 @@ def _closed_loop(bench: Workbench, scenario: str, seeds: int, largest: float) ->
         # A run that ends early counts as infinitely wrong.
         squares.append(rms**2 if rms is not None and run.code == 0 else np.inf)
     rms, missed = float(np.sqrt(np.mean(squares))), int(np.count_nonzero(np.isinf(squares)))
-    return Finding(
-        f"closed_loop_{scenario}",
-        f"level camera, {scenario}, {seeds} seeds: r1 over the last 20 mm",
-        f"<= {largest:.2f} mm rms",
-        f"{rms:.3f} mm rms; {missed} runs missed",
-        rms <= largest,
-    )
+    what = f"level camera, {scenario}, {seeds} seeds, {missed} missed: r1 over the last 20 mm"
+    return at_most(f"closed_loop_{scenario}", what, largest, rms, " mm rms")
 
 
 def _calibration() -> Path:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from campaign.checking import Finding
+from campaign.checking import Finding, at_least, at_most
 from needle_bringup.workplace import ran
 from needle_core.files.installed import find_executable
 
@@ -183,13 +184,9 @@ def run(study: Study, folder: Path) -> Figures:
 
 def compare_figures(study: Study, figures: Figures) -> Iterator[Finding]:
     """Compare the figures of a study with the required ones."""
-    bounds = [(*bound, True) for bound in study.at_least.items()]
-    for key, bound, is_least in (*bounds, *((*bound, False) for bound in study.at_most.items())):
-        value = figures[key]
-        yield Finding(
-            f"{study.key}_{key}",
-            f"{study.controller} {' '.join(study.options) or '(undisturbed)'}: {key}",
-            f"{'>=' if is_least else '<='} {bound:g}",
-            "nothing" if value is None else f"{value:.4g}",
-            value is not None and (value >= bound if is_least else value <= bound),
-        )
+    what = f"{study.controller} {' '.join(study.options) or '(undisturbed)'}"
+    for bounds, compare in ((study.at_least, at_least), (study.at_most, at_most)):
+        for key, bound in bounds.items():
+            # A missing figure is NaN, and meets no bound.
+            value = math.nan if figures[key] is None else figures[key]
+            yield compare(f"{study.key}_{key}", f"{what}: {key}", bound, value)

@@ -8,11 +8,10 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
+from needle_bags.reading.bag_messages import read_contents
 from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_core.errors import UserError
-from needle_core.files.bag_path import METADATA_FILE
-from needle_core.files.yaml_files import load_yaml
 
 WAITING_LIMIT = 400_000
 """Queue limit of the soak's recorder [B]; the default of the node is far larger."""
@@ -41,7 +40,8 @@ class BagMonitor:
 
     def losses_of_ended(self) -> list[str]:
         """Return the losses of a cleanly ended recorder that its bag does not report."""
-        kept, told = _counts(self._bag), _said_lost(self._bag)
+        kept = _counts(self._bag)
+        told = Counter(json.loads(read_contents(self._bag).custom_data.get(MESSAGES_LOST, "{}")))
         return [
             f"{topic}: {len(taken)} came, {kept[topic]} are in the bag, {told[topic]} reported lost"
             for topic, taken in sorted(self._taken.items())
@@ -76,10 +76,3 @@ def _counts(bag: Path) -> Counter[str]:
             for _, channel, _ in make_reader(stream).iter_messages():
                 counts[channel.topic] += 1
     return counts
-
-
-def _said_lost(bag: Path) -> Counter[str]:
-    """Return the lost messages that metadata.yaml reports, by topic."""
-    content = load_yaml((bag / METADATA_FILE).read_text(encoding="utf-8"))
-    custom = content["rosbag2_bagfile_information"]["custom_data"] or {}
-    return Counter(json.loads(custom.get(MESSAGES_LOST, "{}")))

@@ -14,9 +14,8 @@ from needle_core.component import Publish
 from needle_core.messages import EmergencyStop
 from needle_core.runners.transport import Arrival, Arrivals, Link
 from needle_device_driver.conformance.rig import DRIVER
-from scenario.rules.scene import ESTOP, Scene
 from scenario.transport_faults import delay
-from scenario.virtual_rig import VirtualRig
+from scenario.virtual_rig import ESTOP, VirtualRig
 
 SYNC, DEVICE_TYPE, LIMITS, HOMING_SPEEDS = 0x080, 0x1000, 0x607D, 0x6099
 
@@ -136,7 +135,7 @@ def test_both_drives_are_asked_side_by_side_and_homing_begins_when_both_have_tak
 
 
 def test_an_emergency_stop_calls_a_set_up_off_until_it_is_released() -> None:
-    scene = Scene()
+    scene = VirtualRig(1)
     other = scene.start_node(ESTOP)
     scene.act(other, Publish(ESTOP.topic, EmergencyStop(True)))
     scene.until(lambda: scene.state == "ESTOPPED", "the emergency stop")

@@ -12,13 +12,13 @@ from needle_device_driver.conformance.rig import ConformanceRig
 from needle_device_driver.conformance.scenarios import RULES as DRIVE_RULES
 from needle_device_driver.conformance.scenarios import check_rule
 from needle_device_driver.rules import Rule
-from scenario.rules import command_scenes, drive_scenes
 from scenario.rules.bugs import BUGS
+from scenario.rules.scenes import SCENES as OTHER_RULES
 
 CIA402 = partial(ConformanceRig, 1, axis="cia402")
 SCENES: dict[str, Callable[[], None]] = {
     **{rule.value: partial(check_rule, rule, CIA402) for rule in DRIVE_RULES},
-    **{scene.__name__: scene for scene in (*command_scenes.SCENES, *drive_scenes.SCENES)},
+    **OTHER_RULES,
 }
 RULES = sorted(rule.value for rule in Rule)
 

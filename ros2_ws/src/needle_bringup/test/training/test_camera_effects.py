@@ -42,9 +42,7 @@ def centre(image: np.ndarray) -> np.ndarray:
     "changes",
     [
         {"blur_px": 2.5},
-        {"shrink": 0.5},
         {"shrink": 0.83},
-        {"noise": 6.0},
         {"noise": 6.0, "noise_blur_px": 0.8},
         {"noise": 6.0, "denoise": "median"},
         {"noise": 6.0, "denoise": "bilateral"},

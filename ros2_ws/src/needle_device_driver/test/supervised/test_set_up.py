@@ -117,8 +117,6 @@ REFUSED: list[tuple[Change, str]] = [
     kept(0x605A, 6, 2),
     kept(0x605E, 2, 1),
     kept(0x6007, 1, 0),
-    kept(0x6007, 1, 2),
-    kept(0x605E, 2, 3),
     kept(0x607C, 0, 5),
     kept(0x60C2, 20, 10),
     kept(0x607D, -(2**31), 0),

@@ -9,8 +9,9 @@ from needle_sim.studies.needles import NeedleBatch
 
 
 # Up to 2 rad a step: both the series and the closed form beyond it.
-@pytest.mark.parametrize("largest_turn", [1e-9, 0.5, 2.0])
-@pytest.mark.parametrize("torsion", [(0.0, 0.0), (0.3, 0.008)])
+@pytest.mark.parametrize(
+    ("largest_turn", "torsion"), [(1e-9, (0.0, 0.0)), (0.5, (0.0, 0.0)), (2.0, (0.3, 0.008))]
+)
 def test_the_compiled_batch_is_the_plant(largest_turn: float, torsion: tuple[float, float]) -> None:
     rng = np.random.default_rng(6)
     starts = rng.uniform(-1.0, 1.0, (20, 3)) * [0.003, 0.4, 3.0]

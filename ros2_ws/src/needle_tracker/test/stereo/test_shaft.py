@@ -32,8 +32,9 @@ def distance_to(points: np.ndarray, curve: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(points[:, None] - curve[None], axis=-1).min(axis=1))
 
 
-@pytest.mark.parametrize("roll", [0.0, 0.7, 1.6, 3.0, -1.2])
-@pytest.mark.parametrize("curvature", [2.0, 7.0])
+@pytest.mark.parametrize(
+    ("roll", "curvature"), [(0.0, 7.0), (0.7, 2.0), (1.6, 7.0), (3.0, 2.0), (-1.2, 7.0)]
+)
 def test_shaft_points_are_on_the_shaft(views: Views, curvature: float, roll: float) -> None:
     points = arc(curvature, roll)
     # The right path starts elsewhere and has other points.

@@ -171,7 +171,7 @@ def test_checksum_is_that_of_the_standard() -> None:
     assert checksum(b"123456789") == 0x6C40DF5F0B497347
 
 
-@pytest.mark.parametrize("garbage", [1, 50, 58, 59, 62, 66, 70])
+@pytest.mark.parametrize("garbage", [1, 58, 59, 66])
 def test_a_stream_in_pieces_among_other_messages(garbage: int) -> None:
     """Garbage and a large image before a transform do not lose it; each is named once."""
     pose = sensor(0.02, Rotation.identity(), 1)

@@ -1,4 +1,4 @@
-"""No process is left when a node or its parent is killed."""
+"""No process is left when a node, its parent or a command ends."""
 
 from __future__ import annotations
 
@@ -8,7 +8,22 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from needle_bringup.simulation.node_graph import NodeProcess, stop, wait_for
+from needle_bringup.workplace import ending_descendants, processes_with
+
+# A child that starts another one in its own session.
+PARENT = """
+import signal, subprocess, sys
+ends = "import signal; print('on', flush=True); signal.pause()"
+with subprocess.Popen(
+    [sys.executable, "-c", ends], start_new_session=True, stdout=subprocess.PIPE
+) as process:
+    process.stdout.readline()
+    print("on", flush=True)
+    signal.pause()
+"""
 
 
 def test_what_a_node_started_ends_with_it(tmp_path: Path) -> None:
@@ -43,6 +58,21 @@ time.sleep(1000)
     parent.wait()
     parent.stdout.close()
     assert_ends(child)
+
+
+def test_none_is_left_after_an_interrupt() -> None:
+    mark = {"NEEDLE_TEST_MARK": "descendants"}
+    with pytest.raises(KeyboardInterrupt), ending_descendants():
+        process = subprocess.Popen(
+            [sys.executable, "-c", PARENT], env={**os.environ, **mark}, stdout=subprocess.PIPE
+        )
+        assert process.stdout is not None
+        with process.stdout as output:
+            output.readline()
+        assert len(processes_with(*mark.popitem())) == 2
+        raise KeyboardInterrupt
+    process.wait()
+    assert processes_with("NEEDLE_TEST_MARK", "descendants") == []
 
 
 def assert_ends(pid: int) -> None:
