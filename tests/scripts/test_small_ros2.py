@@ -52,8 +52,8 @@ def test_lists_executables(
 @pytest.mark.parametrize(
     ("arguments", "hint"),
     [
-        (["run", "needle_sin", "sim_rig"], "did you mean needle_sim"),
-        (["run", "needle_sim", "simrig"], "did you mean sim_rig?"),
+        (["run", "needle_sin", "sim_rig"], "did you mean 'needle_sim'?"),
+        (["run", "needle_sim", "simrig"], "did you mean 'sim_rig'?"),
         (["run", "needle_console", "zzz"], "known: console"),
         (["pkg", "executables", "zzz"], "known: needle_"),
     ],

@@ -6,14 +6,13 @@ It contains the verbs of this project's documents, in the syntax of the original
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import sys
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import TypeVar
 
-from needle_core.errors import UserError
+from needle_core.errors import UserError, did_you_mean
 from needle_core.process.discovery import clean_environment
 
 HELP = """\
@@ -73,8 +72,4 @@ def _find(kind: str, name: str, known: Mapping[str, T]) -> T:
     """Return a known package or executable; raise a `UserError` with a suggestion otherwise."""
     if name in known:
         return known[name]
-    close = difflib.get_close_matches(name, known, n=3)
-    hint = f"did you mean {' or '.join(close)}?"
-    if not close:
-        hint = f"known: {', '.join(sorted(known))}"
-    raise UserError(f"{kind} '{name}' not found; {hint}")
+    raise UserError(f"{kind} '{name}' not found ({did_you_mean(name, known)})")

@@ -17,13 +17,15 @@ from typing import Any
 import numpy as np
 import rclpy
 import yaml
-from rclpy.exceptions import InvalidServiceNameException, InvalidTopicNameException
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter, get_parameter_value, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from needle_core.errors import UserError
+from needle_core.files.yaml_files import load_yaml
 from needle_core.ros.base_node import full_name
 
 # Time to discover all endpoints, and to discover a given node or topic [s].
@@ -32,23 +34,14 @@ ANSWER_TIMEOUT = 10.0  # [s]
 MAX_LENGTH = 128  # of a printed array or text
 
 
-class CommandError(Exception):
-    """Error of one line, printed for the user."""
-
-
 def spin_until(node: Node, condition: Callable[[], Any], timeout: float) -> bool:
-    """Spin until the condition holds; return whether it holds before the timeout [s]."""
+    """Spin until the condition holds (`bool`: never) or the timeout [s]; return whether it holds."""
     end = time.monotonic() + timeout
     while not condition():
         if time.monotonic() >= end:
             return False
         rclpy.spin_once(node, timeout_sec=0.02)
     return True
-
-
-def spin_for(node: Node, seconds: float) -> None:
-    """Spin for some time."""
-    spin_until(node, lambda: False, seconds)
 
 
 # ---- messages ---------------------------------------------------------------------------------
@@ -60,7 +53,7 @@ def find_type(name: str, kind: str) -> Any:
     try:
         return getattr(importlib.import_module(f"{package}.{kind}"), type_name)
     except (AttributeError, ModuleNotFoundError) as error:
-        raise CommandError(f"there is no {kind} type '{name}'") from error
+        raise UserError(f"there is no {kind} type '{name}'") from error
 
 
 def to_plain(value: Any) -> Any:
@@ -77,49 +70,39 @@ def to_plain(value: Any) -> Any:
     return value
 
 
-def fill(message: Any, text: str) -> list[Any]:
-    """Set the fields of a message from YAML; return the stamps that were given as `now`."""
-    try:
-        values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise CommandError(f"not YAML: {' '.join(str(error).split())}") from error
-    return _fill(message, values)
-
-
-def _fill(message: Any, values: Any) -> list[Any]:
+def fill(message: Any, values: Any) -> list[Any]:
+    """Set the fields of a message from plain data; return the stamps that were given as `now`."""
     if not isinstance(values, Mapping):
-        raise CommandError(f"'{values}' is expected to be a dictionary")
+        raise UserError(f"'{values}' is expected to be a dictionary")
     stamps: list[Any] = []
     types = message.get_fields_and_field_types()
     for name, value in values.items():
         if name not in types:
-            raise CommandError(f"'{type(message).__name__}' has no field '{name}'")
+            raise UserError(f"'{type(message).__name__}' has no field '{name}'")
         field = getattr(message, name)
         if types[name] == "builtin_interfaces/Time" and value == "now":
             stamps.append(field)
         elif hasattr(field, "get_fields_and_field_types"):
-            stamps += _fill(field, value)
+            stamps += fill(field, value)
         else:
             try:
-                setattr(message, name, _converted(value, field, types[name], stamps))
+                setattr(message, name, _converted(value, types[name], stamps))
             except (AssertionError, TypeError, ValueError, OverflowError) as error:
-                raise CommandError(f"{name}: {value!r} is not a {types[name]}") from error
+                raise UserError(f"{name}: {value!r} is not a {types[name]}") from error
     return stamps
 
 
-def _converted(value: Any, field: Any, type_name: str, stamps: list[Any]) -> Any:
-    """Return a value in the type of the field; add the stamps of nested messages."""
-    if isinstance(field, array.array):
-        return array.array(field.typecode, value)
-    if isinstance(field, np.ndarray):
-        return np.array(value, dtype=field.dtype)
-    if isinstance(field, list) and "/" in type_name:
-        messages = [find_type(re.findall(r"\w+/\w+", type_name)[0], "msg")() for _ in value]
-        for message, entry in zip(messages, value, strict=True):
-            stamps += _fill(message, entry)
-        return messages
+def _converted(value: Any, type_name: str, stamps: list[Any]) -> Any:
+    """Return a value with messages and floats as the field has them; add the messages' stamps."""
+    if isinstance(value, list):
+        item_type = re.sub(r"^sequence<|[,<>\[].*$", "", type_name)
+        return [_converted(item, item_type, stamps) for item in value]
+    if "/" in type_name:
+        message = find_type(type_name, "msg")()
+        stamps += fill(message, value)
+        return message
     # Other conversions, such as a text to a number, would rather hide a mistake.
-    return float(value) if isinstance(field, float) and type(value) is int else value
+    return float(value) if type_name in ("float", "double") and type(value) is int else value
 
 
 # ---- commands ---------------------------------------------------------------------------------
@@ -127,14 +110,14 @@ def _converted(value: Any, field: Any, type_name: str, stamps: list[Any]) -> Any
 
 def list_nodes(node: Node, options: argparse.Namespace) -> None:
     """Print the full names of the nodes, except hidden ones, such as that of this command."""
-    spin_for(node, DISCOVERY)
+    spin_until(node, bool, DISCOVERY)
     names = node.get_node_names_and_namespaces()
     print("\n".join(sorted(full_name(space, name) for name, space in names if name[0] != "_")))
 
 
 def list_topics(node: Node, options: argparse.Namespace) -> None:
     """Print the names of the topics."""
-    spin_for(node, DISCOVERY)
+    spin_until(node, bool, DISCOVERY)
     print("\n".join(name for name, _ in node.get_topic_names_and_types()))
 
 
@@ -142,7 +125,7 @@ def echo(node: Node, options: argparse.Namespace) -> None:
     """Print the messages of a topic."""
     topic = node.resolve_topic_name(options.topic_name)
     if not spin_until(node, lambda: node.get_publishers_info_by_topic(topic), SEARCH_TIMEOUT):
-        raise CommandError(f"topic [{options.topic_name}] is not published")
+        raise UserError(f"topic [{options.topic_name}] is not published")
     offered = node.get_publishers_info_by_topic(topic)
     qos = QoSProfile(depth=10)
     if any(one.qos_profile.reliability != ReliabilityPolicy.RELIABLE for one in offered):
@@ -159,7 +142,7 @@ def echo(node: Node, options: argparse.Namespace) -> None:
         try:
             value = to_plain(attrgetter(options.field)(message) if options.field else message)
         except AttributeError as error:
-            raise CommandError(f"Invalid field '{options.field}': {error}") from error
+            raise UserError(f"Invalid field '{options.field}': {error}") from error
         is_text = not isinstance(value, (dict, list))
         text = f"{value}\n" if is_text else yaml.safe_dump(value, width=1 << 30, sort_keys=False)
         print(text, end="---\n", flush=True)
@@ -172,7 +155,7 @@ def echo(node: Node, options: argparse.Namespace) -> None:
 def pub(node: Node, options: argparse.Namespace) -> None:
     """Publish a message once, a number of times, or until interrupted."""
     message = find_type(options.message_type, "msg")()
-    stamps = fill(message, options.values)
+    stamps = fill(message, load_yaml(options.values))
     times = 1 if options.once else options.times
     # Transient local matches every subscriber, including those of targets.
     latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -191,15 +174,15 @@ def pub(node: Node, options: argparse.Namespace) -> None:
         if count == times:
             break
         due = max(due + 1.0 / options.rate, time.monotonic())
-        spin_for(node, due - time.monotonic())
-    spin_for(node, 0.1)  # until the last message has left
+        spin_until(node, bool, due - time.monotonic())
+    spin_until(node, bool, 0.1)  # until the last message has left
 
 
 def call(node: Node, options: argparse.Namespace) -> None:
     """Call a service and print its answer."""
     service = find_type(options.service_type, "srv")
     request = service.Request()
-    fill(request, options.values)
+    fill(request, load_yaml(options.values))
     client = node.create_client(service, options.service_name)
     spin_until(node, client.service_is_ready, float("inf"))
     print(f"requester: making request: {request!r}\n", flush=True)
@@ -208,7 +191,7 @@ def call(node: Node, options: argparse.Namespace) -> None:
 
 def _answer(node: Node, server: str, future: Any) -> Any:
     if not spin_until(node, future.done, ANSWER_TIMEOUT):
-        raise CommandError(f"no answer from {server}")
+        raise UserError(f"no answer from {server}")
     return future.result()
 
 
@@ -216,7 +199,7 @@ def _parameter_client(node: Node, options: argparse.Namespace) -> AsyncParameter
     name = "/" + options.node_name.lstrip("/")
     client = AsyncParameterClient(node, name)
     if not spin_until(node, client.services_are_ready, SEARCH_TIMEOUT):
-        raise CommandError("Node not found")
+        raise UserError("Node not found")
     return client
 
 
@@ -226,7 +209,7 @@ def get_parameter(node: Node, options: argparse.Namespace) -> None:
     values = _answer(node, options.node_name, future).values
     kind = Parameter.Type(values[0].type) if values else Parameter.Type.NOT_SET
     if kind == Parameter.Type.NOT_SET:
-        raise CommandError("Parameter not set")
+        raise UserError("Parameter not set")
     print(f"{kind.name.capitalize()} value is: {parameter_value_to_python(values[0])}")
 
 
@@ -237,7 +220,7 @@ def set_parameter(node: Node, options: argparse.Namespace) -> None:
     future = _parameter_client(node, options).set_parameters([parameter])
     (result,) = _answer(node, options.node_name, future).results
     if not result.successful:
-        raise CommandError(f"Setting parameter failed: {result.reason}")
+        raise UserError(f"Setting parameter failed: {result.reason}")
     print("Set parameter successful")
 
 
@@ -289,7 +272,7 @@ def main(arguments: list[str]) -> int:
         options.action(node, options)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 130
-    except (CommandError, InvalidTopicNameException, InvalidServiceNameException) as error:
+    except (UserError, ValueError, NameValidationException) as error:
         print(str(error).splitlines()[0], file=sys.stderr)
         return 1
     finally:
