@@ -79,4 +79,4 @@ def test_says_what_it_knows(
     code: int,
 ) -> None:
     assert ros2(monkeypatch, *arguments) == code
-    assert "For\neverything else (bag, launch, ...) install ROS 2 Jazzy" in capsys.readouterr().out
+    assert "For everything else (bag, launch, ...) install ROS 2 Jazzy" in capsys.readouterr().out
