@@ -60,36 +60,17 @@ def test_only_a_new_press_from_neutral_is_accepted(
         assert bool(decision.trouble) is isinstance(reading, InputLost)
 
 
-def test_a_stop_is_requested_once_per_press_and_ends_the_hold() -> None:
-    debouncer = HoldDebouncer()
-    readings = (NEUTRAL, INSERT, STOPPED, STOPPED, INSERT, NEUTRAL, InputState(stop=True))
-    decisions = [
-        debouncer.update(reading, CYCLE * number) for number, reading in enumerate(readings)
-    ]
-    assert [one.stop for one in decisions] == [
-        False,
-        False,
-        True,
-        False,
-        False,
-        False,
-        True,
-    ]
-    assert [one.kind is HoldKind.INSERT for one in decisions] == [
-        False,
-        True,
-        *[False] * 5,
-    ]
-
-
-def test_a_stop_pressed_after_a_loss_is_requested_again() -> None:
-    debouncer = HoldDebouncer()
-    pressed = InputState(stop=True)
-    readings: list[InputReading] = [pressed, InputLost("unplugged"), pressed, pressed]
-    decisions = [
-        debouncer.update(reading, CYCLE * number) for number, reading in enumerate(readings)
-    ]
-    assert [one.stop for one in decisions] == [True, False, True, False]
+def test_a_stop_is_requested_once_per_press_also_after_a_loss_and_ends_the_hold() -> None:
+    press = InputState(stop=True)
+    stories: tuple[tuple[list[InputReading], list[int], list[int]], ...] = (
+        ([NEUTRAL, INSERT, STOPPED, STOPPED, INSERT, NEUTRAL, press], [2, 6], [1]),
+        ([press, InputLost("unplugged"), press, press], [0, 2], []),
+    )
+    for readings, stops, held in stories:
+        debouncer = HoldDebouncer()
+        decisions = [debouncer.update(one, CYCLE * n) for n, one in enumerate(readings)]
+        assert [n for n, one in enumerate(decisions) if one.stop] == stops
+        assert [n for n, one in enumerate(decisions) if one.kind is HoldKind.INSERT] == held
 
 
 def test_a_suspended_process_requires_a_new_press() -> None:
