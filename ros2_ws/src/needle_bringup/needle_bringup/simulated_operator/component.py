@@ -10,7 +10,6 @@ from needle_bringup.simulated_operator.operator_sequence import (
     PREPARATION,
     OperatorSequence,
 )
-from needle_bringup.simulated_operator.progress import Shown
 from needle_core import messages as m
 from needle_core.commands.cli import EXIT_INTERRUPTED
 from needle_core.component import (
@@ -153,11 +152,9 @@ class SimulatedOperator(Component):
         return self._advance(at)
 
     def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
-        sequence = self._sequence
-        sequence.handle_controller(message, at.steady)
-        if sequence.steering and sequence.depth:
-            shown = Shown(sequence.insertion, sequence.depth, sequence.waits_because)
-            yield Send(PROGRESS, (shown,))
+        self._sequence.handle_controller(message, at.steady)
+        if self._sequence.steering:
+            yield Send(PROGRESS, (message,))
         yield from self._advance(at)
 
     def _on_device(self, message: DeviceStatus, at: Moment) -> Actions:

@@ -25,6 +25,8 @@ HOMING = "homing"
 # Other refusals may be due to delayed messages, so they are repeated for this time [s].
 REFUSAL_TIMEOUT = 2.0
 _NO_REASON = "no reason given"
+# Fields of the controller's status that change while the needle advances.
+_PROGRESS = ("state", "step", "insertion_m")
 
 
 class OperatorSequence:
@@ -75,13 +77,10 @@ class OperatorSequence:
         self._homing_seen = False
         self._starts: int | None = None
         self._starts_before = 0
-        self._progress: tuple[str, int, float] = ("", 0, 0.0)
+        self._controller = ControllerStatus()
         self._progress_at = now
         self._must_release = False
         self.presses_again = 0
-        self.insertion = 0.0
-        self.depth: float | None = None
-        self.waits_because = ""
         self.outcome: Exit | None = None
 
     @property
@@ -183,25 +182,21 @@ class OperatorSequence:
 
     def handle_controller(self, status: ControllerStatus, now: float) -> None:
         """Handle needle/controller_status."""
-        self.insertion = status.insertion_m
-        self.depth = status.depth_m
-        waits = status.state == "WAITING_FOR_TIP"
-        self.waits_because = status.reason if waits else ""
         self._starts = status.starts or 0
         started = self._starts > self._starts_before
         if self._called(START) and started:
             # The answer may be late or lost.
             self._advance(now)
-        progress = (status.state, status.step, status.insertion_m)
-        if progress != self._progress:
-            self._progress, self._progress_at = progress, now
+        before, self._controller = self._controller, status
+        if any(getattr(status, name) != getattr(before, name) for name in _PROGRESS):
+            self._progress_at = now
         if self.steering and started:
             self._check_end(status)
 
     def _check_end(self, status: ControllerStatus) -> None:
         why = status.reason or _NO_REASON
         if status.state == "DONE":
-            reached = f"inserted {self.insertion * 1e3:.1f} mm in {status.step} steps"
+            reached = f"inserted {status.insertion_m * 1e3:.1f} mm in {status.step} steps"
             self.outcome = Exit(EXIT_DONE, reached)
         elif status.state == "FAULT":
             self._end(f"plane_controller FAULT: {why}")
@@ -227,11 +222,11 @@ class OperatorSequence:
                     f"the rig is not ready after {self._wait_timeout:g} s: {self.pending_reason()}"
                 )
         elif now >= self._progress_at + self._stall_timeout:
-            state = self._progress[0] or "silent"
-            why = f": {self.waits_because}" if self.waits_because else ""
+            status = self._controller
+            waits = status.state == "WAITING_FOR_TIP" and status.reason
             self._end(
-                f"no progress for {self._stall_timeout:g} s at {self.insertion * 1e3:.1f} mm "
-                f"(plane_controller is {state}{why})"
+                f"no progress for {self._stall_timeout:g} s at {status.insertion_m * 1e3:.1f} mm "
+                f"(plane_controller is {status.state or 'silent'}{f': {waits}' if waits else ''})"
             )
 
     @property
