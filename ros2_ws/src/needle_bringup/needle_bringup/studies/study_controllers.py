@@ -49,6 +49,7 @@ from needle_sim.studies.study import CHUNK
 SLIDING_MODE, RRT = "sliding_mode", "rrt"
 """Names of the reference laws for points."""
 CURVATURE = SteeringSettings.curvature
+STEP_LENGTH = SteeringSettings.step_length
 # The linear observer needs a twentieth of the memory of the filter.
 _LINEAR_CHUNK = 20 * CHUNK
 # Upper limit of the settings; a study has its own depth [m].
