@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from needle_bringup.simulation.rig_configuration import command_line_parameters
-from needle_bringup.simulation.simulate_options import SimulateOptions, add_rig_options, parse
+from needle_bringup.simulation.simulate_options import SimulateOptions, parse
 from needle_core.commands.cli import EXIT_INTERRUPTED, EXIT_MISSED, run_command
 from needle_core.commands.options import CommandParser, join_signed_values, whole_number
 from needle_core.process.shutdown import ShutdownFlag
@@ -45,6 +45,22 @@ examples:
 exit codes: 130 ended by Ctrl-C; 1 a component exited; 2 invalid or missing input
 """
 
+# Options with the same meaning as those of `simulate`.
+_SHARED = {
+    "--level": (
+        "tip|camera|drive",
+        "what is simulated: tips, images, or images and drives (default: camera)",
+    ),
+    "--controller": ("paper|best|open_loop", "preset that rotates the needle (default: best)"),
+    "--insertion": (
+        "continuous|stepwise",
+        "without stops, or in steps of 1 mm (default: continuous)",
+    ),
+    "--initial": ("X_MM,PITCH_DEG,ROLL_DEG", "initial pose of the needle (default: -3,2,15)"),
+    "--noise-mm": ("A", "level tip: maximum error of each coordinate [mm] (default: 1.0)"),
+    "--depth-mm": ("D", "final insertion [mm] (default: 120)"),
+    "--seed": ("N", "seed of all random numbers (default: 1)"),
+}
 # The hold uses the port after that of the page.
 _DEFAULT_PORT, _LAST_PORT = "8080", 65534
 LOOPBACK = "127.0.0.1"
@@ -95,14 +111,16 @@ def parse_console(arguments: Sequence[str]) -> ConsoleOptions:
         help=f"port of the page; the hold uses the next one (default: {_DEFAULT_PORT})",
     )
     parser.add_argument("--graph", action="store_true", help="run ROS nodes, for RViz and Foxglove")
-    add_rig_options(parser.add_argument)
-    parser.set_defaults(insertion="continuous")
-    given = vars(parser.parse_args(join_signed_values(arguments)))
-    port = whole_number("--port", given.pop("port"), 1, _LAST_PORT)
-    words = ["--graph"] if given.pop("graph") else ["--real-time-factor", "1"]
-    for name, value in given.items():
+    for option, (metavar, text) in _SHARED.items():
+        parser.add_argument(option, metavar=metavar, help=text)
+    given = parser.parse_args(join_signed_values(arguments))
+    words = ["--graph"] if given.graph else ["--real-time-factor", "1"]
+    words += ["--insertion", "continuous"]
+    for option in _SHARED:
+        value = getattr(given, option[2:].replace("-", "_"))
         if value is not None:
-            words.append(f"--{name.replace('_', '-')}={value}")
+            words.append(f"{option}={value}")
+    port = whole_number("--port", given.port, 1, _LAST_PORT)
     return ConsoleOptions(port, parse(words))
 
 

@@ -204,15 +204,52 @@ def _joined(numbers: Sequence[float]) -> str:
 
 def _parser() -> CommandParser:
     parser = CommandParser("simulate", DESCRIPTION, EPILOG)
-    add_rig_options(parser.add_argument)
     add = parser.add_argument
+    add(
+        "--level",
+        default="camera",
+        metavar="tip|camera|drive",
+        help="what is simulated: the measured tips; the stereo images; or the images and the "
+        "drives, which the device driver moves (default: camera)",
+    )
     add(
         "--drives",
         metavar="NAME[,NAME]",
         help="drives of both axes, or of insertion and rotation: cia402, galil, zaber, stepdir, "
         "or those of another package",
     )
+    add(
+        "--controller",
+        default="best",
+        metavar="paper|best|open_loop",
+        help="preset that rotates the needle: the paper's, this project's best, or none (default: "
+        "best)",
+    )
     add_own_part_options(add, "--target")
+    add(
+        "--insertion",
+        default="stepwise",
+        metavar="|".join(INSERTIONS),
+        help="rest after each step until the tip is measured, or advance throughout the hold "
+        "(default: stepwise)",
+    )
+    add(
+        "--initial",
+        default="-3,2,15",
+        metavar="X_MM,PITCH_DEG,ROLL_DEG",
+        help="initial pose of the needle relative to the target plane (default: -3,2,15)",
+    )
+    add(
+        "--noise-mm",
+        metavar="A",
+        help="level tip: maximum error of each measured coordinate [mm] (default: 1.0)",
+    )
+    add(
+        "--depth-mm",
+        metavar="D",
+        help=f"final insertion [mm] (default: {DEPTH_MM}); with --target the maximum (default: "
+        f"{LARGEST_DEPTH_MM:g})",
+    )
     add(
         "--target",
         metavar="X_MM,Y_MM,Z_MM",
@@ -272,56 +309,14 @@ def _parser() -> CommandParser:
     )
     add("--bag", metavar="DIR", help="new folder for the run (default: time-stamped, in bags/)")
     add("--params", metavar="FILE", help="ROS parameter file that overrides the configuration")
-    add("--json", metavar="FILE", help="also write the result as flat JSON")
-    return parser
-
-
-def add_rig_options(add: Callable[..., Any]) -> None:
-    """Add the options of the rig that `console` has as well."""
-    add(
-        "--level",
-        default="camera",
-        metavar="tip|camera|drive",
-        help="what is simulated: the measured tips; the stereo images; or the images and the "
-        "drives, which the device driver moves (default: camera)",
-    )
-    add(
-        "--controller",
-        default="best",
-        metavar="paper|best|open_loop",
-        help="preset that rotates the needle: the paper's, this project's best, or none (default: "
-        "best)",
-    )
-    add(
-        "--insertion",
-        default="stepwise",
-        metavar="|".join(INSERTIONS),
-        help="rest after each step until the tip is measured, or advance throughout the hold "
-        "(default: %(default)s)",
-    )
-    add(
-        "--initial",
-        default="-3,2,15",
-        metavar="X_MM,PITCH_DEG,ROLL_DEG",
-        help="initial pose of the needle relative to the target plane (default: -3,2,15)",
-    )
-    add(
-        "--noise-mm",
-        metavar="A",
-        help="level tip: maximum error of each measured coordinate [mm] (default: 1.0)",
-    )
-    add(
-        "--depth-mm",
-        metavar="D",
-        help=f"final insertion [mm] (default: {DEPTH_MM}); with --target the maximum (default: "
-        f"{LARGEST_DEPTH_MM:g})",
-    )
     add(
         "--seed",
         default="1",
         metavar="N",
         help="seed of all random numbers; the same seed gives the same run (default: 1)",
     )
+    add("--json", metavar="FILE", help="also write the result as flat JSON")
+    return parser
 
 
 def _components(given: Any) -> tuple[str, ...]:
