@@ -188,7 +188,7 @@ def test_an_answer_that_never_comes_is_told(domain: int, ros2: type[Ros2]) -> No
     ("arguments", "words"),
     [
         (("topic", "pub", "/t", "sensor_msgs/msg/Joyy"), "no msg type"),
-        (("topic", "pub", "/t", "sensor_msgs/msg/Joy", "{axes: [a]}"), "no sequence<float>"),
+        (("topic", "pub", "/t", "sensor_msgs/msg/Joy", "{axes: [a]}"), "is not a sequence<float>"),
         (("topic", "pub", "/t", "sensor_msgs/msg/Joy", "{axis: [1]}"), "no field 'axis'"),
         (("topic", "pub", "/t", "std_msgs/msg/Bool", "{data: 1}"), "data: 1 is not a boolean"),
         (("topic", "pub", "/t", "std_msgs/msg/Bool", "true"), "expected to be a dictionary"),

@@ -52,8 +52,8 @@ def test_lists_executables(
 @pytest.mark.parametrize(
     ("arguments", "hint"),
     [
-        (["run", "needle_sin", "sim_rig"], "did you mean needle_sim"),
-        (["run", "needle_sim", "simrig"], "did you mean sim_rig?"),
+        (["run", "needle_sin", "sim_rig"], "did you mean 'needle_sim'?"),
+        (["run", "needle_sim", "simrig"], "did you mean 'sim_rig'?"),
         (["run", "needle_console", "zzz"], "known: console"),
         (["pkg", "executables", "zzz"], "known: needle_"),
     ],
@@ -79,4 +79,4 @@ def test_says_what_it_knows(
     code: int,
 ) -> None:
     assert ros2(monkeypatch, *arguments) == code
-    assert "For\neverything else (bag, launch, ...) install ROS 2 Jazzy" in capsys.readouterr().out
+    assert "For everything else (bag, launch, ...) install ROS 2 Jazzy" in capsys.readouterr().out

@@ -7,7 +7,7 @@ import os
 import signal
 from pathlib import Path
 
-from needle_bringup.studies.cluster_study import ClusterPart, PartDone, run_part
+from needle_bringup.studies.cluster import ClusterPart, PartDone, run_part
 
 
 def end_the_first(asked: tuple[Path, ClusterPart]) -> PartDone:

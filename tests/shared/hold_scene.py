@@ -19,8 +19,9 @@ class Scene:
         self.bars = {True: "", False: ""}
         self.now = 100.0
         self.reported: list[PageHold] = []
+        self.notices: list[str] = []
         self.protocol = HoldProtocol(
-            lambda is_local: self.bars[is_local], self.reported.append, lambda _: None, self.now
+            self.bars.__getitem__, self.reported.append, self.notices.append, self.now
         )
 
     def page(self, *, is_local: bool = True) -> int:

@@ -15,8 +15,7 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterValue
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -52,7 +51,6 @@ from needle_core.settings.parameter_fields import check_fields, parameter
 
 PATIENCE = 60.0  # [s]
 LONGEST = 1000
-NO_TYPE = 11
 
 
 @contextmanager
@@ -298,12 +296,6 @@ def test_parameters_are_taken_whole_typed_and_within_bounds_or_not_at_all(bench:
     assert set_to(message(2.0)) == (True, "")
     bench.until(lambda: bench.heard == ["gain 2"])
     assert not set_to(message(20.0))[0]
-    untyped = ParameterMessage(name="gain", value=ParameterValue(type=NO_TYPE))
-    refused = (False, "gain: there is no parameter type 11")
-    assert set_to(message(3.0), untyped) == refused
-    name = "echo/set_parameters_atomically"
-    result = bench.call(SetParametersAtomically, name, parameters=[message(3.0), untyped]).result
-    assert (result.successful, result.reason) == refused
     clock = Parameter("use_sim_time", value=True).to_parameter_msg()
     assert set_to(clock) == (False, "use_sim_time is fixed at start")
     assert bench.echo.settings == Settings(2.0)

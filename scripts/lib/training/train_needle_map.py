@@ -31,8 +31,16 @@ from needle_sim.path_traced.tracer import load_mitsuba
 from needle_sim.sequences.boxes import draw_box
 from net_report import report, report_views
 from own_scenes import own_scenes
-from sample_pool import SHARD, Pool, read_shard
-from sample_supply import read_scene, scene_paths, supply, write_scene, write_validation
+from sample_pool import (
+    SHARD,
+    Pool,
+    read_scene,
+    read_shard,
+    scene_paths,
+    supply,
+    write_scene,
+    write_validation,
+)
 from training_loop import Plan, new_run, resumed, train
 from training_net import NeedleNet
 

@@ -10,8 +10,7 @@ import pytest
 
 from dask_cluster import NEEDED, Cluster
 from dying_part import end_every, end_the_first
-from needle_bringup.studies.cluster import on_cluster
-from needle_bringup.studies.cluster_study import ClusterPart, digest
+from needle_bringup.studies.cluster import ClusterPart, digest, on_cluster
 from needle_bringup.studies.monte_carlo import main
 from needle_bringup.studies.monte_carlo_options import parse
 from needle_bringup.studies.study_parts import parts_of

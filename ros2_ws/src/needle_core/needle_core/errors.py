@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Collection
+
 
 class UserError(Exception):
     """Bad argument, file or set-up, explained in one line; commands exit with code 2."""
@@ -37,3 +40,9 @@ def _format(value: float) -> str:
     """Return a whole number in full, such as 2147483647, any other with six digits."""
     whole = float(value).is_integer() and abs(value) < 1e12
     return f"{value:.0f}" if whole else f"{value:g}"
+
+
+def did_you_mean(name: str, known: Collection[str]) -> str:
+    """Return the known name that is most similar to a misspelt one, as a hint, or all of them."""
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(sorted(known))}"

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from needle_bringup.operator.controls import InputReading
-from needle_bringup.operator.hold_debouncer import HoldDebouncer, HoldDecision, HoldKind
+from needle_bringup.operator.hold_debouncer import (
+    HoldDebouncer,
+    HoldDecision,
+    HoldKind,
+    InputReading,
+)
 from needle_bringup.operator.joy_source import JoySource
-from needle_bringup.operator.parameters import JOY, OperatorParameters
+from needle_bringup.operator.parameters import JOY, PERIOD, OperatorParameters
 from needle_bringup.operator.retraction import STOP_STEERING, RetractionSequence
 from needle_core import messages as m
 from needle_core.commands.cli import EXIT_DONE
@@ -35,8 +39,6 @@ from needle_core.messages import HoldSession
 from needle_core.status_messages import DeviceStatus
 
 HOLD, INPUT_DEVICE = "device/hold", "input device"
-PERIOD = 0.02
-"""Period of reading the controls [s]."""
 DEVICE_STOP = "device/stop"
 RELEASES = 3
 """The hold is best effort, so a final release is repeated."""
@@ -64,11 +66,7 @@ class Operator(Component):
         self.name = name
         self.settings = settings
         self._peers = Peers()
-        self._joy = JoySource(
-            settings.controls,
-            lambda: self.settings.speed_scale,
-            lambda: len(self._peers.publishers.get(joy, ())),
-        )
+        self._joy, self._joy_topic = JoySource(settings), joy
         self._debouncer = HoldDebouncer()
         self._retraction = RetractionSequence(name)
         self._decision = HoldDecision()
@@ -80,14 +78,9 @@ class Operator(Component):
         if settings.source == JOY:
             # Queue depth 1: messages queued during a stall are outdated.
             self.inputs += (Input(joy, m.Joystick, self._on_joy, BEST_EFFORT),)
-            self.timers = (Timer(PERIOD, lambda at: self._update(self._joy.read(at.steady), at)),)
+            self.timers = (Timer(PERIOD, self._on_timer),)
         else:
             self.ports = (Port(INPUT_DEVICE, self._on_readings),)
-
-    @property
-    def trouble(self) -> str:
-        """Reason for missing input; empty if there is input."""
-        return self._decision.trouble
 
     def on_settings(self, settings: OperatorParameters, at: Moment) -> Actions:
         """Apply another speed."""
@@ -119,6 +112,10 @@ class Operator(Component):
         stamp = message.stamp_ns / 1e9
         self._joy.receive(message.axes, message.buttons, at.steady, stamp=stamp)
         return ()
+
+    def _on_timer(self, at: Moment) -> Actions:
+        publishers = len(self._peers.publishers.get(self._joy_topic, ()))
+        return self._update(self._joy.read(at.steady, self.settings.speed_scale, publishers), at)
 
     def _on_readings(self, readings: Sequence[InputReading], at: Moment) -> Actions:
         return self._update(readings[-1], at)

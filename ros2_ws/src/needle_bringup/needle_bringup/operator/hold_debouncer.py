@@ -1,14 +1,51 @@
-"""Accepts a press as a hold only if it is a new one, after all buttons were released."""
+"""Readings of an input device; a press is a hold only if it follows a release of all buttons."""
 
 from __future__ import annotations
 
 import dataclasses
 import enum
 
-from needle_bringup.operator.controls import InputLost, InputReading
-
 # A longer gap between two readings means that this process was suspended [s].
 MAX_GAP = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class InputState:
+    """State of the controls at one moment.
+
+    Attributes
+    ----------
+    insert, retract, stop : bool
+        Whether the button is down.
+    speed : float
+        Requested share of the nominal speed, 0..1.
+    """
+
+    insert: bool = False
+    retract: bool = False
+    stop: bool = False
+    speed: float = 1.0
+
+    @property
+    def is_neutral(self) -> bool:
+        """Whether no button is down."""
+        return not (self.insert or self.retract or self.stop)
+
+
+@dataclasses.dataclass(frozen=True)
+class InputLost:
+    """The input device is unavailable.
+
+    Attributes
+    ----------
+    reason : str
+        Why.
+    """
+
+    reason: str
+
+
+InputReading = InputState | InputLost
 
 
 class HoldKind(enum.Enum):

@@ -58,7 +58,7 @@ class InputDevice:
             raise
 
     def read(self) -> bytes:
-        """Return the queued events as the kernel packs them.
+        """Return the queued events as the kernel packs them: whole ones.
 
         Raises
         ------
@@ -121,21 +121,12 @@ class KeyChanges:
     dropped: bool = False
 
 
-class EventReader:
-    """Decodes key changes from the bytes of a device, which may be split anywhere."""
-
-    def __init__(self) -> None:
-        self._rest = b""
-
-    def decode(self, data: bytes) -> KeyChanges:
-        """Return the key changes in the next bytes."""
-        data = self._rest + data
-        whole = len(data) - len(data) % EVENT.size
-        self._rest = data[whole:]
-        changed: dict[int, set[int]] = {_PRESSED: set(), _RELEASED: set()}
-        dropped = False
-        for _, _, kind, code, value in EVENT.iter_unpack(data[:whole]):
-            dropped |= kind == _EV_SYN and code == _SYN_DROPPED
-            if kind == _EV_KEY and value in changed:
-                changed[value].add(code)
-        return KeyChanges(frozenset(changed[_PRESSED]), frozenset(changed[_RELEASED]), dropped)
+def key_changes(data: bytes) -> KeyChanges:
+    """Return the key changes in events as the kernel packs them."""
+    changed: dict[int, set[int]] = {_PRESSED: set(), _RELEASED: set()}
+    dropped = False
+    for _, _, kind, code, value in EVENT.iter_unpack(data):
+        dropped |= kind == _EV_SYN and code == _SYN_DROPPED
+        if kind == _EV_KEY and value in changed:
+            changed[value].add(code)
+    return KeyChanges(frozenset(changed[_PRESSED]), frozenset(changed[_RELEASED]), dropped)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-from needle_bringup.operator.controls import Controls, InputLost, InputReading, InputState
+from needle_bringup.operator.hold_debouncer import InputLost, InputReading, InputState
+from needle_bringup.operator.parameters import NONE, OperatorParameters
 
 # Without a message for this time the joystick is lost [s].
 JOY_TIMEOUT = 0.1
@@ -16,20 +17,12 @@ class JoySource:
 
     Parameters
     ----------
-    controls : Controls
+    settings : OperatorParameters
         Meaning of its buttons and axes.
-    speed : callable
-        Returns the speed at full axis, or without an axis, 0..1.
-    publishers : callable
-        Returns the number of publishers of the topic; with several, none is used.
     """
 
-    def __init__(
-        self, controls: Controls, speed: Callable[[], float], publishers: Callable[[], int]
-    ) -> None:
-        self._controls = controls
-        self._speed = speed
-        self._publishers = publishers
+    def __init__(self, settings: OperatorParameters) -> None:
+        self._settings = settings
         self._axes: Sequence[float] = ()
         self._buttons: Sequence[int] = ()
         self._arrival = self._stamp = -math.inf
@@ -55,42 +48,45 @@ class JoySource:
             return
         self._axes, self._buttons, self._arrival, self._stamp = axes, buttons, now, stamp
 
-    def read(self, now: float) -> InputReading:
-        """Return the state of the controls at this steady time [s]."""
-        reason = self._timeout_reason(now)
+    def read(self, now: float, speed: float, publishers: int) -> InputReading:
+        """Return the state of the controls.
+
+        Parameters
+        ----------
+        now : float
+            Steady time [s].
+        speed : float
+            Speed at full axis, or without an axis, 0..1.
+        publishers : int
+            Number of publishers of the topic; with several, none is used.
+        """
+        reason = self._why_lost(now, publishers)
         if reason:
             return InputLost(reason)
-        controls, speed = self._controls, self._speed()
-        last = max(controls.buttons)
-        if last >= len(self._buttons):
-            return InputLost(
-                f"the joystick's message has {len(self._buttons)} buttons, but no {last}"
-            )
-        if controls.speed_axis is not None:
-            if controls.speed_axis >= len(self._axes):
-                has = f"{len(self._axes)} axes, but no {controls.speed_axis}"
-                return InputLost(f"the joystick's message has {has}")
-            axis = self._axes[controls.speed_axis]
-            if not math.isfinite(axis):
-                return InputLost(f"the joystick's axis {controls.speed_axis} is {axis}")
-            speed *= controls.speed(axis)
-        return InputState(
-            insert=self._is_down(controls.insert),
-            retract=self._is_down(controls.retract),
-            stop=self._is_down(controls.stop),
-            speed=speed,
+        settings = self._settings
+        if settings.speed_axis != NONE:
+            speed *= settings.speed(self._axes[settings.speed_axis])
+        insert, retract, stop = (
+            key != NONE and self._buttons[key] != 0
+            for key in (settings.key, settings.retract_key, settings.stop_key)
         )
+        return InputState(insert=insert, retract=retract, stop=stop, speed=speed)
 
-    def _timeout_reason(self, now: float) -> str:
+    def _why_lost(self, now: float, publishers: int) -> str:
         """Return why the last message is not valid; empty if it is."""
-        publishers = self._publishers()
-        if publishers > 1:
-            return f"{publishers} nodes publish the joystick's topic, expected 1"
-        if math.isinf(self._arrival):
-            return "no message on the joystick's topic yet"
-        if now - self._arrival > JOY_TIMEOUT:
-            return f"no message from the joystick for more than {JOY_TIMEOUT:g} s"
-        return ""
-
-    def _is_down(self, button: int | None) -> bool:
-        return button is not None and self._buttons[button] != 0
+        last, axis = max(self._settings.keys), self._settings.speed_axis
+        has, axes = "the joystick's message has", len(self._axes)
+        for why, wrong in (
+            (f"{publishers} nodes publish the joystick's topic, expected 1", publishers > 1),
+            ("no message on the joystick's topic yet", math.isinf(self._arrival)),
+            (
+                f"no message from the joystick for more than {JOY_TIMEOUT:g} s",
+                now - self._arrival > JOY_TIMEOUT,
+            ),
+            (f"{has} {len(self._buttons)} buttons, but no {last}", last >= len(self._buttons)),
+            (f"{has} {axes} axes, but no {axis}", axis >= axes),
+        ):
+            if wrong:
+                return why
+        at = 0.0 if axis == NONE else self._axes[axis]
+        return "" if math.isfinite(at) else f"the joystick's axis {axis} is {at}"

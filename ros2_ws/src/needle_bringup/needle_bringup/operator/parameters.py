@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
-from needle_bringup.operator.controls import Controls
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter, parameter
 
+PERIOD = 0.02
+"""Period of reading the controls [s]."""
 PEDAL, JOYSTICK, JOY = "pedal", "joystick", "joy"
-_NONE = -1
+NONE = -1
+"""A key or axis that is not assigned."""
 _LAST_KEY, _LAST_AXIS = 0x2FF, 0x3F
 
 
@@ -27,21 +29,21 @@ class OperatorParameters:
         "", "-", "Event device of the pedal or joystick, preferably from /dev/input/by-id."
     )
     key: int = fixed_parameter(
-        _NONE,
+        NONE,
         "-",
         "Key or button held to insert: its code as shown by evtest, or its index in joy.",
-        _NONE,
+        NONE,
         _LAST_KEY,
     )
     retract_key: int = fixed_parameter(
-        _NONE, "-", "Key or button held to retract; -1: none.", _NONE, _LAST_KEY
+        NONE, "-", "Key or button held to retract; -1: none.", NONE, _LAST_KEY
     )
-    stop_key: int = fixed_parameter(_NONE, "-", "Pressed to stop; -1: none.", _NONE, _LAST_KEY)
+    stop_key: int = fixed_parameter(NONE, "-", "Pressed to stop; -1: none.", NONE, _LAST_KEY)
     speed_axis: int = fixed_parameter(
-        _NONE,
+        NONE,
         "-",
         "Joystick axis, or axis index in joy, that sets the speed; -1: none.",
-        _NONE,
+        NONE,
         _LAST_AXIS,
     )
     axis_at_zero: float = fixed_parameter(
@@ -67,33 +69,26 @@ class OperatorParameters:
             If a field is out of bounds, is missing, or contradicts another.
         """
         check_fields(self)
-        if self.key == _NONE:
+        if self.key == NONE:
             raise UserError("key = -1: name what is held to insert (evtest shows codes)")
         if self.source != JOY and not self.device:
             raise UserError(
                 f"device = '': name the {self.source}'s event device, such as "
                 "/dev/input/by-id/usb-..."
             )
-        keys = [key for key in (self.key, self.retract_key, self.stop_key) if key != _NONE]
-        if len(set(keys)) < len(keys):
-            raise UserError(f"key, retract_key and stop_key are not all different: {keys}")
-        if self.speed_axis != _NONE and self.source == PEDAL:
+        if len(set(self.keys)) < len(self.keys):
+            raise UserError(f"key, retract_key and stop_key are not all different: {self.keys}")
+        if self.speed_axis != NONE and self.source == PEDAL:
             raise UserError(f"speed_axis = {self.speed_axis}: a pedal has none")
         if self.axis_at_zero == self.axis_at_full:
             raise UserError(f"axis_at_zero and axis_at_full are both {self.axis_at_full}")
 
     @property
-    def controls(self) -> Controls:
-        """Meaning of the buttons and axes."""
-        return Controls(
-            insert=self.key,
-            retract=_known(self.retract_key),
-            stop=_known(self.stop_key),
-            speed_axis=_known(self.speed_axis),
-            axis_at_zero=self.axis_at_zero,
-            axis_at_full=self.axis_at_full,
-        )
+    def keys(self) -> tuple[int, ...]:
+        """The assigned keys: insert, retract, stop."""
+        return tuple(key for key in (self.key, self.retract_key, self.stop_key) if key != NONE)
 
-
-def _known(code: int) -> int | None:
-    return None if code == _NONE else code
+    def speed(self, axis: float) -> float:
+        """Return the share of `speed_scale`, 0..1, for a reading of the axis."""
+        share = (axis - self.axis_at_zero) / (self.axis_at_full - self.axis_at_zero)
+        return min(max(share, 0.0), 1.0)

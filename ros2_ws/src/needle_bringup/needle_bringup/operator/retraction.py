@@ -21,6 +21,11 @@ class _Phase(enum.Enum):
     OVER = enum.auto()
 
 
+# Phase after the answer of a service.
+_AFTER_ANSWER = {
+    (_Phase.STEERING_ENDS, STOP_STEERING): _Phase.HOLD_COUNTS,
+    (_Phase.DEVICE_ANSWERS, RETRACT): _Phase.NEEDLE_LEAVES,
+}
 # Error text if a phase times out.
 _TIMEOUT_TEXT = {
     _Phase.STEERING_ENDS: f"no answer from {STOP_STEERING}",
@@ -55,12 +60,7 @@ class RetractionSequence:
     @property
     def holds(self) -> bool:
         """Whether to press the hold."""
-        return self._phase in (
-            _Phase.HOLD_COUNTS,
-            _Phase.DEVICE_ANSWERS,
-            _Phase.NEEDLE_LEAVES,
-            _Phase.RETRACTING,
-        )
+        return self._phase not in (_Phase.IDLE, _Phase.STEERING_ENDS, _Phase.OVER)
 
     def handle_device(self, owner: str, activity: str, now: float) -> None:
         """Handle the owner of the hold and the activity in device/status."""
@@ -74,17 +74,15 @@ class RetractionSequence:
 
     def handle_answer(self, service: str, success: bool, message: str, now: float) -> None:
         """Handle the answer to a call; ignore a late one."""
-        if self._phase is _Phase.STEERING_ENDS and service == STOP_STEERING:
-            if success:
-                self._enter(_Phase.HOLD_COUNTS, now)
-            else:
-                self._give_up(f"{service} was refused: {message}", now)
-        elif self._phase is _Phase.DEVICE_ANSWERS and service == RETRACT:
-            if success:
-                self._enter(_Phase.NEEDLE_LEAVES, now)
-                self.handle_device(self._owner, self._activity, now)
-            else:
-                self._give_up(f"{service} was refused: {message}", now)
+        following = _AFTER_ANSWER.get((self._phase, service))
+        if following is None:
+            return
+        if not success:
+            self._give_up(f"{service} was refused: {message}", now)
+            return
+        self._enter(following, now)
+        if following is _Phase.NEEDLE_LEAVES:
+            self.handle_device(self._owner, self._activity, now)
 
     def update(self, held: bool, now: float, *, controller: bool) -> str | None:
         """Update the sequence with the state of the button.

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 
 from needle_bringup.workplace import checkout, ending_descendants, make_folder, temporary_folder
 from needle_core.commands.cli import EXIT_DONE, run_command, write_json
-from needle_core.commands.options import CommandParser, output_file
-from needle_core.errors import UserError
+from needle_core.commands.options import CommandParser, output_file, whole_number
 
 PAGE = "paper.md"
 IMAGES = "images"
@@ -44,8 +43,8 @@ def _paper(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--json", metavar="FILE", help="also write the figures as flat JSON")
     given = parser.parse_args(arguments)
-    if not given.seed.isdecimal() or int(given.seed) >= 2**31 - 100:
-        raise UserError(f"--seed {given.seed!r} is not a whole number of at most 31 bits")
+    # The trials have the following seeds.
+    seed = whole_number("--seed", given.seed, 0, 2**31 - 100)
     file = output_file("--json", given.json)
     root = checkout()
     out = make_folder("--out", given.out or str(root / OUT))
@@ -54,8 +53,7 @@ def _paper(arguments: Sequence[str]) -> int:
     from needle_bags.figures.figure_style import save  # noqa: PLC0415
     from needle_bringup.paper.paper_figures import figures_of  # noqa: PLC0415
     from needle_bringup.paper.paper_page import as_text, key_figures, page, table  # noqa: PLC0415
-    from needle_bringup.paper.paper_results import PaperRuns  # noqa: PLC0415
-    from needle_bringup.paper.paper_runs import Laboratory  # noqa: PLC0415
+    from needle_bringup.paper.paper_results import Laboratory, PaperRuns  # noqa: PLC0415
 
     runs = given.runs and make_folder("--runs", given.runs)
     with (
@@ -63,7 +61,7 @@ def _paper(arguments: Sequence[str]) -> int:
         ending_descendants(),
     ):
         laboratory = Laboratory([str(root / "scripts" / "simulate")], folder)
-        results = PaperRuns(laboratory, int(given.seed), quick=given.quick)
+        results = PaperRuns(laboratory, seed, quick=given.quick)
     for name, figure in figures_of(results).items():
         save(figure, out / IMAGES / f"{name}.png")
     (out / PAGE).write_text(page(results), encoding="utf-8")

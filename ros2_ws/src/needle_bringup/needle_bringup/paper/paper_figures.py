@@ -17,11 +17,11 @@ from needle_bringup.paper.paper_results import (
     DOMAIN_X_MM,
     GOAL_MM,
     LONGER_MM,
+    Columns,
     Floats,
     PaperRuns,
     SteeringTrial,
 )
-from needle_bringup.paper.paper_runs import Columns
 
 MEAN = "#b5179e"
 _DOTS: dict[str, Any] = {

@@ -1,18 +1,28 @@
-"""Reproduction of [KC09] section IV: trials, studies and their results."""
+"""Trials and studies of [KC09] section IV: their runs, as commands, and their results."""
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import dataclasses
+import json
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from needle_bags.reading.bag_reader import Run, Series
+from needle_bags.reading.bag_reader import Run, Series, read_run
 from needle_bags.run.run_summary import reduced_states, target_offset
-from needle_bringup.paper.paper_runs import Columns, Laboratory
 from needle_bringup.studies.pure_insertions import ARC, curvature_errors
+from needle_bringup.workplace import ran
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue
+from needle_core.files.installed import find_executable
 
 Floats = npt.NDArray[np.float64]
+Columns = Mapping[str, Floats]
 
 INITIAL = "-3,2,15"
 TORSION = ("--play-deg", "10", "--lag-mm", "2")
@@ -27,6 +37,72 @@ DOMAIN_X_MM = 20.0
 DOMAIN_PITCH_DEG = 40.0
 DOMAIN_ROLL_DEG = 90.0
 GOAL_MM = 1.0
+_SUMMARY = "summary.json"
+
+
+class Laboratory:
+    """Runs trials and studies, each once.
+
+    Parameters
+    ----------
+    simulate : sequence of str
+        Command of a trial.
+    folder : Path
+        Folder for the results; existing ones are reused.
+    """
+
+    def __init__(self, simulate: Sequence[str], folder: Path) -> None:
+        self._simulate = list(simulate)
+        self._folder = folder
+
+    def trial(self, name: str, *arguments: str) -> Run:
+        """Run a trial and read its bag; a missed plane is no error.
+
+        Raises
+        ------
+        UserError
+            If it fails.
+        """
+        bag = self._folder / name
+        if not (bag / _SUMMARY).is_file():
+            shutil.rmtree(bag, ignore_errors=True)  # of an earlier, failed run
+            command = [*self._simulate, *arguments, "--bag", str(bag)]
+            _run(name, command, (EXIT_DONE, EXIT_MISSED))
+        return read_run(bag)
+
+    def study(self, name: str, *arguments: str) -> tuple[dict[str, JsonValue], Columns]:
+        """Run a Monte Carlo study; return its figures, and the numeric columns of its runs.
+
+        Raises
+        ------
+        UserError
+            If it fails.
+        """
+        runs = self._folder / f"{name}.csv"
+        words = [*arguments, "--csv", str(runs)]
+        figures = self._figures(name, find_executable("needle_sim", "monte_carlo"), *words)
+        with runs.open(encoding="utf-8", newline="") as stream:
+            reader = csv.reader(stream)
+            head = next(reader)
+            columns = dict(zip(head, zip(*reader, strict=True), strict=True))
+        return figures, _numbers(columns)
+
+    def identify(self, name: str, bag: str, *arguments: str) -> dict[str, JsonValue]:
+        """Identify the curvature in the bag of a trial; return the figures.
+
+        Raises
+        ------
+        UserError
+            If it fails.
+        """
+        command = find_executable("needle_controller", "identify_curvature")
+        return self._figures(name, command, str(self._folder / bag), *arguments)
+
+    def _figures(self, name: str, *command: str) -> dict[str, JsonValue]:
+        file = self._folder / f"{name}.json"
+        if not file.is_file():
+            _run(name, [*command, "--json", str(file)], (EXIT_DONE,))
+        return dict(json.loads(file.read_text("utf-8")))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,3 +263,18 @@ def _rows(series: Series, stamps: npt.NDArray[np.int64]) -> Floats:
 def _readable(reduced: Floats) -> Floats:
     angles = np.rad2deg(np.unwrap(reduced[:, 1:], axis=0))
     return np.column_stack([reduced[:, 0] * 1e3, angles])
+
+
+def _numbers(columns: Mapping[str, Sequence[str]]) -> Columns:
+    """Return the numeric columns, with NaN for empty cells."""
+    numbers = {}
+    for name, cells in columns.items():
+        with contextlib.suppress(ValueError):
+            numbers[name] = np.array([float(cell) if cell else np.nan for cell in cells])
+    return numbers
+
+
+def _run(name: str, command: Sequence[str], good: Sequence[int]) -> None:
+    print(f"running {name} ...", file=sys.stderr, flush=True)
+    if ran(command, (*good, 130, -2), what=name).returncode in (130, -2):
+        raise KeyboardInterrupt

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from needle_bringup.operator.component import INPUT_DEVICE, Operator
-from needle_bringup.operator.event_source import Device
 from needle_bringup.operator.input_device import InputDevice
 from needle_bringup.operator.input_port import InputPort
 from needle_bringup.operator.parameters import JOY, OperatorParameters
@@ -28,7 +28,7 @@ Calls       device/stop, device/retract, plane_controller/stop
 """
 
 
-def main(open_device: Callable[[str], Device] = InputDevice) -> int:
+def main(open_device: Callable[[str], Any] = InputDevice) -> int:
     """Run the operator; returns its exit code."""
 
     def ports(settings: OperatorParameters) -> Mapping[str, RealPort]:

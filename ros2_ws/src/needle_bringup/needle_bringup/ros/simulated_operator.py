@@ -13,9 +13,10 @@ from needle_bringup.simulated_operator.component import (
     SimulatedOperator,
     SimulatedOperatorParameters,
 )
-from needle_bringup.simulated_operator.progress import PROGRESS_FD, Progress, Shown
+from needle_bringup.simulated_operator.progress import PROGRESS_FD, Progress
 from needle_core.commands.cli import EXIT_INTERRUPTED
 from needle_core.ros.main import run_component
+from needle_core.status_messages import ControllerStatus
 
 HELP = """\
 simulated_operator: operates the hold-to-run switch of a simulated rig.
@@ -44,10 +45,9 @@ class _ProgressPort:
     def open(self, arrive: Callable[[Any], None]) -> None:
         """Do nothing: this port has no events."""
 
-    def send(self, batch: tuple[Shown, ...]) -> None:
-        for shown in batch:
-            self._progress.show(shown.insertion, shown.depth)
-            self._progress.show_wait(shown.waits_because)
+    def send(self, batch: tuple[ControllerStatus, ...]) -> None:
+        for status in batch:
+            self._progress.show(status)
 
     def close(self) -> None:
         self._progress.close("")

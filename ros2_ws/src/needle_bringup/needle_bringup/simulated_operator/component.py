@@ -9,11 +9,9 @@ from needle_bringup.simulated_operator.operator_sequence import (
     DISABLE,
     PREPARATION,
     OperatorSequence,
-    ServiceCall,
 )
-from needle_bringup.simulated_operator.progress import Shown
 from needle_core import messages as m
-from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
+from needle_core.commands.cli import EXIT_INTERRUPTED
 from needle_core.component import (
     BEST_EFFORT,
     LATCHED,
@@ -107,7 +105,7 @@ class SimulatedOperator(Component):
             stall_timeout=settings.stall_timeout,
         )
         self._session = HoldSession(name)
-        self._pending: ServiceCall | None = None
+        self._pending: Call | None = None
         self._is_finished = False
         self._missing: list[str] = ["everything"]
         self.inputs = (
@@ -150,15 +148,13 @@ class SimulatedOperator(Component):
         outcome = self._sequence.outcome
         if self._is_finished and outcome is not None:
             # The other nodes end on the same signal and do not answer.
-            return (Exit(EXIT_INTERRUPTED, outcome.reason),)
+            return (Exit(EXIT_INTERRUPTED, outcome.text),)
         return self._advance(at)
 
     def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
-        sequence = self._sequence
-        sequence.handle_controller(message, at.steady)
-        if sequence.steering and sequence.depth:
-            shown = Shown(sequence.insertion, sequence.depth, sequence.waits_because)
-            yield Send(PROGRESS, (shown,))
+        self._sequence.handle_controller(message, at.steady)
+        if self._sequence.steering:
+            yield Send(PROGRESS, (message,))
         yield from self._advance(at)
 
     def _on_device(self, message: DeviceStatus, at: Moment) -> Actions:
@@ -191,7 +187,7 @@ class SimulatedOperator(Component):
         call = self._sequence.next_call(at.steady)
         if call is not None:
             self._pending = call
-            yield Call(call.service, call.data)
+            yield call
         yield self._report()
 
     def _finish(self, at: Moment) -> Actions:
@@ -202,17 +198,11 @@ class SimulatedOperator(Component):
         for _ in range(_RELEASES):
             yield self._hold(at, pressed=False)
         yield self._report()
-        yield Call(DISABLE.service, DISABLE.data)
+        yield DISABLE
 
     def _exit(self) -> Actions:
-        outcome = self._sequence.outcome
-        assert outcome is not None
-        if outcome.interrupted:
-            yield Exit(EXIT_INTERRUPTED, outcome.reason)
-        elif not outcome.prepared:
-            yield Exit(EXIT_BAD_INPUT, outcome.reason)
-        else:
-            yield Exit(EXIT_DONE if outcome.done else EXIT_MISSED, outcome.reason)
+        assert self._sequence.outcome is not None
+        yield self._sequence.outcome
 
     def _hold(self, at: Moment, *, pressed: bool) -> Publish:
         speed = self.settings.speed_scale

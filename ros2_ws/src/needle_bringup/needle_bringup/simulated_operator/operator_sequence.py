@@ -2,34 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
+from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
+from needle_core.component import Call, Exit
 from needle_core.process.ros_domain import CONFLICT_HINT
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
-
-@dataclasses.dataclass(frozen=True)
-class ServiceCall:
-    """One service to call.
-
-    Attributes
-    ----------
-    service : str
-        Its relative name.
-    data : bool or None
-        The request of a std_srvs/SetBool; None for a std_srvs/Trigger.
-    """
-
-    service: str
-    data: bool | None = None
-
-
-HOME = ServiceCall("device/home")
-ENABLE = ServiceCall("device/enable", True)
-START = ServiceCall("plane_controller/start")
-PREPARATION = (ServiceCall("device/confirm_needle_out", True), HOME, ENABLE, START)
-DISABLE = ServiceCall("device/enable", False)
+HOME = Call("device/home")
+ENABLE = Call("device/enable", True)
+START = Call("plane_controller/start")
+PREPARATION = (Call("device/confirm_needle_out", True), HOME, ENABLE, START)
+DISABLE = Call("device/enable", False)
 # Start of the refusal of a node that has not discovered all partners; the call is repeated.
 NOT_YET = "waiting for"
 RETRY_AFTER = 0.1
@@ -41,28 +25,8 @@ HOMING = "homing"
 # Other refusals may be due to delayed messages, so they are repeated for this time [s].
 REFUSAL_TIMEOUT = 2.0
 _NO_REASON = "no reason given"
-
-
-@dataclasses.dataclass(frozen=True)
-class Outcome:
-    """End of a run.
-
-    Attributes
-    ----------
-    done : bool
-        Whether the controller reached its depth.
-    reason : str
-        One line for the terminal.
-    prepared : bool
-        Whether the rig got ready.
-    interrupted : bool
-        Whether a signal ended it.
-    """
-
-    done: bool
-    reason: str
-    prepared: bool = True
-    interrupted: bool = False
+# Fields of the controller's status that change while the needle advances.
+_PROGRESS = ("state", "step", "insertion_m")
 
 
 class OperatorSequence:
@@ -113,14 +77,11 @@ class OperatorSequence:
         self._homing_seen = False
         self._starts: int | None = None
         self._starts_before = 0
-        self._progress: tuple[str, int, float] = ("", 0, 0.0)
+        self._controller = ControllerStatus()
         self._progress_at = now
         self._must_release = False
         self.presses_again = 0
-        self.insertion = 0.0
-        self.depth: float | None = None
-        self.waits_because = ""
-        self.outcome: Outcome | None = None
+        self.outcome: Exit | None = None
 
     @property
     def steering(self) -> bool:
@@ -140,7 +101,7 @@ class OperatorSequence:
         """Handle the list of missing partners; empty if all are present."""
         self._missing = missing
 
-    def next_call(self, now: float) -> ServiceCall | None:
+    def next_call(self, now: float) -> Call | None:
         """Return the service to call now; pass its answer to `handle_answer`."""
         waits = bool(self._missing) or now < self._retry_at or not self.may_act
         if waits or self.outcome is not None or self._prepared == len(PREPARATION):
@@ -160,7 +121,7 @@ class OperatorSequence:
         self._retry_at = now + CALL_TIMEOUT
         return call
 
-    def handle_answer(self, call: ServiceCall, success: bool, message: str, now: float) -> None:
+    def handle_answer(self, call: Call, success: bool, message: str, now: float) -> None:
         """Handle the answer to `call`; ignore it if the call is completed."""
         wanted = self._prepared < len(PREPARATION) and call == PREPARATION[self._prepared]
         if self.outcome is not None or not wanted:
@@ -221,40 +182,35 @@ class OperatorSequence:
 
     def handle_controller(self, status: ControllerStatus, now: float) -> None:
         """Handle needle/controller_status."""
-        self.insertion = status.insertion_m
-        self.depth = status.depth_m
-        waits = status.state == "WAITING_FOR_TIP"
-        self.waits_because = status.reason if waits else ""
         self._starts = status.starts or 0
         started = self._starts > self._starts_before
         if self._called(START) and started:
             # The answer may be late or lost.
             self._advance(now)
-        progress = (status.state, status.step, status.insertion_m)
-        if progress != self._progress:
-            self._progress, self._progress_at = progress, now
+        before, self._controller = self._controller, status
+        if any(getattr(status, name) != getattr(before, name) for name in _PROGRESS):
+            self._progress_at = now
         if self.steering and started:
             self._check_end(status)
 
     def _check_end(self, status: ControllerStatus) -> None:
         why = status.reason or _NO_REASON
         if status.state == "DONE":
-            self.outcome = Outcome(
-                True, f"inserted {self.insertion * 1e3:.1f} mm in {status.step} steps"
-            )
+            reached = f"inserted {status.insertion_m * 1e3:.1f} mm in {status.step} steps"
+            self.outcome = Exit(EXIT_DONE, reached)
         elif status.state == "FAULT":
             self._end(f"plane_controller FAULT: {why}")
         elif status.state == "IDLE":
             self._end(f"plane_controller stopped: {why}")
 
-    def _called(self, call: ServiceCall) -> bool:
+    def _called(self, call: Call) -> bool:
         """Return whether `call` was made and its success is not known yet."""
         return self.outcome is None and self._asked and PREPARATION[self._prepared] == call
 
     def interrupt(self) -> None:
         """Handle a signal to end."""
         if self.outcome is None:
-            self.outcome = Outcome(False, "interrupted", interrupted=True)
+            self.outcome = Exit(EXIT_INTERRUPTED, "interrupted")
 
     def check_time(self, now: float) -> None:
         """End the run if a time limit is exceeded."""
@@ -266,11 +222,11 @@ class OperatorSequence:
                     f"the rig is not ready after {self._wait_timeout:g} s: {self.pending_reason()}"
                 )
         elif now >= self._progress_at + self._stall_timeout:
-            state = self._progress[0] or "silent"
-            why = f": {self.waits_because}" if self.waits_because else ""
+            status = self._controller
+            waits = status.state == "WAITING_FOR_TIP" and status.reason
             self._end(
-                f"no progress for {self._stall_timeout:g} s at {self.insertion * 1e3:.1f} mm "
-                f"(plane_controller is {state}{why})"
+                f"no progress for {self._stall_timeout:g} s at {status.insertion_m * 1e3:.1f} mm "
+                f"(plane_controller is {status.state or 'silent'}{f': {waits}' if waits else ''})"
             )
 
     @property
@@ -294,4 +250,5 @@ class OperatorSequence:
 
     def _end(self, reason: str) -> None:
         if self.outcome is None:
-            self.outcome = Outcome(False, reason, prepared=self._prepared == len(PREPARATION))
+            is_prepared = self._prepared == len(PREPARATION)
+            self.outcome = Exit(EXIT_MISSED if is_prepared else EXIT_BAD_INPUT, reason)

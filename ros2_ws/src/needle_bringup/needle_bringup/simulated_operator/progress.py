@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TextIO
 
 from tqdm import tqdm
 
+from needle_core.status_messages import ControllerStatus
+
 # Environment variable: file descriptor for the progress instead of stderr.
 PROGRESS_FD = "NEEDLE_PROGRESS_FD"
-
-
-@dataclasses.dataclass(frozen=True)
-class Shown:
-    """Insertion and final depth [m]; reason for waiting, empty while the needle advances."""
-
-    insertion: float
-    depth: float
-    waits_because: str
 
 
 class Progress:
@@ -36,10 +28,18 @@ class Progress:
         self._shown_quarter = 0
         self._last_reason = ""
 
-    def show(self, insertion: float, depth: float) -> None:
-        """Show the insertion and the final depth [m]."""
-        if depth <= 0.0:
-            return
+    def show(self, status: ControllerStatus) -> None:
+        """Show the insertion, and print each new reason for waiting once."""
+        waits = status.state == "WAITING_FOR_TIP"
+        if (waits or status.state in ("STEERING", "DONE")) and status.depth_m:
+            self._show_insertion(status.insertion_m, status.depth_m)
+        reason = status.reason if waits else ""
+        if reason and reason != self._last_reason:
+            self._remove_bar()
+            print(f"waiting: {reason}", file=self.stream, flush=True)
+        self._last_reason = reason
+
+    def _show_insertion(self, insertion: float, depth: float) -> None:
         if self._terminal:
             self._show_bar(insertion, depth)
             return
@@ -47,13 +47,6 @@ class Progress:
         if quarter > self._shown_quarter:
             self._shown_quarter = quarter
             print(f"{insertion * 1e3:5.1f} of {depth * 1e3:.1f} mm", file=self.stream, flush=True)
-
-    def show_wait(self, reason: str) -> None:
-        """Print each new reason for waiting once; an empty reason: no waiting."""
-        if reason and reason != self._last_reason:
-            self._remove_bar()
-            print(f"waiting: {reason}", file=self.stream, flush=True)
-        self._last_reason = reason
 
     def close(self, line: str) -> None:
         """Remove the bar and print a line, unless it is empty."""

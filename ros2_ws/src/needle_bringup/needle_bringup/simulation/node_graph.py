@@ -95,11 +95,7 @@ class NodeProcess:
 
     def tail(self, count: int) -> list[str]:
         """Return the last `count` lines of its output."""
-        try:
-            lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
-        except OSError:
-            return []
-        return lines[-count:]
+        return self.log.read_text(encoding="utf-8", errors="replace").splitlines()[-count:]
 
     def describe_end(self) -> str:
         """Return how it ended, as text."""

@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
 
 from needle_bringup.simulated_operator.progress import PROGRESS_FD
 from needle_bringup.simulation.node_graph import (
@@ -40,7 +39,6 @@ from needle_core.commands.cli import (
     run_command,
     write_json,
 )
-from needle_core.commands.executables import load
 from needle_core.errors import UserError
 from needle_core.process.discovery import clean_environment
 from needle_core.process.ros_domain import reserve_domain_id
@@ -51,8 +49,6 @@ METADATA = "metadata.yaml"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 POLL = 0.05
-# Start-up time of the nodes; afterwards this process may use a core [s].
-START_UP = 4.0
 # Environment variable of scripts/simulate: start of the command, seconds since the epoch.
 STARTED_AT = "NEEDLE_STARTED_AT"
 
@@ -165,12 +161,10 @@ def _run_graph(
 
 
 def _await_operator(graph: NodeGraph, end: ShutdownFlag) -> None:
-    operator, begin = graph.nodes[OPERATOR], time.monotonic()
+    operator = graph.nodes[OPERATOR]
     while operator.exit_code is None:
         _check(end)
         graph.check()
-        if time.monotonic() - begin > START_UP:
-            _import_report()
         wait_for([operator], POLL)
     graph.check()
     if operator.exit_code not in (EXIT_DONE, EXIT_MISSED):
@@ -179,10 +173,14 @@ def _await_operator(graph: NodeGraph, end: ShutdownFlag) -> None:
 
 def _report(options: SimulateOptions, bag: Path, started_at: float) -> int:
     """Write summary and report of the bag; return the exit code."""
-    report, bag_reader, run_summary = _import_report()
-    run = bag_reader.read_run(bag)
-    summary = run_summary.summarize(run)
-    report.write_report(run, summary)
+    # These imports take a second.
+    from needle_bags.reading.bag_reader import read_run  # noqa: PLC0415
+    from needle_bags.report.report import write_report  # noqa: PLC0415
+    from needle_bags.run.run_summary import summarize  # noqa: PLC0415
+
+    run = read_run(bag)
+    summary = summarize(run)
+    write_report(run, summary)
     summary["wall_s"] = time.time() - started_at
     for path in (bag / SUMMARY, options.json):
         if path is not None:
@@ -194,16 +192,6 @@ def _report(options: SimulateOptions, bag: Path, started_at: float) -> int:
 def shown(path: Path) -> Path:
     """Return a path, relative if it is below the current folder."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-
-
-def _import_report() -> tuple[ModuleType, ...]:
-    """Import the report's modules, which takes a second."""
-    names = (
-        "needle_bags.report.report",
-        "needle_bags.reading.bag_reader",
-        "needle_bags.run.run_summary",
-    )
-    return tuple(load(name) for name in names)
 
 
 def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:

@@ -17,7 +17,7 @@ from needle_bringup.simulated_operator.component import (
     SimulatedOperatorParameters,
 )
 from needle_bringup.simulated_operator.progress import Progress
-from needle_controller.plane_controller import STATUS, PlaneController
+from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.can_frame import CAN
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED
@@ -184,10 +184,14 @@ def run_virtually(
     UserError
         If the rig did not get ready or a component ended before the operator.
     """
-    tap = BagTap(bag, components, (DIAGNOSTICS, LOG), run_info)
-    progress = _ProgressTap(Progress(sys.stderr))
+    tap, progress = BagTap(bag, components, (DIAGNOSTICS, LOG), run_info), Progress(sys.stderr)
+
+    def show(stamp_ns: int, sender: str, message: Any, output: Output) -> None:
+        if isinstance(message, ControllerStatus):
+            progress.show(message)
+
     kind = partial(PacedRunner, pace=real_time_factor) if real_time_factor else VirtualRunner
-    runner = kind(components, seed, compute=COMPUTE, taps=(tap, progress))
+    runner = kind(components, seed, compute=COMPUTE, taps=(tap, show))
     operator = SimulatedOperator.name
     try:
         while not runner.run(_SLICE):
@@ -215,20 +219,3 @@ def _check_exits(exits: Mapping[str, Exit], operator: str) -> None:
 def settings_of(kind: type[Any], parameters: Parameters, node: str) -> Any:
     """Return a component's settings from the parameters of its node."""
     return from_values(kind, parameters.get(node, {}), node)
-
-
-class _ProgressTap:
-    """Shows the progress of the insertion, from the controller's status."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-
-    def __call__(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
-        if output.topic == STATUS and isinstance(message, ControllerStatus):
-            if message.state in ("STEERING", "WAITING_FOR_TIP", "DONE") and message.depth_m:
-                self._progress.show(message.insertion_m, message.depth_m)
-            waits = message.state == "WAITING_FOR_TIP"
-            self._progress.show_wait(message.reason if waits else "")
-
-    def close(self, line: str) -> None:
-        self._progress.close(line)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from needle_bringup.studies.cluster_study import run_parts
+from needle_bringup.studies.cluster import run_parts
 from needle_bringup.studies.monte_carlo_options import MonteCarloOptions, parse
 from needle_bringup.studies.study_parts import parts_of, results_of, settings_of
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json

@@ -11,10 +11,11 @@ from needle_bringup.training.needle_ends import (
     Pose,
     draw_needle,
     draw_shadow,
+    drawn_tracks,
     random_pose,
+    shifted_tracks,
     true_map,
 )
-from needle_bringup.training.old_tracks import drawn_tracks, shifted_tracks
 from needle_bringup.training.samples import (
     CANVAS,
     WITH_BACKGROUND,

@@ -9,8 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_bringup.training.needle_ends import Pose
-from needle_bringup.training.old_tracks import drawn_tracks, faded, made_faint, shifted_tracks
+from needle_bringup.training.needle_ends import (
+    Pose,
+    drawn_tracks,
+    faded,
+    made_faint,
+    shifted_tracks,
+)
 from needle_bringup.training.samples import (
     CANVAS,
     SIZE,

@@ -7,9 +7,16 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from needle_bringup.operator.controls import Controls, InputLost, InputReading, InputState
-from needle_bringup.operator.hold_debouncer import MAX_GAP, HoldDebouncer, HoldKind
+from needle_bringup.operator.hold_debouncer import (
+    MAX_GAP,
+    HoldDebouncer,
+    HoldKind,
+    InputLost,
+    InputReading,
+    InputState,
+)
 from needle_bringup.operator.joy_source import JOY_TIMEOUT, JoySource
+from needle_bringup.operator.parameters import OperatorParameters
 
 CYCLE = 0.02
 INSERT, RETRACT, NEUTRAL = InputState(insert=True), InputState(retract=True), InputState()
@@ -17,7 +24,7 @@ WANTS: dict[InputReading, HoldKind] = {INSERT: HoldKind.INSERT, RETRACT: HoldKin
 BOTH, STOPPED = InputState(insert=True, retract=True), InputState(insert=True, stop=True)
 READINGS = (NEUTRAL, INSERT, RETRACT, BOTH, InputState(stop=True), STOPPED, InputLost("unplugged"))
 moments = st.tuples(st.sampled_from(READINGS), st.sampled_from((CYCLE, CYCLE, CYCLE, 0.15)))
-CONTROLS = Controls(insert=0, retract=2, speed_axis=1, axis_at_zero=0.0, axis_at_full=1.0)
+JOYSTICK = OperatorParameters("joy", key=0, retract_key=2, speed_axis=1, axis_at_zero=0.0)
 
 NO_HANDS: tuple[tuple[int, list[float], list[int], str], ...] = (
     (2, [0.0, 1.0], [1, 0, 0], "2 nodes publish"),
@@ -53,36 +60,17 @@ def test_only_a_new_press_from_neutral_is_accepted(
         assert bool(decision.trouble) is isinstance(reading, InputLost)
 
 
-def test_a_stop_is_requested_once_per_press_and_ends_the_hold() -> None:
-    debouncer = HoldDebouncer()
-    readings = (NEUTRAL, INSERT, STOPPED, STOPPED, INSERT, NEUTRAL, InputState(stop=True))
-    decisions = [
-        debouncer.update(reading, CYCLE * number) for number, reading in enumerate(readings)
-    ]
-    assert [one.stop for one in decisions] == [
-        False,
-        False,
-        True,
-        False,
-        False,
-        False,
-        True,
-    ]
-    assert [one.kind is HoldKind.INSERT for one in decisions] == [
-        False,
-        True,
-        *[False] * 5,
-    ]
-
-
-def test_a_stop_pressed_after_a_loss_is_requested_again() -> None:
-    debouncer = HoldDebouncer()
-    pressed = InputState(stop=True)
-    readings: list[InputReading] = [pressed, InputLost("unplugged"), pressed, pressed]
-    decisions = [
-        debouncer.update(reading, CYCLE * number) for number, reading in enumerate(readings)
-    ]
-    assert [one.stop for one in decisions] == [True, False, True, False]
+def test_a_stop_is_requested_once_per_press_also_after_a_loss_and_ends_the_hold() -> None:
+    press = InputState(stop=True)
+    stories: tuple[tuple[list[InputReading], list[int], list[int]], ...] = (
+        ([NEUTRAL, INSERT, STOPPED, STOPPED, INSERT, NEUTRAL, press], [2, 6], [1]),
+        ([press, InputLost("unplugged"), press, press], [0, 2], []),
+    )
+    for readings, stops, held in stories:
+        debouncer = HoldDebouncer()
+        decisions = [debouncer.update(one, CYCLE * n) for n, one in enumerate(readings)]
+        assert [n for n, one in enumerate(decisions) if one.stop] == stops
+        assert [n for n, one in enumerate(decisions) if one.kind is HoldKind.INSERT] == held
 
 
 def test_a_suspended_process_requires_a_new_press() -> None:
@@ -95,38 +83,44 @@ def test_a_suspended_process_requires_a_new_press() -> None:
     assert (frozen.kind, frozen.ignored_press) == (HoldKind.NOTHING, True)
 
 
-def joystick(publishers: int = 1) -> JoySource:
-    return JoySource(CONTROLS, lambda: 0.5, lambda: publishers)
+class Joystick(JoySource):
+    """The source of a joystick at half the speed."""
+
+    def __init__(self) -> None:
+        super().__init__(JOYSTICK)
+
+    def seen(self, now: float, publishers: int = 1) -> InputReading:
+        return self.read(now, 0.5, publishers)
 
 
 def test_the_last_message_of_a_joystick_is_used_while_recent() -> None:
-    source = joystick()
-    assert isinstance(source.read(0.0), InputLost)
+    source = Joystick()
+    assert isinstance(source.seen(0.0), InputLost)
     source.receive([0.0, 1.0], [1, 0, 0], 5.0)
-    assert source.read(5.0 + 0.999 * JOY_TIMEOUT) == InputState(insert=True, speed=0.5)
-    silent = source.read(5.0 + 1.001 * JOY_TIMEOUT)
+    assert source.seen(5.0 + 0.999 * JOY_TIMEOUT) == InputState(insert=True, speed=0.5)
+    silent = source.seen(5.0 + 1.001 * JOY_TIMEOUT)
     assert silent == InputLost("no message from the joystick for more than 0.1 s")
     source.receive([0.0, 0.5], [0, 1, 1], 6.0)
-    assert source.read(6.0) == InputState(retract=True, speed=0.25)
+    assert source.seen(6.0) == InputState(retract=True, speed=0.25)
 
 
 def test_an_overtaken_message_is_ignored() -> None:
-    source = joystick()
+    source = Joystick()
     source.receive([0.0, 1.0], [1, 0, 0], 5.00, stamp=100.00)
     source.receive([0.0, 1.0], [0, 0, 0], 5.05, stamp=99.98)
-    assert source.read(5.05) == InputState(insert=True, speed=0.5)
-    assert isinstance(source.read(5.00 + 1.001 * JOY_TIMEOUT), InputLost)
+    assert source.seen(5.05) == InputState(insert=True, speed=0.5)
+    assert isinstance(source.seen(5.00 + 1.001 * JOY_TIMEOUT), InputLost)
     # A sender whose clock was set back is heard again after a silence, and one without at once.
     source.receive([0.0, 1.0], [0, 0, 0], 5.11, stamp=40.00)
-    assert source.read(5.11) == InputState(speed=0.5)
+    assert source.seen(5.11) == InputState(speed=0.5)
     source.receive([0.0, 1.0], [1, 0, 0], 5.13)
-    assert source.read(5.13) == InputState(insert=True, speed=0.5)
+    assert source.seen(5.13) == InputState(insert=True, speed=0.5)
 
 
 def test_an_invalid_message_is_a_loss_of_the_joystick() -> None:
     for publishers, axes, buttons, why in NO_HANDS:
-        source = joystick(publishers)
+        source = Joystick()
         source.receive(axes, buttons, 5.0)
-        read = source.read(5.0)
+        read = source.seen(5.0, publishers)
         assert isinstance(read, InputLost)
         assert why in read.reason

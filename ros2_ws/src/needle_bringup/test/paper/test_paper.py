@@ -12,11 +12,17 @@ import numpy as np
 import pytest
 
 from needle_bags.reading.bag_reader import Run, read_run
-from needle_bringup.paper import paper_runs
+from needle_bringup.paper import paper_results
 from needle_bringup.paper.paper import main
 from needle_bringup.paper.paper_figures import common_r1, converged_share
-from needle_bringup.paper.paper_results import Floats, SteeringTrial, missed_later, settled_mm
-from needle_bringup.paper.paper_runs import Columns, Laboratory
+from needle_bringup.paper.paper_results import (
+    Columns,
+    Floats,
+    Laboratory,
+    SteeringTrial,
+    missed_later,
+    settled_mm,
+)
 from needle_bringup.workplace import checkout
 from needle_core.commands.cli import JsonValue
 from needle_core.errors import UserError
@@ -80,7 +86,7 @@ def test_existing_results_are_reused(
 
 def test_runs_are_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[list[str]] = []
-    monkeypatch.setattr(paper_runs, "_run", lambda name, command, good: asked.append(command))
+    monkeypatch.setattr(paper_results, "_run", lambda name, command, good: asked.append(command))
     laboratory = Laboratory(["simulate", "-q"], tmp_path)
     for work, words in (
         (laboratory.trial, ("one", "--level", "tip")),
@@ -145,7 +151,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder with all that `paper` writes of made-up runs."""
     folder = tmp_path_factory.mktemp("paper")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paper_runs, "Laboratory", MadeUpLaboratory)
+        patch.setattr(paper_results, "Laboratory", MadeUpLaboratory)
         words = ["--quick", "--out", str(folder / "out"), "--json", str(folder / "figures.json")]
         assert main(words) == 0
     return folder

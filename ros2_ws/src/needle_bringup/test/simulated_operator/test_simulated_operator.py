@@ -10,7 +10,6 @@ from needle_bringup.simulated_operator.component import (
     SimulatedOperator,
     SimulatedOperatorParameters,
 )
-from needle_bringup.simulated_operator.progress import Shown
 from needle_core import messages as m
 from needle_core.component import Action, Answer, Call, Exit, Moment, Peers, Publish, Send
 from needle_core.diagnostics import Level
@@ -33,7 +32,7 @@ class Scene:
         self.controller = ControllerStatus(state="IDLE", starts=0, depth_m=0.12)
         self.asked: list[tuple[str, bool | None]] = []
         self.holds: list[m.HoldState] = []
-        self.shown: list[Shown] = []
+        self.shown: list[ControllerStatus] = []
         self.end: Exit | None = None
         self.see((RIG,))
 
@@ -94,7 +93,7 @@ def test_the_component_prepares_holds_releases_and_disables() -> None:
     assert scene.asked == [STARTED[0], *STARTED]
     held = scene.holds[-1]
     assert (held.pressed, held.source, held.speed_scale) == (True, "stand_in", 1.0)
-    assert scene.shown[-1] == Shown(0.001, 0.12, "")
+    assert (scene.shown[-1].insertion_m, scene.shown[-1].depth_m) == (0.001, 0.12)
     scene.run(state="DONE", step=120, insertion_m=0.12)
     assert scene.end == Exit(0, "inserted 120.0 mm in 120 steps")
     assert scene.asked[-2:] == [STARTED[-1], DISABLE]

@@ -20,6 +20,7 @@ from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.virtual_run import make_components, run_virtually
 from needle_core.component import Actions, Component, Exit, Moment, Timer
 from needle_core.errors import UserError
+from needle_core.status_messages import ControllerStatus
 
 pytestmark = pytest.mark.usefixtures("compiled")
 WORDS = ("--level", "tip", "--depth-mm", "4", "--initial", "0.2,0,0")
@@ -166,10 +167,12 @@ def test_progress_is_a_line_per_quarter_or_a_bar() -> None:
     stream, terminal = io.StringIO(), Terminal()
     for shown in (Progress(stream), Progress(terminal)):
         for insertion in (0.0, 0.001, 0.003, 0.004):
-            shown.show(insertion, 0.004)
-        shown.show(1.0, 0.0)
-        for reason in ("", "no tip", "no tip", "", "no tip"):
-            shown.show_wait(reason)
+            steering = ControllerStatus(state="STEERING", insertion_m=insertion, depth_m=0.004)
+            shown.show(steering)
+        shown.show(dataclasses.replace(steering, insertion_m=1.0, depth_m=None))
+        waiting = dataclasses.replace(steering, state="WAITING_FOR_TIP", reason="no tip")
+        for status in (steering, waiting, waiting, steering, waiting):
+            shown.show(status)
         shown.close("done")
     waits = ["waiting: no tip"] * 2
     lines = ["  1.0 of 4.0 mm", "  3.0 of 4.0 mm", "  4.0 of 4.0 mm", *waits, "done"]

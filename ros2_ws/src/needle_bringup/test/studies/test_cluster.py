@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from needle_bringup.studies import cluster, cluster_study
+from needle_bringup.studies import cluster
 from needle_bringup.studies.cluster import on_cluster
 from needle_bringup.studies.monte_carlo import main
 from needle_core.errors import UserError
@@ -147,6 +147,6 @@ def test_a_cluster_gives_the_figures_of_one_machine(
     there = figures_of(tmp_path, "--scheduler", ADDRESS)
     assert there == (figures, runs)
     assert "warning" not in capsys.readouterr().err
-    monkeypatch.setattr(cluster_study, "_witness_digest", lambda _: "other bits")
+    monkeypatch.setattr(cluster, "_witness_digest", lambda _: "other bits")
     figures_of(tmp_path, "--scheduler", ADDRESS)
     assert f"warning: {socket.gethostname()} rounds unlike" in capsys.readouterr().err

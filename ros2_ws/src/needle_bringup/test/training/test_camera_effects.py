@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from needle_bringup.training.camera_effects import CameraEffects
+from needle_bringup.training.samples import CameraEffects
 
 PLAIN = CameraEffects(
     haze=0.0,

@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_bringup.training.needle_ends import Pose, draw_needle, draw_shadow, true_map
-from needle_bringup.training.old_tracks import drawn_tracks, shifted_tracks
+from needle_bringup.training.needle_ends import (
+    Pose,
+    draw_needle,
+    draw_shadow,
+    drawn_tracks,
+    shifted_tracks,
+    true_map,
+)
 from needle_bringup.training.patches import patch
 from needle_bringup.training.samples import CANVAS, moved
 

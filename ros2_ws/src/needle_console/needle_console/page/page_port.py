@@ -27,8 +27,6 @@ from needle_core.messages import HOLD_LIFETIME, Point, Pose, quaternion_from_rot
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.optics.refraction import stereo_views
 
-_MAX_EVENTS = 50
-
 
 class PagePort:
     """Connects the threads of page and hold with the runner of the component; never blocks.
@@ -144,8 +142,7 @@ class PagePort:
 
     def _add(self, event: PageEvent) -> None:
         with self._lock:
-            if len(self._events) < _MAX_EVENTS:
-                self._events.append(event)
+            self._events.append(event)
         self._arrive(self._take)
 
 

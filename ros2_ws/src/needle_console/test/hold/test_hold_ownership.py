@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import random
 from collections.abc import Callable
 
 import pytest
@@ -203,91 +201,3 @@ def test_silent_page_is_lost(scene: Scene, page: int) -> None:
     assert scene.protocol.is_silent(page, scene.now)
     scene.say(page, False)
     assert not scene.protocol.is_silent(page, scene.now)
-
-
-class Witness(Scene):
-    """Checks each hold with an independent record."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.pages = [self.page(), self.page()]
-        self.written: list[str] = []
-        # Count to page and time.
-        self._sent: dict[int, tuple[int, float]] = {}
-        # By page: highest echoed count; time of the newest count echoed by a press; event
-        # of the last fresh release, and of the last end of a hold.
-        self._heard: dict[int, int] = {}
-        self._proof: dict[int, float] = {}
-        self._released: dict[int, int] = {}
-        self._over: dict[int, int] = {}
-        self._event = 0
-        self._holder: int | None = None
-
-    def write(self, page: int, pressed: bool) -> str:
-        count = self.count(page)
-        self._sent[count] = page, self.now
-        self.written.append(self.message(page, pressed, count))
-        return self.written[-1]
-
-    def deliver(self, page: int, data: str) -> None:
-        self.look()
-        fields = json.loads(data)
-        to_page, sent = self._sent[fields["count"]]
-        before = self._heard.get(page, 0)
-        if to_page == page and fields["count"] >= before:
-            if fields["pressed"] and fields["count"] > before:
-                self._proof[page] = max(self._proof.get(page, -1.0), sent)
-            elif not fields["pressed"] and self.now - sent <= ECHO_AGE_LIMIT:
-                self._released[page] = self._event
-            self._heard[page] = fields["count"]
-        self.protocol.receive(page, data, self.now)
-        self.look()
-
-    def look(self) -> None:
-        """Check the hold now."""
-        holders = [page for page in self.pages if self.message_to(page)["held"]]
-        assert len(holders) == self.pressed
-        holder = holders[0] if holders else None
-        if holder is not None:
-            # The button was pressed within the limit.
-            assert self.now - self._proof[holder] <= ECHO_AGE_LIMIT
-            if self._holder is None:
-                # And it was released since its last hold.
-                assert self._released[holder] >= self._over.get(holder, -1)
-            else:
-                assert holder == self._holder
-        elif self._holder is not None:
-            self._over[self._holder] = self._event
-        self._holder = holder
-        self._event += 1
-
-    def act(self, rng: random.Random) -> None:
-        """Perform one random action of pages, network or other senders."""
-        number, pressed = rng.randrange(2), rng.random() < 0.6
-        match rng.choice(("echo", "echo", "echo", "wait", "write", "replay", "end")):
-            case "echo":
-                data = self.write(self.pages[number], pressed)
-                self.wait(rng.uniform(0.0, rng.choice((0.05, 0.05, 0.05, 0.3))))
-                self.deliver(self.pages[number], data)
-            case "wait":
-                self.wait(rng.uniform(0.0, 0.3))
-            case "write":
-                self.write(self.pages[number], pressed)
-            case "replay" if self.written:
-                # Later, repeatedly, to any page.
-                self.deliver(self.pages[number], rng.choice(self.written[-8:]))
-            case "end" if pressed:
-                self.protocol.receive(self.pages[number], "{", self.now)
-            case "end":
-                self.protocol.close(self.pages[number], self.now)
-                self.pages[number] = self.page()
-        self.look()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_nothing_resumes_by_itself(seed: int) -> None:
-    rng = random.Random(seed)
-    for _ in range(30):
-        witness = Witness()
-        for _ in range(50):
-            witness.act(rng)

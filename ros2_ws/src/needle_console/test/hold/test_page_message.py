@@ -17,7 +17,8 @@ WRONG: dict[str, list[Any]] = {
     "mode": ["home", ["insert"], None],
     "more": [1],
 }
-NO_OBJECTS = ["", "{", "[]", "1", "null", json.dumps(GOOD) + "x", "[" * 100_000, b"\0", b"\xff\xfe"]
+TEXTS = ("", "{", "[]", "1", "null", json.dumps(GOOD) + "x")
+NO_OBJECTS: tuple[str | bytes, ...] = (*TEXTS, b"\0", b"\xff\xfe")
 
 
 def test_valid_message_is_read() -> None:
@@ -26,17 +27,9 @@ def test_valid_message_is_read() -> None:
         assert read_message(json.dumps({**GOOD, "speed": speed}))[1].speed == float(speed)
 
 
-@pytest.mark.parametrize("key", WRONG)
-def test_invalid_extra_or_missing_field_is_refused(key: str) -> None:
-    for value in WRONG[key]:
+def test_anything_else_is_refused() -> None:
+    fields = [{**GOOD, key: value} for key, values in WRONG.items() for value in values]
+    fields += [{name: GOOD[name] for name in GOOD if name != key} for key in GOOD]
+    for data in (*map(json.dumps, fields), *NO_OBJECTS):
         with pytest.raises(ValueError):
-            read_message(json.dumps({**GOOD, key: value}))
-    if key in GOOD:
-        with pytest.raises(ValueError):
-            read_message(json.dumps({name: value for name, value in GOOD.items() if name != key}))
-
-
-@pytest.mark.parametrize("data", NO_OBJECTS, ids=range(len(NO_OBJECTS)))
-def test_other_data_than_a_json_object_is_refused(data: str | bytes) -> None:
-    with pytest.raises(ValueError):
-        read_message(data)
+            read_message(data)

@@ -2,59 +2,53 @@
 
 from __future__ import annotations
 
+import pytest
+
 from needle_console.hold.page_session import RELEASED, Mode, PageHold
 from needle_console.hold.retraction import RETRACT, STOP_STEERING, HoldOrder, Retraction
 
 INSERT = PageHold(True, 1.0, Mode.INSERT)
 OUT = PageHold(True, 1.0, Mode.RETRACT)
+HELD, FREE = HoldOrder(True), HoldOrder(False)
+STOPS, RETRACTS = HoldOrder(False, (STOP_STEERING,)), HoldOrder(True, (RETRACT,))
+# Button, time [s], whether a controller steers, whether the hold counts; the order.
+Step = tuple[PageHold, float, bool, bool, HoldOrder]
+STORIES: dict[str, tuple[Step, ...]] = {
+    "insertion is passed on unchanged": (
+        (INSERT, 0.0, True, True, HELD),
+        (RELEASED, 9.0, True, False, FREE),
+        (INSERT, 9.1, False, True, HELD),
+        (RELEASED, 9.2, False, False, FREE),
+    ),
+    "steering stops first, and each service is called once": (
+        (OUT, 0.0, True, False, STOPS),
+        (OUT, 0.0, True, False, FREE),
+        (OUT, 0.0, False, False, HELD),
+        (OUT, 0.0, False, True, RETRACTS),
+        (OUT, 0.0, False, True, HELD),
+        # The needle is out and the button still pressed: no second call, and no hold.
+        (OUT, 8.0, False, False, HELD),
+        (OUT, 8.1, False, True, FREE),
+        (OUT, 8.2, True, False, FREE),
+        (RELEASED, 9.0, False, False, FREE),
+        (OUT, 9.1, False, True, RETRACTS),
+    ),
+    "a needle that is out ends the hold": (
+        (OUT, 0.0, False, True, RETRACTS),
+        (OUT, 0.9, False, True, HELD),
+        (OUT, 1.1, False, True, FREE),
+        # Steering that begins now gets no hold.
+        (OUT, 1.2, True, False, FREE),
+    ),
+    "steering that begins meanwhile gets no hold": (
+        (OUT, 0.0, False, False, HELD),
+        (OUT, 0.0, True, True, STOPS),
+    ),
+}
 
 
-def test_insertion_is_passed_on_unchanged() -> None:
+@pytest.mark.parametrize("story", STORIES)
+def test_a_retraction_orders_hold_and_services(story: str) -> None:
     retraction = Retraction()
-    for steering in (True, False):
-        assert retraction.update(INSERT, 0.0, steering=steering, hold_counts=True) == HoldOrder(
-            True
-        )
-        assert retraction.update(RELEASED, 9.0, steering=steering, hold_counts=False) == HoldOrder(
-            False
-        )
-
-
-def test_retraction_stops_steering_first_and_calls_each_service_once() -> None:
-    retraction = Retraction()
-    assert retraction.update(OUT, 0.0, steering=True, hold_counts=False) == HoldOrder(
-        False, (STOP_STEERING,)
-    )
-    assert retraction.update(OUT, 0.0, steering=True, hold_counts=False) == HoldOrder(False)
-    assert retraction.update(OUT, 0.0, steering=False, hold_counts=False) == HoldOrder(True)
-    assert retraction.update(OUT, 0.0, steering=False, hold_counts=True) == HoldOrder(
-        True, (RETRACT,)
-    )
-    assert retraction.update(OUT, 0.0, steering=False, hold_counts=True) == HoldOrder(True)
-    # The needle is out and the button still pressed: no second call, and no hold.
-    assert retraction.update(OUT, 8.0, steering=False, hold_counts=False) == HoldOrder(True)
-    assert retraction.update(OUT, 8.1, steering=False, hold_counts=True) == HoldOrder(False)
-    assert retraction.update(OUT, 8.2, steering=True, hold_counts=False) == HoldOrder(False)
-    assert retraction.update(RELEASED, 9.0, steering=False, hold_counts=False) == HoldOrder(False)
-    assert retraction.update(OUT, 9.1, steering=False, hold_counts=True) == HoldOrder(
-        True, (RETRACT,)
-    )
-
-
-def test_retraction_of_a_needle_that_is_out_ends_the_hold() -> None:
-    retraction = Retraction()
-    assert retraction.update(OUT, 0.0, steering=False, hold_counts=True) == HoldOrder(
-        True, (RETRACT,)
-    )
-    assert retraction.update(OUT, 0.9, steering=False, hold_counts=True) == HoldOrder(True)
-    assert retraction.update(OUT, 1.1, steering=False, hold_counts=True) == HoldOrder(False)
-    # Steering that begins now gets no hold.
-    assert retraction.update(OUT, 1.2, steering=True, hold_counts=False) == HoldOrder(False)
-
-
-def test_steering_that_begins_meanwhile_gets_no_hold() -> None:
-    retraction = Retraction()
-    assert retraction.update(OUT, 0.0, steering=False, hold_counts=False) == HoldOrder(True)
-    assert retraction.update(OUT, 0.0, steering=True, hold_counts=True) == HoldOrder(
-        False, (STOP_STEERING,)
-    )
+    for hold, now, steering, counts, order in STORIES[story]:
+        assert retraction.update(hold, now, steering=steering, hold_counts=counts) == order

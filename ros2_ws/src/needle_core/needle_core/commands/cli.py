@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
@@ -20,8 +19,6 @@ EXIT_MISSED = 1
 EXIT_BAD_INPUT = 2
 EXIT_INTERNAL_ERROR = 3
 EXIT_INTERRUPTED = 130
-# File name that stands for standard output.
-STANDARD_OUTPUT = "-"
 
 JsonValue = str | int | float | bool | None
 
@@ -41,7 +38,7 @@ def run_command(command: Callable[[], int]) -> int:
         SIGINT, SIGTERM or SIGHUP.
     """
     try:
-        with interruptible(), contextlib.redirect_stdout(sys.stdout):
+        with interruptible():
             code = command()
             # A closed pipe raises here instead of at the interpreter's exit.
             sys.stdout.flush()
@@ -90,7 +87,7 @@ def write_json(path: Path, values: Mapping[str, JsonValue]) -> None:
     Parameters
     ----------
     path : Path
-        File to write, in an existing folder; `-` is standard output.
+        File to write, in an existing folder.
     values : mapping
         Key to value; keys end in their unit.
 
@@ -100,7 +97,4 @@ def write_json(path: Path, values: Mapping[str, JsonValue]) -> None:
         If the file cannot be written.
     """
     text = json.dumps({key: finite_or_none(value) for key, value in values.items()}, indent=2)
-    if str(path) == STANDARD_OUTPUT:
-        print(text, file=sys.__stdout__)
-        return
     write_text(path, text + "\n")

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn, overload
+from typing import NoReturn, overload
 
-from needle_core.commands.cli import STANDARD_OUTPUT
 from needle_core.errors import UserError
 from needle_core.settings.bounds import check_bounds
 
@@ -33,13 +31,6 @@ class CommandParser(argparse.ArgumentParser):
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse; with `--json -`, all text goes to stderr and only JSON to standard output."""
-        given = super().parse_known_args(args, namespace)
-        if str(getattr(given[0], "json", None)) == STANDARD_OUTPUT:
-            sys.stdout = sys.stderr
-        return given
 
     def error(self, message: str) -> NoReturn:
         """Raise the error that argparse would print before exiting."""
@@ -86,7 +77,7 @@ def output_file(name: str, text: None) -> None: ...
 @overload
 def output_file(name: str, text: str | Path) -> Path: ...
 def output_file(name: str, text: str | Path | None) -> Path | None:
-    """Return the output file given to an option; None if it was not given, `-` unchanged.
+    """Return the output file given to an option; None if it was not given.
 
     Raises
     ------
@@ -96,8 +87,6 @@ def output_file(name: str, text: str | Path | None) -> Path | None:
     if text is None:
         return None
     path = Path(text).expanduser()
-    if str(path) == STANDARD_OUTPUT:
-        return path
     if path.is_dir() or not path.parent.is_dir():
         raise UserError(f"{name} {text}: its folder must exist, and it must not be a folder")
     return path

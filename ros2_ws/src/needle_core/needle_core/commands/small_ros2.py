@@ -6,27 +6,22 @@ It contains the verbs of this project's documents, in the syntax of the original
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import sys
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import TypeVar
 
-from needle_core.errors import UserError
+from needle_core.errors import UserError, did_you_mean
 from needle_core.process.discovery import clean_environment
 
 HELP = """\
 usage: ros2 run PACKAGE EXECUTABLE [arguments]
        ros2 pkg executables [PACKAGE]
-       ros2 node list
-       ros2 topic list | echo TOPIC | pub TOPIC TYPE [YAML]
-       ros2 service call SERVICE TYPE [YAML]
-       ros2 param get NODE NAME | set NODE NAME VALUE
+       ros2 {node list,topic list,topic echo,topic pub,service call,param get,param set} --help
 
-A small substitute for the ros2 command line, which PyPI does not have. It runs the nodes and tools
-of this project and accesses a running graph; `ros2 topic pub --help` shows its options. For
-everything else (bag, launch, ...) install ROS 2 Jazzy, source it and run scripts/setup again.
+A small substitute for the ros2 command line, which PyPI does not have; options: `--help`.
+For everything else (bag, launch, ...) install ROS 2 Jazzy, source it and run scripts/setup again.
 """
 _MODULE = ".executables"
 T = TypeVar("T")
@@ -43,9 +38,8 @@ def main() -> int:
                 sys.argv = [executable, *arguments]
                 sys.exit(entry.load()())
             case ["pkg", "executables", *given]:
-                known = _executables()
-                for package in given or sorted(known):
-                    for name in _find("package", package, known):
+                for package in given or sorted(_executables()):
+                    for name in _find("package", package, _executables()):
                         print(package, name)
             case ["node" | "topic" | "service" | "param", *_] as arguments:
                 clean_environment()
@@ -73,8 +67,4 @@ def _find(kind: str, name: str, known: Mapping[str, T]) -> T:
     """Return a known package or executable; raise a `UserError` with a suggestion otherwise."""
     if name in known:
         return known[name]
-    close = difflib.get_close_matches(name, known, n=3)
-    hint = f"did you mean {' or '.join(close)}?"
-    if not close:
-        hint = f"known: {', '.join(sorted(known))}"
-    raise UserError(f"{kind} '{name}' not found; {hint}")
+    raise UserError(f"{kind} '{name}' not found ({did_you_mean(name, known)})")

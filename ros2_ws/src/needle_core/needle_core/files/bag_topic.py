@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from rosbags.interfaces import Qos, QosDurability, QosTime
 from rosbags.rosbag2.metadata import parse_qos
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from needle_core.files.yaml_files import load_yaml
@@ -80,21 +80,14 @@ _NEXT_TYPE: Final = re.compile(r"^={80}\nMSG: ", re.MULTILINE)
 
 
 def parsed_types(encoding: str, definition: str, type_name: str) -> dict[str, Any]:
-    """Return the types that a schema defines; none for an unknown encoding."""
-    found: dict[str, Any] = {}
-    if encoding == "ros2msg":
-        head, *others = _NEXT_TYPE.split(definition)
-        found.update(_types_of_part(head, type_name))
-        for other in others:
-            name, _, text = other.partition("\n")
-            found.update(_types_of_part(text, name))
-        return found
-    if encoding not in ("ros2idl", "omgidl"):
+    """Return the types that a schema defines; none for another encoding than `ros2msg`."""
+    if encoding != "ros2msg":
         return {}
-    separator = "=" * 80 + "\n"
-    parts = definition.split(separator)[1:] if definition.startswith(separator) else [definition]
-    for part in parts:
-        found.update(get_types_from_idl(part.partition("\n")[2] if len(parts) > 1 else part))
+    head, *others = _NEXT_TYPE.split(definition)
+    found = dict(_types_of_part(head, type_name))
+    for other in others:
+        name, _, text = other.partition("\n")
+        found.update(_types_of_part(text, name))
     return found
 
 

@@ -6,7 +6,7 @@ import contextlib
 import errno
 import os
 import stat
-import tempfile
+import uuid
 from pathlib import Path
 from typing import BinaryIO
 
@@ -49,17 +49,16 @@ def replace_file(path: Path, data: bytes) -> None:
     OSError
         If writing fails; an existing file stays as it is.
     """
-    number, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    new = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
     try:
-        with os.fdopen(number, "wb") as stream:
+        with new.open("xb") as stream:
             stream.write(data)
             stream.flush()
-            os.fchmod(number, 0o666 & ~_umask())
-            os.fsync(number)
-        Path(name).replace(path)
+            os.fsync(stream.fileno())
+        new.replace(path)
     except BaseException:
         with contextlib.suppress(OSError):
-            Path(name).unlink()
+            new.unlink()
         raise
     sync_directory(path.parent)
 
@@ -71,11 +70,3 @@ def sync_directory(directory: Path) -> None:
         os.fsync(number)
     finally:
         os.close(number)
-
-
-def _umask() -> int:
-    """Return the file mode mask without changing it for a moment, as `os.umask` does."""
-    for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
-        if line.startswith("Umask:"):
-            return int(line.split()[1], 8)
-    return 0o077

@@ -71,10 +71,7 @@ def _close(*files: int | None) -> None:
 
 
 def _holder_of(key: str) -> str:
-    try:
-        lines = _NAMES.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        lines = []
+    lines = _NAMES.read_text(encoding="utf-8", errors="replace").splitlines()
     labels = [line.partition(f"@{key}:")[2].strip() for line in lines]
     return next(filter(None, labels), "another process")
 

@@ -17,38 +17,31 @@ from typing import Any
 import numpy as np
 import rclpy
 import yaml
-from rclpy.exceptions import InvalidServiceNameException, InvalidTopicNameException
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter, get_parameter_value, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from needle_core.errors import UserError
+from needle_core.files.yaml_files import load_yaml
 from needle_core.ros.base_node import full_name
 
-# Time to discover all endpoints, and to discover a given node or topic [s].
-DISCOVERY, SEARCH_TIMEOUT = 1.0, 5.0
-ANSWER_TIMEOUT = 10.0  # [s]
+# Time to discover all endpoints, to discover a given node or topic, and for an answer [s].
+DISCOVERY, SEARCH_TIMEOUT, ANSWER_TIMEOUT = 1.0, 5.0, 10.0
 MAX_LENGTH = 128  # of a printed array or text
 
 
-class CommandError(Exception):
-    """Error of one line, printed for the user."""
-
-
-def spin_until(node: Node, condition: Callable[[], Any], timeout: float) -> bool:
-    """Spin until the condition holds; return whether it holds before the timeout [s]."""
+def spin_until(node: Node, condition: Callable[[], Any], timeout: float, failure: str = "") -> None:
+    """Spin until the condition holds (`bool`: never) or the timeout [s], which may be a failure."""
     end = time.monotonic() + timeout
     while not condition():
         if time.monotonic() >= end:
-            return False
+            if failure:
+                raise UserError(failure)
+            return
         rclpy.spin_once(node, timeout_sec=0.02)
-    return True
-
-
-def spin_for(node: Node, seconds: float) -> None:
-    """Spin for some time."""
-    spin_until(node, lambda: False, seconds)
 
 
 # ---- messages ---------------------------------------------------------------------------------
@@ -60,89 +53,77 @@ def find_type(name: str, kind: str) -> Any:
     try:
         return getattr(importlib.import_module(f"{package}.{kind}"), type_name)
     except (AttributeError, ModuleNotFoundError) as error:
-        raise CommandError(f"there is no {kind} type '{name}'") from error
+        raise UserError(f"there is no {kind} type '{name}'") from error
 
 
 def to_plain(value: Any) -> Any:
     """Return a message, or a field of one, as plain data; long texts and arrays are shortened."""
+    is_longer = hasattr(value, "__len__") and len(value) > MAX_LENGTH
     if isinstance(value, (str, bytes)):
         text = value if isinstance(value, str) else value.decode("latin-1")
-        return text if len(text) <= MAX_LENGTH else text[:MAX_LENGTH] + "..."
+        return text[:MAX_LENGTH] + "..." * is_longer
+    if isinstance(value, (list, array.array, np.ndarray)):
+        return [to_plain(item) for item in value[:MAX_LENGTH]] + ["..."] * is_longer
     if isinstance(value, np.generic):
         return value.item()
-    if isinstance(value, (list, tuple, array.array, np.ndarray)):
-        return [to_plain(item) for item in value[:MAX_LENGTH]] + ["..."] * (len(value) > MAX_LENGTH)
     if hasattr(value, "get_fields_and_field_types"):
         return {name: to_plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
     return value
 
 
-def fill(message: Any, text: str) -> list[Any]:
-    """Set the fields of a message from YAML; return the stamps that were given as `now`."""
-    try:
-        values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise CommandError(f"not YAML: {' '.join(str(error).split())}") from error
-    return _fill(message, values)
-
-
-def _fill(message: Any, values: Any) -> list[Any]:
+def fill(message: Any, values: Any) -> list[Any]:
+    """Set the fields of a message from plain data; return the stamps that were given as `now`."""
     if not isinstance(values, Mapping):
-        raise CommandError(f"'{values}' is expected to be a dictionary")
+        raise UserError(f"'{values}' is expected to be a dictionary")
     stamps: list[Any] = []
     types = message.get_fields_and_field_types()
     for name, value in values.items():
         if name not in types:
-            raise CommandError(f"'{type(message).__name__}' has no field '{name}'")
+            raise UserError(f"'{type(message).__name__}' has no field '{name}'")
         field = getattr(message, name)
         if types[name] == "builtin_interfaces/Time" and value == "now":
             stamps.append(field)
         elif hasattr(field, "get_fields_and_field_types"):
-            stamps += _fill(field, value)
+            stamps += fill(field, value)
         else:
             try:
-                setattr(message, name, _converted(value, field, types[name], stamps))
+                setattr(message, name, _converted(value, types[name], stamps))
             except (AssertionError, TypeError, ValueError, OverflowError) as error:
-                raise CommandError(f"{name}: {value!r} is not a {types[name]}") from error
+                raise UserError(f"{name}: {value!r} is not a {types[name]}") from error
     return stamps
 
 
-def _converted(value: Any, field: Any, type_name: str, stamps: list[Any]) -> Any:
-    """Return a value in the type of the field; add the stamps of nested messages."""
-    if isinstance(field, array.array):
-        return array.array(field.typecode, value)
-    if isinstance(field, np.ndarray):
-        return np.array(value, dtype=field.dtype)
-    if isinstance(field, list) and "/" in type_name:
-        messages = [find_type(re.findall(r"\w+/\w+", type_name)[0], "msg")() for _ in value]
-        for message, entry in zip(messages, value, strict=True):
-            stamps += _fill(message, entry)
-        return messages
+def _converted(value: Any, type_name: str, stamps: list[Any]) -> Any:
+    """Return a value with messages and floats as the field has them; add the messages' stamps."""
+    if isinstance(value, list):
+        item_type = re.sub(r"^sequence<|[,<>\[].*$", "", type_name)
+        return [_converted(item, item_type, stamps) for item in value]
+    if "/" in type_name:
+        message = find_type(type_name, "msg")()
+        stamps += fill(message, value)
+        return message
     # Other conversions, such as a text to a number, would rather hide a mistake.
-    return float(value) if isinstance(field, float) and type(value) is int else value
+    return float(value) if type_name in ("float", "double") and type(value) is int else value
 
 
 # ---- commands ---------------------------------------------------------------------------------
 
 
-def list_nodes(node: Node, options: argparse.Namespace) -> None:
-    """Print the full names of the nodes, except hidden ones, such as that of this command."""
-    spin_for(node, DISCOVERY)
-    names = node.get_node_names_and_namespaces()
-    print("\n".join(sorted(full_name(space, name) for name, space in names if name[0] != "_")))
-
-
-def list_topics(node: Node, options: argparse.Namespace) -> None:
-    """Print the names of the topics."""
-    spin_for(node, DISCOVERY)
-    print("\n".join(name for name, _ in node.get_topic_names_and_types()))
+def list_names(node: Node, options: argparse.Namespace) -> None:
+    """Print the names of the topics, or of the nodes except hidden ones (that of this command)."""
+    spin_until(node, bool, DISCOVERY)
+    nodes = node.get_node_names_and_namespaces()
+    names = [full_name(space, name) for name, space in nodes if name[0] != "_"]
+    if options.command == "topic list":
+        names = [name for name, _ in node.get_topic_names_and_types()]
+    print("\n".join(sorted(names)))
 
 
 def echo(node: Node, options: argparse.Namespace) -> None:
     """Print the messages of a topic."""
     topic = node.resolve_topic_name(options.topic_name)
-    if not spin_until(node, lambda: node.get_publishers_info_by_topic(topic), SEARCH_TIMEOUT):
-        raise CommandError(f"topic [{options.topic_name}] is not published")
+    unknown = f"topic [{options.topic_name}] is not published"
+    spin_until(node, lambda: node.count_publishers(topic), SEARCH_TIMEOUT, unknown)
     offered = node.get_publishers_info_by_topic(topic)
     qos = QoSProfile(depth=10)
     if any(one.qos_profile.reliability != ReliabilityPolicy.RELIABLE for one in offered):
@@ -156,12 +137,9 @@ def echo(node: Node, options: argparse.Namespace) -> None:
         is_selected = options.filter is None or eval(options.filter, {"m": message})
         if not is_selected or (options.once and printed):
             return
-        try:
-            value = to_plain(attrgetter(options.field)(message) if options.field else message)
-        except AttributeError as error:
-            raise CommandError(f"Invalid field '{options.field}': {error}") from error
-        is_text = not isinstance(value, (dict, list))
-        text = f"{value}\n" if is_text else yaml.safe_dump(value, width=1 << 30, sort_keys=False)
+        value = to_plain(attrgetter(options.field)(message) if options.field else message)
+        is_nested = isinstance(value, (dict, list))
+        text = yaml.safe_dump(value, width=1 << 30, sort_keys=False) if is_nested else f"{value}\n"
         print(text, end="---\n", flush=True)
         printed.append(True)
 
@@ -172,13 +150,12 @@ def echo(node: Node, options: argparse.Namespace) -> None:
 def pub(node: Node, options: argparse.Namespace) -> None:
     """Publish a message once, a number of times, or until interrupted."""
     message = find_type(options.message_type, "msg")()
-    stamps = fill(message, options.values)
-    times = 1 if options.once else options.times
+    stamps = fill(message, load_yaml(options.values))
     # Transient local matches every subscriber, including those of targets.
     latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     publisher = node.create_publisher(type(message), options.topic_name, latched)
-    while times and not spin_until(node, publisher.get_subscription_count, 1.0):
-        print("Waiting for at least 1 matching subscription(s)...", flush=True)
+    if options.times:
+        spin_until(node, publisher.get_subscription_count, float("inf"))
     print("publisher: beginning loop", flush=True)
     due = time.monotonic()
     for count in itertools.count(1):
@@ -188,18 +165,17 @@ def pub(node: Node, options: argparse.Namespace) -> None:
         if options.print and count % options.print == 0:
             print(f"publishing #{count}: {message!r}\n", flush=True)
         publisher.publish(message)
-        if count == times:
+        if count == options.times:
             break
         due = max(due + 1.0 / options.rate, time.monotonic())
-        spin_for(node, due - time.monotonic())
-    spin_for(node, 0.1)  # until the last message has left
+        spin_until(node, bool, due - time.monotonic())
+    spin_until(node, bool, 0.1)  # until the last message has left
 
 
 def call(node: Node, options: argparse.Namespace) -> None:
     """Call a service and print its answer."""
     service = find_type(options.service_type, "srv")
-    request = service.Request()
-    fill(request, options.values)
+    fill(request := service.Request(), load_yaml(options.values))
     client = node.create_client(service, options.service_name)
     spin_until(node, client.service_is_ready, float("inf"))
     print(f"requester: making request: {request!r}\n", flush=True)
@@ -207,16 +183,13 @@ def call(node: Node, options: argparse.Namespace) -> None:
 
 
 def _answer(node: Node, server: str, future: Any) -> Any:
-    if not spin_until(node, future.done, ANSWER_TIMEOUT):
-        raise CommandError(f"no answer from {server}")
+    spin_until(node, future.done, ANSWER_TIMEOUT, f"no answer from {server}")
     return future.result()
 
 
 def _parameter_client(node: Node, options: argparse.Namespace) -> AsyncParameterClient:
-    name = "/" + options.node_name.lstrip("/")
-    client = AsyncParameterClient(node, name)
-    if not spin_until(node, client.services_are_ready, SEARCH_TIMEOUT):
-        raise CommandError("Node not found")
+    client = AsyncParameterClient(node, "/" + options.node_name.lstrip("/"))
+    spin_until(node, client.services_are_ready, SEARCH_TIMEOUT, "Node not found")
     return client
 
 
@@ -224,20 +197,20 @@ def get_parameter(node: Node, options: argparse.Namespace) -> None:
     """Print the value of a parameter."""
     future = _parameter_client(node, options).get_parameters([options.parameter_name])
     values = _answer(node, options.node_name, future).values
-    kind = Parameter.Type(values[0].type) if values else Parameter.Type.NOT_SET
-    if kind == Parameter.Type.NOT_SET:
-        raise CommandError("Parameter not set")
+    kind = Parameter.Type(values[0].type if values else 0)
+    if kind is Parameter.Type.NOT_SET:
+        raise UserError("Parameter not set")
     print(f"{kind.name.capitalize()} value is: {parameter_value_to_python(values[0])}")
 
 
 def set_parameter(node: Node, options: argparse.Namespace) -> None:
     """Set a parameter; the exit code is 1 if the node rejects it."""
     value = parameter_value_to_python(get_parameter_value(options.value))
-    parameter = Parameter(options.parameter_name, value=value)
-    future = _parameter_client(node, options).set_parameters([parameter])
+    parameters = [Parameter(options.parameter_name, value=value)]
+    future = _parameter_client(node, options).set_parameters(parameters)
     (result,) = _answer(node, options.node_name, future).results
     if not result.successful:
-        raise CommandError(f"Setting parameter failed: {result.reason}")
+        raise UserError(f"Setting parameter failed: {result.reason}")
     print("Set parameter successful")
 
 
@@ -246,53 +219,46 @@ def set_parameter(node: Node, options: argparse.Namespace) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="ros2", allow_abbrev=False)
-    groups = parser.add_subparsers(required=True, metavar="COMMAND")
-    verbs = {
-        group: groups.add_parser(group).add_subparsers(required=True, metavar="VERB")
-        for group in ("node", "topic", "service", "param")
-    }
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    def command(group: str, verb: str, action: Callable[..., None], *names: str) -> Any:
-        text = action.__doc__
-        added = verbs[group].add_parser(verb, help=text, description=text)
-        added.set_defaults(action=action)
-        for name in names:
-            added.add_argument(name)
+    def command(name: str, action: Callable[..., None], *arguments: str) -> Any:
+        added = commands.add_parser(name, description=action.__doc__)
+        added.set_defaults(action=action, command=name)
+        for argument in arguments:
+            added.add_argument(argument)
         return added.add_argument
 
-    command("node", "list", list_nodes)
-    command("topic", "list", list_topics)
-    add = command("topic", "echo", echo, "topic_name")
+    command("node list", list_names)
+    command("topic list", list_names)
+    add = command("topic echo", echo, "topic_name")
     add("--filter", metavar="EXPR", help="Python expression of the message m")
     add("--field", help="field of the message; sub-fields after a dot")
     add("--once", action="store_true", help="print one message and exit")
     add("--timeout", type=float, default=float("inf"), metavar="N", help="exit after N seconds")
-    add = command("topic", "pub", pub, "topic_name", "message_type")
+    add = command("topic pub", pub, "topic_name", "message_type")
     add("values", nargs="?", default="{}", help="YAML; `now` is the time of sending")
     add("-r", "--rate", type=float, default=1.0, metavar="N", help="rate [Hz]")
     add("-p", "--print", type=int, default=1, metavar="N", help="print every N-th message")
-    add("-1", "--once", action="store_true")
+    add("-1", "--once", action="store_const", dest="times", const=1)
     add("-t", "--times", type=int, default=0, metavar="N")
-    add = command("service", "call", call, "service_name", "service_type")
+    add = command("service call", call, "service_name", "service_type")
     add("values", nargs="?", default="{}", help="the request as YAML")
-    command("param", "get", get_parameter, "node_name", "parameter_name")
-    command("param", "set", set_parameter, "node_name", "parameter_name", "value")
+    command("param get", get_parameter, "node_name", "parameter_name")
+    command("param set", set_parameter, "node_name", "parameter_name", "value")
     return parser
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command; return the exit code."""
-    options = _parser().parse_args(arguments)
+    """Run the command, such as `topic list`; return the exit code."""
+    options = _parser().parse_args([" ".join(arguments[:2]), *arguments[2:]])
     rclpy.init(args=[])
-    node = Node(f"_ros2cli_{os.getpid()}", start_parameter_services=False)
     try:
-        options.action(node, options)
+        options.action(Node(f"_ros2cli_{os.getpid()}", start_parameter_services=False), options)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 130
-    except (CommandError, InvalidTopicNameException, InvalidServiceNameException) as error:
+    except (UserError, AttributeError, ValueError, NameValidationException) as error:
         print(str(error).splitlines()[0], file=sys.stderr)
         return 1
     finally:
-        node.destroy_node()
         rclpy.try_shutdown()
     return 0

@@ -6,25 +6,21 @@ import dataclasses
 import math
 import sys
 from collections.abc import Callable
-from functools import partial
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rcl_interfaces.msg import SetParametersResult as Result
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from needle_core.errors import UserError
-from needle_core.settings.parameter_fields import ParameterSpec, specs, unknown_parameter
+from needle_core.errors import UserError, did_you_mean
+from needle_core.settings.parameter_fields import ParameterSpec, specs
 from needle_core.settings.parameter_files import check_command_line
 
 P = TypeVar("P")
 
 _SIM_TIME = "use_sim_time"
-_TYPES = frozenset(kind.value for kind in Parameter.Type)
-_LONGEST_NAME = 100
 OF_EVERY_NODE = (_SIM_TIME, "start_type_description_service", "qos_overrides.")
 """Prefixes of the parameters that every rclpy node declares itself."""
 
@@ -89,9 +85,6 @@ class NodeParameters(Generic[P]):
         self._sim_time = bool(node.get_parameter(_SIM_TIME).value)
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
-        for service in node.services:
-            if service.srv_type in (SetParameters, SetParametersAtomically):
-                service.callback = partial(_answer_if_typed, service.callback)
 
     def _changed(self, changes: list[Parameter]) -> P:
         own = {field.name for field in dataclasses.fields(self.values)}  # type: ignore[arg-type]
@@ -116,22 +109,6 @@ class NodeParameters(Generic[P]):
                 self._on_change(changed)
 
 
-def _answer_if_typed(answer: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
-    """Reject a request that contains an invalid parameter type, which would end the node."""
-    for given in request.parameters:
-        if given.value.type not in _TYPES:
-            name = given.name[:_LONGEST_NAME]
-            refusal = Result(
-                successful=False, reason=f"{name}: there is no parameter type {given.value.type}"
-            )
-            if isinstance(response, SetParametersAtomically.Response):
-                response.result = refusal
-            else:
-                response.results = [refusal] * len(request.parameters)
-            return response
-    return answer(request, response)
-
-
 def _plain(value: Any) -> Any:
     """Return lists and arrays as tuples, other values unchanged."""
     return value if isinstance(value, (str, int, float, bool)) else tuple(value)
@@ -140,9 +117,11 @@ def _plain(value: Any) -> Any:
 def _reject_unknown(node: Node, known: list[str]) -> None:
     # rclpy silently drops undeclared overrides: a misspelt gain would have no effect.
     for name in node._parameter_overrides:
-        if name in known or name.startswith(OF_EVERY_NODE):
-            continue
-        raise UserError(f"{node.get_fully_qualified_name()}: {unknown_parameter(name, known)}")
+        if name not in known and not name.startswith(OF_EVERY_NODE):
+            hint = did_you_mean(name, known)
+            raise UserError(
+                f"{node.get_fully_qualified_name()}: unknown parameter '{name}' ({hint})"
+            )
 
 
 def _descriptor(spec: ParameterSpec, default: Any) -> ParameterDescriptor:

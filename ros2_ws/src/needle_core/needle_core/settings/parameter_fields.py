@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar, cast
 
-from needle_core.errors import UserError
+from needle_core.errors import UserError, did_you_mean
 from needle_core.settings.bounds import check_bounds
 
 P = TypeVar("P")
@@ -107,7 +106,7 @@ def from_values(kind: type[P], values: Mapping[str, Any], node: str) -> P:
     known = {name: default for name, _, default in specs(kind)}
     for name, value in values.items():
         if name not in known:
-            raise UserError(f"{node}: {unknown_parameter(name, known)}")
+            raise UserError(f"{node}: unknown parameter '{name}' ({did_you_mean(name, known)})")
         if isinstance(known[name], float) and type(value) is int:
             raise UserError(f"{node}: {name} = {value} is not of type float (write {value}.0)")
     plain = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
@@ -115,13 +114,6 @@ def from_values(kind: type[P], values: Mapping[str, Any], node: str) -> P:
         return kind(**plain)
     except UserError as error:
         raise UserError(f"{node}: {error}") from error
-
-
-def unknown_parameter(name: str, known: Collection[str]) -> str:
-    """Return the error text for an unknown parameter, with a suggestion."""
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
-    return f"unknown parameter '{name}' ({hint})"
 
 
 def describe(parameters: type) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import io
 import math
 import os
 import signal
@@ -17,7 +16,6 @@ import pytest
 
 from needle_core.commands import cli, executables
 from needle_core.commands.cli import internal_error, run_command, write_json
-from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
 from needle_core.process import shutdown
 from needle_core.process.shutdown import ENDING_SIGNALS, ShutdownFlag, interruptible
@@ -79,25 +77,6 @@ def test_a_reader_that_leaves_is_no_error(monkeypatch: pytest.MonkeyPatch) -> No
         with os.fdopen(writer, "w") as stream:
             monkeypatch.setattr(sys, "stdout", stream)
             assert run_command(lambda n=count: print("x" * n) or 1) == 0  # type: ignore[misc]
-
-
-def test_json_dash_is_all_there_is_on_standard_output(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "__stdout__", out := io.StringIO())
-
-    def command() -> int:
-        parser = CommandParser("c", "", "")
-        parser.add_argument("--json")
-        file = output_file("--json", parser.parse_args(["--json", "-"]).json)
-        print("words")
-        write_json(file, {"a": 1, "b": math.nan})
-        return 0
-
-    assert run_command(command) == 0
-    print("after")
-    assert out.getvalue() == '{\n  "a": 1,\n  "b": null\n}\n'
-    assert capsys.readouterr() == ("after\n", "words\n")
 
 
 def test_json_goes_into_a_file_or_says_why_not(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -82,11 +81,9 @@ def read(path: Path, topics: tuple[str, ...] = TOPICS, **when: int) -> list[int]
 
 
 def reason(path: Path) -> str:
-    """Why a bag is refused: one line, within bounds of memory."""
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    """Why a bag is refused: one line."""
     with pytest.raises(UserError) as caught:
         read(path)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 700 * 1024
     assert "\n" not in str(caught.value)
     return str(caught.value)
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import pytest
 import yaml
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
-from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from needle_core.files.bag_directory import BagDirectory
@@ -59,27 +57,6 @@ def test_a_bag_of_another_recorder_is_read(
         assert bag.counts == dict.fromkeys(TOPICS, COUNT // 2)
     for file in path.glob("*.mcap*"):
         assert read(file) == ALL
-
-
-def test_types_that_are_defined_in_idl_are_read(tmp_path: Path) -> None:
-    line = "=" * 80
-    text = (
-        f"{line}\nIDL: rig/msg/Thing\n"
-        "module rig { module msg { struct Thing { double x; rig::msg::Part part; }; }; };\n"
-        f"{line}\nIDL: rig/msg/Part\n"
-        "module rig { module msg { struct Part { long n; }; }; };\n"
-    )
-    store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg("int32 n\n", "rig/msg/Part"))
-    store.register(get_types_from_msg("float64 x\nPart part\n", "rig/msg/Thing"))
-    told = store.hash_rihs01("rig/msg/Thing")
-    with BagWriter(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topic = writer.add_connection("/thing", "rig/msg/Thing", msgdef=text, rihs01=told)
-        writer.write(topic, 1000, bytes([0, 1, 0, 0]) + struct.pack("<di", 1.5, 7))
-    with BagDirectory(tmp_path / "bag") as bag:
-        (message,) = bag.messages(lambda _: True)
-        thing = bag.deserialize(bag.typestore(), message)
-    assert (thing.x, thing.part.n) == (1.5, 7)
 
 
 def test_a_definition_is_read_part_by_part_as_it_is_as_a_whole() -> None:

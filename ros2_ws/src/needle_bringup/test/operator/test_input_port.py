@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import fcntl
 import os
 import struct
+from typing import Any
 
 import pytest
 
 from needle_bringup.operator import input_device
-from needle_bringup.operator.controls import Controls, InputLost, InputState
-from needle_bringup.operator.event_source import OPEN_PERIOD, EventSource
-from needle_bringup.operator.hold_debouncer import HoldDebouncer, HoldKind
-from needle_bringup.operator.input_device import EventReader, InputDevice, KeyChanges, set_bits
+from needle_bringup.operator.hold_debouncer import (
+    HoldDebouncer,
+    HoldKind,
+    InputLost,
+    InputReading,
+    InputState,
+)
+from needle_bringup.operator.input_device import InputDevice, KeyChanges, key_changes, set_bits
+from needle_bringup.operator.input_port import OPEN_PERIOD, InputPort
+from needle_bringup.operator.parameters import OperatorParameters
 
 KEY, RETRACT, STOP, AXIS = 48, 46, 30, 2
-CONTROLS = Controls(insert=KEY, retract=RETRACT, stop=STOP)
+PEDAL = OperatorParameters(
+    device="/dev/input/pedal", key=KEY, retract_key=RETRACT, stop_key=STOP, speed_scale=0.8
+)
 CYCLE = 0.02
 UP, DOWN, REPEAT = 0, 1, 2
 
@@ -30,7 +40,7 @@ def key(code: int, value: int) -> bytes:
     return event(1, code, value) + event(0, 0, 0)
 
 
-class PlayedDevice:
+class PlayedDevice(InputDevice):
     """Keeps the state of its keys, as the kernel does; sends what was done since the last look."""
 
     def __init__(self, *down: int) -> None:
@@ -63,12 +73,12 @@ class PlayedDevice:
 
 
 class Desk:
-    """A source, the device before it, and a debouncer behind it."""
+    """A port, the device before it, and a debouncer behind it."""
 
-    def __init__(self, controls: Controls = CONTROLS, *down: int) -> None:
+    def __init__(self, *down: int, **settings: Any) -> None:
         self.device = PlayedDevice(*down)
         self.is_there = True
-        self.source = EventSource("/dev/input/pedal", controls, lambda: 0.8, self.open)
+        self.port = InputPort(dataclasses.replace(PEDAL, **settings), self.open)
         self.debouncer = HoldDebouncer()
         self.now = 10.0
 
@@ -83,9 +93,9 @@ class Desk:
             self.device.sent += key(code, value)
             (self.device.down.discard if value == UP else self.device.down.add)(code)
 
-    def read(self) -> InputState | InputLost:
+    def read(self) -> InputReading:
         self.now += CYCLE
-        return self.source.read(self.now)
+        return self.port.read(self.now)
 
     def held(self) -> HoldKind:
         return self.debouncer.update(self.read(), self.now).kind
@@ -120,7 +130,7 @@ def test_a_reading_ignores_key_repeat() -> None:
 
 
 def test_a_key_down_at_the_start_must_be_pressed_again() -> None:
-    desk = Desk(CONTROLS, KEY)
+    desk = Desk(KEY)
     for _ in range(5):
         assert desk.held() is HoldKind.NOTHING
         desk.do(KEY, REPEAT)
@@ -146,9 +156,6 @@ def test_an_unplugged_pedal_is_lost_and_must_be_pressed_again() -> None:
     old = desk.device
     desk.do(KEY, DOWN)
     assert desk.held() is HoldKind.INSERT
-    # What was cut off with its plug begins no event of the next.
-    old.sent = key(KEY, DOWN)[:10]
-    desk.read()
     old.gone, desk.is_there = errno.ENODEV, False
     assert desk.read() == InputLost(f"/dev/input/pedal: {os.strerror(errno.ENODEV)}")
     assert old.closed
@@ -170,13 +177,14 @@ def test_a_missing_device_or_key_is_named() -> None:
     desk = Desk()
     desk.is_there = False
     assert desk.read() == InputLost("/dev/input/pedal: No such file or directory")
-    desk = Desk(Controls(insert=57))
+    desk = Desk(key=57)
     assert desk.read() == InputLost("/dev/input/pedal: it has no key 57 (its keys: 30, 46, 48)")
     assert desk.device.closed
 
 
 def test_an_axis_sets_the_speed_up_to_the_scale() -> None:
-    desk = Desk(Controls(insert=KEY, speed_axis=AXIS, axis_at_zero=0.5, axis_at_full=-1.0))
+    axis = {"speed_axis": AXIS, "axis_at_zero": 0.5, "axis_at_full": -1.0}
+    desk = Desk(source="joystick", **axis)
     for at, share in ((1.0, 0.0), (0.5, 0.0), (-0.25, 0.5), (-1.0, 1.0)):
         desk.device.axis_at = at
         read = desk.read()
@@ -184,14 +192,9 @@ def test_an_axis_sets_the_speed_up_to_the_scale() -> None:
         assert read.speed == pytest.approx(0.8 * share)
 
 
-def test_bytes_may_be_split_anywhere() -> None:
-    whole = key(KEY, DOWN) + key(RETRACT, REPEAT) + key(KEY, UP) + key(STOP, DOWN)
-    assert EventReader().decode(whole) == KeyChanges(frozenset({KEY, STOP}), frozenset({KEY}))
-    for cut in range(len(whole)):
-        reader = EventReader()
-        one, two = reader.decode(whole[:cut]), reader.decode(whole[cut:])
-        assert one.pressed | two.pressed == {KEY, STOP}
-        assert one.released | two.released == {KEY}
+def test_key_repeat_is_no_change() -> None:
+    data = key(KEY, DOWN) + key(RETRACT, REPEAT) + key(KEY, UP) + key(STOP, DOWN)
+    assert key_changes(data) == KeyChanges(frozenset({KEY, STOP}), frozenset({KEY}))
 
 
 def test_a_file_that_is_no_input_device_is_rejected() -> None:
