@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import cv2
 import numpy as np
 import pytest
 
-from needle_tracker.answers.tracker_parameters import default_settings
-from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.filter.settings import Image, TrackerSettings
+from needle_tracker.filter.needle_tracker import Image, NeedleTracker
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 MakeArc = Callable[..., np.ndarray]
 Views = tuple[RefractedCamera, RefractedCamera]
@@ -46,7 +44,7 @@ def test_a_needle_that_mirrors_a_lamp_is_found(
     make_line: Callable[..., np.ndarray],
     known: bool,
 ) -> None:
-    tracker = NeedleTracker(calibration, default_settings(calibration))
+    tracker = NeedleTracker(calibration, StereoTrackerParameters())
     found = 0
     for mm in range(60, 68):
         path = make_arc(1e-3 * mm, 6.0, 0.7)
@@ -91,11 +89,11 @@ def on_graph_paper(
 
 def test_an_end_on_a_line_of_graph_paper_is_not_believed_wrongly(
     calibration: StereoCalibration,
-    settings: TrackerSettings,
+    settings: StereoTrackerParameters,
     on_graph_paper: Callable[[float, int], tuple[Pair, np.ndarray]],
 ) -> None:
     reference, _ = on_graph_paper(0.0, 1)
-    tracker = NeedleTracker(calibration, dataclasses.replace(settings, reference=reference))
+    tracker = NeedleTracker(calibration, settings, reference)
     for mm in (66, 67, 68):
         pair, truth = on_graph_paper(1e-3 * mm, mm)
         tip = tracker.process(*pair, 1e-3 * mm).tip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Iterable
 
@@ -10,12 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from needle_tracker.answers.tracker_parameters import default_settings
-from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.filter.settings import Image, TrackerSettings
+from needle_tracker.filter.needle_tracker import Image, NeedleTracker
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.stereo.triangulation import SpatialTip
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 SHAPE = (768, 1024)
 WIDTH_PX = 4.6
@@ -66,12 +64,12 @@ def is_at(tip: SpatialTip | None, place: np.ndarray) -> bool:
 
 def test_a_track_since_the_empty_phantom_gives_way_to_the_needle_that_moves(
     calibration: StereoCalibration,
-    settings: TrackerSettings,
+    settings: StereoTrackerParameters,
     draw: Draw,
     track: np.ndarray,
     make_arc: Callable[..., np.ndarray],
 ) -> None:
-    tracker = NeedleTracker(calibration, dataclasses.replace(settings, reference=draw([], 99)))
+    tracker = NeedleTracker(calibration, settings, draw([], 99))
     lengths = [0.0, 0.0, *(0.03 + 1e-3 * i for i in range(6))]
     needles = [make_arc(length, 6.0, 0.4) for length in lengths]
     tips = believed(
@@ -87,9 +85,9 @@ def test_a_track_since_the_empty_phantom_gives_way_to_the_needle_that_moves(
 
 
 def test_a_track_since_the_empty_phantom_is_not_believed_if_nothing_moves(
-    calibration: StereoCalibration, settings: TrackerSettings, draw: Draw, track: np.ndarray
+    calibration: StereoCalibration, settings: StereoTrackerParameters, draw: Draw, track: np.ndarray
 ) -> None:
-    tracker = NeedleTracker(calibration, dataclasses.replace(settings, reference=draw([], 99)))
+    tracker = NeedleTracker(calibration, settings, draw([], 99))
     # Now and then nothing is seen: that begins nothing anew.
     pairs = [draw([track] if i % 4 < 3 else [], i) for i in range(12)]
     tips = believed(tracker, ((pair, None) for pair in pairs))
@@ -99,7 +97,7 @@ def test_a_track_since_the_empty_phantom_is_not_believed_if_nothing_moves(
 def test_a_track_that_the_insertion_passes_is_dropped(
     calibration: StereoCalibration, draw: Draw, track: np.ndarray
 ) -> None:
-    tracker = NeedleTracker(calibration, default_settings(calibration))
+    tracker = NeedleTracker(calibration, StereoTrackerParameters())
     insertions = [0.067 + 0.5e-3 * i for i in range(22)]
     tips = believed(tracker, ((draw([track], i), at) for i, at in enumerate(insertions)))
     seen = [at for tip, at in zip(tips, insertions, strict=True) if tip is not None]

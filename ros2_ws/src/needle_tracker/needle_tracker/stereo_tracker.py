@@ -38,9 +38,9 @@ from needle_tracker.answers.tracker_messages import (
     tip_message,
     tip_pose_message,
 )
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.filter.measurement import TrackState
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, calibration_from
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 TIP, TIP_POSE = "needle/tip", "needle/tip_pose"
 ANNOTATED, CALIBRATION = "stereo_tracker/annotated_image", "stereo_tracker/calibration"
@@ -83,12 +83,7 @@ class StereoTipTracker(Component):
         self._cameras = calibration.cameras
         self._calibration_text = calibration_text
         self._is_calibration_published = False
-        self.answers = PairAnswers(
-            calibration,
-            settings.tracker_settings(calibration),
-            pair_tolerance_ns=settings.pair_tolerance_ns,
-            joint_timeout=settings.joint_timeout,
-        )
+        self.answers = PairAnswers(calibration, settings)
         self._health = Health()
         rate = settings.annotated_rate
         self._annotated_period = 1.0 / rate if rate > 0.0 else math.inf

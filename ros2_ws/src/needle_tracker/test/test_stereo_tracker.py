@@ -16,11 +16,11 @@ from needle_core.component import Actions, Diagnose, Log, Moment, Peers, Publish
 from needle_core.diagnostics import Level
 from needle_core.errors import UserError
 from needle_tracker.answers.tracker_messages import camera_info_problem, image_geometry
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.optics.calibration import Camera, StereoCalibration
 from needle_tracker.stereo.triangulation import SpatialTip
 from needle_tracker.stereo_tracker import StereoTipTracker, make_tracker
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 PIXELS = np.zeros((768, 1024), np.uint8)
 FOUND = Measurement(

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.filter.measurement import Measurement, TrackState
-from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.filter.settings import Image, TrackerSettings
+from needle_tracker.filter.needle_tracker import Image, NeedleTracker
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.sources.pairing import InsertionHistory, Pair, PairMatcher
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 SUSPICION = "left and right images seem to be swapped: exchanged, they show a needle"
 _NEW_RECORDING = 1_000_000_000  # a longer step back in time begins a new recording [ns]
@@ -39,8 +39,8 @@ class SwapWatch:
     ----------
     calibration : StereoCalibration
         The stereo rig.
-    settings : TrackerSettings
-        Settings of the tracker.
+    settings : StereoTrackerParameters
+        Parameters of the tracker.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class SwapWatch:
         Whether the last pairs show a needle only when swapped; reset by a tip.
     """
 
-    def __init__(self, calibration: StereoCalibration, settings: TrackerSettings) -> None:
+    def __init__(self, calibration: StereoCalibration, settings: StereoTrackerParameters) -> None:
         left, right = calibration.left, calibration.right
         # Swapped images of different sizes are rejected by their size.
         self._can_check = (left.height, left.width) == (right.height, right.width)
@@ -131,12 +131,8 @@ class PairAnswers:
     ----------
     calibration : StereoCalibration
         The stereo rig.
-    tracker : TrackerSettings
-        Settings of the tracker.
-    pair_tolerance_ns : int or None
-        Largest difference of the stamps of a pair [ns]; None for free-running cameras.
-    joint_timeout : float
-        Longest wait of a pair for the joint state that follows it [s].
+    settings : StereoTrackerParameters
+        Parameters of the node.
 
     Attributes
     ----------
@@ -146,22 +142,16 @@ class PairAnswers:
         Time from the exposure of the last pair to that joint state [ns]; 0 if the pair is answered.
     """
 
-    def __init__(
-        self,
-        calibration: StereoCalibration,
-        tracker: TrackerSettings,
-        *,
-        pair_tolerance_ns: int | None,
-        joint_timeout: float,
-    ) -> None:
-        self.tracker = NeedleTracker(calibration, tracker)
+    def __init__(self, calibration: StereoCalibration, settings: StereoTrackerParameters) -> None:
+        reference = settings.reference(calibration.sizes)
+        self.tracker = NeedleTracker(calibration, settings, reference)
         self.tracker.warm_up()
-        self.swap = SwapWatch(calibration, tracker)
-        self.matcher: PairMatcher[Frame] = PairMatcher(pair_tolerance_ns)
+        self.swap = SwapWatch(calibration, settings)
+        self.matcher: PairMatcher[Frame] = PairMatcher(settings.pair_tolerance_ns)
         self.insertions = InsertionHistory()
         self.joints_silent = False
         self.unanswered = self.too_early = 0
-        self._joint_timeout = joint_timeout
+        self._joint_timeout = settings.joint_timeout
         self._queue: deque[tuple[float, Pair[Frame]]] = deque()
         self._last_stamp: int | None = None
         self._contradictions: dict[str, str] = {}

@@ -22,7 +22,6 @@ from needle_core.settings.parameter_files import missing_section_warning, read_s
 from needle_tracker.answers.annotation import Image, annotate, missing
 from needle_tracker.answers.pair_answers import SUSPICION, SwapWatch
 from needle_tracker.answers.run_summary import SeenCounts, TruthComparison, read_truth
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
@@ -34,6 +33,7 @@ from needle_tracker.sources.image_files import (
     progress,
     read_insertions,
 )
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 DESCRIPTION = """\
 Measure the needle's tip in stereo images or in two videos.
@@ -103,13 +103,13 @@ def _run(words: Sequence[str]) -> int:
     pairs = open_pairs(Path(given.left), Path(given.right))
     truth = TruthComparison(read_truth(Path(given.truth)) if given.truth else {})
     overlays = None if given.overlay is None else _new_folder("--overlay", given.overlay)
-    tracker = NeedleTracker(calibration, parameters.tracker_settings(calibration))
+    tracker = NeedleTracker(calibration, parameters, parameters.reference(calibration.sizes))
     tracker.warm_up()
     begin = time.perf_counter()
     rows: list[list[str]] = []
     unusable: list[str] = []
     without, stage, seen = 0, (0.0, 0.0), SeenCounts()
-    swap = SwapWatch(calibration, tracker.settings)
+    swap = SwapWatch(calibration, parameters)
     for pair, insertion, measured in track(pairs, tracker, calibration.sizes, insertions):
         without += insertion is None
         if problem := pair.problem(calibration.sizes):

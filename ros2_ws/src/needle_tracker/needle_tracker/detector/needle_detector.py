@@ -21,8 +21,9 @@ from needle_tracker.detector.needle_net import (
     NeedleNet,
     normalized,
 )
-from needle_tracker.detector.search_grid import Reach, SearchGrid, make_search_grid
+from needle_tracker.detector.search_grid import SearchGrid, make_search_grid
 from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = NDArray[np.float64]
 Pixels = TypeVar("Pixels", NDArray[np.float32], NDArray[np.float64])
@@ -66,12 +67,8 @@ class NeedleDetector:
     ----------
     view : RefractedCamera
         The camera.
-    needle_width : float
-        Diameter of the needle, good to 30 % [m].
-    reach : Reach
-        Physical reach of the needle.
-    hole_clearance : float
-        Radius about the entry that is excluded from the search [m].
+    settings : StereoTrackerParameters
+        Width and reach of the needle.
     net : NeedleNet
         The network.
 
@@ -82,25 +79,20 @@ class NeedleDetector:
     """
 
     def __init__(
-        self,
-        view: RefractedCamera,
-        needle_width: float,
-        reach: Reach,
-        hole_clearance: float,
-        net: NeedleNet,
+        self, view: RefractedCamera, settings: StereoTrackerParameters, net: NeedleNet
     ) -> None:
         self._net = net
-        middle = np.array([0.0, 0.0, 0.5 * reach.length])
+        middle = np.array([0.0, 0.0, 0.5 * settings.max_insertion])
         facing = np.stack([view.sideways, [0.0, 0.0, 1.0]], axis=-1)
         self._px_per_m = float(np.linalg.norm(view.jacobian(middle) @ facing, axis=0).mean())
-        self.width_px = needle_width * self._px_per_m
+        self.width_px = settings.needle_width * self._px_per_m
         self._shrink = 1 if self.width_px <= MAX_WIDTH_PX else 2
         self._search_shrink = self._shrink
         if self.width_px >= DETECTOR.coarse_width_px * self._shrink:
             self._search_shrink *= 2
-        self._grid: SearchGrid = make_search_grid(view, reach, hole_clearance)
+        self._grid: SearchGrid = make_search_grid(view, settings)
         self._entry = view.project(np.zeros(3))
-        self._clear_px = hole_clearance * self._px_per_m
+        self._clear_px = settings.hole_clearance * self._px_per_m
         self._backgrounds: dict[int, Map] = {}
         self._shrunk: dict[int, Image] = {}
 

@@ -17,42 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-
-@dataclasses.dataclass(frozen=True)
-class Reach:
-    """Physical reach of the needle.
-
-    Attributes
-    ----------
-    curvature : float
-        Largest curvature of its path [1/m].
-    entry_angle : float
-        Largest angle of its heading to z at the entry [rad].
-    hole_tolerance : float
-        Largest offset of its path at the entry [m].
-    length : float
-        Longest insertion [m].
-    """
-
-    curvature: float
-    entry_angle: float
-    hole_tolerance: float
-    length: float
-
-    def shortest_chord(self, insertion: float) -> float:
-        """Return the least distance of tip and entry [m] after `insertion` [m] along one arc."""
-        half_turn = min(0.5 * self.curvature * insertion, math.pi / 2)
-        return 2.0 * math.sin(half_turn) / self.curvature if self.curvature > 0.0 else insertion
-
-    def chord_angle(self, distance: Array) -> Array:
-        """Return the largest angle to z [rad] of a point of the needle at `distance` [m]."""
-        turned = np.arcsin(np.clip(0.5 * self.curvature * distance, 0.0, 1.0))
-        hole = np.arctan2(self.hole_tolerance, distance)
-        return np.asarray(self.entry_angle + turned + hole)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,21 +88,19 @@ class GridSettings:
 
 # The trackers of one rig share the grids of its two cameras.
 @functools.lru_cache(maxsize=2)
-def make_search_grid(view: RefractedCamera, reach: Reach, first_distance: float) -> SearchGrid:
-    """Return the grid of one camera.
+def make_search_grid(view: RefractedCamera, needle: StereoTrackerParameters) -> SearchGrid:
+    """Return the grid of one camera, from outside the entry hole on.
 
     Parameters
     ----------
     view : RefractedCamera
         The camera.
-    reach : Reach
-        Physical reach of the needle.
-    first_distance : float
-        Distance of the first row from the entry, outside the entry hole [m].
+    needle : StereoTrackerParameters
+        Reach of the needle, and the entry hole.
     """
     settings, camera = GridSettings(), view.camera
-    distances = np.arange(first_distance, reach.length, settings.row_pitch)
-    limit = reach.chord_angle(distances) + settings.parallax_angle
+    distances = np.arange(needle.hole_clearance, needle.max_insertion, settings.row_pitch)
+    limit = needle.chord_angle(distances) + settings.parallax_angle
     limit += np.arctan2(settings.body_offset, distances)
     # Close to the entry the hole tolerance would allow any angle.
     widest = min(float(limit[len(limit) // 2 :].max()), math.pi / 2)

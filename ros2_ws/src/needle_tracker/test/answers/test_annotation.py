@@ -10,13 +10,13 @@ from needle_tracker.answers.annotation import annotate, describe
 from needle_tracker.answers.tracker_messages import picture_message
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 
 def test_tip_and_state_are_drawn_at_their_pixels(
     calibration: StereoCalibration,
-    settings: TrackerSettings,
+    settings: StereoTrackerParameters,
     draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
     make_arc: Callable[..., np.ndarray],
 ) -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from needle_tracker.answers.pair_answers import Answer, Frame, PairAnswers
 from needle_tracker.filter.measurement import Measurement, TrackState
-from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 FRAME = Frame(np.zeros((768, 1024), np.uint8))
 TIMEOUT = 0.1
@@ -44,13 +44,12 @@ class Answering:
 
 
 @pytest.fixture
-def answering(
-    calibration: StereoCalibration, settings: TrackerSettings, monkeypatch: pytest.MonkeyPatch
-) -> Answering:
+def answering(calibration: StereoCalibration, monkeypatch: pytest.MonkeyPatch) -> Answering:
     monkeypatch.setattr(
         "needle_tracker.filter.needle_tracker.NeedleTracker.warm_up", lambda _: None
     )
-    answers = PairAnswers(calibration, settings, pair_tolerance_ns=None, joint_timeout=TIMEOUT)
+    settings = StereoTrackerParameters(free_running=True, joint_timeout=TIMEOUT)
+    answers = PairAnswers(calibration, settings)
     bench = Answering(answers)
     monkeypatch.setattr(bench.answers.tracker, "process", bench.process)
     monkeypatch.setattr(bench.answers.swap, "update", lambda *_: None)

@@ -11,8 +11,8 @@ import pytest
 from needle_tracker.answers import pair_answers
 from needle_tracker.answers.pair_answers import SwapWatch
 from needle_tracker.filter.measurement import Measurement, TrackState
-from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 LEFT, RIGHT = np.zeros((2, 4, 4), np.uint8)
 MISSED = Measurement(None, TrackState.SEARCHING, "no needle")
@@ -43,7 +43,7 @@ def other(monkeypatch: pytest.MonkeyPatch) -> Other:
 
 
 @pytest.fixture
-def watch(calibration: StereoCalibration, settings: TrackerSettings) -> SwapWatch:
+def watch(calibration: StereoCalibration, settings: StereoTrackerParameters) -> SwapWatch:
     return SwapWatch(calibration, settings)
 
 

@@ -14,17 +14,17 @@ from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import find_scenario
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.plant import NeedlePlant, initial_pose
-from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.filter.measurement import TrackState
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import Camera, StereoCalibration
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Exposure = tuple[float, np.ndarray, np.ndarray, np.ndarray]
 
 
 @pytest.fixture
 def tracker(calibration: StereoCalibration) -> NeedleTracker:
-    return NeedleTracker(calibration, default_settings(calibration))
+    return NeedleTracker(calibration, StereoTrackerParameters())
 
 
 def insertion(
@@ -68,7 +68,7 @@ def test_a_needle_may_be_dark_or_bright(
 ) -> None:
     for length, truth, left, right in insertion(calibration_path, "clean", 1, 60, 62):
         for picture in ((left, right), (255 - left, 255 - right)):
-            tracker = NeedleTracker(calibration, default_settings(calibration))
+            tracker = NeedleTracker(calibration, StereoTrackerParameters())
             measured = tracker.process(*picture, length)
             assert measured.tip is not None
             assert np.linalg.norm(measured.tip.position - truth) < 0.25e-3
@@ -85,7 +85,7 @@ def test_cameras_may_be_turned(calibration_path: Path, calibration: StereoCalibr
                 turned = quarter_turned(turned)
             cameras.append(turned)
         rig = dataclasses.replace(calibration, left=cameras[0], right=cameras[1])
-        tracker = NeedleTracker(rig, default_settings(rig))
+        tracker = NeedleTracker(rig, StereoTrackerParameters())
         for length, truth, left, right in exposures:
             pair = [np.ascontiguousarray(np.rot90(image, -quarters)) for image in (left, right)]
             measured = tracker.process(pair[0], pair[1], length)

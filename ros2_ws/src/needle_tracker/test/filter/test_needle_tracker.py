@@ -16,15 +16,16 @@ from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_tracker.filter.measurement import Measurement, NoTip, TrackState
 from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.filter.settings import TrackerSettings
+from needle_tracker.filter.settings import FILTER
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
 MakeArc = Callable[..., np.ndarray]
 
 
 @pytest.fixture
-def tracker(calibration: StereoCalibration, settings: TrackerSettings) -> NeedleTracker:
+def tracker(calibration: StereoCalibration, settings: StereoTrackerParameters) -> NeedleTracker:
     return NeedleTracker(calibration, settings)
 
 
@@ -112,7 +113,7 @@ def test_an_unseen_short_needle_follows_from_the_insertion(
 
 
 def test_same_images_give_the_same_bits(
-    calibration: StereoCalibration, settings: TrackerSettings, calibration_path: Path
+    calibration: StereoCalibration, settings: StereoTrackerParameters, calibration_path: Path
 ) -> None:
     exposures = steered(calibration_path, 100.0, 0.0, 40, 43)
     runs = []
@@ -163,7 +164,7 @@ def test_an_absent_needle_is_never_found(tracker: NeedleTracker, draw_pair: Draw
 
 def test_a_needle_shorter_than_the_insertion_is_rejected(
     calibration: StereoCalibration,
-    settings: TrackerSettings,
+    settings: StereoTrackerParameters,
     draw_pair: Drawer,
     make_arc: MakeArc,
 ) -> None:
@@ -180,9 +181,7 @@ def test_one_blocked_camera_loses_the_track_until_it_sees_again(
     left, right = draw_pair(make_arc(0.05, 5.0, 1.0))
     assert tracker.process(left, right, 0.05).state is TrackState.TRACKING
     blocked = np.full_like(right, 140)
-    answers = [
-        tracker.process(left, blocked, 0.05) for _ in range(tracker.settings.filter.lost_after)
-    ]
+    answers = [tracker.process(left, blocked, 0.05) for _ in range(FILTER.lost_after)]
     assert all(answer.reason == NoTip.NOTHING for answer in answers)
     assert answers[-1].state is TrackState.LOST
     assert answers[-1].tip is None

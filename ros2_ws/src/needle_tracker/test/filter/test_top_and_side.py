@@ -11,10 +11,10 @@ from needle_sim.camera.insertions import render_insertion
 from needle_sim.camera.optics import project
 from needle_sim.camera.scenarios import find_scenario
 from needle_sim.camera.stereo_rig import load_stereo_rig
-from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.optics.refraction import stereo_views
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def test_simulation_and_tracker_project_alike(calibration_path: Path, name: str)
 @pytest.mark.parametrize(("scenario", "most"), [("clean", 0.2e-3), ("clutter", 0.3e-3)])
 def test_tips_are_accurate(path: Path, scenario: str, most: float) -> None:
     calibration = load_calibration(path)
-    tracker = NeedleTracker(calibration, default_settings(calibration))
+    tracker = NeedleTracker(calibration, StereoTrackerParameters())
     errors = []
     for pair in render_insertion(
         load_stereo_rig(path), find_scenario(scenario), seed=3, frames=24, depth=0.1

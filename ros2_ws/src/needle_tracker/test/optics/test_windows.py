@@ -19,14 +19,14 @@ import pytest
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
-from needle_tracker.detector.search_grid import Reach, make_search_grid
+from needle_tracker.detector.search_grid import make_search_grid
 from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
 from needle_tracker.optics.compiled_projection import pixel_ray, project_point
 from needle_tracker.optics.refraction import RefractedCamera, project_optical, stereo_views
 from needle_tracker.optics.window import Layer, Window
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = np.ndarray
-REACH = Reach(curvature=9.0, entry_angle=0.17, hole_tolerance=0.5e-3, length=0.15)
 
 
 def random_view(seed: int, layers: int, turn: Array | None = None) -> tuple[RefractedCamera, Array]:
@@ -253,7 +253,7 @@ def test_lens_and_slopes_agree_with_opencv_and_finite_differences(
 def test_each_view_of_a_box_searches_the_reach_of_the_needle(calibration_path: Path) -> None:
     rig = load_calibration(calibration_path.with_name("calibration_top_and_side.yaml"))
     for number, view in enumerate(stereo_views(rig)):
-        grid = make_search_grid(view, REACH, 2e-3)
+        grid = make_search_grid(view, StereoTrackerParameters())
         assert grid.reachable[:, len(grid.angles) // 2].mean() > 0.9
         assert abs(view.sideways[1 - number]) > 0.999
         # A needle that bends towards this camera lies on the grid's middle, one aside does not.

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from needle_tracker.detector.end_search import ShaftPath
-from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.stereo.sighting import is_reachable, shaft_length, shaft_points
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Views = tuple[RefractedCamera, RefractedCamera]
 LENGTH = 70e-3
@@ -60,20 +60,22 @@ def test_the_steps_of_the_cells_are_smoothed(views: Views, roll: float) -> None:
 
 
 def test_a_needle_is_reachable_and_its_length_is_right(
-    views: Views, settings: TrackerSettings
+    views: Views, settings: StereoTrackerParameters
 ) -> None:
     points = arc(5.0, 1.0)
     found = shaft_points(views, (seen(views[0], points), seen(views[1], points)), points[-1])
-    assert is_reachable(found, settings.reach)
+    assert is_reachable(found, settings)
     assert shaft_length(found) == pytest.approx(LENGTH, abs=0.05e-3)
 
 
-def test_a_shadow_on_the_floor_is_not_reachable(views: Views, settings: TrackerSettings) -> None:
+def test_a_shadow_on_the_floor_is_not_reachable(
+    views: Views, settings: StereoTrackerParameters
+) -> None:
     shadow = arc(5.0, 1.0)
     shadow[:, 0] = -20e-3
     found = shaft_points(views, (seen(views[0], shadow), seen(views[1], shadow)), shadow[-1])
     assert distance_to(found, shadow).max() < 0.3e-3
-    assert not is_reachable(found, settings.reach)
+    assert not is_reachable(found, settings)
 
 
 def test_a_line_along_the_baseline_has_no_shaft_points(views: Views) -> None:

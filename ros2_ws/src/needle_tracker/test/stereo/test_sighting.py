@@ -10,10 +10,10 @@ import pytest
 
 from needle_tracker.detector.end_fit import ImageEnd
 from needle_tracker.detector.end_search import ShaftPath
-from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.stereo.sighting import StereoSearch, evidence
 from needle_tracker.stereo.triangulation import triangulate
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Views = tuple[RefractedCamera, RefractedCamera]
 MakeArc = Callable[..., np.ndarray]
@@ -38,17 +38,10 @@ class SeenLines:
 
 
 @pytest.fixture
-def search(views: Views, settings: TrackerSettings) -> Callable[..., StereoSearch]:
+def search(views: Views, settings: StereoTrackerParameters) -> Callable[..., StereoSearch]:
     def make(left: list[np.ndarray], right: list[np.ndarray]) -> StereoSearch:
         detectors = SeenLines(views[0], left), SeenLines(views[1], right)
-        return StereoSearch(
-            views,
-            detectors,  # type: ignore[arg-type]
-            settings.reach,
-            settings.windows,
-            settings.tip_lean,
-            settings.entry_zone,
-        )
+        return StereoSearch(views, detectors, settings)  # type: ignore[arg-type]
 
     return make
 
