@@ -13,9 +13,8 @@ from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_tracker.calibrating.calibration_session import BoardView, Corners, Place
 from needle_tracker.calibrating.charuco import CharucoBoard
 from needle_tracker.calibrating.rig_calibration import calibrate
-from needle_tracker.calibrating.tip_error import measured_points, needle_points
-from needle_tracker.optics.calibration import load_calibration
-from needle_tracker.optics.window import surface_from_above
+from needle_tracker.calibrating.rig_model import measured_points, needle_points
+from needle_tracker.optics.calibration import load_calibration, surface_from_above
 
 Array = NDArray[np.float64]
 

@@ -80,14 +80,3 @@ def test_images_as_they_should_be_are_not(
     for insertion, left, right in pairs(calibration_path, scenario, 2, 60):
         looks.update(left, right, insertion if known else None)
     assert not looks.ever
-
-
-def test_it_is_over_when_the_cameras_are_exchanged(looks: Looks, calibration_path: Path) -> None:
-    for insertion, left, right in pairs(calibration_path, "clean", 1, 60):
-        if insertion < 0.03:
-            looks.update(right, left, insertion)
-        else:
-            assert looks.ever
-            measured = looks.update(left, right, insertion)
-    assert measured.tip is not None
-    assert not looks.watch.suspected

@@ -154,18 +154,6 @@ def test_bad_images_give_no_tip_and_are_reported(
     assert bench.said("images") == (Level.OK, "pairs complete")
 
 
-def test_the_report_of_many_reasons_is_bounded(bench: Bench) -> None:
-    for number in range(50):
-        assert not bench.pair(10 + number, encoding=f"{number} " + "x" * 3000)
-    for part, kind in (("images", "refused: "), ("track", "no tip: ")):
-        values = bench.health[part].values
-        told = {key: int(value) for key, value in values.items() if key.startswith(kind)}
-        assert sum(told.values()) == 50
-        assert told[f"{kind}other reasons"] == 30
-        assert list(told)[-2].startswith(f"{kind}right image is '49 x")
-        assert max(map(len, [*told, bench.health[part].message])) < 120
-
-
 def test_time_running_backwards_gives_no_tip(bench: Bench) -> None:
     assert bench.pair(5 * SECOND)
     assert not bench.pair(5 * SECOND - 1000)

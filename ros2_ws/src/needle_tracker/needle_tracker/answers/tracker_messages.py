@@ -26,7 +26,6 @@ RIG_FRAME = "rig"
 LEFT_FRAME = "left_camera_optical"
 ROLL_VARIANCE = math.pi**2
 """Variance of an unknown angle [rad^2]: finite, since an infinite one means no tip."""
-_QUOTED = 40  # characters of an unknown encoding
 
 
 def frame_of(message: Any, side: str, camera: Camera) -> Frame:
@@ -35,8 +34,7 @@ def frame_of(message: Any, side: str, camera: Camera) -> Frame:
     The message is an `Image` of needle_core, rclpy or rosbags, which have the same fields.
     """
     if message.encoding not in ENCODINGS:
-        encoding = message.encoding[:_QUOTED]
-        return Frame(None, f"{side} image is {encoding!r}, expected {WANTED}")
+        return Frame(None, f"{side} image is {message.encoding!r}, expected {WANTED}")
     wanted = camera.width, camera.height
     if problem := size_problem(side, (message.width, message.height), wanted):
         return Frame(None, problem)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.detector.end_fit import FIT, ImageEnd, fit_end
-from needle_tracker.detector.end_search import ShaftPath, find_paths
+from needle_tracker.detector.end_search import ShaftPath, find_paths, make_search_grid
 from needle_tracker.detector.needle_net import (
     MARGIN_PX,
     MAX_WIDTH_PX,
@@ -21,7 +21,6 @@ from needle_tracker.detector.needle_net import (
     NeedleNet,
     normalized,
 )
-from needle_tracker.detector.search_grid import SearchGrid, make_search_grid
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
@@ -90,7 +89,7 @@ class NeedleDetector:
         self._search_shrink = self._shrink
         if self.width_px >= DETECTOR.coarse_width_px * self._shrink:
             self._search_shrink *= 2
-        self._grid: SearchGrid = make_search_grid(view, settings)
+        self._grid = make_search_grid(view, settings)
         self._entry = view.project(np.zeros(3))
         self._clear_px = settings.hole_clearance * self._px_per_m
         self._backgrounds: dict[int, Map] = {}
@@ -267,17 +266,12 @@ class NeedleDetector:
         corners = np.array(along)[:, None] * direction + point
         beside = across + FIT.aside_widths * self.width_px
         low, high = corners.min(axis=0) - beside, corners.max(axis=0) + beside
-        height, width = self._shape
+        height, width = self._shrunk[1].shape
         if not np.isfinite(low + high).all() or (high < 0).any() or (low > (width, height)).any():
             return None
         first = np.floor(low / self._shrink).astype(int)
         last = np.ceil(high / self._shrink).astype(int) + 1
         return (*first.tolist(), *last.tolist())
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        height, width = self._shrunk[1].shape
-        return height, width
 
     def _at(self, shrink: int) -> Image:
         if shrink not in self._shrunk:

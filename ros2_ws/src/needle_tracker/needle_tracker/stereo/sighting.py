@@ -18,8 +18,7 @@ from needle_core.compiled import compiled
 from needle_tracker.detector.end_fit import ImageEnd
 from needle_tracker.detector.end_search import SEARCH, ShaftPath
 from needle_tracker.detector.needle_detector import NeedleDetector
-from needle_tracker.optics.compiled_projection import cross, dot, pixel_ray
-from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.optics.refraction import RefractedCamera, cross, dot, pixel_ray
 from needle_tracker.stereo.triangulation import SpatialTip, triangulate
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 

@@ -14,8 +14,13 @@ from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
 from needle_tracker.calibrating.calibration_session import BoardView, Corners, Place
 from needle_tracker.calibrating.charuco import CharucoBoard
-from needle_tracker.optics.calibration import SIDES, StereoCalibration
-from needle_tracker.optics.window import Layer, Window, surface_from_above
+from needle_tracker.optics.calibration import (
+    SIDES,
+    Layer,
+    StereoCalibration,
+    Window,
+    surface_from_above,
+)
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_tracker.detector.end_search import SEARCH, find_paths
-from needle_tracker.detector.search_grid import SearchGrid, make_search_grid
+from needle_tracker.detector.end_search import SEARCH, SearchGrid, find_paths, make_search_grid
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +15,7 @@ from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_tracker.filter.measurement import TrackState
 from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.optics.calibration import Camera, StereoCalibration
+from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Exposure = tuple[float, np.ndarray, np.ndarray, np.ndarray]
@@ -72,40 +71,3 @@ def test_a_needle_may_be_dark_or_bright(
             measured = tracker.process(*picture, length)
             assert measured.tip is not None
             assert np.linalg.norm(measured.tip.position - truth) < 0.25e-3
-
-
-def test_cameras_may_be_turned(calibration_path: Path, calibration: StereoCalibration) -> None:
-    """Both images turned by a quarter or half about the optical axis, the calibration with them."""
-    exposures = list(insertion(calibration_path, "clean", 1, 70, 72))
-    for quarters in (1, 2, 3):
-        cameras = []
-        for camera in (calibration.left, calibration.right):
-            turned = camera
-            for _ in range(quarters):
-                turned = quarter_turned(turned)
-            cameras.append(turned)
-        rig = dataclasses.replace(calibration, left=cameras[0], right=cameras[1])
-        tracker = NeedleTracker(rig, StereoTrackerParameters())
-        for length, truth, left, right in exposures:
-            pair = [np.ascontiguousarray(np.rot90(image, -quarters)) for image in (left, right)]
-            measured = tracker.process(pair[0], pair[1], length)
-            assert measured.tip is not None
-            assert np.linalg.norm(measured.tip.position - truth) < 0.25e-3
-
-
-def quarter_turned(camera: Camera) -> Camera:
-    """The camera whose image is this one's, turned clockwise: u' = height - 1 - v, v' = u."""
-    turn = np.eye(4)
-    turn[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
-    fx, fy = camera.camera_matrix[0, 0], camera.camera_matrix[1, 1]
-    cx, cy = camera.camera_matrix[0, 2], camera.camera_matrix[1, 2]
-    k1, k2, p1, p2, k3 = camera.distortion
-    return dataclasses.replace(
-        camera,
-        width=camera.height,
-        height=camera.width,
-        camera_matrix=np.array([[fy, 0, camera.height - 1 - cy], [0, fx, cx], [0, 0, 1.0]]),
-        # Brown's tangential terms under x' = -y, y' = x.
-        distortion=np.array([k1, k2, p2, -p1, k3]),
-        T_optical_rig=turn @ camera.T_optical_rig,
-    )

@@ -162,19 +162,6 @@ def test_an_absent_needle_is_never_found(tracker: NeedleTracker, draw_pair: Draw
         assert measured.state is TrackState.SEARCHING
 
 
-def test_a_needle_shorter_than_the_insertion_is_rejected(
-    calibration: StereoCalibration,
-    settings: StereoTrackerParameters,
-    draw_pair: Drawer,
-    make_arc: MakeArc,
-) -> None:
-    images = draw_pair(make_arc(0.05, 5.0, 1.0))
-    for insertion, fits in ((0.06, False), (0.045, False), (0.05, True)):
-        measured = NeedleTracker(calibration, settings).process(*images, insertion)
-        assert (measured.tip is not None) == fits
-        assert (measured.reason == "") == fits
-
-
 def test_one_blocked_camera_loses_the_track_until_it_sees_again(
     tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
 ) -> None:
@@ -217,29 +204,6 @@ def test_without_an_encoder_a_needle_is_found_beside_an_old_track_that_stands(
             assert np.linalg.norm(answer.tip.position - path[-1]) < 0.25e-3
     assert set(reasons[:2]) == {NoTip.UNCONFIRMED}
     assert reasons[-2:] == ["", ""]
-
-
-def test_without_an_encoder_an_old_track_does_not_delay_a_needle_that_moves(
-    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
-) -> None:
-    old = make_arc(0.06, 5.0, 0.5)
-    for mm in range(40, 44):
-        path = make_arc(1e-3 * mm, 6.0, 2.6)
-        (left, right), (old_left, old_right) = (draw_pair(each, seed=mm) for each in (path, old))
-        answer = tracker.process(np.minimum(left, old_left), np.minimum(right, old_right), None)
-    assert answer.tip is not None
-    assert np.linalg.norm(answer.tip.position - path[-1]) < 0.25e-3
-
-
-def test_images_of_two_exposures_are_rejected(
-    tracker: NeedleTracker, draw_pair: Drawer, make_arc: MakeArc
-) -> None:
-    """Left of one exposure with the right of another: the ends do not meet."""
-    left, _ = draw_pair(make_arc(0.050, 5.0, 1.0))
-    _, right = draw_pair(make_arc(0.046, 5.0, 1.0))
-    measured = tracker.process(left, right, None)
-    assert measured.tip is None
-    assert measured.reason == NoTip.NOTHING
 
 
 def test_a_black_image_is_reported(
