@@ -21,8 +21,7 @@ from needle_tracker.calibrating.rig_calibration import RigCalibration
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.ros import check_calibration as checking
 from needle_tracker.ros.check_calibration import main as check_calibration
-
-from .synthetic_rig import SIZES, session_content
+from synthetic_rig import SIZES, session_content
 
 Out = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch

@@ -18,8 +18,7 @@ from needle_tracker.calibrating.calibration_session import BoardView, Corners
 from needle_tracker.calibrating.calibration_start import PairsApartError, consistent_views
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.optics.calibration import StereoCalibration
-
-from .synthetic_rig import GIVEN, PLACES, SIZES, free_pose, lenses_of, take, view_of
+from synthetic_rig import GIVEN, PLACES, SIZES, free_pose, lenses_of, take, view_of
 
 
 def said_larger(views: list[BoardView], share: float) -> list[BoardView]:

@@ -19,8 +19,7 @@ from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.calibrating.imported_lenses import read_lenses
 from needle_tracker.calibrating.rig_calibration import calibrate
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
-
-from .synthetic_rig import GIVEN, PLACES, SIZES, take
+from synthetic_rig import GIVEN, PLACES, SIZES, take
 
 Content = dict[str, Any]
 

@@ -24,8 +24,7 @@ from needle_tracker.calibrating.rig_model import (
     needle_points,
 )
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
-
-from .synthetic_rig import (
+from synthetic_rig import (
     GIVEN,
     GIVEN_BOX,
     NOISE_PX,
