@@ -90,11 +90,3 @@ def test_after_a_gap_the_needle_must_move_again(settings: StereoTrackerParameter
         track = track.predicted(insertions[-1] + 1e-3 * n, settings).missed()
     again = track.seen(sighting(insertions[-1] + 19e-3), settings)
     assert again.motion_log_odds < before.motion_log_odds
-
-
-def test_the_zero_of_the_stage_is_estimated(settings: StereoTrackerParameters) -> None:
-    track = after(
-        settings, [0.0508 + 1e-3 * n for n in range(20)], [0.05 + 1e-3 * n for n in range(20)]
-    )
-    zero, scale = track.stage
-    assert zero + scale * 0.06 == pytest.approx(0.8e-3, abs=0.4e-3)
