@@ -26,9 +26,9 @@ from needle_tracker.optics.calibration import (
 
 Array = NDArray[np.float64]
 
-_ANY = "of OpenCV"
+_PLUMB_BOB = "plumb_bob"
 # All begin with k1, k2, p1, p2, k3; further coefficients must be 0.
-_MODELS = ("plumb_bob", "radtan", "rational_polynomial", "none", _ANY)
+_MODELS = (_PLUMB_BOB, "radtan", "rational_polynomial", "none")
 _OPENCV_KEYS = (("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"))  # with suffix 1 and 2
 _CURE = (
     "calibrate with plumb_bob (Kalibr: pinhole-radtan; OpenCV: without CALIB_RATIONAL_MODEL), or "
@@ -164,13 +164,13 @@ def _opencv(text: str, path: Path) -> _Found:
     except (AttributeError, SystemError, cv2.error) as error:
         raise UserError("it is damaged") from error
     lenses = [
-        _Lens(path, _matrix(content, key), _ANY, numbers(content, None, other, "data"), None)
+        _Lens(path, _matrix(content, key), _PLUMB_BOB, numbers(content, None, other, "data"), None)
         for number in "12"
         for key, other in ((m + number, d + number) for m, d in _OPENCV_KEYS)
         if key in content
     ]
     if "camera_matrix" in content:
-        model = "fisheye" if content.get("fisheye_model") else _ANY
+        model = "fisheye" if content.get("fisheye_model") else _PLUMB_BOB
         lenses.append(_one_camera(content, path, model))
     if "R" not in content:
         return _Found(lenses)
@@ -197,7 +197,7 @@ def _transform(rotation: Array, translation: Array) -> Array:
 def _plumb_bob(lens: _Lens) -> Array:
     """Return k1, k2, p1, p2, k3 of a lens, shape (5,)."""
     coefficients = lens.coefficients
-    if lens.model not in _MODELS or np.any(coefficients[5:]):
+    if lens.model not in _MODELS or 0 < len(coefficients) < 4 or np.any(coefficients[5:]):
         raise UserError(
             f"--lenses {lens.path}: distortion model {lens.model} with {len(coefficients)} "
             f"coefficients is not supported: {_CURE}"
