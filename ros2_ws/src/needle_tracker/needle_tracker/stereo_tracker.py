@@ -152,9 +152,8 @@ class StereoTipTracker(Component):
         return self.publish(answers, at)
 
     def _on_camera_info(self, side: str, message: m.CameraInfo, at: Moment) -> Actions:
-        problem, in_size = camera_info_problem(message, side, self._cameras[side])
-        self._health.camera_info[side] = problem
-        self.answers.add_contradiction(side, problem if in_size else "")
+        problem = camera_info_problem(message, side, self._cameras[side])
+        self.answers.camera_info[side] = problem
         return ()
 
     # ---- outputs ------------------------------------------------------------------------------
@@ -170,9 +169,8 @@ class StereoTipTracker(Component):
     def _report(self, at: Moment) -> Actions:
         answers, health = self.answers, self._health
         health.update_unpaired(at.steady, answers.matcher)
-        health.swapped = answers.swap.suspected
         yield from self._diagnose("track", health.track())
-        yield from self._diagnose("images", health.images(at.steady, answers.matcher))
+        yield from self._diagnose("images", health.images(at.steady, answers))
         yield from self._diagnose("joints", health.joints(answers))
 
     def _diagnose(self, part: str, diagnostic: Diagnostic) -> Actions:

@@ -29,16 +29,12 @@ class Health:
         Pairs that were not processed, by reason.
     rejected : Counter of str
         Pairs without a tip, by reason.
-    swapped : bool
-        Whether left and right images are suspected to be swapped.
     """
 
     refused: Counter[str] = dataclasses.field(default_factory=Counter)
     rejected: Counter[str] = dataclasses.field(default_factory=Counter)
     joints_without_insertion: int = 0
     last_refusal: tuple[float, str] | None = None
-    camera_info: dict[str, str] = dataclasses.field(default_factory=dict)
-    swapped: bool = False
     _last_image: dict[str, float] = dataclasses.field(default_factory=dict)
     _first_image: float = 0.0
     _last_unpaired: float | None = None
@@ -91,8 +87,9 @@ class Health:
         message = state.value + (f": {reason}" if reason else "")
         return Diagnostic(Level.OK if good else Level.WARN, message, values)
 
-    def images(self, now: float, matcher: PairMatcher[Any]) -> Diagnostic:
+    def images(self, now: float, answers: PairAnswers) -> Diagnostic:
         """Return the health of the images and their pairing."""
+        matcher = answers.matcher
         recent = [(at, took) for at, took in self._done if now - at <= _RATE_WINDOW]
         latencies = sorted(took for _, took in recent)
         values = {
@@ -109,7 +106,7 @@ class Health:
             skews = zip(("skew_median_ms", "skew_max_ms"), matcher.skew, strict=True)
             values.update({name: f"{1e-6 * skew:.2f}" for name, skew in skews})
         values.update({f"refused: {reason}": str(n) for reason, n in self.refused.items()})
-        return Diagnostic(*self._images_level(now, matcher), values)
+        return Diagnostic(*self._images_level(now, answers), values)
 
     def joints(self, answers: PairAnswers) -> Diagnostic:
         """Return the health of the joint states."""
@@ -128,14 +125,15 @@ class Health:
             level, message = Level.WARN, "no joint state follows the images: insertion unknown"
         return Diagnostic(level, message, values)
 
-    def _images_level(self, now: float, matcher: PairMatcher[Any]) -> tuple[Level, str]:
+    def _images_level(self, now: float, answers: PairAnswers) -> tuple[Level, str]:
         if self.last_refusal is not None and now - self.last_refusal[0] <= TROUBLE_SHOWN:
             return Level.ERROR, f"pair refused: {self.last_refusal[1]}"
-        if problem := next(filter(None, self.camera_info.values()), ""):
-            return Level.ERROR, problem
-        if self.swapped:
+        for problem in answers.camera_info.values():
+            if problem.text:
+                return Level.ERROR, problem.text
+        if answers.swap.suspected:
             return Level.WARN, f"{SUSPICION}; {_EXCHANGE}"
-        return self._pairing_level(now, matcher)
+        return self._pairing_level(now, answers.matcher)
 
     def _pairing_level(self, now: float, matcher: PairMatcher[Any]) -> tuple[Level, str]:
         for side, other in OTHER_SIDE.items():

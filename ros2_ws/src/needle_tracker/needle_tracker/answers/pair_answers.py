@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,6 +103,13 @@ class Frame:
     problem: str = ""
 
 
+class CameraInfoProblem(NamedTuple):
+    """Contradiction of the calibration, empty if none; one of the size rejects all pairs."""
+
+    text: str = ""
+    of_size: bool = False
+
+
 @dataclasses.dataclass(frozen=True)
 class Answer:
     """Result of a pair.
@@ -136,6 +144,8 @@ class PairAnswers:
 
     Attributes
     ----------
+    camera_info : dict of str to CameraInfoProblem
+        By side, as received last.
     unanswered : int
         Pairs exposed before the first joint state.
     too_early : int
@@ -154,7 +164,7 @@ class PairAnswers:
         self._joint_timeout = settings.joint_timeout
         self._queue: deque[tuple[float, Pair[Frame]]] = deque()
         self._last_stamp: int | None = None
-        self._contradictions: dict[str, str] = {}
+        self.camera_info: dict[str, CameraInfoProblem] = {}
 
     def add_image(self, side: str, stamp: int, frame: Frame, now: float) -> Iterator[Answer]:
         """Add an image of one side, exposed at `stamp` [ns]; then as `ready`."""
@@ -162,10 +172,6 @@ class PairAnswers:
         if pair is not None:
             self._queue.append((now, pair))
         return self.ready(now)
-
-    def add_contradiction(self, side: str, reason: str) -> None:
-        """Reject all pairs while a camera is not the calibrated one; empty: accept them."""
-        self._contradictions[side] = reason
 
     def add_insertion(self, stamp: int, insertion: float, now: float) -> Iterator[Answer]:
         """Add an insertion [m] sampled at `stamp` [ns]; then as `ready`."""
@@ -215,8 +221,8 @@ class PairAnswers:
         last = self._last_stamp
         if last is None or pair.stamp > last:
             self._last_stamp = pair.stamp
-            problems = (pair.left.problem, pair.right.problem, *self._contradictions.values())
-            return next(filter(None, problems), "")
+            sizes = (problem.text for problem in self.camera_info.values() if problem.of_size)
+            return next(filter(None, (pair.left.problem, pair.right.problem, *sizes)), "")
         back = last - pair.stamp
         if back >= _NEW_RECORDING:
             self.tracker.reset()

@@ -16,7 +16,7 @@ from needle_core.messages import (
     Pose,
     PoseWithCovariance,
 )
-from needle_tracker.answers.pair_answers import Frame
+from needle_tracker.answers.pair_answers import CameraInfoProblem, Frame
 from needle_tracker.optics.calibration import Camera, rotation_matrix
 from needle_tracker.sources.image_encodings import ENCODINGS, WANTED, bytes_per_pixel, grey_image
 from needle_tracker.sources.image_files import size_problem
@@ -63,23 +63,19 @@ def image_geometry(message: Any) -> tuple[int, int, NDArray[np.float64]]:
     return int(width), int(height), matrix
 
 
-def camera_info_problem(message: Any, side: str, camera: Camera) -> tuple[str, bool]:
-    """Return how a camera_info contradicts the calibration, and whether by the size of the images.
-
-    The text is empty if there is no contradiction.
-    """
+def camera_info_problem(message: Any, side: str, camera: Camera) -> CameraInfoProblem:
+    """Return how a camera_info contradicts the calibration."""
     width, height, matrix = image_geometry(message)
     # Some drivers send zeros for an unknown size.
     if (width, height) in {(0, 0), (camera.width, camera.height)}:
         difference = float(np.abs(matrix - camera.camera_matrix).max())
         # An uncalibrated camera driver sends zeros.
         if np.any(np.asarray(message.k) != 0.0) and difference > 0.5:
-            return f"{side} camera_info differs from the calibration by {difference:.1f} px", False
-        return "", False
-    return (
-        f"{side} camera_info is for {width}x{height}, the calibration for "
-        f"{camera.width}x{camera.height}"
-    ), True
+            text = f"{side} camera_info differs from the calibration by {difference:.1f} px"
+            return CameraInfoProblem(text)
+        return CameraInfoProblem()
+    wanted = f"the calibration for {camera.width}x{camera.height}"
+    return CameraInfoProblem(f"{side} camera_info is for {width}x{height}, {wanted}", True)
 
 
 def insertion_of(message: JointState) -> float | None:
