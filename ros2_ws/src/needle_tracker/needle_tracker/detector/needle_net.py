@@ -47,10 +47,17 @@ def normalized(image: Image) -> Map:
 
 
 class NeedleNet:
-    """The trained network, run by OpenCV."""
+    """The trained network, run by OpenCV.
 
-    def __init__(self) -> None:
-        weights = (files("needle_tracker") / "detector" / "needle_net.onnx").read_bytes()
+    Parameters
+    ----------
+    weights : bytes or None
+        Content of an ONNX file; None: the installed weights.
+    """
+
+    def __init__(self, weights: bytes | None = None) -> None:
+        if weights is None:
+            weights = (files("needle_tracker") / "detector" / "needle_net.onnx").read_bytes()
         self._net = cv2.dnn.readNetFromONNX(np.frombuffer(weights, np.uint8))
 
     def evidence(self, image: Map, background: Map | None) -> tuple[Map, Map]:

@@ -319,7 +319,7 @@ def read_numbers(
                     raise UserError(f"{where}: {name!r} is a duplicate")
                 values = zip(columns, texts, strict=True)
                 found[name] = (
-                    [number(f"{where}: {c}", text, -1.0, 1.0, "m") for c, text in values]
+                    [number(f"{where}: {c}", text, -10.0, 10.0, "m") for c, text in values]
                     if any(texts)
                     else None
                 )

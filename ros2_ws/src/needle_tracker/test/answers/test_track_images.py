@@ -187,7 +187,7 @@ def test_unusable_input_is_reported_in_one_line(track: Track, folder: Path, caps
         ("--insertion", CSV + "a,0.1\na,0.2\n", "line 3"),
         ("--insertion", "", "name"),
         ("--truth", "name,x_m,y_m\n", "no column 'z_m'"),
-        ("--truth", TRUTH + "a,1,2,\n", "line 2: z_m = '' is not a finite number"),
+        ("--truth", TRUTH + "a,1,2,\n", "line 2: z_m '' is not a number"),
         ("--calibration", "", "phantom is missing"),
         ("--left", None, "does not exist"),
         ("--insertion", None, "No such file"),
