@@ -228,17 +228,13 @@ def _join(arrays: list[Array], width: int) -> Array:
     return np.concatenate([np.zeros((0, width)), *arrays])
 
 
-def needle_points(
-    calibration: StereoCalibration, counts: tuple[int, int, int] = (4, 3, 5)
-) -> Array:
+def needle_points(calibration: StereoCalibration) -> Array:
     """Return a grid of points in the region of the needle, shape (n, 3), in `rig` [m].
 
     Parameters
     ----------
     calibration : StereoCalibration
         The points are behind both windows.
-    counts : tuple of int
-        Points along x, y and z, before those outside are removed.
 
     Raises
     ------
@@ -246,9 +242,9 @@ def needle_points(
         No point is behind both windows.
     """
     axes = (
-        np.linspace(HALF_HEIGHT, -HALF_HEIGHT, counts[0]),
-        np.linspace(-HALF_WIDTH, HALF_WIDTH, counts[1]),
-        np.linspace(*INSERTIONS, counts[2]),
+        np.linspace(HALF_HEIGHT, -HALF_HEIGHT, 4),
+        np.linspace(-HALF_WIDTH, HALF_WIDTH, 3),
+        np.linspace(*INSERTIONS, 5),
     )
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     for camera in (calibration.left, calibration.right):
