@@ -22,8 +22,8 @@ from needle_tracker.calibrating.calibration_session import load_session
 FREE_VIEWS = 12
 TRACKER = Path(__file__).resolve().parents[2] / "ros2_ws" / "src" / "needle_tracker"
 # The boards that the calibration is tested on: their rays are traced by other code than its own.
-sys.path.insert(0, str(TRACKER / "test"))
-boards = importlib.import_module("calibrating.synthetic_rig")
+sys.path.insert(0, str(TRACKER.parents[2] / "tests" / "shared"))
+boards = importlib.import_module("synthetic_rig")
 SQUARE, FINER = 80, 2  # [px] of a drawn square; how many times finer than the camera's it is drawn
 
 
@@ -31,7 +31,7 @@ def drawn(
     camera: SimulatedCamera, board: Any, pose: np.ndarray, under: bool, rng: np.random.Generator
 ) -> np.ndarray:
     """Return what a camera sees of a board; each cell of a fine mesh is mapped by its corners."""
-    paper = importlib.import_module("calibrating.drawn_boards").board_image(board, SQUARE, SQUARE)
+    paper = boards.board_image(board, SQUARE, SQUARE)
     sides = (np.linspace(-1.0, n + 1.0, 4 * (n + 2) + 1) for n in (board.columns, board.rows))
     mesh = np.stack(np.meshgrid(*sides), axis=-1)
     flat = np.dstack([mesh * board.square, np.zeros(mesh.shape[:2])]).reshape(-1, 3)

@@ -21,9 +21,9 @@ from needle_sim.camera.scenarios import CLEAN
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.studies.disturbances import Disturbances
 from needle_sim.studies.study import StudySettings, run_study
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 CALIBRATION = (
     Path(__file__).resolve().parents[2] / "ros2_ws/src/needle_tracker/config/calibration.yaml"
@@ -47,7 +47,7 @@ def controllers() -> None:
 def tracker() -> None:
     """Acquisition and tracking of a needle."""
     calibration = load_calibration(CALIBRATION)
-    settings = StereoTrackerParameters().tracker_settings(calibration)
+    settings = StereoTrackerParameters()
     rig = load_stereo_rig(CALIBRATION)
     for known in (True, False):
         stereo = NeedleTracker(calibration, settings)

@@ -37,5 +37,5 @@ enter() {
 # Likewise, and what is in the folder tests can be imported, too.
 enter_tests() {
     enter "$@"
-    export PYTHONPATH="$here/../tests${PYTHONPATH:+:$PYTHONPATH}"
+    export PYTHONPATH="$here/../tests:$here/../tests/shared${PYTHONPATH:+:$PYTHONPATH}"
 }

@@ -13,7 +13,7 @@ import pytest
 
 from needle_core.component import PortChange
 from needle_core.openigtlink import LinkMessage, LinkStream
-from needle_tracker.tracked.transform_port import TransformPort
+from needle_tracker.ros.tracked_tip import TransformPort
 
 pyigtl = pytest.importorskip("pyigtl", reason="the lock is not installed: docs/viewers.md")
 LIMIT = 20.0

@@ -24,9 +24,9 @@ from needle_core.messages import Image, JointState, Pose, quaternion_from_rotati
 from needle_sim.cameras import CameraSensor
 from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import calibration_from
 from needle_tracker.stereo_tracker import TIP, StereoTipTracker
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 ORACLES = Path(__file__).resolve().parent
 BAG = ORACLES / "bags" / "camera_best"

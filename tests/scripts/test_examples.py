@@ -28,7 +28,7 @@ from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSet
 from needle_core.settings.parameter_files import read_parameters
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.sim_rig_parameters import SimRigParameters
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 SETTINGS = SteeringSettings(**PAPER_NOISE)

@@ -1,4 +1,4 @@
-"""Needles that tests draw by distance, and the tracker's settings for them."""
+"""Needles that tests draw by distance."""
 
 from __future__ import annotations
 
@@ -6,26 +6,6 @@ import itertools
 import math
 
 import numpy as np
-
-from needle_tracker.detector.search_grid import Reach
-from needle_tracker.filter.settings import TrackerSettings
-from needle_tracker.optics.calibration import StereoCalibration
-
-
-def tracker_settings(calibration: StereoCalibration) -> TrackerSettings:
-    """Return settings for the needles drawn here."""
-    return TrackerSettings(
-        reach=Reach(
-            curvature=9.0, entry_angle=math.radians(10), hole_tolerance=0.5e-3, length=0.15
-        ),
-        windows=(calibration.left.window, calibration.right.window),
-        needle_width=0.7e-3,
-        tip_lean=math.radians(12),
-        entry_zone=8e-3,
-        hole_clearance=2e-3,
-        stage_zero_sigma=0.5e-3,
-        stage_scale_sigma=0.01,
-    )
 
 
 def draw_line(

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drawn_needles import arc, draw_line, tracker_settings
+from drawn_needles import arc, draw_line
 from needle_core.files.installed import find_shared_file
-from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
 from needle_tracker.optics.refraction import RefractedCamera, stereo_views
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 __all__ = ["calibration", "calibration_path", "make_arc", "make_line", "settings", "views"]
 
@@ -33,8 +33,8 @@ def views(calibration: StereoCalibration) -> tuple[RefractedCamera, RefractedCam
 
 
 @pytest.fixture
-def settings(calibration: StereoCalibration) -> TrackerSettings:
-    return tracker_settings(calibration)
+def settings() -> StereoTrackerParameters:
+    return StereoTrackerParameters()
 
 
 @pytest.fixture(scope="session")

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from needle_bringup.training.traced_scenes import TracedScene, shaft_share
 from needle_core.errors import UserError
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.sources.image_files import open_pairs, read_insertions
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -50,7 +50,7 @@ def own_scenes(folder: Path, width: float) -> tuple[TracedScene, TracedScene]:
     calibration = load_calibration(folder / "calibration.yaml")
     parameters = StereoTrackerParameters(needle_width=width)
     rig = load_stereo_rig(folder / "calibration.yaml")
-    tracker = NeedleTracker(calibration, parameters.tracker_settings(calibration))
+    tracker = NeedleTracker(calibration, parameters)
     empty = _pairs(folder / "empty", {})
     tracker.process(*empty[0].images, 0.0)
     known = read_insertions(folder / "needle" / "insertion.csv")

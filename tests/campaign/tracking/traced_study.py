@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from campaign.tracking.traced_set import DrawnSequence, TracedScene
-from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.stereo.triangulation import SpatialTip
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Image = NDArray[np.uint8]
 _NOISE = 12.0  # grey levels
@@ -147,11 +147,8 @@ def tracked_pairs(
     left, right = (variation.seen(image, rng) for image in sequence.empty)
     tracker = NeedleTracker(
         stereo,
-        dataclasses.replace(
-            default_settings(stereo),
-            needle_width=variation.width * sequence.scene.look.diameter,
-            reference=(left, right) if known is KnownInput.EMPTY_PHANTOM else None,
-        ),
+        StereoTrackerParameters(needle_width=variation.width * sequence.scene.look.diameter),
+        (left, right) if known is KnownInput.EMPTY_PHANTOM else None,
     )
     for number, pair in enumerate(sequence.pairs):
         left, right = (variation.seen(image, rng) for image in pair)

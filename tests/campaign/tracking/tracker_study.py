@@ -15,10 +15,10 @@ from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import find_scenario
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.plant import NeedlePlant, initial_pose
-from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.filter.measurement import TrackState
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = NDArray[np.float64]
 
@@ -157,7 +157,7 @@ class TrackedRun:
 
 def new_tracker(calibration: StereoCalibration) -> NeedleTracker:
     """Return a tracker with the defaults of the node."""
-    return NeedleTracker(calibration, default_settings(calibration))
+    return NeedleTracker(calibration, StereoTrackerParameters())
 
 
 def track_run(

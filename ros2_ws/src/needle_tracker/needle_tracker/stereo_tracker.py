@@ -38,9 +38,9 @@ from needle_tracker.answers.tracker_messages import (
     tip_message,
     tip_pose_message,
 )
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.filter.measurement import TrackState
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, calibration_from
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 TIP, TIP_POSE = "needle/tip", "needle/tip_pose"
 ANNOTATED, CALIBRATION = "stereo_tracker/annotated_image", "stereo_tracker/calibration"
@@ -83,12 +83,7 @@ class StereoTipTracker(Component):
         self._cameras = calibration.cameras
         self._calibration_text = calibration_text
         self._is_calibration_published = False
-        self.answers = PairAnswers(
-            calibration,
-            settings.tracker_settings(calibration),
-            pair_tolerance_ns=settings.pair_tolerance_ns,
-            joint_timeout=settings.joint_timeout,
-        )
+        self.answers = PairAnswers(calibration, settings)
         self._health = Health()
         rate = settings.annotated_rate
         self._annotated_period = 1.0 / rate if rate > 0.0 else math.inf
@@ -157,9 +152,8 @@ class StereoTipTracker(Component):
         return self.publish(answers, at)
 
     def _on_camera_info(self, side: str, message: m.CameraInfo, at: Moment) -> Actions:
-        problem, in_size = camera_info_problem(message, side, self._cameras[side])
-        self._health.camera_info[side] = problem
-        self.answers.add_contradiction(side, problem if in_size else "")
+        problem = camera_info_problem(message, side, self._cameras[side])
+        self.answers.camera_info[side] = problem
         return ()
 
     # ---- outputs ------------------------------------------------------------------------------
@@ -175,9 +169,8 @@ class StereoTipTracker(Component):
     def _report(self, at: Moment) -> Actions:
         answers, health = self.answers, self._health
         health.update_unpaired(at.steady, answers.matcher)
-        health.swapped = answers.swap.suspected
         yield from self._diagnose("track", health.track())
-        yield from self._diagnose("images", health.images(at.steady, answers.matcher))
+        yield from self._diagnose("images", health.images(at.steady, answers))
         yield from self._diagnose("joints", health.joints(answers))
 
     def _diagnose(self, part: str, diagnostic: Diagnostic) -> Actions:

@@ -36,7 +36,7 @@ from needle_tracker.answers.tracker_messages import (
     tip_message,
     tip_pose_message,
 )
-from needle_tracker.optics.calibration import rotation_matrix
+from needle_tracker.optics.calibration import pose_matrix, rotation_matrix
 from needle_tracker.sources.pairing import InsertionHistory
 from needle_tracker.stereo.triangulation import SpatialTip
 from needle_tracker.stereo_tracker import TIP, TIP_POSE
@@ -182,10 +182,10 @@ class TrackedTip(Component):
             position, quaternion = message.position, message.orientation
         else:
             position, quaternion = message.translation, message.rotation
-        matrix, norm = np.eye(4), math.hypot(*quaternion)
+        norm = math.hypot(*quaternion)
         # A quaternion that was not filled in becomes a matrix that is no rotation.
-        matrix[:3, :3] = norm * rotation_matrix(np.array(quaternion) / (norm or 1.0))
-        matrix[:3, 3] = position
+        turn = norm * rotation_matrix(np.array(quaternion) / (norm or 1.0))
+        matrix = pose_matrix(turn, position)
         return self._on_received(TrackerTransform(message.stamp_ns * 1e-9, matrix), at)
 
     def _on_bytes(self, batch: Sequence[bytes], at: Moment) -> Actions:

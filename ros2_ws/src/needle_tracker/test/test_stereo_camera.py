@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+import queue
+from collections.abc import Sequence
 from typing import Any
 from unittest import mock
 
@@ -28,7 +28,6 @@ from needle_core.diagnostics import Level
 from needle_core.errors import UserError
 from needle_core.runners.virtual import VirtualRunner
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.sources import stereo_source
 from needle_tracker.sources.stereo_source import EndOfRecording, PairPort, StampedPair
 from needle_tracker.stereo_camera import PAIRS, StereoCamera, StereoCameraParameters
 
@@ -176,44 +175,19 @@ def test_pairs_come_at_the_rate_until_the_camera_is_lost(calibration: StereoCali
     assert runner.exits == {camera.name: Exit(2, "unplugged?")}
 
 
-def test_a_thread_reads_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Callable[[], Any]] = []
-
-    class Thread:
-        """Does what it is asked when the test lets it."""
-
-        def __init__(self, *_: object) -> None:
-            self.now: Future[Any] = Future()
-
-        def submit(self, task: Callable[[], Any]) -> Future[Any]:
-            asked.append(task)
-            return self.now
-
-        def shutdown(self) -> None:
-            asked.clear()
-
-    monkeypatch.setattr(stereo_source, "ThreadPoolExecutor", Thread)
-    source = mock.Mock()
-    port, arrived = PairPort(source), list[Any]()
-    port.open(arrived.append)
-    port.send(("next",))
-    # Nobody waits for the source.
-    assert (asked, arrived) == ([source.next], [])
-    thread: Any = port._reader
-    for given in (EndOfRecording("all"), None, UserError("unplugged?"), ZeroDivisionError()):
-        future: Future[Any] = Future()
-        thread.now = future
+def test_a_thread_reads_the_source() -> None:
+    source, arrived = mock.Mock(), queue.SimpleQueue[Any]()
+    given = (EndOfRecording("all"), None, UserError("unplugged?"), ZeroDivisionError())
+    source.next.side_effect = given
+    port = PairPort(source)
+    port.open(arrived.put)
+    for _ in given:
         port.send(("next",))
-        if isinstance(given, Exception):
-            future.set_exception(given)
-        else:
-            future.set_result(given)
-    end, unreadable, lost, mistake = arrived
+    end, unreadable, lost, mistake = (arrived.get(timeout=60.0) for _ in given)
     assert (end(), unreadable()) == ((EndOfRecording("all"),), (None,))
     assert lost == PortChange("unplugged?")
     # A mistake of ours ends the node that takes it.
     with pytest.raises(ZeroDivisionError):
         mistake()
     port.close()
-    assert not asked
     source.close.assert_called_once_with()

@@ -43,9 +43,9 @@ from needle_core.settings.parameter_files import (
     read_sections,
     values_for,
 )
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import parse_calibration
 from needle_tracker.stereo_tracker import CALIBRATION, TIP_POSE, StereoTipTracker
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 DESCRIPTION = """\
 Process a bag with the current code, offline: its images with the tracker, its tips with the

@@ -56,7 +56,7 @@ def make_tracker(parameters: Parameters) -> StereoTipTracker:
     """Return the tracker."""
     # Imports OpenCV, which a run without images does not need.
     from needle_tracker import stereo_tracker  # noqa: PLC0415
-    from needle_tracker.answers.tracker_parameters import StereoTrackerParameters  # noqa: PLC0415
+    from needle_tracker.tracker_parameters import StereoTrackerParameters  # noqa: PLC0415
 
     settings = settings_of(StereoTrackerParameters, parameters, "stereo_tracker")
     return stereo_tracker.make_tracker(settings)

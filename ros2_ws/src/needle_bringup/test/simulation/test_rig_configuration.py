@@ -33,7 +33,7 @@ from needle_core.settings.parameter_files import Parameters, read_parameters
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.sim_rig_parameters import SimRigParameters
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 STRAIGHT = NeedleShape(bend_angle=0.0, lean=0.0)
 CLASSES: dict[str, type[Any]] = {

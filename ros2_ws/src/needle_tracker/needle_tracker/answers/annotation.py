@@ -22,17 +22,6 @@ _BY_VIEWS = {
     (False, True): "end seen in the right view only",
     (True, True): "both views show an end but they do not meet",
 }
-HELP = {
-    _BY_VIEWS[False, False]: "light, floor, focus; swapped cameras; `check_calibration`",
-    _BY_VIEWS[True, False]: "light, floor and focus of the right view; objects over the end",
-    _BY_VIEWS[False, True]: "light, floor and focus of the left view; objects over the end",
-    _BY_VIEWS[True, True]: "swapped cameras; images of one exposure; `check_calibration`",
-    NoTip.UNCONFIRMED.value: (
-        "the insertion; is zero the needle's tip at the entry? move the needle"
-    ),
-    NoTip.UNCERTAIN.value: "objects over the end; cameras farther apart",
-}
-"""Remedies for the causes that have one, as in docs/own_rig.md."""
 _SCALE = 0.5
 _GREEN, _YELLOW, _RED = (90, 230, 90), (255, 220, 60), (255, 80, 60)
 _SHAFT_PX = 40.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import deque
+from collections import Counter, deque
 from typing import Any
 
 from needle_core.diagnostics import Diagnostic, Level
@@ -15,36 +15,8 @@ TROUBLE_SHOWN = 5.0  # duration of a warning after its cause [s]
 CLOCKS_DIFFER = 1_000_000_000  # time of a pair before the first joint state that is a fault [ns]
 PARTNER_LATE = 0.5  # an image without a partner is reported after [s]
 _RATE_WINDOW = 5.0  # [s]
-_MOST_REASONS = 20  # counted by name
-OTHER_REASONS = "other reasons"
 _NOTHING_YET = Measurement(None, TrackState.SEARCHING, "no images yet")
 _EXCHANGE = "exchange stereo_camera's parameters left and right, or the cables"
-
-
-class ReasonCounts:
-    """Counts of reasons: the latest by name, all others together.
-
-    Reasons quote received text, so their number must be limited.
-    """
-
-    def __init__(self) -> None:
-        self._named: dict[str, int] = {}
-        self._others = 0
-
-    def add(self, reason: str) -> None:
-        """Count a reason."""
-        # The names are in the order of their latest count.
-        self._named[reason] = self._named.pop(reason, 0) + 1
-        if len(self._named) > _MOST_REASONS:
-            self._others += self._named.pop(next(iter(self._named)))
-
-    def total(self) -> int:
-        """Return the total count."""
-        return sum(self._named.values()) + self._others
-
-    def items(self) -> list[tuple[str, int]]:
-        """Return reasons and counts, `OTHER_REASONS` last if there are any."""
-        return [*self._named.items(), *([(OTHER_REASONS, self._others)] if self._others else [])]
 
 
 @dataclasses.dataclass
@@ -53,20 +25,16 @@ class Health:
 
     Attributes
     ----------
-    refused : ReasonCounts
+    refused : Counter of str
         Pairs that were not processed, by reason.
-    rejected : ReasonCounts
+    rejected : Counter of str
         Pairs without a tip, by reason.
-    swapped : bool
-        Whether left and right images are suspected to be swapped.
     """
 
-    refused: ReasonCounts = dataclasses.field(default_factory=ReasonCounts)
-    rejected: ReasonCounts = dataclasses.field(default_factory=ReasonCounts)
+    refused: Counter[str] = dataclasses.field(default_factory=Counter)
+    rejected: Counter[str] = dataclasses.field(default_factory=Counter)
     joints_without_insertion: int = 0
     last_refusal: tuple[float, str] | None = None
-    camera_info: dict[str, str] = dataclasses.field(default_factory=dict)
-    swapped: bool = False
     _last_image: dict[str, float] = dataclasses.field(default_factory=dict)
     _first_image: float = 0.0
     _last_unpaired: float | None = None
@@ -85,7 +53,7 @@ class Health:
 
     def add_refused(self, reason: str, now: float) -> None:
         """Count a pair that was not processed."""
-        self.refused.add(reason)
+        self.refused[reason] += 1
         self.last_refusal = (now, reason)
 
     def add_pair(self, arrival: float, now: float, measured: Measurement) -> None:
@@ -93,7 +61,7 @@ class Health:
         self._done.append((now, now - arrival))
         self._measured = measured
         if measured.tip is None:
-            self.rejected.add(measured.reason)
+            self.rejected[measured.reason] += 1
         else:
             self._tips += 1
 
@@ -119,8 +87,9 @@ class Health:
         message = state.value + (f": {reason}" if reason else "")
         return Diagnostic(Level.OK if good else Level.WARN, message, values)
 
-    def images(self, now: float, matcher: PairMatcher[Any]) -> Diagnostic:
+    def images(self, now: float, answers: PairAnswers) -> Diagnostic:
         """Return the health of the images and their pairing."""
+        matcher = answers.matcher
         recent = [(at, took) for at, took in self._done if now - at <= _RATE_WINDOW]
         latencies = sorted(took for _, took in recent)
         values = {
@@ -137,7 +106,7 @@ class Health:
             skews = zip(("skew_median_ms", "skew_max_ms"), matcher.skew, strict=True)
             values.update({name: f"{1e-6 * skew:.2f}" for name, skew in skews})
         values.update({f"refused: {reason}": str(n) for reason, n in self.refused.items()})
-        return Diagnostic(*self._images_level(now, matcher), values)
+        return Diagnostic(*self._images_level(now, answers), values)
 
     def joints(self, answers: PairAnswers) -> Diagnostic:
         """Return the health of the joint states."""
@@ -156,14 +125,15 @@ class Health:
             level, message = Level.WARN, "no joint state follows the images: insertion unknown"
         return Diagnostic(level, message, values)
 
-    def _images_level(self, now: float, matcher: PairMatcher[Any]) -> tuple[Level, str]:
+    def _images_level(self, now: float, answers: PairAnswers) -> tuple[Level, str]:
         if self.last_refusal is not None and now - self.last_refusal[0] <= TROUBLE_SHOWN:
             return Level.ERROR, f"pair refused: {self.last_refusal[1]}"
-        if problem := next(filter(None, self.camera_info.values()), ""):
-            return Level.ERROR, problem
-        if self.swapped:
+        for problem in answers.camera_info.values():
+            if problem.text:
+                return Level.ERROR, problem.text
+        if answers.swap.suspected:
             return Level.WARN, f"{SUSPICION}; {_EXCHANGE}"
-        return self._pairing_level(now, matcher)
+        return self._pairing_level(now, answers.matcher)
 
     def _pairing_level(self, now: float, matcher: PairMatcher[Any]) -> tuple[Level, str]:
         for side, other in OTHER_SIDE.items():

@@ -11,15 +11,16 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.filter.measurement import Measurement, TrackState
-from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.filter.settings import Image, TrackerSettings
+from needle_tracker.filter.needle_tracker import Image, NeedleTracker
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.sources.pairing import InsertionHistory, Pair, PairMatcher
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 SUSPICION = "left and right images seem to be swapped: exchanged, they show a needle"
 _NEW_RECORDING = 1_000_000_000  # a longer step back in time begins a new recording [ns]
@@ -39,8 +40,8 @@ class SwapWatch:
     ----------
     calibration : StereoCalibration
         The stereo rig.
-    settings : TrackerSettings
-        Settings of the tracker.
+    settings : StereoTrackerParameters
+        Parameters of the tracker.
 
     Attributes
     ----------
@@ -48,7 +49,7 @@ class SwapWatch:
         Whether the last pairs show a needle only when swapped; reset by a tip.
     """
 
-    def __init__(self, calibration: StereoCalibration, settings: TrackerSettings) -> None:
+    def __init__(self, calibration: StereoCalibration, settings: StereoTrackerParameters) -> None:
         left, right = calibration.left, calibration.right
         # Swapped images of different sizes are rejected by their size.
         self._can_check = (left.height, left.width) == (right.height, right.width)
@@ -102,6 +103,13 @@ class Frame:
     problem: str = ""
 
 
+class CameraInfoProblem(NamedTuple):
+    """Contradiction of the calibration, empty if none; one of the size rejects all pairs."""
+
+    text: str = ""
+    of_size: bool = False
+
+
 @dataclasses.dataclass(frozen=True)
 class Answer:
     """Result of a pair.
@@ -131,40 +139,32 @@ class PairAnswers:
     ----------
     calibration : StereoCalibration
         The stereo rig.
-    tracker : TrackerSettings
-        Settings of the tracker.
-    pair_tolerance_ns : int or None
-        Largest difference of the stamps of a pair [ns]; None for free-running cameras.
-    joint_timeout : float
-        Longest wait of a pair for the joint state that follows it [s].
+    settings : StereoTrackerParameters
+        Parameters of the node.
 
     Attributes
     ----------
+    camera_info : dict of str to CameraInfoProblem
+        By side, as received last.
     unanswered : int
         Pairs exposed before the first joint state.
     too_early : int
         Time from the exposure of the last pair to that joint state [ns]; 0 if the pair is answered.
     """
 
-    def __init__(
-        self,
-        calibration: StereoCalibration,
-        tracker: TrackerSettings,
-        *,
-        pair_tolerance_ns: int | None,
-        joint_timeout: float,
-    ) -> None:
-        self.tracker = NeedleTracker(calibration, tracker)
+    def __init__(self, calibration: StereoCalibration, settings: StereoTrackerParameters) -> None:
+        reference = settings.reference(calibration.sizes)
+        self.tracker = NeedleTracker(calibration, settings, reference)
         self.tracker.warm_up()
-        self.swap = SwapWatch(calibration, tracker)
-        self.matcher: PairMatcher[Frame] = PairMatcher(pair_tolerance_ns)
+        self.swap = SwapWatch(calibration, settings)
+        self.matcher: PairMatcher[Frame] = PairMatcher(settings.pair_tolerance_ns)
         self.insertions = InsertionHistory()
         self.joints_silent = False
         self.unanswered = self.too_early = 0
-        self._joint_timeout = joint_timeout
+        self._joint_timeout = settings.joint_timeout
         self._queue: deque[tuple[float, Pair[Frame]]] = deque()
         self._last_stamp: int | None = None
-        self._contradictions: dict[str, str] = {}
+        self.camera_info: dict[str, CameraInfoProblem] = {}
 
     def add_image(self, side: str, stamp: int, frame: Frame, now: float) -> Iterator[Answer]:
         """Add an image of one side, exposed at `stamp` [ns]; then as `ready`."""
@@ -172,10 +172,6 @@ class PairAnswers:
         if pair is not None:
             self._queue.append((now, pair))
         return self.ready(now)
-
-    def add_contradiction(self, side: str, reason: str) -> None:
-        """Reject all pairs while a camera is not the calibrated one; empty: accept them."""
-        self._contradictions[side] = reason
 
     def add_insertion(self, stamp: int, insertion: float, now: float) -> Iterator[Answer]:
         """Add an insertion [m] sampled at `stamp` [ns]; then as `ready`."""
@@ -225,8 +221,8 @@ class PairAnswers:
         last = self._last_stamp
         if last is None or pair.stamp > last:
             self._last_stamp = pair.stamp
-            problems = (pair.left.problem, pair.right.problem, *self._contradictions.values())
-            return next(filter(None, problems), "")
+            sizes = (problem.text for problem in self.camera_info.values() if problem.of_size)
+            return next(filter(None, (pair.left.problem, pair.right.problem, *sizes)), "")
         back = last - pair.stamp
         if back >= _NEW_RECORDING:
             self.tracker.reset()

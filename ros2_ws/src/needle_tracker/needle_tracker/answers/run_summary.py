@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_core.commands.cli import JsonValue
-from needle_tracker.answers.annotation import HELP, IN_ENTRY_ZONE, missing, shows_end, shows_shaft
+from needle_tracker.answers.annotation import IN_ENTRY_ZONE, missing, shows_end, shows_shaft
 from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.optics.calibration import SIDES
 from needle_tracker.sources.image_files import read_numbers
@@ -45,17 +45,15 @@ class SeenCounts:
             self.shafts[side] += shows_shaft(end)
 
     def describe(self) -> str:
-        """Return the counts as text, and the remedy for the most frequent cause."""
+        """Return the counts as text."""
         lines = [
             f"  {side:5}: end seen in {self.ends[side]} of {self.pairs} pairs, "
             f"shaft in {self.shafts[side]}"
             for side in SIDES
         ]
         lines += [f"  no tip {n:6d} x  {cause}" for cause, n in self.missing.most_common()]
-        for cause, _ in self.missing.most_common():
-            if cause in HELP:
-                lines.append(f"  most often `{cause}`: check {HELP[cause]} (docs/own_rig.md)")
-                break
+        if self.missing:
+            lines.append("  docs/own_rig.md gives a remedy for each reason")
         return "\n".join(lines)
 
     def figures(self) -> dict[str, JsonValue]:

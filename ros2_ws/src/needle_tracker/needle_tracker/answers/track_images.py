@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-import dataclasses
+import io
 import math
 import sys
 import time
@@ -18,11 +18,12 @@ import numpy as np
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser, number, output_file
 from needle_core.errors import UserError
+from needle_core.files.file_access import write_text
+from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import missing_section_warning, read_sections, values_for
-from needle_tracker.answers.annotation import Image, annotate, missing
+from needle_tracker.answers.annotation import annotate, missing
 from needle_tracker.answers.pair_answers import SUSPICION, SwapWatch
 from needle_tracker.answers.run_summary import SeenCounts, TruthComparison, read_truth
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.filter.measurement import Measurement
 from needle_tracker.filter.needle_tracker import NeedleTracker
 from needle_tracker.optics.calibration import load_calibration
@@ -34,6 +35,7 @@ from needle_tracker.sources.image_files import (
     progress,
     read_insertions,
 )
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 DESCRIPTION = """\
 Measure the needle's tip in stereo images or in two videos.
@@ -83,18 +85,15 @@ COLUMNS = (
 )
 _NODE = "stereo_tracker"
 _NAMED = 5  # names that a warning lists; it counts the others
-_JPEG_QUALITY = 90
 _NEW_RUN = 10e-3  # change of the insertion between two images that begins a new run [m]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `track_images`; returns its exit code."""
-    words = sys.argv[1:] if arguments is None else list(arguments)
-    return run_command(lambda: _run(words))
+    return run_command(lambda: _run(_parser().parse_args(arguments)))
 
 
-def _run(words: Sequence[str]) -> int:
-    given = _parser().parse_args(words)
+def _run(given: argparse.Namespace) -> int:
     output = output_file("--output", given.output)
     json = output_file("--json", given.json)
     parameters = _parameters(given)
@@ -103,13 +102,13 @@ def _run(words: Sequence[str]) -> int:
     pairs = open_pairs(Path(given.left), Path(given.right))
     truth = TruthComparison(read_truth(Path(given.truth)) if given.truth else {})
     overlays = None if given.overlay is None else _new_folder("--overlay", given.overlay)
-    tracker = NeedleTracker(calibration, parameters.tracker_settings(calibration))
+    tracker = NeedleTracker(calibration, parameters, parameters.reference(calibration.sizes))
     tracker.warm_up()
     begin = time.perf_counter()
     rows: list[list[str]] = []
     unusable: list[str] = []
     without, stage, seen = 0, (0.0, 0.0), SeenCounts()
-    swap = SwapWatch(calibration, tracker.settings)
+    swap = SwapWatch(calibration, parameters)
     for pair, insertion, measured in track(pairs, tracker, calibration.sizes, insertions):
         without += insertion is None
         if problem := pair.problem(calibration.sizes):
@@ -118,12 +117,15 @@ def _run(words: Sequence[str]) -> int:
             if not problem:
                 swap.update(pair.left, pair.right, insertion, measured)
             if overlays is not None:
-                write_overlay(overlays, pair.name, annotate(pair.left, pair.right, measured))
+                picture = annotate(pair.left, pair.right, measured)[..., ::-1]
+                cv2.imwrite(str(overlays / f"{Path(pair.name).stem}.jpg"), picture)
         truth.add(pair.names, measured)
         seen.add(measured)
         rows.append(to_row(pair.name, measured))
         stage = measured.stage if measured.tip is not None else stage
-    write_rows(output, rows)
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([COLUMNS, *rows])
+    write_text(output, text.getvalue())
     found = sum(row[1] == "1" for row in rows)
     print(f"{found} tips in {len(rows)} pairs: {output}\n{seen.describe()}")
     if given.insertion:
@@ -139,9 +141,9 @@ def _run(words: Sequence[str]) -> int:
         f"{pairs.cut_off} pairs listed in the videos cannot be read": pairs.cut_off,
         f"{without} pairs have no insertion": given.insertion and without,
     }
-    for text, holds in warnings.items():
+    for warning, holds in warnings.items():
         if holds:
-            _warn(text)
+            _warn(warning)
     if json is not None:
         result: dict[str, JsonValue] = {
             "pairs": len(rows),
@@ -166,13 +168,10 @@ def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
         if values is None:
             _warn(missing_section_warning(given.params, sections, f"/{_NODE}"))
         changes |= values or {}
-        known = {field.name for field in dataclasses.fields(StereoTrackerParameters)}
-        if unknown := sorted(set(changes) - known):
-            raise UserError(f"--params: {_NODE} has no parameter {', '.join(unknown)}")
     if given.needle_width_mm is not None:
         width = number("--needle-width-mm", given.needle_width_mm, 0.2, 3.0, "mm")
         changes["needle_width"] = 1e-3 * width
-    return StereoTrackerParameters(**changes)
+    return from_values(StereoTrackerParameters, changes, _NODE)
 
 
 def track(
@@ -226,39 +225,6 @@ def to_row(name: str, measured: Measurement) -> list[str]:
     for end in measured.ends:
         shown += ["", ""] if end is None else [f"{end.ends:.2f}", f"{end.shaft:.2f}"]
     return [name, "0" if cause else "1", *place, *shown, cause]
-
-
-def write_overlay(folder: Path, name: str, picture: Image) -> None:
-    """Write the annotated picture of a pair.
-
-    Raises
-    ------
-    UserError
-        If it cannot be written.
-    """
-    _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    path = folder / f"{Path(name).stem}.jpg"
-    try:
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
-
-
-def write_rows(path: Path, rows: Sequence[Sequence[str]]) -> None:
-    """Write the CSV file.
-
-    Raises
-    ------
-    UserError
-        If it cannot be written.
-    """
-    try:
-        with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(COLUMNS)
-            writer.writerows(rows)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _new_folder(name: str, text: str) -> Path:

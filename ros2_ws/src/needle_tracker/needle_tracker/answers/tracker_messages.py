@@ -16,7 +16,7 @@ from needle_core.messages import (
     Pose,
     PoseWithCovariance,
 )
-from needle_tracker.answers.pair_answers import Frame
+from needle_tracker.answers.pair_answers import CameraInfoProblem, Frame
 from needle_tracker.optics.calibration import Camera, rotation_matrix
 from needle_tracker.sources.image_encodings import ENCODINGS, WANTED, bytes_per_pixel, grey_image
 from needle_tracker.sources.image_files import size_problem
@@ -26,7 +26,6 @@ RIG_FRAME = "rig"
 LEFT_FRAME = "left_camera_optical"
 ROLL_VARIANCE = math.pi**2
 """Variance of an unknown angle [rad^2]: finite, since an infinite one means no tip."""
-_QUOTED = 40  # characters of an unknown encoding
 
 
 def frame_of(message: Any, side: str, camera: Camera) -> Frame:
@@ -35,8 +34,7 @@ def frame_of(message: Any, side: str, camera: Camera) -> Frame:
     The message is an `Image` of needle_core, rclpy or rosbags, which have the same fields.
     """
     if message.encoding not in ENCODINGS:
-        encoding = message.encoding[:_QUOTED]
-        return Frame(None, f"{side} image is {encoding!r}, expected {WANTED}")
+        return Frame(None, f"{side} image is {message.encoding!r}, expected {WANTED}")
     wanted = camera.width, camera.height
     if problem := size_problem(side, (message.width, message.height), wanted):
         return Frame(None, problem)
@@ -65,23 +63,19 @@ def image_geometry(message: Any) -> tuple[int, int, NDArray[np.float64]]:
     return int(width), int(height), matrix
 
 
-def camera_info_problem(message: Any, side: str, camera: Camera) -> tuple[str, bool]:
-    """Return how a camera_info contradicts the calibration, and whether by the size of the images.
-
-    The text is empty if there is no contradiction.
-    """
+def camera_info_problem(message: Any, side: str, camera: Camera) -> CameraInfoProblem:
+    """Return how a camera_info contradicts the calibration."""
     width, height, matrix = image_geometry(message)
     # Some drivers send zeros for an unknown size.
     if (width, height) in {(0, 0), (camera.width, camera.height)}:
         difference = float(np.abs(matrix - camera.camera_matrix).max())
         # An uncalibrated camera driver sends zeros.
         if np.any(np.asarray(message.k) != 0.0) and difference > 0.5:
-            return f"{side} camera_info differs from the calibration by {difference:.1f} px", False
-        return "", False
-    return (
-        f"{side} camera_info is for {width}x{height}, the calibration for "
-        f"{camera.width}x{camera.height}"
-    ), True
+            text = f"{side} camera_info differs from the calibration by {difference:.1f} px"
+            return CameraInfoProblem(text)
+        return CameraInfoProblem()
+    wanted = f"the calibration for {camera.width}x{camera.height}"
+    return CameraInfoProblem(f"{side} camera_info is for {width}x{height}, {wanted}", True)
 
 
 def insertion_of(message: JointState) -> float | None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import sys
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
-from needle_core.commands.options import CommandParser
+from needle_core.commands.options import CommandParser, output_file
 from needle_core.errors import UserError
 from needle_core.files.file_access import write_text
+from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_tracker.calibrating.calibration_outliers import contradictions, misfits, square_error
 from needle_tracker.calibrating.calibration_session import (
     KINDS,
@@ -26,14 +27,14 @@ from needle_tracker.calibrating.calibration_session import (
     nothing_seen,
     views_in_folders,
 )
+from needle_tracker.calibrating.calibration_start import PairsApartError, describe_apart
 from needle_tracker.calibrating.charuco import CharucoBoard, write_board
 from needle_tracker.calibrating.imported_lenses import read_lenses
-from needle_tracker.calibrating.pair_consistency import PairsApartError, describe_apart
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_model import LENS, SURFACE, unit_of
-from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
-from needle_tracker.optics.compiled_projection import pack_camera, pixel_ray
-from needle_tracker.optics.window import Window
+from needle_tracker.optics.calibration import SIDES, StereoCalibration, Window
+
+Array = NDArray[np.float64]
 
 _DESCRIPTION = """\
 Calibrate the stereo rig from images of a ChArUco board.
@@ -84,12 +85,11 @@ the rig (nothing is written); 130 interrupted
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    return run_command(lambda: calibrate_stereo(sys.argv[1:] if arguments is None else arguments))
+    return run_command(lambda: _run(_parser().parse_args(arguments)))
 
 
-def calibrate_stereo(arguments: Sequence[str]) -> int:
+def _run(options: Namespace) -> int:
     """Calibrate, print and write the result."""
-    options = _parser().parse_args(arguments)
     if options.board is not None:
         board = CharucoBoard() if options.session is None else load_session(options.session).board
         write_board(board, options.board)
@@ -98,10 +98,8 @@ def calibrate_stereo(arguments: Sequence[str]) -> int:
     for name in ("left", "right", "session", "output"):
         if getattr(options, name) is None:
             raise UserError(f"--{name} is missing; see --help")
-    if not (math.isfinite(options.goal_mm) and options.goal_mm > 0.0):
-        raise UserError(f"--goal-mm {options.goal_mm} is not above 0")
-    if not options.output.parent.is_dir():
-        raise UserError(f"--output {options.output}: {options.output.parent} is not a folder")
+    check_bounds("--goal-mm", options.goal_mm, ABOVE_0, 100.0, "mm")
+    options.output = output_file("--output", options.output)
     session = load_session(options.session)
     views, sizes = views_in_folders(options.left, options.right, session)
     empty = [view.name for view in views if nothing_seen(view) and view.place is None]
@@ -118,10 +116,9 @@ def calibrate_stereo(arguments: Sequence[str]) -> int:
         return EXIT_MISSED
     size = square_error(result)
     problems = contradictions(result, size)
-    lines = [report(result, size, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
-    text = "\n".join(lines)
-    print(text)
-    save_calibration(options.output, result.calibration, text.splitlines())
+    lines = [*report(result, size, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
+    print("\n".join(lines))
+    save_calibration(options.output, result.calibration, lines)
     save_figure(rig_figure(result), options.output.with_suffix(".rig.png"))
     if options.json is not None:
         values = figures(result, options.goal_mm) | {"problem": "; ".join(problems) or None}
@@ -142,35 +139,26 @@ def reprojection_by_kind(result: RigCalibration) -> dict[tuple[str, str], float]
     }
 
 
-def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) -> str:
-    """Return a calibration as text."""
+def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) -> list[str]:
+    """Return a calibration as lines of text."""
     kinds = [view.kind for view in result.model.views]
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in KINDS)
     lines = [
         f"views: {counts}; corners: {len(result.model.pixels['left'])} left, "
         f"{len(result.model.pixels['right'])} right, each to {result.fit.corner_sigma_px:.3f} px"
     ]
-    lines += [
-        f"reprojection error, {side} camera, {kind} boards: {error:.3f} px rms"
-        for (side, kind), error in reprojection_by_kind(result).items()
-    ]
+    for (side, kind), error in reprojection_by_kind(result).items():
+        lines.append(f"reprojection error, {side} camera, {kind} boards: {error:.3f} px rms")
     if result.apart:
         lines.append(f"WARNING: {describe_apart(result.apart)}; left out")
     lines += [f"WARNING: {text}" for view, text in misfits(result) if view.place is None]
     if "left.fx" not in result.parameters:
-        pose = " and relative pose" if result.model.tied else ""
-        lines.append(f"lenses{pose}: as given; their error adds to the tip error below")
+        lines.append("lenses: as given; their error adds to the tip error below")
     for name, found in result.parameters.items():
         scale, unit = unit_of(name)
-        value, given, sigma = (scale * v for v in (found.value, found.given, found.sigma))
-        unit = unit and f" {unit}"
-        result_text = f"{value:.5g}{unit} +- {sigma:.2g}{unit}"
-        if found.kept:
-            asked = "not estimated from these views"
-            if math.isfinite(sigma):
-                asked = f"NOT DETERMINED by these views (+- {sigma:.2g}{unit})"
-            result_text = f"{asked}, kept at the given {given:g}{unit}"
-        lines.append(f"{name}: {result_text}")
+        value, sigma, unit = scale * found.value, scale * found.sigma, unit and f" {unit}"
+        kept = f" (NOT DETERMINED by these views, kept as given: {value:g}{unit})"
+        lines.append(f"{name}: {value:.5g}{unit} +- {sigma:.2g}{unit}{kept if found.kept else ''}")
     error, sigma = (100.0 * value for value in size)
     if sigma < _SCALE_KNOWN:
         lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % relative to the session")
@@ -190,7 +178,7 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
             "errors of given values add to it: about 0.14 mm for 0.01 of the index, 0.31 mm "
             "for 1 mm of the surface"
         )
-    return "\n".join(lines)
+    return lines
 
 
 def figures(result: RigCalibration, goal_mm: float) -> dict[str, JsonValue]:
@@ -228,15 +216,22 @@ def _parser() -> CommandParser:
     return parser
 
 
-def calibration_text(calibration: StereoCalibration, comments: list[str]) -> str:
-    """Return the YAML text of a calibration.
+def save_calibration(path: Path, calibration: StereoCalibration, comments: list[str]) -> None:
+    """Write a calibration file.
 
     Parameters
     ----------
+    path : Path
+        The file.
     calibration : StereoCalibration
         The calibration.
     comments : list of str
         Lines of the header.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
     """
     surface, content = calibration.surface, dict[str, Any]()
     if surface is not None:
@@ -263,29 +258,11 @@ def calibration_text(calibration: StereoCalibration, comments: list[str]) -> str
                 "inside": float(window.inside),
             }
     text = yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120)
-    return "".join(f"# {line}\n" for line in comments) + text
-
-
-def save_calibration(path: Path, calibration: StereoCalibration, comments: list[str]) -> None:
-    """Write a calibration file.
-
-    Raises
-    ------
-    UserError
-        If it cannot be written.
-    """
-    write_text(path, calibration_text(calibration, comments))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
-
-
-Array = NDArray[np.float64]
+    write_text(path, "".join(f"# {line}\n" for line in comments) + text)
 
 
 def rig_figure(result: RigCalibration) -> Figure:
-    """Return a figure of the rig from two sides: cameras, surface, boards, frustums."""
+    """Return a figure of the rig from two sides: cameras, surface, boards."""
     figure = Figure(figsize=(9.0, 8.5), layout="constrained")
     planes = (2, "z (insertion) [mm]"), (1, "y [mm]")
     for axes, (axis, label) in zip(figure.subplots(1, 2), planes, strict=True):
@@ -294,10 +271,9 @@ def rig_figure(result: RigCalibration) -> Figure:
             outline, (name, colour) = _MM * _outline(result, i), _BOARDS[view.kind]
             axes.plot(outline[:, axis], outline[:, 0], color=colour, linewidth=1.5, label=name)
         for side, camera in result.calibration.cameras.items():
-            name, colour = f"{side} camera", _COLOURS[side]
-            centre = _MM * camera.centre
-            axes.plot(centre[axis], centre[0], "o", color=colour, label=name)
-            _draw_frustum(axes, camera, axis, colour)
+            centre, ahead = _MM * camera.centre, 50.0 * camera.T_optical_rig[2, :3]
+            axes.plot(centre[axis], centre[0], "o", color=_COLOURS[side], label=f"{side} camera")
+            axes.arrow(centre[axis], centre[0], ahead[axis], ahead[0], color=_COLOURS[side])
             _draw_face(axes, camera.window, axis)
         axes.set(aspect="equal", xlabel=label, ylabel="x (up) [mm]")
         axes.grid(color="#e4e6ea")
@@ -339,11 +315,5 @@ def _draw_face(axes: Any, window: Window, axis: int) -> None:
         axes.axline(place, (place[0] + up, place[1] - along), color="#2e9d55", label="window")
 
 
-def _draw_frustum(axes: Any, camera: Camera, axis: int, colour: str) -> None:
-    """Draw the rays of the corners of the image, down to the window."""
-    width, height = float(camera.width), float(camera.height)
-    packed, end, direction = pack_camera(camera), np.empty(3), np.empty(3)
-    for corner in ((0.0, 0.0), (width, 0.0), (width, height), (0.0, height)):
-        pixel_ray(packed, np.array(corner), end, direction)
-        ray = _MM * np.stack([camera.centre, end])
-        axes.plot(ray[:, axis], ray[:, 0], color=colour, linewidth=0.8)
+if __name__ == "__main__":
+    sys.exit(main())

@@ -28,9 +28,10 @@ from needle_tracker.calibrating.rig_model import (
     LENS,
     RigModel,
     camera_slice,
+    tip_error_p95,
+    tip_shifts,
     unit_of,
 )
-from needle_tracker.calibrating.tip_error import tip_error_p95, tip_shifts
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 
 Array = NDArray[np.float64]
@@ -38,8 +39,11 @@ Array = NDArray[np.float64]
 CAMERAS = tuple(f"{side}_camera_turned" for side in SIDES)
 LEAST_IMPROVEMENT = 30.0  # of chi-squared: far above noise
 EXPLAINED_PX = 1.0  # largest misfit of an explanation by causes
-NOTHING_SHOWN = 1.0  # undetected error of tips above which a target is useless [m]
 TURN_LIMIT = np.deg2rad(0.01)  # a camera with a larger rotation was touched
+_UNEXPLAINED = (
+    "corners are off by {:.2f} px, which no turned camera, index or surface explains: {}, or other "
+    "cameras"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,10 +137,8 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     asis = _fit(model, [], sigma).residuals.reshape(-1, 2)
     reprojection = float(np.sqrt(np.mean(np.sum(asis**2, axis=-1))))
     if not misfit <= EXPLAINED_PX:
-        problem = (
-            f"corners are off by {misfit:.1f} px, which no turned camera, index or surface "
-            "explains: another target or place than in the session, left and right exchanged, "
-            "or other cameras"
+        problem = _UNEXPLAINED.format(
+            misfit, "another target or place than in the session, left and right exchanged"
         )
         return CheckResult(causes, [], np.nan, unseen, sigma, reprojection, [problem])
     found = _causes(model, causes, sigma)
@@ -145,10 +147,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     shift = _p95(calibration, model.calibration(best.parameters))
     problems = []
     if misfit > LARGEST_MISFIT_PX:
-        problems.append(
-            f"corners are off by {misfit:.2f} px, which no turned camera, index or surface "
-            "explains: another lens setting, or a target that is not flat or not at its place"
-        )
+        problems.append(_UNEXPLAINED.format(misfit, "another lens setting, a target not flat"))
     if shift > limit:
         problems.append(f"tips are off by {1e3 * shift:.2f} mm (95 %), allowed {1e3 * limit:g}")
     problems += [
@@ -158,9 +157,8 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     ]
     if unseen > limit:
         problems.append(
-            "this target cannot show tip errors"
-            + (f" below {1e3 * unseen:.2f} mm" if unseen < NOTHING_SHOWN else "")
-            + ": lay it at known places on and under the surface, tilted"
+            f"this target cannot show tip errors below {1e3 * unseen:.2f} mm: lay it at known "
+            "places on and under the surface, tilted"
         )
     return CheckResult(causes, deviations, shift, unseen, sigma, reprojection, problems)
 
@@ -220,20 +218,12 @@ def report(result: CheckResult) -> str:
         f"{math.sqrt(2.0) * result.corner_sigma_px:.3f})"
     ]
     lines += [f"found: {_describe(deviation)}" for deviation in result.deviations]
-    explained = math.isfinite(result.tip_error)
-    if explained and not result.deviations:
-        lines.append("no difference from the calibration found")
     if {d.cause for d in result.deviations} >= set(CAMERAS):
         lines.append("both cameras turned, or the target is not at the session's place")
-    if explained:
-        unseen = result.unseen_tip_error
+    if math.isfinite(result.tip_error):
         lines.append(
             f"tips in the phantom, 95 %: off by {1e3 * result.tip_error:.3f} mm; with this target "
-            + (
-                f"errors below {1e3 * unseen:.3f} mm cannot be seen"
-                if unseen < NOTHING_SHOWN
-                else "other errors cannot be seen, however large"
-            )
+            f"errors below {1e3 * result.unseen_tip_error:.3f} mm cannot be seen"
         )
     lines += [f"NOT OK: {problem}" for problem in result.problems]
     if result.ok:
@@ -243,11 +233,10 @@ def report(result: CheckResult) -> str:
 
 def figures(result: CheckResult) -> dict[str, JsonValue]:
     """Return the figures of a check for --json; null for a cause that was not found."""
-    unseen = result.unseen_tip_error if result.unseen_tip_error < NOTHING_SHOWN else math.nan
     values: dict[str, JsonValue] = {
         "ok": result.ok,
         "tip_error_p95_mm": 1e3 * result.tip_error,
-        "unseen_tip_error_p95_mm": 1e3 * unseen,
+        "unseen_tip_error_p95_mm": 1e3 * result.unseen_tip_error,
         "corner_sigma_px": result.corner_sigma_px,
         "reprojection_rms_px": result.reprojection_px,
         "problem": "; ".join(result.problems) or None,

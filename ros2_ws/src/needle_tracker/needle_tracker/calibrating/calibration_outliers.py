@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.calibrating.calibration_session import BoardView
-from needle_tracker.calibrating.pair_consistency import describe_apart
+from needle_tracker.calibrating.calibration_start import describe_apart
 from needle_tracker.calibrating.rig_calibration import RigCalibration
 from needle_tracker.calibrating.rig_fit import (
     LARGEST_MISFIT_PX,

@@ -17,11 +17,13 @@ from needle_core.settings.bounds import check_bounds
 from needle_tracker.calibrating.charuco import CharucoBoard
 from needle_tracker.optics.calibration import (
     SIDES,
+    Window,
+    common_surface,
     number,
     numbers,
     parse_windows,
+    pose_matrix,
 )
-from needle_tracker.optics.window import Window, common_surface
 from needle_tracker.sources.image_files import Image, Sizes, open_pairs, progress
 
 Array = NDArray[np.float64]
@@ -244,11 +246,8 @@ def _place(content: Any, name: str) -> Place:
     if float(np.linalg.norm(np.cross(x, y))) < _LEAST_SINE:
         raise UserError(f"{name}: columns {along} and rows {across} are not at right angles")
     y = y - x * float(x @ y)
-    transform = np.eye(4)
-    transform[:3, :3] = np.stack([x, y / np.linalg.norm(y), np.zeros(3)], axis=-1)
-    transform[:3, 2] = np.cross(transform[:3, 0], transform[:3, 1])
-    transform[:3, 3] = origin
-    return Place(transform, under, sigma)
+    y /= np.linalg.norm(y)
+    return Place(pose_matrix(np.stack([x, y, np.cross(x, y)], axis=-1), origin), under, sigma)
 
 
 def _mapping(content: Any, name: str, keys: tuple[str, ...]) -> dict[str, Any]:

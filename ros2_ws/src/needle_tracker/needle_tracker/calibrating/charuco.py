@@ -7,9 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
@@ -20,6 +18,7 @@ Array = NDArray[np.float64]
 
 _INCH = 0.0254
 _PRINT_DPI = 600
+_SQUARE_PX = 240  # of the drawing that is printed, in whole pixels
 _MARGIN = 0.01  # [m] of white paper on all sides
 
 
@@ -92,33 +91,6 @@ class CharucoBoard:
         flat = np.stack([u.ravel(), v.ravel(), np.zeros(u.size)], axis=-1)
         return np.asarray(self.square * flat)
 
-    def black_squares(self) -> Array:
-        """Return the black squares, and the black modules of the markers.
-
-        Returns
-        -------
-        ndarray, shape (n, 3)
-            x and y of the corner nearest to the origin, and the side, in the board frame [m].
-        """
-        white_first = self.legacy and self.rows % 2 == 0
-        parity = np.add.outer(range(self.rows), range(self.columns)) % 2
-        rows, columns = np.nonzero(parity == white_first)
-        sides = np.full(len(rows), self.square)
-        parts = [np.column_stack([self.square * columns, self.square * rows, sides])]
-        board = self._opencv()
-        dictionary = board.getDictionary()
-        modules = dictionary.markerSize + 2
-        side = self.marker / modules
-        for number, outline in zip(
-            np.asarray(board.getIds()).ravel().tolist(), board.getObjPoints(), strict=True
-        ):
-            origin = np.asarray(outline, dtype=np.float64).reshape(-1, 3)[0, :2]
-            bits = cv2.aruco.generateImageMarker(dictionary, number, modules)
-            rows, columns = np.nonzero(np.asarray(bits) == 0)
-            places = origin + side * np.column_stack([columns, rows])
-            parts.append(np.column_stack([places, np.full(len(rows), side)]))
-        return np.concatenate(parts)
-
     def find(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.intp], Array]:
         """Find the inner corners of the board in an image.
 
@@ -152,6 +124,11 @@ class CharucoBoard:
         found = np.asarray(refined, dtype=np.float64).reshape(-1, 2)
         return np.asarray(numbers, dtype=np.intp).reshape(-1)[order], found[order]
 
+    def drawing(self, square_px: int) -> NDArray[np.uint8]:
+        """Return the pattern without margin, each square of so many pixels."""
+        size = self.columns * square_px, self.rows * square_px
+        return np.asarray(self._opencv().generateImage(size), dtype=np.uint8)
+
     def _opencv(self) -> cv2.aruco.CharucoBoard:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         board = cv2.aruco.CharucoBoard(
@@ -184,11 +161,15 @@ def write_board(board: CharucoBoard, path: Path) -> None:
     axes = figure.add_axes(
         (_MARGIN / paper[0], _MARGIN / paper[1], length / paper[0], height / paper[1])
     )
-    axes.set(xlim=(0.0, length), ylim=(height, 0.0))
     axes.axis("off")
-    # Vector graphics: an image would be rounded to whole dots and enlarge the board.
-    black = [Rectangle((x, y), side, side) for x, y, side in board.black_squares()]
-    axes.add_collection(PatchCollection(black, facecolor="black", linewidth=0.0, snap=False))
+    # A PDF embeds the drawing at its exact size; a PNG would round its edges to whole dots.
+    axes.imshow(
+        board.drawing(_SQUARE_PX),
+        cmap="gray",
+        extent=(0.0, length, height, 0.0),
+        interpolation="none" if path.suffix.lower() == ".pdf" else "bilinear",
+        aspect="auto",
+    )
     figure.text(
         0.5,
         0.25 * _MARGIN / paper[1],

@@ -17,26 +17,24 @@ from needle_tracker.optics.calibration import (
     SIDES,
     Camera,
     StereoCalibration,
+    Window,
     check_camera_matrix,
     numbers,
+    pose_matrix,
     value_of,
 )
-from needle_tracker.optics.refraction import distort
-from needle_tracker.optics.window import Window
 
 Array = NDArray[np.float64]
 
-_RATIONAL = "rational_polynomial"  # of 0, 4, 5, 8, 12 or 14 coefficients, as in OpenCV
-_EQUIDISTANT = "equidistant"  # of 4 coefficients: fisheye of OpenCV
-_MODELS = {"plumb_bob": _RATIONAL, "radtan": _RATIONAL, "none": _RATIONAL, "fisheye": _EQUIDISTANT}
-_COUNTS = {_RATIONAL: (0, 4, 5, 8, 12, 14), _EQUIDISTANT: (4,)}
+_PLUMB_BOB = "plumb_bob"
+# All begin with k1, k2, p1, p2, k3; further coefficients must be 0.
+_MODELS = (_PLUMB_BOB, "radtan", "rational_polynomial", "none")
 _OPENCV_KEYS = (("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"))  # with suffix 1 and 2
 _CURE = (
     "calibrate with plumb_bob (Kalibr: pinhole-radtan; OpenCV: without CALIB_RATIONAL_MODEL), or "
     "run without --lenses"
 )
 _LARGEST_SKEW = 1e-3  # error of the singular values of a rotation: files have few digits
-_LARGEST_MISS_PX = 0.05  # error of plumb_bob instead of another lens model
 
 
 class _Lens(NamedTuple):
@@ -76,13 +74,12 @@ def read_lenses(
     -------
     StereoCalibration
         The left camera is at the origin; the right one too if no file gives the relative pose.
-        Another lens model is replaced by a plumb_bob that equals it to 0.05 px in all the image.
 
     Raises
     ------
     UserError
-        An unreadable or unknown file, not two cameras, images of another size, or a lens that
-        plumb_bob cannot describe.
+        An unreadable or unknown file, not two cameras, images of another size, or another lens
+        model than plumb_bob.
     """
     if len(set(paths)) < len(paths):
         raise UserError(f"--lenses {' '.join(map(str, paths))}: a file is given twice")
@@ -106,8 +103,7 @@ def read_lenses(
             )
         check_camera_matrix(f"--lenses {lens.path}, {side} camera", lens.matrix)
         pose = poses[0] if poses and cameras else np.eye(4)
-        distortion = _plumb_bob(lens, sizes[side])
-        cameras.append(Camera(*sizes[side], lens.matrix, distortion, pose, window))
+        cameras.append(Camera(*sizes[side], lens.matrix, _plumb_bob(lens), pose, window))
     return StereoCalibration(*cameras)
 
 
@@ -168,13 +164,13 @@ def _opencv(text: str, path: Path) -> _Found:
     except (AttributeError, SystemError, cv2.error) as error:
         raise UserError("it is damaged") from error
     lenses = [
-        _Lens(path, _matrix(content, key), _RATIONAL, numbers(content, None, other, "data"), None)
+        _Lens(path, _matrix(content, key), _PLUMB_BOB, numbers(content, None, other, "data"), None)
         for number in "12"
         for key, other in ((m + number, d + number) for m, d in _OPENCV_KEYS)
         if key in content
     ]
     if "camera_matrix" in content:
-        model = _EQUIDISTANT if content.get("fisheye_model") else _RATIONAL
+        model = "fisheye" if content.get("fisheye_model") else _PLUMB_BOB
         lenses.append(_one_camera(content, path, model))
     if "R" not in content:
         return _Found(lenses)
@@ -195,39 +191,15 @@ def _transform(rotation: Array, translation: Array) -> Array:
     left, scales, right = np.linalg.svd(rotation)
     if np.abs(scales - 1.0).max() > _LARGEST_SKEW or np.linalg.det(rotation) < 0.0:
         raise UserError(f"{np.round(rotation, 4).tolist()} is not a rotation")
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = left @ right, translation
-    return transform
+    return pose_matrix(left @ right, translation)
 
 
-def _plumb_bob(lens: _Lens, size: tuple[int, int]) -> Array:
+def _plumb_bob(lens: _Lens) -> Array:
     """Return k1, k2, p1, p2, k3 of a lens, shape (5,)."""
-    matrix, coefficients = lens.matrix, lens.coefficients
-    model = _MODELS.get(lens.model, lens.model)
-    if len(coefficients) not in _COUNTS.get(model, ()):
+    coefficients = lens.coefficients
+    if lens.model not in _MODELS or 0 < len(coefficients) < 4 or np.any(coefficients[5:]):
         raise UserError(
             f"--lenses {lens.path}: distortion model {lens.model} with {len(coefficients)} "
             f"coefficients is not supported: {_CURE}"
         )
-    if model == _RATIONAL and not np.any(coefficients[5:]):
-        return np.append(coefficients, np.zeros(5))[:5]
-    # Rays from the centre outwards, up to the border of the image.
-    turns, slopes = np.linspace(0.0, 2.0 * np.pi, 72), np.tan(np.linspace(0.0, 1.4, 141))
-    ideal = np.stack([np.outer(np.cos(turns), slopes), np.outer(np.sin(turns), slopes)], axis=-1)
-    points = np.insert(ideal.reshape(-1, 1, 2), 2, 1.0, axis=-1)
-    project = cv2.projectPoints if model == _RATIONAL else cv2.fisheye.projectPoints
-    pixels, _ = project(points, np.zeros(3), np.zeros(3), matrix, coefficients)
-    pixels = pixels.reshape(ideal.shape)
-    inside = np.all((pixels >= 0.0) & (pixels <= np.array(size) - 1.0), axis=-1)
-    inside = np.logical_and.accumulate(inside, axis=1)
-    ideal, seen = ideal[inside], (pixels[inside] - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
-    # plumb_bob is linear in its coefficients.
-    basis = np.stack([(distort(ideal, unit) - ideal).ravel() for unit in np.eye(5)], axis=-1)
-    found = np.linalg.lstsq(basis, (seen - ideal).ravel(), rcond=None)[0]
-    miss = float(np.abs(distort(ideal, found) - seen).max() * matrix[0, 0])
-    if miss > _LARGEST_MISS_PX:
-        raise UserError(
-            f"--lenses {lens.path}: plumb_bob differs from its {lens.model} lens by {miss:.2f} px, "
-            f"limit {_LARGEST_MISS_PX} px: {_CURE}"
-        )
-    return np.asarray(found)
+    return np.append(coefficients, np.zeros(5))[:5]

@@ -18,9 +18,9 @@ from needle_tracker.calibrating.calibration_start import (
     are_posed,
     cameras_alone,
     checked_views,
+    consistent_views,
     first_calibration,
 )
-from needle_tracker.calibrating.pair_consistency import consistent_views
 from needle_tracker.calibrating.rig_fit import RigFit, board_parameters_free, fit
 from needle_tracker.calibrating.rig_model import (
     CAMERA_PARAMETERS,
@@ -28,10 +28,15 @@ from needle_tracker.calibrating.rig_model import (
     POSE,
     RigModel,
     camera_slice,
+    tip_error_p95,
 )
-from needle_tracker.calibrating.tip_error import tip_error_p95
-from needle_tracker.optics.calibration import LEAST_BASELINE, SIDES, StereoCalibration
-from needle_tracker.optics.window import Window, common_surface
+from needle_tracker.optics.calibration import (
+    LEAST_BASELINE,
+    SIDES,
+    StereoCalibration,
+    Window,
+    common_surface,
+)
 
 Array = NDArray[np.float64]
 
@@ -56,11 +61,10 @@ _LARGEST_TURN = 0.2  # largest angle between a given relative pose and that of t
 
 @dataclasses.dataclass(frozen=True)
 class Determined:
-    """Result for one parameter: `sigma` is that of the views, `value` is the one in use."""
+    """Result for one parameter: `sigma` is that of the views, whether or not the value was kept."""
 
     value: float
     sigma: float
-    given: float
     kept: bool
 
 
@@ -188,9 +192,7 @@ def calibrate(
             "both cameras are estimated at one place: are left and right the same images?"
         )
     determined = {
-        name: Determined(
-            float(result.parameters[i]), float(sigmas[name]), float(given[i]), not free[i]
-        )
+        name: Determined(float(result.parameters[i]), float(sigmas[name]), not free[i])
         for i, name in enumerate(names)
         if i >= CAMERA_PARAMETERS or (lenses is None and name.split(".")[-1] in LENS)
     }
@@ -209,11 +211,7 @@ def _check_relative_pose(given: Array, seen: Array) -> None:
         raise UserError(
             f"--lenses puts the cameras {1e3 * lengths[0]:.4g} mm apart, the images put them "
             f"{1e3 * lengths[1]:.1f} mm apart"
-            + (
-                ": is T in metres?"
-                if alike
-                else ", in another direction: are left and right exchanged?"
-            )
+            + (": is T in metres?" if alike else ": are left and right exchanged?")
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.detector.end_fit import FIT, ImageEnd, fit_end
-from needle_tracker.detector.end_search import ShaftPath, find_paths
+from needle_tracker.detector.end_search import ShaftPath, find_paths, make_search_grid
 from needle_tracker.detector.needle_net import (
     MARGIN_PX,
     MAX_WIDTH_PX,
@@ -21,8 +21,8 @@ from needle_tracker.detector.needle_net import (
     NeedleNet,
     normalized,
 )
-from needle_tracker.detector.search_grid import Reach, SearchGrid, make_search_grid
 from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = NDArray[np.float64]
 Pixels = TypeVar("Pixels", NDArray[np.float32], NDArray[np.float64])
@@ -66,12 +66,8 @@ class NeedleDetector:
     ----------
     view : RefractedCamera
         The camera.
-    needle_width : float
-        Diameter of the needle, good to 30 % [m].
-    reach : Reach
-        Physical reach of the needle.
-    hole_clearance : float
-        Radius about the entry that is excluded from the search [m].
+    settings : StereoTrackerParameters
+        Width and reach of the needle.
     net : NeedleNet
         The network.
 
@@ -82,25 +78,20 @@ class NeedleDetector:
     """
 
     def __init__(
-        self,
-        view: RefractedCamera,
-        needle_width: float,
-        reach: Reach,
-        hole_clearance: float,
-        net: NeedleNet,
+        self, view: RefractedCamera, settings: StereoTrackerParameters, net: NeedleNet
     ) -> None:
         self._net = net
-        middle = np.array([0.0, 0.0, 0.5 * reach.length])
+        middle = np.array([0.0, 0.0, 0.5 * settings.max_insertion])
         facing = np.stack([view.sideways, [0.0, 0.0, 1.0]], axis=-1)
         self._px_per_m = float(np.linalg.norm(view.jacobian(middle) @ facing, axis=0).mean())
-        self.width_px = needle_width * self._px_per_m
+        self.width_px = settings.needle_width * self._px_per_m
         self._shrink = 1 if self.width_px <= MAX_WIDTH_PX else 2
         self._search_shrink = self._shrink
         if self.width_px >= DETECTOR.coarse_width_px * self._shrink:
             self._search_shrink *= 2
-        self._grid: SearchGrid = make_search_grid(view, reach, hole_clearance)
+        self._grid = make_search_grid(view, settings)
         self._entry = view.project(np.zeros(3))
-        self._clear_px = hole_clearance * self._px_per_m
+        self._clear_px = settings.hole_clearance * self._px_per_m
         self._backgrounds: dict[int, Map] = {}
         self._shrunk: dict[int, Image] = {}
 
@@ -275,17 +266,12 @@ class NeedleDetector:
         corners = np.array(along)[:, None] * direction + point
         beside = across + FIT.aside_widths * self.width_px
         low, high = corners.min(axis=0) - beside, corners.max(axis=0) + beside
-        height, width = self._shape
+        height, width = self._shrunk[1].shape
         if not np.isfinite(low + high).all() or (high < 0).any() or (low > (width, height)).any():
             return None
         first = np.floor(low / self._shrink).astype(int)
         last = np.ceil(high / self._shrink).astype(int) + 1
         return (*first.tolist(), *last.tolist())
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        height, width = self._shrunk[1].shape
-        return height, width
 
     def _at(self, shrink: int) -> Image:
         if shrink not in self._shrunk:

@@ -14,9 +14,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.filter.settings import FilterSettings, TrackerSettings
+from needle_tracker.filter.settings import FILTER
 from needle_tracker.stereo.sighting import PAIRING, Sighting
 from needle_tracker.stereo.triangulation import SpatialTip
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ class NeedleMotion:
     covariance: Array
 
     @staticmethod
-    def begin(tip: SpatialTip, settings: TrackerSettings) -> NeedleMotion:
+    def begin(tip: SpatialTip, settings: StereoTrackerParameters) -> NeedleMotion:
         """Return the state after a first sighting.
 
         The heading of the path is that of the visible end, with half the lean as its uncertainty.
@@ -56,7 +57,7 @@ class NeedleMotion:
         covariance[SCALE, SCALE] = settings.stage_scale_sigma**2
         return NeedleMotion(mean, covariance)
 
-    def advanced(self, way: float, curvature: float, settings: FilterSettings) -> NeedleMotion:
+    def advanced(self, way: float, curvature: float) -> NeedleMotion:
         """Return the state after a way of the base of the needle.
 
         p_{k+1} = p_k + (1 + scale) way h_k,  h_{k+1} = h_k + turn across h_k
@@ -67,8 +68,6 @@ class NeedleMotion:
             Way of the base, negative for a retraction [m].
         curvature : float
             Largest curvature of the path [1/m].
-        settings : FilterSettings
-            Noise of the motion.
         """
         heading = self.mean[HEADING] / np.linalg.norm(self.mean[HEADING])
         mean, transition = self.mean.copy(), np.eye(SIZE)
@@ -80,9 +79,9 @@ class NeedleMotion:
         turn = curvature * way
         noise = np.zeros((SIZE, SIZE))
         noise[POSITION, POSITION] = (
-            (settings.slip_sigma * way) ** 2 * np.outer(heading, heading)
+            (FILTER.slip_sigma * way) ** 2 * np.outer(heading, heading)
             + (0.5 * turn * way) ** 2 * _across(heading)
-            + settings.drift_sigma**2 * np.eye(3)
+            + FILTER.drift_sigma**2 * np.eye(3)
         )
         noise[HEADING, HEADING] = turn**2 * _across(heading)
         return NeedleMotion(mean, transition @ self.covariance @ transition.T + noise)
@@ -190,36 +189,35 @@ class NeedleTrack:
 
     @staticmethod
     def begin(
-        sighting: Sighting, insertion: float | None, settings: TrackerSettings
+        sighting: Sighting, insertion: float | None, settings: StereoTrackerParameters
     ) -> NeedleTrack:
         """Return the track of a first sighting."""
-        tip, numbers = sighting.tip, settings.filter
+        tip = sighting.tip
         motion = NeedleMotion.begin(tip, settings)
         if insertion is not None and sighting.length is not None:
-            motion = motion.measured(sighting.length, insertion, numbers.length_sigma)
-        end = numbers.prior_log_odds + sighting.evidence
+            motion = motion.measured(sighting.length, insertion, FILTER.length_sigma)
+        end = FILTER.prior_log_odds + sighting.evidence
         place = place_log_odds(sighting, insertion, settings)
         return NeedleTrack(
             motion, tip.position, tip.covariance, end, place, 0.0, insertion
-        )._bounded(settings)
+        )._bounded()
 
-    def predicted(self, insertion: float | None, settings: TrackerSettings) -> NeedleTrack:
+    def predicted(self, insertion: float | None, settings: StereoTrackerParameters) -> NeedleTrack:
         """Return the track at the next pair, before a sighting in it."""
-        numbers, curvature = settings.filter, settings.reach.curvature
-        step, way, way_sigma = 0.0, None, numbers.free_step * math.sqrt(self.misses + 1.0)
+        step, way, way_sigma = 0.0, None, FILTER.free_step * math.sqrt(self.misses + 1.0)
         if insertion is not None and self.insertion is not None:
             step, way_sigma = insertion - self.insertion, 0.0
             way = None if self.way is None else self.way + step
         return dataclasses.replace(
             self,
-            motion=self.motion.advanced(step, curvature, numbers),
+            motion=self.motion.advanced(step, settings.max_curvature),
             way=way,
             way_sigma=way_sigma,
-            place_covariance=self.place_covariance + numbers.drift_sigma**2 * np.eye(3),
+            place_covariance=self.place_covariance + FILTER.drift_sigma**2 * np.eye(3),
             insertion=insertion,
         )
 
-    def surprise(self, tip: SpatialTip, settings: TrackerSettings) -> float:
+    def surprise(self, tip: SpatialTip, settings: StereoTrackerParameters) -> float:
         """Return the squared distance over the covariance of a sighting that may be this track's.
 
         The smaller of the distances from the needle, with an unknown way, and from the place.
@@ -229,24 +227,24 @@ class NeedleTrack:
         as_other, _ = gaussian(tip.position - self.place, self.place_covariance + tip.covariance)
         return min(as_needle, as_other)
 
-    def fits(self, tip: SpatialTip, settings: TrackerSettings) -> bool:
+    def fits(self, tip: SpatialTip, settings: StereoTrackerParameters) -> bool:
         """Return whether a sighting may be this track's."""
         return self.surprise(tip, settings) < PAIRING.gate
 
-    def seen(self, sighting: Sighting, settings: TrackerSettings) -> NeedleTrack:
+    def seen(self, sighting: Sighting, settings: StereoTrackerParameters) -> NeedleTrack:
         """Return the predicted track after a sighting that `fits`."""
-        numbers, tip = settings.filter, sighting.tip
+        tip = sighting.tip
         motion = self._motion_to(tip, settings)
         _, stood = gaussian(tip.position - self.place, self.place_covariance + tip.covariance)
         gain = self._log_density(tip, motion, stood) - _log_sum(
-            stood, math.log(numbers.chance_density)
+            stood, math.log(FILTER.chance_density)
         )
         place, covariance = _merged(self.place, self.place_covariance, tip)
         way = math.dist(tip.position, self.place) if self.way is None else abs(self.way)
-        independent = min(way / numbers.evidence_length, 1.0)
+        independent = min(way / FILTER.evidence_length, 1.0)
         # The end after a gap may be that of another thing, such as the shadow of the needle.
         before = self.motion_log_odds
-        before = max(before - numbers.miss_cost * self.misses, min(before, 0.0))
+        before = max(before - FILTER.miss_cost * self.misses, min(before, 0.0))
         return dataclasses.replace(
             self,
             motion=motion.seen(tip),
@@ -260,14 +258,14 @@ class NeedleTrack:
             motion_log_odds=before + gain,
             way=0.0,
             misses=0,
-        )._bounded(settings)
+        )._bounded()
 
-    def _motion_to(self, tip: SpatialTip, settings: TrackerSettings) -> NeedleMotion:
+    def _motion_to(self, tip: SpatialTip, settings: StereoTrackerParameters) -> NeedleMotion:
         """Return the state at a sighting: an unknown way is that to the sighting."""
         if self.way_sigma == 0.0:
             return self.motion
         way = self._ways(tip) * self.way_sigma
-        return self.motion.advanced(way, settings.reach.curvature, settings.filter)
+        return self.motion.advanced(way, settings.max_curvature)
 
     def _ways(self, tip: SpatialTip) -> float:
         """Return the way to a sighting in standard deviations; 0 if the insertion is known."""
@@ -293,7 +291,7 @@ class NeedleTrack:
         """Return the predicted track after a pair without a sighting."""
         return dataclasses.replace(self, misses=self.misses + 1)
 
-    def log_odds(self, settings: TrackerSettings) -> float:
+    def log_odds(self) -> float:
         """Return the log-odds that this is the needle.
 
         The alternatives are the end of another thing, which does not move as the needle does; no
@@ -307,15 +305,15 @@ class NeedleTrack:
         if self.insertion is None:
             no_end -= self.motion_log_odds
         others = _log_sum(-self.motion_log_odds, no_end)
-        return self.place_log_odds - _log_sum(others, -settings.filter.shadow_log_odds)
+        return self.place_log_odds - _log_sum(others, -FILTER.shadow_log_odds)
 
-    def rank(self, settings: TrackerSettings) -> float:
+    def rank(self) -> float:
         """Return the log-odds against other tracks, which fall with each miss."""
-        return self.log_odds(settings) - settings.filter.miss_cost * self.misses
+        return self.log_odds() - FILTER.miss_cost * self.misses
 
-    def _bounded(self, settings: TrackerSettings) -> NeedleTrack:
+    def _bounded(self) -> NeedleTrack:
         """Return the track with bounded log-odds."""
-        bound = settings.filter.max_log_odds
+        bound = FILTER.max_log_odds
         return dataclasses.replace(
             self,
             end_log_odds=min(max(self.end_log_odds, -bound), bound),
@@ -333,7 +331,9 @@ class NeedleTrack:
         return float(self.motion.mean[ZERO]), float(self.motion.mean[SCALE])
 
 
-def place_log_odds(sighting: Sighting, insertion: float | None, settings: TrackerSettings) -> float:
+def place_log_odds(
+    sighting: Sighting, insertion: float | None, settings: StereoTrackerParameters
+) -> float:
     """Return the log-odds that it is the needle that ends in a place.
 
     The needle is as long as the insertion, while other things end at any distance. An end that
@@ -346,10 +346,10 @@ def place_log_odds(sighting: Sighting, insertion: float | None, settings: Tracke
     sigma = math.hypot(
         settings.stage_zero_sigma,
         settings.stage_scale_sigma * insertion,
-        settings.filter.length_sigma,
+        FILTER.length_sigma,
     )
     off = (sighting.length - insertion) / sigma
-    return math.log(settings.reach.length / (math.sqrt(2.0 * math.pi) * sigma)) - 0.5 * off * off
+    return math.log(settings.max_insertion / (math.sqrt(2.0 * math.pi) * sigma)) - 0.5 * off * off
 
 
 def _merged(place: Array, covariance: Array, tip: SpatialTip) -> tuple[Array, Array]:
@@ -366,14 +366,14 @@ def _log_sum(one: float, other: float) -> float:
     return float(np.logaddexp(one, other))
 
 
-def tip_at_entry(insertion: float, settings: TrackerSettings) -> SpatialTip:
+def tip_at_entry(insertion: float, settings: StereoTrackerParameters) -> SpatialTip:
     """Return the tip of a needle that is not visible yet, on the z axis of `rig`."""
-    reach = settings.reach
-    sideways = math.hypot(reach.hole_tolerance, insertion * math.sin(reach.entry_angle))
-    along = math.hypot(reach.hole_tolerance, insertion * (1.0 - math.cos(reach.entry_angle)))
+    hole, angle = settings.hole_tolerance, settings.entry_angle
+    sideways = math.hypot(hole, insertion * math.sin(angle))
+    along = math.hypot(hole, insertion * (1.0 - math.cos(angle)))
     return SpatialTip(
         np.array([0.0, 0.0, insertion]),
         np.diag([sideways**2, sideways**2, along**2]),
         np.array([0.0, 0.0, 1.0]),
-        np.diag([reach.entry_angle**2, reach.entry_angle**2, 0.0]),
+        np.diag([angle**2, angle**2, 0.0]),
     )

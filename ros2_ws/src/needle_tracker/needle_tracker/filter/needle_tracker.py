@@ -18,13 +18,17 @@ from needle_tracker.detector.needle_detector import DETECTOR, NeedleDetector
 from needle_tracker.detector.needle_net import NeedleNet
 from needle_tracker.filter.measurement import Measurement, NoTip, TrackState
 from needle_tracker.filter.needle_track import HEADING, NeedleTrack, tip_at_entry
-from needle_tracker.filter.settings import Image, Pair, TrackerSettings
+from needle_tracker.filter.settings import FILTER
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.optics.refraction import stereo_views
 from needle_tracker.stereo.sighting import PAIRING, Ends, Sighting, StereoSearch, evidence
 from needle_tracker.stereo.triangulation import SpatialTip, triangulate
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Pair = tuple[Image, Image]
+"""Left and right image."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,31 +101,28 @@ class NeedleTracker:
     ----------
     calibration : StereoCalibration
         The stereo rig.
-    settings : TrackerSettings
-        Needle, stage and filter.
+    settings : StereoTrackerParameters
+        Needle and stage.
+    reference : pair of ndarray of uint8, shape (height, width), or None
+        Left and right image of the phantom without needle.
     """
 
-    def __init__(self, calibration: StereoCalibration, settings: TrackerSettings) -> None:
+    def __init__(
+        self,
+        calibration: StereoCalibration,
+        settings: StereoTrackerParameters,
+        reference: Pair | None = None,
+    ) -> None:
         # Results must not depend on the number of cores.
         cv2.setNumThreads(1)
         self.settings = settings
         self.views = stereo_views(calibration)
         self._shapes = tuple((c.height, c.width) for c in (calibration.left, calibration.right))
-        net, clearance = NeedleNet(), settings.hole_clearance
-        left, right = (
-            NeedleDetector(view, settings.needle_width, settings.reach, clearance, net)
-            for view in self.views
-        )
+        net = NeedleNet()
+        left, right = (NeedleDetector(view, settings, net) for view in self.views)
         self._detectors = (left, right)
-        self._search = StereoSearch(
-            self.views,
-            self._detectors,
-            settings.reach,
-            settings.windows,
-            settings.tip_lean,
-            settings.entry_zone,
-        )
-        self._background = self._new_background(settings.reference)
+        self._search = StereoSearch(self.views, self._detectors, settings)
+        self._background = self._new_background(reference)
         self._views_before: tuple[Array, ...] | None = None
         self._current_background: Pair | None = None
         self.reset()
@@ -216,7 +217,7 @@ class NeedleTracker:
         if sighting is not None and best is not None:
             predicted, followed = self._tracks, best.seen(sighting, settings)
             self._tracks = [followed if t is best else t.missed() for t in predicted]
-            if self._probability(followed) > settings.filter.accepted:
+            if self._probability(followed) > FILTER.accepted:
                 return self._answer(sighting, "")
             self._tracks = predicted
         if changed:
@@ -243,16 +244,16 @@ class NeedleTracker:
     def _look_everywhere(self, insertion: float | None) -> tuple[Sighting | None, Ends]:
         """Search both images; return the best sighting and the best end of each view."""
         settings = self.settings
-        least, most = settings.hole_clearance, settings.reach.length
+        least, most = settings.hole_clearance, settings.max_insertion
         if insertion is not None:
             margin = PAIRING.sigmas * math.hypot(
                 settings.stage_zero_sigma, settings.stage_scale_sigma * insertion
             )
-            least = max(least, settings.reach.shortest_chord(insertion) - margin)
+            least = max(least, settings.shortest_chord(insertion) - margin)
             most = min(most, insertion + margin)
         left, ends = self._search.search(least, most)
         tracks: list[tuple[NeedleTrack, Sighting | None]] = []
-        for track in sorted(self._tracks, key=lambda t: -t.rank(settings)):
+        for track in sorted(self._tracks, key=lambda t: -t.rank()):
             own = min(left, key=lambda s: track.surprise(s.tip, settings), default=None)
             if own is None or not track.fits(own.tip, settings):
                 tracks.append((track.missed(), None))
@@ -260,15 +261,15 @@ class NeedleTracker:
                 left.remove(own)
                 tracks.append((track.seen(own, settings), own))
         tracks += [(NeedleTrack.begin(each, insertion, settings), each) for each in left]
-        kept = [pair for pair in tracks if pair[0].misses < settings.filter.forgotten_after]
-        kept.sort(key=lambda pair: -pair[0].rank(settings))
+        kept = [pair for pair in tracks if pair[0].misses < FILTER.forgotten_after]
+        kept.sort(key=lambda pair: -pair[0].rank())
         self._tracks = [track for track, _ in kept[: FOLLOWING.tracks]]
         return kept[0][1] if kept else None, ends
 
     def _follow(self, track: NeedleTrack) -> Sighting | None:
         """Return the sighting of a track at its predicted tip; None if the fit fails."""
         position, covariance = track.tip
-        if float(np.linalg.eigvalsh(covariance)[-1]) > (2.0 * self.settings.filter.free_step) ** 2:
+        if float(np.linalg.eigvalsh(covariance)[-1]) > (2.0 * FILTER.free_step) ** 2:
             return None
         heading = track.motion.mean[HEADING]
         ends = []
@@ -303,12 +304,11 @@ class NeedleTracker:
         if best is None:
             self._believed = False
             return Measurement(None, TrackState.SEARCHING, reason or NoTip.NOTHING, ends)
-        numbers = self.settings.filter
         probability = self._probability(best)
-        accepted = probability > numbers.accepted
-        self._believed = accepted or (self._believed and best.log_odds(self.settings) > 0.0)
+        accepted = probability > FILTER.accepted
+        self._believed = accepted or (self._believed and best.log_odds() > 0.0)
         state = TrackState.TRACKING if self._believed else TrackState.CONFIRMING
-        if self._believed and best.misses >= numbers.lost_after:
+        if self._believed and best.misses >= FILTER.lost_after:
             state = TrackState.LOST
         if sighting is not None:
             ends = sighting.ends
@@ -328,19 +328,18 @@ class NeedleTracker:
         Errors by a bevel, its light or a shadow beside the shaft persist from pair to pair: they
         cancel in motion, and pairs are not averaged.
         """
-        numbers = self.settings.filter
-        if float(np.linalg.eigvalsh(tip.covariance)[-1]) > numbers.max_sigma**2:
+        if float(np.linalg.eigvalsh(tip.covariance)[-1]) > FILTER.max_sigma**2:
             return None
-        hidden = numbers.end_sigma * self.settings.needle_width * tip.direction
+        hidden = FILTER.end_sigma * self.settings.needle_width * tip.direction
         return dataclasses.replace(tip, covariance=tip.covariance + np.outer(hidden, hidden))
 
     def _best(self) -> NeedleTrack | None:
-        return max(self._tracks, key=lambda track: track.rank(self.settings), default=None)
+        return max(self._tracks, key=lambda track: track.rank(), default=None)
 
     def _probability(self, track: NeedleTrack) -> float:
         """Return the probability that a track, and no other, is the needle."""
-        odds = [math.exp(each.rank(self.settings)) for each in self._tracks]
-        return math.exp(track.rank(self.settings)) / (1.0 + sum(odds))
+        odds = [math.exp(each.rank()) for each in self._tracks]
+        return math.exp(track.rank()) / (1.0 + sum(odds))
 
     def _new_background(self, reference: Pair | None) -> Background:
         return Background(reference, FOLLOWING.least_new_widths * self.settings.needle_width)

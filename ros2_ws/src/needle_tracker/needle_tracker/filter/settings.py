@@ -1,18 +1,8 @@
-"""Settings of the tracker besides the calibration, and the numbers of its filter."""
+"""Numbers of the filter over time."""
 
 from __future__ import annotations
 
 import dataclasses
-
-import numpy as np
-from numpy.typing import NDArray
-
-from needle_tracker.detector.search_grid import Reach
-from needle_tracker.optics.window import Window
-
-Image = NDArray[np.uint8]
-Pair = tuple[Image, Image]
-"""Left and right image."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,41 +66,4 @@ class FilterSettings:
         return 2.0 * self.max_log_odds / self.miss_cost
 
 
-@dataclasses.dataclass(frozen=True)
-class TrackerSettings:
-    """Settings of the tracker besides the calibration.
-
-    Attributes
-    ----------
-    reach : Reach
-        Physical reach of the needle.
-    windows : tuple of Window
-        Windows of the cameras.
-    needle_width : float
-        Diameter of the needle, to within 30 % [m].
-    tip_lean : float
-        Largest angle between the visible end and the path of the needle (pre-bend) [rad].
-    entry_zone : float
-        Insertion below which the tip of a needle that is not seen follows from the insertion [m].
-    hole_clearance : float
-        Radius around the entry that is excluded from the search [m].
-    stage_zero_sigma : float
-        Standard deviation of the insertion at which the tip is at the entry [m].
-    stage_scale_sigma : float
-        Standard deviation of the scale of the insertion [-].
-    filter : FilterSettings
-        Numbers of the filter.
-    reference : pair of ndarray of uint8, shape (height, width), or None
-        Left and right image of the phantom without needle.
-    """
-
-    reach: Reach
-    windows: tuple[Window, ...]
-    needle_width: float
-    tip_lean: float
-    entry_zone: float
-    hole_clearance: float
-    stage_zero_sigma: float
-    stage_scale_sigma: float
-    filter: FilterSettings = dataclasses.field(default_factory=FilterSettings)
-    reference: Pair | None = dataclasses.field(default=None, compare=False)
+FILTER = FilterSettings()

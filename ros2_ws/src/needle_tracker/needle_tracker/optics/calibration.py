@@ -1,4 +1,4 @@
-"""Calibration file of the stereo rig: reading and checks."""
+"""Calibration of the stereo rig: cameras, the windows that they look through, and its file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from needle_core.errors import UserError
 from needle_core.files.yaml_files import load_yaml, read_calibration
 from needle_core.settings.bounds import ABOVE_0, check_bounds
-from needle_tracker.optics.window import Layer, Window, common_surface, surface_from_above
 
 SIDES = ("left", "right")
 LEAST_BASELINE = 1e-3  # distance between the cameras [m]
@@ -23,6 +22,103 @@ _DISTORTION_MODEL = "plumb_bob"
 _INDICES = (1.0, 3.0)
 _THICKEST = 0.5  # largest thickness of a layer [m]
 _LEAST_ASIDE = 0.3  # component of the normal of a window across the needle [-]
+
+
+@dataclasses.dataclass(frozen=True)
+class Layer:
+    """A plane-parallel plate, such as a wall of acrylic.
+
+    Attributes
+    ----------
+    thickness : float
+        Along the normal of the window [m].
+    refractive_index : float
+        Relative to air [-], at least 1.
+    """
+
+    thickness: float
+    refractive_index: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """Surface at which light enters the body with the needle.
+
+    Attributes
+    ----------
+    point : ndarray, shape (3,)
+        Any point of the outer face in `rig` [m].
+    normal : ndarray, shape (3,)
+        Unit vector in `rig`, across the faces and towards the camera.
+    layers : tuple of Layer
+        From the outer face inwards; none for a body with a free surface.
+    inside : float
+        Refractive index of the body relative to air [-], at least 1.
+    """
+
+    point: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    layers: tuple[Layer, ...]
+    inside: float
+
+    @property
+    def thickness(self) -> float:
+        """Thickness of all layers together [m]."""
+        return sum(layer.thickness for layer in self.layers)
+
+    def height(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the height of points above the outer face, towards the camera.
+
+        Parameters
+        ----------
+        points : ndarray, shape (..., 3)
+            In `rig` [m].
+
+        Returns
+        -------
+        ndarray, shape (...)
+            Negative behind the face [m].
+        """
+        return np.asarray((points - self.point) @ self.normal)
+
+    def depth(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the depth of points in the body, behind all layers.
+
+        Parameters
+        ----------
+        points : ndarray, shape (..., 3)
+            In `rig` [m].
+
+        Returns
+        -------
+        ndarray, shape (...)
+            Negative in a layer and before the window [m].
+        """
+        return -self.height(points) - self.thickness
+
+
+def common_surface(left: Window, right: Window) -> Window | None:
+    """Return the level, free surface that two windows share, if any."""
+    for window in (left, right):
+        if window.layers or not np.array_equal(window.normal, [1.0, 0.0, 0.0]):
+            return None
+    same = left.point[0] == right.point[0] and left.inside == right.inside
+    return left if same else None
+
+
+def surface_from_above(surface_height: float, refractive_index: float) -> Window:
+    """Return the free, level surface of a body.
+
+    Parameters
+    ----------
+    surface_height : float
+        x of the surface in `rig` [m].
+    refractive_index : float
+        Refractive index of the body relative to air [-].
+    """
+    return Window(
+        np.array([surface_height, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), (), refractive_index
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,6 +6,7 @@ import sys
 import time
 from argparse import Namespace
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -76,17 +77,12 @@ def parse(arguments: Sequence[str]) -> Namespace:
         Contradictory options, or a number out of bounds.
     """
     given = _parser().parse_args(arguments)
-    if (given.live is None) != (given.left is not None and given.right is not None):
+    if len({given.left is None, given.right is None, given.live is not None}) > 1:
         raise UserError("give either --left and --right, or --live; see --help")
-    if given.live is not None and (given.left is not None or given.right is not None):
-        raise UserError("--live takes its images from topics: omit --left and --right")
-    for name, lower, upper, unit in (
-        ("count", 1, 1000, "pairs"),
-        ("timeout", 0.1, 3600.0, "s"),
-        ("pair_tolerance", 0.0, 0.1, "s"),
-        ("limit_mm", 0.001, 10.0, "mm"),
-    ):
-        check_bounds(f"--{name.replace('_', '-')}", getattr(given, name), lower, upper, unit)
+    check_bounds("--count", given.count, 1, 1000, "pairs")
+    check_bounds("--timeout", given.timeout, 0.1, 3600.0, "s")
+    check_bounds("--pair-tolerance", given.pair_tolerance, 0.0, 0.1, "s")
+    check_bounds("--limit-mm", given.limit_mm, 0.001, 10.0, "mm")
     given.limit = 1e-3 * given.limit_mm
     return given
 
@@ -115,11 +111,8 @@ def check_calibration(options: Namespace, words: list[str]) -> int:
         for side, wanted in calibration.sizes.items():
             if problem := size_problem(side, sizes[side], wanted):
                 raise UserError(problem)
-        free = [view.name for view in views if view.place is None]
-        if free:
-            print(
-                f"treated as held freely in air, the session has no such place: {', '.join(free)}"
-            )
+        if free := [view.name for view in views if view.place is None]:
+            print(f"held freely in air, as the session has no such place: {', '.join(free)}")
     else:
         views = [_live_view(options, calibration, session, words)]
     result = check(calibration, views, options.limit)
@@ -140,66 +133,49 @@ def _live_view(
     remove_incomplete_ports()
     rclpy.init(args=words, context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        pairs = _Capture(context, calibration, options).take()
+        pairs = _live_pairs(context, calibration, options)
     finally:
         rclpy.try_shutdown(context=context)
     return averaged_view(name, session, pairs)
 
 
-class _Capture(WholeNode):
-    """Node that receives a number of image pairs."""
+def _live_pairs(
+    context: Context, calibration: StereoCalibration, options: Namespace
+) -> list[dict[str, np.ndarray]]:
+    """Receive image pairs; raise a `UserError` for images of other cameras, or too few."""
+    node = WholeNode("check_calibration", context=context)
+    matcher: PairMatcher[Frame] = PairMatcher(round(1e9 * options.pair_tolerance))
+    pairs: list[dict[str, np.ndarray]] = []
 
-    def __init__(
-        self, context: Context, calibration: StereoCalibration, options: Namespace
-    ) -> None:
-        super().__init__("check_calibration", context=context)
-        self._options = options
-        self._cameras = calibration.cameras
-        self._matcher: PairMatcher[Frame] = PairMatcher(round(1e9 * options.pair_tolerance))
-        self._pairs: list[dict[str, np.ndarray]] = []
-        self._problem = ""
-        for side in SIDES:
-            self.create_subscription(
-                Image,
-                f"stereo/{side}/image_raw",
-                lambda message, side=side: self._on_image(side, message),
-                IMAGES_BEST_EFFORT,
-            )
-
-    def take(self) -> list[dict[str, np.ndarray]]:
-        """Return the pairs.
-
-        Raises
-        ------
-        UserError
-            Images of other cameras, or too few before the timeout.
-        """
-        executor = SingleThreadedExecutor(context=self.context)
-        executor.add_node(self)
-        end = time.monotonic() + self._options.timeout
-        try:
-            while len(self._pairs) < self._options.count and not self._problem:
-                left = end - time.monotonic()
-                if left <= 0.0:
-                    raise UserError(
-                        f"{len(self._pairs)} image pairs of {self._options.count} in "
-                        f"{self._options.timeout:g} s on stereo/{{left,right}}/image_raw "
-                        f"(without a partner: {self._matcher.unpaired.total()})"
-                    )
-                executor.spin_once(timeout_sec=left)
-        finally:
-            executor.shutdown()
-            self.destroy_node()
-        if self._problem:
-            raise UserError(self._problem)
-        return self._pairs
-
-    def _on_image(self, side: str, message: Image) -> None:
-        frame = frame_of(message, side, self._cameras[side])
-        self._problem = self._problem or frame.problem
-        pair = self._matcher.add(side, to_nanoseconds(message.header.stamp), frame)
+    def receive(side: str, message: Image) -> None:
+        frame = frame_of(message, side, calibration.cameras[side])
+        if frame.pixels is None:
+            raise UserError(frame.problem)
+        image = frame.pixels.copy()
+        pair = matcher.add(side, to_nanoseconds(message.header.stamp), Frame(image))
         if pair is not None and pair.left.pixels is not None and pair.right.pixels is not None:
-            self._pairs.append({"left": pair.left.pixels.copy(), "right": pair.right.pixels.copy()})
+            pairs.append({"left": pair.left.pixels, "right": pair.right.pixels})
+
+    for side in SIDES:
+        on_image = partial(receive, side)
+        node.create_subscription(Image, f"stereo/{side}/image_raw", on_image, IMAGES_BEST_EFFORT)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    end = time.monotonic() + options.timeout
+    try:
+        while len(pairs) < options.count:
+            left = end - time.monotonic()
+            if left <= 0.0:
+                raise UserError(
+                    f"{len(pairs)} image pairs of {options.count} in {options.timeout:g} s on "
+                    f"stereo/{{left,right}}/image_raw (without a partner: "
+                    f"{matcher.unpaired.total()})"
+                )
+            executor.spin_once(timeout_sec=left)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+    return pairs
 
 
 if __name__ == "__main__":

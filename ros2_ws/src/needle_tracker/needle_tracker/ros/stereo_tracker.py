@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 
 from needle_core.ros.main import run_component
-from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.stereo_tracker import make_tracker
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 HELP = """
 stereo_tracker: measures the needle's tip in stereo images through the phantom's surface.

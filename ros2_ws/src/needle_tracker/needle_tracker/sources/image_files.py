@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import itertools
-import math
 import re
 import sys
 from collections.abc import Iterator, Mapping
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from needle_core.commands.options import number
 from needle_core.errors import UserError
 
 Image = NDArray[np.uint8]
@@ -131,18 +131,18 @@ class PairSequence:
     def _frames(self) -> Iterator[NamedPair]:
         videos = [cv2.VideoCapture(str(path)) for path in (self._left, self._right)]
         self.unpaired.clear()
-        for number in itertools.count():
+        for index in itertools.count():
             left, right = frames = [_next_frame(video) for video in videos]
             if left is None or right is None:
                 break
-            name = f"{number:06d}"
+            name = f"{index:06d}"
             yield NamedPair(name, left, right, (self._left / name, self._right / name))
         for side, video, more in zip(_SIDES, videos, frames, strict=True):
-            unpaired, frame = number, more
+            unpaired, frame = index, more
             while frame is not None:
                 self.unpaired.append(f"{side} {unpaired:06d}")
                 unpaired, frame = unpaired + 1, _next_frame(video)
-        self.cut_off = max(len(self.names) - number, 0)
+        self.cut_off = max(len(self.names) - index, 0)
 
 
 def open_pairs(left: Path, right: Path) -> PairSequence:
@@ -173,7 +173,7 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
         counts = [
             _frame_count(side, path) for side, path in zip(_SIDES, (left, right), strict=True)
         ]
-        names = [f"{number:06d}" for number in range(max(min(counts), 0))]
+        names = [f"{index:06d}" for index in range(max(min(counts), 0))]
         return PairSequence(names, [], left, right, None)
     one_folder = left.samefile(right)
     left, right = _image_folder(left), _image_folder(right)
@@ -319,23 +319,15 @@ def read_numbers(
                     raise UserError(f"{where}: {name!r} is a duplicate")
                 values = zip(columns, texts, strict=True)
                 found[name] = (
-                    [_number(text, where, c) for c, text in values] if any(texts) else None
+                    [number(f"{where}: {c}", text, -10.0, 10.0, "m") for c, text in values]
+                    if any(texts)
+                    else None
                 )
     except OSError as error:
         raise UserError(f"{option} {path}: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{option} {path} is not a CSV file: {error}") from error
     return found
-
-
-def _number(text: str, where: str, column: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise UserError(f"{where}: {column} = {text!r} is not a finite number")
-    return value
 
 
 def _image_folder(folder: Path) -> Path:
@@ -364,18 +356,9 @@ def _natural(name: str) -> tuple[list[tuple[int, str]], str]:
 
 def _read(path: Path) -> Image | None:
     """Return the grey image of a file; None unless it has 8 bits."""
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError:
-        return None
-    if not data.size:
-        return None
     # Without ANYDEPTH OpenCV would silently convert 16 bits to 8.
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        return _grey(cv2.imdecode(data, flags))
-    except cv2.error:
-        return None
+    return _grey(cv2.imread(str(path), flags))
 
 
 def _frame_count(side: str, path: Path) -> int:

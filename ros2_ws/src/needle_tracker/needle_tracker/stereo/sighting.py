@@ -18,11 +18,9 @@ from needle_core.compiled import compiled
 from needle_tracker.detector.end_fit import ImageEnd
 from needle_tracker.detector.end_search import SEARCH, ShaftPath
 from needle_tracker.detector.needle_detector import NeedleDetector
-from needle_tracker.detector.search_grid import Reach
-from needle_tracker.optics.compiled_projection import cross, dot, pixel_ray
-from needle_tracker.optics.refraction import RefractedCamera
-from needle_tracker.optics.window import Window
+from needle_tracker.optics.refraction import RefractedCamera, cross, dot, pixel_ray
 from needle_tracker.stereo.triangulation import SpatialTip, triangulate
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Array = NDArray[np.float64]
 Ends = tuple[ImageEnd | None, ImageEnd | None]
@@ -105,22 +103,13 @@ class StereoSearch:
         Left and right.
     detectors : pair of NeedleDetector
         Left and right.
-    reach : Reach
-        Physical reach of the needle.
-    windows : tuple of Window
-        Windows of the cameras: the needle is behind each of them.
-    tip_lean : float
-        Largest angle between the visible end and the path [rad].
-    entry_zone : float
-        Insertion below which the tip may follow from the insertion [m].
+    settings : StereoTrackerParameters
+        Reach of the needle.
     """
 
     views: tuple[RefractedCamera, RefractedCamera]
     detectors: tuple[NeedleDetector, NeedleDetector]
-    reach: Reach
-    windows: tuple[Window, ...]
-    tip_lean: float
-    entry_zone: float
+    settings: StereoTrackerParameters
 
     def search(self, least: float, most: float) -> tuple[list[Sighting], Ends]:
         """Return the pairs of ends that may be those of the needle, and the best end of each view.
@@ -140,7 +129,7 @@ class StereoSearch:
         found = [each.search(least, most) for each in self.detectors]
         meeting = self._paths_that_meet(found)
         # The first tip of a short needle may come from the end in one view and the shaft in both.
-        hidden = most < 2.0 * self.entry_zone
+        hidden = most < 2.0 * self.settings.entry_zone
         left, right = (
             [(end, path) for path in own for end in detector.ends_near(path, hidden=hidden)]
             for detector, own in zip(self.detectors, meeting, strict=True)
@@ -191,7 +180,7 @@ class StereoSearch:
             for detector, path, end in zip(self.detectors, paths, ends, strict=True)
         )
         shaft = shaft_points(self.views, (left, right), tip.position)
-        if not is_reachable(shaft, self.reach):
+        if not is_reachable(shaft, self.settings):
             return None
         return Sighting(tip, ends, evidence(ends, tip), shaft_length(shaft))
 
@@ -200,9 +189,9 @@ class StereoSearch:
         distance = float(np.linalg.norm(tip.position))
         return (
             least <= distance <= most
-            and all(window.depth(tip.position) >= 0.0 for window in self.windows)
+            and all(view.camera.window.depth(tip.position) >= 0.0 for view in self.views)
             and math.acos(tip.position[2] / distance)
-            <= float(self.reach.chord_angle(np.array(distance)))
+            <= float(self.settings.chord_angle(np.array(distance)))
             and self._comes_from_entry(tip, distance)
         )
 
@@ -215,10 +204,10 @@ class StereoSearch:
         """
         ahead = float(tip.position @ tip.direction)
         miss = float(np.linalg.norm(tip.position - ahead * tip.direction))
-        bend = 0.5 * self.reach.curvature * distance**2
-        lean = math.sin(self.tip_lean) * min(distance, PAIRING.pre_bend)
+        bend = 0.5 * self.settings.max_curvature * distance**2
+        lean = math.sin(self.settings.tip_lean) * min(distance, PAIRING.pre_bend)
         sigma = math.sqrt(float(np.trace(tip.direction_covariance)))
-        loose = self.reach.hole_tolerance + PAIRING.sigmas * sigma * distance
+        loose = self.settings.hole_tolerance + PAIRING.sigmas * sigma * distance
         return ahead > 0.0 and miss <= bend + lean + loose
 
 
@@ -328,19 +317,19 @@ def _meeting_points(
     return count
 
 
-def is_reachable(points: Array, reach: Reach) -> bool:
+def is_reachable(points: Array, needle: StereoTrackerParameters) -> bool:
     """Return whether most points along a shaft are within reach.
 
     Parameters
     ----------
     points : ndarray, shape (n, 3)
         From `shaft_points`.
-    reach : Reach
-        Physical reach of the needle.
+    needle : StereoTrackerParameters
+        Reach of the needle.
     """
     distance = np.linalg.norm(points, axis=1)
     sideways = np.linalg.norm(points[:, :2], axis=1)
-    angle = np.minimum(reach.chord_angle(distance), math.pi / 2)
+    angle = np.minimum(needle.chord_angle(distance), math.pi / 2)
     allowed = distance * np.sin(angle) + PAIRING.tolerance
     return bool(np.median(sideways - allowed) <= 0.0)
 

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from needle_core.compiled import compiled
 from needle_tracker.detector.end_fit import ImageEnd
-from needle_tracker.optics.compiled_projection import (
+from needle_tracker.optics.refraction import (
+    RefractedCamera,
     cross,
     dot,
     pixel_ray,
     point_jacobian,
     project_point,
 )
-from needle_tracker.optics.refraction import RefractedCamera
 
 Array = NDArray[np.float64]
 
@@ -176,10 +176,8 @@ def _solve_position(
         # Scaled by its diagonal, the determinant shows how well the position is determined.
         product = normal[0, 0] * normal[1, 1] * normal[2, 2]
         # A NaN, of a point behind a camera, must not reach det().
-        if not 0.0 < product < math.inf:
-            return False, normal, residual, jacobians
-        if not np.linalg.det(normal) > _ROUNDING * product:
-            return False, normal, residual, jacobians
+        if not (0.0 < product < math.inf and np.linalg.det(normal) > _ROUNDING * product):
+            break
         step = np.linalg.solve(normal, rows.T @ residual)
         position += step
         if np.abs(step).max() < _ROUNDING:

@@ -16,8 +16,8 @@ import pytest
 from needle_tracker.answers import track_images
 from needle_tracker.answers.track_images import COLUMNS, main
 from needle_tracker.filter.measurement import Measurement, TrackState
-from needle_tracker.filter.settings import TrackerSettings
 from needle_tracker.stereo.triangulation import SpatialTip
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 Out = pytest.CaptureFixture[str]
 LENGTHS_MM = (3, 50, 51, 52)
@@ -27,12 +27,13 @@ SIGMA = 1e-4
 class Scripted:
     """In place of the tracker: the tip is as far as an image is bright [mm], 3 mm is the entry."""
 
-    made: list[TrackerSettings]
+    made: list[StereoTrackerParameters]
+    references: list[Any]
     resets: list[float | None]
 
-    def __init__(self, _: object, settings: TrackerSettings) -> None:
-        self.settings = settings
+    def __init__(self, _: object, settings: StereoTrackerParameters, reference: Any) -> None:
         self.made.append(settings)
+        self.references.append(reference)
 
     def warm_up(self) -> None:
         pass
@@ -58,7 +59,7 @@ class Scripted:
 
 @pytest.fixture(autouse=True)
 def scripted(monkeypatch: pytest.MonkeyPatch) -> type[Scripted]:
-    Scripted.made, Scripted.resets = [], []
+    Scripted.made, Scripted.references, Scripted.resets = [], [], []
     monkeypatch.setattr(track_images, "NeedleTracker", Scripted)
     return Scripted
 
@@ -155,8 +156,7 @@ def test_parameters_of_the_node_apply(track: Track, folder: Path, capsys: Out) -
         save(folder / "empty" / side / "1.png", mm + 4)
     params.write_text(NODE % f"reference_folder: {folder / 'empty'}")
     assert track("--params", str(params))[0] == 0
-    reference = Scripted.made[-1].reference
-    assert reference is not None
+    reference = Scripted.references[-1]
     assert [np.unique(image).tolist() for image in reference] == [[9], [11]]
     save(folder / "empty" / "right" / "0.png", 9, (480, 640))
     assert track("--params", str(params))[0] == 2
@@ -187,7 +187,7 @@ def test_unusable_input_is_reported_in_one_line(track: Track, folder: Path, caps
         ("--insertion", CSV + "a,0.1\na,0.2\n", "line 3"),
         ("--insertion", "", "name"),
         ("--truth", "name,x_m,y_m\n", "no column 'z_m'"),
-        ("--truth", TRUTH + "a,1,2,\n", "line 2: z_m = '' is not a finite number"),
+        ("--truth", TRUTH + "a,1,2,\n", "line 2: z_m '' is not a number"),
         ("--calibration", "", "phantom is missing"),
         ("--left", None, "does not exist"),
         ("--insertion", None, "No such file"),

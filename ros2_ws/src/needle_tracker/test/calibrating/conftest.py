@@ -9,8 +9,7 @@ import pytest
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
-
-from .synthetic_rig import GIVEN, GIVEN_BOX, SIZES, take, take_in_box
+from synthetic_rig import GIVEN, GIVEN_BOX, SIZES, take, take_in_box
 
 
 @pytest.fixture(scope="session")

@@ -18,9 +18,7 @@ from needle_tracker.calibrating.calibration_session import (
 )
 from needle_tracker.calibrating.charuco import CharucoBoard
 from needle_tracker.optics.calibration import SIDES
-
-from .drawn_boards import SMALL, board_image
-from .synthetic_rig import GIVEN, flat_pose
+from synthetic_rig import GIVEN, SMALL, board_image, flat_pose
 
 SESSION = Session(SMALL, GIVEN, {"top": Place(flat_pose([0.018, 0.0, 0.0]))})
 IMAGE = board_image(SMALL, 24, 24)

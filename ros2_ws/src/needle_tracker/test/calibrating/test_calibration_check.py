@@ -14,8 +14,7 @@ from needle_tracker.calibrating.calibration_check import check, figures, report
 from needle_tracker.calibrating.calibration_session import BoardView, Place
 from needle_tracker.calibrating.rig_calibration import RigCalibration
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
-
-from .synthetic_rig import (
+from synthetic_rig import (
     BOX_BOARD,
     IN_BOX,
     NOISE_PX,

@@ -13,8 +13,7 @@ import yaml
 from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_session import Place, load_session, parse_session
 from needle_tracker.optics.calibration import SIDES
-
-from .synthetic_rig import BOARD, GIVEN_BOX, PLACES, STANDS, flat_pose, session_content
+from synthetic_rig import BOARD, GIVEN_BOX, PLACES, STANDS, flat_pose, session_content
 
 FLAT = {"origin": [0.018, -0.04, 0.01]}
 

@@ -11,8 +11,7 @@ import pytest
 
 from needle_core.errors import UserError
 from needle_tracker.calibrating.charuco import CharucoBoard, write_board
-
-from .drawn_boards import SMALL, board_image
+from synthetic_rig import SMALL, board_image
 
 
 def test_corners_are_found_where_they_are_drawn() -> None:

@@ -19,8 +19,7 @@ from needle_tracker.calibrating.calibration_session import BoardView
 from needle_tracker.calibrating.imported_lenses import read_lenses
 from needle_tracker.calibrating.rig_calibration import calibrate
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
-
-from .synthetic_rig import GIVEN, PLACES, SIZES, take
+from synthetic_rig import GIVEN, PLACES, SIZES, take
 
 Content = dict[str, Any]
 
@@ -132,38 +131,13 @@ def test_single_camera_files_of_opencv_have_no_relative_pose(
     np.testing.assert_allclose(found.right.distortion, calibration.right.distortion)
 
 
-def test_another_model_of_a_narrow_lens_becomes_plumb_bob(
-    tmp_path: Path, calibration: StereoCalibration
-) -> None:
-    rational = [2.5, 1.2, 0.0003, -0.0002, 0.05, 2.85, 2.0, 0.25]
-    fisheye = [-0.02, 0.01, -0.008, 0.002]
-    paths, (left, right) = [], ros(calibration)
-    for content, model, lens in (
-        (left, "rational_polynomial", rational),
-        (right, "equidistant", fisheye),
-    ):
-        content |= {"distortion_model": model, "distortion_coefficients": {"data": lens}}
-        paths.append(written(tmp_path / f"{model}.yaml", content))
-    found, nothing = read(*paths), np.zeros(3)
-    points = np.random.default_rng(0).uniform([-0.1, -0.08, 1.0], [0.1, 0.08, 1.0], (50, 1, 3))
-    for camera, project, lens in (
-        (found.left, cv2.projectPoints, rational),
-        (found.right, cv2.fisheye.projectPoints, fisheye),
-    ):
-        matrix = camera.camera_matrix
-        true, _ = project(points, nothing, nothing, matrix, np.array(lens))
-        same, _ = cv2.projectPoints(points, nothing, nothing, matrix, camera.distortion)
-        np.testing.assert_allclose(same.reshape(-1, 2), true.reshape(-1, 2), atol=0.05)
-
-
 def test_an_unusable_chain_is_rejected_with_the_reason(
     tmp_path: Path, calibration: StereoCalibration
 ) -> None:
-    fisheye = {"distortion_model": "equidistant", "distortion_coeffs": [-0.02, 0.01, -0.008, 0.002]}
     for camera, changes, says in (
         ("cam0", {"camera_model": "omni"}, "cam0.camera_model 'omni' is not supported"),
-        ("cam0", fisheye | {"intrinsics": [420, 420, 512, 384]}, "plumb_bob differs from its"),
-        ("cam0", {"distortion_model": "fov", "distortion_coeffs": [1]}, "fov with 1 coefficients"),
+        ("cam0", {"distortion_model": "fov"}, "fov with 4 coefficients"),
+        ("cam0", {"distortion_coeffs": [0.1] * 6}, "radtan with 6 coefficients"),
         (
             "cam0",
             {"resolution": [2048, 1536]},
@@ -213,7 +187,7 @@ def test_with_given_lenses_boards_at_known_places_suffice(
         off = getattr(result.calibration, side).centre - getattr(calibration, side).centre
         assert np.linalg.norm(off) < 0.3e-3
     assert "left.fx" not in result.parameters
-    assert "lenses and relative pose: as given" in report(result, square_error(result), 0.06)
+    assert any("lenses: as given" in line for line in report(result, square_error(result), 0.06))
     assert "left_fx_px" not in figures(result, 0.06)
 
 

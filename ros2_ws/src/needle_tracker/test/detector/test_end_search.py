@@ -5,20 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_tracker.detector.end_search import SEARCH, find_paths
-from needle_tracker.detector.search_grid import SearchGrid, make_search_grid
-from needle_tracker.filter.settings import TrackerSettings
+from needle_tracker.detector.end_search import SEARCH, SearchGrid, find_paths, make_search_grid
 from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 END_ROW = 120
 
 
 @pytest.fixture(scope="module")
-def grid(views: tuple[RefractedCamera, RefractedCamera], calibration: object) -> SearchGrid:
-    from drawn_needles import tracker_settings  # noqa: PLC0415
-
-    settings: TrackerSettings = tracker_settings(calibration)  # type: ignore[arg-type]
-    return make_search_grid(views[0], settings.reach, settings.hole_clearance)
+def grid(views: tuple[RefractedCamera, RefractedCamera]) -> SearchGrid:
+    return make_search_grid(views[0], StereoTrackerParameters())
 
 
 def drawn(

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_tracker.filter.needle_tracker import Background
-from needle_tracker.filter.settings import Pair
+from needle_tracker.filter.needle_tracker import Background, Pair
 
 LEAST_NEW = 2e-3
 

@@ -16,8 +16,9 @@ from needle_tracker.filter.needle_track import (
     NeedleMotion,
     gaussian,
 )
-from needle_tracker.filter.settings import TrackerSettings
+from needle_tracker.filter.settings import FILTER
 from needle_tracker.stereo.triangulation import SpatialTip
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 AHEAD = np.array([0.05, -0.1, 0.99]) / np.linalg.norm([0.05, -0.1, 0.99])
 
@@ -27,32 +28,32 @@ def sighting(position: np.ndarray, sigma: float = 0.1e-3) -> SpatialTip:
 
 
 @pytest.fixture
-def motion(settings: TrackerSettings) -> NeedleMotion:
+def motion(settings: StereoTrackerParameters) -> NeedleMotion:
     return NeedleMotion.begin(sighting(np.array([0.001, 0.002, 0.05])), settings)
 
 
 def test_the_needle_advances_along_its_heading_by_the_way_of_the_stage(
-    motion: NeedleMotion, settings: TrackerSettings
+    motion: NeedleMotion, settings: StereoTrackerParameters
 ) -> None:
-    after = motion.advanced(2e-3, settings.reach.curvature, settings.filter)
+    after = motion.advanced(2e-3, settings.max_curvature)
     np.testing.assert_allclose(
         after.mean[POSITION], motion.mean[POSITION] + 2e-3 * AHEAD, atol=1e-12
     )
-    back = after.advanced(-2e-3, settings.reach.curvature, settings.filter)
+    back = after.advanced(-2e-3, settings.max_curvature)
     np.testing.assert_allclose(back.mean, motion.mean, atol=1e-12)
     assert np.linalg.eigvalsh(back.covariance)[0] > 0.0
 
 
 def test_the_covariance_after_a_way_agrees_with_simulated_needles(
-    motion: NeedleMotion, settings: TrackerSettings
+    motion: NeedleMotion, settings: StereoTrackerParameters
 ) -> None:
     rng, way = np.random.default_rng(0), 5e-3
     starts = rng.multivariate_normal(motion.mean, motion.covariance, 20_000)
     heading = starts[:, HEADING]
     ends = starts[:, POSITION] + (1.0 + starts[:, [SCALE]]) * way * heading
-    after = motion.advanced(way, 1e-9, settings.filter)
-    slip = (settings.filter.slip_sigma * way) ** 2 * np.outer(AHEAD, AHEAD)
-    noise = slip + settings.filter.drift_sigma**2 * np.eye(3)
+    after = motion.advanced(way, 1e-9)
+    slip = (FILTER.slip_sigma * way) ** 2 * np.outer(AHEAD, AHEAD)
+    noise = slip + FILTER.drift_sigma**2 * np.eye(3)
     np.testing.assert_allclose(
         after.covariance[POSITION, POSITION], np.cov(ends.T) + noise, atol=5e-9
     )
@@ -82,7 +83,7 @@ def test_sequential_corrections_equal_one_batch(motion: NeedleMotion) -> None:
 
 
 def test_an_error_of_the_stage_is_estimated_and_does_not_move_the_tip(
-    motion: NeedleMotion, settings: TrackerSettings
+    motion: NeedleMotion, settings: StereoTrackerParameters
 ) -> None:
     """Zero 1 mm off, scale 1 %: 60 mm of insertion, a sighting and a length for each mm."""
     rng, zero, scale = np.random.default_rng(2), 1e-3, 0.01
@@ -92,7 +93,7 @@ def test_an_error_of_the_stage_is_estimated_and_does_not_move_the_tip(
         length = (1.0 + scale) * insertion + zero
         true = at + (length - (1.0 + scale) * 0.05 - zero) * AHEAD
         if mm:
-            motion = motion.advanced(1e-3, settings.reach.curvature, settings.filter)
+            motion = motion.advanced(1e-3, settings.max_curvature)
         motion = motion.seen(sighting(true + rng.normal(0.0, 0.1e-3, 3)))
         motion = motion.measured(length + rng.normal(0.0, 0.2e-3), insertion, 0.4e-3)
     assert np.linalg.norm(motion.mean[POSITION] - true) < 0.15e-3

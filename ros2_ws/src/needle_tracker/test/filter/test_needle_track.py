@@ -9,9 +9,10 @@ import pytest
 
 from needle_tracker.detector.end_fit import ImageEnd
 from needle_tracker.filter.needle_track import NeedleTrack
-from needle_tracker.filter.settings import TrackerSettings
+from needle_tracker.filter.settings import FILTER
 from needle_tracker.stereo.sighting import Sighting
 from needle_tracker.stereo.triangulation import SpatialTip
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 AHEAD = np.array([0.0, 0.0, 1.0])
 SIGMA = 0.1e-3
@@ -25,7 +26,7 @@ def sighting(z: float, evidence: float = 4.0) -> Sighting:
 
 
 def after(
-    settings: TrackerSettings, places: list[float], insertions: list[float | None]
+    settings: StereoTrackerParameters, places: list[float], insertions: list[float | None]
 ) -> NeedleTrack:
     """Return the track after sightings at these distances from the entry [m]."""
     track = NeedleTrack.begin(sighting(places[0]), insertions[0], settings)
@@ -38,39 +39,43 @@ def after(
     return track
 
 
-def test_an_end_at_the_insertion_is_the_needle_at_once(settings: TrackerSettings) -> None:
-    assert after(settings, [0.05], [0.05]).log_odds(settings) > ACCEPTED
-    assert after(settings, [0.05], [0.056]).log_odds(settings) < 0.0
+def test_an_end_at_the_insertion_is_the_needle_at_once(settings: StereoTrackerParameters) -> None:
+    assert after(settings, [0.05], [0.05]).log_odds() > ACCEPTED
+    assert after(settings, [0.05], [0.056]).log_odds() < 0.0
     # A stage 1 mm off does not hide the needle.
-    assert after(settings, [0.05], [0.051]).log_odds(settings) > ACCEPTED
+    assert after(settings, [0.05], [0.051]).log_odds() > ACCEPTED
 
 
-def test_a_thing_at_rest_while_the_stage_moves_is_no_needle(settings: TrackerSettings) -> None:
+def test_a_thing_at_rest_while_the_stage_moves_is_no_needle(
+    settings: StereoTrackerParameters,
+) -> None:
     insertions = [0.049 + 5e-4 * n for n in range(8)]
-    assert after(settings, [0.05] * 8, list(insertions)).log_odds(settings) < 0.0
+    assert after(settings, [0.05] * 8, list(insertions)).log_odds() < 0.0
     moving = after(settings, [0.001 + i for i in insertions], list(insertions))
-    assert moving.log_odds(settings) > ACCEPTED
+    assert moving.log_odds() > ACCEPTED
 
 
-def test_without_the_insertion_a_moving_thing_is_the_needle(settings: TrackerSettings) -> None:
+def test_without_the_insertion_a_moving_thing_is_the_needle(
+    settings: StereoTrackerParameters,
+) -> None:
     nothing: list[float | None] = [None] * 10
     resting = after(settings, [0.05] * 10, nothing)
-    assert resting.log_odds(settings) < ACCEPTED
+    assert resting.log_odds() < ACCEPTED
     moving = after(settings, [0.05 + 1e-3 * n for n in range(4)], nothing[:4])
-    assert moving.log_odds(settings) > ACCEPTED
+    assert moving.log_odds() > ACCEPTED
 
 
-def test_a_miss_reduces_the_rank_and_not_the_odds(settings: TrackerSettings) -> None:
+def test_a_miss_reduces_the_rank_and_not_the_odds(settings: StereoTrackerParameters) -> None:
     before = after(settings, [0.05], [0.05])
     missed = before.predicted(0.051, settings).missed()
-    assert missed.log_odds(settings) == before.log_odds(settings)
-    assert missed.rank(settings) == before.rank(settings) - settings.filter.miss_cost
+    assert missed.log_odds() == before.log_odds()
+    assert missed.rank() == before.rank() - FILTER.miss_cost
     assert missed.misses == 1
 
 
 @pytest.mark.parametrize("insertion", [0.05, None])
 def test_the_same_picture_again_is_no_further_evidence(
-    settings: TrackerSettings, insertion: float | None
+    settings: StereoTrackerParameters, insertion: float | None
 ) -> None:
     once = after(settings, [0.05], [insertion])
     often = after(settings, [0.05] * 20, [insertion] * 20)
@@ -78,18 +83,10 @@ def test_the_same_picture_again_is_no_further_evidence(
     assert often.motion_log_odds < 0.1
 
 
-def test_after_a_gap_the_needle_must_move_again(settings: TrackerSettings) -> None:
+def test_after_a_gap_the_needle_must_move_again(settings: StereoTrackerParameters) -> None:
     insertions = [0.05 + 1e-3 * n for n in range(20)]
     track = before = after(settings, insertions, list(insertions))
     for n in range(20):
         track = track.predicted(insertions[-1] + 1e-3 * n, settings).missed()
     again = track.seen(sighting(insertions[-1] + 19e-3), settings)
     assert again.motion_log_odds < before.motion_log_odds
-
-
-def test_the_zero_of_the_stage_is_estimated(settings: TrackerSettings) -> None:
-    track = after(
-        settings, [0.0508 + 1e-3 * n for n in range(20)], [0.05 + 1e-3 * n for n in range(20)]
-    )
-    zero, scale = track.stage
-    assert zero + scale * 0.06 == pytest.approx(0.8e-3, abs=0.4e-3)

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 import yaml
 
-from needle_tracker.answers.tracker_parameters import default_settings
-from needle_tracker.filter.needle_tracker import NeedleTracker
-from needle_tracker.filter.settings import Image
+from needle_tracker.filter.needle_tracker import Image, NeedleTracker
 from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
 from needle_tracker.stereo.triangulation import SpatialTip
+from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 SCENES = Path(__file__).parents[1] / "data" / "traced"
 SIDES = ("left", "right")
@@ -53,12 +52,8 @@ def tracked(
         calibration = load_calibration(folder / "calibration.yaml")
     left, right = (cut(getattr(calibration, side), scene["crop"][side]) for side in SIDES)
     cut_out = StereoCalibration(left, right)
-    settings = dataclasses.replace(
-        default_settings(cut_out),
-        needle_width=scene["diameter"],
-        reference=read(folder, "empty") if empty else None,
-    )
-    tracker = NeedleTracker(cut_out, settings)
+    settings = StereoTrackerParameters(needle_width=scene["diameter"])
+    tracker = NeedleTracker(cut_out, settings, read(folder, "empty") if empty else None)
     return [
         (
             tracker.process(

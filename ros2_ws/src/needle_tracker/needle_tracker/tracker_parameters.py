@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
-from needle_tracker.detector.search_grid import Reach
-from needle_tracker.filter.settings import TrackerSettings
-from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.sources.image_files import mean_pair
+from needle_tracker.sources.image_files import Image, Sizes, mean_pair
+
+Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,32 +96,31 @@ class StereoTrackerParameters:
         """Largest difference of the stamps of a pair [ns]; None for free-running cameras."""
         return None if self.free_running else round(self.pair_tolerance * 1e9)
 
-    def tracker_settings(self, calibration: StereoCalibration) -> TrackerSettings:
-        """Return the settings of the tracker of a stereo rig.
+    def reference(self, sizes: Sizes) -> tuple[Image, Image] | None:
+        """Return the images of the phantom without needle in `reference_folder`, if any.
+
+        Parameters
+        ----------
+        sizes : dict of str to (int, int)
+            Width and height of the images of each side [px].
 
         Raises
         ------
         UserError
-            Reference images that are missing or unusable.
+            Images that are missing or unusable.
         """
         folder = Path(self.reference_folder)
-        return TrackerSettings(
-            reach=Reach(
-                self.max_curvature, self.entry_angle, self.hole_tolerance, self.max_insertion
-            ),
-            windows=(calibration.left.window, calibration.right.window),
-            needle_width=self.needle_width,
-            tip_lean=self.tip_lean,
-            entry_zone=self.entry_zone,
-            hole_clearance=self.hole_clearance,
-            stage_zero_sigma=self.stage_zero_sigma,
-            stage_scale_sigma=self.stage_scale_sigma,
-            reference=mean_pair(folder / "left", folder / "right", calibration.sizes)
-            if self.reference_folder
-            else None,
+        return (
+            mean_pair(folder / "left", folder / "right", sizes) if self.reference_folder else None
         )
 
+    def shortest_chord(self, insertion: float) -> float:
+        """Return the least distance of tip and entry [m] after `insertion` [m] along one arc."""
+        half_turn = min(0.5 * self.max_curvature * insertion, math.pi / 2)
+        return 2.0 * math.sin(half_turn) / self.max_curvature
 
-def default_settings(calibration: StereoCalibration) -> TrackerSettings:
-    """Return the settings for the needle of [KC09] section II (0.7 mm, 10 deg pre-bend)."""
-    return StereoTrackerParameters().tracker_settings(calibration)
+    def chord_angle(self, distance: Array) -> Array:
+        """Return the largest angle to z [rad] of a point of the needle at `distance` [m]."""
+        turned = np.arcsin(np.clip(0.5 * self.max_curvature * distance, 0.0, 1.0))
+        hole = np.arctan2(self.hole_tolerance, distance)
+        return np.asarray(self.entry_angle + turned + hole)

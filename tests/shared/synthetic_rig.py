@@ -14,13 +14,19 @@ from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
 from needle_tracker.calibrating.calibration_session import BoardView, Corners, Place
 from needle_tracker.calibrating.charuco import CharucoBoard
-from needle_tracker.optics.calibration import SIDES, StereoCalibration
-from needle_tracker.optics.window import Layer, Window, surface_from_above
+from needle_tracker.optics.calibration import (
+    SIDES,
+    Layer,
+    StereoCalibration,
+    Window,
+    surface_from_above,
+)
 
 Array = NDArray[np.float64]
 
 BOARD = CharucoBoard(9, 6, 0.0135, 0.010)
 BOX_BOARD = CharucoBoard(columns=12, rows=5, square=0.008, marker=0.006)
+SMALL = CharucoBoard(5, 4, dictionary="DICT_4X4_50")
 SIZES = dict.fromkeys(SIDES, (1024, 768))
 NOISE_PX = 0.03
 GIVEN = (surface_from_above(0.0175, 1.33),) * 2
@@ -126,11 +132,15 @@ def _tilt(
     return turn
 
 
-def free_pose(rng: np.random.Generator, tilts_deg: tuple[float, float] = (15, 42)) -> Array:
+def free_pose(
+    rng: np.random.Generator,
+    tilts_deg: tuple[float, float] = (15, 42),
+    board: CharucoBoard = BOARD,
+) -> Array:
     """A board held in the working volume, its middle seen by both cameras, tilted."""
     middle, up = rng.uniform([0.06, -0.012, 0.05], [0.10, 0.012, 0.075]), np.eye(3)[0]
     spin = rng.uniform(-25, 25) + 180 * rng.integers(2)
-    return held(_tilt(up, tilts_deg, spin, rng), up, middle)
+    return held(_tilt(up, tilts_deg, spin, rng), up, middle, board)
 
 
 PLACES = {
@@ -163,14 +173,15 @@ def take(
     free: int = 6,
     places: dict[str, Place] = PLACES,
     noise: float = NOISE_PX,
+    board: CharucoBoard = BOARD,
 ) -> list[BoardView]:
     """Views of a calibration session; places are those the session file says."""
     rng = np.random.default_rng(seed)
     poses: list[tuple[str, Array, Place | None]] = [
-        (f"free_{i:02d}", free_pose(rng), None) for i in range(free)
+        (f"free_{i:02d}", free_pose(rng, board=board), None) for i in range(free)
     ]
     poses += [(name, scatter(place, rng), place) for name, place in places.items()]
-    return [view_of(rig, name, pose, place, rng, noise) for name, pose, place in poses]
+    return [view_of(rig, name, pose, place, rng, noise, board) for name, pose, place in poses]
 
 
 def take_in_box(
@@ -192,3 +203,8 @@ def take_in_box(
         middle = rng.uniform([-0.001, -0.012, 0.05], [0.001, 0.008, 0.075])
         poses.append((f"box_{i:02d}", held(turn, _DIAGONAL, middle, BOX_BOARD), IN_BOX))
     return [view_of(rig, name, pose, place, rng, noise, BOX_BOARD) for name, pose, place in poses]
+
+
+def board_image(board: CharucoBoard, square_px: int, margin: int = 0) -> NDArray[np.uint8]:
+    """The pattern with a white margin."""
+    return np.pad(board.drawing(square_px), margin, constant_values=255)
