@@ -8,7 +8,7 @@ from functools import partial
 
 from needle_core import messages as m
 from needle_core.component import Call, Publish
-from needle_device_driver.axes.cycle_times import PERIOD
+from needle_device_driver.axes.axis import PERIOD
 from needle_device_driver.conformance.rig import AXES, Held
 from needle_device_driver.rules import Rule
 from scenario.virtual_rig import COMMANDS, HOLD, STATUS, VirtualRig
