@@ -74,7 +74,12 @@ def _rows(message: Any) -> Iterator[dict[str, Any]]:
         for status in message.status:
             yield {**dict(_flat(message.header, ("header",))), **dict(_flat(status, ()))}
     else:
-        yield dict(_flat(message, ()))
+        yield flat_fields(message)
+
+
+def flat_fields(message: Any) -> dict[str, Any]:
+    """Return the fields of a message of rosbags as the columns of `read_frames`."""
+    return dict(_flat(message, ()))
 
 
 def _flat(

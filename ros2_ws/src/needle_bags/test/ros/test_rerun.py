@@ -21,10 +21,9 @@ from needle_bags.link import openigtlink
 from needle_bags.live import live_view
 from needle_bags.reading.bag_messages import raw_as_sent, read_contents, read_messages
 from needle_bags.reading.bag_reader import read_run
-from needle_bags.rerun.bag_pass import Output
 from needle_bags.rerun.rerun_bag import TABLE, write_rerun
+from needle_bags.rerun.stages import Output
 from needle_bags.ros import rerun as rerun_node
-from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.errors import UserError
 from needle_tracker.optics.calibration import StereoCalibration, parse_calibration
 
@@ -122,34 +121,6 @@ def test_a_parameter_off_by_a_hundredth_is_detected(
     file, result = given(tmp_path, f"{parameter}: {value}"), tmp_path / "result.json"
     assert rerun(eight_steps, "--params", file, "--json", result) == 1
     assert field in changed_fields(result)
-
-
-def test_a_gain_off_by_a_hundredth_is_detected(
-    paper_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    designed = SteeringSettings.gains
-
-    def off(settings: SteeringSettings) -> Any:
-        gains = designed(settings)
-        feedback = np.array(gains.feedback, copy=True)
-        feedback.flat[0] *= 1.01
-        return dataclasses.replace(gains, feedback=feedback)
-
-    monkeypatch.setattr(SteeringSettings, "gains", off)
-    result = tmp_path / "result.json"
-    assert rerun(paper_bag, "--json", result) == 1
-    assert "needle_control_input_v" in changed_fields(result)
-
-
-def test_an_exception_gives_another_exit_code_than_a_change(
-    eight_steps: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
-    def mistaken(*_: object) -> None:
-        raise ValueError("behind the camera")
-
-    monkeypatch.setattr("needle_bags.ros.controller_rerun.ControllerStage.process", mistaken)
-    assert rerun(eight_steps) == 3
-    assert "internal error, please report it: ValueError: behind" in capsys.readouterr().err
 
 
 def test_another_preset_is_a_run_of_its_own(eight_steps: Path, paper_bag: Path) -> None:
@@ -336,15 +307,3 @@ def test_bad_input_gives_a_one_line_error(
         lines = capsys.readouterr().err.splitlines()
         (line,) = [line for line in lines if "no longer has" not in line]
         assert words in line
-
-
-def test_parameters_reach_the_node_or_give_a_warning(
-    eight_steps: Path, tmp_path: Path, capsys: Capture
-) -> None:
-    file = given(tmp_path, "curvature: 8.0", "/rig1/plane_controller")
-    assert rerun(eight_steps, "--params", file) == 2
-    assert "this node is /plane_controller: write '/plane_controller'" in capsys.readouterr().err
-    file = given(tmp_path, "max_depth: 0.1", "device_driver")
-    assert rerun(eight_steps, "--params", file) == 0
-    warning = f"warning: {file}: no section for /plane_controller: it has device_driver"
-    assert capsys.readouterr().err.splitlines()[0] == warning
