@@ -136,11 +136,6 @@ class BagWriter:
         with self._writing():
             self._mcap.add_metadata(name, dict(values))
 
-    def add_attachment(self, name: str, media_type: str, data: bytes, time: int) -> None:
-        """Append a file as an MCAP attachment; `time` is system time [ns]."""
-        with self._writing():
-            self._mcap.add_attachment(time, time, name, media_type, data)
-
     def set_custom_data(self, key: str, value: str) -> None:
         """Set a text of `custom_data` in metadata.yaml."""
         self._custom_data[key] = value

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import heapq
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,6 @@ __all__ = [
     "SentMessage",
     "messages_as_sent",
     "raw_as_sent",
-    "raw_messages",
     "read_contents",
     "read_messages",
 ]
@@ -68,21 +67,6 @@ def read_messages(path: Path, wanted: Callable[[str], bool]) -> Iterator[tuple[s
         store = bag.typestore()
         for message in bag.messages(wanted):
             yield message.topic, message.log_time, bag.deserialize(store, message)
-
-
-def raw_messages(
-    path: Path, topics: Collection[str], start: int, stop: int
-) -> Iterator[tuple[str, int, bytes]]:
-    """Yield (topic, log time [ns], serialised message) with start <= log time < stop, in order.
-
-    Raises
-    ------
-    UserError
-        If the bag cannot be read.
-    """
-    with BagDirectory(path) as bag:
-        for message in bag.messages(topics.__contains__, start, stop):
-            yield message.topic, message.log_time, message.data
 
 
 def messages_as_sent(

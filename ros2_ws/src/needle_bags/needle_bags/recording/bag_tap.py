@@ -18,7 +18,7 @@ from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.format.bag_metadata import USUAL_QOS
-from needle_bags.format.bag_writer import BagWriter
+from needle_bags.format.bag_writer import BagWriter, standard_topic
 from needle_bags.recording.provenance import commit, distribution, versions
 from needle_core.component import Component, Delivery, Input, Output
 from needle_core.convert import Converter, ros_type
@@ -81,15 +81,8 @@ class BagTap:
         self._writer.close()
 
     def _topic(self, row: Input | Output) -> BagTopic:
-        type_name = ros_type(row.message)
-        definition, _ = self._store.generate_msgdef(type_name, ros_version=2)
-        return BagTopic(
-            absolute_name(row.topic),
-            type_name,
-            definition,
-            self._store.hash_rihs01(type_name),
-            (_offered(row.delivery),),
-        )
+        topic = standard_topic(absolute_name(row.topic), ros_type(row.message))
+        return dataclasses.replace(topic, offered_qos=(_offered(row.delivery),))
 
     def _write_parameters(self, components: Iterable[Component]) -> None:
         document = {}

@@ -188,10 +188,6 @@ class Recording:
         """Queue a metadata record; unlike metadata.yaml it survives a kill."""
         self._put(lambda: self._bag.add_metadata(name, values))
 
-    def add_file(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
-        """Queue a file to attach to the bag."""
-        self._put(lambda: self._bag.add_attachment(name, media_type, data, time_ns))
-
     def set_custom_data(self, key: str, value: str) -> None:
         """Queue a text for metadata.yaml's `custom_data`."""
         self._worker.put(lambda: self._bag.set_custom_data(key, value))

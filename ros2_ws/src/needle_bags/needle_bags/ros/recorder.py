@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,7 +17,7 @@ from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
 from needle_bags.recording.provenance import commit, distribution, versions
-from needle_bags.recording.recorder_health import DecodeErrors, RecorderHealth
+from needle_bags.recording.recorder_health import RecorderHealth
 from needle_bags.recording.recording import Received, open_recording, reuse_freed_memory
 from needle_bags.ros.graph_topics import GraphTopics
 from needle_bags.ros.parameter_snapshots import ParameterSnapshots
@@ -50,9 +49,8 @@ With `snapshot_seconds` the last seconds stay in memory. They are written on a c
 ~/snapshot (std_srvs/Trigger), and a second after device/status reports FAULT or ESTOPPED. All
 snapshots are in the same bag; each message is written once.
 
-/diagnostics has a warning if messages are lost, if a message cannot be decoded (it is recorded
-anyway), and if the disk is nearly full. When only `reserve` is free, the recording ends and the bag
-is completed; the node continues to report this.
+/diagnostics has a warning if messages are lost and if the disk is nearly full. When only `reserve`
+is free, the recording ends and the bag is completed; the node continues to report this.
 Exit codes: 0 the bag is complete; 1 the disk was full or a write failed; 2 invalid parameters, or
 the bag cannot be created
 """
@@ -82,7 +80,6 @@ class Recorder(WholeNode):
         calibration = read_calibration(Path(file)) if file else ""
         self._diagnostics = DiagnosticsPublisher(self)
         self._topics = GraphTopics(self, self._settings.choice, self._add_topic, self._receive)
-        self._decode_errors = DecodeErrors()
         self._recent = self._settings.recent
         self._states: dict[str, str] = {}
         self._snapshot_due: tuple[float, str] | None = None
@@ -120,10 +117,6 @@ class Recorder(WholeNode):
         for key, text in texts.items():
             self.recording.set_custom_data(key, text)
         self.recording.add_record(RUN_RECORD, texts)
-        if calibration:
-            self.recording.add_file(
-                "calibration.yaml", "application/yaml", calibration.encode(), time.time_ns()
-            )
 
     def _store_parameters(self, node: str, values: dict[str, Any]) -> None:
         document = {node: {"ros__parameters": values}}
@@ -155,22 +148,9 @@ class Recorder(WholeNode):
         else:
             self._recent.put(message)
             if message.topic.endswith(DEVICE_STATUS):
-                self._inspect(message, self._check_device_status)
+                self._check_device_status(message)
         if message.topic == PARAMETER_EVENTS:
-            self._inspect(message, self._store_parameter_event)
-
-    def _inspect(self, message: Received, inspect: Callable[[Received], None]) -> None:
-        """Decode a recorded message; a malformed one is counted."""
-        try:
-            inspect(message)
-        except Exception as error:  # noqa: BLE001
-            self.report_decode_error(message.topic, error)
-
-    def report_decode_error(self, source: str, error: Exception) -> None:
-        """Count an input that could not be decoded; log the first of its source."""
-        if self._decode_errors.add(source, error):
-            self.get_logger().warning(f"cannot decode {source}: {error}")
-        self._diagnostics.set("input", self._decode_errors.diagnostic())
+            self._store_parameter_event(message)
 
     def _check_device_status(self, message: Received) -> None:
         status = deserialize_message(message.data, DiagnosticStatus)
@@ -246,9 +226,6 @@ class Recorder(WholeNode):
             self.recording.set_custom_data("parameter_changes", changes)
         parameters = yaml.safe_dump(self._snapshots.document())
         self.recording.set_custom_data("parameters", parameters)
-        self.recording.add_file(
-            "parameters.yaml", "application/yaml", parameters.encode(), time.time_ns()
-        )
         self.recording.close(self._topics.lost)
         count = self.recording.messages_received
         lost = self._lost()
@@ -263,14 +240,6 @@ class Recorder(WholeNode):
         return EXIT_DONE if self.recording.error is None else EXIT_MISSED
 
 
-def _spin_once(executor: SingleThreadedExecutor, recorder: Recorder, timeout: float) -> None:
-    """Execute one callback; a malformed request of another node does not end this node."""
-    try:
-        executor.spin_once(timeout_sec=timeout)
-    except Exception as error:  # noqa: BLE001
-        recorder.report_decode_error("a service or the graph", error)
-
-
 def main(args: list[str] | None = None) -> int:
     """Run the recorder; returns the exit code."""
     reuse_freed_memory()
@@ -281,12 +250,12 @@ def main(args: list[str] | None = None) -> int:
         executor.add_node(recorder)
         try:
             while not end.requested:
-                _spin_once(executor, recorder, 0.1)
+                executor.spin_once(0.1)
             limit = time.monotonic() + DRAIN_LIMIT
             quiet = time.monotonic() + DRAIN_QUIET
             while time.monotonic() < min(quiet, limit):
                 before = recorder.recording.messages_received
-                _spin_once(executor, recorder, 0.05)
+                executor.spin_once(0.05)
                 if recorder.recording.messages_received > before:
                     quiet = time.monotonic() + DRAIN_QUIET
             return recorder.finish()

@@ -46,7 +46,7 @@ class RecorderParameters:
     calibration_file: str = fixed_parameter(
         "",
         "-",
-        "File to store in the bag as calibration.yaml; a tracker publishes its own.",
+        "Calibration to store in the bag; a tracker publishes its own.",
     )
     run_info: str = fixed_parameter(
         "", "-", "Text about the run to store in the bag: YAML `key: value` lines or JSON."
