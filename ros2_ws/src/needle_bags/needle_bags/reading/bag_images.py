@@ -82,7 +82,7 @@ def exposures(run: Run) -> Stamps:
         If the bag cannot be read.
     """
     left = {run.namespace + topic for topic, side in TOPICS.items() if side == "left"}
-    sent = raw_as_sent(run.path, left.__contains__, left.__contains__)
+    sent = raw_as_sent(run.path, left.__contains__)
     return np.unique(np.array([stamp_of(message.data) for message in sent], np.int64))
 
 

@@ -56,9 +56,7 @@ def write_small_bag(source: Path, target: Path) -> None:
     contents = read_contents(source)
     copy = BagCopy(target, contents.distribution, _custom_data(run))
     images = {run.namespace + name: name for name in IMAGE_TOPICS}
-    for message in raw_as_sent(
-        source, lambda name: not name.endswith(_LEFT_OUT), images.__contains__
-    ):
+    for message in raw_as_sent(source, lambda name: not name.endswith(_LEFT_OUT)):
         if message.topic not in images:
             topic = contents.topics[message.topic]
             copy.put(topic, message.data, message.log_time, message.time)

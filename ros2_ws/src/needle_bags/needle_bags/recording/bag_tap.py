@@ -58,10 +58,11 @@ class BagTap:
         rows: list[Input | Output] = [*others]
         for component in components:
             rows += [*component.outputs, *component.inputs]
-        self._numbers: dict[str, int] = {}
+        first: dict[str, Input | Output] = {}
         for row in rows:
-            if row.topic not in self._numbers:
-                self._numbers[row.topic] = self._writer.add_topic(self._topic(row))
+            first.setdefault(row.topic, row)
+        for row in first.values():
+            self._writer.add_topic(self._topic(row))
         texts = {"run_info": json.dumps(run_info), "commit": commit(), "calibration": ""}
         self._writer.add_metadata(RUN_RECORD, texts)
         for key, text in {**texts, "versions": json.dumps(versions())}.items():
@@ -74,7 +75,8 @@ class BagTap:
         data = bytes(self._store.serialize_cdr(ros_message, ros_type(output.message)))
         self._sequence[sender, output.topic] += 1
         sequence = self._sequence[sender, output.topic]
-        self._writer.write(self._numbers[output.topic], data, stamp_ns, stamp_ns, sequence)
+        topic = absolute_name(output.topic)
+        self._writer.write(topic, data, stamp_ns, stamp_ns, sequence)
 
     def close(self) -> None:
         """Complete the bag."""

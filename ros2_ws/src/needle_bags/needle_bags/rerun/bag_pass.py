@@ -236,9 +236,7 @@ def _inputs(
 ) -> Iterator[tuple[str, SentMessage, Any]]:
     """Yield (relative topic, raw message, message) of these topics, with a progress bar."""
     names = {name if name.startswith("/") else run.namespace + name: name for name in relative}
-    messages = messages_as_sent(
-        run.path, lambda name: name in names, lambda name: names[name] in IMAGE_TOPICS, reorder
-    )
+    messages = messages_as_sent(run.path, names.__contains__, reorder)
     bar = tqdm(
         messages,
         total=sum(run.topics.get(name, 0) for name in names),

@@ -181,7 +181,7 @@ def step_ends(path: Path, namespace: str) -> dict[int, JointSample]:
     joints, results = namespace + "joint_states", namespace + "device/result"
     ends: dict[int, JointSample] = {}
     answered: list[int] = []
-    for sent, message in messages_as_sent(path, {joints, results}.__contains__, lambda _: False):
+    for sent, message in messages_as_sent(path, {joints, results}.__contains__):
         if sent.topic == results:
             answered.append(to_nanoseconds(message.stamp))
             continue

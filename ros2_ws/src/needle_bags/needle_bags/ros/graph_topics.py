@@ -16,8 +16,9 @@ from rclpy.subscription import Subscription
 from needle_bags.format.message_definitions import full_definition, message_class
 from needle_bags.format.message_loss import SequenceGaps
 from needle_bags.format.topic_choice import TopicChoice
+from needle_bags.reading.bag_messages import IMAGE_TYPES
 from needle_bags.recording.recording import Received
-from needle_bags.ros.conversions import IMAGE_TYPES, offered_qos, strictest_request
+from needle_bags.ros.conversions import offered_qos, strictest_request
 from needle_core.files.bag_topic import BagTopic
 
 # Time limit of one poll of the graph; the next poll continues [s].

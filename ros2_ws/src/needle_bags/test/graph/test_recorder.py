@@ -26,7 +26,7 @@ from needle_bags.recording.worker import Job, RunJob
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_bags.ros import graph_topics, parameter_snapshots
 from needle_bags.ros import recorder as node
-from needle_bags.ros.recorder_parameters import RecorderParameters
+from needle_bags.ros.recorder import RecorderParameters
 from needle_core.errors import UserError
 
 from .played_graph import BEST_EFFORT, LATCHED, PlayedGraph

@@ -30,7 +30,7 @@ def two_rigs(make_run: MakeRun, tmp_path: Path) -> Path:
     copy = BagCopy(tmp_path / "two", "jazzy", {})
     for bag in (make_run("one", steps=30), make_run("other", namespace="/bench/", steps=20)):
         contents = read_contents(bag)
-        for m in raw_as_sent(bag, lambda _: True, lambda _: False):
+        for m in raw_as_sent(bag, lambda _: True):
             copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
     copy.close()
     return tmp_path / "two"

@@ -132,7 +132,7 @@ def test_another_preset_is_a_run_of_its_own(eight_steps: Path, paper_bag: Path) 
     assert before.counts == after.counts
     for topic in ("/joint_states", "/device/status", "/sim/tip_pose"):
         kept = [
-            [(m.log_time, m.data) for m in raw_as_sent(bag, topic.__eq__, lambda _: False)]
+            [(m.log_time, m.data) for m in raw_as_sent(bag, topic.__eq__)]
             for bag in (eight_steps, paper_bag)
         ]
         assert kept[0] == kept[1]
@@ -216,7 +216,7 @@ def copied(bag: Path, target: Path, custom: dict[str, str], topic: str, kind: st
     @contextlib.contextmanager
     def writing() -> Iterator[Callable[[bytes], None]]:
         yield lambda data: copy.put(new, data, contents.start, contents.start)
-        for m in raw_as_sent(bag, lambda _: True, lambda _: False):
+        for m in raw_as_sent(bag, lambda _: True):
             copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
         copy.close()
 
