@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,21 +16,16 @@ from needle_bags.reading.bag_messages import read_contents, read_messages
 from needle_core.errors import UserError
 from needle_core.files.bag_directory import BagDirectory
 from needle_core.files.yaml_files import load_yaml
+from needle_core.message_types import to_nanoseconds
 from needle_core.messages import INSERTION_JOINT, ROTATION_JOINT
 
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 
-_NANOSECONDS = 1_000_000_000
 CALIBRATION = "stereo_tracker/calibration"
 _CONTROLLER, _DEVICE, _RESULT = "needle/controller_status", "device/status", "device/result"
 _HEALTH = "/diagnostics"
 RECORDING = ("recording_ended", "recovered", "messages_lost", "parameter_changes")
-
-
-class _HasStamp(Protocol):
-    sec: int
-    nanosec: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,7 +228,7 @@ def read_run(path: Path, namespace: str | None = None) -> Run:
             **{name: _series(name, found[topic]) for name, (topic, _, _) in _SERIES.items()},
             controller_status=_statuses(found[_CONTROLLER]),
             device_status=_statuses(found[_DEVICE]),
-            results=[Result(t, nanoseconds(m.stamp), m.frame_id) for t, m in found[_RESULT]],
+            results=[Result(t, to_nanoseconds(m.stamp), m.frame_id) for t, m in found[_RESULT]],
             health=_health_events(found[_HEALTH], namespace, namespaces(contents)),
             topics=contents.counts,
             parameters=_parameters(custom.get("parameters", "")),
@@ -325,7 +320,7 @@ def _series(name: str, messages: _Messages) -> Series:
     _, width, row_of = _SERIES[name]
     # The stamp of a hold is a counter of its source.
     rows = [
-        (log_time if name == "holds" else nanoseconds(message.header.stamp), log_time, row)
+        (log_time if name == "holds" else to_nanoseconds(message.header.stamp), log_time, row)
         for log_time, message in messages
         if (row := row_of(message)) is not None
     ]
@@ -353,11 +348,6 @@ def _mapping(text: str) -> dict[str, Any]:
     if value is None:
         return {}
     return value if isinstance(value, dict) else {"text": str(value)}
-
-
-def nanoseconds(stamp: _HasStamp) -> int:
-    """Return a message's stamp in ns since the clock's epoch."""
-    return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
 
 
 def _xyz(vector: Any) -> tuple[float, ...]:

@@ -21,12 +21,13 @@ from needle_bags.reading.bag_messages import (
     messages_as_sent,
     read_contents,
 )
-from needle_bags.reading.bag_reader import Run, Series, nanoseconds
+from needle_bags.reading.bag_reader import Run, Series
 from needle_bags.reading.frames import flat_fields
 from needle_bags.rerun.comparison import FIELDS, Record
 from needle_bags.rerun.stages import Output, Stage
 from needle_bags.run.run_summary import estimate_error
 from needle_controller.controller_status import ReceivedMessage, received_messages
+from needle_core.message_types import to_nanoseconds
 
 POSE = "needle/tip_pose"
 TIP_TOPICS = ("needle/tip", POSE)
@@ -94,7 +95,7 @@ def run_again(run: Run, tracker: Stage | None, controller: Stage) -> Rerun:
     """
     watched = FIELDS.keys() - (TIP_TOPICS if tracker is None else ())
     recorded = [
-        Record(topic, nanoseconds(message.header.stamp), flat_fields(message))
+        Record(topic, to_nanoseconds(message.header.stamp), flat_fields(message))
         for topic, _, message in _inputs(run, watched)
     ]
     outputs: list[Output] = []
@@ -108,7 +109,7 @@ def run_again(run: Run, tracker: Stage | None, controller: Stage) -> Rerun:
 
         def received(topic: str, message: Any) -> Iterator[tuple[str, Any]]:
             is_left = IMAGE_TOPICS.get(topic) == "left"
-            if not is_left or nanoseconds(message.header.stamp) in exposed:
+            if not is_left or to_nanoseconds(message.header.stamp) in exposed:
                 yield topic, message
 
         outputs += run_stage(run, tracker, change=received)
@@ -174,7 +175,7 @@ def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Out
     recorded = set(run.tips.stamps.tolist())
 
     def replaced(topic: str, message: Any) -> Iterator[tuple[str, Any]]:
-        stamp = nanoseconds(message.header.stamp) if topic in TIP_TOPICS else None
+        stamp = to_nanoseconds(message.header.stamp) if topic in TIP_TOPICS else None
         if stamp not in answered:
             yield topic, message
             return
