@@ -114,7 +114,7 @@ def parameters(run: Run, node: str, kind: type[Any]) -> Any:
 
 def messages(topics: set[str]) -> Iterator[tuple[str, Any, Moment]]:
     wanted = {f"/{topic}" for topic in topics}
-    for sent, message in messages_as_sent(BAG, wanted.__contains__, lambda _: False):
+    for sent, message in messages_as_sent(BAG, wanted.__contains__):
         yield sent.topic.removeprefix("/"), message, Moment(sent.time * 1e-9, sent.time, sent.time)
 
 

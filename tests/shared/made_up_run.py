@@ -58,7 +58,7 @@ class SyntheticBag:
     def __init__(self, directory: Path, namespace: str = "/") -> None:
         self.bag = BagWriter(directory)
         self.namespace = namespace
-        self.channels: dict[str, int] = {}
+        self.channels: dict[str, str] = {}
         self.now = START
 
     def put(self, topic: str, content: Any, *, latched: bool = False) -> None:

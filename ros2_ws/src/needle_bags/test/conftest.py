@@ -49,7 +49,7 @@ def cut_bag(tmp_path_factory: pytest.TempPathFactory) -> Callable[[float], Path]
         row = int(np.searchsorted(run.joints.values[:, 0], insertion))
         bag = tmp_path_factory.mktemp("cut") / "bag"
         copy = BagCopy(bag, contents.distribution, contents.custom_data)
-        for message in raw_as_sent(BAG, lambda _: True, lambda _: False):
+        for message in raw_as_sent(BAG, lambda _: True):
             if message.log_time < run.joints.received[row]:
                 copy.put(
                     contents.topics[message.topic], message.data, message.log_time, message.time
@@ -81,7 +81,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, str]:
     }
     copy = BagCopy(bag, contents.distribution, custom)
     tips = 0
-    for message in raw_as_sent(BAG, lambda _: True, lambda _: False):
+    for message in raw_as_sent(BAG, lambda _: True):
         topic, data = contents.topics[message.topic], message.data
         if topic.name == "/needle/tip":
             tips += 1

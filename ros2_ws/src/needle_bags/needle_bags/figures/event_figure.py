@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Sequence
+from operator import itemgetter
+from typing import NamedTuple
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -18,7 +21,7 @@ from needle_bags.figures.figure_style import (
     STYLE,
     WIDTH,
 )
-from needle_bags.reading.bag_reader import HealthEvent, Run, Status
+from needle_bags.reading.bag_reader import Run
 from needle_bags.run.run_summary import health_of, is_aborted, trips
 
 _STATE_COLORS = {
@@ -37,8 +40,7 @@ _MAX_PARTS = 12
 _MIN_LENGTH = 0.004
 
 
-@dataclasses.dataclass(frozen=True)
-class Span:
+class Span(NamedTuple):
     """Coloured part of a lane from `begin` to `end`, system clock [ns]."""
 
     begin: int
@@ -46,36 +48,24 @@ class Span:
     color: str
 
 
-@dataclasses.dataclass(frozen=True)
-class Lane:
-    """One row of the figure."""
-
-    name: str
-    spans: Sequence[Span]
-
-
-def lanes_of(run: Run) -> list[Lane]:
-    """Return the lanes of a run: controller, device, hold, then the parts with problems."""
+def lanes_of(run: Run) -> dict[str, list[Span]]:
+    """Return the lanes by name: controller, device, hold, then the parts with problems."""
     end = _end(run)
-    lanes = [
-        Lane("controller", list(_state_spans(run.controller_status, end))),
-        Lane("device", list(_state_spans(run.device_status, end))),
-    ]
-    if len(run.holds):
-        lanes.append(Lane("hold", list(_hold_spans(run, end))))
-    stops = [
-        Span(result.log_time, result.log_time, RED) for result in run.results if is_aborted(result)
-    ]
-    if stops:
-        lanes.append(Lane("aborted steps", stops))
-    tripped = [Span(event.log_time, event.log_time, MEASURED) for event in trips(run)]
-    lanes.append(Lane("watchdogs", tripped))
+    lanes = {}
+    for name, statuses in (("controller", run.controller_status), ("device", run.device_status)):
+        states = ((s.log_time, s.values.get("state", "")) for s in statuses)
+        lanes[name] = _spans([(t, _STATE_COLORS.get(state, _QUIET)) for t, state in states], end)
+    pressed = zip(run.holds.received.tolist(), run.holds.values[:, 0] > 0.5, strict=True)
+    lanes["hold"] = _spans([(time, GOAL_BAND if held else None) for time, held in pressed], end)
+    aborted = [result.log_time for result in run.results if is_aborted(result)]
+    lanes["aborted steps"] = [Span(time, time, RED) for time in aborted]
+    tripped = [event.log_time for event in trips(run)]
+    lanes["watchdogs"] = [Span(time, time, MEASURED) for time in tripped]
     health = health_of(run)
-    parts = dict.fromkeys(event.part for event in health)
-    lanes += [
-        Lane(part, list(_problem_spans(health, part, end))) for part in list(parts)[:_MAX_PARTS]
-    ]
-    return [lane for lane in lanes if lane.spans]
+    for part in list(dict.fromkeys(event.part for event in health))[:_MAX_PARTS]:
+        events = [event for event in health if event.part == part]
+        lanes[part] = _spans([(e.log_time, _LEVEL_COLORS.get(e.level)) for e in events], end)
+    return {name: spans for name, spans in lanes.items() if spans}
 
 
 def event_figure(run: Run) -> Figure | None:
@@ -83,26 +73,25 @@ def event_figure(run: Run) -> Figure | None:
     lanes = lanes_of(run)
     if not lanes:
         return None
-    begin = run.first_command
-    start = min(s.begin for lane in lanes for s in lane.spans) if begin is None else begin
+    spans = [span for lane in lanes.values() for span in lane]
+    first = min(span.begin for span in spans)
+    start = first if run.first_command is None else run.first_command
+    shortest = _MIN_LENGTH * (_end(run) - first)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 1.5 + 0.3 * len(lanes)), layout="constrained")
         axes = figure.subplots()
-        length = (_end(run) - min(s.begin for lane in lanes for s in lane.spans)) * 1e-9
-        for row, lane in enumerate(lanes):
-            for color in dict.fromkeys(span.color for span in lane.spans):
-                bars = [
-                    ((s.begin - start) * 1e-9, max((s.end - s.begin) * 1e-9, _MIN_LENGTH * length))
-                    for s in lane.spans
-                    if s.color == color
-                ]
-                axes.broken_barh(bars, (row - 0.36, 0.72), color=color, lw=0)
-        axes.set_yticks(range(len(lanes)), [lane.name for lane in lanes])
+        for row, lane in enumerate(lanes.values()):
+            begins = np.array([span.begin - start for span in lane])
+            lengths = np.array([max(span.end - span.begin, shortest) for span in lane])
+            bars = np.column_stack([begins, lengths]) * 1e-9
+            colors = [span.color for span in lane]
+            axes.broken_barh(bars.tolist(), (row - 0.36, 0.72), color=colors, lw=0)
+        axes.set_yticks(range(len(lanes)), list(lanes))
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
         axes.set_axisbelow(True)
         axes.set_xlabel("wall time since the first command [s]")
-        _legend(figure, {span.color for lane in lanes for span in lane.spans})
+        _legend(figure, {span.color for span in spans})
         return figure
 
 
@@ -111,37 +100,12 @@ def level_name(level: int) -> str:
     return _LEVEL_NAMES.get(level, "?")
 
 
-def _state_spans(statuses: Sequence[Status], end: int) -> Iterable[Span]:
-    """Yield a span for each period of a state."""
-    changes = [(s.log_time, s.values.get("state", "")) for s in statuses]
-    begin, state = changes[0] if changes else (0, "")
-    for time, now in changes:
-        if now != state:
-            yield Span(begin, time, _STATE_COLORS.get(state, _QUIET))
-            begin, state = time, now
-    if changes:
-        yield Span(begin, end, _STATE_COLORS.get(state, _QUIET))
-
-
-def _hold_spans(run: Run, end: int) -> Iterable[Span]:
-    times, pressed = run.holds.received.tolist(), run.holds.values[:, 0] > 0.5
-    begin = None
-    for time, now in zip(times, pressed.tolist(), strict=True):
-        if now and begin is None:
-            begin = time
-        elif not now and begin is not None:
-            yield Span(begin, time, GOAL_BAND)
-            begin = None
-    if begin is not None:
-        yield Span(begin, end, GOAL_BAND)
-
-
-def _problem_spans(health: Sequence[HealthEvent], part: str, end: int) -> Iterable[Span]:
-    """Yield the periods in which a part had a problem."""
-    events = [event for event in health if event.part == part]
-    for event, after in zip(events, [*(e.log_time for e in events[1:]), end], strict=True):
-        if event.level:
-            yield Span(event.log_time, after, _LEVEL_COLORS.get(event.level, RED))
+def _spans(changes: Sequence[tuple[int, str | None]], end: int) -> list[Span]:
+    """Return the periods between changes of colour (time [ns], colour); None: no span."""
+    groups = itertools.groupby(changes, key=itemgetter(1))
+    begins = [(next(group)[0], color) for color, group in groups]
+    ends = [*(time for time, _ in begins[1:]), end]
+    return [Span(t, e, c) for (t, c), e in zip(begins, ends, strict=False) if c is not None]
 
 
 def _end(run: Run) -> int:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from needle_bags.run.run_summary import GOAL
 
 # Distinguishable with any colour vision deficiency, on light and dark backgrounds.
 INK = "#1b1b1b"
@@ -19,17 +24,12 @@ PLUM, TEAL, RED = "#7a1050", "#2099c0", "#b3140c"
 GREY = "#9aa0a8"
 BROAD: dict[str, Any] = {"color": TRUTH, "lw": 3.6, "solid_capstyle": "round"}
 """Style of the truth: broad, so that a thin line can be drawn over it."""
-THIN: dict[str, Any] = {"color": ESTIMATE, "lw": 1.3}
-DASHED, DOTTED = (0, (4, 2)), (0, (1, 1.4))
-AXES: dict[str, dict[str, Any]] = {
-    "x (out of the plane)": {"color": MEASURED, "lw": 1.1},
-    "y (beside)": {"color": PLUM, "lw": 1.1, "ls": DASHED},
-    "z (along)": {"color": TEAL, "lw": 1.3, "ls": DOTTED},
-}
 MM = 1e3
 # Narrow enough to read the text on a phone [inch].
 WIDTH = 5.6
-# Space for five digits and a label; an axis with its label; a title [inch].
+# Space between rows for a title and an axis; at the sides for five digits and a label, for an axis
+# with its label, and for a title [inch].
+_GAP = 0.34
 _MARGINS = {"left": 0.75, "right": 0.12, "bottom": 0.5, "top": 0.3}
 STYLE: dict[Any, Any] = {
     "font.size": 9.5,
@@ -59,27 +59,37 @@ def png_size(png: bytes) -> tuple[int, int]:
     return int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big")
 
 
-def place(figure: Figure, rows: int, *, gap: float = 0.34, **margins: float) -> None:
-    """Place the axes of a figure by fixed margins; a layout engine takes three times as long.
+@contextlib.contextmanager
+def stacked(rows: int, height: float, **margins: float) -> Iterator[tuple[Figure, list[Any]]]:
+    """Yield a figure and its axes, one below the other, in the common style.
+
+    Fixed margins place them; a layout engine takes three times as long.
 
     Parameters
     ----------
-    figure : Figure
-        A figure with a grid of axes.
     rows : int
-        Rows of the grid.
-    gap : float
-        Space between rows, for a title and an axis with its label [inch].
+        Number of axes.
+    height : float
+        Height of the figure [inch].
     **margins : float
         `left`, `right`, `bottom` and `top`, if not the defaults [inch].
     """
-    width, height = figure.get_size_inches()
     left, right, bottom, top = (margins.get(side, inch) for side, inch in _MARGINS.items())
-    row = (height - bottom - top - gap * (rows - 1)) / rows
-    figure.subplots_adjust(
-        left=left / width,
-        right=1.0 - right / width,
-        bottom=bottom / height,
-        top=1.0 - top / height,
-        hspace=gap / row,
-    )
+    row = (height - bottom - top - _GAP * (rows - 1)) / rows
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, height))
+        figure.subplots_adjust(
+            left=left / WIDTH,
+            right=1.0 - right / WIDTH,
+            bottom=bottom / height,
+            top=1.0 - top / height,
+            hspace=_GAP / row,
+        )
+        yield figure, list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+
+
+def draw_goal(axes: Any, plane: float = 0.0) -> None:
+    """Draw the target plane at a height [m], with the band in which a run has converged."""
+    band = ((plane - GOAL) * MM, (plane + GOAL) * MM)
+    axes.axhspan(*band, color=GOAL_BAND, alpha=0.16, lw=0)
+    axes.axhline(plane * MM, color=GOAL_BAND, lw=1.3)

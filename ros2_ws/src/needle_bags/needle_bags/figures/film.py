@@ -1,20 +1,43 @@
-"""Film of the insertion: exposures of the bag, each with the shape of the needle."""
+"""Film of the insertion: exposures with the needle, in camera images and in drawings."""
 
 from __future__ import annotations
 
 import dataclasses
-from bisect import bisect_left
+import io
+from collections.abc import Callable, Sequence
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from needle_bags.reading.bag_images import TOPICS, exposures
-from needle_bags.reading.bag_reader import Run, Series, Stamps, Status
-from needle_bags.run.run_summary import true_r1
+from needle_bags.figures.figure_style import (
+    GOAL_BAND,
+    MM,
+    TRUTH,
+    draw_goal,
+    png_size,
+    save,
+    stacked,
+)
+from needle_bags.reading.bag_images import SIDES, TOPICS, exposures, images_at
+from needle_bags.reading.bag_reader import Run, Series, Stamps
+from needle_bags.run.run_summary import GOAL, finite_tips, target_offset, target_point, true_r1
 from needle_bags.run.shaft_trail import ShaftTrail
+from needle_core.errors import UserError
+from needle_core.files.yaml_files import load_yaml
+from needle_tracker.optics.calibration import parse_calibration
 
 Floats = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
+Projection = Callable[[Floats], Floats]
 
+MAX_BYTES = 30_000
+"""Size limit of a camera image; a film of both cameras has at most 3.7 MB, 5 MB as text."""
+_LARGEST_PX = (480, 400)
+# Tried in this order.
+_QUALITIES = (75, 60, 45, 30, 15, 5, 1)
+_MAX_POINTS = 24
+_MAX_COORDINATE_PX = 1e4
 MAX_FRAMES = 61
 """Every 2 mm of 120 mm, and the start."""
 
@@ -25,10 +48,8 @@ READINGS = (
     "Pitch, estimated",
     "Roll, estimated",
     "Base turned",
-    "Controller",
 )
 """Labels of the values shown with each frame."""
-_NOTHING = "-"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,10 +90,11 @@ def film_of(run: Run) -> list[Frame]:
     stamps = all_stamps[_spread(run.insertion_at(all_stamps))]
     measured = _trails(run, run.tips, stamps)
     true = _trails(run, run.truth, stamps) if len(run.truth) else measured
-    readings = _Readings(run)
     return [
-        Frame(int(stamp), shaft, needle, readings.at(int(stamp)))
-        for stamp, shaft, needle in zip(stamps, measured, true, strict=True)
+        Frame(int(stamp), shaft, needle, texts)
+        for stamp, shaft, needle, texts in zip(
+            stamps, measured, true, _readings(run, stamps), strict=True
+        )
     ]
 
 
@@ -105,60 +127,172 @@ def _trails(run: Run, series: Series, stamps: Stamps) -> list[Floats]:
     return [found.get(stamp, np.empty((0, 3))) for stamp in stamps.tolist()]
 
 
-class _Readings:
-    """Values shown with an exposure."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-        self._true_r1 = dict(zip(run.truth.stamps.tolist(), true_r1(run).tolist(), strict=True))
-        self._estimates = {stamp: index for index, stamp in enumerate(run.reduced_state.stamps)}
-        self._status_times = [status.log_time for status in run.controller_status]
-
-    def at(self, stamp: int) -> tuple[str, ...]:
-        run = self._run
-        insertion, rotation = run.joints_at(np.array([stamp]))[0].tolist()
-        r1 = self._true_r1.get(stamp)
-        index = self._estimates.get(stamp)
-        estimated, controller = (_NOTHING,) * 3, _NOTHING
-        if index is not None:
-            status = self._status_of(index)
-            x, pitch, roll = run.reduced_state.values[index].tolist()
-            estimated = (
-                f"{x * 1e3:+.2f} mm{_interval(status)}",
-                f"{np.degrees(pitch):+.1f} deg",
-                f"{np.degrees(roll):+.0f} deg",
-            )
-            controller = _confidence(status)
-        return (
-            _NOTHING if np.isnan(insertion) else f"{insertion * 1e3:.1f} mm",
-            _NOTHING if r1 is None else f"{r1 * 1e3:+.2f} mm",
-            *estimated,
-            _NOTHING if np.isnan(rotation) else f"{np.degrees(rotation):.0f} deg",
-            controller,
-        )
-
-    def _status_of(self, index: int) -> Status | None:
-        """Return the last controller status before the next estimate."""
-        received = self._run.reduced_state.received
-        until = int(received[index + 1]) if index + 1 < len(received) else None
-        statuses = self._run.controller_status
-        last = len(statuses) if until is None else bisect_left(self._status_times, until)
-        return statuses[last - 1] if last else None
+def _readings(run: Run, stamps: Stamps) -> list[tuple[str, ...]]:
+    """Return the values shown with each exposure, as text."""
+    insertion, rotation = run.joints_at(stamps).T
+    columns = [
+        (insertion * 1e3, "{:.1f} mm"),
+        (_at(run.truth, true_r1(run), stamps) * 1e3, "{:+.2f} mm"),
+        (np.degrees(rotation), "{:.0f} deg"),
+    ]
+    x, pitch, roll = (_at(run.reduced_state, v, stamps) for v in run.reduced_state.values.T)
+    columns[2:2] = [
+        (x * 1e3, "{:+.2f} mm"),
+        (np.degrees(pitch), "{:+.1f} deg"),
+        (np.degrees(roll), "{:+.0f} deg"),
+    ]
+    texts = [[form.format(v) if np.isfinite(v) else "-" for v in vs] for vs, form in columns]
+    return list(zip(*texts, strict=True))
 
 
-def _interval(status: Status | None) -> str:
-    """Return half of the 95 % interval of r1, as text."""
-    if status is None:
-        return ""
+def _at(series: Series, values: Floats, stamps: Stamps) -> Floats:
+    """Return the values of a series at these stamps, (N,); NaN where it has none."""
+    found = np.full(len(stamps), np.nan)
+    here, there = series.at(stamps)
+    found[there] = values[here]
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A picture for all frames, or one for each, with the needle drawn over it.
+
+    Attributes
+    ----------
+    name : str
+        Caption.
+    size : tuple of int
+        Width and height of the coordinates in `lines` [px].
+    pictures : sequence of bytes
+        A JPEG for each frame, empty if the bag has none; or one PNG for all frames.
+    lines : sequence of (n, 2) float64
+        The needle in each frame, from the entry point to the tip; empty: not drawn.
+    """
+
+    name: str
+    size: tuple[int, int]
+    pictures: Sequence[bytes]
+    lines: Sequence[Floats]
+
+    @property
+    def is_chart(self) -> bool:
+        """Whether there is one drawing for all frames."""
+        return len(self.pictures) == 1 and self.pictures[0].startswith(b"\x89PNG")
+
+
+def projections(run: Run) -> dict[str, Projection]:
+    """Return the projections of both cameras; empty without a calibration."""
+    # Compiled code, which a run without images does not need.
+    from needle_tracker.optics.refraction import stereo_views  # noqa: PLC0415
+
     try:
-        low, high = float(status.values["r1_low_m"]), float(status.values["r1_high_m"])
-    except (KeyError, ValueError):
-        return ""
-    return f" ± {(high - low) / 2 * 1e3:.2f}" if np.isfinite(high - low) else ""
+        calibration = parse_calibration(load_yaml(run.calibration))
+    except (UserError, ValueError):
+        return {}
+    views = stereo_views(calibration)
+    return {side: view.project for side, view in zip(SIDES, views, strict=True)}
 
 
-def _confidence(status: Status | None) -> str:
-    trusted = status.values.get("trusted", "") if status else ""
-    if trusted in ("", "trusted"):
-        return trusted or _NOTHING
-    return trusted.partition(":")[0]
+def camera_views(run: Run, frames: Sequence[Frame]) -> list[View]:
+    """Return the camera views.
+
+    Parameters
+    ----------
+    run : Run
+        The run; its images are read.
+    frames : sequence of Frame
+        Frames of the film.
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be read.
+    """
+    pictures: dict[tuple[int, str], bytes] = {}
+    sizes: dict[str, tuple[int, int]] = {}
+    stamps = np.array([frame.stamp for frame in frames], np.int64)
+    for index, side, image in images_at(run, stamps):
+        pictures[index, side] = _small_jpeg(image)
+        sizes.setdefault(side, (image.shape[1], image.shape[0]))
+    seen_by = projections(run) if sizes else {}
+    return [
+        View(
+            f"{side} camera",
+            sizes[side],
+            [pictures.get((index, side), b"") for index in range(len(frames))],
+            [_pixels(seen_by.get(side), frame.shaft) for frame in frames],
+        )
+        for side in SIDES
+        if side in sizes
+    ]
+
+
+def plan_views(run: Run, frames: Sequence[Frame]) -> list[View]:
+    """Return drawings of needle and target from the side and from above."""
+    names = {0: "from the side, with the target plane", 1: "from above"}
+    return [_plan_view(run, frames, axis, name) for axis, name in names.items()]
+
+
+def _plan_view(run: Run, frames: Sequence[Frame], axis: int, name: str) -> View:
+    plane, point = target_offset(run), target_point(run)
+    known = [run.truth.values[:, :3], finite_tips(run).values, np.zeros((1, 3))]
+    if point is not None:
+        known.append(point[None])
+    elif axis == 0:
+        known.append(np.array([[plane - GOAL, 0.0, 0.0], [plane + GOAL, 0.0, 0.0]]))
+    places = np.concatenate(known) * MM
+    with stacked(1, 2.5, top=0.12) as (figure, (axes,)):
+        low, high = places.min(axis=0), places.max(axis=0)
+        room = 0.06 * (high - low) + 0.2
+        axes.set_xlim(low[2] - room[2], high[2] + room[2])
+        axes.set_ylim(low[axis] - room[axis], high[axis] + room[axis])
+        if point is not None:
+            axes.plot(point[2] * MM, point[axis] * MM, "*", ms=13, color=GOAL_BAND)
+        elif axis == 0:
+            draw_goal(axes, plane)
+        path = (run.truth if len(run.truth) else finite_tips(run)).values * MM
+        axes.plot(path[:, 2], path[:, axis], color=TRUTH, lw=0.9, ls=(0, (2, 3)))
+        axes.set(xlabel="z, insertion [mm]", ylabel=("x, up [mm]", "y, beside [mm]")[axis])
+        buffer = io.BytesIO()
+        save(figure, buffer)
+        picture = buffer.getvalue()
+        width, height = png_size(picture)
+        corners = np.array([[0.0, 0.0], [1.0, 1.0]])
+        (left, bottom), (right, top) = figure.transFigure.inverted().transform(
+            axes.transAxes.transform(corners)
+        )
+        x_range, y_range = axes.get_xlim(), axes.get_ylim()
+
+    def pixels(needle: Floats) -> Floats:
+        along = (needle[:, 2] * MM - x_range[0]) / (x_range[1] - x_range[0])
+        up = (needle[:, axis] * MM - y_range[0]) / (y_range[1] - y_range[0])
+        u = (left + along * (right - left)) * width
+        v = (1.0 - bottom - up * (top - bottom)) * height
+        return np.stack([u, v], axis=1)
+
+    lines = [_pixels(pixels, frame.needle) for frame in frames]
+    return View(name, (width, height), [picture], lines)
+
+
+def _pixels(project: Projection | None, needle: Floats) -> Floats:
+    """Return the pixels of a needle, thinned out, (n, 2)."""
+    if project is None or not len(needle):
+        return np.empty((0, 2))
+    chosen = np.unique(np.linspace(0, len(needle) - 1, _MAX_POINTS).round().astype(int))
+    line = np.asarray(project(needle[chosen]), np.float64)
+    return np.clip(line[np.isfinite(line).all(axis=1)], -_MAX_COORDINATE_PX, _MAX_COORDINATE_PX)
+
+
+def _small_jpeg(image: Image) -> bytes:
+    """Return an image as a JPEG of at most `_LARGEST_PX` and `MAX_BYTES`."""
+    height, width = image.shape
+    scale = min(1.0, _LARGEST_PX[0] / width, _LARGEST_PX[1] / height)
+    size = (max(round(width * scale), 1), max(round(height * scale), 1))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    data = b""
+    for quality in _QUALITIES:
+        done, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        data = bytes(encoded) if done else b""
+        if len(data) <= MAX_BYTES:
+            break
+    return data

@@ -80,7 +80,7 @@ class BagWriter:
         self._max_file_size = max_file_size
         self._describe_itself = describe_itself
         self._compression = CompressionType[compression.upper()]
-        self._topics: list[BagTopic] = []
+        self._topics: dict[str, BagTopic] = {}
         self._files: list[DataFile] = []
         self._custom_data: dict[str, str] = {}
         try:
@@ -95,21 +95,21 @@ class BagWriter:
         """The file that is being written."""
         return self.directory / self._files[-1].name
 
-    def add_topic(self, topic: BagTopic) -> int:
-        """Announce a topic; return its number for `write`."""
-        self._topics.append(topic)
+    def add_topic(self, topic: BagTopic) -> str:
+        """Announce a topic; return its name."""
+        self._topics[topic.name] = topic
         self._register(topic)
-        return len(self._topics) - 1
+        return topic.name
 
     def write(
-        self, topic: int, data: bytes, log_time: int, publish_time: int, sequence: int = 0
+        self, topic: str, data: bytes, log_time: int, publish_time: int, sequence: int = 0
     ) -> None:
         """Append one serialised message.
 
         Parameters
         ----------
-        topic : int
-            Number from `add_topic`.
+        topic : str
+            Name of a topic that was announced.
         data : bytes
             The message as CDR with its header.
         log_time, publish_time : int
@@ -129,17 +129,12 @@ class BagWriter:
                 self._channels[topic], log_time, data, publish_time, sequence & _SEQUENCE_MASK
             )
         self._file_bytes += len(data)
-        self._files[-1].add(self._topics[topic].name, log_time)
+        self._files[-1].add(topic, log_time)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Append a named MCAP metadata record."""
         with self._writing():
             self._mcap.add_metadata(name, dict(values))
-
-    def add_attachment(self, name: str, media_type: str, data: bytes, time: int) -> None:
-        """Append a file as an MCAP attachment; `time` is system time [ns]."""
-        with self._writing():
-            self._mcap.add_attachment(time, time, name, media_type, data)
 
     def set_custom_data(self, key: str, value: str) -> None:
         """Set a text of `custom_data` in metadata.yaml."""
@@ -193,13 +188,13 @@ class BagWriter:
         self._files.append(DataFile(name))
         self._file_bytes = 0
         self._schemas: dict[tuple[str, str], int] = {}
-        self._channels: list[int] = []
+        self._channels: dict[str, int] = {}
         self._mcap = Writer(
             self._stream, chunk_size=self._chunk_size, compression=self._compression
         )
         self._mcap.start(profile="ros2", library=LIBRARY)
         self._mcap.add_metadata(METADATA_RECORD, {DISTRO_KEY: self._distribution})
-        for topic in self._topics:
+        for topic in self._topics.values():
             self._register(topic)
         # Detect a full or broken disk before there are messages to lose.
         self._mcap.flush()  # type: ignore[no-untyped-call]
@@ -227,10 +222,8 @@ class BagWriter:
             self._schemas[key] = self._mcap.register_schema(
                 topic.type_name, topic.encoding, topic.definition.encode()
             )
-        self._channels.append(
-            self._mcap.register_channel(
-                topic.name, "cdr", self._schemas[key], channel_metadata(topic)
-            )
+        self._channels[topic.name] = self._mcap.register_channel(
+            topic.name, "cdr", self._schemas[key], channel_metadata(topic)
         )
 
     @contextlib.contextmanager
@@ -241,7 +234,9 @@ class BagWriter:
             raise BagWriteError(f"cannot write {self.data_file}: {error.strerror}") from error
 
     def _information(self) -> dict[str, object]:
-        return bag_information(self._files, self._topics, self._custom_data, self._distribution)
+        return bag_information(
+            self._files, list(self._topics.values()), self._custom_data, self._distribution
+        )
 
 
 def refuse_existing_bag(directory: Path) -> None:
@@ -252,7 +247,7 @@ def refuse_existing_bag(directory: Path) -> None:
         raise UserError(f"{directory} already contains a bag: give a new directory")
 
 
-class BagCopy:
+class BagCopy(BagWriter):
     """A compressed bag that adds each topic with its first message.
 
     Parameters
@@ -271,26 +266,20 @@ class BagCopy:
     """
 
     def __init__(self, directory: Path, distribution: str, custom_data: Mapping[str, str]) -> None:
-        self._writer = BagWriter(directory, distribution=distribution, compression="zstd")
-        self._topics: dict[str, int] = {}
-        for key, text in custom_data.items():
-            self._writer.set_custom_data(key, text)
+        super().__init__(directory, distribution=distribution, compression="zstd")
+        self._custom_data.update(custom_data)
 
     def put(self, topic: BagTopic, data: bytes, log_time: int, sent: int) -> None:
         """Append a message that was received at `log_time` and sent at `sent` [ns].
 
         Raises
         ------
-        UserError
+        BagWriteError
             If the disk refuses the data.
         """
         if topic.name not in self._topics:
-            self._topics[topic.name] = self._writer.add_topic(topic)
-        self._writer.write(self._topics[topic.name], data, log_time, sent)
-
-    def close(self) -> None:
-        """Complete the bag; raises UserError if the disk refuses the data."""
-        self._writer.close()
+            self.add_topic(topic)
+        self.write(topic.name, data, log_time, sent)
 
 
 def standard_topic(name: str, type_name: str) -> BagTopic:

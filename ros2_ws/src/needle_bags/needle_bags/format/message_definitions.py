@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import importlib
-import re
+from collections.abc import Iterator
 from typing import Any
 
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from needle_core.errors import UserError
-from needle_core.files.bag_topic import parsed_types
+from needle_core.files.bag_topic import BagTopic, parsed_types
 from needle_core.files.installed import find_shared_file
 
 _SEPARATOR = "=" * 80
-_BUILT_IN_TEXT = """
-bool byte char float32 float64 int8 uint8 int16 uint16 int32 uint32 int64 uint64 string wstring
-"""
-_BUILT_IN = frozenset(_BUILT_IN_TEXT.split())
-# A type, its bound (`string<=10`) and its array mark, then the field's name.
-_FIELD = re.compile(r"^\s*([A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w")
+_SINGLE = (Nodetype.BASE, Nodetype.NAME)
 
 
 def full_definition(type_name: str) -> str:
@@ -77,6 +73,27 @@ def message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.{kind}"), short)
 
 
+def unplayable(topic: BagTopic) -> str:
+    """Return why a topic cannot be played; an empty text if it can."""
+    try:
+        installed = full_definition(topic.type_name)
+        message_class(topic.type_name)
+        installed_hash = type_hash(topic.type_name, installed)
+        recorded_hash = topic.type_hash or (
+            type_hash(topic.type_name, topic.definition) if topic.definition else installed_hash
+        )
+    except UserError as error:
+        return str(error)
+    except (ImportError, AttributeError, ValueError):
+        return f"{topic.type_name} is not installed"
+    if installed_hash != recorded_hash:
+        return (
+            f"{topic.type_name} has another definition in this bag than here (another "
+            "ROS distribution): play it where it was recorded"
+        )
+    return ""
+
+
 def _read(type_name: str) -> str:
     try:
         package, kind, name = type_name.split("/")
@@ -88,16 +105,11 @@ def _read(type_name: str) -> str:
         raise UserError(why) from None
 
 
-def _contained(type_name: str, text: str) -> list[str]:
-    """Return the full names of the message types in a definition."""
-    found = []
-    for line in text.splitlines():
-        match = _FIELD.match(line.split("#", 1)[0])
-        if match is None or match[1] in _BUILT_IN:
-            continue
-        pieces = match[1].split("/")
-        package = pieces[0] if len(pieces) > 1 else type_name.partition("/")[0]
-        if pieces == ["Header"]:
-            package = "std_msgs"
-        found.append(f"{package}/msg/{pieces[-1]}")
-    return found
+def _contained(type_name: str, text: str) -> Iterator[str]:
+    """Yield the full names of the message types in a definition."""
+    _, fields = parsed_types("ros2msg", text, type_name)[type_name]
+    for _, (kind, detail) in fields:
+        # An array or sequence is described by its element and its length.
+        element, name = (kind, detail) if kind in _SINGLE else detail[0]
+        if element == Nodetype.NAME:
+            yield name

@@ -1,16 +1,23 @@
-"""Clock of the player, and a thread that reads messages ahead."""
+"""Clock and keys of the player."""
 
 from __future__ import annotations
 
-import queue
-import threading
-from collections.abc import Callable, Iterator
-from typing import Generic, TypeVar
+import os
+import re
+import select
+import sys
+import termios
+import tty
+from typing import Any, Final
 
-T = TypeVar("T")
 _NANOSECONDS = 1e9
-# Number of messages read ahead: one second of stereo images, less than 60 MB.
-READ_AHEAD = 64
+PAUSE: Final = " "
+FASTER: Final = "\x1b[A"
+SLOWER: Final = "\x1b[B"
+FORWARD: Final = "\x1b[C"
+BACK: Final = "\x1b[D"
+# A terminal sends an arrow key as three characters, in application mode with O.
+_KEY: Final = re.compile(r"\x1b[\[O][A-D]|.", re.DOTALL)
 
 
 class PlaybackClock:
@@ -69,49 +76,30 @@ class PlaybackClock:
         return self._time + (now - self._since) * _NANOSECONDS * self.rate
 
 
-class ReadAhead(Generic[T]):
-    """Runs an iterator ahead in its own thread.
+def keys_in(text: str) -> list[str]:
+    """Return the keys in the characters of a terminal."""
+    return [key.replace("\x1bO", "\x1b[") for key in _KEY.findall(text)]
 
-    Parameters
-    ----------
-    make : callable
-        Makes the iterator, inside the thread.
-    """
 
-    def __init__(self, make: Callable[[], Iterator[T]]) -> None:
-        self._make = make
-        self._items: queue.Queue[tuple[T | None, Exception | None]] = queue.Queue(READ_AHEAD)
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="bag_reader", daemon=True)
-        self._thread.start()
+class Keys:
+    """Keys pressed in the terminal; none without a terminal."""
 
-    def next(self) -> T | None:
-        """Return the next item, None at the end; re-raises exceptions of the iterator."""
-        item, error = self._items.get()
-        if error is not None:
-            raise error
-        return item
+    def __init__(self) -> None:
+        self._file = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else None
+        self._before: list[Any] = []
 
-    def close(self) -> None:
-        """End the thread."""
-        self._closed.set()
-        self._thread.join()
+    def __enter__(self) -> Keys:
+        if self._file is not None:
+            self._before = termios.tcgetattr(self._file)
+            tty.setcbreak(self._file)
+        return self
 
-    def _run(self) -> None:
-        try:
-            for item in self._make():
-                if not self._put(item, None):
-                    return
-            self._put(None, None)
-        # next() re-raises it.
-        except Exception as error:  # noqa: BLE001
-            self._put(None, error)
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            termios.tcsetattr(self._file, termios.TCSADRAIN, self._before)
 
-    def _put(self, item: T | None, error: Exception | None) -> bool:
-        while not self._closed.is_set():
-            try:
-                self._items.put((item, error), timeout=0.1)
-            except queue.Full:
-                continue
-            return True
-        return False
+    def pressed(self) -> list[str]:
+        """Return the keys pressed since the last call."""
+        if self._file is None or not select.select([self._file], [], [], 0.0)[0]:
+            return []
+        return keys_in(os.read(self._file, 256).decode(errors="replace"))

@@ -121,20 +121,11 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
         metavar="HZ",
         help="publish the recording time on /clock, at 40 Hz or HZ, instead of a recorded one",
     )
-    given = parser.parse_args(arguments)
-    return PlayerOptions(
-        given.bag,
-        given.rate,
-        given.start,
-        given.end,
-        TopicChoice(
-            tuple(absolute_name(name) for name in given.topics), given.regex, given.exclude_regex
-        ),
-        dict(_remap(text) for text in given.remap),
-        given.loop,
-        given.paused,
-        given.clock,
-    )
+    given = vars(parser.parse_args(arguments))
+    names = tuple(map(absolute_name, given.pop("topics")))
+    topics = TopicChoice(names, given.pop("regex"), given.pop("exclude_regex"))
+    remaps = dict(map(_remap, given.pop("remap")))
+    return PlayerOptions(**given, topics=topics, remaps=remaps)
 
 
 def require_fits(options: PlayerOptions, contents: BagDirectory) -> None:

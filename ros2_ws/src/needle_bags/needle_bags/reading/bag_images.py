@@ -13,8 +13,9 @@ import numpy.typing as npt
 
 from needle_bags.format.bag_writer import stamp_of
 from needle_bags.reading.bag_messages import raw_as_sent, read_messages
-from needle_bags.reading.bag_reader import Run, nanoseconds
+from needle_bags.reading.bag_reader import Run
 from needle_core.errors import UserError
+from needle_core.message_types import to_nanoseconds
 
 SIDES = ("left", "right")
 TOPICS = {
@@ -82,7 +83,7 @@ def exposures(run: Run) -> Stamps:
         If the bag cannot be read.
     """
     left = {run.namespace + topic for topic, side in TOPICS.items() if side == "left"}
-    sent = raw_as_sent(run.path, left.__contains__, left.__contains__)
+    sent = raw_as_sent(run.path, left.__contains__)
     return np.unique(np.array([stamp_of(message.data) for message in sent], np.int64))
 
 
@@ -104,7 +105,7 @@ def images_at(run: Run, stamps: Stamps) -> Iterator[tuple[int, str, npt.NDArray[
     wanted = {int(stamp): index for index, stamp in enumerate(stamps)}
     names = {run.namespace + topic: side for topic, side in TOPICS.items()}
     for topic, _, message in read_messages(run.path, lambda name: name in names):
-        index = wanted.get(nanoseconds(message.header.stamp))
+        index = wanted.get(to_nanoseconds(message.header.stamp))
         if index is None:
             continue
         image = plain_image(message)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import heapq
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -18,15 +18,16 @@ from typing import Any
 from needle_core.files.bag_directory import BagDirectory, SentMessage
 
 __all__ = [
+    "IMAGE_TYPES",
     "Reorder",
     "SentMessage",
     "messages_as_sent",
     "raw_as_sent",
-    "raw_messages",
     "read_contents",
     "read_messages",
 ]
 
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 # If the fastest message of a topic has a delay outside these bounds [ns], the clocks differ.
 _MIN_DELAY, _MAX_DELAY = -1_000_000, 200_000_000
 # With fewer messages the delay may be that of the recorder.
@@ -70,41 +71,23 @@ def read_messages(path: Path, wanted: Callable[[str], bool]) -> Iterator[tuple[s
             yield message.topic, message.log_time, bag.deserialize(store, message)
 
 
-def raw_messages(
-    path: Path, topics: Collection[str], start: int, stop: int
-) -> Iterator[tuple[str, int, bytes]]:
-    """Yield (topic, log time [ns], serialised message) with start <= log time < stop, in order.
-
-    Raises
-    ------
-    UserError
-        If the bag cannot be read.
-    """
-    with BagDirectory(path) as bag:
-        for message in bag.messages(topics.__contains__, start, stop):
-            yield message.topic, message.log_time, message.data
-
-
 def messages_as_sent(
-    path: Path,
-    wanted: Callable[[str], bool],
-    is_large: Callable[[str], bool],
-    reorder: Reorder | None = None,
+    path: Path, wanted: Callable[[str], bool], reorder: Reorder | None = None
 ) -> Iterator[tuple[SentMessage, Any]]:
     """Yield raw and decoded messages in the order of `raw_as_sent`.
 
-    `reorder` changes the order of the messages that are not large, if the senders' clocks agree.
+    `reorder` changes the order of all messages but images, if the senders' clocks agree.
     """
     with BagDirectory(path) as bag:
         store = bag.typestore()
-        for sent in _as_sent(bag, wanted, is_large, reorder):
+        for sent in _as_sent(bag, wanted, reorder):
             yield sent, bag.deserialize(store, sent)
 
 
-def raw_as_sent(
-    path: Path, wanted: Callable[[str], bool], is_large: Callable[[str], bool]
-) -> Iterator[SentMessage]:
+def raw_as_sent(path: Path, wanted: Callable[[str], bool]) -> Iterator[SentMessage]:
     """Yield the messages of the wanted topics in the order of sending.
+
+    Images do not fit into memory; each of their topics is expected in order.
 
     Parameters
     ----------
@@ -112,9 +95,6 @@ def raw_as_sent(
         The bag.
     wanted : callable
         Whether a topic is wanted.
-    is_large : callable
-        Whether the messages of a topic, such as images, do not fit into memory; such topics are
-        expected in order.
 
     Raises
     ------
@@ -122,17 +102,15 @@ def raw_as_sent(
         If the bag cannot be read.
     """
     with BagDirectory(path) as bag:
-        yield from _as_sent(bag, wanted, is_large, None)
+        yield from _as_sent(bag, wanted, None)
 
 
 def _as_sent(
-    bag: BagDirectory,
-    wanted: Callable[[str], bool],
-    is_large: Callable[[str], bool],
-    reorder: Reorder | None,
+    bag: BagDirectory, wanted: Callable[[str], bool], reorder: Reorder | None
 ) -> Iterator[SentMessage]:
-    small = list(bag.messages(lambda name: wanted(name) and not is_large(name)))
-    streamed = bag.messages(lambda name: wanted(name) and is_large(name))
+    images = {name for name, topic in bag.topics.items() if topic.type_name in IMAGE_TYPES}
+    small = list(bag.messages(lambda name: wanted(name) and name not in images))
+    streamed = bag.messages(lambda name: wanted(name) and name in images)
     if not _clocks_agree(small):
         small, streamed = list(map(_as_received, small)), map(_as_received, streamed)
         reorder = None

@@ -4,33 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from needle_bags.reading.bag_messages import read_contents, read_messages
-from needle_bags.reading.bag_rigs import CALIBRATION, namespace_of, namespaces, require_types
 from needle_core.errors import UserError
+from needle_core.files.bag_directory import BagDirectory
 from needle_core.files.yaml_files import load_yaml
+from needle_core.message_types import to_nanoseconds
+from needle_core.messages import INSERTION_JOINT, ROTATION_JOINT
 
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 
-_NANOSECONDS = 1_000_000_000
-# Row length of each series.
-_WIDTHS = {
-    **{"tips": 3, "tip_covariances": 9, "truth": 7, "estimate": 7, "estimate_covariances": 36},
-    **{"reduced_state": 3, "joints": 2, "control_input": 3, "commands": 2, "holds": 2},
-}
+CALIBRATION = "stereo_tracker/calibration"
+_CONTROLLER, _DEVICE, _RESULT = "needle/controller_status", "device/status", "device/result"
+_HEALTH = "/diagnostics"
 RECORDING = ("recording_ended", "recovered", "messages_lost", "parameter_changes")
-
-
-class _HasStamp(Protocol):
-    sec: int
-    nanosec: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,133 +215,119 @@ def read_run(path: Path, namespace: str | None = None) -> Run:
     contents = read_contents(path)
     custom = contents.custom_data
     namespace = namespace_of(contents, namespace)
-    collected = _Collector(namespace, namespaces(contents))
-    handlers = {namespace + name: handler for name, handler in collected.handlers().items()}
-    handlers["/diagnostics"] = collected.add_diagnostics
-    require_types(contents, namespace)
-    for topic, log_time, message in read_messages(path, lambda name: name in handlers):
-        try:
-            handlers[topic](log_time, message)
-        except (AttributeError, TypeError, ValueError) as error:
-            where = contents.distribution or "another distribution"
-            raise UserError(
-                f"{path}: {topic} is not {contents.topics[topic].type_name} as Jazzy has it "
-                f"(bag of {where}: {error}): record it with ROS 2 Jazzy"
-            ) from error
-    return Run(
-        path=path,
-        **{name: collected.series(name, width) for name, width in _WIDTHS.items()},
-        controller_status=collected.controller_status,
-        device_status=collected.device_status,
-        results=collected.results,
-        health=collected.health,
-        topics=contents.counts,
-        parameters=_parameters(custom.get("parameters", "")),
-        run_info=_mapping(custom.get("run_info", "")),
-        versions={str(k): str(v) for k, v in _mapping(custom.get("versions", "")).items()},
-        calibration=collected.calibration or custom.get("calibration", ""),
-        commit=custom.get("commit", ""),
-        recording={key: custom[key] for key in RECORDING if custom.get(key)},
-        namespace=namespace,
+    topics = {topic for topic, _, _ in _SERIES.values()}
+    topics |= {_CONTROLLER, _DEVICE, _RESULT, CALIBRATION}
+    names = {namespace + topic: topic for topic in topics} | {_HEALTH: _HEALTH}
+    found: dict[str, _Messages] = {topic: [] for topic in names.values()}
+    for topic, log_time, message in read_messages(path, names.__contains__):
+        found[names[topic]].append((log_time, message))
+    calibrations = [str(message.data) for _, message in found[CALIBRATION]]
+    try:
+        return Run(
+            path=path,
+            **{name: _series(name, found[topic]) for name, (topic, _, _) in _SERIES.items()},
+            controller_status=_statuses(found[_CONTROLLER]),
+            device_status=_statuses(found[_DEVICE]),
+            results=[Result(t, to_nanoseconds(m.stamp), m.frame_id) for t, m in found[_RESULT]],
+            health=_health_events(found[_HEALTH], namespace, namespaces(contents)),
+            topics=contents.counts,
+            parameters=_parameters(custom.get("parameters", "")),
+            run_info=_mapping(custom.get("run_info", "")),
+            versions={str(k): str(v) for k, v in _mapping(custom.get("versions", "")).items()},
+            calibration=calibrations[-1] if calibrations else custom.get("calibration", ""),
+            commit=custom.get("commit", ""),
+            recording={key: custom[key] for key in RECORDING if custom.get(key)},
+            namespace=namespace,
+        )
+    except (AttributeError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{path} is not of the rig's graph as ROS 2 Jazzy has it (bag of "
+            f"{contents.distribution or 'another distribution'}: {error})"
+        ) from error
+
+
+def namespaces(contents: BagDirectory) -> list[str]:
+    """Return the namespaces of the rigs in a bag; each ends with `/`."""
+    return sorted(
+        name.removesuffix(_CONTROLLER)
+        for name in contents.topics
+        if name.endswith(f"/{_CONTROLLER}")
     )
 
 
-class _Collector:
-    """Collects the messages of one rig as rows, topic by topic."""
+def namespace_of(contents: BagDirectory, wanted: str | None = None) -> str:
+    """Return the namespace of the rig to read; it ends with `/`.
 
-    def __init__(self, namespace: str, rigs: Sequence[str]) -> None:
-        self._own = namespace.lstrip("/")
-        self._others = tuple(rig.lstrip("/") for rig in rigs if rig not in ("/", namespace))
-        self._rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = {}
-        self.controller_status: list[Status] = []
-        self.device_status: list[Status] = []
-        self.results: list[Result] = []
-        self.health: list[HealthEvent] = []
-        self.calibration = ""
-        self._last_health: dict[str, tuple[int, str]] = {}
+    Parameters
+    ----------
+    contents : BagDirectory
+        The bag.
+    wanted : str, optional
+        Namespace given by the user; required if the bag holds several rigs.
 
-    def handlers(self) -> dict[str, Callable[[int, Any], None]]:
-        """Return the handlers by relative topic name."""
-        return {
-            "needle/tip": lambda t, m: self._add("tips", t, m, _xyz(m.point)),
-            "needle/tip_pose": lambda t, m: self._add(
-                "tip_covariances",
-                t,
-                m,
-                tuple(np.reshape(m.pose.covariance, (6, 6))[:3, :3].ravel()),
-            ),
-            "sim/tip_pose": lambda t, m: self._add("truth", t, m, _pose(m.pose)),
-            "needle/estimate": self._add_estimate,
-            "needle/reduced_state": lambda t, m: self._add("reduced_state", t, m, _xyz(m.vector)),
-            "needle/control_input": lambda t, m: self._add("control_input", t, m, _xyz(m.vector)),
-            "device/hold": self._add_hold,
-            "joint_states": self._add_joints,
-            "device/joint_trajectory": self._add_command,
-            "device/result": self._add_result,
-            "needle/controller_status": lambda t, m: self.controller_status.append(
-                Status(t, {pair.key: pair.value for pair in m.values})
-            ),
-            "device/status": lambda t, m: self.device_status.append(
-                Status(t, {pair.key: pair.value for pair in m.values})
-            ),
-            CALIBRATION: self._add_calibration,
-        }
+    Raises
+    ------
+    UserError
+        If the bag holds no rig, not the wanted one, or several and none is given.
+    """
+    found = namespaces(contents)
+    if not found:
+        raise UserError(
+            f"{contents.path} contains no needle run: no topic {_CONTROLLER} among its "
+            f"{len(contents.topics)}; give a bag that the rig's recorder made"
+        )
+    listed = ", ".join(name.rstrip("/") or "/" for name in found)
+    if wanted is not None:
+        namespace = f"/{wanted.strip('/')}/".replace("//", "/")
+        if namespace not in found:
+            raise UserError(f"{contents.path} has no rig in {wanted}; it has rigs in {listed}")
+        return namespace
+    if len(found) > 1:
+        raise UserError(
+            f"{contents.path} holds {len(found)} rigs, in {listed}: choose one with --namespace"
+        )
+    return found[0]
 
-    def series(self, name: str, width: int) -> Series:
-        """Return the rows of a series sorted by stamp; of equal stamps the first."""
-        rows = self._rows.get(name, [])
-        stamps = np.array([stamp for stamp, _, _ in rows], dtype=np.int64)
-        received = np.array([log_time for _, log_time, _ in rows], dtype=np.int64)
-        values = np.array([row for _, _, row in rows], dtype=np.float64).reshape(len(rows), width)
-        unique, first = np.unique(stamps, return_index=True)
-        return Series(unique, values[first], received[first])
 
-    def _add(self, name: str, log_time: int, message: Any, row: tuple[float, ...]) -> None:
-        rows = self._rows.setdefault(name, [])
-        rows.append((nanoseconds(message.header.stamp), log_time, row))
+_Messages = list[tuple[int, Any]]
+"""Log times [ns] and messages of a topic."""
 
-    def _add_estimate(self, log_time: int, message: Any) -> None:
-        self._add("estimate", log_time, message, _pose(message.pose.pose))
-        covariance = tuple(float(value) for value in message.pose.covariance)
-        self._add("estimate_covariances", log_time, message, covariance)
 
-    def _add_hold(self, log_time: int, message: Any) -> None:
-        pressed = float(message.buttons[0]) if len(message.buttons) else 0.0
-        scale = float(message.axes[0]) if len(message.axes) else 0.0
-        # The stamp of a hold is a counter of its source.
-        self._rows.setdefault("holds", []).append((log_time, log_time, (pressed, scale)))
+def _statuses(messages: _Messages) -> list[Status]:
+    return [Status(t, {pair.key: pair.value for pair in m.values}) for t, m in messages]
 
-    def _add_joints(self, log_time: int, message: Any) -> None:
-        position = dict(zip(message.name, message.position, strict=False))
-        if "insertion_joint" in position and "rotation_joint" in position:
-            row = (float(position["insertion_joint"]), float(position["rotation_joint"]))
-            self._add("joints", log_time, message, row)
 
-    def _add_command(self, log_time: int, message: Any) -> None:
-        insertion = rotation = np.nan
-        if len(message.points) == 1:
-            positions = dict(zip(message.joint_names, message.points[0].positions, strict=False))
-            insertion = float(positions.get("insertion_joint", np.nan))
-            rotation = float(positions.get("rotation_joint", np.nan))
-        self._add("commands", log_time, message, (insertion, rotation))
+def _health_events(messages: _Messages, namespace: str, rigs: Sequence[str]) -> list[HealthEvent]:
+    """Return the changes between problem and recovery of each part, not of other rigs' parts."""
+    own = namespace.lstrip("/")
+    others = tuple(rig.lstrip("/") for rig in rigs if rig not in ("/", namespace))
+    last: dict[str, tuple[int, str]] = {}
+    events = []
+    for log_time, status in ((t, status) for t, m in messages for status in m.status):
+        name = str(status.name).removeprefix(own)
+        if name == status.name and name.startswith(others):
+            continue
+        now = (int(status.level), str(status.message))
+        before = last.get(name, (0, ""))
+        if before != now and (now[0] or before[0]):
+            events.append(HealthEvent(log_time, name, *now))
+        last[name] = now
+    return events
 
-    def _add_calibration(self, _: int, message: Any) -> None:
-        self.calibration = str(message.data)
 
-    def _add_result(self, log_time: int, message: Any) -> None:
-        self.results.append(Result(log_time, nanoseconds(message.stamp), message.frame_id))
-
-    def add_diagnostics(self, log_time: int, message: Any) -> None:
-        """Add the changes between problem and recovery of each part."""
-        for status in message.status:
-            name = str(status.name).removeprefix(self._own)
-            if name == status.name and name.startswith(self._others):
-                continue
-            now = (int(status.level), str(status.message))
-            before = self._last_health.get(name, (0, ""))
-            if before != now and (now[0] or before[0]):
-                self.health.append(HealthEvent(log_time, name, *now))
-            self._last_health[name] = now
+def _series(name: str, messages: _Messages) -> Series:
+    """Return the rows of a series sorted by stamp; of equal stamps the first."""
+    _, width, row_of = _SERIES[name]
+    # The stamp of a hold is a counter of its source.
+    rows = [
+        (log_time if name == "holds" else to_nanoseconds(message.header.stamp), log_time, row)
+        for log_time, message in messages
+        if (row := row_of(message)) is not None
+    ]
+    values = np.array([row for *_, row in rows], np.float64).reshape(len(rows), width)
+    received = np.array([log_time for _, log_time, _ in rows], np.int64)
+    unique, first = np.unique(np.array([row[0] for row in rows], np.int64), return_index=True)
+    return Series(unique, values[first], received[first])
 
 
 def _parameters(text: str) -> dict[str, dict[str, Any]]:
@@ -369,15 +350,47 @@ def _mapping(text: str) -> dict[str, Any]:
     return value if isinstance(value, dict) else {"text": str(value)}
 
 
-def nanoseconds(stamp: _HasStamp) -> int:
-    """Return a message's stamp in ns since the clock's epoch."""
-    return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
-
-
 def _xyz(vector: Any) -> tuple[float, ...]:
-    return (float(vector.x), float(vector.y), float(vector.z))
+    return (vector.x, vector.y, vector.z)
 
 
 def _pose(pose: Any) -> tuple[float, ...]:
-    q = pose.orientation
-    return (*_xyz(pose.position), float(q.x), float(q.y), float(q.z), float(q.w))
+    return (*_xyz(pose.position), *_xyz(pose.orientation), pose.orientation.w)
+
+
+def _tip_covariance(message: Any) -> Floats:
+    return np.reshape(message.pose.covariance, (6, 6))[:3, :3].ravel()
+
+
+def _hold(message: Any) -> tuple[float, ...]:
+    pressed = message.buttons[0] if len(message.buttons) else 0
+    return (pressed, message.axes[0] if len(message.axes) else 0.0)
+
+
+def _joints(names: Sequence[str], positions: Sequence[float]) -> tuple[float, ...] | None:
+    at: Mapping[str, float] = dict(zip(names, positions, strict=False))
+    if INSERTION_JOINT not in at or ROTATION_JOINT not in at:
+        return None
+    return (at[INSERTION_JOINT], at[ROTATION_JOINT])
+
+
+def _command(message: Any) -> tuple[float, ...]:
+    joints = None
+    if len(message.points) == 1:
+        joints = _joints(message.joint_names, message.points[0].positions)
+    return joints or (math.nan, math.nan)
+
+
+_SERIES: Mapping[str, tuple[str, int, Callable[[Any], Any]]] = {
+    "tips": ("needle/tip", 3, lambda m: _xyz(m.point)),
+    "tip_covariances": ("needle/tip_pose", 9, _tip_covariance),
+    "truth": ("sim/tip_pose", 7, lambda m: _pose(m.pose)),
+    "estimate": ("needle/estimate", 7, lambda m: _pose(m.pose.pose)),
+    "estimate_covariances": ("needle/estimate", 36, lambda m: m.pose.covariance),
+    "reduced_state": ("needle/reduced_state", 3, lambda m: _xyz(m.vector)),
+    "joints": ("joint_states", 2, lambda m: _joints(m.name, m.position)),
+    "control_input": ("needle/control_input", 3, lambda m: _xyz(m.vector)),
+    "commands": ("device/joint_trajectory", 2, _command),
+    "holds": ("device/hold", 2, _hold),
+}
+"""Series to its topic, the length of a row, and the row of a message; None: no row."""

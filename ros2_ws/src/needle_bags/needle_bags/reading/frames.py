@@ -7,15 +7,13 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from needle_bags.reading.bag_messages import read_contents, read_messages
+from needle_bags.reading.bag_messages import IMAGE_TYPES, read_contents, read_messages
 from needle_core.errors import UserError
 
 if TYPE_CHECKING:
     import pandas as pd
 
 INDEX, RECEIVED = "stamp", "received"
-# Images have no columns.
-_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _HEALTH = "diagnostic_msgs/msg/DiagnosticArray"
 _MAX_ELEMENTS = 64
 _NAMES = ("name", "joint_names")
@@ -60,7 +58,7 @@ def read_frames(path: str | Path, topics: Collection[str] = ()) -> dict[str, pd.
     for name in topics:
         if name not in types:
             raise UserError(f"{path}: no topic {name} (it has {', '.join(sorted(types))})")
-    wanted = topics or {name for name, kind in types.items() if kind not in _IMAGES}
+    wanted = topics or {name for name, kind in types.items() if kind not in IMAGE_TYPES}
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in sorted(wanted)}
     for topic, log_time, message in read_messages(path, rows.__contains__):
         for row in _rows(message):
@@ -74,7 +72,12 @@ def _rows(message: Any) -> Iterator[dict[str, Any]]:
         for status in message.status:
             yield {**dict(_flat(message.header, ("header",))), **dict(_flat(status, ()))}
     else:
-        yield dict(_flat(message, ()))
+        yield flat_fields(message)
+
+
+def flat_fields(message: Any) -> dict[str, Any]:
+    """Return the fields of a message of rosbags as the columns of `read_frames`."""
+    return dict(_flat(message, ()))
 
 
 def _flat(

@@ -18,7 +18,7 @@ from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.format.bag_metadata import USUAL_QOS
-from needle_bags.format.bag_writer import BagWriter
+from needle_bags.format.bag_writer import BagWriter, standard_topic
 from needle_bags.recording.provenance import commit, distribution, versions
 from needle_core.component import Component, Delivery, Input, Output
 from needle_core.convert import Converter, ros_type
@@ -58,10 +58,11 @@ class BagTap:
         rows: list[Input | Output] = [*others]
         for component in components:
             rows += [*component.outputs, *component.inputs]
-        self._numbers: dict[str, int] = {}
+        first: dict[str, Input | Output] = {}
         for row in rows:
-            if row.topic not in self._numbers:
-                self._numbers[row.topic] = self._writer.add_topic(self._topic(row))
+            first.setdefault(row.topic, row)
+        for row in first.values():
+            self._writer.add_topic(self._topic(row))
         texts = {"run_info": json.dumps(run_info), "commit": commit(), "calibration": ""}
         self._writer.add_metadata(RUN_RECORD, texts)
         for key, text in {**texts, "versions": json.dumps(versions())}.items():
@@ -74,22 +75,16 @@ class BagTap:
         data = bytes(self._store.serialize_cdr(ros_message, ros_type(output.message)))
         self._sequence[sender, output.topic] += 1
         sequence = self._sequence[sender, output.topic]
-        self._writer.write(self._numbers[output.topic], data, stamp_ns, stamp_ns, sequence)
+        topic = absolute_name(output.topic)
+        self._writer.write(topic, data, stamp_ns, stamp_ns, sequence)
 
     def close(self) -> None:
         """Complete the bag."""
         self._writer.close()
 
     def _topic(self, row: Input | Output) -> BagTopic:
-        type_name = ros_type(row.message)
-        definition, _ = self._store.generate_msgdef(type_name, ros_version=2)
-        return BagTopic(
-            absolute_name(row.topic),
-            type_name,
-            definition,
-            self._store.hash_rihs01(type_name),
-            (_offered(row.delivery),),
-        )
+        topic = standard_topic(absolute_name(row.topic), ros_type(row.message))
+        return dataclasses.replace(topic, offered_qos=(_offered(row.delivery),))
 
     def _write_parameters(self, components: Iterable[Component]) -> None:
         document = {}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from needle_bags.recording.recording import Recording, megabytes
-from needle_core.diagnostics import Diagnostic, Level
+from needle_core.diagnostics import Level
 
 # Warn when this many bytes are queued: one second of stereo images.
 WARN_WAITING: Final = 50_000_000
@@ -15,7 +15,6 @@ WARN_WAITING: Final = 50_000_000
 # is below this multiple of the reserve.
 WARN_BEFORE: Final = 120.0
 WARN_RESERVES: Final = 3
-_MAX_REASON_LENGTH: Final = 200
 
 
 class RecorderHealth:
@@ -77,26 +76,3 @@ class RecorderHealth:
             return ""
         reserve = megabytes(space.reserve)
         return f"the disk of {self._bag} is nearly full: recording stops at {reserve} free"
-
-
-class DecodeErrors:
-    """Number of inputs that could not be decoded, by source, with the last reason of each."""
-
-    def __init__(self) -> None:
-        self._counts: dict[str, int] = {}
-        self._reasons: dict[str, str] = {}
-
-    def add(self, source: str, error: Exception) -> bool:
-        """Count an error; return whether it is the first of its source."""
-        self._counts[source] = self._counts.get(source, 0) + 1
-        text = next(iter(str(error).splitlines()), "")
-        self._reasons[source] = f"{type(error).__name__}: {text}"[:_MAX_REASON_LENGTH]
-        return self._counts[source] == 1
-
-    def diagnostic(self) -> Diagnostic:
-        """Return a warning that names all sources with errors, or OK without any."""
-        if not self._counts:
-            return Diagnostic(Level.OK, "all understood", {})
-        parts = [f"{source} ({self._reasons[source]})" for source in self._counts]
-        values = {source: str(count) for source, count in self._counts.items()}
-        return Diagnostic(Level.WARN, f"cannot decode: {'; '.join(parts)}", values)

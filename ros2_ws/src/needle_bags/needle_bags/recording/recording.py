@@ -139,7 +139,6 @@ class Recording:
         self._clock = clock
         self._bag = bag
         self._waiting_limit = waiting_limit
-        self._numbers: dict[str, int] = {}
         self.error: str | None = None
         self.is_whole = False
         self.dropped: dict[str, int] = {}
@@ -163,7 +162,7 @@ class Recording:
 
     def add_topic(self, topic: BagTopic) -> None:
         """Announce a topic; required before the first `append` with its name."""
-        self._put(lambda: self._add_topic(topic))
+        self._put(lambda: self._bag.add_topic(topic))
 
     def append(self, message: Received) -> None:
         """Queue a message; drop and count it if the backlog limit is reached."""
@@ -188,10 +187,6 @@ class Recording:
         """Queue a metadata record; unlike metadata.yaml it survives a kill."""
         self._put(lambda: self._bag.add_metadata(name, values))
 
-    def add_file(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
-        """Queue a file to attach to the bag."""
-        self._put(lambda: self._bag.add_attachment(name, media_type, data, time_ns))
-
     def set_custom_data(self, key: str, value: str) -> None:
         """Queue a text for metadata.yaml's `custom_data`."""
         self._worker.put(lambda: self._bag.set_custom_data(key, value))
@@ -208,12 +203,14 @@ class Recording:
         self._lost_before = dict(lost_before or {})
         self._worker.finish()
 
-    def _put(self, job: Job) -> None:
+    def _put(self, job: Callable[[], object]) -> None:
         """Queue a job that is skipped once the recording has ended."""
-        self._worker.put(lambda: job() if self.error is None else None)
 
-    def _add_topic(self, topic: BagTopic) -> None:
-        self._numbers[topic.name] = self._bag.add_topic(topic)
+        def run() -> None:
+            if self.error is None:
+                job()
+
+        self._worker.put(run)
 
     def _write(self, message: Received) -> None:
         topic = message.topic
@@ -222,7 +219,7 @@ class Recording:
             return
         try:
             self._bag.write(
-                self._numbers[topic],
+                topic,
                 message.data,
                 message.log_time,
                 message.publish_time,

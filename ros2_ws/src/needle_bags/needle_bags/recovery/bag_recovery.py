@@ -11,15 +11,21 @@ import dataclasses
 import errno
 import os
 import shutil
+import struct
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
-from typing import Any, Final, NamedTuple
+from typing import IO, Any, Final, NamedTuple
 
+import zstandard
+from mcap.exceptions import EndOfFile, McapError
+from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
 from tqdm import tqdm
 
 from needle_bags.format.bag_metadata import DataFile, bag_information, write_metadata
-from needle_bags.recovery.mcap_prefix import PrefixCopy
+from needle_bags.format.bag_writer import CHUNK_SIZE, LIBRARY
 from needle_core.errors import UserError
 from needle_core.files.bag_directory import BagDirectory
 from needle_core.files.bag_path import (
@@ -28,12 +34,17 @@ from needle_core.files.bag_path import (
     read_information,
     recording_files,
 )
-from needle_core.files.file_access import sync_directory
+from needle_core.files.file_access import open_regular, sync_directory
 from needle_core.files.mcap_file import RUN_RECORD, custom_data_of
 
 # custom_data key: description of the loss.
 _RECOVERED: Final = "recovered"
 _DAMAGED: Final = ".damaged"
+# Errors of mcap's reader on damaged data.
+_DAMAGE: Final = (
+    *(McapError, ValueError, LookupError, struct.error, OverflowError, RuntimeError),
+    zstandard.ZstdError,
+)
 _NOTHING_LOST: Final = "its metadata or index was rebuilt; it contains everything that was written"
 
 
@@ -102,16 +113,10 @@ def recover_bag(path: Path) -> BagRecovery:
         metadata = {}  # metadata.yaml describes other files
     try:
         bag = _read_through(path)
-    except BrokenBagError as error:
+    except BrokenBagError:
         files = [path] if path.is_file() else listed or recording_files(path)
-        if not files or any(".mcap" not in file.suffixes for file in files):
-            raise  # SQLite: the message names another remedy
-        is_unpacked = all(file.suffix == ".mcap" and file.exists() for file in files)
-        if not is_unpacked and any(folder.glob("*.mcap.zstd")):
-            raise UserError(
-                f"{path}: {error.reason}; whole files are compressed: run "
-                f"`unzstd --rm {folder}/*.mcap.zstd` first"
-            ) from error
+        if not files or any(file.suffix != ".mcap" for file in files):
+            raise
     else:
         return BagRecovery(True, bag, "", 0.0, _left_out(bag, listed), [])
     try:
@@ -181,12 +186,10 @@ class _Recovery:
 
     def _read_damaged(self, file: Path) -> _Loss:
         """Copy the records before the damage of a file to a new file; return the loss."""
-        if shutil.disk_usage(self._scratch).free < file.stat().st_size:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))
         new = self._scratch / file.name
         loss = _Loss()
         with new.open("wb") as stream:
-            copy = PrefixCopy(file, stream)
+            copy = _PrefixCopy(file, stream)
             if copy.reason:
                 where = f"byte {copy.end} of {file.name} ({copy.reason})"
                 loss = self._loss(where, max(copy.last, self._last))
@@ -278,3 +281,78 @@ def _keep_original(path: Path) -> list[str]:
     except OSError:
         path.rename(kept)
     return [kept.name]
+
+
+class _PrefixCopy:
+    """Copy of all records before the first damaged one; its writer is not finished yet.
+
+    Parameters
+    ----------
+    source : Path
+        The damaged file.
+    target : file
+        Destination.
+
+    Raises
+    ------
+    OSError
+        If the disk refuses it.
+
+    Attributes
+    ----------
+    writer : Writer
+        Writer of the copy.
+    end : int
+        Position of the damage [B]; 0 if there is no intact record.
+    reason : str
+        The kind of damage; empty if the data end properly.
+    messages, last : int
+        Messages in the copy, and their latest log time [ns].
+    """
+
+    def __init__(self, source: Path, target: IO[bytes]) -> None:
+        self.writer = Writer(target, CHUNK_SIZE)
+        self.end = self.messages = self.last = 0
+        self.reason = ""
+        self._schemas = {0: 0}
+        self._channels: dict[int, int] = {}
+        with open_regular(source) as stream:
+            try:
+                # The reader returns the records of a chunk after checking its checksum.
+                for record in StreamReader(stream, validate_crcs=True).records:
+                    self._copy(record)
+                    self.end = stream.tell()
+            except EndOfFile:
+                self.reason = "the file ends inside a record"
+            except _DAMAGE as error:
+                self.reason = f"a record is damaged: {type(error).__name__}"
+
+    def _copy(self, record: Any) -> None:
+        match record:
+            case Header():
+                self.writer.start(record.profile, LIBRARY)
+            case Schema() if record.id not in self._schemas:
+                self._schemas[record.id] = self.writer.register_schema(
+                    record.name, record.encoding, record.data
+                )
+            case Channel() if record.id not in self._channels:
+                self._channels[record.id] = self.writer.register_channel(
+                    record.topic,
+                    record.message_encoding,
+                    self._schemas[record.schema_id],
+                    record.metadata,
+                )
+            case Message():
+                self.writer.add_message(
+                    self._channels[record.channel_id],
+                    record.log_time,
+                    record.data,
+                    record.publish_time,
+                    record.sequence,
+                )
+                self.messages += 1
+                self.last = max(self.last, record.log_time)
+            case Metadata():
+                self.writer.add_metadata(record.name, record.metadata)
+            case Attachment():
+                self.writer.add_attachment(**vars(record))

@@ -12,18 +12,13 @@ from matplotlib.figure import Figure
 
 from needle_bags.figures.event_figure import event_figure
 from needle_bags.figures.figure_style import save
-from needle_bags.figures.film import film_of
-from needle_bags.figures.film_views import camera_views, plan_views
-from needle_bags.figures.image_figure import frames_shown, images_figure
-from needle_bags.figures.insertion_figures import error_figure, path_figure, states_figure
-from needle_bags.figures.pair_figures import pair_figures
-from needle_bags.figures.step_figures import innovation_figure, timing_figure
+from needle_bags.figures.film import camera_views, film_of, plan_views
+from needle_bags.figures.run_figures import run_figures
+from needle_bags.figures.timing_figure import timing_figure
 from needle_bags.reading.bag_reader import Run, read_run
-from needle_bags.report.pair_page import build_pair_page, pair_values
-from needle_bags.report.report_page import build_page, verdict_text
-from needle_bags.run.innovation import innovations
-from needle_bags.run.run_summary import summarize, tip_error
-from needle_bags.run.stage_timing import StageTiming, stage_timings
+from needle_bags.report.pages import build_page, build_pair_page, pair_values, verdict_text
+from needle_bags.run.run_summary import summarize
+from needle_bags.run.stage_timing import stage_timings
 from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_core.commands.options import CommandParser
 from needle_core.errors import UserError
@@ -78,12 +73,15 @@ def write_report(run: Run, summary: dict[str, JsonValue], directory: Path | None
     """
     timings = stage_timings(run)
     frames = film_of(run)
-    cameras, images = camera_views(run, frames, frames_shown(run, frames))
-    figures = {**figures_of(run, timings), "images": images_figure(run, frames, images)}
-    data = {name: _png(figure) for name, figure in figures.items() if figure is not None}
+    views = [*camera_views(run, frames), *plan_views(run, frames)]
+    figures = run_figures([run])
+    if timings:
+        figures["timing"] = timing_figure(run, timings)
+    if (events := event_figure(run)) is not None:
+        figures["events"] = events
+    data = {name: _png(figure) for name, figure in figures.items()}
     files = {f"{name}.png": png for name, png in data.items()}
-    film = (frames, [*cameras, *plan_views(run, frames)])
-    files[PAGE] = build_page(run, summary, data, timings, film).encode()
+    files[PAGE] = build_page(run, summary, data, timings, (frames, views)).encode()
     return _write(directory or _folder(run), files)
 
 
@@ -111,7 +109,7 @@ def write_pair_report(
     UserError
         If it cannot be written.
     """
-    data = {name: _png(figure) for name, figure in pair_figures(*runs).items()}
+    data = {name: _png(figure) for name, figure in run_figures(runs).items()}
     name = f"compared_with_{runs[0].path.absolute().name}.html"
     page = build_pair_page(runs, summaries, data).encode()
     return _write(directory or _folder(runs[1]), {name: page})
@@ -140,27 +138,6 @@ def _png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     save(figure, buffer)
     return buffer.getvalue()
-
-
-def figures_of(run: Run, timings: Sequence[StageTiming]) -> dict[str, Figure | None]:
-    """Return the figures of a run except images, by file name; None without data.
-
-    Parameters
-    ----------
-    run : Run
-        The recorded run.
-    timings : sequence of StageTiming
-        Its stages (`stage_timing.stage_timings`).
-    """
-    found = innovations(run)
-    return {
-        "states": states_figure(run),
-        "path": path_figure(run),
-        "errors": error_figure(run) if len(tip_error(run)) else None,
-        "innovation": None if found is None else innovation_figure(run, found),
-        "timing": timing_figure(run, timings) if timings else None,
-        "events": event_figure(run),
-    }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import sys
-from collections.abc import Iterator, Sequence, Set
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,75 +14,31 @@ from rosbags.typesys import Stores, get_typestore
 from tqdm import tqdm
 
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
-from needle_bags.reading.bag_messages import Reorder, SentMessage, messages_as_sent
-from needle_bags.reading.bag_reader import Run, Series, nanoseconds
-from needle_bags.rerun.comparison import FIELDS, Record, members
-from needle_bags.rerun.reception_order import in_reception_order
+from needle_bags.reading.bag_images import exposures
+from needle_bags.reading.bag_messages import (
+    Reorder,
+    SentMessage,
+    messages_as_sent,
+    read_contents,
+)
+from needle_bags.reading.bag_reader import Run, Series
+from needle_bags.reading.frames import flat_fields
+from needle_bags.rerun.comparison import FIELDS, Record
+from needle_bags.rerun.stages import Output, Stage
 from needle_bags.run.run_summary import estimate_error
-from needle_core.convert import Converter
-from needle_core.message_types import rosbags_types
+from needle_controller.controller_status import ReceivedMessage, received_messages
+from needle_core.message_types import to_nanoseconds
 
 POSE = "needle/tip_pose"
 TIP_TOPICS = ("needle/tip", POSE)
 
 # The answers to inputs this short before the end of the bag may be missing from it [ns].
 _END_MARGIN = 500_000_000
+_STATUS = "needle/controller_status"
 _STORE = get_typestore(Stores.ROS2_JAZZY)
-CONVERTER = Converter(rosbags_types(_STORE))
-"""Converts to rosbags messages."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Output:
-    """A message of the current code.
-
-    Attributes
-    ----------
-    topic : str
-        Relative name.
-    log_time : int
-        Log time of the input that caused it [ns].
-    stamp : int
-        Stamp of the message [ns].
-    message : Any
-        The message, of rosbags' class.
-    """
-
-    topic: str
-    log_time: int
-    stamp: int
-    message: Any
-
-    @property
-    def type_name(self) -> str:
-        """Name of the message's type."""
-        return str(self.message.__msgtype__)
-
-    @property
-    def data(self) -> bytes:
-        """The message as CDR."""
-        return bytes(_STORE.serialize_cdr(self.message, self.type_name))
-
-
-class Stage(Protocol):
-    """A part of the rig that turns messages into outputs."""
-
-    @property
-    def topics(self) -> frozenset[str]:
-        """Names of its input topics, relative to the rig's namespace, or absolute."""
-        ...
-
-    def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
-        """Process a message of a topic, by its relative name; return the outputs."""
-        ...
-
-
-class FinishingStage(Stage, Protocol):
-    """A stage that may have outputs left at the end of the bag."""
-
-    def finish(self, log_time: int) -> list[Output]:
-        """Return the remaining outputs."""
-        ...
+Errors = npt.NDArray[np.float64] | None
+Change = Callable[[str, Any], Iterable[tuple[str, Any]]]
+"""Replaces an input (relative topic, message) by any number of others."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,17 +71,17 @@ def has_images(run: Run) -> bool:
     return len(sides) == 2
 
 
-def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None) -> Rerun:
+def run_again(run: Run, tracker: Stage | None, controller: Stage) -> Rerun:
     """Process a bag with the stages.
 
     Parameters
     ----------
     run : Run
         The run; its bag is read again.
-    tracker : FinishingStage or None
+    tracker : Stage or None
         Processes the images; None without images.
-    controller : Stage or None
-        Processes the recorded tips; None if no controller was recorded.
+    controller : Stage
+        Processes the recorded tips.
 
     Returns
     -------
@@ -137,49 +93,51 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
     UserError
         If the bag is broken.
     """
-    watched: set[str] = set()
-    if tracker is not None:
-        watched.update(TIP_TOPICS)
-    if controller is not None:
-        watched.update(topic for topic in FIELDS if topic not in TIP_TOPICS)
-    recorded: list[Record] = []
+    watched = FIELDS.keys() - (TIP_TOPICS if tracker is None else ())
+    recorded = [
+        Record(topic, to_nanoseconds(message.header.stamp), flat_fields(message))
+        for topic, _, message in _inputs(run, watched)
+    ]
     outputs: list[Output] = []
-    exposed: set[int] = set()
-    # The tracker answers every pair that it receives.
-    answered = set(run.tip_covariances.stamps.tolist())
-    without_images = last_time = unanswered = 0
-    for topic, sent, message in _inputs(run, watched | _topics(tracker)):
-        last_time = max(last_time, sent.log_time)
-        if IMAGE_TOPICS.get(topic) == "left":
-            stamp = nanoseconds(message.header.stamp)
-            if answered and stamp not in answered:
-                unanswered += 1
-                continue
-            exposed.add(stamp)
-        if topic in watched:
-            stamp = nanoseconds(message.header.stamp)
-            recorded.append(Record(topic, stamp, dict(members(message))))
-        if tracker is not None and topic in tracker.topics:
-            outputs += tracker.process(topic, sent, message)
+    without_images = unanswered = 0
     if tracker is not None:
-        outputs += tracker.finish(last_time)
-        kept = [r for r in recorded if r.topic not in TIP_TOPICS or r.stamp in exposed]
-        without_images = sum(record.topic == POSE for record in recorded) - sum(
-            record.topic == POSE for record in kept
-        )
-        recorded = kept
-    if controller is not None:
-        for topic, sent, message in _inputs(run, controller.topics, _by_reception(run)):
-            outputs += controller.process(topic, sent, message)
+        exposed = set(exposures(run).tolist())
+        # The tracker answers every pair that it receives.
+        answered = set(run.tip_covariances.stamps.tolist()) or exposed
+        unanswered = len(exposed - answered)
+        exposed &= answered
+
+        def received(topic: str, message: Any) -> Iterator[tuple[str, Any]]:
+            is_left = IMAGE_TOPICS.get(topic) == "left"
+            if not is_left or to_nanoseconds(message.header.stamp) in exposed:
+                yield topic, message
+
+        outputs += run_stage(run, tracker, change=received)
+        without_images = sum(r.topic == POSE and r.stamp not in exposed for r in recorded)
+        recorded = [r for r in recorded if r.topic not in TIP_TOPICS or r.stamp in exposed]
+    outputs += run_stage(run, controller, _by_reception(run))
     today = [
-        Record(o.topic, o.stamp, dict(members(o.message)))
-        for o in _recordable(recorded, outputs, last_time)
+        Record(output.topic, output.stamp, flat_fields(output.message))
+        for output in _recordable(recorded, outputs, read_contents(run.path).end)
     ]
     return Rerun(recorded, today, outputs, without_images, unanswered)
 
 
-def run_stage(run: Run, stage: FinishingStage) -> list[Output]:
-    """Process a bag with one stage, in the order of sending; return its outputs.
+def run_stage(
+    run: Run, stage: Stage, reorder: Reorder | None = None, change: Change | None = None
+) -> list[Output]:
+    """Process a bag with one stage; return its outputs.
+
+    Parameters
+    ----------
+    run : Run
+        The run; its bag is read again.
+    stage : Stage
+        Processes the messages.
+    reorder : Reorder, optional
+        Order of the messages; by default that of sending.
+    change : Change, optional
+        Replaces messages.
 
     Raises
     ------
@@ -188,9 +146,10 @@ def run_stage(run: Run, stage: FinishingStage) -> list[Output]:
     """
     outputs: list[Output] = []
     last_time = 0
-    for topic, sent, message in _inputs(run, stage.topics):
+    for topic, sent, message in _inputs(run, stage.topics, reorder):
         last_time = max(last_time, sent.log_time)
-        outputs += stage.process(topic, sent, message)
+        for name, content in change(topic, message) if change else ((topic, message),):
+            outputs += stage.process(name, sent, content)
     return outputs + stage.finish(last_time)
 
 
@@ -214,30 +173,29 @@ def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Out
     today = {(answer.topic, answer.stamp): answer.message for answer in answers}
     answered = {answer.stamp for answer in answers}
     recorded = set(run.tips.stamps.tolist())
-    outputs: list[Output] = []
-    for topic, sent, message in _inputs(run, controller.topics, _by_reception(run)):
-        stamp = nanoseconds(message.header.stamp) if topic in TIP_TOPICS else 0
-        if topic not in TIP_TOPICS or stamp not in answered:
-            taken = {topic: message}
-        elif topic == POSE and stamp not in recorded:
-            taken = {name: today.get((name, stamp)) for name in TIP_TOPICS}
-        else:
-            taken = {topic: today.get((topic, stamp))}
-        for name, content in taken.items():
-            if name in controller.topics and content is not None:
-                outputs += controller.process(name, sent, content)
-    return outputs
+
+    def replaced(topic: str, message: Any) -> Iterator[tuple[str, Any]]:
+        stamp = to_nanoseconds(message.header.stamp) if topic in TIP_TOPICS else None
+        if stamp not in answered:
+            yield topic, message
+            return
+        names = TIP_TOPICS if topic == POSE and stamp not in recorded else (topic,)
+        for name in controller.topics.intersection(names):
+            if (name, stamp) in today:
+                yield name, today[name, stamp]
+
+    return run_stage(run, controller, _by_reception(run), replaced)
 
 
-def estimate_errors(run: Run, outputs: Sequence[Output] | None) -> npt.NDArray[np.float64] | None:
+def estimate_errors(run: Run, outputs: Sequence[Output] | None = None) -> Errors:
     """Return the RMS error of r = (x [m], beta [rad], gamma [rad]) against the truth, (3,).
 
     Parameters
     ----------
     run : Run
         The run, with its truth.
-    outputs : sequence of Output or None
-        Outputs of the current code; None for the recorded estimates.
+    outputs : sequence of Output, optional
+        Outputs of the current code; by default, the recorded estimates.
 
     Returns
     -------
@@ -270,10 +228,6 @@ def _recordable(
             yield output
 
 
-def _topics(stage: Stage | None) -> frozenset[str]:
-    return frozenset() if stage is None else stage.topics
-
-
 def _by_reception(run: Run) -> Reorder:
     return functools.partial(in_reception_order, namespace=run.namespace)
 
@@ -283,9 +237,7 @@ def _inputs(
 ) -> Iterator[tuple[str, SentMessage, Any]]:
     """Yield (relative topic, raw message, message) of these topics, with a progress bar."""
     names = {name if name.startswith("/") else run.namespace + name: name for name in relative}
-    messages = messages_as_sent(
-        run.path, lambda name: name in names, lambda name: names[name] in IMAGE_TOPICS, reorder
-    )
+    messages = messages_as_sent(run.path, names.__contains__, reorder)
     bar = tqdm(
         messages,
         total=sum(run.topics.get(name, 0) for name in names),
@@ -296,3 +248,55 @@ def _inputs(
     )
     for sent, message in bar:
         yield names[sent.topic], sent, message
+
+
+def in_reception_order(
+    messages: list[SentMessage], namespace: str
+) -> list[tuple[int, SentMessage]]:
+    """Return the messages with their times of reception by the controller, in that order.
+
+    Parameters
+    ----------
+    messages : list of SentMessage
+        All small messages of a bag.
+    namespace : str
+        Namespace of the rig's topics, ends with `/`.
+
+    Returns
+    -------
+    list of tuple
+        Time [ns] and message: the time of sending, or the earliest later one that keeps the order
+        of reception. Messages of topics that no status lists are received when they were sent. A
+        message that is not listed, although a later one of its topic is, is left out.
+    """
+    ordered = sorted(messages, key=lambda m: (m.time, m.log_time))
+    received_at: dict[tuple[str, int], int] = {}
+    time = 0
+    for status, received in _statuses(ordered, namespace):
+        for topic, sent_ns in received:
+            time = max(time + 1, sent_ns)
+            received_at.setdefault((namespace + topic, sent_ns), time)
+        # A status follows the messages that it lists.
+        time = received_at[status.topic, status.time] = max(time + 1, status.time)
+    last: dict[str, int] = {}
+    for topic, sent_ns in received_at:
+        last[topic] = max(sent_ns, last.get(topic, 0))
+    # Messages after the last status were received after it.
+    rest = dict.fromkeys(last, time + 1)
+    timed = [
+        (received_at.get((m.topic, m.time)) or max(m.time, rest.get(m.topic, 0)), m)
+        for m in ordered
+        if (m.topic, m.time) in received_at or m.time >= last.get(m.topic, 0)
+    ]
+    # Equal times keep the order of sending.
+    return sorted(timed, key=lambda pair: pair[0])
+
+
+def _statuses(
+    messages: Iterable[SentMessage], namespace: str
+) -> Iterator[tuple[SentMessage, list[ReceivedMessage]]]:
+    for message in messages:
+        if message.topic == namespace + _STATUS:
+            status: Any = _STORE.deserialize_cdr(message.data, message.type_name)
+            values = {pair.key: pair.value for pair in status.values}
+            yield message, received_messages(values.get("heard", ""))

@@ -11,11 +11,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from needle_bags.reading.frames import INDEX
+from needle_core.messages import INSERTION_JOINT, ROTATION_JOINT
 
 Floats = npt.NDArray[np.float64]
 Values = Mapping[str, Any]
@@ -63,14 +66,19 @@ class Field:
     tolerance: Tolerance
 
 
-def _members(path: str, members: str = "xyz") -> tuple[str, ...]:
+def _members(path: str, members: Iterable[str] = "xyz") -> tuple[str, ...]:
     return tuple(f"{path}.{member}" for member in members)
+
+
+def _points(member: str) -> tuple[str, ...]:
+    # A step is one point, a path ahead two or three.
+    return tuple(f"points.{k}.{member}" for k in range(3))
 
 
 _POSE = (
     Field("position", _members("pose.pose.position"), LENGTH),
     Field(ORIENTATION, _members("pose.pose.orientation", "xyzw"), QUATERNION),
-    Field("covariance", ("pose.covariance",), COVARIANCE),
+    Field("covariance", _members("pose.covariance", map(str, range(36))), COVARIANCE),
 )
 
 _PATH_POINTS = tuple(path for k in range(300) for path in _members(f"poses.{k}.pose.position"))
@@ -96,10 +104,9 @@ FIELDS: Mapping[str, tuple[Field, ...]] = {
     ),
     "needle/planned_path": (Field("points", _PATH_POINTS, LENGTH),),
     "device/joint_trajectory": (
-        # A step is one point, a path ahead two or three.
-        Field("insertion", tuple(f"points.{k}.positions.0" for k in range(3)), LENGTH),
-        Field("rotation", tuple(f"points.{k}.positions.1" for k in range(3)), ANGLE),
-        Field("duration", tuple(f"points.{k}.time_from_start" for k in range(3)), DURATION),
+        Field("insertion", _points(f"positions.{INSERTION_JOINT}"), LENGTH),
+        Field("rotation", _points(f"positions.{ROTATION_JOINT}"), ANGLE),
+        Field("duration", _points("time_from_start"), DURATION),
     ),
 }
 """Relative topic to its fields with a tolerance; all other members must be equal."""
@@ -163,42 +170,6 @@ class Comparison:
         return any(t.missing or t.extra for t in self.topics) or any(
             field.differing for field in self.fields
         )
-
-
-def members(message: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield (path, value) of a message of rosbags; large arrays and durations stay whole.
-
-    Parameters
-    ----------
-    message : dataclass instance
-        A deserialised message.
-    path : str
-        Prefix of the paths.
-    """
-    for field in dataclasses.fields(message):
-        if field.name.startswith("__"):
-            continue
-        value, name = getattr(message, field.name), f"{path}{field.name}"
-        elements = list(value) if isinstance(value, (list, tuple)) else None
-        if dataclasses.is_dataclass(value):
-            if {f.name for f in dataclasses.fields(value)} >= {"sec", "nanosec"}:
-                yield name, _seconds(value)
-            else:
-                yield from members(value, f"{name}.")
-        elif elements is not None:
-            for i, element in enumerate(elements):
-                if dataclasses.is_dataclass(element):
-                    yield from members(element, f"{name}.{i}.")
-                else:
-                    yield f"{name}.{i}", element
-        elif isinstance(value, np.ndarray) and value.size < 36:
-            yield from ((f"{name}.{i}", float(number)) for i, number in enumerate(value))
-        else:
-            yield name, value
-
-
-def _seconds(value: Any) -> float:
-    return float(value.sec + value.nanosec * 1e-9)
 
 
 def compare(recorded: Iterable[Record], today: Iterable[Record]) -> Comparison:
@@ -276,11 +247,11 @@ def _compare_field(topic: str, field: Field, pairs: _Pairs) -> FieldResult:
 
 def _compare_rest(topic: str, known: Sequence[Field], pairs: _Pairs) -> FieldResult:
     """Compare the members without a tolerance, such as names and frames."""
-    skipped = {path for field in known for path in field.paths} | {"header.stamp"}
+    skipped = {path for field in known for path in field.paths} | {INDEX}
     different = []
     for stamp, old, new in pairs:
         names = (old.keys() | new.keys()) - skipped
-        if any(not _equal(old.get(name), new.get(name)) for name in names):
+        if any(old.get(name) != new.get(name) for name in names):
             different.append(stamp)
     return FieldResult(
         topic,
@@ -294,10 +265,7 @@ def _compare_rest(topic: str, known: Sequence[Field], pairs: _Pairs) -> FieldRes
 
 
 def _numbers(field: Field, values: Values) -> Floats:
-    parts = [
-        np.ravel(np.asarray(values[path], np.float64)) for path in field.paths if path in values
-    ]
-    return np.concatenate(parts) if parts else np.empty(0)
+    return np.array([values[path] for path in field.paths if path in values], np.float64)
 
 
 def _difference(a: Floats, b: Floats) -> Floats:
@@ -321,9 +289,3 @@ def _relative_to_sigmas(a: Floats, b: Floats) -> Floats:
         difference, scale, out=np.where(difference > 0.0, math.inf, 0.0), where=scale > 0.0
     )
     return scaled
-
-
-def _equal(a: Any, b: Any) -> bool:
-    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        return bool(np.array_equal(a, b))
-    return bool(a == b)

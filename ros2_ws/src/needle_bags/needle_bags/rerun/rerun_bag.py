@@ -10,13 +10,12 @@ from typing import Any
 import yaml
 
 from needle_bags.format.bag_writer import BagCopy, stamp_of, standard_text, standard_topic
-from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
 from needle_bags.reading.bag_messages import raw_as_sent, read_contents
-from needle_bags.reading.bag_reader import Run
-from needle_bags.reading.bag_rigs import CALIBRATION
+from needle_bags.reading.bag_reader import CALIBRATION, Run
 from needle_bags.recording.provenance import commit
-from needle_bags.rerun.bag_pass import TIP_TOPICS, Output
+from needle_bags.rerun.bag_pass import TIP_TOPICS
 from needle_bags.rerun.rerun_text import outputs_table
+from needle_bags.rerun.stages import Output
 from needle_bags.run.run_summary import steered_by
 from needle_core.errors import UserError
 from needle_core.files.file_access import replace_file
@@ -65,8 +64,7 @@ def write_rerun(
     contents = read_contents(run.path)
     custom = {**contents.custom_data, "calibration": calibration}
     copy = BagCopy(target, contents.distribution, {**custom, **_changed(run, custom, parameters)})
-    is_image = {run.namespace + name for name in IMAGE_TOPICS}.__contains__
-    for message in raw_as_sent(run.path, lambda _: True, is_image):
+    for message in raw_as_sent(run.path, lambda _: True):
         topic = contents.topics[message.topic]
         name = topic.name.removeprefix(run.namespace)
         data = message.data

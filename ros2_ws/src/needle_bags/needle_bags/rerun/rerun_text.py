@@ -8,8 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from needle_bags.reading.bag_reader import Run
-from needle_bags.rerun.bag_pass import Output, estimate_errors
+from needle_bags.rerun.bag_pass import Errors
 from needle_bags.rerun.comparison import FIELDS, Comparison, FieldResult, TopicResult
+from needle_bags.rerun.stages import Output
 from needle_core.commands.cli import JsonValue
 
 _SHOWN = 3
@@ -100,20 +101,19 @@ def _cells(values: Sequence[float] | None, scales: Sequence[float], digits: int)
     ]
 
 
-def errors_text(run: Run, outputs: Sequence[Output]) -> str:
-    """Return the errors of both estimates against the truth; empty without it."""
-    pairs = {"recorded": estimate_errors(run, None), "today": estimate_errors(run, outputs)}
+def errors_text(errors: Mapping[str, Errors]) -> str:
+    """Return the errors of both estimates (`estimate_errors`) as a table; empty without truth."""
     rows = []
-    for name, errors in pairs.items():
-        if errors is not None:
-            r1, r2, r3 = errors[0] * 1e3, *np.degrees(errors[1:])
+    for name, rms in errors.items():
+        if rms is not None:
+            r1, r2, r3 = rms[0] * 1e3, *np.degrees(rms[1:])
             rows.append((name, f"{r1:.3f} mm", f"{r2:.2f} deg", f"{r3:.2f} deg"))
     if not rows:
         return ""
     return _table(("estimate minus truth, rms", "r1", "r2", "r3"), rows, "<>>>")
 
 
-def flat(run: Run, comparison: Comparison, outputs: Sequence[Output]) -> dict[str, JsonValue]:
+def flat(run: Run, comparison: Comparison, errors: Mapping[str, Errors]) -> dict[str, JsonValue]:
     """Return the result as a flat mapping for --json."""
     values: dict[str, JsonValue] = {"bag": str(run.path), "changed": comparison.changed}
     for topic in comparison.topics:
@@ -126,10 +126,9 @@ def flat(run: Run, comparison: Comparison, outputs: Sequence[Output]) -> dict[st
         values[f"{key}_differing"] = field.differing
         if field.unit:
             values[f"{key}_largest_difference{_SUFFIX[field.unit]}"] = field.largest
-    sides = {"recorded": estimate_errors(run, None), "today": estimate_errors(run, outputs)}
-    for side, errors in sides.items():
+    for side, rms in errors.items():
         for i, (name, scale) in enumerate(_ERRORS):
-            values[f"{side}_{name}"] = None if errors is None else float(errors[i] * scale)
+            values[f"{side}_{name}"] = None if rms is None else float(rms[i] * scale)
     return values
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from needle_bags.reading.bag_messages import SentMessage, messages_as_sent
-from needle_bags.rerun.bag_pass import CONVERTER, Output
+from needle_bags.rerun.stages import CONVERTER, Output
 from needle_bags.ros.parameter_snapshots import plain_value
 from needle_controller.plane_controller import (
     STATUS,
@@ -100,6 +100,10 @@ class ControllerStage:
             outputs.append(Output(action.topic, sent.log_time, action.message.stamp_ns, content))
         return outputs
 
+    def finish(self, log_time: int) -> list[Output]:
+        """Return no outputs: none remain at the end of a bag."""
+        return []
+
     def _handle_result(self, message: Any, sent_ns: int) -> Actions:
         stamp = to_nanoseconds(message.stamp)
         if (end := self._ends.get(stamp)) is not None:
@@ -177,7 +181,7 @@ def step_ends(path: Path, namespace: str) -> dict[int, JointSample]:
     joints, results = namespace + "joint_states", namespace + "device/result"
     ends: dict[int, JointSample] = {}
     answered: list[int] = []
-    for sent, message in messages_as_sent(path, {joints, results}.__contains__, lambda _: False):
+    for sent, message in messages_as_sent(path, {joints, results}.__contains__):
         if sent.topic == results:
             answered.append(to_nanoseconds(message.stamp))
             continue

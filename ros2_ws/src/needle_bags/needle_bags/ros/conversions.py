@@ -21,7 +21,8 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+from needle_bags.reading.bag_messages import IMAGE_TYPES
+
 # Assumed depths, because DDS does not announce that of a publisher: of latched topics, of images,
 # and of other topics.
 UNKNOWN_LATCHED_DEPTH = 10

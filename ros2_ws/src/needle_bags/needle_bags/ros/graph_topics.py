@@ -16,8 +16,9 @@ from rclpy.subscription import Subscription
 from needle_bags.format.message_definitions import full_definition, message_class
 from needle_bags.format.message_loss import SequenceGaps
 from needle_bags.format.topic_choice import TopicChoice
+from needle_bags.reading.bag_messages import IMAGE_TYPES
 from needle_bags.recording.recording import Received
-from needle_bags.ros.conversions import IMAGE_TYPES, offered_qos, strictest_request
+from needle_bags.ros.conversions import offered_qos, strictest_request
 from needle_core.files.bag_topic import BagTopic
 
 # Time limit of one poll of the graph; the next poll continues [s].
@@ -176,12 +177,7 @@ class GraphTopics:
             topic.lost_events[number] = event.total_count
 
         def receive(data: bytes, info: dict[str, int]) -> None:
-            if following is topic.replaced:
-                self._receive_one(topic, data, info)
-                return
-            # Messages of the previous subscription come first.
-            self._receive_replaced(topic)
-            self._receive_all(topic, data, info)
+            self._receive_all(topic, following, data, info)
 
         following = self._node.create_subscription(
             topic.message_class,
@@ -205,25 +201,21 @@ class GraphTopics:
 
     def _drop_replaced(self, topic: _Topic) -> None:
         """Receive the queued messages of a replaced subscription, and destroy it."""
-        self._receive_replaced(topic)
         if topic.replaced is not None:
+            # The new subscription receives what arrives meanwhile.
+            depth = topic.replaced.qos_profile.depth
+            for taken in islice(_queued(topic, topic.replaced), depth):
+                self._receive_one(topic, *taken)
             self._node.destroy_subscription(topic.replaced)
             topic.replaced = None
 
-    def _receive_replaced(self, topic: _Topic) -> None:
-        if topic.replaced is None:
-            return
-        # The new subscription receives what arrives meanwhile.
-        for taken in islice(_queued(topic, topic.replaced), topic.replaced.qos_profile.depth):
-            self._receive_one(topic, *taken)
-
-    def _receive_all(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
+    def _receive_all(
+        self, topic: _Topic, source: Subscription, data: bytes, info: dict[str, int]
+    ) -> None:
         """Receive a message and those queued behind it: an executor turn is more expensive."""
         self._receive_one(topic, data, info)
-        if topic.subscription is None:
-            return
         until = time.monotonic() + TURN
-        for taken in _queued(topic, topic.subscription):
+        for taken in _queued(topic, source):
             self._receive_one(topic, *taken)
             if time.monotonic() >= until:
                 return
@@ -240,7 +232,8 @@ class GraphTopics:
         topic.recent.append((sent, number))
         if not topic.described:
             self._describe(topic)
-        if number and topic.publishers == 1:
+        # Two subscriptions deliver in any order.
+        if number and topic.publishers == 1 and topic.replaced is None:
             topic.gaps.add(number)
         received = info["received_timestamp"] or time.time_ns()
         # The publisher may send an invalid stamp.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,12 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
+from rclpy.task import Future
 
-from needle_bags.ros.repeated_request import RepeatedRequest
 from needle_core.ros import base_node
+
+# Time after which an unanswered request is repeated; it doubles each time [s].
+RETRY_AFTER = 1.0
 
 
 def plain_value(value: ParameterValue) -> Any:
@@ -56,7 +61,7 @@ class ParameterSnapshots:
     def __init__(self, node: Node, on_snapshot: Callable[[str, dict[str, Any]], None]) -> None:
         self._node = node
         self._on_snapshot = on_snapshot
-        self._requests: dict[str, _ParameterRequests] = {}
+        self._queries: dict[str, _Query] = {}
         self._values: dict[str, dict[str, Any]] = {}
         self._current: dict[str, dict[str, Any]] = {}
         self.changes: list[dict[str, Any]] = []
@@ -99,26 +104,22 @@ class ParameterSnapshots:
             if full_name == self._node.get_fully_qualified_name():
                 self._store_own(full_name)
             elif full_name not in self._values:
-                self._request(full_name)
+                if full_name not in self._queries:
+                    store = partial(self._store, full_name)
+                    self._queries[full_name] = _Query(self._node, full_name, store)
+                self._queries[full_name].send()
         # Not in the callback of an answer, which uses the client.
-        for full_name in [n for n in self._requests if n in self._values or n not in present]:
-            self._requests.pop(full_name).close()
+        for full_name in [n for n in self._queries if n in self._values or n not in present]:
+            self._queries.pop(full_name).close()
 
     def _store_own(self, full_name: str) -> None:
         if full_name not in self._values:
             own = self._node.get_parameters_by_prefix("")
             self._store(full_name, {name: p.value for name, p in own.items()})
 
-    def _request(self, full_name: str) -> None:
-        requests = self._requests.get(full_name)
-        if requests is None:
-            requests = _ParameterRequests(
-                self._node, full_name, lambda values: self._store(full_name, values)
-            )
-            self._requests[full_name] = requests
-        requests.send()
-
     def _store(self, full_name: str, values: dict[str, Any]) -> None:
+        if full_name in self._values:
+            return
         self._values[full_name] = {
             name: value for name, value in values.items() if value is not None
         }
@@ -126,8 +127,12 @@ class ParameterSnapshots:
         self._on_snapshot(full_name, self._values[full_name])
 
 
-class _ParameterRequests:
-    """Requests to one node: the names of its parameters, then their values."""
+class _Query:
+    """Requests to one node: the names of its parameters, then their values.
+
+    A request is repeated until it is answered, because an answer can be lost for good: a server
+    that has not discovered the client yet drops it without notice.
+    """
 
     def __init__(
         self, node: Node, full_name: str, on_values: Callable[[dict[str, Any]], None]
@@ -135,28 +140,34 @@ class _ParameterRequests:
         self._node = node
         self._on_values = on_values
         self._names: list[str] | None = None
-        names_of = node.create_client(ListParameters, f"{full_name}/list_parameters")
-        values_of = node.create_client(GetParameters, f"{full_name}/get_parameters")
-        self._clients: tuple[Client, ...] = (names_of, values_of)
-        self._names_of = RepeatedRequest(names_of, self._receive_names)
-        self._values_of = RepeatedRequest(values_of, self._receive_values)
+        self._list = node.create_client(ListParameters, f"{full_name}/list_parameters")
+        self._get = node.create_client(GetParameters, f"{full_name}/get_parameters")
+        self._next, self._wait = time.monotonic(), RETRY_AFTER
 
     def send(self) -> None:
-        """Send the next request if it is due."""
+        """Send the next request if it is due, and its service available."""
+        now = time.monotonic()
+        client: Client[Any, Any] = self._list if self._names is None else self._get
+        if now < self._next or not client.service_is_ready():
+            return
+        self._next, self._wait = now + self._wait, 2.0 * self._wait
         if self._names is None:
-            self._names_of.send(ListParameters.Request())
+            client.call_async(ListParameters.Request()).add_done_callback(self._receive_names)
         else:
-            self._values_of.send(GetParameters.Request(names=self._names))
+            request = GetParameters.Request(names=self._names)
+            client.call_async(request).add_done_callback(self._receive_values)
 
     def close(self) -> None:
         """Destroy the clients."""
-        for client in self._clients:
+        for client in (self._list, self._get):
             self._node.destroy_client(client)
 
-    def _receive_names(self, response: ListParameters.Response) -> None:
-        self._names = list(response.result.names)
-        self.send()
+    def _receive_names(self, future: Future[Any]) -> None:
+        if self._names is None:
+            self._names = list(future.result().result.names)
+            self._next, self._wait = time.monotonic(), RETRY_AFTER
+            self.send()
 
-    def _receive_values(self, response: GetParameters.Response) -> None:
-        values = [plain_value(value) for value in response.values]
+    def _receive_values(self, future: Future[Any]) -> None:
+        values = [plain_value(value) for value in future.result().values]
         self._on_values(dict(zip(self._names or [], values, strict=False)))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from functools import partial
 from typing import Any, Final, cast
 
@@ -19,9 +18,16 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 from tqdm import tqdm
 
-from needle_bags.format.message_definitions import message_class
-from needle_bags.player.playable import unplayable
-from needle_bags.player.playback import PlaybackClock, ReadAhead
+from needle_bags.format.message_definitions import message_class, unplayable
+from needle_bags.player.playback import (
+    BACK,
+    FASTER,
+    FORWARD,
+    PAUSE,
+    SLOWER,
+    Keys,
+    PlaybackClock,
+)
 from needle_bags.player.player_options import (
     MAX_RATE,
     MIN_RATE,
@@ -30,13 +36,12 @@ from needle_bags.player.player_options import (
     require_fits,
 )
 from needle_bags.player.replay_names import REPLAY, is_guarded, marks_a_rig, played_name
-from needle_bags.player.terminal_keys import BACK, FASTER, FORWARD, PAUSE, SLOWER, Keys
-from needle_bags.reading.bag_messages import raw_messages, read_contents
+from needle_bags.reading.bag_messages import read_contents
 from needle_bags.ros.conversions import recorded_offer
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
-from needle_core.files.bag_directory import BagDirectory
+from needle_core.files.bag_directory import BagDirectory, SentMessage
 from needle_core.files.bag_topic import BagTopic
 from needle_core.process.shutdown import ShutdownFlag
 from needle_core.ros.base_node import RELIABLE, DiagnosticsPublisher, WholeNode, to_stamp
@@ -55,8 +60,6 @@ MAX_TURN: Final = 0.02  # maximum delay of a signal, a key or a service call [s]
 _NANOSECONDS: Final = 1_000_000_000
 RATE_STEP: Final = 1.1
 SEEK_STEP: Final = 5 * _NANOSECONDS
-
-Message = tuple[str, int, bytes]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +101,6 @@ class Player(WholeNode):
         self._diagnostics = DiagnosticsPublisher(self)
         now = time.monotonic()
         self.clock = PlaybackClock(options.rate, self.start, now, paused=options.paused)
-        self._clock_publisher: Publisher | None = None
         self._next_clock = 0.0
         self._checked_at = 0.0
         self.beside_rig = False
@@ -164,12 +166,10 @@ class Player(WholeNode):
     def _make_publishers(self) -> None:
         for sender in self._senders.values():
             self.destroy_publisher(sender)
-        if self._clock_publisher is not None:
-            self.destroy_publisher(self._clock_publisher)
         self._senders = {name: self._publisher(topic) for name, topic in self._topics.items()}
         if self._options.clock is not None:
             name = played_name(CLOCK, "rosgraph_msgs/msg/Clock", {}, beside_rig=self.beside_rig)
-            self._clock_publisher = self.create_publisher(Clock, name, RELIABLE)
+            self._senders[CLOCK] = self.create_publisher(Clock, name, RELIABLE)
 
     def _publisher(self, topic: BagTopic) -> Publisher:
         name = played_name(
@@ -201,15 +201,17 @@ class Player(WholeNode):
         latched = {name for name, topic in self._topics.items() if topic.is_latched}
         if before == self._contents.start or not latched:
             return
-        last: dict[str, Message] = {}
-        for message in raw_messages(self._options.bag, latched, self._contents.start, before):
-            last[message[0]] = message
-        for message in sorted(last.values(), key=lambda one: one[1]):
+        last = {m.topic: m for m in self._messages(latched, self._contents.start, before)}
+        for message in sorted(last.values(), key=lambda one: one.log_time):
             self.publish(message)
 
-    def read(self) -> Iterator[Message]:
+    def _messages(self, topics: Container[str], start: int, stop: int) -> Iterator[SentMessage]:
+        with BagDirectory(self._options.bag) as bag:
+            yield from bag.messages(topics.__contains__, start, stop)
+
+    def read(self) -> Iterator[SentMessage]:
         """Yield the messages to play, in order, from the current start."""
-        return raw_messages(self._options.bag, set(self._topics), self._begin, self.end + 1)
+        return self._messages(self._topics, self._begin, self.end + 1)
 
     def seek(self, time: int) -> None:
         """Jump to a recording time [ns], limited to the bag."""
@@ -234,9 +236,9 @@ class Player(WholeNode):
         elif key in (BACK, FORWARD):
             self.seek(self.clock.time(now) + (SEEK_STEP if key == FORWARD else -SEEK_STEP))
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: SentMessage) -> None:
         """Publish a message."""
-        self._senders[message[0]].publish(message[2])
+        self._senders[message.topic].publish(message.data)
         self.messages += 1
 
     def check_graph(self) -> None:
@@ -248,9 +250,9 @@ class Player(WholeNode):
             If a rig appeared while topics are played under their own names.
         """
         now = time.monotonic()
-        if self._clock_publisher is not None and now >= self._next_clock:
-            self._next_clock = now + 1.0 / cast(float, self._options.clock)
-            self._clock_publisher.publish(Clock(clock=to_stamp(self.clock.time(now))))
+        if self._options.clock is not None and now >= self._next_clock:
+            self._next_clock = now + 1.0 / self._options.clock
+            self._senders[CLOCK].publish(Clock(clock=to_stamp(self.clock.time(now))))
         if now - self._checked_at < CHECK_PERIOD:
             return
         self._checked_at = now
@@ -308,26 +310,26 @@ def _play(player: Player, loop: bool, end: ShutdownFlag) -> int:
         if not player.prepare(partial(executor.spin_once, 0.05), end):
             return EXIT_DONE
         while True:
-            with contextlib.closing(ReadAhead(player.read)) as source:
-                message = source.next()
-                while message is not None and player.seek_target is None:
-                    # An executor turn is more expensive than a message: publish several per turn.
-                    wait = player.clock.wait(message[1], time.monotonic())
-                    turn = time.monotonic() + MAX_TURN
-                    while wait == 0.0 and message is not None and time.monotonic() < turn:
-                        player.publish(message)
-                        message = source.next()
-                        if message is not None:
-                            wait = player.clock.wait(message[1], time.monotonic())
-                    executor.spin_once(min(wait, MAX_TURN))
-                    player.check_graph()
-                    if end.requested:
-                        return EXIT_DONE
-                    for key in keys.pressed():
-                        player.press(key)
-                    elapsed = player.clock.time(time.monotonic()) - player.start
-                    bar.n = min(bar.total, elapsed / _NANOSECONDS)
-                    bar.set_description("paused" if player.clock.is_paused else "playing")
+            messages = player.read()
+            message = next(messages, None)
+            while message is not None and player.seek_target is None:
+                # An executor turn is more expensive than a message: publish several per turn.
+                wait = player.clock.wait(message.log_time, time.monotonic())
+                turn = time.monotonic() + MAX_TURN
+                while wait == 0.0 and message is not None and time.monotonic() < turn:
+                    player.publish(message)
+                    message = next(messages, None)
+                    if message is not None:
+                        wait = player.clock.wait(message.log_time, time.monotonic())
+                executor.spin_once(min(wait, MAX_TURN))
+                player.check_graph()
+                if end.requested:
+                    return EXIT_DONE
+                for key in keys.pressed():
+                    player.press(key)
+                elapsed = player.clock.time(time.monotonic()) - player.start
+                bar.n = min(bar.total, elapsed / _NANOSECONDS)
+                bar.set_description("paused" if player.clock.is_paused else "playing")
             if not loop and player.seek_target is None:
                 player.finish()
                 return EXIT_DONE

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,14 +17,22 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
+from needle_bags.format.bag_writer import COMPRESSIONS
+from needle_bags.format.topic_choice import TopicChoice
 from needle_bags.recording.provenance import commit, distribution, versions
-from needle_bags.recording.recorder_health import DecodeErrors, RecorderHealth
-from needle_bags.recording.recording import Received, open_recording, reuse_freed_memory
+from needle_bags.recording.recent_messages import RecentMessages
+from needle_bags.recording.recorder_health import RecorderHealth
+from needle_bags.recording.recording import (
+    RESERVE,
+    Received,
+    open_recording,
+    reuse_freed_memory,
+)
 from needle_bags.ros.graph_topics import GraphTopics
 from needle_bags.ros.parameter_snapshots import ParameterSnapshots
-from needle_bags.ros.recorder_parameters import RecorderParameters
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.errors import UserError
 from needle_core.files.bag_path import recover_hint
 from needle_core.files.bag_topic import BagTopic
 from needle_core.files.mcap_file import RUN_RECORD
@@ -33,6 +41,8 @@ from needle_core.process.shutdown import ShutdownFlag
 from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, WholeNode
 from needle_core.ros.main import run_node
 from needle_core.ros.parameters import NodeParameters
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.settings.parameter_files import absolute_name
 
 HELP = """
 recorder: records every topic of the graph into a bag (a rosbag2 directory with MCAP data).
@@ -50,9 +60,8 @@ With `snapshot_seconds` the last seconds stay in memory. They are written on a c
 ~/snapshot (std_srvs/Trigger), and a second after device/status reports FAULT or ESTOPPED. All
 snapshots are in the same bag; each message is written once.
 
-/diagnostics has a warning if messages are lost, if a message cannot be decoded (it is recorded
-anyway), and if the disk is nearly full. When only `reserve` is free, the recording ends and the bag
-is completed; the node continues to report this.
+/diagnostics has a warning if messages are lost and if the disk is nearly full. When only `reserve`
+is free, the recording ends and the bag is completed; the node continues to report this.
 Exit codes: 0 the bag is complete; 1 the disk was full or a write failed; 2 invalid parameters, or
 the bag cannot be created
 """
@@ -71,6 +80,83 @@ DEVICE_STATUS = "/device/status"
 FAULTS = ("FAULT", "ESTOPPED")
 
 
+@dataclasses.dataclass(frozen=True)
+class RecorderParameters:
+    """Parameters of the recorder."""
+
+    bag: str = fixed_parameter(
+        "", "-", "Directory of the bag; empty: a new time-stamped one in the working directory."
+    )
+    topics: tuple[str, ...] = fixed_parameter(
+        (), "-", "Topics to record; with neither topics nor a regex, all topics.", texts=True
+    )
+    regex: str = fixed_parameter("", "-", "Also record topics whose name matches this expression.")
+    exclude_regex: str = fixed_parameter(
+        "/annotated_image$|/live_view/",
+        "-",
+        "Do not record topics whose name matches this expression, unless `topics` has them.",
+    )
+    snapshot_seconds: float = fixed_parameter(
+        0.0,
+        "s",
+        "Keep the messages of this time, write them on request or on a fault; 0: write all.",
+        0.0,
+        3600.0,
+    )
+    snapshot_size: int = fixed_parameter(
+        500_000_000,
+        "B",
+        "Maximum memory of the snapshot; with images it may be shorter than snapshot_seconds.",
+        1_000_000,
+        2**40,
+    )
+    calibration_file: str = fixed_parameter(
+        "",
+        "-",
+        "Calibration to store in the bag; a tracker publishes its own.",
+    )
+    run_info: str = fixed_parameter(
+        "", "-", "Text about the run to store in the bag: YAML `key: value` lines or JSON."
+    )
+    max_file_size: int = fixed_parameter(
+        4_000_000_000,
+        "B",
+        "Maximum bytes of messages per data file; 0: no limit.",
+        lower=0,
+    )
+    compression: str = fixed_parameter(
+        "none",
+        "-",
+        "Compression of the data; zstd needs a third of a core for noisy images.",
+        choices=COMPRESSIONS,
+    )
+    reserve: int = fixed_parameter(
+        RESERVE,
+        "B",
+        "Free disk space at which the recording ends; at most a tenth of the disk.",
+        lower=0,
+    )
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        check_fields(self)
+        if not all(isinstance(name, str) for name in self.topics):
+            raise UserError(f"topics = {list(self.topics)} are not names")
+        _ = self.choice
+
+    @property
+    def choice(self) -> TopicChoice:
+        """The topics to record."""
+        return TopicChoice(tuple(map(absolute_name, self.topics)), self.regex, self.exclude_regex)
+
+    @property
+    def recent(self) -> RecentMessages | None:
+        """Empty snapshot buffer; None if everything is written."""
+        if not self.snapshot_seconds:
+            return None
+        return RecentMessages(self.snapshot_seconds, self.snapshot_size)
+
+
 class Recorder(WholeNode):
     """Subscribes to all topics of the graph and passes their messages to a `Recording`."""
 
@@ -82,7 +168,6 @@ class Recorder(WholeNode):
         calibration = read_calibration(Path(file)) if file else ""
         self._diagnostics = DiagnosticsPublisher(self)
         self._topics = GraphTopics(self, self._settings.choice, self._add_topic, self._receive)
-        self._decode_errors = DecodeErrors()
         self._recent = self._settings.recent
         self._states: dict[str, str] = {}
         self._snapshot_due: tuple[float, str] | None = None
@@ -120,10 +205,6 @@ class Recorder(WholeNode):
         for key, text in texts.items():
             self.recording.set_custom_data(key, text)
         self.recording.add_record(RUN_RECORD, texts)
-        if calibration:
-            self.recording.add_file(
-                "calibration.yaml", "application/yaml", calibration.encode(), time.time_ns()
-            )
 
     def _store_parameters(self, node: str, values: dict[str, Any]) -> None:
         document = {node: {"ros__parameters": values}}
@@ -155,22 +236,9 @@ class Recorder(WholeNode):
         else:
             self._recent.put(message)
             if message.topic.endswith(DEVICE_STATUS):
-                self._inspect(message, self._check_device_status)
+                self._check_device_status(message)
         if message.topic == PARAMETER_EVENTS:
-            self._inspect(message, self._store_parameter_event)
-
-    def _inspect(self, message: Received, inspect: Callable[[Received], None]) -> None:
-        """Decode a recorded message; a malformed one is counted."""
-        try:
-            inspect(message)
-        except Exception as error:  # noqa: BLE001
-            self.report_decode_error(message.topic, error)
-
-    def report_decode_error(self, source: str, error: Exception) -> None:
-        """Count an input that could not be decoded; log the first of its source."""
-        if self._decode_errors.add(source, error):
-            self.get_logger().warning(f"cannot decode {source}: {error}")
-        self._diagnostics.set("input", self._decode_errors.diagnostic())
+            self._store_parameter_event(message)
 
     def _check_device_status(self, message: Received) -> None:
         status = deserialize_message(message.data, DiagnosticStatus)
@@ -246,9 +314,6 @@ class Recorder(WholeNode):
             self.recording.set_custom_data("parameter_changes", changes)
         parameters = yaml.safe_dump(self._snapshots.document())
         self.recording.set_custom_data("parameters", parameters)
-        self.recording.add_file(
-            "parameters.yaml", "application/yaml", parameters.encode(), time.time_ns()
-        )
         self.recording.close(self._topics.lost)
         count = self.recording.messages_received
         lost = self._lost()
@@ -263,14 +328,6 @@ class Recorder(WholeNode):
         return EXIT_DONE if self.recording.error is None else EXIT_MISSED
 
 
-def _spin_once(executor: SingleThreadedExecutor, recorder: Recorder, timeout: float) -> None:
-    """Execute one callback; a malformed request of another node does not end this node."""
-    try:
-        executor.spin_once(timeout_sec=timeout)
-    except Exception as error:  # noqa: BLE001
-        recorder.report_decode_error("a service or the graph", error)
-
-
 def main(args: list[str] | None = None) -> int:
     """Run the recorder; returns the exit code."""
     reuse_freed_memory()
@@ -281,12 +338,12 @@ def main(args: list[str] | None = None) -> int:
         executor.add_node(recorder)
         try:
             while not end.requested:
-                _spin_once(executor, recorder, 0.1)
+                executor.spin_once(0.1)
             limit = time.monotonic() + DRAIN_LIMIT
             quiet = time.monotonic() + DRAIN_QUIET
             while time.monotonic() < min(quiet, limit):
                 before = recorder.recording.messages_received
-                _spin_once(executor, recorder, 0.05)
+                executor.spin_once(0.05)
                 if recorder.recording.messages_received > before:
                     quiet = time.monotonic() + DRAIN_QUIET
             return recorder.finish()

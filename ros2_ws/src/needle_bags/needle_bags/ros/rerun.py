@@ -16,15 +16,16 @@ from needle_bags.reading.bag_messages import read_messages
 from needle_bags.reading.bag_reader import Run, read_run
 from needle_bags.rerun.bag_pass import (
     TIP_TOPICS,
+    estimate_errors,
     has_images,
     run_again,
     run_stage,
     run_tips,
 )
-from needle_bags.rerun.bag_stage import BagStage
 from needle_bags.rerun.comparison import compare
 from needle_bags.rerun.rerun_bag import write_rerun
 from needle_bags.rerun.rerun_text import describe, errors_text, flat, tolerance_table
+from needle_bags.rerun.stages import BagStage
 from needle_bags.ros.controller_rerun import ControllerStage, step_ends
 from needle_bags.ros.parameter_snapshots import plain_value
 from needle_controller.presets.own_parts import GROUPS
@@ -153,13 +154,14 @@ def _run(words: Sequence[str]) -> int:
     controller = _controller(controller_node, ends)
     rerun = run_again(run, tracker, controller)
     comparison = compare(rerun.recorded, rerun.today)
+    errors = {"recorded": estimate_errors(run), "today": estimate_errors(run, rerun.outputs)}
     viewers = _viewers(run, params, calibration) if given.viewers else {}
     shown = [output for viewer in viewers.values() for output in run_stage(run, viewer)]
 
     if file is not None:
         sent = [item for viewer in viewers.values() for item in viewer.runner.counts.items()]
         counts = {f"{what.replace('/', '_')}_sent": count for what, count in sent}
-        write_json(file, {**flat(run, comparison, rerun.outputs), **counts})
+        write_json(file, {**flat(run, comparison, errors), **counts})
     if given.output is not None:
         outputs = rerun.outputs
         answers = [output for output in outputs if output.topic in TIP_TOPICS]
@@ -178,7 +180,7 @@ def _run(words: Sequence[str]) -> int:
     print("CHANGED" if comparison.changed else f"UNCHANGED: {len(rerun.recorded)} messages agree")
     for text in (
         describe(run, comparison),
-        errors_text(run, rerun.outputs),
+        errors_text(errors),
         _viewer_counts(viewers),
     ):
         if text:

@@ -106,13 +106,19 @@ def target_offset(run: Run) -> float:
         return float(configured) if isinstance(configured, (int, float)) else 0.0
 
 
-def point_error(run: Run) -> float | None:
-    """Return the final distance of the true tip from the target point [m], or None."""
+def target_point(run: Run) -> Floats | None:
+    """Return the last target point in `rig` [m], (3,), or None."""
     try:
-        point = [float(part) for part in run.last_status("target_point_m").split(",")]
+        point = np.array([float(part) for part in run.last_status("target_point_m").split(",")])
     except ValueError:
         return None
-    if len(point) != 3 or not len(run.truth):
+    return point if point.shape == (3,) and np.isfinite(point).all() else None
+
+
+def point_error(run: Run) -> float | None:
+    """Return the final distance of the true tip from the target point [m], or None."""
+    point = target_point(run)
+    if point is None or not len(run.truth):
         return None
     return float(np.linalg.norm(run.truth.values[-1, :3] - point))
 

@@ -95,7 +95,7 @@ def _first_sent(run: Run) -> dict[str, dict[int, int]]:
     topics = (*_IMAGES, _EXPOSURE, _TIP, _COMMAND, _RESULT, _JOINTS)
     names = {run.namespace + name: name for name in topics}
     sent: dict[str, dict[int, int]] = defaultdict(dict)
-    for message in raw_as_sent(run.path, names.__contains__, lambda _: False):
+    for message in raw_as_sent(run.path, names.__contains__):
         sent[names[message.topic]].setdefault(stamp_of(message.data), message.time)
     return sent
 
@@ -104,7 +104,7 @@ def _received_commands(run: Run) -> tuple[Times, Times]:
     """Return the times of device statuses, (N,), and the latest command stamps in them."""
     reported_at, latest_stamps = [], []
     status = run.namespace + _STATUS
-    for sent, message in messages_as_sent(run.path, status.__eq__, lambda _: False):
+    for sent, message in messages_as_sent(run.path, status.__eq__):
         values = {pair.key: pair.value for pair in message.values}
         reported_at.append(sent.time)
         latest_stamps.append(int(values.get("command_ns") or 0))

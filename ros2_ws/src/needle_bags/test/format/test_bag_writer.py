@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 import yaml
-from mcap.reader import make_reader
 from rosbags.interfaces import QosDurability, QosReliability, QosTime
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -24,7 +23,6 @@ from needle_bags.recording import recording as recording_module
 from needle_bags.recording.recorder_health import WARN_WAITING, RecorderHealth
 from needle_bags.recording.recording import FreeSpace, Received, Recording, open_recording
 from needle_bags.recording.worker import Job, RunJob
-from needle_bags.recovery.bag_recovery import recover_bag
 from needle_core.diagnostics import Level
 from needle_core.errors import UserError
 
@@ -58,7 +56,6 @@ def texts(tmp_path_factory: pytest.TempPathFactory) -> Path:
         time = TIME + number * 1000
         bag.write(channel, standard_text(str(number)), time, time - 10)
     bag.set_custom_data("run_info", "level: tip\nseed: 1\n")
-    bag.add_attachment("calibration.yaml", "application/yaml", b"left: {}\n", TIME)
     bag.close()
     return directory
 
@@ -93,20 +90,6 @@ def test_rosbags_reads_messages_and_qos(texts: Path) -> None:
     assert information["custom_data"] == {"run_info": "level: tip\nseed: 1\n"}
 
 
-def test_mcap_reads_the_file_alone(texts: Path) -> None:
-    with (texts / "bag_0.mcap").open("rb") as stream:
-        reader = make_reader(stream)
-        assert reader.get_header().profile == "ros2"
-        messages = list(reader.iter_messages())
-        (attachment,) = reader.iter_attachments()
-    schema, channel, message = messages[7]
-    assert schema is not None
-    assert (len(messages), schema.name, schema.encoding) == (200, TYPE, "ros2msg")
-    assert channel.metadata["topic_type_hash"] == STORE.hash_rihs01(TYPE)
-    assert (message.log_time, message.publish_time) == (TIME + 7000, TIME + 6990)
-    assert attachment.data == b"left: {}\n"
-
-
 def test_an_existing_bag_is_not_replaced(texts: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="already contains a bag"):
         BagWriter(texts)
@@ -123,16 +106,6 @@ class _BrokenFile(io.FileIO):
         raise OSError(errno.EIO, "Input/output error")
 
 
-class _FullFile(io.FileIO):
-    """A file on a disk with 8 MB of room; the last write is cut short."""
-
-    def write(self, data: Any) -> int:
-        room = 8_000_000 - self.tell()
-        if room <= 0:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return super().write(data[:room])
-
-
 def test_a_disk_that_refuses_data_is_an_error_at_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -146,22 +119,6 @@ def test_a_disk_that_refuses_data_is_an_error_at_the_start(
         open_recording(tmp_path / "bag", reserve=1_000_001)
     monkeypatch.undo()
     open_recording(tmp_path / "bag").close()
-
-
-def test_recover_completes_the_bag_of_a_disk_that_refused_data(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(BagWriter, "open_file", lambda _, path: _FullFile(path, "xb"))
-    recording = open_recording(tmp_path / "bag")
-    recording.add_topic(TOPIC)
-    for number in range(2000):
-        recording.append(Received("/t", standard_text(f"{number:010000}"), TIME, TIME))
-    recording.close()
-    assert not recording.is_whole
-    assert str(recording.error).endswith("bag_0.mcap: No space left on device")
-    recovery = recover_bag(tmp_path / "bag")
-    kept = read_contents(tmp_path / "bag").counts["/t"]
-    assert 0 < kept == recovery.messages < 2000
 
 
 def test_a_recording_ends_in_order_before_its_disk_is_full_or_at_an_error(

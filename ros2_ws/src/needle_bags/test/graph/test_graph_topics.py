@@ -60,15 +60,6 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Graph:
     return Graph(monkeypatch)
 
 
-def test_queued_messages_of_the_previous_subscription_come_first_and_once(graph: Graph) -> None:
-    before, following = graph.replace()
-    graph.hear(before, 1)
-    before.waiting.extend(map(sent, (2, 3, 4)))
-    following.waiting.append(sent(5))
-    graph.hear(following, 4)
-    assert graph.numbers == [1, 2, 3, 4, 5]
-
-
 def test_duplicates_of_two_subscriptions_are_dropped(graph: Graph) -> None:
     before, following = graph.replace(1, 2)
     graph.hear(following, 1, 2, 3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +23,7 @@ from trajectory_msgs.msg import JointTrajectory
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition
-from needle_bags.player.terminal_keys import FASTER, FORWARD, PAUSE, Keys
+from needle_bags.player.playback import FASTER, FORWARD, PAUSE, Keys
 from needle_bags.ros import player as node
 from needle_core.files.bag_topic import BagTopic
 
@@ -73,19 +73,6 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-class AtOnce:
-    """Reads as much ahead as is asked for."""
-
-    def __init__(self, make: Callable[[], Iterator[Any]]) -> None:
-        self._items = make()
-
-    def next(self) -> Any:
-        return next(self._items, None)
-
-    def close(self) -> None:
-        """Nothing runs."""
-
-
 class Scene(PlayedGraph):
     """A player and its graph."""
 
@@ -101,7 +88,6 @@ class Scene(PlayedGraph):
         monkeypatch.setattr(node, "run_node", run_node)
         monkeypatch.setattr(node, "NodeParameters", lambda *_: None)
         monkeypatch.setattr(node, "SingleThreadedExecutor", self.executor)
-        monkeypatch.setattr(node, "ReadAhead", AtOnce)
         monkeypatch.setattr(
             Keys, "pressed", lambda _: [self.pressed.pop(0)] if self.pressed else []
         )

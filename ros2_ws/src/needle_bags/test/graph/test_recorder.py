@@ -24,9 +24,9 @@ from needle_bags.reading.bag_messages import read_contents, read_messages
 from needle_bags.recording.recording import FreeSpace, Recording
 from needle_bags.recording.worker import Job, RunJob
 from needle_bags.recovery.bag_recovery import recover_bag
-from needle_bags.ros import graph_topics, repeated_request
+from needle_bags.ros import graph_topics, parameter_snapshots
 from needle_bags.ros import recorder as node
-from needle_bags.ros.recorder_parameters import RecorderParameters
+from needle_bags.ros.recorder import RecorderParameters
 from needle_core.errors import UserError
 
 from .played_graph import BEST_EFFORT, LATCHED, PlayedGraph
@@ -54,7 +54,7 @@ class Scene(PlayedGraph):
     """A recorder that begins and ends when the test says so."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-        super().__init__(monkeypatch, node, graph_topics, repeated_request)
+        super().__init__(monkeypatch, node, graph_topics, parameter_snapshots)
         self.bag = folder / "bag"
 
         def begin(bag: Path, *, reserve: int, **how: Any) -> Recording:
@@ -141,31 +141,6 @@ def test_the_bag_has_all_messages_and_what_a_rerun_needs(
     assert scene.health("parameters_of").message == "/recorder, /source"
 
 
-def test_malformed_messages_are_reported_and_recorded(scene: Scene) -> None:
-    scene.offer(EVENTS, ParameterEvent)
-    malformed = (b"\0\1\0\0" + bytes(8) + b"\xff\xff\xff\x7fmore", b"\xff" * 8)
-
-    def strange() -> None:
-        raise ValueError("a service's bytes")
-
-    scene.at(0.25, strange)
-
-    def act() -> None:
-        scene.send(EVENTS, *malformed)
-        scene.run(1.0)
-
-    assert scene.record(act) == 0
-    said = scene.health("input")
-    assert said.level == DiagnosticStatus.WARN
-    assert {pair.key: pair.value for pair in said.values} == {
-        EVENTS: "2",
-        "a service or the graph": "1",
-    }
-    assert "a service's bytes" in said.message
-    assert read_contents(scene.bag).counts[EVENTS] == 2
-    assert len(scene.logged) == 3
-
-
 def test_a_full_disk_ends_the_recording_and_not_the_node(
     scene: Scene, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -221,7 +196,6 @@ def test_snapshots_on_request_and_a_second_after_a_fault(scene: Scene) -> None:
         assert not int({p.key: p.value for p in scene.health("bag").values}["messages"])
         scene.services["~/snapshot"](Trigger.Request(), answer)
         scene.send("/numbered", Int32(data=-1))
-        scene.send(STATUS, b"\xff\xff\xff")
         say("FAULT")
         scene.run(0.9)
         scene.send("/numbered", Int32(data=-2))
@@ -238,7 +212,7 @@ def test_snapshots_on_request_and_a_second_after_a_fault(scene: Scene) -> None:
     assert kept[0] > 150
     assert kept == [*range(kept[0], 1400), -1, -2]
     assert scene.numbers("/plane") == [7]
-    assert read_contents(scene.bag).counts[STATUS] == 3
+    assert read_contents(scene.bag).counts[STATUS] == 2
 
 
 def test_topic_selection_and_invalid_parameters() -> None:

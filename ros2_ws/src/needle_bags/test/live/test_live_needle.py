@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from needle_bags.live.camera_images import LatestImages, draw_needle
+from needle_bags.live.camera_images import LatestImages
 from needle_bags.live.live_messages import SIGMAS, ellipsoid
 from needle_bags.live.live_needle import LiveNeedle, MeasuredTip, TipEstimate
 from needle_bags.run.shaft_trail import ShaftTrail
@@ -191,19 +190,3 @@ def test_an_image_is_shown_once_with_its_answer_or_late_without() -> None:
     images.add(20, blank(20))
     assert drawn(None, 5.6) == (20, False)
     assert drawn(None, 5.7) is None
-
-
-def test_shaft_and_tip_are_drawn_at_their_pixels() -> None:
-    def coloured(shaft: NDArray[np.float64]) -> NDArray[np.bool_]:
-        data = np.frombuffer(draw_needle(blank(), shaft, ""), np.uint8)
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
-        assert picture is not None
-        assert picture.shape == (120, 160, 3)
-        return np.asarray(picture.max(axis=2) > 60)
-
-    shaft = np.array([[20.0, 30.0], [100.0, 30.0], [np.nan, np.nan], [130.0, 60.0]])
-    seen = coloured(shaft)
-    assert seen[29:32, 60].any()
-    assert seen[60, 119:123].any()
-    assert not seen[80:, :].any()
-    assert not coloured(np.empty((0, 2))).any()

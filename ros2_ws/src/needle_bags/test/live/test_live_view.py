@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from needle_bags.figures.film_views import Projection
+from needle_bags.figures.film import Projection
 from needle_bags.live import live_view
 from needle_bags.live.live_messages import ADD
 from needle_bags.live.live_view import FOXGLOVE, LiveView, LiveViewParameters, Watched

@@ -1,17 +1,13 @@
 from __future__ import annotations
 
-import contextlib
 import math
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from needle_bags.player.playback import READ_AHEAD, PlaybackClock, ReadAhead
+from needle_bags.player.playback import BACK, FASTER, FORWARD, PAUSE, SLOWER, PlaybackClock, keys_in
 from needle_bags.player.player_options import parse_options
 from needle_bags.player.replay_names import is_guarded, marks_a_rig, played_name
-from needle_bags.player.terminal_keys import BACK, FASTER, FORWARD, PAUSE, SLOWER, keys_in
 from needle_core.errors import UserError
 
 SECOND = 1_000_000_000
@@ -43,28 +39,6 @@ def test_a_pause_takes_no_time() -> None:
 
 def test_arrow_keys_are_decoded() -> None:
     assert keys_in(" \x1b[A\x1bOBx\x1b[C\x1b[D") == [PAUSE, FASTER, SLOWER, "x", FORWARD, BACK]
-
-
-def test_reading_ahead_keeps_order_and_limit_and_passes_on_errors() -> None:
-    read: list[int] = []
-    full = threading.Event()
-
-    def items() -> Iterator[int]:
-        for number in range(200):
-            read.append(number)
-            if number == READ_AHEAD:
-                full.set()
-            yield number
-        raise UserError("broken")
-
-    with contextlib.closing(ReadAhead(items)) as source:
-        assert full.wait(10.0)
-        assert len(read) <= READ_AHEAD + 2
-        assert [source.next() for _ in range(200)] == list(range(200))
-        with pytest.raises(UserError, match="broken"):
-            source.next()
-    assert ReadAhead(lambda: iter(())).next() is None
-    ReadAhead(lambda: iter(range(10**9))).close()
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_bags.format.bag_writer import BagCopy, BagWriter, standard_topic
+from needle_bags.format.bag_writer import BagCopy, BagWriter, standard_text, standard_topic
 from needle_bags.reading.bag_messages import raw_as_sent, read_contents
-from needle_bags.reading.bag_reader import _Collector, read_run
+from needle_bags.reading.bag_reader import _health_events, _series, read_run
 from needle_core.errors import UserError
 from needle_core.files.bag_topic import BagTopic
 
@@ -30,7 +30,7 @@ def two_rigs(make_run: MakeRun, tmp_path: Path) -> Path:
     copy = BagCopy(tmp_path / "two", "jazzy", {})
     for bag in (make_run("one", steps=30), make_run("other", namespace="/bench/", steps=20)):
         contents = read_contents(bag)
-        for m in raw_as_sent(bag, lambda _: True, lambda _: False):
+        for m in raw_as_sent(bag, lambda _: True):
             copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
     copy.close()
     return tmp_path / "two"
@@ -66,19 +66,16 @@ def test_health_is_that_of_the_selected_rig() -> None:
         ("/", ["sim_rig: a", "camera/left: c"]),
         ("/bench/", ["sim_rig: a", "sim_rig: b", "camera/left: c"]),
     ):
-        collected = _Collector(namespace, ["/", "/bench/"])
-        collected.add_diagnostics(0, SimpleNamespace(status=[status(name) for name in names]))
-        assert [event.part for event in collected.health] == kept
+        message = SimpleNamespace(status=[status(name) for name in names])
+        health = _health_events([(0, message)], namespace, ["/", "/bench/"])
+        assert [event.part for event in health] == kept
 
 
 def test_holds_of_two_sessions_are_stamped_by_arrival() -> None:
-    collected = _Collector("/", ["/"])
-    for time, session in ((10, "a"), (20, "b")):
-        # The first message of each.
-        header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=1), frame_id=f"me/{session}")
-        joy = SimpleNamespace(header=header, axes=[0.5], buttons=[1])
-        collected.handlers()["device/hold"](time, joy)
-    holds = collected.series("holds", 2)
+    # The first message of each.
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=1))
+    joy = SimpleNamespace(header=header, axes=[0.5], buttons=[1])
+    holds = _series("holds", [(10, joy), (20, joy)])
     assert holds.stamps.tolist() == holds.received.tolist() == [10, 20]
 
 
@@ -97,7 +94,7 @@ def other_type(path: Path) -> None:
     bag = BagWriter(path)
     for name in ("/needle/controller_status", "/needle/tip"):
         topic = bag.add_topic(standard_topic(name, "std_msgs/msg/String"))
-        bag.write(topic, bytes(8), 1, 1)
+        bag.write(topic, standard_text(""), 1, 1)
     bag.close()
 
 
@@ -118,8 +115,8 @@ def other_distribution(path: Path) -> None:
     ("make", "words"),
     [
         (foreign, "contains no needle run"),
-        (other_type, "/needle/tip has type std_msgs/msg/String, the rig's has"),
-        (other_distribution, r"as Jazzy has it \(bag of humble"),
+        (other_type, "is not of the rig's graph"),
+        (other_distribution, r"as ROS 2 Jazzy has it \(bag of humble"),
     ],
 )
 def test_a_bag_without_a_readable_run_is_one_line(

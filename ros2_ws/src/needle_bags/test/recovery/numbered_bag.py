@@ -64,7 +64,7 @@ def write(
         text = f"{{{node}: {{ros__parameters: {{gain: {gain}}}}}}}"
         bag.add_metadata("parameters", {"node": node, "yaml": text})
     bag.add_metadata("parameter_change", {"stamp_ns": "5", "node": "/one", "value": "2.0"})
-    bag.add_attachment("calibration.yaml", "application/yaml", b"left: {}\n", 1)
+    bag._mcap.add_attachment(1, 1, "calibration.yaml", "application/yaml", b"left: {}\n")
     for number in range(first, first + count):
         time = START + number * STEP
         bag.write(topics[number % 3], payload(number), time, time - 1000, number // 3 + 1)

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from rosbags.interfaces import QosDurability
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as OtherWriter
 
 from needle_bags.format.bag_writer import BagWriter, standard_text, standard_topic
@@ -23,7 +23,6 @@ from needle_bags.reading.bag_reader import read_run
 from needle_bags.recovery import bag_recovery, recover
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_core.errors import UserError
-from needle_core.files.bag_data import unpack_file
 
 from .numbered_bag import START, STEP, TOPICS, chunks, contents, damage, kill, numbers, write
 
@@ -111,50 +110,19 @@ def test_a_bag_that_is_being_recorded_is_left_alone(tmp_path: Path) -> None:
     assert recover_bag(path).was_whole
 
 
-def write_compressed(path: Path, mode: CompressionMode) -> Path:
-    """A bag of 30 messages as another recorder compresses it."""
+def test_messages_compressed_one_by_one_are_recovered(tmp_path: Path) -> None:
+    path = tmp_path / "bag"
     writer = OtherWriter(path, version=9, storage_plugin=StoragePlugin.MCAP)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
     told: Any = {"msgdef": STRING.definition, "rihs01": STRING.type_hash}
     with writer:
         topic = writer.add_connection("/a", STRING.type_name, **told)
         for number in range(30):
             writer.write(topic, 1000 + number, standard_text(f"message {number}"))
-    return path
-
-
-def texts(path: Path) -> list[str]:
-    return [message.data for _, _, message in read_messages(path, "/a".__eq__)]
-
-
-def test_messages_compressed_one_by_one_are_recovered_up_to_the_damage(
-    tmp_path: Path,
-) -> None:
-    path = write_compressed(tmp_path / "bag", CompressionMode.MESSAGE)
-    assert recover_bag(path).was_whole
     (path / "metadata.yaml").unlink()
     assert recover_bag(path).kept == []
-    assert texts(path) == texts(path / "bag.mcap") == [f"message {k}" for k in range(30)]
-    with Reader(path) as reader:
-        assert sum(1 for _ in reader.messages()) == 30
-
-
-def test_files_compressed_as_a_whole_are_whole_or_must_be_unpacked(tmp_path: Path) -> None:
-    path = write_compressed(tmp_path / "bag", CompressionMode.FILE)
-    assert recover_bag(path).was_whole
-    (packed,) = path.glob("*.zstd")
-    assert len(texts(packed)) == 30
-    whole = packed.read_bytes()
-    packed.write_bytes(whole[:-200])
-    for _ in range(2):
-        with pytest.raises(UserError, match=r"run `unzstd --rm .*/bag/\*\.mcap\.zstd` first"):
-            recover_bag(path)
-        (path / "metadata.yaml").unlink(missing_ok=True)
-        packed.write_bytes(whole)
-    unpack_file(packed, path)
-    packed.unlink()
-    assert recover_bag(path).lost == ""
-    assert len(texts(path)) == 30
+    messages = read_messages(path, "/a".__eq__)
+    assert [m.data for _, _, m in messages] == [f"message {k}" for k in range(30)]
 
 
 def test_an_unrecoverable_bag_gives_a_one_line_error_and_is_kept(

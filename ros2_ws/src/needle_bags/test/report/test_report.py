@@ -13,11 +13,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from needle_bags.figures.event_figure import lanes_of
-from needle_bags.figures.pair_figures import is_same_needle
+from needle_bags.figures.run_figures import is_same_needle
 from needle_bags.reading.bag_reader import HealthEvent, Result, Run, Status, read_run
 from needle_bags.report import report
-from needle_bags.report.page import TERMS, Glossary
-from needle_bags.report.report_page import verdict_text
+from needle_bags.report.pages import verdict_text
 from needle_bags.rerun.rerun_bag import write_rerun
 from needle_bags.run.run_summary import summarize, troubles
 from needle_bags.run.stage_timing import STAGES
@@ -56,13 +55,12 @@ def test_the_report_is_one_self_contained_file(reported: tuple[Run, str]) -> Non
     run, page = reported
     assert_leads_nowhere_else(page)
     # Two drawings of the film beside the figures, which are files, too.
-    figures = ("states", "path", "errors", "innovation", "timing", "events", "images")
+    figures = ("states", "path", "errors", "timing", "events")
     assert page.count("data:image/png;base64,") == len(figures) + 2
     for name in figures:
         assert (run.path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     contents = re.findall(r'<li><a href="#([^"]+)">([^<]+)</a>', page)
     assert contents == re.findall(r'<section id="([^"]+)"><h2>([^<]+)</h2>', page)
-    assert {"What the cameras saw", "Innovation and gate"} <= {title for _, title in contents}
     rows = re.findall(r"<tr><td>([\w -]+)</td><td>[^<]*</td><td>(\d+)</td>", page)
     assert [name for name, _ in rows] == [name for name, _ in STAGES]
     assert all(120 <= int(count) <= 121 for _, count in rows)
@@ -136,7 +134,7 @@ def test_the_report_of_a_rerun(make_run: MakeRun, tmp_path: Path, drawn: list[Fi
     labels = [line.get_label() for axes in drawn[0].axes for line in axes.lines]
     assert labels.count("A and B, truth") == 3
     assert "A, truth" not in labels
-    assert {"A commanded", "B would have commanded"} < set(labels)
+    assert {"A, commanded", "B, would have commanded, step by step"} < set(labels)
     page = (again / "compared_with_steered.html").read_text()
     assert "Missed the plane / Rerun" in page
     assert "what the needle did is the same in both" in page
@@ -171,7 +169,7 @@ def test_events_omit_the_warnings_of_the_start(
         ("device: step", "aborted: hold released"),
         ("sim_rig: simulation", "waiting again"),
     ]
-    lanes = {lane.name: lane.spans for lane in lanes_of(run)}
+    lanes = lanes_of(run)
     assert {"controller", "device", "aborted steps"} < set(lanes)
     assert lanes["watchdogs"][0].begin == begin + SECOND // 2
     (waiting,) = lanes["sim_rig: simulation"]
@@ -207,17 +205,10 @@ def test_verdicts(make_run: MakeRun) -> None:
         assert told(nothing)["point_error_mm"] is None
 
 
-def test_a_term_is_explained_at_its_first_use() -> None:
-    glossary = Glossary()
-    first = glossary.explain("The [roll] is < [turned|roll] by the [hold].")
-    assert first.count('id="term-roll"') == 1
-    assert first.count('href="#term-roll"') == 2
-    assert "&lt;" in first
-    again = glossary.explain("[roll] and [95 %]")
-    assert 'id="term-roll"' not in again
-    assert 'id="term-95"' in again
-    with pytest.raises(KeyError):
-        glossary.explain("[what nobody knows]")
-    text = "".join(path.read_text() for path in Path(report.__file__).parent.glob("static/*.html"))
-    used = {b or a for a, b in re.findall(r"\[([^\]|\[\n\"]+)(?:\|([^\]\n\"]+))?\]", text)}
-    assert set(TERMS) <= used
+def test_an_image_of_a_wrong_size_gives_a_one_line_error(
+    make_run: MakeRun, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert report.main([str(make_run(image_height=7, steps=3))]) == 2
+    said = capsys.readouterr().err
+    assert "an image declares 7 rows of 4 pixels" in said
+    assert said.count("\n") == 1

@@ -6,7 +6,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.reading.bag_messages import SentMessage
-from needle_bags.rerun.reception_order import in_reception_order
+from needle_bags.rerun.bag_pass import in_reception_order
 from needle_controller.controller_status import ReceptionLog
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

@@ -21,10 +21,9 @@ from needle_bags.link import openigtlink
 from needle_bags.live import live_view
 from needle_bags.reading.bag_messages import raw_as_sent, read_contents, read_messages
 from needle_bags.reading.bag_reader import read_run
-from needle_bags.rerun.bag_pass import Output
 from needle_bags.rerun.rerun_bag import TABLE, write_rerun
+from needle_bags.rerun.stages import Output
 from needle_bags.ros import rerun as rerun_node
-from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.errors import UserError
 from needle_tracker.optics.calibration import StereoCalibration, parse_calibration
 
@@ -124,34 +123,6 @@ def test_a_parameter_off_by_a_hundredth_is_detected(
     assert field in changed_fields(result)
 
 
-def test_a_gain_off_by_a_hundredth_is_detected(
-    paper_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    designed = SteeringSettings.gains
-
-    def off(settings: SteeringSettings) -> Any:
-        gains = designed(settings)
-        feedback = np.array(gains.feedback, copy=True)
-        feedback.flat[0] *= 1.01
-        return dataclasses.replace(gains, feedback=feedback)
-
-    monkeypatch.setattr(SteeringSettings, "gains", off)
-    result = tmp_path / "result.json"
-    assert rerun(paper_bag, "--json", result) == 1
-    assert "needle_control_input_v" in changed_fields(result)
-
-
-def test_an_exception_gives_another_exit_code_than_a_change(
-    eight_steps: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
-    def mistaken(*_: object) -> None:
-        raise ValueError("behind the camera")
-
-    monkeypatch.setattr("needle_bags.ros.controller_rerun.ControllerStage.process", mistaken)
-    assert rerun(eight_steps) == 3
-    assert "internal error, please report it: ValueError: behind" in capsys.readouterr().err
-
-
 def test_another_preset_is_a_run_of_its_own(eight_steps: Path, paper_bag: Path) -> None:
     code, said = printed(paper_bag)
     assert code == 0
@@ -161,7 +132,7 @@ def test_another_preset_is_a_run_of_its_own(eight_steps: Path, paper_bag: Path) 
     assert before.counts == after.counts
     for topic in ("/joint_states", "/device/status", "/sim/tip_pose"):
         kept = [
-            [(m.log_time, m.data) for m in raw_as_sent(bag, topic.__eq__, lambda _: False)]
+            [(m.log_time, m.data) for m in raw_as_sent(bag, topic.__eq__)]
             for bag in (eight_steps, paper_bag)
         ]
         assert kept[0] == kept[1]
@@ -245,7 +216,7 @@ def copied(bag: Path, target: Path, custom: dict[str, str], topic: str, kind: st
     @contextlib.contextmanager
     def writing() -> Iterator[Callable[[bytes], None]]:
         yield lambda data: copy.put(new, data, contents.start, contents.start)
-        for m in raw_as_sent(bag, lambda _: True, lambda _: False):
+        for m in raw_as_sent(bag, lambda _: True):
             copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
         copy.close()
 
@@ -336,15 +307,3 @@ def test_bad_input_gives_a_one_line_error(
         lines = capsys.readouterr().err.splitlines()
         (line,) = [line for line in lines if "no longer has" not in line]
         assert words in line
-
-
-def test_parameters_reach_the_node_or_give_a_warning(
-    eight_steps: Path, tmp_path: Path, capsys: Capture
-) -> None:
-    file = given(tmp_path, "curvature: 8.0", "/rig1/plane_controller")
-    assert rerun(eight_steps, "--params", file) == 2
-    assert "this node is /plane_controller: write '/plane_controller'" in capsys.readouterr().err
-    file = given(tmp_path, "max_depth: 0.1", "device_driver")
-    assert rerun(eight_steps, "--params", file) == 0
-    warning = f"warning: {file}: no section for /plane_controller: it has device_driver"
-    assert capsys.readouterr().err.splitlines()[0] == warning

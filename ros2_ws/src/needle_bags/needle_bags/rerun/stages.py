@@ -1,18 +1,74 @@
-"""Runs a component on the messages of a bag."""
+"""Parts of the rig that process the messages of a bag, and their outputs."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Protocol
+
+from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.reading.bag_images import plain_image
 from needle_bags.reading.bag_messages import SentMessage
-from needle_bags.rerun.bag_pass import CONVERTER, Output
 from needle_core.component import Component, Moment, Publish
-from needle_core.convert import from_ros
+from needle_core.convert import Converter, from_ros
+from needle_core.message_types import rosbags_types
 from needle_core.messages import Image
 from needle_core.runners.bag import BagRunner
+
+_STORE = get_typestore(Stores.ROS2_JAZZY)
+CONVERTER = Converter(rosbags_types(_STORE))
+"""Converts to rosbags messages."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Output:
+    """A message of the current code.
+
+    Attributes
+    ----------
+    topic : str
+        Relative name.
+    log_time : int
+        Log time of the input that caused it [ns].
+    stamp : int
+        Stamp of the message [ns].
+    message : Any
+        The message, of rosbags' class.
+    """
+
+    topic: str
+    log_time: int
+    stamp: int
+    message: Any
+
+    @property
+    def type_name(self) -> str:
+        """Name of the message's type."""
+        return str(self.message.__msgtype__)
+
+    @property
+    def data(self) -> bytes:
+        """The message as CDR."""
+        return bytes(_STORE.serialize_cdr(self.message, self.type_name))
+
+
+class Stage(Protocol):
+    """A part of the rig that turns messages into outputs."""
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """Names of its input topics, relative to the rig's namespace, or absolute."""
+        ...
+
+    def process(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
+        """Process a message of a topic, by its relative name; return the outputs."""
+        ...
+
+    def finish(self, log_time: int) -> list[Output]:
+        """Return the outputs that remain at the end of the bag."""
+        ...
 
 
 class BagStage:
