@@ -103,7 +103,7 @@ class DriveMotion:
             return
         target = self._within_limits(self._objects.value(TARGET_POSITION))
         distance = target + self._zero - self._demand.position
-        if self._is_blocked(distance):
+        if self._motor.is_blocked(distance):
             self._limited = True
         elif distance != 0.0:
             period = self._objects.value(0x60C2, 1) * 10.0 ** self._objects.value(0x60C2, 2)
@@ -134,7 +134,7 @@ class DriveMotion:
     def operate(self, period: float) -> None:
         """Advance the demand by `period` [s] in the present mode."""
         demand = self._demand
-        if self._homing is None and self._is_blocked(demand.velocity):
+        if self._homing is None and self._motor.is_blocked(demand.velocity):
             self.brake(0x6085, period)
             self._target = self._next_target = None
             self._limited = True
@@ -200,12 +200,6 @@ class DriveMotion:
     @property
     def _halted(self) -> bool:
         return bool(self._word & HALT)
-
-    def _is_blocked(self, direction: float) -> bool:
-        """Return whether a limit switch blocks a direction."""
-        return (direction < 0.0 and self._motor.at_negative_switch) or (
-            direction > 0.0 and self._motor.at_positive_switch
-        )
 
     def _start_profile_motion(self, word: int) -> None:
         value = self._objects.value
