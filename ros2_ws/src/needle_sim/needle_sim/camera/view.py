@@ -184,9 +184,8 @@ class View:
 
     def visible_share(self, points: FloatArray, moment: SceneState) -> float:
         """Return the share of points (M, 3) in `rig` that are in the image and not under a hand."""
-        width, height = self._optics.image_size
         pixels = self._optics.project(points)
-        visible = np.all((pixels >= 0.0) & (pixels <= [width - 1, height - 1]), axis=1)
+        visible = self._optics.in_image(pixels)
         if moment.hand and len(points):
             hidden = self._hand_mask(moment)
             column, row = np.rint(pixels[visible]).astype(np.intp).T

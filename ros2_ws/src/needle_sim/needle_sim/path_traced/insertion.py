@@ -116,7 +116,10 @@ def trace_insertion(
                     right = _mesh(later, appearance)
                 meshes = left, right
                 distal = [mesh.line[-int(_DISTAL_LENGTH / _SPACING) :] for mesh in meshes]
-                visible = list(map(_visible_share, distal, optics))
+                visible = [
+                    float(camera.in_image(camera.project(points)).mean())
+                    for camera, points in zip(optics, distal, strict=True)
+                ]
             images = renderer.render(meshes, number)
             yield TracedPair(number, images, insertion, truth, (visible[0], visible[1]), meshes)
 
@@ -161,13 +164,6 @@ def _middle_line(plant: NeedlePlant, appearance: Appearance) -> FloatArray:
     back /= np.linalg.norm(back)
     before = np.arange(int(_OUTSIDE / _SPACING), 0, -1)[:, np.newaxis] * _SPACING
     return np.concatenate([line[0] + before * back, line])
-
-
-def _visible_share(points: FloatArray, optics: Optics) -> float:
-    """Return the share of points (N, 3) in `rig` that are in a camera's image."""
-    pixels = optics.project(points)
-    visible = np.all((pixels >= 0.0) & (pixels <= np.subtract(optics.image_size, 1.0)), axis=1)
-    return float(visible.mean())
 
 
 TRUTH_COLUMNS = (
