@@ -15,7 +15,6 @@ from needle_core.files.installed import find_shared_file
 from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
 from needle_sim.path_traced.appearance import draw_appearance
-from needle_sim.path_traced.floors import FloorPicture
 from needle_sim.path_traced.insertion import trace_insertion
 from needle_sim.path_traced.path_tracing import PathTracer, refracted_rays
 from needle_sim.path_traced.scene import Scene
@@ -130,9 +129,9 @@ def test_what_mirrors_the_floor_mirrors_its_picture(mitsuba: Mitsuba) -> None:
     look = dataclasses.replace(draw_appearance("drawn_on_grey", 3), bubbles=0)
     world = make_world(load_stereo_rig(CALIBRATION), look)
     behind = world.backdrops[0]
-    shape = behind.picture.reflectance.shape
+    shape = behind.picture.shape
     slanting = np.linspace(0.1, 0.5, shape[0])[:, np.newaxis] + np.linspace(0.0, 0.4, shape[1])
-    behind = dataclasses.replace(behind, picture=FloorPicture(slanting.astype(np.float32)))
+    behind = dataclasses.replace(behind, picture=slanting.astype(np.float32))
     scene = Scene(mitsuba, dataclasses.replace(world, backdrops=(behind, behind)))
     places = np.array([[look.floor_height, y, z] for y in (-0.04, 0.05) for z in (0.02, 0.12)])
     above = (MM * (places + np.array([0.01, 0.0, 0.0]))).astype(np.float32)

@@ -10,7 +10,6 @@ import contextlib
 import json
 import os
 import queue
-import select
 import subprocess
 import sys
 import tempfile
@@ -31,7 +30,7 @@ from needle_device_driver.link.can_port import Batch, CanPort, LinkSettings
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
-from needle_sim.bus.pty_can import PtyPort
+from needle_sim.bus.pty_can import PtyCan
 from needle_sim.drive_emulator import AXES, DriveEmulatorParameters
 from needle_sim.drives.emulated_bus import EmulatedBus
 
@@ -209,7 +208,7 @@ def serve(channel: str) -> None:
     now = time.monotonic()
     bus = EmulatedBus(map(values.cia402, AXES), now)
     bus.poll(now)
-    port = PtyPort(Path(channel))
+    port = PtyCan(Path(channel))
     print("ready", flush=True)
     ended = threading.Event()
 
@@ -220,12 +219,12 @@ def serve(channel: str) -> None:
     threading.Thread(target=wait_for_line, daemon=True).start()
     arrived: list[float] = []
     while not ended.is_set():
-        select.select(port.filenos, [], [], 0.005)
+        port.wait(0.005)
         port.send(bus.receive(port.receive(), time.monotonic()))
         port.send(bus.poll(time.monotonic()))
         while len(arrived) < bus.syncs:
             arrived.append(time.monotonic())
-    port.unplug()
+    port.close()
     print(json.dumps(arrived))
 
 

@@ -116,7 +116,7 @@ class StereoCameras:
             self._folder.close()
 
 
-class CameraSensor:
+class CameraSensor(StereoCameras):
     """Sensor of the levels with cameras: renders in this process.
 
     Parameters
@@ -130,17 +130,12 @@ class CameraSensor:
     ports: tuple[Port, ...] = ()
 
     def __init__(self, bench: SimulatedBench, settings: SimRigParameters) -> None:
+        super().__init__(settings)
         self._bench = bench
-        self._cameras = StereoCameras(settings)
-        self.half_sizes, self.outputs = self._cameras.half_sizes, self._cameras.outputs
 
     def expose(self, number: int, stamp_ns: int) -> Actions:
         """Return the images of an exposure."""
-        return self._cameras.render(Exposure.of(self._bench, number, stamp_ns))
-
-    def close(self) -> None:
-        """Close the files of the image folder."""
-        self._cameras.close()
+        return self.render(Exposure.of(self._bench, number, stamp_ns))
 
 
 class RemoteCameras:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from needle_core import messages as m
@@ -22,17 +24,23 @@ from needle_core.component import (
     Send,
     Timer,
 )
+from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_sim.drives.cia402 import SERVO, STEPPER
-from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.emulated_drives import FAULT, AxisState, EmulatedDrives
-from needle_sim.drives.emulators import CIA402, load_emulator
-from needle_sim.drives.fault_commands import execute_command, health
 from needle_sim.drives.motor import MotorSettings
 
+CIA402 = "cia402"
+GROUP = "needle_sim.drives"
+"""Group of the entry points: name to a callable that returns an `EmulatedDrives`."""
+_OWN = {
+    "galil": "needle_sim.drives.galil_drives:GalilDrives",
+    "zaber": "needle_sim.drives.zaber_drives:ZaberDrives",
+    "stepdir": "needle_sim.drives.stepdir_drives:StepdirDrives",
+}
 # Encoder of the rotation axis: 16 bits per turn, no gear.
 COUNTS_PER_RADIAN = 65536.0 / (2.0 * math.pi)
 # Lead of the insertion axis' screw: travel per turn of the motor [m].
@@ -59,12 +67,6 @@ class DriveEmulatorParameters:
     )
     pty: str = fixed_parameter(
         "", "-", "Symbolic link to the pseudo-terminal; empty: only its own name is logged."
-    )
-    limit_action: str = fixed_parameter(
-        LimitAction.CLAMP.value,
-        "-",
-        "Reaction of a homed drive to a target beyond its software limits (0x607D).",
-        choices=tuple(action.value for action in LimitAction),
     )
     rpm: bool = fixed_parameter(
         False, "-", "Both drives use rpm for speeds and rpm/s for ramps, and report it (0x60A9)."
@@ -141,11 +143,18 @@ class DriveEmulatorParameters:
         """Return the CiA 402 drive of an axis: a stepper on a screw, or a servo."""
         device_type, turn = (STEPPER, _LEAD) if axis == "insertion" else (SERVO, 2.0 * math.pi)
         motor, node_id = self.motor(axis), getattr(self, f"{axis}_node_id")
-        action = LimitAction(self.limit_action)
         rpm = motor.counts_per_unit * turn / 60.0 if self.rpm else None
-        return EmulatedDriveSettings(axis, node_id, device_type, motor, action, self.boot_time, rpm)
+        return EmulatedDriveSettings(axis, node_id, device_type, motor, self.boot_time, rpm)
 
 
+COMMANDS = """\
+cut_bus             lose all data in both directions; the connection stays open
+unplug              remove the CAN adapter, or close the TCP connections
+stall AXIS          block the motor
+reboot AXIS         interrupt the drive's power
+emcy AXIS CODE      put the drive into a fault with this error code, such as 0x5530
+hang AXIS           hang the drive's processor: it is silent, the motor ends at its set-point
+restore             end cut_bus, unplug, stall and hang; AXIS is insertion or rotation"""
 AXES = ("insertion", "rotation")
 POSITIONS = "sim/drive_positions"
 ADAPTERS, COMMAND_LINES = "adapters", "command lines"
@@ -213,18 +222,17 @@ class DriveEmulator(Component):
         axes = self.settings.axes_of[name]
         if name == CIA402:
             return EmulatedBus(map(self.settings.cia402, axes), now)
-        return load_emulator(name)({axis: self.settings.motor(axis) for axis in axes}, now)
+        return _load_emulator(name)({axis: self.settings.motor(axis) for axis in axes}, now)
 
     def _on_input(self, port: str, batch: Sequence[Any], at: Moment) -> Actions:
         return self._send(port, self.connections[port].receive(batch, at.steady))
 
     def _on_commands(self, lines: Sequence[str], at: Moment) -> Actions:
         """Execute fault commands and log the motor positions; log invalid commands."""
-        connections = tuple(self.connections.values())
         for line in lines:
             axes = self.axes(at.steady)
             try:
-                plugged_in = execute_command(line, connections, at.steady)
+                plugged_in = self._execute(line, at.steady)
             except UserError as error:
                 yield Log("error", str(error))
                 continue
@@ -233,20 +241,57 @@ class DriveEmulator(Component):
             yield Log("warning", f"on command: {line.strip()}, at {where}")
             if plugged_in is not None:
                 yield Send(ADAPTERS, (plugged_in,))
-            yield Diagnose("drives", health(connections))
+            yield Diagnose("drives", self._health())
+
+    def _execute(self, line: str, now: float) -> bool | None:
+        """Execute one of `COMMANDS`; return whether to plug the adapters in or out, if either."""
+        drives_of = {axis: drives for drives in self.connections.values() for axis in drives.motors}
+        match line.split():
+            case ["cut_bus"]:
+                for drives in drives_of.values():
+                    drives.is_cut = True
+            case ["unplug"]:
+                return False
+            case ["restore"]:
+                for drives in self.connections.values():
+                    drives.restore(now)
+                return True
+            case ["stall" | "hang" as fault, axis] if axis in drives_of:
+                getattr(drives_of[axis], fault)(axis)
+            case ["reboot", axis] if axis in drives_of:
+                drives_of[axis].reboot(axis, now)
+            case ["emcy", axis, text] if axis in drives_of and (code := _error_code(text)):
+                drives_of[axis].fail(axis, code)
+            case _:
+                raise UserError(f"{line!r} is not a command; known:\n{COMMANDS}")
+        return None
+
+    def _health(self) -> Diagnostic:
+        """Return the states of all drives, and the faults of drives and connections."""
+        states = self._states_of_all()
+        problems = [
+            f"{drives.port} is cut" for drives in self.connections.values() if drives.is_cut
+        ]
+        if faults := [name for name, state in states.items() if state.startswith(FAULT)]:
+            problems.insert(0, f"fault of {' and '.join(faults)}")
+        level = Level.WARN if problems else Level.OK
+        return Diagnostic(level, ", ".join(problems) or "runs", states)
+
+    def _states_of_all(self) -> dict[str, str]:
+        every = (drives.states() for drives in self.connections.values())
+        return {axis: state for states in every for axis, state in states.items()}
 
     def _poll(self, at: Moment) -> Actions:
-        states: dict[str, str] = {}
         for port, drives in self.connections.items():
             yield from self._send(port, drives.poll(at.steady))
-            states |= drives.states()
+        states = self._states_of_all()
         if states == self._states:
             return
         for name, state in states.items():
             if state.startswith(FAULT) and self._states.get(name) != state:
                 yield Log("warning", f"{name} drive: {state.replace(FAULT, 'fault')}")
         self._states = states
-        yield Diagnose("drives", health(tuple(self.connections.values())))
+        yield Diagnose("drives", self._health())
 
     def _send(self, port: str, batch: Sequence[Any]) -> Actions:
         if batch:
@@ -260,3 +305,24 @@ class DriveEmulator(Component):
         velocities = tuple(axis.velocity for axis in axes.values())
         names = tuple(f"{name}_joint" for name in axes)
         yield Publish(POSITIONS, m.JointState(at.stamp_ns, names, positions, velocities))
+
+
+def _error_code(text: str) -> int:
+    """Return an error code of 16 bits; 0 for any other text."""
+    with contextlib.suppress(ValueError):
+        code = int(text, 0)
+        return code if 1 <= code <= 0xFFFF else 0
+    return 0
+
+
+def _load_emulator(name: str) -> Callable[[Mapping[str, MotorSettings], float], EmulatedDrives]:
+    """Return what makes the drives of a name, of this package or another one.
+
+    Its arguments are the motors of the axes, and the time of power-up [s].
+    """
+    own = (EntryPoint(known, place, GROUP) for known, place in _OWN.items())
+    found = {entry.name: entry for entry in (*own, *entry_points(group=GROUP))}
+    if name not in found:
+        raise UserError(f"drives: {name!r} is unknown; known: {', '.join((CIA402, *found))}")
+    loaded: Callable[[Mapping[str, MotorSettings], float], EmulatedDrives] = found[name].load()
+    return loaded

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import abc
 import enum
-from collections.abc import Callable
 from functools import partial
 
 from needle_core.can_frame import CanFrame
-from needle_sim.bus.object_dictionary import Kind, ObjectDictionary, SdoServer
+from needle_sim.bus.object_dictionary import Kind, ObjectDictionary, SdoServer, one_of
 from needle_sim.bus.process_data import INVALID, ReceivePdo, TransmitPdo
 
 NMT = 0x000
@@ -20,12 +20,11 @@ HEARTBEAT = 0x700
 _RECEIVE = (0x200, 0x300, 0x400, 0x500)
 _TRANSMIT = (0x180, 0x280, 0x380, 0x480)
 _HEARTBEAT_CONSUMERS = 2
-_ERRORS_KEPT = 4
 HEARTBEAT_LOST = 0x8130
 _COMMUNICATION_ERROR = 0x10
 _GENERIC_ERROR = 0x01
-# 0x1029: reaction of the network state to a lost heartbeat.
-_KEEP_STATE, _STOP = 1, 2
+# 0x1029: whether a lost heartbeat ends OPERATIONAL.
+_LEAVE_OPERATIONAL, _KEEP_STATE = 0, 1
 
 
 class NetworkState(enum.IntEnum):
@@ -37,8 +36,8 @@ class NetworkState(enum.IntEnum):
     PRE_OPERATIONAL = 0x7F
 
 
-class CanopenDevice:
-    """Generic CANopen device; its profile is in `dictionary` and the callbacks.
+class CanopenDevice(abc.ABC):
+    """Generic CANopen device; a subclass adds the profile.
 
     Sent frames collect in `outbox`. All times are readings of one steady clock [s].
 
@@ -52,10 +51,6 @@ class CanopenDevice:
         Mapping of the first PDO of each direction after power-up.
     boot_time : float
         From power-up to the boot-up message [s].
-    on_power_up, on_boot : callable
-        Called at power-up (also by an NMT reset), and at the boot-up message.
-    on_connection_lost : callable
-        Called when a monitored heartbeat is lost, or NMT stops the device.
     """
 
     def __init__(
@@ -66,22 +61,15 @@ class CanopenDevice:
         default_receive: tuple[int, ...],
         default_transmit: tuple[int, ...],
         boot_time: float,
-        on_power_up: Callable[[], None],
-        on_boot: Callable[[], None],
-        on_connection_lost: Callable[[], None],
     ) -> None:
         self.node_id = node_id
-        self.dictionary = dictionary
+        self._objects = dictionary
         self.outbox: list[CanFrame] = []
-        self.state = NetworkState.BOOTING
+        self.network_state = NetworkState.BOOTING
         self._boot_time = boot_time
-        self._on_power_up = on_power_up
-        self._on_boot = on_boot
-        self._on_connection_lost = on_connection_lost
         self._boots_at = 0.0
         self._heartbeat_at = 0.0
         self._last_heartbeats: dict[int, float] = {}
-        self._errors: list[int] = []
         self._sdo = SdoServer(dictionary)
         self._add_communication_objects()
 
@@ -98,25 +86,27 @@ class CanopenDevice:
             for k, cob_id in enumerate(cob_ids(_TRANSMIT))
         ]
 
+    @abc.abstractmethod
+    def on_boot(self) -> None:
+        """Handle the boot-up message."""
+
+    @abc.abstractmethod
+    def on_connection_lost(self) -> None:
+        """Handle the loss of a monitored heartbeat, or a stop by NMT."""
+
     def power_up(self, now: float) -> None:
         """Power up: all written values return to their defaults."""
-        self.dictionary.power_up()
-        self.state = NetworkState.BOOTING
+        self._objects.power_up()
+        self.network_state = NetworkState.BOOTING
         self._boots_at = now + self._boot_time
         self._last_heartbeats.clear()
-        self._errors.clear()
         self._reset_pdos()
-        self._on_power_up()
 
-    def is_read_request(self, frame: CanFrame) -> bool:
-        """Return whether a frame requests the value of an object of this device."""
-        return frame.identifier == SDO_REQUEST + self.node_id
-
-    def receive(self, frame: CanFrame, now: float) -> bool:
-        """Handle a frame other than SYNC; return whether it was for this device."""
+    def receive(self, frame: CanFrame, now: float) -> None:
+        """Handle a frame other than SYNC."""
         # Remote frames are not supported, like by many drives.
-        if self.state is NetworkState.BOOTING or frame.remote:
-            return False
+        if self.network_state is NetworkState.BOOTING or frame.remote:
+            return
         identifier = frame.identifier
         if identifier == NMT:
             self._handle_nmt(frame.data, now)
@@ -125,14 +115,14 @@ class CanopenDevice:
         elif identifier > HEARTBEAT and identifier & 0x7F != self.node_id:
             if identifier & ~0x7F == HEARTBEAT:
                 self._last_heartbeats[identifier & 0x7F] = now
-            return False
-        else:
-            return self.state is NetworkState.OPERATIONAL and self._handle_pdo(frame)
-        return True
+        elif self.network_state is NetworkState.OPERATIONAL:
+            for pdo in self._receive:
+                if pdo.cob_id == identifier:
+                    pdo.receive(frame.data)
 
     def sync(self) -> None:
         """Handle a SYNC: send the synchronous PDOs, then apply the received ones."""
-        if self.state is not NetworkState.OPERATIONAL:
+        if self.network_state is not NetworkState.OPERATIONAL:
             return
         for transmit in self._transmit:
             self._send_pdo(transmit, transmit.sync())
@@ -141,42 +131,35 @@ class CanopenDevice:
 
     def tick(self, now: float) -> None:
         """Handle timers: booting, heartbeats, watchdogs, event timers."""
-        if self.state is NetworkState.BOOTING:
+        if self.network_state is NetworkState.BOOTING:
             if now >= self._boots_at:
-                self.state = NetworkState.PRE_OPERATIONAL
+                self.network_state = NetworkState.PRE_OPERATIONAL
                 self._send(HEARTBEAT, bytes([NetworkState.BOOTING]))
                 self._heartbeat_at = now
-                self._on_boot()
+                self.on_boot()
             return
-        period = self.dictionary.value(0x1017) * 1e-3
+        period = self._objects.value(0x1017) * 1e-3
         if period > 0.0 and now - self._heartbeat_at >= period:
             # If the process was suspended, missed heartbeats are not sent later.
             self._heartbeat_at = max(self._heartbeat_at + period, now - period)
-            self._send(HEARTBEAT, bytes([self.state]))
+            self._send(HEARTBEAT, bytes([self.network_state]))
         self._check_heartbeats(now)
-        if self.state is NetworkState.OPERATIONAL:
+        if self.network_state is NetworkState.OPERATIONAL:
             for pdo in self._transmit:
-                self._send_pdo(pdo, pdo.event(now))
+                self._send_pdo(pdo, pdo.event())
 
     def emergency(self, code: int, register: int = 0) -> None:
         """Send an emergency; code 0 means that no error is left."""
         if code:
-            self._errors = [code, *self._errors][:_ERRORS_KEPT]
             register |= _GENERIC_ERROR
-        self.dictionary.set(0x1001, 0, register)
-        self.dictionary.set(0x1003, 0, len(self._errors))
-        for k, error in enumerate(self._errors):
-            self.dictionary.set(0x1003, k + 1, error)
-        if self.state is not NetworkState.BOOTING:
+        self._objects.set(0x1001, 0, register)
+        if self.network_state is not NetworkState.BOOTING:
             self._send(EMERGENCY, code.to_bytes(2, "little") + bytes([register]) + bytes(5))
 
     def _add_communication_objects(self) -> None:
-        add = self.dictionary.add
+        add = self._objects.add
         writable = partial(add, writable=True)
         add(0x1001, 0, Kind.U8, mappable=True)
-        writable(0x1003, 0, Kind.U8)
-        for k in range(1, _ERRORS_KEPT + 1):
-            add(0x1003, k, Kind.U32)
         writable(0x1005, 0, Kind.U32, SYNC)
         writable(0x1006, 0, Kind.U32, 0)
         add(0x1014, 0, Kind.U32, EMERGENCY + self.node_id)
@@ -184,17 +167,11 @@ class CanopenDevice:
         for k in range(1, _HEARTBEAT_CONSUMERS + 1):
             writable(0x1016, k, Kind.U32, 0)
             # Monitoring starts with the first heartbeat after the configuration.
-            self.dictionary.on_write(0x1016, k, then=self._restart_monitoring)
+            self._objects.on_write(0x1016, k, then=self._restart_monitoring)
         writable(0x1017, 0, Kind.U16, 0)
         add(0x1029, 0, Kind.U8, 1)
-        writable(0x1029, 1, Kind.U8, 0)
-        self.dictionary.on_write(0x1003, 0, then=lambda _: self._errors.clear())
-
-    def _handle_pdo(self, frame: CanFrame) -> bool:
-        matching = [pdo for pdo in self._receive if pdo.cob_id == frame.identifier]
-        for pdo in matching:
-            pdo.receive(frame.data)
-        return bool(matching)
+        writable(0x1029, 1, Kind.U8, _LEAVE_OPERATIONAL)
+        self._objects.on_write(0x1029, 1, check=one_of((_LEAVE_OPERATIONAL, _KEEP_STATE)))
 
     def _restart_monitoring(self, consumer: int) -> None:
         self._last_heartbeats.pop(consumer >> 16 & 0x7F, None)
@@ -209,15 +186,15 @@ class CanopenDevice:
             0x80: NetworkState.PRE_OPERATIONAL,
         }
         if command in states:
-            self._set_state(states[command])
+            self._set_network_state(states[command])
             if command == 0x02:
-                self._on_connection_lost()
+                self.on_connection_lost()
         elif command in (0x81, 0x82):
             self.power_up(now)
 
-    def _set_state(self, state: NetworkState) -> None:
-        if state is not self.state:
-            self.state = state
+    def _set_network_state(self, state: NetworkState) -> None:
+        if state is not self.network_state:
+            self.network_state = state
             self._reset_pdos()
 
     def _reset_pdos(self) -> None:
@@ -227,7 +204,7 @@ class CanopenDevice:
             transmit.reset()
 
     def _answer(self, frame: CanFrame) -> None:
-        if self.state is NetworkState.STOPPED:
+        if self.network_state is NetworkState.STOPPED:
             return
         answer = self._sdo.answer(frame.data)
         if answer is not None:
@@ -235,7 +212,7 @@ class CanopenDevice:
 
     def _check_heartbeats(self, now: float) -> None:
         for k in range(1, _HEARTBEAT_CONSUMERS + 1):
-            consumer = self.dictionary.value(0x1016, k)
+            consumer = self._objects.value(0x1016, k)
             if not consumer:
                 continue
             node, limit = consumer >> 16 & 0x7F, (consumer & 0xFFFF) * 1e-3
@@ -245,12 +222,10 @@ class CanopenDevice:
                 continue
             del self._last_heartbeats[node]
             self.emergency(HEARTBEAT_LOST, _COMMUNICATION_ERROR)
-            self._on_connection_lost()
-            behaviour = self.dictionary.value(0x1029, 1)
-            if behaviour == _STOP:
-                self._set_state(NetworkState.STOPPED)
-            elif behaviour != _KEEP_STATE and self.state is NetworkState.OPERATIONAL:
-                self._set_state(NetworkState.PRE_OPERATIONAL)
+            self.on_connection_lost()
+            keeps_state = self._objects.value(0x1029, 1) == _KEEP_STATE
+            if self.network_state is NetworkState.OPERATIONAL and not keeps_state:
+                self._set_network_state(NetworkState.PRE_OPERATIONAL)
 
     def _send_pdo(self, pdo: TransmitPdo, data: bytes | None) -> None:
         if data is not None and pdo.cob_id is not None:

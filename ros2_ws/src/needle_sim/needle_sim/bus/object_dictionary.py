@@ -6,8 +6,6 @@ import dataclasses
 import enum
 from collections.abc import Callable
 
-Key = tuple[int, int]
-
 
 class Abort(enum.IntEnum):
     """SDO abort codes of CiA 301."""
@@ -21,8 +19,6 @@ class Abort(enum.IntEnum):
     WRONG_LENGTH = 0x06070010
     NO_SUBINDEX = 0x06090011
     VALUE_RANGE = 0x06090030
-    VALUE_TOO_HIGH = 0x06090031
-    VALUE_TOO_LOW = 0x06090032
     DEVICE_STATE = 0x08000022
 
 
@@ -32,6 +28,16 @@ class SdoAbortError(Exception):
     def __init__(self, code: Abort) -> None:
         super().__init__(f"{code.name} (0x{code:08X})")
         self.code = code
+
+
+def one_of(values: tuple[int, ...]) -> Callable[[int], None]:
+    """Return a check that rejects all other values."""
+
+    def check(value: int) -> None:
+        if value not in values:
+            raise SdoAbortError(Abort.VALUE_RANGE)
+
+    return check
 
 
 class Kind(enum.Enum):
@@ -76,6 +82,8 @@ class StoredObject:
         Whether a PDO may contain it.
     text : bytes
         The text; empty for a number.
+    check, then : callable, optional
+        Callbacks for writing, see `ObjectDictionary.on_write`.
     default : int
         The number after power-up.
     """
@@ -85,6 +93,8 @@ class StoredObject:
     writable: bool = False
     mappable: bool = False
     text: bytes = b""
+    check: Callable[[int], None] | None = None
+    then: Callable[[int], None] | None = None
     default: int = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
@@ -96,10 +106,8 @@ class ObjectDictionary:
     """Values by index and sub-index, with access rights and callbacks for writing."""
 
     def __init__(self) -> None:
-        self._entries: dict[Key, StoredObject] = {}
+        self._entries: dict[tuple[int, int], StoredObject] = {}
         self._indices: set[int] = set()
-        self._checks: dict[Key, Callable[[int], None]] = {}
-        self._reactions: dict[Key, Callable[[int], None]] = {}
 
     def add(
         self,
@@ -135,10 +143,8 @@ class ObjectDictionary:
         then : callable, optional
             Called with the value after it is stored.
         """
-        if check is not None:
-            self._checks[index, subindex] = check
-        if then is not None:
-            self._reactions[index, subindex] = then
+        entry = self._entries[index, subindex]
+        entry.check, entry.then = check, then
 
     def entry(self, index: int, subindex: int) -> StoredObject:
         """Return an entry.
@@ -191,12 +197,11 @@ class ObjectDictionary:
         if len(data) != entry.kind.size:
             raise SdoAbortError(Abort.WRONG_LENGTH)
         value = int.from_bytes(data, "little", signed=entry.kind.signed)
-        key = (index, subindex)
-        if key in self._checks:
-            self._checks[key](value)
+        if entry.check is not None:
+            entry.check(value)
         entry.value = value
-        if key in self._reactions:
-            self._reactions[key](value)
+        if entry.then is not None:
+            entry.then(value)
 
     def power_up(self) -> None:
         """Reset all values to their defaults."""

@@ -5,17 +5,13 @@ from __future__ import annotations
 import contextlib
 from functools import partial
 
-from needle_sim.bus.object_dictionary import (
-    Abort,
-    Kind,
-    ObjectDictionary,
-    SdoAbortError,
-)
+from needle_sim.bus.object_dictionary import Abort, Kind, ObjectDictionary, SdoAbortError, one_of
 
 INVALID = 1 << 31
 _MOST_ENTRIES = 8
-_LAST_SYNCHRONOUS = 240
-_EVENT_DRIVEN = 254
+# Transmission types: with every SYNC, or at once (of the manufacturer or the device profile).
+_EVERY_SYNC = 1
+_AT_ONCE = (254, 255)
 
 
 class _Pdo:
@@ -34,10 +30,10 @@ class _Pdo:
     """
 
     # For each direction: indices of the first communication and mapping parameters, and further
-    # sub-indices of the former.
+    # sub-indices of the former, which only accept 0.
     _first_parameters: int
     _first_mapping: int
-    _more_parameters: tuple[int, ...] = ()
+    _unused_parameters: tuple[int, ...] = ()
 
     def __init__(
         self, dictionary: ObjectDictionary, number: int, cob_id: int, mapped: tuple[int, ...]
@@ -45,24 +41,23 @@ class _Pdo:
         self._dictionary = dictionary
         self._parameters = parameters = self._first_parameters + number
         self._mapping = mapping = self._first_mapping + number
-        add = dictionary.add
-        writable = partial(add, writable=True)
-        add(parameters, 0, Kind.U8, max((2, *self._more_parameters)))
+        writable = partial(dictionary.add, writable=True)
+        dictionary.add(parameters, 0, Kind.U8, max((2, *self._unused_parameters)))
         writable(parameters, 1, Kind.U32, cob_id)
-        writable(parameters, 2, Kind.U8, 255)
-        for subindex in self._more_parameters:
+        writable(parameters, 2, Kind.U8, _AT_ONCE[-1])
+        for subindex in self._unused_parameters:
             writable(parameters, subindex, Kind.U16, 0)
+            dictionary.on_write(parameters, subindex, check=one_of((0,)))
         writable(mapping, 0, Kind.U8, len(mapped))
         for entry in range(1, _MOST_ENTRIES + 1):
             value = mapped[entry - 1] if entry <= len(mapped) else 0
             writable(mapping, entry, Kind.U32, value)
             dictionary.on_write(mapping, entry, check=self._check_entry)
         dictionary.on_write(parameters, 1, check=self._check_cob_id)
+        dictionary.on_write(parameters, 2, check=one_of((_EVERY_SYNC, *_AT_ONCE)))
         dictionary.on_write(mapping, 0, check=self._check_count)
         # Cached, because they are read at every frame and every tick.
         self._mapping_entries = [dictionary.entry(mapping, k) for k in range(_MOST_ENTRIES + 1)]
-        self._mapped_by: tuple[int, list[int]] | None = None
-        self._mapped: list[tuple[int, int, int]] = []
         self._cob_id = dictionary.entry(parameters, 1)
         self._transmission_type = dictionary.entry(parameters, 2)
 
@@ -73,18 +68,15 @@ class _Pdo:
         return None if value & INVALID else value & 0x7FF
 
     @property
-    def transmission_type(self) -> int:
-        """Transmission type: 0..240 with SYNC, 254 and 255 event-driven."""
-        return self._transmission_type.value
+    def _is_synchronous(self) -> bool:
+        return self._transmission_type.value == _EVERY_SYNC
 
     @property
     def mapped(self) -> list[tuple[int, int, int]]:
         """(index, subindex, bytes) of each mapped object."""
-        count, *values = (entry.value for entry in self._mapping_entries)
-        if (count, values) != self._mapped_by:
-            self._mapped_by = count, values
-            self._mapped = [(v >> 16, v >> 8 & 0xFF, (v & 0xFF) // 8) for v in values[:count]]
-        return self._mapped
+        count, *entries = self._mapping_entries
+        values = (entry.value for entry in entries[: count.value])
+        return [(v >> 16, v >> 8 & 0xFF, (v & 0xFF) // 8) for v in values]
 
     def _check_cob_id(self, value: int) -> None:
         changed = (value ^ self._dictionary.value(self._parameters, 1)) & 0x1FFFFFFF
@@ -128,7 +120,7 @@ class ReceivePdo(_Pdo):
 
     def receive(self, data: bytes) -> None:
         """Apply the data of a frame, now or with the next SYNC."""
-        if self.transmission_type <= _LAST_SYNCHRONOUS:
+        if self._is_synchronous:
             self._waiting = data
         else:
             self._apply(data)
@@ -157,52 +149,30 @@ class ReceivePdo(_Pdo):
 
 
 class TransmitPdo(_Pdo):
-    """Sends values to the bus: with every n-th SYNC, on change or by timer.
-
-    The parameters are those of `_Pdo`.
-    """
+    """Sends values to the bus, with every SYNC or on change; the parameters are those of `_Pdo`."""
 
     _first_parameters, _first_mapping = 0x1800, 0x1A00
     # Inhibit time and event timer.
-    _more_parameters = (3, 5)
-    _syncs = 0
+    _unused_parameters = (3, 5)
     _sent: bytes | None = None
-    _sent_at = 0.0
-
-    def data(self) -> bytes:
-        """Return the present values."""
-        return b"".join(self._dictionary.read(index, sub) for index, sub, _ in self.mapped)
 
     def sync(self) -> bytes | None:
-        """Return the data to send with this SYNC, if any."""
-        kind = self.transmission_type
-        if self.cob_id is None or kind > _LAST_SYNCHRONOUS:
-            return None
-        data = self.data()
-        if kind == 0:
-            changed, self._sent = data != self._sent, data
-            return data if changed else None
-        self._syncs += 1
-        if self._syncs < kind:
-            return None
-        self._syncs = 0
-        return data
+        """Return the data to send with a SYNC, if any."""
+        return self._data() if self.cob_id is not None and self._is_synchronous else None
 
-    def event(self, now: float) -> bytes | None:
-        """Return the data to send because of a change or the event timer, if any; `now` in s."""
-        if self._transmission_type.value < _EVENT_DRIVEN or self._cob_id.value & INVALID:
+    def event(self) -> bytes | None:
+        """Return the data to send because of a change, if any."""
+        if self.cob_id is None or self._is_synchronous:
             return None
-        data = self.data()
-        age = now - self._sent_at
-        inhibit = self._dictionary.value(self._parameters, 3) * 1e-4
-        timer = self._dictionary.value(self._parameters, 5) * 1e-3
-        due = (data != self._sent and age >= inhibit) or (timer > 0.0 and age >= timer)
-        if not due:
+        data = self._data()
+        if data == self._sent:
             return None
-        self._sent, self._sent_at = data, now
+        self._sent = data
         return data
 
     def reset(self) -> None:
         """Forget the data sent last, so that the next event sends it again."""
         self._sent = None
-        self._syncs = 0
+
+    def _data(self) -> bytes:
+        return b"".join(self._dictionary.read(index, sub) for index, sub, _ in self.mapped)

@@ -23,8 +23,10 @@ _MAX_PENDING = 16384
 _WAKE_UP_PERIOD = 0.05  # [s]
 
 
-class PtyPort:
-    """Pseudo-terminal that a computer opens as the serial port of a CAN adapter.
+class PtyCan:
+    """Port of a component: a pseudo-terminal, which a computer opens as a serial CAN adapter.
+
+    `open` starts a thread that reads it; without one, call `receive`.
 
     Parameters
     ----------
@@ -40,15 +42,11 @@ class PtyPort:
     def __init__(self, link: Path | None = None) -> None:
         self._link = link
         self._master = self._slave = -1
-        self._adapter = SlcanAdapter()
-        self._pending = b""
         self._claim: Claim | None = None
-        self.plug_in()
-
-    @property
-    def filenos(self) -> list[int]:
-        """File descriptors of the input; empty while unplugged."""
-        return [self._master] if self._master >= 0 else []
+        self._lock = threading.Lock()
+        self._is_closed = False
+        self._thread: threading.Thread | None = None
+        self.plug(plugged_in=True)
 
     @property
     def path(self) -> str:
@@ -57,10 +55,67 @@ class PtyPort:
             return str(self._link)
         return os.ttyname(self._slave) if self._slave >= 0 else ""
 
-    def plug_in(self) -> None:
-        """Create the pseudo-terminal, with the channel closed."""
-        if self._master >= 0:
-            return
+    def open(self, arrive: Callable[[Any], None]) -> None:
+        """Start the reader thread."""
+        self._thread = threading.Thread(target=self.read, args=(arrive,), daemon=True)
+        self._thread.start()
+
+    def read(self, arrive: Callable[[Any], None]) -> None:
+        """Deliver frames of the computer until the port is closed."""
+        while not self._is_closed:
+            self.wait(_WAKE_UP_PERIOD)
+            if frames := self.receive():
+                arrive(frames)
+
+    def wait(self, timeout: float) -> None:
+        """Wait for input, for at most a time [s]."""
+        inputs = [self._master] if self._master >= 0 else []
+        # The adapter may be unplugged meanwhile.
+        with contextlib.suppress(OSError):
+            select.select(inputs, [], [], timeout)
+
+    def receive(self) -> tuple[CanFrame, ...]:
+        """Return the frames that the computer has sent; never block."""
+        with self._lock:
+            try:
+                data = os.read(self._master, _READ_SIZE)
+            except OSError:
+                return ()
+            result = self._adapter.feed(data)
+            if result.closed:
+                # The next program closes the channel before it opens it, and must not read output
+                # for the previous one. At opening it would be too late.
+                self._pending = b""
+                termios.tcflush(self._slave, termios.TCIFLUSH)
+            self._write(result.reply)
+            return result.frames
+
+    def send(self, batch: Sequence[CanFrame]) -> None:
+        """Send frames to the computer; they are lost if it does not read."""
+        with self._lock:
+            if self._master >= 0:
+                data = b"".join(self._adapter.encode(frame) for frame in batch)
+                self._write(data if len(self._pending) + len(data) <= _MAX_PENDING else b"")
+
+    def plug(self, *, plugged_in: bool) -> None:
+        """Plug the adapter in, with the channel closed, or unplug it.
+
+        A program that has it open gets an error then.
+        """
+        with self._lock:
+            if plugged_in and self._master < 0:
+                self._plug_in()
+            elif not plugged_in and self._master >= 0:
+                self._unplug()
+
+    def close(self) -> None:
+        """Stop the reader thread and remove the adapter."""
+        self._is_closed = True
+        if self._thread is not None:
+            self._thread.join()
+        self.plug(plugged_in=False)
+
+    def _plug_in(self) -> None:
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -71,13 +126,10 @@ class PtyPort:
                 self._make_link(self._link)
             except UserError:
                 self._link = None
-                self.unplug()
+                self._unplug()
                 raise
 
-    def unplug(self) -> None:
-        """Remove the pseudo-terminal: a program that has it open gets an error."""
-        if self._master < 0:
-            return
+    def _unplug(self) -> None:
         if self._link is not None:
             with contextlib.suppress(OSError):
                 if str(self._link.readlink()) == os.ttyname(self._slave):
@@ -87,29 +139,6 @@ class PtyPort:
         os.close(self._master)
         os.close(self._slave)
         self._master = self._slave = -1
-
-    def receive(self) -> tuple[CanFrame, ...]:
-        """Return the frames that the computer has sent; never block."""
-        if self._master < 0:
-            return ()
-        try:
-            data = os.read(self._master, _READ_SIZE)
-        except OSError:
-            return ()
-        result = self._adapter.feed(data)
-        if result.closed:
-            # The next program closes the channel before it opens it, and must not read output for
-            # the previous one. At opening it would be too late.
-            self._pending = b""
-            termios.tcflush(self._slave, termios.TCIFLUSH)
-        self._write(result.reply)
-        return result.frames
-
-    def send(self, batch: Sequence[CanFrame]) -> None:
-        """Send frames to the computer; they are lost if it does not read."""
-        if self._master >= 0:
-            data = b"".join(self._adapter.encode(frame) for frame in batch)
-            self._write(data if len(self._pending) + len(data) <= _MAX_PENDING else b"")
 
     def _make_link(self, link: Path) -> None:
         """Link to the pseudo-terminal; replace the link of a killed emulator."""
@@ -132,53 +161,3 @@ class PtyPort:
             except OSError:
                 return
             self._pending = self._pending[written:]
-
-
-class PtyCan(PtyPort):
-    """Port of a component with a reader thread; the parameter is that of `PtyPort`."""
-
-    def __init__(self, link: Path | None) -> None:
-        super().__init__(link)
-        self._lock = threading.Lock()
-        self._is_closed = False
-        self._thread: threading.Thread | None = None
-
-    def open(self, arrive: Callable[[Any], None]) -> None:
-        """Start the reader thread."""
-        self._thread = threading.Thread(target=self.read, args=(arrive,), daemon=True)
-        self._thread.start()
-
-    def read(self, arrive: Callable[[Any], None]) -> None:
-        """Deliver frames of the computer until the port is closed."""
-        while not self._is_closed:
-            with self._lock:
-                inputs = self.filenos
-            try:
-                select.select(inputs, [], [], _WAKE_UP_PERIOD)
-            except OSError:
-                # The adapter was unplugged meanwhile.
-                continue
-            with self._lock:
-                frames = self.receive()
-            if frames:
-                arrive(frames)
-
-    def send(self, batch: Sequence[CanFrame]) -> None:
-        """Send frames to the computer."""
-        with self._lock:
-            super().send(batch)
-
-    def plug(self, *, plugged_in: bool) -> None:
-        """Plug the adapter in, or unplug it."""
-        with self._lock:
-            if plugged_in:
-                self.plug_in()
-            else:
-                self.unplug()
-
-    def close(self) -> None:
-        """Stop the reader thread and remove the adapter."""
-        self._is_closed = True
-        if self._thread is not None:
-            self._thread.join()
-        self.unplug()

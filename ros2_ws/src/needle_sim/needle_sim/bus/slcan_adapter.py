@@ -46,7 +46,6 @@ class SlcanAdapter:
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._open = False
-        self._listens_only = False
 
     def feed(self, data: bytes) -> SlcanInput:
         """Process bytes from the computer; incomplete commands are buffered."""
@@ -79,11 +78,10 @@ class SlcanAdapter:
             return DONE
         if kind in b"tTrR":
             return self._send(kind, rest, frames)
-        if kind in b"OL":
+        if kind == b"O":
             if self._open or rest:
                 return REFUSED
             self._open = True
-            self._listens_only = kind == b"L"
             return DONE
         if kind == b"C" and not rest:
             self._open = False
@@ -97,7 +95,7 @@ class SlcanAdapter:
         return DONE if kind in b"ZXMmQWUY" else REFUSED
 
     def _send(self, kind: bytes, rest: bytes, frames: list[CanFrame]) -> bytes:
-        if not self._open or self._listens_only:
+        if not self._open:
             return REFUSED
         extended = kind in b"TR"
         digits = 8 if extended else 3

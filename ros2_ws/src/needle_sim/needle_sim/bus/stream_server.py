@@ -11,11 +11,32 @@ from socketserver import ThreadingTCPServer
 from typing import Any
 
 from needle_core.errors import UserError
-from needle_sim.bus.client_bytes import ClientBytes
 
 _HOST = "127.0.0.1"
 _READ_SIZE = 4096
 _WAKE_UP_PERIOD = 0.05  # [s]
+
+
+class ClientBytes(bytes):
+    """Bytes from or for one client.
+
+    Plain bytes are of client 0, the only one of a connection between components.
+
+    Parameters
+    ----------
+    data : bytes
+        The bytes.
+    client : int
+        Number of the client.
+    """
+
+    client: int
+
+    def __new__(cls, data: bytes, client: int) -> ClientBytes:
+        """Return the bytes, marked with their client."""
+        made = super().__new__(cls, data)
+        made.client = client
+        return made
 
 
 class _Server(ThreadingTCPServer):

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import erf
 
 from needle_sim.camera.optics import FloatImage, Optics
-from needle_sim.camera.scenarios import Bubbles, Cable, FloorShadow, GraphPaper, Occlusion
+from needle_sim.camera.scenarios import Bubbles, FloorShadow
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_sim.needle.se3 import FloatArray
 
@@ -122,6 +122,10 @@ def _one_bubble(
     return gain, 3.0 * share * _SPOT * np.exp(-0.5 * (from_spot / spread) ** 2)
 
 
+CABLE_DIAMETER = 0.0007
+"""Diameter of the cable, similar to the needle's [m]."""
+# Height above the surface, amplitude across the needle [m], period [exposures].
+_CABLE_HEIGHT, _CABLE_SWAY, _CABLE_PERIOD = 0.003, 0.022, 70.0
 _CABLE_POINTS = 120
 _CABLE_HALF_LENGTH = 0.075
 _CABLE_MIDDLE = 0.07
@@ -141,15 +145,11 @@ _HIGH = 0.18
 _LOW = 0.03
 
 
-def cable_line(
-    cable: Cable, surface_height: float, exposure_number: int, rng: np.random.Generator
-) -> FloatArray:
+def cable_line(surface_height: float, exposure_number: int, rng: np.random.Generator) -> FloatArray:
     """Return the line of the cable at an exposure.
 
     Parameters
     ----------
-    cable : Cable
-        Properties of the cable.
     surface_height : float
         x of the phantom's surface in `rig` [m].
     exposure_number : int
@@ -166,14 +166,14 @@ def cable_line(
     paces = rng.uniform(0.8, 1.25, 4)
     half_length = _CABLE_HALF_LENGTH * rng.uniform(0.4, 1.0)
     sway, turn, slide, bow = np.sin(
-        2.0 * np.pi * exposure_number / cable.period * paces + phases
+        2.0 * np.pi * exposure_number / _CABLE_PERIOD * paces + phases
     ).tolist()
     angle = 0.5 * turn
     along = np.linspace(-half_length, half_length, _CABLE_POINTS)
     across = 0.006 * bow * (1.0 - (along / half_length) ** 2)
     line = np.empty((_CABLE_POINTS, 3))
-    line[:, 0] = surface_height + cable.height
-    line[:, 1] = cable.sway * sway + np.sin(angle) * along + np.cos(angle) * across
+    line[:, 0] = surface_height + _CABLE_HEIGHT
+    line[:, 1] = _CABLE_SWAY * sway + np.sin(angle) * along + np.cos(angle) * across
     line[:, 2] = _CABLE_MIDDLE + 0.03 * slide + np.cos(angle) * along - np.sin(angle) * across
     return line
 
@@ -229,18 +229,22 @@ class OcclusionEvent:
     progress: float
 
 
-def occlusion_at(occlusion: Occlusion, seed: int, exposure_number: int) -> OcclusionEvent | None:
+# First exposure that may be affected, period, duration for one and for both cameras [exposures].
+_FIRST_EVENT, _EVENT_PERIOD, _EVENT_LENGTH, _EVENT_LENGTH_BOTH = 20, 40, 14, 6
+
+
+def occlusion_at(seed: int, exposure_number: int) -> OcclusionEvent | None:
     """Return the obstruction at an exposure; None without one."""
-    if exposure_number < occlusion.first:
+    if exposure_number < _FIRST_EVENT:
         return None
-    period, within = divmod(exposure_number - occlusion.first, occlusion.every)
+    period, within = divmod(exposure_number - _FIRST_EVENT, _EVENT_PERIOD)
     # Each group of three periods has left, right and both in random order, by hand or cover.
     round_, place = divmod(period, 3)
     order = np.random.default_rng([seed, round_, 8]).permutation(3)
     rng = np.random.default_rng([seed, period, 9])
     blocks = ((True, False), (False, True), (True, True))[int(order[place])]
-    length = occlusion.length_both if all(blocks) else occlusion.length
-    begin = int(rng.integers(0, max(occlusion.every - length, 0) + 1))
+    length = _EVENT_LENGTH_BOTH if all(blocks) else _EVENT_LENGTH
+    begin = int(rng.integers(0, _EVENT_PERIOD - length + 1))
     covered = bool(rng.random() < 0.4)
     if not begin <= within < begin + length:
         return None
@@ -296,20 +300,20 @@ def hand_capsules(
     ]
 
 
+PAPER_LINE_WIDTH, PAPER_GREY = 0.0004, 95.0
+"""Width [m] and brightness [grey levels] of the paper's lines."""
+# Depth of the paper under the surface, and distance of its lines [m].
+_PAPER_DEPTH, _PAPER_PITCH = 0.035, 0.005
 _PAPER_LENGTHS, _PAPER_SIDES = (-0.02, 0.16), (-0.07, 0.07)
 _POINTS = 60
 _LARGEST_TURN = 0.35
 
 
-def paper_lines(
-    paper: GraphPaper, half_height: float, rng: np.random.Generator
-) -> list[FloatArray]:
+def paper_lines(half_height: float, rng: np.random.Generator) -> list[FloatArray]:
     """Return the lines of graph paper under the phantom, each (M, 3) in `rig` [m].
 
     Parameters
     ----------
-    paper : GraphPaper
-        Properties of the paper.
     half_height : float
         Distance from the needle's entry to the phantom's surface [m].
     rng : numpy.random.Generator
@@ -318,14 +322,14 @@ def paper_lines(
     turn, aside, ahead = rng.uniform(-_LARGEST_TURN, _LARGEST_TURN), *rng.uniform(0.0, 1.0, 2)
     along = np.array([0.0, np.sin(turn), np.cos(turn)])
     across = np.array([0.0, np.cos(turn), -np.sin(turn)])
-    middle = np.array([half_height - paper.floor_depth, 0.0, float(np.mean(_PAPER_LENGTHS))])
+    middle = np.array([half_height - _PAPER_DEPTH, 0.0, float(np.mean(_PAPER_LENGTHS))])
     reach = float(np.hypot(np.ptp(_PAPER_LENGTHS), np.ptp(_PAPER_SIDES))) / 2.0
-    count = int(reach / paper.pitch)
+    count = int(reach / _PAPER_PITCH)
     places = np.linspace(-reach, reach, _POINTS)[:, np.newaxis]
     lines = []
     for k in range(-count, count + 1):
         for direction, beside, offset in ((along, across, aside), (across, along, ahead)):
-            line = middle + (k + offset) * paper.pitch * beside + places * direction
+            line = middle + (k + offset) * _PAPER_PITCH * beside + places * direction
             inside = (line[:, 2] > _PAPER_LENGTHS[0]) & (line[:, 2] < _PAPER_LENGTHS[1])
             inside &= (line[:, 1] > _PAPER_SIDES[0]) & (line[:, 1] < _PAPER_SIDES[1])
             if inside.sum() > 1:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -16,9 +17,6 @@ from needle_sim.camera.view import GreyImage
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.se3 import FloatArray
 
-CALIBRATION = "calibration.yaml"
-INSERTION = "insertion.csv"
-TRUTH = "truth.csv"
 _INSERTION_COLUMNS = ("name", "insertion_m")
 _TRUTH_COLUMNS = (
     *("name", "x_m", "y_m", "z_m", "pitch_rad", "yaw_rad", "shaft_pitch_rad", "shaft_yaw_rad"),
@@ -87,18 +85,16 @@ class ImageFolder:
         self, folder: Path, calibration_file: Path, more_columns: tuple[str, ...] = ()
     ) -> None:
         self._folder = folder
-        try:
+        with self._reported_errors():
             folder.mkdir(parents=True, exist_ok=True)
             if any(folder.iterdir()):
                 raise UserError(f"{folder} is not empty")
             calibration = calibration_file.read_bytes()
-            (folder / CALIBRATION).write_bytes(calibration)
+            (folder / "calibration.yaml").write_bytes(calibration)
             for side in ("left", "right"):
                 (folder / side).mkdir()
-            self._insertions = self._table(INSERTION, _INSERTION_COLUMNS)
-            self._truths = self._table(TRUTH, _TRUTH_COLUMNS + more_columns)
-        except OSError as error:
-            raise UserError(f"cannot write {folder}: {error.strerror}") from error
+            self._insertions = self._table("insertion.csv", _INSERTION_COLUMNS)
+            self._truths = self._table("truth.csv", _TRUTH_COLUMNS + more_columns)
 
     def write(
         self,
@@ -109,8 +105,8 @@ class ImageFolder:
         visible_share: tuple[float, float],
         *,
         more: Sequence[float | str] = (),
-    ) -> str:
-        """Add an exposure; return its name.
+    ) -> None:
+        """Add an exposure.
 
         Parameters
         ----------
@@ -133,23 +129,19 @@ class ImageFolder:
             If a file cannot be written.
         """
         name = f"{number:06d}.png"
-        for side, image in zip(("left", "right"), images, strict=True):
-            path = self._folder / side / name
-            written, data = cv2.imencode(".png", image, _PNG_OPTIONS)
-            if not written:
-                raise UserError(f"cannot encode {path}")
-            try:
-                path.write_bytes(data.tobytes())
-            except OSError as error:
-                raise UserError(f"cannot write {path}: {error.strerror}") from error
         values: list[float | str] = [""] * 7
         if truth is not None:
             angles = (truth.pitch, truth.yaw, truth.shaft_pitch, truth.shaft_yaw)
             values = [*truth.tip.tolist(), *angles]
-        self._add(self._insertions, name, [float(insertion)])
         visible = [round(share, 3) for share in visible_share]
-        self._add(self._truths, name, [*values, *visible, *more])
-        return name
+        with self._reported_errors():
+            for side, image in zip(("left", "right"), images, strict=True):
+                data = cv2.imencode(".png", image, _PNG_OPTIONS)[1]
+                (self._folder / side / name).write_bytes(data.tobytes())
+            _add(self._insertions, [name, repr(float(insertion))])
+            # repr() keeps all digits.
+            row = (v if isinstance(v, str) else repr(v) for v in (*values, *visible, *more))
+            _add(self._truths, [name, *row])
 
     def close(self) -> None:
         """Close the tables, which are complete up to the last exposure at any time."""
@@ -158,16 +150,17 @@ class ImageFolder:
 
     def _table(self, name: str, columns: tuple[str, ...]) -> TextIO:
         stream = (self._folder / name).open("w", encoding="utf-8", newline="")
-        csv.writer(stream, lineterminator="\n").writerow(columns)
-        stream.flush()
+        _add(stream, columns)
         return stream
 
-    def _add(self, stream: TextIO, name: str, values: Sequence[float | str]) -> None:
+    @contextlib.contextmanager
+    def _reported_errors(self) -> Iterator[None]:
         try:
-            # repr() keeps all digits.
-            csv.writer(stream, lineterminator="\n").writerow(
-                [name, *(value if isinstance(value, str) else repr(value) for value in values)]
-            )
-            stream.flush()
+            yield
         except OSError as error:
             raise UserError(f"cannot write {self._folder}: {error.strerror}") from error
+
+
+def _add(stream: TextIO, row: Sequence[str]) -> None:
+    csv.writer(stream, lineterminator="\n").writerow(row)
+    stream.flush()

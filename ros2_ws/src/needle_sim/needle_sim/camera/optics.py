@@ -129,6 +129,11 @@ class Optics:
         """Return the pixels (..., 2) of points (..., 3) in `rig` [m]."""
         return project(points, self.camera)
 
+    def in_image(self, pixels: FloatArray) -> NDArray[np.bool_]:
+        """Return whether pixels, (N, 2), are inside the image."""
+        inside = (pixels >= 0.0) & (pixels <= np.subtract(self.image_size, 1.0))
+        return np.asarray(inside.all(axis=1))
+
     def points_on_face(self, aside: FloatArray, along: FloatArray) -> FloatArray:
         """Return points (N, 3) of the window's outer face in `rig` [m].
 

@@ -80,13 +80,10 @@ class StereoRenderer:
         self.bubbles: BubbleCloud | None = None
         if scenario.bubbles is not None:
             self.bubbles = place_bubbles(scenario.bubbles, rig, rng)
-        paper = scenario.paper
         still = StaticScene(
             bubbles=self.bubbles,
             lamp=place_lamp(self._rng(_LAMP_KEY)),
-            lines=[]
-            if paper is None
-            else paper_lines(paper, rig.half_height, self._rng(_PAPER_KEY)),
+            lines=paper_lines(rig.half_height, self._rng(_PAPER_KEY)) if scenario.paper else [],
         )
         self._views = tuple(
             View(
@@ -158,9 +155,7 @@ class StereoRenderer:
         return left, right
 
     def _event(self, exposure_number: int) -> OcclusionEvent | None:
-        if self._scenario.occlusion is None:
-            return None
-        return occlusion_at(self._scenario.occlusion, self._seed, exposure_number)
+        return occlusion_at(self._seed, exposure_number) if self._scenario.occlusion else None
 
     def _moment(
         self,
@@ -179,8 +174,8 @@ class StereoRenderer:
         if scenario.shadow is not None and len(needle):
             part = needle[_SHADOW_PART]
             shadow, fall = shadow_line(scenario.shadow, height, part, self._rng(_SHADOW_KEY))
-        if scenario.cable is not None:
-            cable = cable_line(scenario.cable, height, exposure_number, self._rng(_CABLE_KEY))
+        if scenario.cable:
+            cable = cable_line(height, exposure_number, self._rng(_CABLE_KEY))
         return SceneState(
             number=exposure_number,
             needle=needle,
@@ -188,7 +183,6 @@ class StereoRenderer:
             shadow=shadow,
             shadow_fall=fall,
             cable=cable,
-            cable_diameter=0.0 if scenario.cable is None else scenario.cable.diameter,
             hand=[]
             if event is None or event.covered
             else hand_capsules(event, pose[:3, 3], self._rig),

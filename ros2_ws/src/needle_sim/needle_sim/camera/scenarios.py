@@ -79,28 +79,6 @@ class Lighting:
 
 
 @dataclasses.dataclass(frozen=True)
-class Cable:
-    """Thin dark cable that moves over the phantom.
-
-    Attributes
-    ----------
-    diameter : float
-        Diameter, similar to the needle's [m].
-    height : float
-        Height above the phantom's surface [m].
-    sway : float
-        Amplitude of the motion across the needle [m].
-    period : float
-        Period of the motion [exposures].
-    """
-
-    diameter: float = 0.0007
-    height: float = 0.003
-    sway: float = 0.022
-    period: float = 70.0
-
-
-@dataclasses.dataclass(frozen=True)
 class FloorShadow:
     """Shadow of the needle on the phantom's floor.
 
@@ -145,50 +123,6 @@ class MetalShaft:
 
 
 @dataclasses.dataclass(frozen=True)
-class GraphPaper:
-    """Ruled paper on the phantom's floor.
-
-    Attributes
-    ----------
-    floor_depth : float
-        Depth of the floor under the surface [m].
-    pitch : float
-        Distance of the lines [m].
-    line_width : float
-        Width of the lines [m].
-    grey : float
-        Brightness of the lines [grey levels].
-    """
-
-    floor_depth: float = 0.035
-    pitch: float = 0.005
-    line_width: float = 0.0004
-    grey: float = 95.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Occlusion:
-    """Hands over the phantom and covered cameras, as periodic events.
-
-    Attributes
-    ----------
-    first : int
-        Number of exposures before the first event.
-    every : int
-        Period of the events [exposures].
-    length : int
-        Duration of an event that affects one camera [exposures].
-    length_both : int
-        Duration of an event that affects both cameras [exposures].
-    """
-
-    first: int = 20
-    every: int = 40
-    length: int = 14
-    length_both: int = 6
-
-
-@dataclasses.dataclass(frozen=True)
 class Lens:
     """Defocused thin lens, with its circle of confusion.
 
@@ -219,8 +153,11 @@ class Scenario:
         Standard deviation of the sensor noise [grey levels].
     needle : bool
         Whether the images show a needle.
-    bubbles, glints, lighting, cable, shadow, occlusion, lens, metal, paper
-        The disturbances; None if absent.
+    bubbles, glints, lighting, shadow, lens, metal
+        Disturbances; None if absent.
+    cable, occlusion, paper : bool
+        Whether a thin dark cable moves over the phantom, hands pass and cameras are covered, ruled
+        paper lies on the phantom's floor; see `clutter`.
 
     Raises
     ------
@@ -235,12 +172,12 @@ class Scenario:
     bubbles: Bubbles | None = None
     glints: Glints | None = None
     lighting: Lighting | None = None
-    cable: Cable | None = None
     shadow: FloorShadow | None = None
-    occlusion: Occlusion | None = None
     lens: Lens | None = None
     metal: MetalShaft | None = None
-    paper: GraphPaper | None = None
+    cable: bool = False
+    occlusion: bool = False
+    paper: bool = False
 
     def __post_init__(self) -> None:
         check_bounds("noise", self.noise, 0.0, 50.0, "grey levels")
@@ -262,8 +199,8 @@ _HEAVY_CLUTTER = Scenario(
     bubbles=Bubbles(170, 0.00015, 0.0022),
     glints=Glints(40, 5, 7, 0.007, 240.0, flicker=0.4),
     lighting=Lighting(0.09, 0.3, 0.1),
-    cable=Cable(),
     shadow=FloorShadow(),
+    cable=True,
 )
 _ALL = (
     CLEAN,
@@ -273,7 +210,7 @@ _ALL = (
         _HEAVY_CLUTTER,
         name="occlusion",
         summary="heavy clutter; hands pass, one or both cameras are blocked for a while",
-        occlusion=Occlusion(),
+        occlusion=True,
     ),
     dataclasses.replace(
         _HEAVY_CLUTTER,
@@ -300,7 +237,7 @@ _ALL = (
         "bare needle over ruled paper at an angle",
         metal=MetalShaft(),
         lighting=Lighting(0.04, 0.1, 0.03),
-        paper=GraphPaper(),
+        paper=True,
     ),
     Scenario(
         "hard_shadow",

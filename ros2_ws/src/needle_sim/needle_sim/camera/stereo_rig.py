@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from needle_core.errors import UserError
 from needle_core.files.yaml_files import load_yaml, read_calibration
-from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_sim.needle.se3 import FloatArray
 
 
@@ -62,11 +61,10 @@ class SimulatedWindow:
         return np.asarray(across / np.linalg.norm(across))
 
 
-_MAX_SIDE_PX = 20_000
-_INDICES = (1.0, 3.0)  # refractive
+_SIZE = ("width", "height")
+_LENGTH_TOLERANCE = 0.01  # of unit vectors
 _HALF_HEIGHT = 0.0175  # of a phantom without a window above [m]
 _FACING = 0.75  # minimum component of a window's normal along the axis that it faces
-_MIN_ACROSS = 0.3  # minimum component of a window's normal across the needle
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,149 +145,98 @@ def load_stereo_rig(path: Path | str) -> StereoRig:
     Raises
     ------
     UserError
-        If it cannot be read or a value is invalid; the message has file, key and value.
+        If it cannot be read or a value is invalid; the message has file and key.
     """
     path = Path(path)
     text = read_calibration(path)
     try:
         document = load_yaml(text)
+        return StereoRig(*(_camera(document, side) for side in ("left", "right")))
     except ValueError as error:
         raise UserError(f"calibration {path}: {error}") from error
+
+
+def _entry(document: Any, key: str) -> Any:
+    """Return an entry by its key, such as `left.window.layers.0.thickness`.
+
+    Raises
+    ------
+    ValueError
+        If it is missing.
+    """
+    value = document
+    for part in key.split("."):
+        try:
+            value = value[int(part) if part.isdigit() else part]
+        except (KeyError, IndexError, TypeError):
+            raise ValueError(f"{key} is missing") from None
+    return value
+
+
+def _numbers(document: Any, key: str, *shape: int) -> FloatArray:
+    """Return the finite numbers of an entry; raise a ValueError if it does not have that shape."""
+    value = _entry(document, key)
     try:
-        return _stereo_rig(_Entries(document))
-    except UserError as error:
-        raise UserError(f"calibration {path}: {error}") from error
+        numbers = np.array(value, dtype=np.float64).reshape(shape)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if not np.all(np.isfinite(numbers)):
+        raise ValueError(f"{key} = {value!r} is not {math.prod(shape)} finite numbers")
+    return numbers
 
 
-class _Entries:
-    """Entries of the file or of a part of it, whose errors contain the full key."""
-
-    def __init__(self, value: object, name: str = "") -> None:
-        if not isinstance(value, Mapping):
-            raise UserError(f"{name or 'the file'} has no keys")
-        self._values = value
-        self._prefix = f"{name}." if name else ""
-
-    def __contains__(self, key: str) -> bool:
-        return key in self._values
-
-    def name(self, key: str) -> str:
-        return self._prefix + key
-
-    def get(self, key: str) -> object:
-        if key not in self._values:
-            raise UserError(f"{self.name(key)} is missing")
-        return self._values[key]
-
-    def part(self, key: str) -> _Entries:
-        return _Entries(self.get(key), self.name(key))
-
-    def parts(self, key: str) -> list[_Entries]:
-        values, name = self.get(key), self.name(key)
-        if not isinstance(values, list):
-            raise UserError(f"{name} = {values!r} is not a list")
-        return [_Entries(value, f"{name}[{number}]") for number, value in enumerate(values)]
-
-    def number(
-        self, key: str, lower: float = -math.inf, upper: float = math.inf, unit: str = "-"
-    ) -> float:
-        value = _number(self.get(key), self.name(key))
-        check_bounds(self.name(key), value, lower, upper, unit)
-        return value
-
-    def pixels(self, key: str) -> int:
-        value = self.number(key, 1, _MAX_SIDE_PX, "px")
-        if not value.is_integer():
-            raise UserError(f"{self.name(key)} = {value:g} px is not a whole number")
-        return int(value)
-
-    def numbers(self, key: str, count: int) -> FloatArray:
-        values, name = self.get(key), self.name(key)
-        if not isinstance(values, list) or len(values) != count:
-            raise UserError(f"{name} = {values!r} is not a list of {count} numbers")
-        return np.array([_number(value, name) for value in values])
-
-    def matrix(self, key: str, rows: int, columns: int) -> FloatArray:
-        own, name = self.part(key), self.name(key)
-        shape = own.get("rows"), own.get("cols")
-        if shape != (rows, columns):
-            raise UserError(f"{name} is {shape[0]!r} x {shape[1]!r}, not {rows} x {columns}")
-        return own.numbers("data", rows * columns).reshape(rows, columns)
+def _number(document: Any, key: str, lower: float = -math.inf) -> float:
+    """Return a number; raise a ValueError if it is below a bound."""
+    value = float(_numbers(document, key))
+    if value < lower:
+        raise ValueError(f"{key} = {value:g} is below {lower:g}")
+    return value
 
 
-def _number(value: object, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise UserError(f"{name} = {value!r} is not a finite number")
-    return float(value)
+def _unit_vector(document: Any, key: str, size: int) -> FloatArray:
+    """Return a vector of length 1, without its rounding error."""
+    vector = _numbers(document, key, size)
+    length = float(np.linalg.norm(vector))
+    if abs(length - 1.0) > _LENGTH_TOLERANCE:
+        raise ValueError(f"{key} has length {length:g}, not 1")
+    return np.asarray(vector / length)
 
 
-def _stereo_rig(top: _Entries) -> StereoRig:
-    cameras = []
-    for side in ("left", "right"):
-        own = top.part(side)
-        camera = _camera(own, _window_of(top, own))
-        before = float(camera.window.height(camera.centre)) - camera.window.outer
-        if before <= 0.0:
-            raise UserError(
-                f"{side}.T_optical_rig puts the camera {-before:g} m behind the window's outer "
-                "face, not above the surface"
-            )
-        cameras.append(camera)
-    return StereoRig(*cameras)
-
-
-def _window_of(top: _Entries, own: _Entries) -> SimulatedWindow:
+def _window(document: Any, side: str) -> SimulatedWindow:
     """Return the window of a camera: its own one, or the phantom's surface."""
-    if ("phantom" in top) == ("window" in own):
-        what = "beside phantom" if "phantom" in top else "is missing, and so phantom is missing"
-        raise UserError(
-            f"{own.name('window')} {what}: give either phantom, the surface of both, or a window "
-            "for each"
-        )
-    if "phantom" in top:
-        phantom = top.part("phantom")
-        height = phantom.number("surface_height")
-        index = phantom.number("refractive_index", *_INDICES)
+    if "window" not in _entry(document, side):
+        height = _number(document, "phantom.surface_height")
+        index = _number(document, "phantom.refractive_index", 1.0)
         return SimulatedWindow(np.array([1.0, 0.0, 0.0]), height, (), (index,))
-    window = own.part("window")
-    point, normal = window.numbers("point", 3), window.numbers("normal", 3)
-    length = float(np.linalg.norm(normal))
-    if abs(length - 1.0) > 0.01:
-        raise UserError(f"{window.name('normal')} has length {length:g}, not 1")
-    normal = normal / length
-    if np.linalg.norm(normal[:2]) < _MIN_ACROSS:
-        raise UserError(f"{window.name('normal')} = {normal.tolist()} is parallel to the needle")
-    layers = window.parts("layers")
-    thicknesses = tuple(layer.number("thickness", ABOVE_0, unit="m") for layer in layers)
-    indices = [layer.number("refractive_index", *_INDICES) for layer in layers]
-    inside = window.number("inside", *_INDICES)
-    return SimulatedWindow(normal, float(normal @ point), thicknesses, (*indices, inside))
+    window = f"{side}.window"
+    layers = [f"{window}.layers.{k}" for k in range(len(_entry(document, f"{window}.layers")))]
+    normal = _unit_vector(document, f"{window}.normal", 3)
+    thicknesses = tuple(_number(document, f"{layer}.thickness", 0.0) for layer in layers)
+    indices = [_number(document, f"{layer}.refractive_index", 1.0) for layer in layers]
+    inside = _number(document, f"{window}.inside", 1.0)
+    outer = float(normal @ _numbers(document, f"{window}.point", 3))
+    return SimulatedWindow(normal, outer, thicknesses, (*indices, inside))
 
 
-def _camera(own: _Entries, window: SimulatedWindow) -> SimulatedCamera:
-    width, height = own.pixels("image_width"), own.pixels("image_height")
-    matrix = own.matrix("camera_matrix", 3, 3)
-    if not (matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0) or np.any(
-        matrix[[1, 2, 2, 2], [0, 0, 1, 2]] != (0.0, 0.0, 0.0, 1.0)
-    ):
-        name = own.name("camera_matrix")
-        raise UserError(f"{name} = {matrix.ravel().tolist()} is not a pinhole matrix")
-    model = own.get("distortion_model")
+def _camera(document: Any, side: str) -> SimulatedCamera:
+    width, height = (int(_number(document, f"{side}.image_{name}", 1)) for name in _SIZE)
+    matrix = _numbers(document, f"{side}.camera_matrix.data", 3, 3)
+    model = _entry(document, f"{side}.distortion_model")
     if model != "plumb_bob":
-        raise UserError(f"{own.name('distortion_model')} = {model!r} is not 'plumb_bob'")
-    distortion = own.matrix("distortion_coefficients", 1, 5)[0]
-    transform = own.part("T_optical_rig")
+        raise ValueError(f"{side}.distortion_model = {model!r} is not 'plumb_bob'")
+    distortion = _numbers(document, f"{side}.distortion_coefficients.data", 5)
     pose = np.eye(4)
-    pose[:3, 3] = transform.numbers("translation", 3)
-    pose[:3, :3] = _rotation_matrix(transform.numbers("rotation", 4), transform.name("rotation"))
-    return SimulatedCamera(width, height, matrix, distortion, pose, window)
+    pose[:3, 3] = _numbers(document, f"{side}.T_optical_rig.translation", 3)
+    pose[:3, :3] = _rotation_matrix(_unit_vector(document, f"{side}.T_optical_rig.rotation", 4))
+    window = _window(document, side)
+    camera = SimulatedCamera(width, height, matrix, distortion, pose, window)
+    if float(window.height(camera.centre)) <= window.outer:
+        raise ValueError(f"{side}.T_optical_rig puts the camera behind its window")
+    return camera
 
 
-def _rotation_matrix(quaternion: FloatArray, name: str) -> FloatArray:
+def _rotation_matrix(quaternion: FloatArray) -> FloatArray:
     """Return the matrix of a unit quaternion x, y, z, w."""
-    norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1.0) > 1e-3:
-        raise UserError(f"{name} has norm {norm:g}, not 1")
-    vector, scalar = quaternion[:3] / norm, quaternion[3] / norm
+    vector, scalar = quaternion[:3], quaternion[3]
     cross = np.cross(np.eye(3), vector)
     return np.asarray(np.eye(3) + 2.0 * (scalar * cross + cross @ cross))

@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from needle_sim.camera.clutter import BubbleCloud, BubbleImage, draw_bubbles
+from needle_sim.camera.clutter import (
+    CABLE_DIAMETER,
+    PAPER_GREY,
+    PAPER_LINE_WIDTH,
+    BubbleCloud,
+    BubbleImage,
+    draw_bubbles,
+)
 from needle_sim.camera.lighting import (
     drift,
     flicker,
@@ -64,8 +71,8 @@ class SceneState:
         Number of the exposure.
     needle, shadow, cable : ndarray, shape (M, 3)
         Centrelines [m]; empty if absent.
-    diameter, cable_diameter : float
-        Diameters of needle and cable [m].
+    diameter : float
+        Diameter of the needle [m].
     shadow_fall : ndarray, shape (M,)
         Height above the floor of the point that casts each shadow point [m].
     hand : list of (ndarray (3,), ndarray (3,), float)
@@ -78,7 +85,6 @@ class SceneState:
     shadow: FloatArray
     shadow_fall: FloatArray
     cable: FloatArray
-    cable_diameter: float
     hand: list[tuple[FloatArray, FloatArray, float]]
 
 
@@ -178,9 +184,8 @@ class View:
 
     def visible_share(self, points: FloatArray, moment: SceneState) -> float:
         """Return the share of points (M, 3) in `rig` that are in the image and not under a hand."""
-        width, height = self._optics.image_size
         pixels = self._optics.project(points)
-        visible = np.all((pixels >= 0.0) & (pixels <= [width - 1, height - 1]), axis=1)
+        visible = self._optics.in_image(pixels)
         if moment.hand and len(points):
             hidden = self._hand_mask(moment)
             column, row = np.rint(pixels[visible]).astype(np.intp).T
@@ -197,7 +202,7 @@ class View:
             factor = flicker(glints, moment.number, self._phase)
             cv2.scaleAdd(self._glints, factor, image, dst=image)
         if len(moment.cable):
-            self._draw_tube(image, moment.cable, moment.cable_diameter, _CABLE)
+            self._draw_tube(image, moment.cable, CABLE_DIAMETER, _CABLE)
         if moment.hand:
             mask = self._hand_mask(moment)
             inner = cv2.GaussianBlur(
@@ -223,10 +228,8 @@ class View:
         bench = cv2.fillPoly(np.zeros_like(image), [outline.astype(np.int32)], 1.0)
         softness = float(np.hypot(_BENCH_EDGE_PX, np.max(self._optics.blur_px(edge)) - SHARP_PX))
         image += (_BENCH - _PHANTOM) * cv2.GaussianBlur(bench, (0, 0), softness)
-        paper = self._scenario.paper
-        if paper is not None:
-            for line in self._scene.lines:
-                self._draw_tube(image, line, paper.line_width, paper.grey)
+        for line in self._scene.lines:
+            self._draw_tube(image, line, PAPER_LINE_WIDTH, PAPER_GREY)
         image *= self._light
         if self._bubbles is not None:
             image *= self._bubbles.gain

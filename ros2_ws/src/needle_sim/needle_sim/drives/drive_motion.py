@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import enum
-
-from needle_sim.bus.object_dictionary import Abort, ObjectDictionary, SdoAbortError
+from needle_sim.bus.object_dictionary import ObjectDictionary
 from needle_sim.drives.cia402 import (
     CYCLIC_SYNCHRONOUS_POSITION,
     HOMING,
@@ -26,18 +24,6 @@ _NEGATIVE_SWITCH, _POSITIVE_SWITCH, _HOME_SWITCH = 1, 2, 4
 _NO_WINDOW = 0xFFFFFFFF
 
 
-class LimitAction(enum.Enum):
-    """Reactions of a drive to a target beyond its software limits (0x607D)."""
-
-    CLAMP = "clamp"
-    FAULT = "fault"
-    ABORT = "abort"
-
-
-class LimitExceededError(Exception):
-    """Target beyond the software limits, for which the drive is configured to fault."""
-
-
 class DriveMotion:
     """Motion of a powered drive: modes, ramps, limits and following error.
 
@@ -49,19 +35,14 @@ class DriveMotion:
         Objects of the drive.
     motor : Motor
         Motor to move.
-    limit_action : LimitAction
-        Reaction to a target beyond the software limits, which act once the drive is homed.
     speed_unit : float
         Unit of the drive's speeds [counts/s] and ramps [counts/s^2].
     """
 
-    def __init__(
-        self, objects: ObjectDictionary, motor: Motor, limit_action: LimitAction, speed_unit: float
-    ) -> None:
+    def __init__(self, objects: ObjectDictionary, motor: Motor, speed_unit: float) -> None:
         self._speed_unit = speed_unit
         self._objects = objects
         self._motor = motor
-        self._limit_action = limit_action
         self._demand = Demand(motor.position)
         self._zero = motor.position
         self._mode = 0
@@ -73,7 +54,6 @@ class DriveMotion:
         self._next_target: float | None = None
         self._limited = False
         self._late = 0.0
-        objects.on_write(TARGET_POSITION, 0, check=self._check_target)
 
     # ---- power --------------------------------------------------------------------------------
 
@@ -105,13 +85,7 @@ class DriveMotion:
             self._objects.set(0x6061, 0, mode)
 
     def apply_controlword(self, word: int, *, enabled: bool) -> None:
-        """Apply the mode-specific bits of the controlword, if operation is enabled.
-
-        Raises
-        ------
-        LimitExceededError
-            If they start a motion to a target beyond the limits.
-        """
+        """Apply the mode-specific bits of the controlword, if operation is enabled."""
         rising = word & ~self._word
         self._word = word
         if not enabled:
@@ -124,31 +98,18 @@ class DriveMotion:
             self._homing = None
 
     def apply_set_point(self) -> None:
-        """Apply the target of cyclic synchronous position mode; the motion ends there.
-
-        Raises
-        ------
-        LimitExceededError
-            If the target is beyond the limits.
-        """
+        """Apply the target of cyclic synchronous position mode; the motion ends there."""
         if self._mode != CYCLIC_SYNCHRONOUS_POSITION or self._halted:
             return
         target = self._within_limits(self._objects.value(TARGET_POSITION))
-        if target is None:
-            return
         distance = target + self._zero - self._demand.position
-        if self._is_blocked(distance):
+        if self._motor.is_blocked(distance):
             self._limited = True
         elif distance != 0.0:
-            self._demand.begin_segment(target + self._zero, self.interpolation_period)
+            period = self._objects.value(0x60C2, 1) * 10.0 ** self._objects.value(0x60C2, 2)
+            self._demand.begin_segment(target + self._zero, float(max(period, MOTION_STEP)))
 
     # ---- time ---------------------------------------------------------------------------------
-
-    @property
-    def interpolation_period(self) -> float:
-        """Duration of the motion to a cyclic set-point, 0x60C2 [s]."""
-        period = self._objects.value(0x60C2, 1) * 10.0 ** self._objects.value(0x60C2, 2)
-        return float(max(period, MOTION_STEP))
 
     @property
     def at_rest(self) -> bool:
@@ -165,17 +126,15 @@ class DriveMotion:
             and self._target is None
         )
 
-    def rest(self) -> bool:
-        """Rest for one step; return whether the motor moved before."""
-        moved = self._motor.velocity != 0.0 or self._late != 0.0
+    def rest(self) -> None:
+        """Rest for one step."""
         self._motor.rest()
         self._late = 0.0
-        return moved
 
     def operate(self, period: float) -> None:
         """Advance the demand by `period` [s] in the present mode."""
         demand = self._demand
-        if self._homing is None and self._is_blocked(demand.velocity):
+        if self._homing is None and self._motor.is_blocked(demand.velocity):
             self.brake(0x6085, period)
             self._target = self._next_target = None
             self._limited = True
@@ -242,18 +201,10 @@ class DriveMotion:
     def _halted(self) -> bool:
         return bool(self._word & HALT)
 
-    def _is_blocked(self, direction: float) -> bool:
-        """Return whether a limit switch blocks a direction."""
-        return (direction < 0.0 and self._motor.at_negative_switch) or (
-            direction > 0.0 and self._motor.at_positive_switch
-        )
-
     def _start_profile_motion(self, word: int) -> None:
         value = self._objects.value
         start = value(POSITION) if word & _RELATIVE else 0
         target = self._within_limits(start + value(TARGET_POSITION))
-        if target is None:
-            return
         if word & _AT_ONCE or self._target is None:
             self._target, self._next_target = target + self._zero, None
         else:
@@ -280,20 +231,8 @@ class DriveMotion:
             self._homed = True
             self._homing = None
 
-    def _within_limits(self, target: int) -> int | None:
-        """Return the target after the software limits; None if it is rejected."""
+    def _within_limits(self, target: int) -> int:
+        """Return the target, clipped to the software limits of a homed drive."""
         lower, upper = self._objects.value(0x607D, 1), self._objects.value(0x607D, 2)
         self._limited = self._homed and not lower <= target <= upper
-        if not self._limited:
-            return target
-        if self._limit_action is LimitAction.CLAMP:
-            return min(max(target, lower), upper)
-        if self._limit_action is LimitAction.FAULT:
-            raise LimitExceededError
-        return None
-
-    def _check_target(self, target: int) -> None:
-        aborts = self._limit_action is LimitAction.ABORT and self._homed
-        if aborts and self._within_limits(target) is None:
-            above = target > self._objects.value(0x607D, 2)
-            raise SdoAbortError(Abort.VALUE_TOO_HIGH if above else Abort.VALUE_TOO_LOW)
+        return min(max(target, lower), upper) if self._limited else target

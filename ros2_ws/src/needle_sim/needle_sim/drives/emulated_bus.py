@@ -6,9 +6,8 @@ from collections.abc import Iterable, Sequence
 
 from needle_core.can_frame import CAN, CanFrame
 from needle_sim.bus.canopen_device import SYNC
-from needle_sim.drives.cia402 import PowerState
 from needle_sim.drives.emulated_drive import EmulatedDrive, EmulatedDriveSettings
-from needle_sim.drives.emulated_drives import FAULT, EmulatedDrives
+from needle_sim.drives.emulated_drives import EmulatedDrives
 
 
 class EmulatedBus(EmulatedDrives):
@@ -26,7 +25,7 @@ class EmulatedBus(EmulatedDrives):
 
     def __init__(self, settings: Iterable[EmulatedDriveSettings], now: float) -> None:
         self.drives = {each.name: EmulatedDrive(each) for each in settings}
-        super().__init__({name: drive.motor for name, drive in self.drives.items()}, now)
+        super().__init__(self.drives, now)
         self.syncs = 0
         for drive in self.drives.values():
             drive.power_up(now)
@@ -55,15 +54,6 @@ class EmulatedBus(EmulatedDrives):
             drive.tick(now)
         return self._drain_outboxes()
 
-    def states(self) -> dict[str, str]:
-        """Return the power state of each drive, with the error code of a fault."""
-        return {
-            name: f"{FAULT} 0x{drive.error_code:04X}"
-            if drive.state is PowerState.FAULT
-            else drive.state.name
-            for name, drive in self.drives.items()
-        }
-
     def advance(self, steps: int) -> None:
         """Advance the motion by a number of `MOTION_STEP`."""
         for drive in self.drives.values():
@@ -73,32 +63,23 @@ class EmulatedBus(EmulatedDrives):
         """Interrupt the power of a drive."""
         self.drives[axis].power_up(now)
 
-    def fail(self, axis: str, code: int) -> None:
-        """Cause a fault with this error code in a drive."""
-        self.drives[axis].fail(code)
-
-    def hang(self, axis: str) -> None:
-        """Hang the processor of a drive: it is silent, and its motor ends at the set-point."""
-        self.drives[axis].hung = True
-
     def intrude(self) -> bool:
         """Let another master send a SYNC."""
-        next(iter(self.drives.values())).device.outbox.append(CanFrame(SYNC))
+        next(iter(self.drives.values())).outbox.append(CanFrame(SYNC))
         return True
 
     def restore(self, now: float) -> None:
         """End cut bus, stalled motors and hung processors; drive faults stay until reset."""
+        hung = [drive for drive in self.drives.values() if drive.hung]
         super().restore(now)
-        for drive in self.drives.values():
-            if drive.hung:
-                drive.hung = False
-                # Its timers kept running: handle expired ones before new frames.
-                drive.tick(now)
+        for drive in hung:
+            # Its timers kept running: handle expired ones before new frames.
+            drive.tick(now)
 
     def _drain_outboxes(self) -> list[CanFrame]:
         """Return the frames that the drives sent since the last call."""
         frames: list[CanFrame] = []
         for drive in self.drives.values():
-            frames += drive.device.outbox
-            drive.device.outbox.clear()
+            frames += drive.outbox
+            drive.outbox.clear()
         return [] if self.is_cut else frames

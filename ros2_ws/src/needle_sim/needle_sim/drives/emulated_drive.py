@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 
 from needle_core.can_frame import CanFrame
-from needle_sim.bus.canopen_device import HEARTBEAT_LOST, CanopenDevice
-from needle_sim.bus.object_dictionary import Abort, SdoAbortError
+from needle_sim.bus.canopen_device import HEARTBEAT_LOST, SDO_REQUEST, CanopenDevice
+from needle_sim.bus.object_dictionary import one_of
 from needle_sim.drives.cia402 import (
     CONTROLWORD,
     ERROR_CODE,
@@ -21,23 +20,29 @@ from needle_sim.drives.cia402 import (
     drive_dictionary,
     next_state,
 )
-from needle_sim.drives.drive_motion import DriveMotion, LimitAction, LimitExceededError
-from needle_sim.drives.emulated_drives import MOTION_STEP
+from needle_sim.drives.drive_motion import DriveMotion
+from needle_sim.drives.emulated_drives import FAULT, MOTION_STEP
 from needle_sim.drives.motion_profile import METHODS
 from needle_sim.drives.motor import Motor, MotorSettings
 
 FOLLOWING_ERROR = 0x8611
-LIMIT_EXCEEDED = 0x8612
 _MOTION_ERROR = 0x20
 _ON = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION)
 _VOLTAGE, _REMOTE = 1 << 4, 1 << 9
 # Ramp objects.
 _SLOW_DOWN, _QUICK = 0x6084, 0x6085
-# Option codes (0x6007, 0x605A, 0x605B, 0x605C, 0x605E).
-_AT_ONCE = 0
-_LOST_FAULT, _LOST_DISABLE, _LOST_QUICK_STOP = 1, 2, 3
-_BY_SLOW_DOWN = (1, 5)
-_THEN_DISABLE = (1, 2)
+# Quick stop options: on its ramp, then off or hold; options for switching off: at once or a ramp.
+_THEN_OFF, _THEN_HOLD = 2, 6
+_AT_ONCE, _ON_RAMP = 0, 1
+# Supported values of modes and option codes; a lost connection is a fault, which brakes.
+_CHOICES = {
+    0x6007: (1,),
+    0x605A: (_THEN_OFF, _THEN_HOLD),
+    0x605B: (_AT_ONCE, _ON_RAMP),
+    0x605C: (_AT_ONCE, _ON_RAMP),
+    0x605E: (2,),
+    0x6098: (0, *METHODS),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,8 +59,6 @@ class EmulatedDriveSettings:
         Object 0x1000: stepper or servo.
     motor : MotorSettings
         Mechanics of the axis.
-    limit_action : LimitAction
-        Reaction to a target beyond the software limits.
     boot_time : float
         From power-up to the boot-up message [s].
     rpm : float or None
@@ -66,12 +69,11 @@ class EmulatedDriveSettings:
     node_id: int
     device_type: int
     motor: MotorSettings
-    limit_action: LimitAction
     boot_time: float
     rpm: float | None = None
 
 
-class EmulatedDrive:
+class EmulatedDrive(CanopenDevice):
     """Drive on the bus. Times are readings of one steady clock [s]; motion counts its own steps.
 
     Parameters
@@ -83,64 +85,63 @@ class EmulatedDrive:
     def __init__(self, settings: EmulatedDriveSettings) -> None:
         self.settings = settings
         self.motor = Motor(settings.motor)
-        self._objects = objects = drive_dictionary(
+        objects = drive_dictionary(
             settings.name,
             settings.device_type,
             settings.node_id,
             counts_per_unit=settings.motor.counts_per_unit,
             rpm=settings.rpm,
         )
-        speed_unit = settings.rpm or 1.0
-        self._motion = DriveMotion(objects, self.motor, settings.limit_action, speed_unit)
-        self.device = CanopenDevice(
+        super().__init__(
             settings.node_id,
             objects,
             default_receive=(CONTROLWORD << 16 | 16,),
             default_transmit=(STATUSWORD << 16 | 16,),
             boot_time=settings.boot_time,
-            on_power_up=self._on_power_up,
-            on_boot=self._on_boot,
-            on_connection_lost=self._on_connection_lost,
         )
+        self._motion = DriveMotion(objects, self.motor, settings.rpm or 1.0)
         objects.on_write(CONTROLWORD, 0, then=self._on_controlword)
-        objects.on_write(MODE, 0, check=_one_of(MODES), then=self._motion.set_mode)
-        objects.on_write(0x6098, 0, check=_one_of((0, *METHODS)))
+        objects.on_write(MODE, 0, check=one_of(MODES), then=self._motion.set_mode)
+        for index, choices in _CHOICES.items():
+            objects.on_write(index, 0, check=one_of(choices))
         self.state = PowerState.NOT_READY
         # Power state after the present ramp.
         self._pending_state: PowerState | None = None
         self._word = 0
         self.hung = False
-        # Whether the objects need an update before the master reads them.
-        self._stale = True
 
     # ---- the bus ------------------------------------------------------------------------------
 
     def power_up(self, now: float) -> None:
-        """Power up."""
-        self.device.power_up(now)
+        """Power up; an NMT reset does the same."""
+        super().power_up(now)
+        self.state = PowerState.NOT_READY
+        self._pending_state = None
+        self._word = 0
+        self._motion.power_up()
 
     def receive(self, frame: CanFrame, now: float) -> None:
         """Handle a frame other than SYNC."""
-        if not self.hung:
-            if self.device.is_read_request(frame):
-                self._update_objects()
-            self._stale |= self.device.receive(frame, now)
+        if self.hung:
+            return
+        if frame.identifier == SDO_REQUEST + self.node_id:
+            self._update_objects()
+        super().receive(frame, now)
 
     def sync(self) -> None:
         """Handle a SYNC: send the state of the motor, then apply the set-point received before."""
         if self.hung:
             return
         self._update_objects()
-        self.device.sync()
+        super().sync()
         if self.state is PowerState.OPERATION_ENABLED and self._pending_state is None:
-            self._try(self._motion.apply_set_point)
-        self._stale = True
+            self._motion.apply_set_point()
 
     def tick(self, now: float) -> None:
         """Handle timers."""
         if not self.hung:
             self._update_objects()
-            self.device.tick(now)
+            super().tick(now)
 
     def fail(self, code: int) -> None:
         """Enter a fault with this error code: brake, then FAULT."""
@@ -151,8 +152,7 @@ class EmulatedDrive:
         self.state = PowerState.FAULT_REACTION if self.state in _ON else PowerState.FAULT
         # The CANopen device reports a lost heartbeat itself.
         if code != HEARTBEAT_LOST:
-            self.device.emergency(code, _MOTION_ERROR)
-        self._stale = True
+            self.emergency(code, _MOTION_ERROR)
 
     @property
     def error_code(self) -> int:
@@ -165,31 +165,26 @@ class EmulatedDrive:
         """Advance by a number of `MOTION_STEP`."""
         for _ in range(steps):
             if self.state not in _ON or self._settled:
-                self._stale |= self._motion.rest()
+                self._motion.rest()
                 break
             self._step(MOTION_STEP)
-            self._stale = True
 
     @property
     def _settled(self) -> bool:
         """Whether the state stays constant without further commands."""
         if self._pending_state is not None or self.state is PowerState.FAULT_REACTION:
             return False
-        if self.state is PowerState.QUICK_STOP_ACTIVE and self._quick_stop_option in _THEN_DISABLE:
-            return False
-        return self._motion.settled
+        return self._motion.settled and not self._ends_quick_stop
 
     def _step(self, period: float) -> None:
         motion = self._motion
         if self.state is PowerState.QUICK_STOP_ACTIVE:
-            option = self._quick_stop_option
-            motion.brake(_SLOW_DOWN if option in _BY_SLOW_DOWN else _QUICK, period)
-            if option == _AT_ONCE or (option in _THEN_DISABLE and motion.at_rest):
+            motion.brake(_QUICK, period)
+            if self._ends_quick_stop and motion.at_rest:
                 self.state = PowerState.SWITCH_ON_DISABLED
         elif self.state is PowerState.FAULT_REACTION:
-            option = self._objects.value(0x605E)
-            motion.brake(_SLOW_DOWN if option == 1 else _QUICK, period)
-            if option == _AT_ONCE or motion.at_rest:
+            motion.brake(_QUICK, period)
+            if motion.at_rest:
                 self.state = PowerState.FAULT
         elif self._pending_state is not None:
             motion.brake(_SLOW_DOWN, period)
@@ -203,8 +198,10 @@ class EmulatedDrive:
             self.fail(FOLLOWING_ERROR)
 
     @property
-    def _quick_stop_option(self) -> int:
-        return self._objects.value(0x605A)
+    def _ends_quick_stop(self) -> bool:
+        """Whether the drive switches off after its present quick stop."""
+        is_active = self.state is PowerState.QUICK_STOP_ACTIVE
+        return is_active and self._objects.value(0x605A) == _THEN_OFF
 
     # ---- power --------------------------------------------------------------------------------
 
@@ -214,12 +211,12 @@ class EmulatedDrive:
         if self.state is PowerState.FAULT:
             if rising & FAULT_RESET:
                 self._objects.set(ERROR_CODE, 0, 0)
-                self.device.emergency(0)
+                self.emergency(0)
                 self.state = PowerState.SWITCH_ON_DISABLED
         elif self._pending_state is None:
             self._change(next_state(self.state, word))
         enabled = self.state is PowerState.OPERATION_ENABLED and self._pending_state is None
-        self._try(lambda: self._motion.apply_controlword(word, enabled=enabled))
+        self._motion.apply_controlword(word, enabled=enabled)
 
     def _change(self, state: PowerState) -> None:
         before = self.state
@@ -241,46 +238,21 @@ class EmulatedDrive:
         index = 0x605B if state is PowerState.READY_TO_SWITCH_ON else 0x605C
         return self._objects.value(index) != _AT_ONCE
 
-    def _try(self, command: Callable[[], None]) -> None:
-        try:
-            command()
-        except LimitExceededError:
-            self.fail(LIMIT_EXCEEDED)
-
-    def _on_power_up(self) -> None:
-        self.state = PowerState.NOT_READY
-        self._pending_state = None
-        self._word = 0
-        self._motion.power_up()
-        self._stale = True
-
-    def _on_boot(self) -> None:
+    def on_boot(self) -> None:
+        """Get ready to be switched on."""
         self.state = PowerState.SWITCH_ON_DISABLED
-        self._stale = True
 
-    def _on_connection_lost(self) -> None:
-        self._stale = True
-        option = self._objects.value(0x6007)
-        if option == _LOST_FAULT:
-            self.fail(HEARTBEAT_LOST)
-        elif option == _LOST_DISABLE and self.state in _ON[:2]:
-            self.state = PowerState.SWITCH_ON_DISABLED
-            self._motion.switch_off()
-        elif option == _LOST_QUICK_STOP and self.state is PowerState.OPERATION_ENABLED:
-            self._change(PowerState.QUICK_STOP_ACTIVE)
+    def on_connection_lost(self) -> None:
+        """Enter a fault."""
+        self.fail(HEARTBEAT_LOST)
+
+    @property
+    def state_text(self) -> str:
+        """Power state, with the error code of a fault."""
+        is_fault = self.state is PowerState.FAULT
+        return f"{FAULT} 0x{self.error_code:04X}" if is_fault else self.state.name
 
     def _update_objects(self) -> None:
         """Update the objects that a master can read."""
-        if not self._stale:
-            return
-        self._stale = False
         bits = self._motion.update_objects(enabled=self.state is PowerState.OPERATION_ENABLED)
         self._objects.set(STATUSWORD, 0, self.state.value | _VOLTAGE | _REMOTE | bits)
-
-
-def _one_of(values: tuple[int, ...]) -> Callable[[int], None]:
-    def check(value: int) -> None:
-        if value not in values:
-            raise SdoAbortError(Abort.VALUE_RANGE)
-
-    return check

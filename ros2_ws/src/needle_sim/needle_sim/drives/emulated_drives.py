@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 from needle_sim.drives.motor import Motor
 
@@ -31,13 +31,35 @@ class AxisState:
     velocity: float
 
 
+class AxisDrive(Protocol):
+    """Drive of one axis.
+
+    Attributes
+    ----------
+    motor : Motor
+        Its motor.
+    hung : bool
+        Whether its processor hangs.
+    """
+
+    motor: Motor
+    hung: bool
+
+    @property
+    def state_text(self) -> str:
+        """State for the diagnostics; it begins with `FAULT` for a fault."""
+
+    def fail(self, code: int) -> None:
+        """Enter a fault with this error code."""
+
+
 class EmulatedDrives(abc.ABC):
     """Drives of one or two axes behind one connection.
 
     Parameters
     ----------
-    motors : mapping of str to Motor
-        Axis (`insertion`, `rotation`) to its motor.
+    drives : mapping of str to AxisDrive
+        Axis (`insertion`, `rotation`) to its drive.
     now : float
         Steady time of power-up [s].
 
@@ -51,8 +73,9 @@ class EmulatedDrives(abc.ABC):
 
     port: str
 
-    def __init__(self, motors: Mapping[str, Motor], now: float) -> None:
-        self.motors = dict(motors)
+    def __init__(self, drives: Mapping[str, AxisDrive], now: float) -> None:
+        self._drives = drives
+        self.motors = {name: drive.motor for name, drive in drives.items()}
         self._advanced_to = now
         self.is_cut = False
 
@@ -64,9 +87,9 @@ class EmulatedDrives(abc.ABC):
     def poll(self, now: float) -> list[Any]:
         """Advance the drives to steady time `now` [s]; return what they sent."""
 
-    @abc.abstractmethod
     def states(self) -> dict[str, str]:
         """Return the state of each drive; it begins with `FAULT` for a fault."""
+        return {name: drive.state_text for name, drive in self._drives.items()}
 
     @abc.abstractmethod
     def advance(self, steps: int) -> None:
@@ -98,13 +121,13 @@ class EmulatedDrives(abc.ABC):
     def reboot(self, axis: str, now: float) -> None:
         """Interrupt the power of a drive."""
 
-    @abc.abstractmethod
     def fail(self, axis: str, code: int) -> None:
         """Cause a fault with this error code in a drive."""
+        self._drives[axis].fail(code)
 
-    @abc.abstractmethod
     def hang(self, axis: str) -> None:
         """Hang the processor of a drive: it is silent, and its motor ends at the set-point."""
+        self._drives[axis].hung = True
 
     def intrude(self) -> bool:
         """Let another computer interfere; return False if none can be connected."""
@@ -113,5 +136,5 @@ class EmulatedDrives(abc.ABC):
     def restore(self, now: float) -> None:
         """End cut connection, stalled motors and hung processors; faults stay until reset."""
         self.is_cut = False
-        for motor in self.motors.values():
-            motor.stalled = False
+        for drive in self._drives.values():
+            drive.motor.stalled = drive.hung = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-from needle_sim.bus.client_bytes import ClientBytes
+from needle_sim.bus.stream_server import ClientBytes
 from needle_sim.drives.motor import MotorSettings
 from needle_sim.drives.text_drives import TextDrive, TextDrives
 

@@ -141,7 +141,7 @@ class Homing:
         if method in CURRENT_POSITION:
             self._phase = _Phase.DONE
         else:
-            self._phase = _Phase.LEAVE if self._is_switch_active else _Phase.SEARCH
+            self._phase = _Phase.LEAVE if motor.is_blocked(self._direction) else _Phase.SEARCH
 
     @property
     def done(self) -> bool:
@@ -152,7 +152,7 @@ class Homing:
         """Advance the demand by `period` [s]."""
         if self._phase is _Phase.SEARCH:
             demand.run(self._direction * self._speed, self._acceleration, period)
-            if self._is_switch_active:
+            if self._motor.is_blocked(self._direction):
                 self._phase = _Phase.TURN
         elif self._phase is _Phase.TURN:
             demand.brake(self._acceleration, period)
@@ -160,7 +160,7 @@ class Homing:
                 self._phase = _Phase.LEAVE
         elif self._phase is _Phase.LEAVE:
             demand.run(-self._direction * self._edge_speed, self._acceleration, period)
-            if not self._is_switch_active:
+            if not self._motor.is_blocked(self._direction):
                 # The drive latches the encoder position at the edge.
                 self.home_position = self._motor.travel if self._direction > 0.0 else 0.0
                 self._phase = _Phase.STOP
@@ -168,8 +168,3 @@ class Homing:
             demand.brake(self._acceleration, period)
             if demand.at_rest:
                 self._phase = _Phase.DONE
-
-    @property
-    def _is_switch_active(self) -> bool:
-        motor = self._motor
-        return motor.at_positive_switch if self._direction > 0.0 else motor.at_negative_switch

@@ -64,6 +64,12 @@ class Motor:
         """Whether the positive limit switch is active."""
         return self._has_switches and self.position > self._settings.travel
 
+    def is_blocked(self, direction: float) -> bool:
+        """Return whether the limit switch in a direction is active."""
+        return (direction < 0.0 and self.at_negative_switch) or (
+            direction > 0.0 and self.at_positive_switch
+        )
+
     @property
     def travel(self) -> float:
         """Edge of the positive limit switch [counts]."""

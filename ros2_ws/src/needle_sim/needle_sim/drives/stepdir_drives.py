@@ -80,19 +80,16 @@ class StepdirDrive(TextDrive):
 
     def advance_demand(self, period: float) -> None:
         """Move to the target on a trapezoid, or brake; a switch blocks its direction."""
-        if self.target is not None and self._is_blocked(self.target - self.demand.position):
-            self.target = None
+        if self.target is not None:
+            # The outer switch is the negative one.
+            way = -self.outer * (self.target - self.demand.position)
+            if self.motor.is_blocked(way):
+                self.target = None
         ramp = self.deceleration
         if self.target is None:
             self.demand.brake(ramp, period)
         else:
             self.demand.approach(self.target, self.speed, ramp, ramp, period)
-
-    def _is_blocked(self, way: float) -> bool:
-        outward = way * self.outer
-        return (outward > 0.0 and self.motor.at_negative_switch) or (
-            outward < 0.0 and self.motor.at_positive_switch
-        )
 
 
 class StepdirDrives(TextDrives[StepdirDrive]):

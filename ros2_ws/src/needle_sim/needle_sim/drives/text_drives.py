@@ -8,7 +8,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Generic, TypeVar
 
-from needle_sim.bus.client_bytes import ClientBytes
+from needle_sim.bus.stream_server import ClientBytes
 from needle_sim.drives.emulated_drives import FAULT, MOTION_STEP, EmulatedDrives
 from needle_sim.drives.motion_profile import Demand
 from needle_sim.drives.motor import Motor, MotorSettings
@@ -69,7 +69,7 @@ class TextDrive:
         return round(self.motor.position - self.zero)
 
     @property
-    def state(self) -> str:
+    def state_text(self) -> str:
         """State for the diagnostics."""
         return f"{FAULT} 0x{self.fault:04X}" if self.fault else "ON" if self.powered else "OFF"
 
@@ -126,7 +126,7 @@ class TextDrives(EmulatedDrives, Generic[Drive]):
         make_drive: Callable[[str, MotorSettings], Drive],
     ) -> None:
         self.drives = {name: make_drive(name, settings) for name, settings in motors.items()}
-        super().__init__({name: drive.motor for name, drive in self.drives.items()}, now)
+        super().__init__(self.drives, now)
         self.late = 0.0
         self.partial = self.wrong = self.lost = False
         self._inputs: dict[int, bytes] = defaultdict(bytes)
@@ -201,10 +201,6 @@ class TextDrives(EmulatedDrives, Generic[Drive]):
 
     # ---- time and faults ----------------------------------------------------------------------
 
-    def states(self) -> dict[str, str]:
-        """Return the state of each drive."""
-        return {name: drive.state for name, drive in self.drives.items()}
-
     def advance(self, steps: int) -> None:
         """Advance the motion by a number of `MOTION_STEP`."""
         drives = self.drives.values()
@@ -228,20 +224,10 @@ class TextDrives(EmulatedDrives, Generic[Drive]):
             drive.hung = False
             drive.boots_until = now + self.boot_time
 
-    def fail(self, axis: str, code: int) -> None:
-        """Cause a fault with this error code in a drive."""
-        self.drives[axis].fail(code)
-
     def hang(self, axis: str) -> None:
         """Hang the processor of a drive: it is silent, and its motor ends at the set-point."""
         for drive in self._together(axis):
             drive.hung = True
-
-    def restore(self, now: float) -> None:
-        """End cut connection, stalled motors and hung processors; faults stay until reset."""
-        super().restore(now)
-        for drive in self.drives.values():
-            drive.hung = False
 
     def _together(self, axis: str) -> list[Drive]:
         return list(self.drives.values()) if self.one_processor else [self.drives[axis]]

@@ -156,7 +156,7 @@ class ZaberDrive(TextDrive):
         else:
             self.demand.brake(ramp, period)
         motor, velocity = self.motor, self.demand.velocity
-        if velocity and (motor.at_negative_switch, motor.at_positive_switch)[velocity > 0.0]:
+        if motor.is_blocked(velocity):
             if self._homing:
                 self.zero = self.demand.position = 0.0
                 self.flags -= {"WR", "WH"}
@@ -183,7 +183,6 @@ class ZaberDrives(TextDrives[ZaberDrive]):
     """
 
     port = "zaber"
-    intruder = "/1 1 move vel 16384"
     one_processor = False
     # Line of another computer: it moves the insertion axis at 10000 counts/s.
     intruder = "/1 1 move rel 20000 16384"

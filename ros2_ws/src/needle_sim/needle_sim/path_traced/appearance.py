@@ -19,18 +19,20 @@ FLOORS: tuple[Floor, ...] = get_args(Floor)
 
 _STREAM = 20
 _PLAIN_DIAMETER = 0.0007
-# Range of the floor's grey level under full light, by kind.
-_LEVELS: dict[Floor, tuple[float, float]] = {
-    "grey": (95.0, 165.0),
-    "dark": (22.0, 60.0),
-    "light": (150.0, 195.0),
-    "graph": (105.0, 190.0),
-    "brushed": (80.0, 170.0),
-    "cloth": (60.0, 165.0),
-    "print": (110.0, 195.0),
-    "panel": (140.0, 215.0),
-    "clutter": (50.0, 150.0),
+# Mean reflectance, and range of the grey level under full light, by kind of floor.
+_FLOORS: dict[Floor, tuple[float, float, float]] = {
+    "grey": (0.35, 95.0, 165.0),
+    "dark": (0.05, 22.0, 60.0),
+    "light": (0.75, 150.0, 195.0),
+    "graph": (0.75, 105.0, 190.0),
+    "brushed": (0.45, 80.0, 170.0),
+    "cloth": (0.35, 60.0, 165.0),
+    "print": (0.75, 110.0, 195.0),
+    "panel": (0.6, 140.0, 215.0),
+    "clutter": (0.4, 50.0, 150.0),
 }
+ALBEDO = {floor: albedo for floor, (albedo, *_) in _FLOORS.items()}
+"""Mean reflectance by kind of floor."""
 # Roughness (GGX alpha) along the shaft, across it and of the ground face, by metal.
 _ROUGHNESS: dict[Metal, tuple[tuple[float, float], ...]] = {
     "polished": ((0.05, 0.15), (0.05, 0.15), (0.05, 0.2)),
@@ -127,6 +129,11 @@ class Appearance:
     shot_noise: float
     flicker: float
     lag: float
+
+    @property
+    def bevel_length(self) -> float:
+        """Length of the bevel along the needle's axis [m]."""
+        return float(self.diameter / np.tan(self.bevel_angle))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -243,7 +250,7 @@ def draw_appearance(name: str, seed: int) -> Appearance:
         room_light=between(0.2, 1.0) ** 2 * 0.6,
         floor=floor,
         floor_height=between(-0.035, -0.018),
-        floor_level=between(*_LEVELS[floor]),
+        floor_level=between(*_FLOORS[floor][1:]),
         floor_blur_px=sometimes(0.7, 0.2, 2.5),
         bubbles=round(sometimes(0.8, 3.0, 90.0)),
         lint=round(sometimes(0.7, 1.0, 25.0)),

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from needle_sim.camera.optics import FloatImage
-from needle_sim.needle.se3 import FloatArray
-from needle_sim.path_traced.appearance import Floor
+from needle_sim.path_traced.appearance import ALBEDO, Floor
 
 # Extent of the picture: across the needle over its rows, z over its columns [m].
 SIDE = 0.1
@@ -19,47 +18,12 @@ END = 0.2
 SPACING = 0.0001
 """Spacing of the pixels [m]."""
 
-ALBEDO: dict[Floor, float] = {
-    "grey": 0.35,
-    "dark": 0.05,
-    "light": 0.75,
-    "graph": 0.75,
-    "brushed": 0.45,
-    "cloth": 0.35,
-    "print": 0.75,
-    "panel": 0.6,
-    "clutter": 0.4,
-}
-"""Mean reflectance by kind of floor."""
-
 _SHAPE = (round(2.0 * SIDE / SPACING), round((END - BEGIN) / SPACING))
 _WORDS = ("needle", "phantom", "gel 35 mm", "sample 04", "do not shake", "lot 2.1", "top", "up")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class FloorPicture:
-    """Reflectance of a floor.
-
-    Attributes
-    ----------
-    reflectance : ndarray of float32, shape (rows, columns)
-        Reflectance at each pixel; brightness of a lit panel.
-    """
-
-    reflectance: FloatImage
-
-    def at(self, aside: FloatArray, along: FloatArray) -> FloatImage:
-        """Return the reflectance, (rows, columns), at lateral and z coordinates [m]."""
-        column = ((along - BEGIN) / SPACING - 0.5).astype(np.float32)
-        row = ((aside + SIDE) / SPACING - 0.5).astype(np.float32)
-        sampled = cv2.remap(
-            self.reflectance, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-        )
-        return np.asarray(sampled, dtype=np.float32)
-
-
-def floor_picture(floor: Floor, rng: np.random.Generator) -> FloorPicture:
-    """Return a random floor of a kind.
+def floor_picture(floor: Floor, rng: np.random.Generator) -> FloatImage:
+    """Return the reflectance of a random floor of a kind; brightness of a lit panel.
 
     Parameters
     ----------
@@ -74,19 +38,9 @@ def floor_picture(floor: Floor, rng: np.random.Generator) -> FloorPicture:
     else:
         picture *= 1.0 + rng.uniform(0.01, 0.06) * _noise(rng, rng.uniform(0.006, 0.02))
         picture *= 1.0 + rng.uniform(0.005, 0.04) * _noise(rng, rng.uniform(0.0001, 0.0006))
-    if floor == "graph":
-        picture *= _lines(rng)
-    elif floor == "brushed":
-        picture *= _streaks(rng)
-    elif floor == "cloth":
-        picture *= _weave(rng)
-    elif floor == "print":
-        picture *= _print(rng)
-    elif floor == "clutter":
-        picture *= _clutter(rng)
-    elif floor == "panel":
-        picture *= 1.0 - rng.uniform(0.0, 0.03) * _dots(rng)
-    return FloorPicture(np.clip(picture, 0.01, 0.95))
+    if texture := _TEXTURES.get(floor):
+        picture *= texture(rng)
+    return np.asarray(np.clip(picture, 0.01, 0.95))
 
 
 def _noise(rng: np.random.Generator, size: float, size_z: float | None = None) -> FloatImage:
@@ -154,9 +108,10 @@ def _weave(rng: np.random.Generator) -> FloatImage:
 
 def _dots(rng: np.random.Generator) -> FloatImage:
     """Return the dot lattice of a light panel."""
-    turn = np.float32(2.0 * np.pi / rng.uniform(0.0015, 0.006))
+    strength, turn = rng.uniform(0.0, 0.03), np.float32(2.0 * np.pi / rng.uniform(0.0015, 0.006))
     first, second = _turned(rng, 0.1)
-    return np.asarray((np.cos(turn * first) * np.cos(turn * second)) ** 2, dtype=np.float32)
+    dots = (np.cos(turn * first) * np.cos(turn * second)) ** 2
+    return np.asarray(1.0 - strength * dots, dtype=np.float32)
 
 
 def _print(rng: np.random.Generator) -> FloatImage:
@@ -221,3 +176,13 @@ def _clutter(rng: np.random.Generator) -> FloatImage:
         first, last = ((middle[0] + k * away[0], middle[1] + k * away[1]) for k in (-1, 1))
         cv2.line(factor, first, last, 0.2, max(radius // 4, 1), cv2.LINE_AA)
     return np.asarray(cv2.GaussianBlur(factor, (0, 0), rng.uniform(1.0, 6.0)), dtype=np.float32)
+
+
+_TEXTURES: dict[Floor, Callable[[np.random.Generator], FloatImage]] = {
+    "graph": _lines,
+    "brushed": _streaks,
+    "cloth": _weave,
+    "print": _print,
+    "clutter": _clutter,
+    "panel": _dots,
+}

@@ -22,7 +22,7 @@ from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray, exp_twist
 from needle_sim.path_traced.appearance import Appearance
-from needle_sim.path_traced.needle_mesh import NeedleEnd, NeedleMesh, needle_mesh
+from needle_sim.path_traced.needle_mesh import NeedleMesh, needle_mesh
 from needle_sim.path_traced.renderer import PathTracedRenderer
 from needle_sim.path_traced.tracer import MM, Mitsuba
 
@@ -106,7 +106,7 @@ def trace_insertion(
         for number, insertion in enumerate([0.0, *insertions] if empty_first else insertions):
             advance_to(plant, insertion, path.rotation)
             truth = meshes = None
-            visible = (0.0, 0.0)
+            visible = [0.0, 0.0]
             if appearance.needle and insertion > 0.0:
                 left = right = _mesh(plant, appearance)
                 truth = truth_of(plant.T_rig_tip, _shape(appearance))
@@ -116,12 +116,12 @@ def trace_insertion(
                     right = _mesh(later, appearance)
                 meshes = left, right
                 distal = [mesh.line[-int(_DISTAL_LENGTH / _SPACING) :] for mesh in meshes]
-                visible = (
-                    _visible_share(distal[0], optics[0]),
-                    _visible_share(distal[1], optics[1]),
-                )
+                visible = [
+                    float(camera.in_image(camera.project(points)).mean())
+                    for camera, points in zip(optics, distal, strict=True)
+                ]
             images = renderer.render(meshes, number)
-            yield TracedPair(number, images, insertion, truth, visible, meshes)
+            yield TracedPair(number, images, insertion, truth, (visible[0], visible[1]), meshes)
 
     return pairs()
 
@@ -151,9 +151,8 @@ def _shape(appearance: Appearance) -> NeedleShape:
 
 
 def _mesh(plant: NeedlePlant, appearance: Appearance) -> NeedleMesh:
-    end = NeedleEnd(appearance.diameter, appearance.bevel_angle, appearance.hollow)
     # The needle bends towards its sharp side.
-    return needle_mesh(_middle_line(plant, appearance), -plant.T_rig_tip[:3, 1], end)
+    return needle_mesh(_middle_line(plant, appearance), -plant.T_rig_tip[:3, 1], appearance)
 
 
 def _middle_line(plant: NeedlePlant, appearance: Appearance) -> FloatArray:
@@ -167,13 +166,6 @@ def _middle_line(plant: NeedlePlant, appearance: Appearance) -> FloatArray:
     return np.concatenate([line[0] + before * back, line])
 
 
-def _visible_share(points: FloatArray, optics: Optics) -> float:
-    """Return the share of points (N, 3) in `rig` that are in a camera's image."""
-    pixels = optics.project(points)
-    visible = np.all((pixels >= 0.0) & (pixels <= np.subtract(optics.image_size, 1.0)), axis=1)
-    return float(visible.mean())
-
-
 TRUTH_COLUMNS = (
     *("axis_x_mm", "axis_y_mm", "axis_z_mm", "extreme_x_mm", "extreme_y_mm", "extreme_z_mm"),
     *("face_x_mm", "face_y_mm", "face_z_mm", "heading_x", "heading_y", "heading_z"),
@@ -184,21 +176,16 @@ TRUTH_COLUMNS = (
 
 def truth_values(appearance: Appearance, pair: TracedPair) -> list[float | str]:
     """Return the values of `TRUTH_COLUMNS`; empty without a needle."""
-    scene: list[float | str] = [
-        appearance.lamps,
-        appearance.floor,
-        appearance.metal,
-        appearance.bubbles,
-    ]
+    metal = "" if pair.truth is None else appearance.metal
+    scene = (appearance.lamps, appearance.floor, metal, appearance.bubbles)
     if pair.truth is None or pair.meshes is None:
-        return [*[""] * 14, appearance.lamps, appearance.floor, "", appearance.bubbles]
+        return [*[""] * 14, *scene]
     truth = pair.truth
     heading = (
         np.sin(truth.pitch),
         -np.cos(truth.pitch) * np.sin(truth.yaw),
         np.cos(truth.pitch) * np.cos(truth.yaw),
     )
-    end = NeedleEnd(appearance.diameter, appearance.bevel_angle, appearance.hollow)
     places = np.concatenate([truth.tip, pair.meshes[0].extreme, pair.meshes[0].face_middle])
-    values = [*places * MM, *heading, end.bevel_length * MM, end.diameter * MM]
+    values = [*places * MM, *heading, appearance.bevel_length * MM, appearance.diameter * MM]
     return [*(round(float(value), 6) for value in values), *scene]

@@ -1,4 +1,4 @@
-"""Triangle mesh of the needle: a tube along a bent centreline, with a bevel at its end."""
+"""Triangle mesh of the needle: a tube along a bent centreline, with a bevel at its needle."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_sim.needle.se3 import FloatArray
+from needle_sim.path_traced.appearance import Appearance
 
 IndexArray = NDArray[np.uint32]
 
@@ -17,30 +18,6 @@ _SIDES = 40
 _STATIONS = 480
 _BORE_SHARE = 0.6
 _BORE_DEPTH_DIAMETERS = 4.0
-
-
-@dataclasses.dataclass(frozen=True)
-class NeedleEnd:
-    """Geometry of the needle's end.
-
-    Attributes
-    ----------
-    diameter : float
-        Diameter of the shaft [m].
-    bevel_angle : float
-        Angle between bevel and axis [rad].
-    hollow : bool
-        Whether the needle is hollow.
-    """
-
-    diameter: float
-    bevel_angle: float
-    hollow: bool
-
-    @property
-    def bevel_length(self) -> float:
-        """Length of the bevel along the axis [m]."""
-        return float(self.diameter / np.tan(self.bevel_angle))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,12 +87,12 @@ class _Axis:
         return point, side, np.cross(tangent, side)
 
 
-def needle_mesh(line: FloatArray, sharp_side: FloatArray, end: NeedleEnd) -> NeedleMesh:
+def needle_mesh(line: FloatArray, sharp_side: FloatArray, needle: Appearance) -> NeedleMesh:
     """Return the mesh of the needle along a centreline.
 
     The last point of the line is the end of the axis, level with the foremost point of the metal.
     The plane of the bevel contains the foremost point and meets the axis half the bevel's length
-    behind its end.
+    behind its needle.
 
     Parameters
     ----------
@@ -123,16 +100,16 @@ def needle_mesh(line: FloatArray, sharp_side: FloatArray, end: NeedleEnd) -> Nee
         Centreline in `rig`, the end last [m].
     sharp_side : ndarray, shape (3,)
         Direction from the axis to the foremost point, in `rig`.
-    end : NeedleEnd
-        Geometry of the needle's end.
+    needle : Appearance
+        Diameter and bevel of the needle, and whether it is hollow.
     """
     axis = _Axis(line, sharp_side)
-    radius = end.diameter / 2.0
-    # Denser at the bent and bevelled end.
+    radius = needle.diameter / 2.0
+    # Denser at the bent and bevelled needle.
     station = axis.length * (1.0 - (1.0 - np.linspace(0.0, 1.0, _STATIONS)) ** 1.5)
     angle = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)
     # Arc length at which the bevel cuts the tube at each angle; stations beyond it coincide.
-    cut = axis.length - end.bevel_length / 2.0 * (1.0 - np.cos(angle))
+    cut = axis.length - needle.bevel_length / 2.0 * (1.0 - np.cos(angle))
     reach = np.minimum(station[:, np.newaxis], cut)
     middle, side, third = axis.at(reach)
     outward = np.cos(angle)[:, np.newaxis] * side + np.sin(angle)[:, np.newaxis] * third
@@ -140,14 +117,14 @@ def needle_mesh(line: FloatArray, sharp_side: FloatArray, end: NeedleEnd) -> Nee
 
     rim = shaft.points[-_SIDES:]
     extreme, heel = rim[0], rim[_SIDES // 2]
-    face_middle = axis.at(np.array(axis.length - end.bevel_length / 2.0))[0]
+    face_middle = axis.at(np.array(axis.length - needle.bevel_length / 2.0))[0]
     normal = np.cross(extreme - heel, rim[_SIDES // 4] - rim[3 * _SIDES // 4])
     normal *= np.sign(normal @ (line[-1] - line[-2])) / np.linalg.norm(normal)
     parts = {"shaft": shaft}
-    if end.hollow:
+    if needle.hollow:
         inner = face_middle + _BORE_SHARE * (rim - face_middle)
         parts["face"] = _ring_face(rim, inner, normal)
-        parts["bore"] = _bore(axis, inner, radius * _BORE_SHARE, angle, end)
+        parts["bore"] = _bore(axis, inner, radius * _BORE_SHARE, angle, needle)
     else:
         parts["face"] = _ring_face(rim, np.broadcast_to(face_middle, rim.shape), normal)
     return NeedleMesh(line, parts, extreme, face_middle)
@@ -175,10 +152,10 @@ def _ring_face(outer: FloatArray, inner: FloatArray, normal: FloatArray) -> Mesh
 
 
 def _bore(
-    axis: _Axis, opening: FloatArray, radius: float, angle: FloatArray, end: NeedleEnd
+    axis: _Axis, opening: FloatArray, radius: float, angle: FloatArray, needle: Appearance
 ) -> Mesh:
     """Return the bore of a hollow needle's end, closed at its bottom."""
-    bottom = np.array(axis.length - end.bevel_length - _BORE_DEPTH_DIAMETERS * end.diameter)
+    bottom = np.array(axis.length - needle.bevel_length - _BORE_DEPTH_DIAMETERS * needle.diameter)
     middle, side, third = axis.at(bottom)
     outward = np.cos(angle)[:, np.newaxis] * side + np.sin(angle)[:, np.newaxis] * third
     deep = middle + radius * outward

@@ -12,8 +12,7 @@ from needle_sim.camera.optics import FloatImage, Optics
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
 from needle_sim.camera.view import GreyImage
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.path_traced.appearance import Appearance
-from needle_sim.path_traced.floors import ALBEDO
+from needle_sim.path_traced.appearance import ALBEDO, Appearance
 from needle_sim.path_traced.marks import Marks
 from needle_sim.path_traced.needle_mesh import NeedleMesh
 from needle_sim.path_traced.path_tracing import PathTracer, refracted_rays

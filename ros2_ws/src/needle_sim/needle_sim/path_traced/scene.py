@@ -13,8 +13,7 @@ import numpy as np
 
 from needle_sim.camera.clutter import BubbleCloud
 from needle_sim.path_traced import floors
-from needle_sim.path_traced.appearance import Metal
-from needle_sim.path_traced.floors import ALBEDO
+from needle_sim.path_traced.appearance import ALBEDO, Metal
 from needle_sim.path_traced.needle_mesh import Mesh
 from needle_sim.path_traced.tracer import MM, Mitsuba
 from needle_sim.path_traced.world import (
@@ -143,7 +142,7 @@ class Scene:
             "type": "rectangle",
             "to_world": transform @ self._transform().scale([MM * half_z, MM * floors.SIDE, 1.0]),
         }
-        picture = behind.picture.reflectance[::_COARSER, ::_COARSER, np.newaxis]
+        picture = behind.picture[::_COARSER, ::_COARSER, np.newaxis]
         if world.appearance.floor == "panel":
             shape["emitter"] = {"type": "area", "radiance": PANEL_RADIANCE}
             picture = np.full_like(picture, ALBEDO["panel"])

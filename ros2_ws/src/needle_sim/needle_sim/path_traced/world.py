@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 
 from needle_sim.camera.clutter import BubbleCloud, place_bubbles
@@ -11,8 +12,8 @@ from needle_sim.camera.optics import FloatImage, refraction_point
 from needle_sim.camera.scenarios import Bubbles
 from needle_sim.camera.stereo_rig import SimulatedCamera, SimulatedWindow, StereoRig
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.path_traced.appearance import Appearance, Lamps
-from needle_sim.path_traced.floors import ALBEDO, FloorPicture, floor_picture
+from needle_sim.path_traced import floors
+from needle_sim.path_traced.appearance import ALBEDO, Appearance, Lamps
 
 LENGTH = 0.155
 """Length of the block along z, from the needle's entry [m]."""
@@ -58,15 +59,15 @@ class Backdrop:
         Distance of the plane behind the needle's axis [m].
     gel : float
         Path length through the phantom, from the window's inner face [m].
-    picture : FloorPicture
-        Reflectance of the plane.
+    picture : ndarray of float32, shape (rows, columns)
+        Reflectance of the plane, see `floors`.
     """
 
     normal: FloatArray
     sideways: FloatArray
     depth: float
     gel: float
-    picture: FloorPicture
+    picture: FloatImage
 
     def points(self, aside: FloatArray, along: FloatArray) -> FloatArray:
         """Return points on the plane, (..., 3) in `rig`, from lateral and z coordinates [m]."""
@@ -83,11 +84,16 @@ class Backdrop:
 
     def reflectance(self, points: FloatArray) -> FloatImage:
         """Return the reflectance at points of the plane, (rows, columns, 3) in `rig` [m]."""
-        return self.picture.at(points @ self.sideways, points[..., 2])
+        column = ((points[..., 2] - floors.BEGIN) / floors.SPACING - 0.5).astype(np.float32)
+        row = ((points @ self.sideways + floors.SIDE) / floors.SPACING - 0.5).astype(np.float32)
+        sampled = cv2.remap(
+            self.picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+        )
+        return np.asarray(sampled, dtype=np.float32)
 
 
 def backdrop(
-    camera: SimulatedCamera, rig: StereoRig, appearance: Appearance, picture: FloorPicture
+    camera: SimulatedCamera, rig: StereoRig, appearance: Appearance, picture: FloatImage
 ) -> Backdrop:
     """Return the backdrop of a camera: the floor, or the background behind the box."""
     window = camera.window
@@ -237,10 +243,10 @@ def make_world(rig: StereoRig, appearance: Appearance) -> World:
         kinds = Bubbles(appearance.bubbles, _SMALLEST_BUBBLE, float(rng.uniform(*_LARGEST_BUBBLES)))
         bubbles = place_bubbles(kinds, rig, rng)
     room = appearance.room_light * irradiance(lamps, rig) / np.pi if lamps else 1.0
-    left = backdrop(rig.left, rig, appearance, floor_picture(appearance.floor, rng))
+    left = backdrop(rig.left, rig, appearance, floors.floor_picture(appearance.floor, rng))
     right = left
     if is_box(rig):
-        right = backdrop(rig.right, rig, appearance, floor_picture(appearance.floor, rng))
+        right = backdrop(rig.right, rig, appearance, floors.floor_picture(appearance.floor, rng))
     return World(rig, appearance, lamps, room, (left, right), bubbles, wall, albedo)
 
 

@@ -18,12 +18,12 @@ from needle_sim.bus.pty_can import PtyCan
 from needle_sim.bus.stream_server import StreamServer
 from needle_sim.drive_emulator import (
     ADAPTERS,
+    CIA402,
     COMMAND_LINES,
+    COMMANDS,
     DriveEmulator,
     DriveEmulatorParameters,
 )
-from needle_sim.drives.emulators import CIA402
-from needle_sim.drives.fault_commands import COMMANDS
 
 HELP = f"""\
 drive_emulator: emulates the drives of insertion and rotation with their motors.

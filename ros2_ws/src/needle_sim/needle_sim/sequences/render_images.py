@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import dataclasses
 import math
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from needle_core.files.installed import find_shared_file
 from needle_sim.camera.image_folder import ImageFolder
 from needle_sim.camera.insertions import CURVATURE, RenderedPair, render_insertion
 from needle_sim.camera.scenarios import CLEAN, SCENARIOS, Scenario, find_scenario
-from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
+from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.path_traced.appearance import APPEARANCES, RANDOM, Appearance, draw_appearance
 from needle_sim.path_traced.insertion import (
     TRUTH_COLUMNS,
@@ -59,137 +60,99 @@ exit codes: 0 done; 2 invalid input or a missing file or package; 130 interrupte
 """
 
 
-@dataclasses.dataclass(frozen=True)
-class RenderOptions:
-    """Options of `render_images`, in SI units."""
-
-    output: Path
-    look: Scenario | Appearance
-    frames: int
-    seed: int
-    begin: float
-    depth: float
-    step: float
-    curvature: float
-    calibration: Path | None
-    box: bool
-    json: Path | None
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `render_images`; return its exit code."""
     words = sys.argv[1:] if arguments is None else arguments
-    return run_command(lambda: render_images(parse(words)))
+    return run_command(lambda: render_images(_parser().parse_args(words)))
 
 
-def render_images(options: RenderOptions) -> int:
-    """Render the images; return the exit code."""
-    if not options.box:
-        return _render(options)
-    with tempfile.TemporaryDirectory() as folder:
-        calibration = Path(folder) / "box.yaml"
-        calibration.write_text(draw_box(options.seed), encoding="utf-8")
-        return _render(dataclasses.replace(options, calibration=calibration))
-
-
-def _render(options: RenderOptions) -> int:
-    begin = time.perf_counter()
-    calibration = options.calibration
-    if calibration is None:
-        calibration = find_shared_file("needle_tracker", "config/calibration.yaml")
-    rig = load_stereo_rig(calibration)
-    look = options.look
-    for _ in tqdm(
-        _write(rig, look, options, calibration),
-        total=options.frames,
-        unit="pair",
-        delay=1.0,
-        leave=False,
-        disable=not sys.stderr.isatty(),
-    ):
-        pass
-    wall = time.perf_counter() - begin
-    print(f"{options.frames} pairs of {look.name} in {options.output}, {wall:.1f} s")
-    if options.json is not None:
-        kind = "scenario" if isinstance(look, Scenario) else "appearance"
-        result: dict[str, JsonValue] = {
-            "renderer": RENDERERS[isinstance(look, Appearance)],
-            kind: look.name,
-            "frames": options.frames,
-            "seed": options.seed,
-            "output": str(options.output),
-            "wall_s": wall,
-        }
-        write_json(options.json, result)
-    return EXIT_DONE
-
-
-def parse(arguments: Sequence[str]) -> RenderOptions:
-    """Return the options of a command line (without the program's name).
+def render_images(given: argparse.Namespace) -> int:
+    """Render the images that the options describe; return the exit code.
 
     Raises
     ------
     UserError
         If an option is invalid.
     """
-    given = _parser().parse_args(arguments)
     depth = number("--depth-mm", given.depth_mm, 1.0, 300.0, "mm") / 1e3
     step = number("--step-mm", given.step_mm, 0.001, 50.0, "mm") / 1e3
     begin = number("--start-mm", given.start_mm, 0.0, depth * 1e3, "mm") / 1e3
     frames = math.ceil((depth - begin) / step - 1e-9) + 1
     if given.frames is not None:
         frames = whole_number("--frames", given.frames, 1, 999_999)
-    if given.box and given.calibration is not None:
-        raise UserError("--box generates its own calibration: omit --calibration")
     seed = whole_number("--seed", given.seed, 0, 2**31 - 1)
-    return RenderOptions(
-        output=Path(given.output).expanduser(),
-        look=_look(given.renderer, given.scenario, given.appearance, given.noise, seed),
-        frames=frames,
-        seed=seed,
-        begin=begin,
-        depth=depth,
-        step=step,
-        curvature=number("--curvature", given.curvature, 0.0, 100.0, "1/m"),
-        calibration=None if given.calibration is None else Path(given.calibration).expanduser(),
-        box=given.box,
-        json=output_file("--json", given.json),
-    )
+    look = _look(given, seed)
+    curvature = number("--curvature", given.curvature, 0.0, 100.0, "1/m")
+    way = {"depth": depth, "step": step, "begin": begin, "curvature": curvature, "frames": frames}
+    output, summary = Path(given.output).expanduser(), output_file("--json", given.json)
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        calibration = _calibration(given, seed, Path(folder))
+        written = _write(look, seed, way, output, calibration)
+        is_silent = not sys.stderr.isatty()
+        for _ in tqdm(
+            written, total=frames, unit="pair", delay=1.0, leave=False, disable=is_silent
+        ):
+            pass
+    wall = time.perf_counter() - started
+    print(f"{frames} pairs of {look.name} in {output}, {wall:.1f} s")
+    if summary is not None:
+        kind = "scenario" if isinstance(look, Scenario) else "appearance"
+        result: dict[str, JsonValue] = {
+            "renderer": given.renderer,
+            kind: look.name,
+            "frames": frames,
+            "seed": seed,
+            "output": str(output),
+            "wall_s": wall,
+        }
+        write_json(summary, result)
+    return EXIT_DONE
 
 
-def _look(
-    renderer: str, scenario: str | None, appearance: str | None, noise: str | None, seed: int
-) -> Scenario | Appearance:
+def _look(given: argparse.Namespace, seed: int) -> Scenario | Appearance:
     """Return the scenario or appearance; reject options of the other renderer."""
-    if renderer not in RENDERERS:
-        raise UserError(f"--renderer {renderer!r} is not one of {', '.join(RENDERERS)}")
-    if renderer == "path_traced":
-        for name, text in (("--scenario", scenario), ("--noise", noise)):
+    if given.renderer not in RENDERERS:
+        raise UserError(f"--renderer {given.renderer!r} is not one of {', '.join(RENDERERS)}")
+    if given.renderer == "path_traced":
+        for name, text in (("--scenario", given.scenario), ("--noise", given.noise)):
             if text is not None:
                 raise UserError(f"{name} is for renderer quick; path_traced takes --appearance")
-        return draw_appearance(RANDOM if appearance is None else appearance, seed)
-    if appearance is not None:
+        return draw_appearance(given.appearance or RANDOM, seed)
+    if given.appearance is not None:
         raise UserError("--appearance is for renderer path_traced; quick takes --scenario")
-    look = find_scenario(CLEAN.name if scenario is None else scenario)
-    if noise is not None:
-        return dataclasses.replace(look, noise=number("--noise", noise, 0.0, 50.0, "grey levels"))
+    look = find_scenario(given.scenario or CLEAN.name)
+    if given.noise is not None:
+        noise = number("--noise", given.noise, 0.0, 50.0, "grey levels")
+        return dataclasses.replace(look, noise=noise)
     return look
 
 
+def _calibration(given: argparse.Namespace, seed: int, folder: Path) -> Path:
+    """Return the calibration: of a box, which is written into a folder, given or shipped."""
+    if given.box:
+        if given.calibration is not None:
+            raise UserError("--box generates its own calibration: omit --calibration")
+        box = folder / "box.yaml"
+        box.write_text(draw_box(seed), encoding="utf-8")
+        return box
+    if given.calibration is not None:
+        return Path(given.calibration).expanduser()
+    return find_shared_file("needle_tracker", "config/calibration.yaml")
+
+
 def _write(
-    rig: StereoRig, look: Scenario | Appearance, options: RenderOptions, calibration: Path
+    look: Scenario | Appearance, seed: int, way: Mapping[str, Any], output: Path, calibration: Path
 ) -> Iterator[None]:
     """Write the pairs, one per iteration."""
-    way: dict[str, Any] = {
-        name: getattr(options, name) for name in ("frames", "depth", "step", "curvature", "begin")
-    }
+    rig = load_stereo_rig(calibration)
     columns: tuple[str, ...] = ()
     pairs: Iterator[RenderedPair]
     if isinstance(look, Scenario):
-        pairs = render_insertion(rig, look, seed=options.seed, **way)
+        pairs = render_insertion(rig, look, seed=seed, **way)
     else:
         columns, pairs = TRUTH_COLUMNS, trace_insertion(load_mitsuba(), rig, look, **way)
-    with contextlib.closing(ImageFolder(options.output, calibration, columns)) as folder:
+    with contextlib.closing(ImageFolder(output, calibration, columns)) as folder:
         for pair in pairs:
             more: Sequence[float | str] = ()
             if isinstance(look, Appearance) and isinstance(pair, TracedPair):

@@ -53,9 +53,9 @@ class ConsistencyTally:
     """
 
     def __init__(self, needles: int) -> None:
-        self._within: FloatArray = np.zeros((2, needles))
-        self._x_within_3: FloatArray = np.zeros(needles)
-        self._compared = 0
+        # Steps in which x, and the pitch, was within 2 and within 3 standard deviations.
+        self._within: FloatArray = np.zeros((2, 2, needles))
+        self._steps = 0
         self.missed: FloatArray = np.full(needles, np.nan)
 
     def add(self, belief: Belief | None, x: FloatArray, pitch: FloatArray) -> None:
@@ -70,29 +70,25 @@ class ConsistencyTally:
         """
         if belief is None:
             return
-        for off, std in (
-            (np.abs(belief.x - x), belief.x_std),
-            (np.abs(belief.sin_pitch - np.sin(pitch)), belief.sin_pitch_std),
-        ):
-            self._within += off <= np.array([[2.0], [3.0]]) * std
-            self._compared += 1
-        self._x_within_3 += np.abs(belief.x - x) <= 3.0 * belief.x_std
+        off = np.abs([belief.x - x, belief.sin_pitch - np.sin(pitch)])
+        std = np.array([belief.x_std, belief.sin_pitch_std])
+        self._within += off[:, np.newaxis] <= np.array([[2.0], [3.0]]) * std[:, np.newaxis]
+        self._steps += 1
         if belief.missed is not None:
             self.missed = belief.missed
 
     @property
     def inside(self) -> FloatArray:
         """Share of x and pitch within 2 (first row) and 3 sigma, (2, N); NaN without estimates."""
-        if not self._compared:
-            return np.full_like(self._within, np.nan)
-        return self._within / self._compared
+        return self._share(self._within.mean(axis=0))
 
     @property
     def x_inside(self) -> FloatArray:
         """Share of x alone within 3 sigma, (N,); NaN without estimates."""
-        if not self._compared:
-            return np.full_like(self._x_within_3, np.nan)
-        return 2.0 * self._x_within_3 / self._compared
+        return self._share(self._within[0, 1])
+
+    def _share(self, count: FloatArray) -> FloatArray:
+        return count / self._steps if self._steps else np.full_like(count, np.nan)
 
 
 def is_doubtful(missed: FloatArray) -> FloatArray:

@@ -10,18 +10,14 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from needle_core.errors import UserError
 from needle_sim.camera.clutter import OcclusionEvent, occlusion_at
 from needle_sim.camera.optics import Optics, project
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import (
-    CLEAN,
     SCENARIOS,
     Bubbles,
     FloorShadow,
     Lens,
-    Occlusion,
-    find_scenario,
 )
 from needle_sim.camera.stereo_rig import (
     SimulatedCamera,
@@ -76,12 +72,6 @@ def test_a_scenario_is_drawn_through_windows_too(name: str) -> None:
         for camera in cameras(rig):
             heights = camera.window.height(renderer.bubbles.centre)
             assert np.all(heights + renderer.bubbles.radius < camera.window.inner)
-
-
-def test_an_unknown_scenario_is_reported() -> None:
-    assert find_scenario("clean") is CLEAN
-    with pytest.raises(UserError, match="scenario 'fog' is not one of clean, clutter, heavy_clu"):
-        find_scenario("fog")
 
 
 def test_bubbles_are_seen_where_refraction_puts_them(rig: StereoRig) -> None:
@@ -159,8 +149,7 @@ def test_blur_is_a_thin_lens_s_and_keeps_the_needle_s_darkness(rig: StereoRig) -
 
 
 def test_events_come_in_every_stretch_and_in_every_kind() -> None:
-    occlusion = Occlusion(first=20, every=40, length=14, length_both=6)
-    events = [occlusion_at(occlusion, 3, number) for number in range(20 + 40 * 30)]
+    events = [occlusion_at(3, number) for number in range(20 + 40 * 30)]
     assert all(event is None for event in events[:20])
     kinds = set()
     for stretch in range(30):
@@ -177,7 +166,7 @@ def test_an_occlusion_blocks_its_cameras(
     rig: StereoRig, monkeypatch: pytest.MonkeyPatch, length: float
 ) -> None:
     rig = small(rig)
-    renderer = troubled(rig, occlusion=Occlusion())
+    renderer = troubled(rig, occlusion=True)
     plant = needle(length, 3.0, 17.0, curvature=2.0)
     pose, line = plant.T_rig_tip, plant.centreline(0.001)
     for blocks, covered in itertools.product(

@@ -50,31 +50,24 @@ def test_each_camera_may_have_its_own_window() -> None:
 GONE = object()
 # Key in the file, invalid value, and key in the error.
 BAD = [
-    ("phantom", GONE, "phantom is missing"),
-    ("left.camera_matrix", GONE, "left.camera_matrix is missing"),
+    ("phantom", GONE, "phantom.surface_height is missing"),
+    ("left.camera_matrix", GONE, "left.camera_matrix.data is missing"),
     ("right.T_optical_rig.rotation", GONE, "right.T_optical_rig.rotation is missing"),
-    ("phantom.refractive_index", 0.9, r"refractive_index = 0.9 is outside \[1, 3\]"),
-    ("phantom.surface_height", float("nan"), "surface_height = nan"),
-    ("phantom.surface_height", True, "surface_height = True"),
-    ("phantom.surface_height", 0.6, "not above the surface"),
-    ("left.image_width", 0, "left.image_width = 0 px"),
-    ("left.image_height", 10.5, "left.image_height = 10.5 px"),
+    ("phantom.refractive_index", 0.9, "phantom.refractive_index = 0.9 is below 1"),
+    ("phantom.surface_height", float("nan"), "surface_height = nan is not 1 finite number"),
+    ("phantom.surface_height", 0.6, "left.T_optical_rig puts the camera behind its window"),
+    ("left.image_width", 0, "left.image_width = 0 is below 1"),
     ("left.distortion_model", "fisheye", "'fisheye' is not 'plumb_bob'"),
-    ("left.camera_matrix.data", [0] * 9, "not a pinhole matrix"),
-    ("left.camera_matrix.data", [1, 2], "not a list of 9 numbers"),
-    ("left.distortion_coefficients.cols", 4, "is 1 x 4, not 1 x 5"),
-    ("left.T_optical_rig.rotation", [0, 0, 0, 2], "norm 2, not 1"),
-    ("left", "left", "left has no keys"),
+    ("left.camera_matrix.data", [1, 2], r"data = \[1, 2\] is not 9 finite numbers"),
+    ("left.T_optical_rig.rotation", [0, 0, 0, 2], "rotation has length 2, not 1"),
+    ("left", "left", "left.image_width is missing"),
 ]
 BAD_WINDOWS = [
-    ("phantom", {"surface_height": 0.0, "refractive_index": 1.3}, "beside"),
-    ("right.window", GONE, "right.window is missing, and so phantom is missing"),
+    ("right.window", GONE, "phantom.surface_height is missing"),
     ("left.window.layers", GONE, "left.window.layers is missing"),
-    ("left.window.normal", [0, 0, 1], "is parallel to the needle"),
     ("left.window.normal", [1, 1, 0], "normal has length 1.41"),
-    ("left.window.normal", [-1, 0, 0], "not above the surface"),
-    ("left.window.inside", 0.9, r"inside = 0.9 is outside \[1, 3\]"),
-    ("left.window.layers.0.thickness", 0, "thickness = 0 m"),
+    ("left.window.normal", [-1, 0, 0], "puts the camera behind its window"),
+    ("left.window.layers.0.thickness", -1, "left.window.layers.0.thickness = -1 is below 0"),
 ]
 
 
@@ -104,7 +97,10 @@ def test_a_file_that_cannot_be_read_is_named_in_one_line(tmp_path: Path) -> None
     with pytest.raises(UserError, match=r"absent\.yaml: cannot be read: No such file"):
         load_stereo_rig(tmp_path / "absent.yaml")
     broken = tmp_path / "broken.yaml"
-    for text, named in (("left: [1, 2\nright: }", "not YAML in line 2"), ("", "has no keys")):
+    for text, named in (
+        ("left: [1, 2\nright: }", "not YAML in line 2"),
+        ("", "left.image_width is missing"),
+    ):
         broken.write_text(text)
         with pytest.raises(UserError, match=named) as raised:
             load_stereo_rig(broken)

@@ -10,7 +10,6 @@ import canopen
 
 from needle_core.can_frame import CanFrame
 from needle_sim.drives.cia402 import SERVO, STEPPER
-from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.motor import MotorSettings
@@ -22,26 +21,20 @@ COUNTS_PER_RADIAN = 65536 / math.tau
 SYNC_PERIOD = 0.02
 
 
-def settings(name: str, limit_action: LimitAction, *, start: float = 0.0, lag: float = 0.0) -> Any:
+def settings(name: str, *, start: float = 0.0, lag: float = 0.0) -> Any:
     if name == "insertion":
         scale = COUNTS_PER_METRE
         motor = MotorSettings(scale, 0.01 * scale, lag, start, 0.25 * scale)
-        return EmulatedDriveSettings(name, INSERTION, STEPPER, motor, limit_action, 0.3)
+        return EmulatedDriveSettings(name, INSERTION, STEPPER, motor, 0.3)
     motor = MotorSettings(COUNTS_PER_RADIAN, 20.0 * COUNTS_PER_RADIAN, lag)
-    return EmulatedDriveSettings(name, ROTATION, SERVO, motor, limit_action, 0.3)
+    return EmulatedDriveSettings(name, ROTATION, SERVO, motor, 0.3)
 
 
 class Master:
     """Both drives, booted and OPERATIONAL, and the frames received from them."""
 
-    def __init__(
-        self,
-        limit_action: LimitAction = LimitAction.CLAMP,
-        **motor: float,
-    ) -> None:
-        self.bus = EmulatedBus(
-            (settings("insertion", limit_action, **motor), settings("rotation", limit_action)), 0.0
-        )
+    def __init__(self, **motor: float) -> None:
+        self.bus = EmulatedBus((settings("insertion", **motor), settings("rotation")), 0.0)
         self.now = 0.0
         self.heard: list[CanFrame] = []
         self.network = canopen.Network()

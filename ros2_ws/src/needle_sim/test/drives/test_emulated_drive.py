@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import itertools
 
-import canopen
 import pytest
 
-from needle_sim.bus.object_dictionary import Abort
 from needle_sim.drives.cia402 import PowerState, next_state
-from needle_sim.drives.drive_motion import LimitAction
 
-from .master import CSP, INSERTION, MASTER, PP, ROTATION, Master
+from .master import CSP, HM, INSERTION, MASTER, PP, ROTATION, Master
 
 # Shutdown, switch on, enable operation, disable voltage, quick stop: state to the states after
 # each, as the figure of CiA 402 has them.
@@ -82,6 +79,100 @@ def test_a_lagging_motor_follows_and_arrives_exactly() -> None:
     assert master.read(0x6064) == 800 * 15
 
 
+# ---- profile positions, homing, limit switches -----------------------------------------------
+
+
+def test_profile_position_ends_at_the_target_in_the_time_of_a_trapezoid(master: Master) -> None:
+    speed, ramp, at = 40_000, 400_000, 0
+    for index, value in ((0x6081, speed), (0x6083, ramp), (0x6084, ramp)):
+        master.write(index, 0, value, 4, ROTATION)
+    master.enable(PP, ROTATION)
+    for target in (1, 8, -1_000, 10_000):
+        master.target(target, ROTATION)
+        master.control(0x0F, 0x1F, node=ROTATION)
+        assert master.status(ROTATION) & 0x1000
+        syncs, fastest = 0, 0
+        while not master.status(ROTATION) & 0x400:
+            master.sync()
+            syncs += 1
+            fastest = max(fastest, abs(master.read(0x606C, node=ROTATION)))
+            assert syncs < 1000
+        distance, at = abs(target - at), target
+        if distance > speed**2 / ramp:
+            time = distance / speed + speed / ramp
+        else:
+            time = 2.0 * (distance / ramp) ** 0.5
+        assert syncs * 0.02 == pytest.approx(time, abs=0.03)
+        assert fastest <= speed
+        assert master.read(0x6064, node=ROTATION) == target
+
+
+def test_the_next_profile_target_waits_for_the_first_and_relative_ones_add(
+    master: Master,
+) -> None:
+    master.enable(PP)
+    for relative in (1_000, 500):
+        master.target(relative)
+        master.control(0x0F, 0x5F)
+    master.sync(200)
+    # Both relative to where the drive stood when they came.
+    assert master.read(0x6064) == 500
+
+
+@pytest.mark.parametrize("start", [2_345.5, -1.0, -5_000.0])
+def test_homing_finds_the_edge_of_the_switch(start: float) -> None:
+    master = Master(start=start)
+    # It counts from its position at power-up.
+    assert master.read(0x6064) == 0
+    master.home()
+    # It rests a braking distance off the edge and counts from the edge.
+    assert 0 <= master.read(0x6064) < 100
+    assert master.true_counts() == pytest.approx(master.read(0x6064), abs=0.5)
+
+
+def test_homing_to_the_positive_switch_with_an_offset_and_at_the_present_position() -> None:
+    master = Master(start=0.249 * 2e7)
+    master.write(0x607C, 0, 100, 4)
+    master.home(18)
+    assert master.true_counts() < 0.25 * 2e7
+    assert master.read(0x6064) == pytest.approx(master.true_counts() - 0.25 * 2e7 - 100, abs=1)
+    assert master.home(37, ROTATION) <= 1
+    assert master.true_counts("rotation") == 0.0
+
+
+def test_homing_can_be_broken_off() -> None:
+    master = Master(start=200_000.0)
+    master.write(0x6098, 0, 17, 1)
+    master.write(0x6099, 1, 40_000, 4)
+    master.enable(HM)
+    master.control(0x1F)
+    master.sync(20)
+    master.control(0x0F)
+    master.sync(30)
+    at = master.read(0x6064)
+    master.sync(10)
+    assert at == master.read(0x6064) < 0
+    assert not master.status() & 0x1000
+
+
+def test_a_limit_switch_stops_the_axis(master: Master) -> None:
+    master.write(0x6085, 0, 1_000_000, 4)
+    master.enable(CSP)
+    for k in range(1, 40):
+        master.target(-800 * k)
+        master.sync()
+    assert -2_000 < master.true_counts() < 0
+    assert master.status() & 0x800
+    assert master.read(0x60FD) == 0b101
+    at = master.true_counts()
+    master.sync(10)
+    assert master.true_counts() == at
+    # The opposite direction is free.
+    master.target(0)
+    master.sync(3)
+    assert master.true_counts() == 0.0
+
+
 # ---- stopping ----------------------------------------------------------------------------------
 
 
@@ -140,28 +231,14 @@ def test_halt_stops_and_its_release_goes_on(master: Master) -> None:
 # ---- limits, faults ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("action", LimitAction)
-def test_a_target_beyond_the_software_limits_is_not_reached(action: LimitAction) -> None:
-    master = Master(limit_action=action)
-    master.write(0x607D, 1, 0, 4)
+def test_a_target_beyond_the_software_limits_of_a_homed_drive_is_clipped(master: Master) -> None:
     master.write(0x607D, 2, 1_000, 4)
     master.home()
     master.enable(CSP)
-    if action is LimitAction.ABORT:
-        with pytest.raises(canopen.SdoAbortedError) as refused:
-            master.target(1_001)
-        assert refused.value.code == Abort.VALUE_TOO_HIGH
-        assert master.status() & 0x800
-    else:
-        master.target(1_001)
+    master.target(1_001)
     master.sync(3)
-    at = master.read(0x6064)
-    if action is LimitAction.CLAMP:
-        assert (master.state(), at) == (0x27, 1_000)
-        assert master.status() & 0x800
-    else:
-        assert at < 100
-        assert master.read(0x603F) == (0x8612 if action is LimitAction.FAULT else 0)
+    assert (master.state(), master.read(0x6064)) == (0x27, 1_000)
+    assert master.status() & 0x800
 
 
 def test_a_stalled_motor_is_a_following_error(master: Master) -> None:
@@ -207,18 +284,6 @@ def test_a_fault_brakes_and_is_reset_by_a_rising_edge(master: Master) -> None:
     assert master.state() == 0x08
 
 
-def test_a_reboot_stops_forgets_home_and_counts_anew(master: Master) -> None:
-    master.home()
-    master.enable(CSP)
-    run_at(master, 800)
-    at = master.true_counts()
-    master.bus.reboot("insertion", master.now)
-    master.sync(5)
-    assert master.true_counts() == at
-    master.wait(0.31)
-    assert (master.read(0x6064), master.state()) == (0, 0x40)
-
-
 def test_a_hung_drive_is_silent_and_ends_at_its_set_point(
     master: Master,
 ) -> None:
@@ -239,20 +304,3 @@ def test_a_hung_drive_is_silent_and_ends_at_its_set_point(
     master.sync(5)
     assert (master.state(), master.read(0x603F)) == (0x08, 0x8130)
     assert master.true_counts() == 8_000.0
-
-
-def test_a_cut_bus_loses_frames_both_ways_and_trips_the_drive_s_watchdog(
-    master: Master,
-) -> None:
-    master.write(0x1017, 0, 30, 2)
-    master.write(0x1016, 1, MASTER << 16 | 100, 4)
-    master.network.send_message(0x700 + MASTER, b"\5")
-    master.enable(CSP)
-    master.bus.is_cut = True
-    master.heard.clear()
-    master.network.send_message(0x601, b"\x23\x7a\x60\0\x20\x03\0\0")
-    master.network.send_message(0x80, b"")
-    master.wait(0.2)
-    assert master.heard == []
-    assert master.true_counts() == 0.0
-    assert master.bus.drives["insertion"].state is PowerState.FAULT

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from needle_sim.bus.client_bytes import ClientBytes
+from needle_sim.bus.stream_server import ClientBytes
 from needle_sim.drives.galil_drives import GalilDrives
 from needle_sim.drives.motor import MotorSettings
 

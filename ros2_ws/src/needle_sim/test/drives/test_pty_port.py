@@ -12,22 +12,22 @@ import pytest
 
 from needle_core.can_frame import CanFrame
 from needle_core.errors import UserError
-from needle_sim.bus.pty_can import PtyCan, PtyPort
+from needle_sim.bus.pty_can import PtyCan
 
 
 @pytest.fixture
-def port(tmp_path: Path) -> Iterator[PtyPort]:
-    port = PtyPort(tmp_path / "can")
+def port(tmp_path: Path) -> Iterator[PtyCan]:
+    port = PtyCan(tmp_path / "can")
     yield port
-    port.unplug()
+    port.plug(plugged_in=False)
     assert not (tmp_path / "can").is_symlink()
 
 
-def computer(port: PtyPort | PtyCan) -> Any:
+def computer(port: PtyCan) -> Any:
     return can.Bus(interface="slcan", channel=port.path, bitrate=500_000, sleep_after_open=0)
 
 
-def received(port: PtyPort) -> tuple[CanFrame, ...]:
+def received(port: PtyCan) -> tuple[CanFrame, ...]:
     """Return the frames that the adapter reads, in however many pieces they come."""
     frames: tuple[CanFrame, ...] = ()
     for _ in range(100):
@@ -35,7 +35,7 @@ def received(port: PtyPort) -> tuple[CanFrame, ...]:
     return frames
 
 
-def test_stock_slcan_exchanges_frames_through_the_port(port: PtyPort) -> None:
+def test_stock_slcan_exchanges_frames_through_the_port(port: PtyCan) -> None:
     with computer(port) as bus:
         bus.send(can.Message(arbitration_id=0x201, data=b"\x0f\0", is_extended_id=False))
         assert received(port) == (CanFrame(0x201, b"\x0f\0"),)
@@ -47,12 +47,12 @@ def test_stock_slcan_exchanges_frames_through_the_port(port: PtyPort) -> None:
     ]
 
 
-def test_an_unplugged_adapter_is_an_error_and_comes_back(port: PtyPort) -> None:
+def test_an_unplugged_adapter_is_an_error_and_comes_back(port: PtyCan) -> None:
     link = Path(port.path)
     bus = computer(port)
-    port.unplug()
+    port.plug(plugged_in=False)
     assert not link.is_symlink()
-    assert (port.filenos, port.receive()) == ([], ())
+    assert port.receive() == ()
     port.send([CanFrame(0x181)])
     with pytest.raises((can.CanError, OSError)):
         bus.recv(0.01)
@@ -60,18 +60,15 @@ def test_an_unplugged_adapter_is_an_error_and_comes_back(port: PtyPort) -> None:
         bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
     bus.serialPortOrig.close()
     bus._is_shutdown = True
-    port.plug_in()
+    port.plug(plugged_in=True)
     with computer(port) as bus:
         bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         assert received(port) == (CanFrame(0x80),)
 
 
-def test_a_bus_reads_the_port_until_it_is_closed_and_can_be_plugged(tmp_path: Path) -> None:
+def test_a_port_is_read_until_it_is_closed(tmp_path: Path) -> None:
     adapter = PtyCan(tmp_path / "can")
     heard: list[CanFrame] = []
-    adapter.plug(plugged_in=False)
-    assert not (tmp_path / "can").is_symlink()
-    adapter.plug(plugged_in=True)
 
     def arrive(frames: tuple[CanFrame, ...]) -> None:
         heard.extend(frames)
@@ -98,7 +95,7 @@ def read(terminal: int, count: int) -> bytes:
     return data
 
 
-def test_closing_the_channel_drops_pending_output_and_opening_it_does_not(port: PtyPort) -> None:
+def test_closing_the_channel_drops_pending_output_and_opening_it_does_not(port: PtyCan) -> None:
     terminal = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
     try:
         for words in (b"C\r", b"S6\r", b"O\r"):
@@ -119,15 +116,15 @@ def test_files_and_links_of_others_are_left_alone(tmp_path: Path) -> None:
     file = tmp_path / "can"
     file.write_text("mine")
     with pytest.raises(UserError, match="can"):
-        PtyPort(file)
+        PtyCan(file)
     assert file.read_text() == "mine"
     # The link of a killed emulator is dead, or leads to the terminal of another process.
     stale = tmp_path / "stale"
     stale.symlink_to("/dev/pts/ptmx")
-    port = PtyPort(stale)
+    port = PtyCan(stale)
     assert stale.resolve() != Path("/dev/pts/ptmx")
     with pytest.raises(UserError, match="another emulator"):
-        PtyPort(stale)
+        PtyCan(stale)
     assert stale.exists()
-    port.unplug()
+    port.plug(plugged_in=False)
     assert list(tmp_path.iterdir()) == [file]

@@ -9,8 +9,7 @@ import pytest
 
 from needle_core.component import Diagnose, Moment, Send
 from needle_core.errors import UserError
-from needle_sim.bus.client_bytes import ClientBytes
-from needle_sim.bus.stream_server import StreamServer
+from needle_sim.bus.stream_server import ClientBytes, StreamServer
 from needle_sim.drive_emulator import DriveEmulator, DriveEmulatorParameters
 from needle_sim.drives.motor import MotorSettings
 from needle_sim.drives.text_drives import TextDrive, TextDrives

@@ -151,21 +151,6 @@ def test_a_loss_of_power_loses_the_reference_but_no_setting() -> None:
     assert "WR" in chain.say("2 warnings")
 
 
-def test_a_disabled_driver_refuses_motion() -> None:
-    chain = Chain().homed()
-    chain.say("1 1 move abs 50000")
-    chain.drives.foreign("/1 1 driver disable")
-    assert chain.say("1 1 move abs 0", 0.2) == "@01 1 RJ IDLE FO DRIVERDISABLED\r\n"
-    place = chain.place
-    chain.say("1 1 driver enable", 0.5)
-    assert chain.say("1 1") == "@01 1 OK IDLE -- 0\r\n"
-    assert chain.place == place
-    chain.drives.fail("insertion", 0x3210)
-    assert chain.drives.states()["insertion"] == "FAULT 0x3210"
-    chain.say("1 1 driver enable")
-    assert chain.say("1 1 move abs 0") == "@01 1 RJ IDLE FV DRIVERDISABLED\r\n"
-
-
 def test_a_device_alone_keeps_its_address() -> None:
     drives = ZaberDrives({"rotation": MotorSettings(1000.0, 20_000.0)}, -1.0)
     assert drives.receive((b"/1 0\n/2 0\n",), 0.0) == [b"@02 0 OK IDLE WR 0\r\n"]

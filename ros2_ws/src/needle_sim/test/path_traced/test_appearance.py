@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from needle_core.errors import UserError
 from needle_sim.path_traced import floors
 from needle_sim.path_traced.appearance import (
     APPEARANCES,
@@ -34,8 +33,6 @@ def test_a_name_fixes_its_properties_and_the_seed_draws_the_others_in_full_range
             for kind in ("metal", "lamps", "floor"):
                 assert getattr(fixed, kind) in (None, getattr(look, kind))
         assert len({look.floor_level for look in looks}) == 5
-    with pytest.raises(UserError, match="appearance 'fog' is not one of random, drawn_on_grey"):
-        draw_appearance("fog", 0)
 
 
 def test_a_floor_gives_back_a_share_of_the_light_and_repeats(
@@ -44,9 +41,8 @@ def test_a_floor_gives_back_a_share_of_the_light_and_repeats(
     monkeypatch.setattr(floors, "_SHAPE", (500, 650))
     for floor in FLOORS:
         first, second = (floors.floor_picture(floor, np.random.default_rng(3)) for _ in range(2))
-        np.testing.assert_array_equal(first.reflectance, second.reflectance)
-        assert 0.01 <= first.reflectance.min() < first.reflectance.max() <= 0.95
-        assert first.at(np.array([[0.01, -0.02]]), np.array([[0.05, 0.1]])).shape == (1, 2)
+        np.testing.assert_array_equal(first, second)
+        assert 0.01 <= first.min() < first.max() <= 0.95
 
 
 def test_the_sensor_blooms_saturates_and_is_noisy() -> None:

@@ -14,8 +14,7 @@ from needle_sim.camera.optics import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
 from needle_sim.path_traced import insertion
 from needle_sim.path_traced.appearance import LAMPS, RANDOM, draw_appearance
-from needle_sim.path_traced.floors import FloorPicture
-from needle_sim.path_traced.needle_mesh import NeedleEnd, needle_mesh
+from needle_sim.path_traced.needle_mesh import needle_mesh
 from needle_sim.path_traced.path_tracing import refracted_rays
 from needle_sim.path_traced.world import (
     MIDDLE,
@@ -96,10 +95,12 @@ def test_before_the_phantom_rays_go_straight_on() -> None:
 @pytest.mark.parametrize("hollow", [False, True])
 def test_the_mesh_has_its_diameter_and_its_end(hollow: bool) -> None:
     line, aside = bent_line()
-    end = NeedleEnd(0.0007, float(np.deg2rad(30.0)), hollow)
-    needle = needle_mesh(line, aside, end)
+    look = dataclasses.replace(
+        draw_appearance(RANDOM, 3), diameter=0.0007, bevel_angle=np.pi / 6.0, hollow=hollow
+    )
+    needle = needle_mesh(line, aside, look)
     heading = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
-    assert end.bevel_length == pytest.approx(0.0012124, abs=1e-7)
+    assert look.bevel_length == pytest.approx(0.0012124, abs=1e-7)
     # Beside the axis's end, on the side it bends to, and level with it.
     away = needle.extreme - line[-1]
     assert np.linalg.norm(away) == pytest.approx(0.00035, abs=1e-8)
@@ -147,7 +148,7 @@ def test_an_insertion_is_the_empty_phantom_then_a_needle_that_stops_at_its_depth
 
 
 def test_a_box_stands_in_front_of_its_background(boxes: list[StereoRig]) -> None:
-    look, picture = draw_appearance(RANDOM, 3), FloorPicture(np.zeros((2, 2), dtype=np.float32))
+    look, picture = draw_appearance(RANDOM, 3), np.zeros((2, 2), dtype=np.float32)
     for rig, camera in cameras(boxes):
         behind = backdrop(camera, rig, look, picture)
         assert behind.depth == pytest.approx(camera.window.inner + look.behind)

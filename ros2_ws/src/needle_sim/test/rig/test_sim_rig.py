@@ -56,11 +56,6 @@ def test_tips_are_within_their_noise_of_the_truth_and_another_seed_draws_others(
     assert [message for topic, message in another if topic == "needle/tip"] != tips
 
 
-def test_an_idle_needle_is_exposed_once_a_second() -> None:
-    said = run(made(), 0.0, 4.5)
-    assert sum(topic == "needle/tip" for topic, _ in said) == 4
-
-
 def test_at_level_drive_the_motors_move_the_needle_and_its_way_out_presses_the_stop() -> None:
     # Almost straight up: out of the surface, 17.5 mm above.
     rig = made(level="drive", initial_pitch=1.4, curvature=0.0)
