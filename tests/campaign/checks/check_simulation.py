@@ -6,11 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from campaign.checking import Check, Finding, Workbench, at_most, bag_read_error
-from needle_bags.reading.bag_messages import raw_messages
+from needle_core.files.bag_directory import BagDirectory
 
 SAME_TOPICS = ("/needle/tip", "/device/joint_trajectory", "/device/result", "/sim/tip_pose")
-# Latest time of a message [ns].
-_LATEST = 2**63 - 1
 # Largest error over the last 20 mm [mm RMS], by options of `simulate`.
 CONVERGING = {
     "--level drive": 1.0,
@@ -79,8 +77,9 @@ def _differences(one: Path, other: Path) -> list[str]:
     sent: list[dict[str, list[bytes]]] = []
     for bag in (one, other):
         sent.append({topic: [] for topic in SAME_TOPICS})
-        for topic, _, data in raw_messages(bag, SAME_TOPICS, 0, _LATEST):
-            sent[-1][topic].append(data)
+        with BagDirectory(bag) as directory:
+            for message in directory.messages(SAME_TOPICS.__contains__):
+                sent[-1][message.topic].append(message.data)
     return [
         topic for topic in SAME_TOPICS if not sent[0][topic] or sent[0][topic] != sent[1][topic]
     ]
