@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import random
 from typing import Any
 
 import pytest
 
 from needle_core.can_frame import CanFrame
 from needle_core.component import LATCHED, Call, Component, Exit, Output
+from needle_core.runners.transport import Arrival, Arrivals, Link
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.axes.axis import PERIOD
 from needle_device_driver.axes.link import DriveError
 from needle_device_driver.conformance.rig import DRIVER, ConformanceRig
-from needle_device_driver.device import STATUS
+from needle_device_driver.device import JOINTS, STATUS
 from needle_device_driver.device_driver import EXIT_BROKEN, DeviceDriver
 from needle_device_driver.procedure import Procedure
+
+SYNC = 0x080
 
 
 def restarted(rig: ConformanceRig, search_from: float = 0.0) -> ConformanceRig:
@@ -161,3 +165,23 @@ def test_status_rate_is_limited_for_positions() -> None:
         rig.runner.run(PERIOD)
         told.append(rig.hand.status is not before)
     assert 1 <= told.count(True) <= 2
+
+
+def test_joint_states_carry_the_time_of_the_sync() -> None:
+    syncs, stamps = set[int](), set[int]()
+
+    def watch(link: Link, message: Any, now: float, _: random.Random) -> Arrivals:
+        if link.topic == JOINTS:
+            stamps.add(message.stamp_ns)
+        elif link.sender == DRIVER and link.topic in rig.drives.connections:
+            syncs.update(
+                rig.runner.timeline.stamp_ns for frame in message if frame.identifier == SYNC
+            )
+        return (Arrival(0.0, message),)
+
+    rig = ConformanceRig(1, faults=(watch,))
+    rig.start()
+    rig.runner.run(0.1)
+    assert len(stamps) >= 5
+    # The drives receive the SYNC up to 1 ms after it was sent, and reply after that.
+    assert all(any(0 <= sync - stamp < 1_000_000 for sync in syncs) for stamp in stamps)
