@@ -55,6 +55,29 @@ def test_frames_and_limits_are_those_of_calibration_and_parameters(
     assert attributes["rotation_joint limit velocity"] == "1.5"
 
 
+def test_the_shaft_reaches_from_the_holder_to_the_insertion(calibration: StereoCalibration) -> None:
+    rig = loaded(calibration)
+    c, s = np.cos(MOVED["rotation_joint"]), np.sin(MOVED["rotation_joint"])
+    T_rig_shaft = [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, MOVED["insertion_joint"]], [0, 0, 0, 1]]
+    np.testing.assert_allclose(rig.get_transform("shaft", "rig"), T_rig_shaft, atol=1e-12)
+    shaft = shape(rig, "shaft")
+    assert (shaft.radius, shaft.length) == (0.00045, 0.2)
+    middle = rig.get_transform(shaft.frame, "shaft")[:3, 3]
+    np.testing.assert_allclose(middle, [0.0, 0.0, -0.1], atol=1e-12)
+
+
+def test_the_phantom_ends_at_the_windows(calibration: StereoCalibration) -> None:
+    rig = loaded(calibration)
+    phantom = shape(rig, "phantom")
+    T_rig_phantom = rig.get_transform(phantom.frame, "rig")
+    for camera in calibration.cameras.values():
+        across = int(np.argmax(np.abs(camera.window.normal)))
+        end = T_rig_phantom[across, 3] + 0.5 * phantom.size[across]
+        assert end == pytest.approx(camera.window.point[across])
+    entry = T_rig_phantom[2, 3] - 0.5 * phantom.size[2]
+    assert (entry, phantom.size[2]) == (0.0, 0.15)
+
+
 def test_published_transforms_are_those_of_the_urdf(calibration: StereoCalibration) -> None:
     rig, needle = loaded(calibration), LiveNeedle()
     needle.joints = m.JointState(9, tuple(MOVED), tuple(MOVED.values()))
