@@ -26,7 +26,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         env={
             **os.environ,
             "PYTHONPATH": os.pathsep.join(
-                [*map(str, (ROOT / "scripts/lib", ROOT / "tests")), os.environ["PYTHONPATH"]]
+                [
+                    *map(str, (ROOT / "scripts/lib", ROOT / "tests", ROOT / "tests/shared")),
+                    os.environ["PYTHONPATH"],
+                ]
             ),
         },
         capture_output=True,
