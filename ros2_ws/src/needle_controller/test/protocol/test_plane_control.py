@@ -199,12 +199,14 @@ def test_a_moving_point_is_reached_if_its_clock_is_known() -> None:
             else:
                 needle.control.observe_target_point(breathing(needle.time), needle.time + apart)
 
-        needle.steer(before=see)
+        needle.steer(30, before=see)
         ends.append(needle.tip)
         if apart == 0.0:
+            needle.steer(before=see)
             assert needle.off(breathing(needle.time)) < 0.0006
     # With stamps of another clock, the last observed position is used.
     np.testing.assert_array_equal(ends[1], ends[2])
+    assert math.dist(ends[0], ends[1]) > 1e-5
 
 
 def test_steering_ends_at_the_depth_before_the_point() -> None:
