@@ -18,10 +18,10 @@ class TrackState(enum.Enum):
     """State of the believed track."""
 
     SEARCHING = "SEARCHING"  # no track: the whole reachable region is searched
-    CONFIRMING = "CONFIRMING"  # tracks, none of them believed yet
+    CONFIRMING = "CONFIRMING"  # tracks exist, but none is believed yet
     TRACKING = "TRACKING"
-    LOST = "LOST"  # believed before, and not seen
-    ENTRY = "ENTRY"  # short and not seen: the tip follows from the insertion
+    LOST = "LOST"  # believed before, but no longer detected
+    ENTRY = "ENTRY"  # short and not detected: the tip follows from the insertion
 
 
 class NoTip(str, enum.Enum):
