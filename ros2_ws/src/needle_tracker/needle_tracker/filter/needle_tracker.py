@@ -1,4 +1,4 @@
-"""Tracker of the needle's tip: a stereo pair in, the believed tip out.
+"""Tracker of the needle's tip: a stereo pair in, the accepted tip out.
 
 Tracks are looked for where they are expected; if that fails, both images are searched. The result
 depends only on the images and insertions so far: no time, no randomness, one thread.
@@ -323,7 +323,7 @@ class NeedleTracker:
         return Measurement(tip, state, reason, ends, probability, best.stage)
 
     def _published(self, tip: SpatialTip) -> SpatialTip | None:
-        """Return the tip of a believed needle to be published; None if it is too uncertain.
+        """Return the tip to be published of an accepted needle; None if it is too uncertain.
 
         Errors from the bevel, its lighting or a shadow beside the shaft persist from pair to pair:
         they cancel in displacements, and averaging pairs would not reduce them.

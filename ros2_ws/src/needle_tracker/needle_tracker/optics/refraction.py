@@ -321,7 +321,7 @@ class RefractedCamera:
         self.packed = pack_camera(camera)
 
     def __eq__(self, other: object) -> bool:
-        """Return whether both cameras project all points alike."""
+        """Return whether both cameras project all points identically."""
         return isinstance(other, RefractedCamera) and self._identity == other._identity
 
     def __hash__(self) -> int:

@@ -1,4 +1,4 @@
-"""Registration of a tracker to the rig: the file of `register_tracker`, and its error by place."""
+"""Registration of a tracker to the rig: the file of `register_tracker`, and its local error."""
 
 from __future__ import annotations
 
