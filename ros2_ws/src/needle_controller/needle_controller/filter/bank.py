@@ -1,7 +1,7 @@
 """Bank of hypotheses of one needle: prediction by insertion, update by tips; compiled.
 
 Hypotheses that explain the tips badly lose weight and are removed; equal ones are merged. The
-insertion since the last tip waits in a queue, so that a late tip is applied at the insertion of its
+insertion since the last tip waits in a queue, so that a late tip is applied at the depth of its
 exposure. Angles of base and tip are relative to the start.
 """
 
@@ -184,7 +184,7 @@ def _advance_to_exposure(needle: Any, hypotheses: Records, age: float, assumed: 
         if length > 0.0:
             share = take / length
         else:
-            # A rotation without insertion belongs to the insertion at which it happened.
+            # A rotation without insertion belongs to the depth at which it happened.
             share = 1.0 if ahead > 0.0 or age <= AGE_TOLERANCE else 0.0
         if share > 1.0 - 1e-9:
             share = 1.0

@@ -60,7 +60,7 @@ def checked_views(
     Raises
     ------
     UserError
-        Too few views or corners, a board that only one camera sees, or no board of known place.
+        Too few views or corners, a board that only one camera sees, or no board at a known place.
     """
     checked = [checked_view(v, alone=surface is None and v.place is None) for v in views]
     for side in SIDES:
@@ -148,7 +148,7 @@ def first_calibration(
 ) -> tuple[StereoCalibration, Array]:
     """Return a calibration to start the adjustment from.
 
-    A board of known place defines `rig`; windows are ignored.
+    A board at a known place defines `rig`; windows are ignored.
 
     Parameters
     ----------

@@ -160,8 +160,8 @@ def calibrate(
     given = model.start[: model.shared].copy()
     given[[name.split(".")[-1] in LENS[4:] for name in names]] = 0.0
     free = board_parameters_free(model)
-    # The initial values ignore refraction: without a board of known place in air, fit the poses of
-    # cameras and boards first.
+    # The initial values ignore refraction: without a board at a known place in air, fit the poses
+    # of cameras and boards first.
     poses = free.copy()
     poses[: model.shared] = [name.split(".")[-1] in POSE for name in names]
     poses[camera_slice("right")] &= not tied

@@ -292,7 +292,7 @@ def _end_on_line(
 
 @compiled
 def _keep_about_the_most(density: Array, width: float) -> None:
-    """Set the density to 0 outside the interval that contains most of it.
+    """Set the density to 0 outside the interval with the largest sum.
 
     A wide window may show two ends, and their median would be at neither.
     """

@@ -46,7 +46,8 @@ class FollowingSettings:
     glance_shrink : int
         Factor by which a view is shrunk for comparison with the previous one.
     change : float
-        Least relative change in brightness of a changed view: more than flicker, less than a lamp.
+        Least relative change in the brightness of most of a view: more than flicker, less than a
+        lamp.
     dark : int
         Brightest grey level of a black image.
     """
