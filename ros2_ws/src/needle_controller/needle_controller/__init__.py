@@ -1,1 +1,1 @@
-"""Steers a bevel-tip needle into a plane: tip positions to the rotation of each insertion step."""
+"""Steering of a bevel-tip needle into a plane: measured tips in, rotation of each step out."""

@@ -1,7 +1,8 @@
 """Content of needle/controller_status, including the log of received messages.
 
 A node on a busy machine receives a message some time after it was sent, possibly after later ones;
-messages that exceed its queue are lost. The log lets a bag be replayed in the order of reception.
+messages that exceed its queue are lost. With the log, a bag can be replayed in the order of
+reception.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from needle_core.status_messages import ControllerStatus
 
 _LEVELS = {SteeringState.FAULT: Level.ERROR, SteeringState.WAITING_FOR_TIP: Level.WARN}
 _LOG_LENGTH = 100
-"""Most messages in one log: one or two seconds of a rig at rest."""
+"""Largest number of messages in one log: one or two seconds of a rig at rest."""
 _LOGGED = re.compile(r"(\S+) (\d{1,19})")
 
 

@@ -1,4 +1,4 @@
-"""Filters, observers and laws of many needles, for studies: compiled loops over the node's code."""
+"""Filters, observers and laws for studies of many needles: compiled loops over the node's code."""
 
 # Numba functions take positional arguments: keywords are slow or unsupported.
 # ruff: noqa: PLR0917
@@ -34,7 +34,7 @@ Records = npt.NDArray[np.void]
 
 
 class ManyFilters:
-    """Hypothesis filters of N needles, equal to N times `HypothesisFilter`.
+    """Hypothesis filters of N needles, equivalent to N instances of `HypothesisFilter`.
 
     The needles enter at the origin along z, with their bases at 0.
 

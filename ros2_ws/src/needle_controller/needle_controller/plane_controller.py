@@ -207,7 +207,7 @@ class PlaneController(Component):
         return [Log("info", f"{TARGET_POINT} at {_text(point)}", TARGET_POINT)]
 
     def _on_proposal(self, message: m.Point, at: Moment) -> Iterable[Action]:
-        # A rejected proposal withdraws the one before: the planner no longer wants that.
+        # A rejected proposal withdraws the previous one, which the planner no longer proposes.
         before, self._proposal = self._proposal, None
         point = self._checked_point(message)
         self._proposal = dataclasses.replace(message, stamp_ns=0)
@@ -249,7 +249,7 @@ class PlaneController(Component):
         yield Reply(number, reply.success, reply.message)
 
     def _on_accept(self, _: bool | None, number: int, at: Moment) -> Actions:
-        """Publish the proposal as the target point, which a bag then contains."""
+        """Publish the proposal as the target point, so that a bag records it."""
         if self._proposal is None:
             yield Reply(number, False, f"no target on {PROPOSED_TARGET}")
             return
@@ -304,7 +304,7 @@ def trajectory(command: SendStep | SendPath) -> m.Trajectory:
 
 
 def joint_sample(message: m.JointState, sent_ns: int) -> JointSample:
-    """Return the two joints of a message that was sent at a time [ns].
+    """Return the joint positions of a message that was sent at `sent_ns`.
 
     Raises
     ------
@@ -333,7 +333,7 @@ def measured_heading(message: m.PoseWithCovariance) -> Heading | None:
     turn = np.array(message.covariance).reshape(6, 6)[3:, 3:]
     if not np.all(np.isfinite(turn)):
         return None
-    # The mean variance of the two turns across the heading.
+    # Mean variance of the two rotations perpendicular to the heading.
     variance = 0.5 * float(np.trace(turn) - direction @ turn @ direction)
     return None if variance > _UNKNOWN_HEADING else (direction, variance)
 

@@ -1,1 +1,1 @@
-"""Stereo images to the needle's tip, through the phantom's refracting surface."""
+"""Measurement of the needle's tip in stereo images, through the phantom's refracting surface."""

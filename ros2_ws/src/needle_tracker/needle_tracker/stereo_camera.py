@@ -104,7 +104,7 @@ class StereoCamera(Component):
         self.name, self.settings = name, settings
         self._infos = {side: _camera_info(c, side) for side, c in calibration.cameras.items()}
         self._has_begun = not settings.wait_for_subscribers
-        # A request is due since a tick; a requested pair is not received yet.
+        # Whether a tick has made a request due, and whether a requested pair is outstanding.
         self._is_due = self._is_pending = False
         self._started_at = math.inf
         # Times of publication of the latest pairs [s].

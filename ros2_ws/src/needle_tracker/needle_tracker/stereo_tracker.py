@@ -88,7 +88,7 @@ class StereoTipTracker(Component):
         rate = settings.annotated_rate
         self._annotated_period = 1.0 / rate if rate > 0.0 else math.inf
         self._annotated_at = -math.inf
-        # The states at every start are not logged.
+        # The states at startup are not logged.
         self._reported = {"track": TrackState.SEARCHING.value, "images": "no images yet"}
         joints = Input("joint_states", m.JointState, self._on_joints, JOINT_STATES)
         self.inputs = (joints, *self._image_rows())

@@ -93,7 +93,7 @@ class TrackedTipParameters:
 
 
 class TrackedTip(Component):
-    """Publishes the tips that a tracker measures; names and counts what is no tip.
+    """Publishes the tips measured by a tracker; counts rejected transforms by fault.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class TrackedTip(Component):
         self.timers = (Timer(0.1, self._on_timer),)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Check for a second source: the tips of two must not be mixed."""
+        """Check for a second source, since the tips of two sources must not be mixed."""
         names = peers.publishers.get(TIP, ())
         self._second_source = ", ".join(n for n in names if n != self.name.lstrip("/"))
         return ()
@@ -162,7 +162,7 @@ class TrackedTip(Component):
             return rejection
         static = self._noise**2 * np.eye(3) + registration.covariance_at(position)
         late = (settings.latency_std * speed) ** 2 * np.outer(heading, heading)
-        # A small rotation w turns the heading by w x heading.
+        # A small rotation w changes the heading by w x heading.
         across = np.cross(np.eye(3), heading).T
         return SpatialTip(position, static + late, heading, across @ turned @ across.T)
 
@@ -183,7 +183,7 @@ class TrackedTip(Component):
         else:
             position, quaternion = message.translation, message.rotation
         norm = math.hypot(*quaternion)
-        # A quaternion that was not filled in becomes a matrix that is no rotation.
+        # An unset quaternion becomes a matrix that is not a rotation.
         turn = norm * rotation_matrix(np.array(quaternion) / (norm or 1.0))
         matrix = pose_matrix(turn, position)
         return self._on_received(TrackerTransform(message.stamp_ns * 1e-9, matrix), at)

@@ -18,13 +18,13 @@ from needle_controller.model.arrays import Array
 from needle_core.errors import UserError
 
 _CLIPPED = 3.0  # limit of outliers [standard deviations]
-_NEIGHBOURS = 8  # 1 / share of the tips within which two are neighbours
+_NEIGHBOURS = 8  # inverse of the share of the tips within which two are neighbours
 _BY_CHANCE = 3.0  # limit of the significance [standard deviations]
 _ALLOWED = 5e-5  # correlated error of a tracker [m]
 _REPEATING = 2.5  # the same, in repeating errors
 _MEDIAN = math.sqrt(2.0 * math.log(2.0))  # median length of a vector of two normal components
 _CONTRADICTION = 4.0
-"""Difference from which on the tips contradict a prior [standard deviations]."""
+"""Difference above which the tips contradict a prior [standard deviations]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,7 +128,7 @@ def neighbour_correlation(residuals: Array) -> tuple[float, float]:
     shared : float
         Root mean square of the common part [m].
     significance : float
-        Relative to the standard deviation for independent errors [-].
+        Correlation relative to its standard deviation for independent errors [-].
     """
     lengths = np.linalg.norm(residuals, axis=-1)
     sigma = float(np.median(lengths)) / _MEDIAN
@@ -137,7 +137,7 @@ def neighbour_correlation(residuals: Array) -> tuple[float, float]:
     total, variance, pairs = 0.0, 0.0, 0
     for apart in range(1, len(residuals) // _NEIGHBOURS + 1):
         total += float(np.sum(clipped[apart:] * clipped[:-apart]))
-        # The mean squared cosine of two independent directions across is 1/2.
+        # The mean squared cosine of two independent directions across the arc is 1/2.
         variance += 0.5 * float(squared[apart:] @ squared[:-apart])
         pairs += len(residuals) - apart
     significance = total / math.sqrt(variance) if variance > 0.0 else 0.0

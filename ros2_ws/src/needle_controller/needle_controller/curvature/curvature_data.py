@@ -43,7 +43,7 @@ class InsertionRecord:
         Parameters
         ----------
         least, most : float
-            Inserted lengths [m].
+            Bounds of the inserted length [m].
 
         Raises
         ------
@@ -72,7 +72,7 @@ class InsertionRecord:
         Raises
         ------
         UserError
-            It turned; the message gives angle and insertion.
+            The base turned; the message gives angle and insertion.
         """
         if self.rotation is None or len(self.rotation) == 0:
             return
@@ -95,8 +95,8 @@ def read_record(path: Path, insertion_file: Path | None = None) -> InsertionReco
     Parameters
     ----------
     path : Path
-        A CSV with the columns x_m, y_m, z_m and, if there are any, insertion_m, rotation_rad, valid
-        and name; or the directory of a rosbag2 bag with `needle/tip` and `joint_states`.
+        A CSV with the columns x_m, y_m, z_m and, optionally, insertion_m, rotation_rad, valid and
+        name; or the directory of a rosbag2 bag with `needle/tip` and `joint_states`.
     insertion_file : Path, optional
         A CSV name,insertion_m for a CSV of tips with names.
 
@@ -139,7 +139,7 @@ def read_csv(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
                 bound = _LARGEST_COORDINATE
                 raise OutOfBoundsError(f"{path}:{line}: {name}", value, -bound, bound, "m")
         if of_name is not None:
-            # By the image's name with or without its ending, as in `track_images`.
+            # By the image's name with or without its suffix, as in `track_images`.
             length = of_name.get(row["name"], of_name.get(Path(row["name"]).stem))
             if length is None:
                 raise UserError(f"{insertion_file}: no insertion for {row['name']}")

@@ -5,11 +5,11 @@ inserted length l is
 
     p(l) = p0 + d sin(kappa l) / kappa + n (1 - cos(kappa l)) / kappa
 
-with the entry p0, the heading d there and the direction n the needle bends to. The most likely arc
-is found by Gauss-Newton on p0, two angles of d and the two components of kappa n across d: in these
-the problem is almost linear, has no singularity at kappa = 0, and needs no initial guess of the
-roll. Heading and entry have priors. Tips far from the arc lose weight, so a few outliers do no
-harm. The needle's insertion per recorded insertion of the stage is one more unknown.
+with the entry p0, the heading d there and the direction n in which the needle bends. The most
+likely arc is found by Gauss-Newton on p0, two angles of d and the two components of kappa n across
+d: in these the problem is almost linear, has no singularity at kappa = 0, and needs no initial
+guess of the roll. Heading and entry have priors. Tips far from the arc lose weight, so a few
+outliers do no harm. The needle's insertion per recorded insertion of the stage is one more unknown.
 
 Leading axes broadcast.
 """
@@ -73,8 +73,8 @@ class CurvatureFitSettings:
     slip_std : float
         Standard deviation of the relative difference between the insertions of needle and stage.
     repeating_error : float
-        Error common to all tips, bowed along the arc, as of a calibration; residuals cannot show it
-        [m]. Bowed by e over a length l, an arc has 8 e / l^2 more curvature.
+        Error common to all tips that bows the arc, such as that of a calibration; residuals cannot
+        reveal it [m]. A bow of e over a length l adds 8 e / l^2 to the curvature.
     """
 
     heading: tuple[float, float, float] = (0.0, 0.0, 1.0)
@@ -108,7 +108,7 @@ class CurvatureFit:
     measurement_std : ndarray, shape (...)
         Standard deviation of one measured coordinate, assumed or from the residuals [m].
     weights : ndarray, shape (..., K)
-        Weight of each tip, near 1 as a rule and near 0 for an outlier.
+        Weight of each tip, 1 for most tips and near 0 for an outlier.
     residuals : ndarray, shape (..., K, 3)
         Residual of each tip across the arc [m].
     entry : ndarray, shape (..., 3)
@@ -116,15 +116,15 @@ class CurvatureFit:
     entry_std : ndarray, shape (...)
         Its standard deviation along the worst axis [m].
     heading : ndarray, shape (..., 3)
-        Direction there.
+        Direction at the start of the arc.
     heading_std : ndarray, shape (...)
         Its standard deviation about the worst axis [rad].
     slip, slip_std : ndarray, shape (...)
         Relative excess of the stage's insertion over the needle's, and its standard deviation; 0
         and `CurvatureFitSettings.slip_std` if the insertion is not known.
     unknowns : ndarray, shape (..., 8)
-        Those of `insertion_arc`, relative to the known entry in the `frame` of the known heading,
-        and the needle's insertion per insertion of the stage, less 1.
+        Unknowns of `insertion_arc`, relative to the known entry in the `frame` of the known
+        heading, and the needle's insertion per insertion of the stage, less 1.
     length : ndarray, shape (..., K)
         Insertion of the stage at each tip [m]; of the needle if that of the stage is not known.
     """
@@ -249,7 +249,7 @@ def fit_curvature(
 
 
 def checked_tips(tips: npt.ArrayLike) -> Array:
-    """Return tips as an array, shape (..., K, 3); raises UserError for too few or not finite."""
+    """Check tips and return them as an array, shape (..., K, 3); raises UserError if unusable."""
     tips = np.asarray(tips, dtype=float)
     count = tips.shape[-2] if tips.ndim >= 2 else 0
     if count < FEWEST_TIPS:
@@ -270,7 +270,7 @@ def _check_length(length: Array) -> None:
 
 
 def _noise(residual: Array, weights: Array, *, directions: int, robust: bool) -> Array:
-    """Return the standard deviation of one coordinate, from the tips that are no outliers."""
+    """Return the standard deviation of one coordinate, from the tips that are not outliers."""
     squared = np.sum(residual**2, axis=-1)
     if robust:
         variance = np.median(squared, axis=-1) / _MEDIAN_SQUARED[directions]
@@ -285,7 +285,7 @@ def _length(bend: Array, covariance: Array) -> tuple[Array, Array]:
     """Return the length of a noisy vector of two components, and its standard deviation."""
     length = np.sqrt(np.sum(bend**2, axis=-1))
     unit = bend / np.maximum(length, 1e-12)[..., None]
-    # The direction of a straight line is undefined: take the mean over all.
+    # The bend of a straight line has no direction: average over all directions.
     mean = 0.5 * np.trace(covariance, axis1=-2, axis2=-1)
     along = np.einsum("...i,...ij,...j->...", unit, covariance, unit)
     return length, np.sqrt(np.where(length > 1e-9, along, mean))
@@ -295,8 +295,8 @@ def circle_curvature(tips: npt.ArrayLike) -> Array:
     """Return the curvature of the plain least-squares circle ([KC09] IV-B), for comparison.
 
     The plane is that of the two largest principal axes; the circle minimises the sum of (|p - c|^2
-    - r^2)^2. The result is biased, because noise along a short arc looks like curvature: at 60 mm,
-    +-1 mm, it is a quarter too large. Use `fit_curvature`.
+    - r^2)^2. The result is biased, because noise along a short arc looks like curvature: with +-1
+    mm of noise on 60 mm, it is a quarter too large. Use `fit_curvature`.
 
     Parameters
     ----------

@@ -82,7 +82,7 @@ _BOUNDS = {
     "rotation_tolerance_deg": (0.0, 10.0),
     "forecast_mm": (1.0, 1000.0),
 }
-"""Bounds of the options with a number, whose names end in their units."""
+"""Bounds of the numeric options, whose names end in their units."""
 _OUTLIER_WEIGHT = 0.5
 
 

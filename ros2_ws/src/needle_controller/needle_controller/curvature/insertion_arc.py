@@ -1,7 +1,7 @@
-"""Arc of a pure insertion ([KC09] IV-B): its points, and their derivatives by the unknowns.
+"""Arc of a pure insertion ([KC09] IV-B): points, and derivatives with respect to the unknowns.
 
 The unknowns, (..., 7): the entry [m], two angles of the heading there [rad], and the two components
-of kappa n across the heading [1/m], where n is the direction to which the needle bends. There is no
+of kappa n across the heading [1/m], where n is the direction in which the needle bends. There is no
 singularity at kappa = 0. Leading axes broadcast.
 """
 
@@ -23,7 +23,7 @@ UNKNOWNS = 7
 
 
 def frame(heading: Array) -> Array:
-    """Return axes as columns, of which the third is the heading."""
+    """Return axes as columns; the third is the heading."""
     aside = np.eye(3)[np.argmin(np.abs(heading))]
     first = np.cross(aside, heading)
     first /= np.linalg.norm(first)
@@ -66,7 +66,7 @@ def arc_points(unknowns: Array, length: Array) -> tuple[Array, Array, Array]:
 
 
 def _arc_factors(q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return sin(a)/a, (1 - cos(a))/a^2 of q = a^2 and their derivatives by q."""
+    """Return sin(a)/a and (1 - cos(a))/a^2 for q = a^2, and their derivatives with respect to q."""
     along, across, _ = rodrigues_factors(q)
     small = q < SERIES_BELOW
     safe = np.where(small, 1.0, q)

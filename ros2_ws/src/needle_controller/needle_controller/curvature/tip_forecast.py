@@ -6,10 +6,10 @@ So the path is an arc plus the effect of a local curvature c, a stationary rando
     p(s) = arc(s) + integral over u < s of c(u) x (arc(s) - arc(u)) du,
     E[c(u) c(v)^T] = spread^2 exp(-|u - v| / length) across the path.
 
-The curvature of the arc is normal about 0 in each direction. Only the order of magnitude of its
-standard deviation is known: each of `SCALES` is a hypothesis, weighted by the evidence of the tips.
-So the uncertain arc of a stiff needle is not extrapolated as if it were known, and that of a
-flexible needle is not straightened.
+The curvature of the arc is normally distributed about 0 in each direction. Only the order of
+magnitude of its standard deviation is known: each of `SCALES` is a hypothesis, weighted by the
+evidence of the tips. So the uncertain arc of a stiff needle is not extrapolated as if it were
+known, and that of a flexible needle is not straightened.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from needle_controller.curvature.insertion_arc import BEND, UNKNOWNS, arc_points
 from needle_controller.model.arrays import Array
 
 LOCAL_SPREAD, LOCAL_LENGTH = 0.4, 0.02
-"""Standard deviation of the local curvature [1/m], and the length over which it is one [m]: from 51
+"""Standard deviation of the local curvature [1/m], and its correlation length [m]: from 51
 insertions of a stiff needle (2022-08-31 to 10-13 of maribernardes/trajcontrol_lisa), whose tips at
 98 mm are within the 95 % intervals of a forecast from 50 mm in 96 % of cases."""
 SCALES: Array = np.geomspace(0.05, 50.0, 13)
@@ -39,16 +39,16 @@ class TipForecast:
     Attributes
     ----------
     tip : ndarray, shape (3,)
-        In `rig` [m].
+        Predicted tip in `rig` [m].
     covariance : ndarray, shape (3, 3)
-        [m^2].
+        Covariance of the tip [m^2].
     """
 
     tip: Array
     covariance: Array
 
     def interval(self, deviations: float = 1.96) -> Array:
-        """Return half the interval of each coordinate, (3,) [m], by default that of 95 %."""
+        """Return the half-width of each coordinate's interval, (3,) [m], by default for 95 %."""
         return np.asarray(deviations * np.sqrt(np.diagonal(self.covariance)))
 
 
@@ -62,9 +62,9 @@ def forecast_tip(
     tips : ndarray, shape (K, 3)
         Measured tips in `rig` [m].
     insertion_known : bool
-        Whether the fit has used their insertion; if not, that of the forecast is along the path.
+        Whether the fit used their insertion; if not, `insertion` is measured along the path.
     checked : CheckedFit
-        The arc through them.
+        Fit of the arc through the tips.
     insertion : float
         Insertion of the forecast, > 0 [m].
 
@@ -115,14 +115,14 @@ def forecast_tip(
 
 
 def _local_slopes(unknowns: Array, stations: Array) -> Array:
-    """Return the derivatives of points by the local curvature of each cell, (K, 3, 2 M) [m^2].
+    """Return the derivatives of points with respect to each cell's curvature, (K, 3, 2 M) [m^2].
 
     Parameters
     ----------
     unknowns : ndarray, shape (8,)
-        Of the arc.
+        Unknowns of the arc.
     stations : ndarray, shape (K,)
-        Positions of the points along it, the farthest last [m].
+        Positions of the points along the arc, the farthest last [m].
     """
     cells = np.arange(0.5 * _CELL, stations[-1], _CELL)
     points, _, _ = arc_points(unknowns[:UNKNOWNS], stations)
@@ -131,7 +131,7 @@ def _local_slopes(unknowns: Array, stations: Array) -> Array:
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     turned = []
     for across in (first, np.cross(tangents, first)):
-        # A turn of the path by c du about an axis across it, at u
+        # At u, the path turns by c du about an axis perpendicular to it.
         lever = points[:, None] - places
         moved = np.cross(across, lever) * _CELL
         turned.append(np.where((stations[:, None] > cells)[..., None], moved, 0.0))

@@ -1,7 +1,7 @@
 """Bank of hypotheses of one needle: prediction by insertion, update by tips; compiled.
 
 Hypotheses that explain the tips badly lose weight and are removed; equal ones are merged. The
-insertion since the last tip waits in a queue, so that a late tip is applied at the place of its
+insertion since the last tip waits in a queue, so that a late tip is applied at the depth of its
 exposure. Angles of base and tip are relative to the start.
 """
 
@@ -38,15 +38,15 @@ AGE_TOLERANCE = 1e-9
 UNKNOWN_POSITION_STD = 0.02
 """Standard deviation of the position of a needle that starts without a tip [m]."""
 _LONGEST_STEP = 0.002
-"""Longer advances are divided [m]."""
+"""Length above which an advance is divided [m]."""
 _ENTRY_STD = 0.0005
 """Standard deviation of the tip's position along the needle with the stage at 0 [m]."""
 _SMALLEST_WEIGHT = 1.0 / 1000.0
-"""A hypothesis with a smaller weight, relative to the likeliest one, is removed."""
+"""Weight relative to the likeliest hypothesis below which a hypothesis is removed."""
 _NEWEST_SHARE = 0.1
 _SURVIVORS_PER_JUMP = 4
 _JUMP_TURN_VARIANCE = math.radians(2.0) ** 2
-"""Of the rotation in a displacement of phantom or tracker [rad^2]."""
+"""Variance of the rotation in a displacement of phantom or tracker [rad^2]."""
 
 
 @compiled
@@ -59,7 +59,7 @@ def start_needle(
     turn: float,
     assumed: Any,
 ) -> None:
-    """Start at a first tip; entry and initial rotation of `needle` are set already.
+    """Start at a first tip; entry and initial rotation of `needle` must already be set.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def _advance_all(
 
 @compiled
 def _advance_to_exposure(needle: Any, hypotheses: Records, age: float, assumed: Any) -> None:
-    """Advance the hypotheses to a tip's exposure; note if they are beyond it already."""
+    """Advance the hypotheses to a tip's exposure; record whether they are already beyond it."""
     pending, needle.pending, ahead = needle.pending, 0, -age
     for k in range(pending):
         ahead += needle.pending_length[k]
@@ -184,7 +184,7 @@ def _advance_to_exposure(needle: Any, hypotheses: Records, age: float, assumed: 
         if length > 0.0:
             share = take / length
         else:
-            # A rotation without insertion belongs to the place where it happened.
+            # A rotation without insertion belongs to the depth at which it happened.
             share = 1.0 if ahead > 0.0 or age <= AGE_TOLERANCE else 0.0
         if share > 1.0 - 1e-9:
             share = 1.0
@@ -226,7 +226,7 @@ def correct_needle(
     """Apply a measured tip.
 
     The events of the first centimetres are recorded. If they show that the tips are late, they are
-    replayed with tips of that age, which later tips have, too.
+    replayed with that age, which is assumed for later tips, too.
 
     Parameters
     ----------
@@ -237,9 +237,9 @@ def correct_needle(
     tip : ndarray, shape (3,)
         The tip [m]; NaN if it was not found.
     covariance : ndarray, shape (3, 3)
-        Its covariance [m^2] if `has_covariance`; otherwise its noise has the assumed bound.
+        Covariance of the tip [m^2] if `has_covariance`; otherwise the noise has the assumed bound.
     age : float
-        Stated insertion since its exposure [m].
+        Stated insertion since the exposure of the tip [m].
     """
     reading = new_reading()
     _set_reading(reading, tip, covariance, has_covariance, assumed)
@@ -362,8 +362,7 @@ def _add_jump_hypotheses(needle: Any, hypotheses: Records, reading: Reading, ass
     """Add copies of hypotheses for which the tip was an outlier, displaced to the tip.
 
     The likeliest come first, each with the weight of its jump. If the needle was not displaced,
-    they will be removed soon; if it was, the next tips will confirm them, and the others will be
-    removed.
+    they are soon removed; if it was, the next tips confirm them, and the others are removed.
     """
     survivors = needle.count
     room = min(hypotheses.size - survivors, 1 + survivors // _SURVIVORS_PER_JUMP)

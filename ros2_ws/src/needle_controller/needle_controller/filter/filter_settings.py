@@ -23,7 +23,7 @@ from needle_controller.model.kinematics import rotation_from_angles
 
 # Read by compiled code.
 PLAY, LAG, GAIN = range(3)
-"""Parameters of a torsion, of which each hypothesis estimates one."""
+"""Parameters of the torsion model; each hypothesis estimates one of them."""
 
 
 class TorsionHypothesis(NamedTuple):
@@ -100,7 +100,7 @@ class NoiseHypothesis(NamedTuple):
     weight : float
         Prior weight, relative to the others'.
     correlations : tuple of float
-        For `CORRELATED` noise, the correlation of an error with that of the tip before, for each
+        For `CORRELATED` noise, the correlation of an error with that of the previous tip, for each
         size, in [0, 1); empty for the others.
     """
 
@@ -189,7 +189,7 @@ class FilterSettings:
         Growth of the standard deviations of play [rad/sqrt(m)] and lag length [sqrt(m)] over a
         metre if they are estimated, which allows for effects beyond the model.
     torsion_hypotheses, roll_hypotheses, noise_hypotheses : tuple
-        All combinations are tried; at most one noise hypothesis of each shape.
+        Hypotheses, tried in all combinations; at most one noise hypothesis of each shape.
     """
 
     curvature: float = 1.0 / 0.122

@@ -1,7 +1,7 @@
 """Update of a hypothesis by a measured heading ([KC09] V); compiled.
 
-A sensor with five or six degrees of freedom measures the direction of the tip, and not its roll
-about it. As a tip, a heading may be an outlier.
+A sensor with five or six degrees of freedom measures the direction of the tip, but not the roll
+about it. Like a tip, a heading may be an outlier.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def update_by_heading(h: Any, heading: Array, assumed: Any, work: Workspace) -> 
     """Update a hypothesis by a heading; return its likelihood, relative to the claimed noise.
 
     With d the estimated heading and m the measured one, the true one is exp(w) d to first order in
-    the turn w of the error. v is the turn across d from d to m; along the tip's axes x and y,
+    the rotation error w. v is the rotation across d from d to m; along the tip's axes x and y,
 
         v x = w x + noise, v y = w y + noise.
 
@@ -51,7 +51,7 @@ def update_by_heading(h: Any, heading: Array, assumed: Any, work: Workspace) -> 
     sine = math.sqrt(x * x + y * y)
     stretch = math.atan2(sine, z) / sine if sine > 0.0 else 1.0
     for i in range(2):
-        # c = P H^T, less the reduction by the axis before
+        # c = P H^T, less the reduction by the previous axis
         by = r[0, i] * c[0, E_TURN] + r[1, i] * c[0, E_TURN + 1] + r[2, i] * c[0, E_TURN + 2]
         for k in range(ERROR):
             c[i, k] = -work.reduction[0] * by * c[0, k]

@@ -118,7 +118,7 @@ class HypothesisFilter:
         direction : array_like, shape (3,)
             Unit vector in `target_plane`, measured at the exposure of that tip.
         variance : float
-            Of its angle in each direction [rad^2].
+            Variance of its angle in each direction [rad^2].
         """
         self.needle["heading"] = [*np.asarray(direction, dtype=float), variance]
 

@@ -34,21 +34,21 @@ def hidden_age(
 ) -> float:
     """Return the hidden age of tips, in insertion [m]; 0 if it is not significant.
 
-    It is the intercept of a straight line through the missing insertion, beside the error of the
-    first tip; the slope of the line is the slip.
+    The age is the intercept of a straight line through the missing insertion, apart from the error
+    of the first tip; the slope of the line is the slip.
 
     Parameters
     ----------
     inserted : ndarray, shape (K,)
         Insertion since the first tip at each stated exposure [m].
     ways : ndarray, shape (K, 3)
-        From the first tip to each tip [m]; NaN if there is none.
+        Displacement from the first tip to each tip [m]; NaN if there is none.
     too_deep : float
-        Distance of the first tip beyond the place where the needle is known to enter [m].
+        Distance of the first tip beyond the known entry [m].
     entry_std : float
         Standard deviation of the entry [m]; infinite if it is not known.
     bound : float
-        Largest error claimed of a coordinate [m].
+        Largest claimed error of a coordinate [m].
     scale_spread : float
         Standard deviation of the insertion scale.
     """
@@ -81,7 +81,7 @@ def hidden_age(
         products += (at[k] - middle) * (missing[k] - mean)
         across += (missing[k] - mean) ** 2
     noise = max(across / number, least)
-    # missing = age + slip inserted, the slip with the prior N(0, scale_spread^2).
+    # missing = age + slip inserted, with the prior N(0, scale_spread^2) of the slip.
     slip_variance = 0.0
     if scale_spread > 0.0:
         slip_variance = 1.0 / (squares / noise + scale_spread**-2.0)

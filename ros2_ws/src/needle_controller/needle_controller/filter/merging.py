@@ -69,7 +69,7 @@ def _are_same(a: Any, b: Any) -> bool:
         and abs(a.play - b.play) < 0.5 * _SAME_ANGLE
         and abs(a.lag - b.lag) < _SAME_LAG
         and abs(a.gain - b.gain) < _SAME_GAIN
-        # Otherwise one of them has jumped.
+        # If the positions differ, one of them has jumped.
         and (a.position[0] - b.position[0]) ** 2 < max(a.covariance[0, 0], b.covariance[0, 0])
     )
 
@@ -84,7 +84,7 @@ def _join(a: Any, b: Any, difference: Array) -> None:
     s = b.weight / weight
     for k in range(3):
         difference[k] = b.position[k] - a.position[k]
-        # R_b R_a^T, a small turn, as a vector.
+        # R_b R_a^T, a small rotation, as a vector.
         left, right, turn = (k + 1) % 3, (k + 2) % 3, 0.0
         for m in range(3):
             turn += b.rotation[right, m] * a.rotation[left, m]

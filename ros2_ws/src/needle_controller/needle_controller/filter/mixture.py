@@ -29,13 +29,13 @@ WARNINGS = (
 )
 """Warnings of an estimate, in the order of their bits."""
 MAX_OUTLIER_PROBABILITY = 0.35
-"""Share of outliers among about the last ten tips."""
+"""Largest acceptable share of outliers among about the last ten tips."""
 LARGEST_NOISE = 3.0
-"""Noise, relative to the claimed one."""
+"""Largest acceptable noise, relative to the claimed one."""
 LARGEST_SLIP = 0.15
-"""Distance of the insertion scale from 1."""
+"""Largest acceptable distance of the insertion scale from 1."""
 HIDDEN_SHARE = 0.5
-"""Assumed systematic part of a claimed variance that the tips do not show."""
+"""Assumed systematic part of a claimed variance that the tips do not reveal."""
 _AT_LIMIT = 0.03
 _AMBIGUOUS_COSINE = math.cos(math.radians(60.0))
 _NO_MEAN_ROLL = 0.1
@@ -57,7 +57,7 @@ def estimate_needle(
     torsions : ndarray of TORSION, shape (K,), changed
         Mean over the hypotheses of each torsion.
     assumed : ASSUMPTIONS
-        As of `bank.advance_needle`.
+        As for `bank.advance_needle`.
     """
     every = predicted_hypotheses(needle, hypotheses, assumed)
     whole, best = 0.0, 0
@@ -81,7 +81,7 @@ def estimate_needle(
         bend -= w * h.curvature * r[0, 1]
         curvature += w * h.curvature
         scale += w * h.scale
-        # A turn w changes sin(pitch), the heading's x, by w_y heading_z - w_z heading_y.
+        # A rotation w changes sin(pitch), the heading's x, by w_y heading_z - w_z heading_y.
         x, y_y, z_z = h.position[0], p[E_TURN + 1, E_TURN + 1], p[E_TURN + 2, E_TURN + 2]
         x_x = p[0, 0] + assumed.model_error + _hidden_share(h, assumed) * needle.claimed[0]
         xx += w * (x_x + x * x)

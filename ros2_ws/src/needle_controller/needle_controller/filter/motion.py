@@ -26,7 +26,7 @@ _LARGEST_ROTATION = 1.5
 
 @compiled
 def rotation_factors(squared: float) -> tuple[float, float, float]:
-    """Return Rodrigues' factors sin(a)/a, (1 - cos(a))/a^2, (a - sin(a))/a^3 of a^2.
+    """Return Rodrigues' factors sin(a)/a, (1 - cos(a))/a^2, (a - sin(a))/a^3 for a^2.
 
     The series have relative errors up to 5e-8 for a <= 2.
     """
@@ -58,8 +58,8 @@ def turn_tip(
     tip, behind_play : float
         Initial angles of the tip and of the shaft behind the play [rad].
     per_size : float
-        Initial derivative of `tip` by the torsion parameter: by the lag length if there is one
-        [rad/m], otherwise by the play [-].
+        Initial derivative of `tip` with respect to the torsion parameter: the lag length if there
+        is one [rad/m], otherwise the play [-].
     base, turn : float
         Initial angle of the base, and its change [rad].
     length : float
@@ -88,7 +88,7 @@ def turn_tip(
     if length <= 0.0:
         # Without insertion, the tip does not follow.
         return tip, behind, per_size
-    # The play closes first; the ramp after it takes the rest of the length, q lags.
+    # The play closes first; the subsequent ramp takes the rest of the length, q lags.
     share = min(max(change / turn, 0.0), 1.0) if turn != 0.0 else 1.0
     decay, q = math.exp(-length / lag_length), length * share / lag_length
     if q < _SHORT_RAMP:
@@ -108,7 +108,8 @@ def advance_hypothesis(
 ) -> None:
     """Predict a hypothesis and its covariance by a motion of the base: P <- F P F^T + Q.
 
-    The pose is exact; its derivative by the curvature is correct up to (kappa length)^2.
+    The pose is exact; its derivative with respect to the curvature is correct up to (kappa
+    length)^2.
 
     Parameters
     ----------
@@ -211,7 +212,7 @@ def rotate(rotation: Array, x: float, y: float, z: float) -> None:
     a, b, _ = rotation_factors(squared)
     for k in range(3):
         r0, r1, r2 = rotation[0, k], rotation[1, k], rotation[2, k]
-        # exp(v^) r = r + a v x r + b v x (v x r), the last of which is v (v r) - r v^2
+        # exp(v^) r = r + a v x r + b v x (v x r), where v x (v x r) = v (v r) - r v^2
         along = x * r0 + y * r1 + z * r2
         rotation[0, k] = r0 + a * (y * r2 - z * r1) + b * (x * along - squared * r0)
         rotation[1, k] = r1 + a * (z * r0 - x * r2) + b * (y * along - squared * r1)

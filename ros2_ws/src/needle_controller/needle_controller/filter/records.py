@@ -48,14 +48,14 @@ HYPOTHESIS = np.dtype(
 )
 NEEDLE = np.dtype(
     [
-        ("count", np.int64),  # of its hypotheses
+        ("count", np.int64),  # number of hypotheses
         ("base", np.float64),  # rotation of the base since the start [rad]
-        ("start_turn", np.float64),  # and at the start [rad]
+        ("start_turn", np.float64),  # rotation of the base at the start [rad]
         ("outlier_probability", np.float64),  # probability that the last tip was an outlier
         ("mean_outlier_probability", np.float64),  # its running mean over the last tips
         ("tips", np.int64),  # number of tips used
-        ("claimed", np.float64, 3),  # variance of each coordinate of the last one [m^2]
-        ("tip_too_late", np.bool_),  # whether the last tip was older than the one before
+        ("claimed", np.float64, 3),  # variance of each coordinate of the last tip [m^2]
+        ("tip_too_late", np.bool_),  # whether the last tip was older than the previous one
         ("pending", np.int64),  # number of queued advances
         ("pending_length", np.float64, LONGEST_QUEUE),  # [m]
         ("pending_turn", np.float64, LONGEST_QUEUE),  # [rad]
@@ -80,7 +80,7 @@ EVENT = np.dtype(
         ("has_covariance", np.bool_),
         ("covariance", np.float64, (3, 3)),  # [m^2]
         ("age", np.float64),  # [m]
-        ("heading", np.float64, 4),  # as of a needle
+        ("heading", np.float64, 4),  # as in NEEDLE
     ]
 )
 ESTIMATE = np.dtype(
@@ -104,7 +104,7 @@ TORSION = np.dtype(
         ("roll", np.float64),  # mean direction [rad]
         ("agreement", np.float64),  # of the rolls, 0..1
         ("curvature", np.float64),  # [1/m]
-        ("tip_angle", np.float64),  # as of a hypothesis, likewise the next three
+        ("tip_angle", np.float64),  # as in HYPOTHESIS; likewise the next four
         ("behind_play", np.float64),
         ("play", np.float64),
         ("lag", np.float64),

@@ -2,19 +2,20 @@
 
 Several noise models are possible, each uniform within a bound or normal; the tip may also be an
 outlier, which carries no information. With uniform noise the tip lies in a box around the
-measurement, so the posterior of a Gaussian prior is that Gaussian truncated to the box. One
+measurement, so the posterior of a Gaussian prior is that Gaussian truncated to the box. For one
 coordinate after the other, the mixture over the models is replaced by the Gaussian of the same mean
 and variance (assumed-density filtering; truncated normals have these in closed form). The final
-estimate is the mixture of the updated and the old one, weighted by the probability of an outlier.
-A tip with a correlated covariance is split along directions in which its errors are independent.
+estimate is the mixture of the updated and the old one, weighted by the probability of an outlier. A
+tip with a correlated covariance is split along directions in which its errors are independent.
 
 If errors are correlated from tip to tip, e' = c e + sqrt(1 - c^2) w with w of variance R, the
-innovation less c times the residual of the tip before is
+innovation less c times the residual of the previous tip is
 
     d' - c d + sqrt(1 - c^2) w
 
-where d and d' are the errors of the estimate at both tips. A part of the variance of d', at most R,
-was there at the tip before, because no estimate is less certain than its tip; the rest is new.
+where d and d' are the errors of the estimate at both tips. Part of the variance of d', at most R,
+already existed at the previous tip, because no estimate is less certain than its tip; the rest is
+new.
 """
 
 # Numba functions take positional arguments: keywords are slow or unsupported.
@@ -46,7 +47,7 @@ _GIVEN_UP = 1e-3
 _REOPENED = 0.2
 _FAR = 5.5
 DENSITY = 1.0 / math.sqrt(2.0 * math.pi)
-"""Of a standard normal variable at 0."""
+"""Density of a standard normal variable at 0."""
 
 
 class Reading(NamedTuple):
@@ -63,7 +64,7 @@ class Reading(NamedTuple):
 class Workspace(NamedTuple):
     """Working memory of an update."""
 
-    cross_covariance: Array  # with the error, of each coordinate in turn, (3, 9)
+    cross_covariance: Array  # of each coordinate with the error, (3, 9)
     reduction: Array  # of the covariance by each coordinate, (3,)
     change: Array  # of the mean of the error, (9,)
     shares: Array  # probability of each noise model by each coordinate, (3, NOISES)
@@ -168,7 +169,7 @@ def _innovation(h: Any, reading: Reading, i: int, work: Workspace) -> tuple[floa
     # c = P u, u the direction of the reading in the position ...
     for k in range(ERROR):
         c[i, k] = ux * p[0, k] + uy * p[1, k] + uz * p[2, k]
-    # ... less the reduction by the coordinates before: (P - sum_b n_b c_b c_b^T) u.
+    # ... less the reduction by the previous coordinates: (P - sum_b n_b c_b c_b^T) u.
     for b in range(i):
         by = work.reduction[b] * (ux * c[b, 0] + uy * c[b, 1] + uz * c[b, 2])
         for k in range(ERROR):
@@ -199,7 +200,7 @@ def _weigh_noises(
     """
     bound, deviation, shape = reading.bounds[i], math.sqrt(variance), h.shape
     shares, noises = work.shares, assumed.noises
-    # Equal noise in all coordinates: continue with the probabilities of the coordinate before.
+    # Equal noise in all coordinates: continue with the probabilities of the previous coordinate.
     row = i if shape == CORRELATED else 0
     per_deviation, per_variance = 1.0 / deviation, 1.0 / variance
     claimed = max(bound * bound / 3.0, assumed.model_error)
@@ -285,7 +286,7 @@ def truncated_moments(lower: float, upper: float) -> tuple[float, float, float]:
     bell_upper = math.exp(-0.5 * above * above) if above < _FAR else 0.0
     tail_lower, tail_upper = bell_lower * tail_ratio(below), bell_upper * tail_ratio(above)
     bell_lower, bell_upper = DENSITY * bell_lower, DENSITY * bell_upper
-    # Differences of small tails are more accurate than of numbers near 1.
+    # Differences of small tails are more accurate than those of numbers near 1.
     if lower > 0.0:
         mass = tail_lower - tail_upper
     elif upper < 0.0:
@@ -332,7 +333,7 @@ def reduce_covariance(p: Array, outlier: float, work: Workspace) -> None:
 
 @compiled
 def apply_change(h: Any, outlier: float, assumed: Any, work: Workspace) -> None:
-    """Apply the change of the error; a torsion parameter has affected the tip's angle so far."""
+    """Apply the change of the error; a change of the torsion also changes the tip's angle."""
     inside, change = 1.0 - outlier, work.change
     for k in range(ERROR):
         change[k] *= inside

@@ -1,1 +1,1 @@
-"""From an estimate to the rotation of the next step."""
+"""Control laws: an estimate in, the rotation of the next step out."""

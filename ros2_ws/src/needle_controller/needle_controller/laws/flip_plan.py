@@ -1,7 +1,7 @@
 """A plan of flips: insertion depths at which the bevel is turned to the other side of the plane.
 
-Within the plane the needle bends to the side that the sign of cos(roll) says; turning the bevel
-over at planned depths lets it follow a path of arcs there (Reed et al., Integrated planning and
+Within the plane, the needle bends to the side given by the sign of cos(roll). Turning the bevel
+over at planned depths makes it follow a path of arcs (Reed et al., Integrated planning and
 image-guided control for planar needle steering, BioRob 2008), while the law keeps it in the plane.
 """
 
@@ -19,7 +19,7 @@ class FlipPlan:
     Attributes
     ----------
     depths : tuple of float
-        Increasing, above 0 [m]; none by default.
+        Depths in increasing order, above 0 [m]; none by default.
 
     Raises
     ------
@@ -39,7 +39,7 @@ class FlipPlan:
             before = depth
 
     def check_within(self, depth: float) -> None:
-        """Check that every flip comes before the needle's end.
+        """Check that every flip comes before the end of steering.
 
         Parameters
         ----------
@@ -56,12 +56,13 @@ class FlipPlan:
             raise OutOfBoundsError(f"flip {number}", self.depths[-1], 0.0, depth, "m")
 
     def bend_sign(self, insertion: float) -> float:
-        """Return the wanted sign of cos(roll), +1 or -1, from an insertion on.
+        """Return the desired sign of cos(roll), +1 or -1, at an insertion.
 
         Parameters
         ----------
         insertion : float
-            Insertion depth [m]; at a flip's own depth the sign is that after it, to 1 um.
+            Insertion depth [m]; at the depth of a flip, within 1 um, the sign is that after the
+            flip.
         """
         done = sum(depth <= insertion + DEPTH_TOLERANCE for depth in self.depths)
         return 1.0 if done % 2 == 0 else -1.0

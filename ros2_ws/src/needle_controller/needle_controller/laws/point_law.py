@@ -8,7 +8,7 @@ the uncertainty, shrinks to zero over the last centimetres, where errors can no 
 corrected. Each hypothesis then determines the turn of the base for that turn of the tip.
 """
 
-# Compiled code takes keywords slowly or not at all.
+# Compiled code handles keyword arguments slowly or not at all.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ class PointLaw:
         target : array_like, shape (3,)
             Target of the tip in the frame of the estimate [m]. It may move between calls.
         rotation_left : float
-            Remaining rotation of the base, in either direction [rad]: with less, it turns less
-            often.
+            Remaining rotation of the base, in either direction [rad]; the less remains, the less
+            often it turns.
         """
         known = hypotheses_of(estimate)
         turn, left = point_turn(

@@ -1,6 +1,6 @@
 """Path to a point, and the turn of the bevel for it; compiled. See `point_law`."""
 
-# Compiled code takes keywords slowly or not at all.
+# Compiled code handles keyword arguments slowly or not at all.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ class PointLawSettings(NamedTuple):
     max_rotation_per_length : float
         Maximum rotation of the base per inserted length [rad/m].
     max_winding : float
-        Limit of the base's angle in both directions; beyond it the base turns the other way [rad].
+        Limit of the base's angle in both directions; beyond it, the base turns in the other
+        direction [rad].
     reserve : float
         Share of the curvature kept in reserve: the bevel turns to the target before the arc to it
         needs the rest. A smaller reserve means fewer turns, and less room to correct errors.
@@ -40,7 +41,7 @@ class PointLawSettings(NamedTuple):
         Remaining insertion at which reserve and doubt are 0: no later turn can correct an error
         [m].
     last_turns_from : float
-        Remaining insertion from which both shrink to that [m].
+        Remaining insertion at which both begin to shrink [m].
     close_enough : float
         Dead band of the miss [m], at least half the standard deviation of the tip at the target.
     dead_band : float
@@ -80,8 +81,8 @@ def write_need(target: Array, need: Array) -> float:
     target : ndarray, shape (3,)
         Target in the frame of the tip [m].
     need : ndarray, shape (2,), written
-        Along x and y of the tip: half the curvature of the arc times its length squared, the
-        offset of the target from the heading if the arc is short [m].
+        Offset along x and y of the tip: half the curvature of the arc times its length squared,
+        which is the offset of the target from the heading if the arc is short [m].
     """
     across = math.hypot(target[0], target[1])
     need[:] = 0.0
@@ -201,9 +202,9 @@ def wanted_turn(
 def affordable_reserve(left: float, rotation_left: float, last_turn: float) -> float:
     """Return the reserve whose number of turns fits the rotation budget.
 
-    With a reserve r, the needle bends to the target and as far past that direction: the remaining
-    insertion falls by the factor sqrt(r / (2 - r)) from one half turn to the next. The affordable
-    half turns must reach the last turn.
+    With a reserve r, the needle bends to the target and equally far past that direction: the
+    remaining insertion falls by the factor sqrt(r / (2 - r)) from one half turn to the next. The
+    affordable half turns must reach the last turn.
 
     Parameters
     ----------
@@ -230,7 +231,7 @@ def turn_to(need: Array) -> float:
 def rest_after(
     need: Array, left: float, curvature: float, rate: float, length: float
 ) -> tuple[float, float]:
-    """Return the rest of a needed offset after a length at a constant rotation rate, (x, y) [m].
+    """Return the needed offset that remains after a length at a constant rotation rate, (2,) [m].
 
     To first order: with u the direction of the bevel, the integral of curvature u(s) (left - s) ds.
 
@@ -261,7 +262,7 @@ def rest_after(
 def better_end(need: Array, left: float, curvature: float, rate: float) -> float:
     """Return a quarter turn to the side that ends closer to the target, or 0 [rad].
 
-    For a target too near for the whole turn: no turn may be better.
+    For a target that is too near for the whole turn; no turn may be better.
     """
     best = 0.0
     missed = rest_after(need, left, curvature, 0.0, left)

@@ -2,9 +2,10 @@
 
 In the linearized state s of [KC09] (6), x and sin(pitch) are means over all hypotheses. Far from
 the plane, the desired pitch is the steepest from which the needle can level out with a share of its
-curvature; near it, it is proportional to the distance. The desired s3 turns the pitch to it, and
-the roll turns the shorter way to one of the two that have this s3. Each torsion determines the
-rotation of the base that turns the tip through play and lag; the mean over all torsions is used.
+curvature; near it, it is proportional to the distance. The desired s3 brings the pitch to it, and
+the tip takes the shorter turn to one of the two rolls that have this s3. Each torsion determines
+the rotation of the base that turns the tip through play and lag; the mean over all torsions is
+used.
 """
 
 # Numba functions take positional arguments: keywords are slow or unsupported.
@@ -41,7 +42,7 @@ class RollLawSettings(NamedTuple):
     max_rotation_per_length : float
         Largest rotation of the base per inserted length [rad/m].
     max_winding : float
-        Largest absolute angle of the base; beyond it, the turn goes the other way round [rad].
+        Largest absolute angle of the base; beyond it, the base turns in the other direction [rad].
     plane_gain : float
         Desired sin(pitch) per distance near the plane [1/m].
     pitch_gain : float
@@ -62,13 +63,13 @@ class RollLawSettings(NamedTuple):
         which hides its roll.
     scatter_dead_band : float
         Increase of the dead band in proportion to the disagreement of the hypotheses' rolls: a
-        needle that is not turned shows its roll soonest [rad].
+        needle that is not turned reveals its roll soonest [rad].
     near : float
         Distance from the plane within which `near_dead_band` holds [m].
     near_dead_band, far_dead_band : float
         Largest errors of the roll that are not corrected, which saves rotation [rad].
     largest_turn : float
-        Largest rotation for a single torsion in one step, before the mean [rad].
+        Largest rotation for a single torsion in one step, before averaging [rad].
     smallest_weight : float
         Torsions with a smaller weight, relative to the heaviest, are ignored.
     """
@@ -111,12 +112,12 @@ class RollLaw:
         Parameters
         ----------
         estimate : Estimate
-            Of the hypothesis filter; an estimate of another estimator is treated as one hypothesis
-            without torsion.
+            Estimate from the hypothesis filter; that of another estimator is treated as one
+            hypothesis without torsion.
         bend_sign : float
             Desired sign of cos(roll), the side to which the needle bends within the plane; 0 for
-            the nearer one. A change of sign is a turn by pi - 2 roll, which keeps the curvature
-            out of the plane.
+            the nearer one. A change of sign is a turn by pi - 2 roll, which preserves the component
+            of the curvature normal to the plane.
         """
         known, s = hypotheses_of(estimate), estimate.linearized
         turn, desired = roll_turn(
@@ -136,7 +137,7 @@ class RollLaw:
 def hypotheses_of(estimate: Estimate) -> Hypotheses:
     """Return the hypotheses of an estimate, or the estimate as the only one.
 
-    In the latter case the angle of the base is not known and assumed to be 0.
+    In the latter case, the angle of the base is unknown and assumed to be 0.
     """
     if estimate.hypotheses is not None:
         return estimate.hypotheses
@@ -215,7 +216,7 @@ def desired_bend(
     x, sin_pitch : float
         Distance from the plane [m] and sine of the pitch, over all hypotheses.
     uncertainty : ndarray, shape (3,)
-        Of both; see `Hypotheses`.
+        Uncertainty of both; see `Hypotheses`.
     t : TORSION
         A torsion.
     settings : RollLawSettings
@@ -264,7 +265,7 @@ def nearest_turn(
     wound : float
         Angle of the base [rad].
     max_winding : float
-        Limit of its absolute value [rad]; if every turn exceeds it, the one that unwinds is chosen.
+        Limit of that angle's absolute value [rad]; if every turn exceeds it, the base unwinds.
     """
     upright = math.asin(sine)
     best = cheapest = math.inf
@@ -321,7 +322,7 @@ def base_turn(t: Any, tip_turn: float, base: float, length: float) -> float:
         Inserted length of the step [m].
     """
     if t.lag > _SMALLEST_LAG:
-        # In one step the tip follows a share of the difference to the angle behind the play.
+        # In one step, the tip covers a share of the difference to the angle behind the play.
         goal = t.tip_angle + tip_turn / (1.0 - math.exp(-length / t.lag))
     elif tip_turn == 0.0:
         goal = t.behind_play

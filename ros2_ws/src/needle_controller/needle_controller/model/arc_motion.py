@@ -49,7 +49,7 @@ def left_jacobian(vector: npt.ArrayLike) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class RelativeMotion:
-    """End of a motion in the axes of its start.
+    """Pose at the end of a motion, in the axes of its start.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ def arc(length: npt.ArrayLike, turn: npt.ArrayLike, curvature: npt.ArrayLike) ->
     length : array_like, shape (...)
         Inserted length l [m].
     turn : array_like, shape (...)
-        Rotation theta of the tip about its axis over it [rad].
+        Rotation theta of the tip about its axis over that length [rad].
     curvature : array_like, shape (...)
         kappa [1/m].
     """
@@ -87,7 +87,7 @@ def arc(length: npt.ArrayLike, turn: npt.ArrayLike, curvature: npt.ArrayLike) ->
 
 
 def rodrigues_factors(squared: Array) -> tuple[Array, Array, Array]:
-    """Return Rodrigues' factors sin(a)/a, (1 - cos(a))/a^2, (a - sin(a))/a^3 of a^2."""
+    """Return Rodrigues' factors sin(a)/a, (1 - cos(a))/a^2, (a - sin(a))/a^3 for a^2."""
     q = np.asarray(squared, dtype=float)
     small = q < SERIES_BELOW
     safe = np.where(small, 1.0, q)

@@ -6,8 +6,8 @@ broadcast.
 
 s only represents |roll| < pi/2: a roll beyond +-90 deg has the s of its mirror image. The inverse
 of (7) divides by kappa cos(pitch) cos(roll), which is 0 there; `luenberger.saturate` keeps
-estimates off that boundary. The law and the observer hold u over a step and use (7) integrated over
-it (`law`, `luenberger`).
+estimates away from that boundary. The law and the observer hold u over a step and use (7)
+integrated over it (`law`, `luenberger`).
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def transition(length: npt.ArrayLike) -> Array:
     Returns
     -------
     ndarray, shape (..., 3, 3)
-        F; A is nilpotent, hence a polynomial in l.
+        F, a polynomial in l, since A is nilpotent.
     """
     length = np.asarray(length, dtype=float)[..., None, None]
     return np.asarray(np.eye(3) + A * length + (A @ A) * (0.5 * length**2))
@@ -143,7 +143,7 @@ def reduced_covariance(covariance: Array, reduced: Array, curvature: npt.ArrayLi
     Parameters
     ----------
     covariance : ndarray, shape (..., 3, 3)
-        Of s.
+        Covariance of s.
     reduced : ndarray, shape (..., 3)
         x [m], pitch, roll [rad]; the roll must not be +-90 deg.
     curvature : array_like, shape (...)
@@ -152,7 +152,7 @@ def reduced_covariance(covariance: Array, reduced: Array, curvature: npt.ArrayLi
     Returns
     -------
     ndarray, shape (..., 3, 3)
-        Of x [m], pitch and roll [rad].
+        Covariance of x [m], pitch and roll [rad].
     """
     pitch, roll = reduced[..., 1], reduced[..., 2]
     jacobian = np.zeros((*pitch.shape, 3, 3))

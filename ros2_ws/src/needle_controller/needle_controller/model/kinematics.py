@@ -2,7 +2,7 @@
 
 Paper symbols: q = (x, y, z, alpha, beta, gamma) are the coordinates (tip position, yaw, pitch,
 roll), r = (x, beta, gamma) the reduced state. All are in the frame `target_plane`, whose y-z plane
-is the desired one. Leading axes broadcast.
+is the desired plane. Leading axes broadcast.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Whether a needle can reach a plane or a point, and the smallest depth at which it can.
+"""Reachability of a plane or a point, and the smallest depth at which it can be reached.
 
 In the reduced model (5) of [KC09], with a free choice of the roll, the pitch changes by at most
 kappa per inserted length, and x by sin(pitch): a double integrator with |x''| <= kappa to first
@@ -28,7 +28,7 @@ from needle_controller.model.target_plane import TargetPlane
 from needle_core.errors import UserError
 
 LARGEST_PITCH = math.radians(80.0)
-"""Largest pitch on the way: beyond it the coordinates (3) fail, and no needle should go there."""
+"""Largest pitch along the path: beyond it the coordinates (3) fail; no needle should go there."""
 SHORTEST_CHECKED_DEPTH = 0.12
 """Depth of the insertions of [KC09] IV-B [m]; shorter runs count as parts of one."""
 
@@ -97,11 +97,11 @@ def least_insertion(
     Returns
     -------
     ndarray, shape (...)
-        [m]; NaN where the state is.
+        Least insertion [m]; NaN where the state is NaN.
     """
     reduced, curvature = np.asarray(reduced, dtype=float), np.asarray(curvature, dtype=float)
     x, pitch = reduced[..., 0], reduced[..., 1]
-    # Position after levelling out at once.
+    # Position after levelling out immediately.
     level_x = x + np.sign(pitch) * (1.0 - np.cos(pitch)) / curvature
     # Distance to the band around the plane; below it, the needle goes up first (+x).
     way = level_x - np.clip(level_x, -tolerance, tolerance)
@@ -146,7 +146,7 @@ def farthest_offsets(
 
 
 def check_plane(plane: TargetPlane, curvature: float, depth: float) -> None:
-    """Check that a needle that is still out can be steered into a plane.
+    """Check that a needle that is not yet inserted can be steered into a plane.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def _highest(pitch: Array, curvature: Array, length: Array) -> Array:
     top = np.minimum(0.5 * (curvature * length + pitch), limit)
     straight = length - (2.0 * top - pitch) / curvature
     offset = (np.cos(pitch) - 2.0 * np.cos(top) + 1.0) / curvature + straight * np.sin(limit)
-    # Levelling out at once from above takes pitch / kappa at least.
+    # Levelling out immediately takes at least |pitch| / kappa.
     possible = curvature * length >= np.abs(pitch) - 1e-12
     return np.asarray(np.where(possible, offset, np.nan))
 
@@ -196,23 +196,23 @@ def point_reachability(
     end: npt.ArrayLike,
     tolerance: float = 0.0,
 ) -> Reachability:
-    """Return whether a point can still be reached in the insertion that is left.
+    """Return whether a point can be reached within the remaining insertion.
 
     Parameters
     ----------
     target : array_like, shape (..., 3)
-        In the tip's frame [m].
+        Point in the tip's frame [m].
     curvature : array_like, shape (...)
         kappa [1/m].
     insertion, end : array_like, shape (...)
         Present insertion, and the one at which steering ends at the latest [m].
     tolerance : float
-        Distance from the point that counts as there, small beside 1 / kappa [m].
+        Distance at which the point counts as reached, small compared with 1 / kappa [m].
 
     Returns
     -------
     Reachability
-        The answer, and the least insertion at which the tip can be there; NaN where it never can.
+        Whether it can, and the least insertion at which it can; NaN where it never can.
     """
     depth = np.asarray(insertion, dtype=float) + least_insertion_to_point(
         target, curvature, tolerance=tolerance
@@ -223,10 +223,10 @@ def point_reachability(
 def least_insertion_to_point(
     target: npt.ArrayLike, curvature: npt.ArrayLike, *, tolerance: float = 0.0
 ) -> Array:
-    """Return the least insertion that brings a tip to a point, shape (...) [m]; NaN: none does.
+    """Return the least insertion from a tip to a point, shape (...) [m]; NaN if out of reach.
 
     A point beside or behind the tip, or one for which the needle would have to turn by more than
-    `LARGEST_PITCH`, counts as one that it cannot reach. Parameters as of `point_reachability`.
+    `LARGEST_PITCH`, counts as out of reach. Parameters as for `point_reachability`.
     """
     target = np.asarray(target, dtype=float)
     radius = 1.0 / np.asarray(curvature, dtype=float)
@@ -242,12 +242,12 @@ def least_insertion_to_point(
 
 
 def check_point(point: npt.ArrayLike, curvature: float, depth: float) -> None:
-    """Check that a needle that is still out could be steered to a point.
+    """Check that a needle that is not yet inserted can be steered to a point.
 
     Parameters
     ----------
     point : array_like, shape (3,)
-        In `rig` [m]: the needle enters at its origin, along z.
+        Point in `rig` [m]; the needle enters at the origin, along z.
     curvature : float
         kappa [1/m].
     depth : float
@@ -256,7 +256,7 @@ def check_point(point: npt.ArrayLike, curvature: float, depth: float) -> None:
     Raises
     ------
     UserError
-        The needle cannot come there: says why, and from where it could.
+        The point is out of reach; the message says why and, if only sideways, which entry would do.
     """
     x, y, z = (float(value) for value in np.asarray(point, dtype=float))
     named = f"target point ({x:.4g}, {y:.4g}, {z:.4g}) m cannot be reached"
@@ -276,7 +276,7 @@ def check_point(point: npt.ArrayLike, curvature: float, depth: float) -> None:
 
 
 def widest_at(ahead: float, curvature: float) -> float:
-    """Return how far to the side a needle gets at a distance > 0 ahead of it [m]."""
+    """Return the largest lateral offset that a needle reaches at a distance > 0 ahead of it [m]."""
     radius = 1.0 / curvature
     widest_arc = min(math.asin(min(ahead / radius, 1.0)), LARGEST_PITCH)
     straight = ahead - radius * math.sin(widest_arc)

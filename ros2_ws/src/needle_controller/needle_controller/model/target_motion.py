@@ -1,10 +1,11 @@
-"""Prediction of a moving target from where it was observed.
+"""Prediction of a moving target from its observed positions.
 
-Tissue drifts and breathes. Three models compete for the observed places: a random walk (the target
-may go anywhere, so it is expected where it was last observed), a drift, and a drift with a period
-and its first overtone. Drift and period are linear in their coefficients, which have Gaussian
-priors, so that evidence and prediction have closed forms (Bishop, Pattern Recognition and Machine
-Learning, 2006, section 3.5). The prediction is the mean of the models, weighted by their evidence.
+Tissue drifts and breathes. Three models compete to explain the observed positions: a random walk
+(the target may go anywhere, so it is expected where it was last observed), a drift, and a drift
+with a period and its first overtone. Drift and period are linear in their coefficients, which have
+Gaussian priors, so that evidence and prediction have closed forms (Bishop, Pattern Recognition and
+Machine Learning, 2006, section 3.5). The prediction is the mean of the models, weighted by their
+evidence.
 """
 
 from __future__ import annotations
@@ -21,26 +22,26 @@ from needle_controller.model.arrays import Array
 WINDOW = 20.0
 """Observations are kept for this long [s]."""
 SHORTEST = 3.0
-"""The target is expected where it was last observed until it was observed for this long [s]: half
-a breath, before which a breath looks like a drift."""
+"""Duration of observation below which the target is expected where it was last observed [s]: half a
+breath, before which a breath looks like a drift."""
 _BEGINS = (WINDOW, 0.5 * WINDOW, 0.25 * WINDOW)
-"""A motion may have begun this long ago, equally likely; before, the target walked [s]."""
+"""Equally likely times since the motion began; before, the target followed a random walk [s]."""
 _DRIFT_STD = (0.1, 0.001)
-"""Standard deviations of a drifting target's place [m] and speed [m/s] in each direction."""
+"""Standard deviations of a drifting target's position [m] and speed [m/s] in each direction."""
 _BREATH_STD = (0.1, 0.0001, 0.005, 0.005, 0.002, 0.002)
-"""The same of a breathing one, and of the cosine and sine of its period and overtone [m]."""
+"""The same for a breathing target, and for cosine and sine of its period and overtone [m]."""
 _SLOWEST, _FASTEST, _RATE_STEP = 0.08, 0.7, 0.004
 """Rates of breathing [Hz]."""
 _EVERY = 5
-"""Every so many of these rates is a model of its own while the likeliest is not known."""
+"""Stride between the rates that are separate models, in addition to the likeliest rate."""
 _OF_SAMPLING = 0.2
 """Fastest breathing as a share of the sampling rate: a faster overtone aliases."""
 _SCATTER = (1e-4, 3e-4, 1e-3)
-"""Standard deviations of what drift and breath leave unexplained, equally likely [m]."""
+"""Equally likely standard deviations of the motion beyond drift and breathing [m]."""
 _RATE_SCATTER = 1e-4
-"""The same where the likeliest rate is looked for [m]."""
+"""The same in the search for the likeliest rate [m]."""
 _WALK = (1e-3, 3e-3, 1e-2)
-"""Standard deviations of a random walk over 1 s, equally likely [m]."""
+"""Equally likely standard deviations of a random walk over 1 s [m]."""
 _MOST_SAMPLES = 80
 _TERMS = len(_BREATH_STD)
 
@@ -58,18 +59,18 @@ class TargetMotion:
 
     @property
     def last(self) -> Array:
-        """Place where it was last observed, shape (..., 3) [m].
+        """Last observed position, shape (..., 3) [m].
 
         Raises
         ------
         IndexError
-            Nothing was observed yet.
+            Nothing has been observed yet.
         """
         return self._points[-1]
 
     @property
     def seen(self) -> float:
-        """Time at which it was last observed [s]."""
+        """Time of the last observation [s]."""
         return self._times[-1]
 
     def see(self, time: float, points: npt.ArrayLike) -> None:
@@ -84,7 +85,7 @@ class TargetMotion:
         """
         if self._times and time <= self._times[-1]:
             self.forget()
-        # Not more often than the window needs: the last one may still be replaced.
+        # Limit the number of samples in the window by replacing the last one.
         spacing = WINDOW / _MOST_SAMPLES
         if len(self._times) > 1 and time - self._times[-2] < spacing:
             del self._times[-1], self._points[-1]
@@ -95,13 +96,13 @@ class TargetMotion:
         self._motion = None
 
     def forget(self) -> None:
-        """Forget all observations."""
+        """Discard all observations."""
         self._times.clear()
         self._points.clear()
         self._motion = None
 
     def at(self, time: npt.ArrayLike) -> Array:
-        """Return where the target is expected, shape (..., 3) [m].
+        """Return the expected position of the target, shape (..., 3) [m].
 
         Parameters
         ----------
@@ -117,7 +118,7 @@ class _Motion:
     """Models of targets that were observed at times (K,) [s] at points (K, ..., 3) [m].
 
     Each model has a rate (H, N) [Hz] and coefficients (H, N, T, 3), times its weight. The random
-    walk has none: all is relative to the last place.
+    walk has no coefficients, since all positions are relative to the last one.
     """
 
     def __init__(self, times: Array, points: Array) -> None:
@@ -136,7 +137,7 @@ class _Motion:
             self._rates[:, moving], self._coefficients[:, moving] = rates, coefficients
 
     def at(self, time: Array) -> Array:
-        """Return where the targets are expected [m]."""
+        """Return the expected positions of the targets [m]."""
         ahead = np.broadcast_to(time - self._end, self._shape).reshape(-1)
         moved = np.einsum("hnt,hntc->nc", _terms(ahead, self._rates), self._coefficients)
         return np.asarray((self._last + moved).reshape(*self._shape, 3))
@@ -163,7 +164,7 @@ def _weighted_models(since: Array, samples: Array) -> tuple[Array, Array]:
 def _models(since: Array, samples: Array) -> Iterator[tuple[Array, Array, Array]]:
     """Yield rates (H, 1 or N) [Hz], log evidence (H, N), coefficients (H, N, T, 3).
 
-    First rest and drift, then breaths.
+    Rest and drift come first, then breathing.
     """
     still = np.zeros((1, 1))
     for std in (_DRIFT_STD[:1], _DRIFT_STD):
@@ -184,8 +185,8 @@ def _fit(since: Array, rates: Array, samples: Array, std: tuple[float, ...]) -> 
     """Return log evidence (H, N), coefficients (H, N, T, 3) of models of samples (N, K, 3).
 
     Terms X, prior N(0, S^2) of the coefficients and scatter s give the samples the covariance
-    X S^2 X' + s^2, and the coefficients the mean S (S X'X S + s^2)^-1 S X'y. The eigenvalues of
-    S X'X S serve every s. Rates have shape (H, 1), for all targets, or (H, N).
+    X S^2 X' + s^2, and the coefficients the mean S (S X'X S + s^2)^-1 S X'y. The eigenvalues of S
+    X'X S are the same for every s. Rates have shape (H, 1), for all targets, or (H, N).
     """
     scale = np.array(std)
     scaled = _terms(since, rates[..., None])[..., : len(std)] * scale
@@ -209,7 +210,7 @@ def _fit(since: Array, rates: Array, samples: Array, std: tuple[float, ...]) -> 
 
 
 def _walk_evidence(since: Array, samples: Array) -> Array:
-    """Return log densities of a random walk's steps, (N, S, K); the first is the place's."""
+    """Return log densities of a random walk's steps, (N, S, K); the first is the position's."""
     variance = np.square(_WALK)[:, None] * np.diff(since)
     steps = np.sum(np.diff(samples, axis=1) ** 2, axis=2)[:, None]
     log = -1.5 * np.log(2.0 * math.pi * variance) - 0.5 * steps / variance
@@ -223,8 +224,8 @@ def _log_mean(logs: Array) -> Array:
 
 
 def _likeliest_rates(since: Array, samples: Array, rates: Array) -> Array:
-    """Return each target's likeliest rate, (N,) [Hz]; between those given, too."""
-    # The prior as further rows: an observation of each coefficient, 0 to one standard deviation.
+    """Return each target's likeliest rate, interpolated between the given rates, (N,) [Hz]."""
+    # Append the prior as rows: each coefficient is observed as 0 with its standard deviation.
     scaled = _terms(since, rates[:, None]) * np.array(_BREATH_STD)
     prior = np.broadcast_to(_RATE_SCATTER * np.eye(_TERMS), (len(rates), _TERMS, _TERMS))
     q, r = np.linalg.qr(np.concatenate([scaled, prior], axis=1))
@@ -240,7 +241,7 @@ def _likeliest_rates(since: Array, samples: Array, rates: Array) -> Array:
 
 
 def _terms(time: Array, rate: Array) -> Array:
-    """Return the terms of a motion, (..., T): a place, a drift, a period and its overtone."""
+    """Return the terms of a motion, (..., T): a position, a drift, a period and its overtone."""
     phase = 2.0 * np.pi * rate * time
     one = np.ones_like(phase)
     return np.stack(

@@ -42,7 +42,7 @@ class TargetPlane:
         return float(self.T_rig_plane[:3, 0] @ self.T_rig_plane[:3, 3])
 
     def from_rig(self, position: npt.ArrayLike) -> Array:
-        """Return positions in `target_plane` of positions in `rig`, shape (..., 3) [m]."""
+        """Transform positions in `rig` to `target_plane`, shape (..., 3) [m]."""
         shifted = np.asarray(position, dtype=float) - self.T_rig_plane[:3, 3]
         return np.asarray(shifted @ self.T_rig_plane[:3, :3])
 
@@ -91,7 +91,7 @@ def plane_from_pose(
     transform[:3, :3] = rotation_from_quaternion(q / norm)
     transform[:3, 3] = origin
     plane = TargetPlane(transform)
-    # The entering needle's sine of pitch in the plane's coordinates.
+    # Sine of the entering needle's pitch in the plane's coordinates.
     if abs(transform[2, 0]) > np.sin(np.deg2rad(80.0)):
         angle = np.rad2deg(np.arcsin(min(1.0, abs(transform[2, 0]))))
         raise UserError(f"the needle enters at {angle:.0f} deg to target_plane, limit 80 deg")

@@ -1,1 +1,1 @@
-"""Estimators of the needle's state, and what an estimator is to the rest."""
+"""Estimators of the needle's state, and their common interface."""

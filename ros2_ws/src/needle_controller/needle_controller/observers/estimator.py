@@ -15,7 +15,7 @@ from needle_controller.model.kinematics import REDUCED, angles_from_rotation, ro
 
 @dataclasses.dataclass(frozen=True)
 class Hypotheses:
-    """Estimate over several hypotheses, as far as laws need it.
+    """Estimate over several hypotheses: the part that the laws need.
 
     Attributes
     ----------
@@ -98,9 +98,9 @@ def pose_estimate(
     rotation : array_like, shape (3, 3)
         Orientation: the heading is the last column, the needle bends to -y.
     curvature : float
-        Of the needle's path [1/m].
+        Curvature of the needle's path [1/m].
     covariance : array_like, shape (6, 6)
-        Of x, y, z [m], yaw, pitch, roll [rad].
+        Covariance of x, y, z [m], yaw, pitch, roll [rad].
     warnings : tuple of str
         Warnings for the user.
     """

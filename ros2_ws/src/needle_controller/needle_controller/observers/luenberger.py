@@ -293,7 +293,7 @@ def correct_observer(
     age : float
         Insertion since its exposure [m].
     gain : tuple of float
-        L, of `sampled_observer_gain` over the insertion since the last correction.
+        L, from `sampled_observer_gain` over the insertion since the last correction.
     model : ObserverModel
         Assumptions.
     """

@@ -1,1 +1,1 @@
-"""Paths to a target point round obstacles, for a needle of given curvature and bounded turns."""
+"""Paths to a target point around obstacles, for a needle of given curvature and bounded turns."""

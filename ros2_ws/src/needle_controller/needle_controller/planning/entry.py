@@ -1,4 +1,4 @@
-"""Paths of a needle that is still out: whether there is one, and from which entries there are."""
+"""Paths of a needle before insertion: whether one exists, and for which entries."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def entry_state(
     curvature : float
         kappa [1/m].
     rotation : float
-        Of the base [rad].
+        Rotation of the base [rad].
     x, y : float
         Position of the entry, relative to the rig's entry point [m].
     pitch, yaw : float
@@ -52,11 +52,11 @@ def entry_state(
 def first_path(
     planner: PathPlanner, entry: TipState, target: npt.ArrayLike, obstacles: Obstacles
 ) -> NeedlePath | str:
-    """Return the path of a needle that is still out, or the reason why there is none.
+    """Return the path of a needle that is not yet inserted, or the reason why there is none.
 
     If the quick search finds no path and the flood fill does not rule one out, the thorough search
-    follows. The reason tells a proof ("no path is clear") from a failed search ("was found clear"),
-    and names an entry with a path if one is near.
+    follows. The reason distinguishes a proof ("no path is clear") from a failed search ("was found
+    clear"), and names a nearby entry with a path, if any.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def first_path(
     entry : TipState
         The needle's tip.
     target : array_like, shape (3,)
-        In `rig` [m].
+        Target in `rig` [m].
     obstacles : Obstacles
         Obstacles to avoid.
     """
@@ -98,7 +98,7 @@ def first_path(
 def nearest_entry(
     planner: PathPlanner, entry: TipState, target: npt.ArrayLike, obstacles: Obstacles
 ) -> Array | None:
-    """Return the nearest entry (x, y) [m], on rings around one, from which there is a path.
+    """Return the nearest entry (x, y) [m], on rings around a given one, from which there is a path.
 
     The parameters are those of `first_path`. Heading and rotation stay the same.
     """

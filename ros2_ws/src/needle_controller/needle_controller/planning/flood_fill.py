@@ -12,8 +12,8 @@ every curve whose curvature nowhere exceeds kappa:
   blocked.
 
 A cell of the grid stands for all points within rho of its middle: lengths are uncertain by rho, and
-directions by asin(rho / length). The needle always moves forward, less than 90 deg off its heading
-at the entry.
+directions by asin(rho / length). The needle always moves forward, within 90 deg of its heading at
+the entry.
 """
 
 # Numba functions take positional arguments: keywords are slow or unsupported.
@@ -31,7 +31,7 @@ from needle_controller.planning.path_evaluation import PathProblem
 from needle_core.compiled import compiled
 
 _PLANES_APART = 0.010
-"""Largest distance of two planes [m], over which a needle bends 0.1 mm aside."""
+"""Largest distance between two planes [m], over which a needle bends 0.1 mm sideways."""
 _CELL = 0.0005
 _UNCERTAIN = _CELL / math.sqrt(2.0)
 """rho, the distance of a cell's corners from its middle [m]."""
@@ -60,7 +60,7 @@ def may_have_path(problem: PathProblem) -> bool:
 @compiled
 def _fill(goal: Array, curvature: float, capsules: Array, tolerance: float) -> bool:
     """Return whether the fill reaches the target; all in the entry's axes, with z the heading."""
-    # Paths end in a ball around the target, at the latest at its first plane.
+    # Paths end in a ball around the target: fill up to the first plane that touches it.
     depth = goal[2] - tolerance
     planes = math.ceil(depth / _PLANES_APART)
     aside = _sag(_distance(_ENTRY, goal) + tolerance, curvature) + 4.0 * (tolerance + _CELL)

@@ -35,11 +35,11 @@ class Leg(NamedTuple):
     Attributes
     ----------
     turn : float
-        Of the bevel at its start [rad].
+        Turn of the bevel at the start of the leg [rad].
     turning, bend, straight : float
         Lengths of the helix during the turn, of the arc, and of the straight line [m].
     curvature : float
-        Of the arc [1/m].
+        Curvature of the arc [1/m].
     miss : float
         Distance by which the leg misses the aim; 0 if it leads there [m].
     gentle_miss : float
@@ -62,7 +62,7 @@ def advance_pose(pose: Array, length: float, turn: float, curvature: float, move
     Parameters
     ----------
     pose, moved : ndarray, shape (3, 4)
-        Before and after; may be the same array.
+        Poses before and after; may be the same array.
     length : float
         Inserted length [m].
     turn : float
@@ -95,7 +95,7 @@ def in_tip_axes(pose: Array, aim: Array) -> tuple[float, float, float]:
     Parameters
     ----------
     pose : ndarray, shape (3, 4)
-        The tip's.
+        Pose of the tip.
     aim : ndarray, shape (3,)
         The point.
     """
@@ -117,7 +117,7 @@ def leg_towards(pose: Array, aim: Array, curvature: float, share: float, turn_ra
     Parameters
     ----------
     pose : ndarray, shape (3, 4)
-        Of the tip.
+        Pose of the tip.
     aim : ndarray, shape (3,)
         Position of the aim [m].
     curvature : float
@@ -145,7 +145,7 @@ def leg_towards(pose: Array, aim: Array, curvature: float, share: float, turn_ra
                 break
     gentle = 2.0 * aside / (aside * aside + ahead * ahead)
     if abs(change) >= _TURN_FOUND and gentle < curvature * share and ahead > 0.0:
-        # Almost ahead: the needle would pass it while the bevel turns, so the bevel alternates.
+        # The aim is almost ahead and would be passed during the turn, so the bevel alternates.
         angle = 2.0 * math.atan2(aside, ahead)
         return Leg(first, 0.0, angle / gentle, 0.0, gentle, 0.0, 0.0)
     aside, turning = math.hypot(x, y), abs(turn) / turn_rate
@@ -162,7 +162,7 @@ def leg_towards(pose: Array, aim: Array, curvature: float, share: float, turn_ra
 
 @compiled
 def truncated(leg: Leg, longest: float) -> Leg:
-    """Return a leg that ends after at most a length [m]."""
+    """Return a leg, cut off at a largest length [m]."""
     turning = min(leg.turning, longest)
     turn = leg.turn
     if turning < leg.turning:
@@ -182,7 +182,7 @@ def leg_length(leg: Leg) -> float:
 def trace_leg(
     pose: Array, leg: Leg, curvature: float, length: float, points: Array, end: Array
 ) -> int:
-    """Compute the corners of a chain along a leg; return their number.
+    """Compute the corners of a polyline along a leg; return their number.
 
     Parameters
     ----------

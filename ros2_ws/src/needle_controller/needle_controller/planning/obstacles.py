@@ -32,7 +32,7 @@ MOST_OBSTACLES = 64
 FARTHEST = 1.0
 """Largest coordinate [m]; larger values suggest another unit."""
 LARGEST_RADIUS = 0.2
-# Of visualization_msgs/Marker.
+# Types and actions of visualization_msgs/Marker.
 SPHERE, CYLINDER = 2, 3
 _DELETE, _DELETEALL = 2, 3
 _ROUND = 1e-3
@@ -50,7 +50,7 @@ class Obstacle(NamedTuple):
     start, end : sequence of float
         Ends of the axis in `rig` [m].
     radius : float
-        Of the capsule [m].
+        Radius of the capsule [m].
     """
 
     start: Sequence[float] | Array
@@ -64,12 +64,12 @@ class Obstacles:
     Parameters
     ----------
     obstacles : sequence of Obstacle
-        In `rig`; messages number them from 1 on.
+        Obstacles in `rig`; error messages number them from 1.
 
     Attributes
     ----------
     table : ndarray, shape (N, 7)
-        Ends of the axis and radius of each [m].
+        Ends of the axis and radius of each obstacle [m].
 
     Raises
     ------
@@ -94,12 +94,12 @@ class Obstacles:
         return len(self.table)
 
     def clearance(self, position: npt.ArrayLike) -> float:
-        """Return a point's distance from the nearest surface [m]: < 0 inside, inf without any.
+        """Return a point's distance from the nearest surface [m]: < 0 inside, inf if there is none.
 
         Parameters
         ----------
         position : array_like, shape (3,)
-            In `rig` [m].
+            Position in `rig` [m].
         """
         point = np.asarray(position, dtype=float)
         nearest = math.inf
@@ -112,7 +112,7 @@ class Obstacles:
 def obstacles_from_markers(message: Markers) -> Obstacles:
     """Return the obstacles of a message: its SPHERE and CYLINDER markers.
 
-    A cylinder counts as the capsule around it. Markers that delete others, for RViz, are ignored.
+    A cylinder counts as the capsule around it. Deletion markers, which are for RViz, are ignored.
 
     Raises
     ------

@@ -19,7 +19,7 @@ from needle_controller.planning.obstacles import segment_distance
 from needle_core.compiled import compiled
 
 _MARGIN_PRICE, _MISS_PRICE, _VIOLATION_PRICE = 4.0, 5.0, 100.0
-"""Additional path length that is worth a unit of clearance up to `preferred_margin`, of distance
+"""Additional path length equivalent to a unit of clearance up to `preferred_margin`, of distance
 from the target, and of violated constraints."""
 
 
@@ -32,27 +32,27 @@ class PathSettings(NamedTuple):
     max_rotation_per_length : float
         Largest rotation of the bevel per inserted length [rad/m].
     curvature_share : float
-        Share of the curvature that paths are planned with; the rest is left for corrections.
+        Share of the curvature used for planning; the rest is left for corrections.
     gentle_share : float
         Preferred largest share of the curvature on the last leg.
     needle_radius : float
-        Of the needle [m].
+        Radius of the needle [m].
     sigmas : float
-        Number of standard deviations of the position that must be clear, beside the needle's
+        Number of standard deviations of the position that must be clear in addition to the needle's
         radius.
     tracking_std : float
         Standard deviation of the distance between the needle and its path [m].
     correction_length : float
         Insertion over which an initial error is observed and corrected [m].
     committed_length : float
-        Length over which a path must be clear of what is known now [m]. The rest is planned again,
-        with new observations, before the needle is there.
+        Length over which a path must be clear for the present estimate [m]. The rest is replanned
+        with new observations before the needle gets there.
     preferred_margin : float
         Preferred clearance beyond the required one [m].
     goal_tolerance : float
         Largest distance of a path's end from the target [m].
     longest : float
-        Largest length of a path from the entry on [m].
+        Largest length of a path from the entry [m].
     """
 
     max_rotation_per_length: float
@@ -79,9 +79,9 @@ class PoseUncertainty(NamedTuple):
     Attributes
     ----------
     position_std : float
-        Of the tip, across the needle [m].
+        Standard deviation of the tip across the needle [m].
     heading_std : float
-        Of its heading [rad].
+        Standard deviation of its heading [rad].
     """
 
     position_std: float
@@ -124,7 +124,7 @@ class PathEvaluation(NamedTuple):
     Attributes
     ----------
     length : float
-        Of the whole path.
+        Length of the whole path.
     margin : float
         Least clearance beyond the required one; inf without obstacles.
     near_margin : float
@@ -165,7 +165,7 @@ def required_clearance(
 def chain_margin(
     points: Array, count: int, table: Array, uncertainty: PoseUncertainty, settings: PathSettings
 ) -> float:
-    """Return the least clearance of a chain beyond the required one [m].
+    """Return the least clearance of a polyline beyond the required one [m].
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def chain_margin(
     table : ndarray, shape (N, 7)
         See `Obstacles`.
     uncertainty : PoseUncertainty
-        At length 0.
+        Uncertainty of the pose at length 0.
     settings : PathSettings
         Requirements.
     """

@@ -1,9 +1,9 @@
-"""Plans a needle's path to a target around obstacles, again at every step.
+"""Planner of a needle's path to a target around obstacles, which replans at every step.
 
 The needle follows the path by the law for points (turn the bevel towards the target), with the next
 via point as the target. The previous plan is continued from the present pose while its beginning is
 clear and no other plan is better by `_BETTER_BY`: a plan that changes with the noise of every tip
-would turn the bevel for nothing.
+would turn the bevel unnecessarily.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class NeedlePath:
     legs : ndarray, shape (K, 4)
         Aim of each leg in `rig`, and its length [m]. The last aim is the target.
     insertion : float
-        At the beginning of the path [m].
+        Insertion at the beginning of the path [m].
     length, margin, near_margin, gentle_miss, violation, cost : float
-        See `PathEvaluation` [m]. A path with a violation is only followed for want of another.
+        See `PathEvaluation` [m]. A path with a violation is only followed if there is no other.
     """
 
     legs: Array
@@ -80,7 +80,7 @@ class TipState:
     Attributes
     ----------
     position : ndarray, shape (3,)
-        In `rig` [m].
+        Position in `rig` [m].
     rotation : ndarray, shape (3, 3)
         Orientation in `rig`: the heading is the last column.
     curvature : float
@@ -112,7 +112,7 @@ class PathPlanner:
     Raises
     ------
     OutOfBoundsError
-        A rotation rate that is too small for plans.
+        A rotation rate that is too small for planning.
     """
 
     def __init__(self, settings: PathSettings) -> None:
@@ -133,21 +133,22 @@ class PathPlanner:
     ) -> NeedlePath | None:
         """Return the path to follow; None if none is found.
 
-        A needle that is still out needs a path without violations. Later the best path is followed
-        even with one, while its beginning is clear: new tips may show that the rest is, too.
+        A needle that is not yet inserted needs a path without violations. Later, the best path is
+        followed even with a violation while its beginning is clear: new tips may show that the rest
+        is clear, too.
 
         Parameters
         ----------
         tip : TipState
             Present tip.
         target : array_like, shape (3,)
-            In `rig` [m].
+            Target in `rig` [m].
         obstacles : Obstacles
             Obstacles to avoid.
         insertion : float
             Present insertion [m].
         previous : NeedlePath, optional
-            Path followed up to now.
+            Path followed so far.
         starts : int
             Largest number of starts of the search.
 
@@ -162,14 +163,14 @@ class PathPlanner:
             return path
         if previous is None:
             return None
-        # Use the whole curvature, of which a share was kept for this case.
+        # Use the whole curvature; a share of it was reserved for this case.
         problem = problem._replace(curvature=tip.curvature)
         return self._best(problem, insertion, previous, starts)
 
     def _best(
         self, problem: PathProblem, insertion: float, previous: NeedlePath | None, starts: int
     ) -> NeedlePath | None:
-        """Return the path of least cost; None if the beginning of none is clear."""
+        """Return the path of least cost; None if no path has a clear beginning."""
         legs = np.array([[*problem.target, math.inf]])
         best = kept = _evaluated(legs, problem, insertion)
         if previous is not None:
@@ -190,7 +191,7 @@ class PathPlanner:
         return min(clear, key=lambda path: path.cost - bonus * (path is kept), default=None)
 
     def trace(self, path: NeedlePath, tip: TipState) -> Array:
-        """Return the corners of a chain along a path from a tip, shape (N, 3) [m]."""
+        """Return the corners of a polyline along a path from a tip, shape (N, 3) [m]."""
         settings, pose, corners = self.settings, tip.pose, np.empty((MOST_POINTS, 4))
         curvature = settings.curvature_share * tip.curvature
         share = settings.gentle_share / settings.curvature_share
@@ -202,7 +203,7 @@ class PathPlanner:
         return np.concatenate(parts)
 
     def warm_up(self) -> None:
-        """Compile the code that planning runs, which would delay the first steps otherwise."""
+        """Compile the planning code, which would otherwise delay the first steps."""
         tip, target = TipState(np.zeros(3), np.eye(3), 1.0), np.array([0.0, 0.0, 0.01])
         problem = self._problem(tip, target, Obstacles(), 0.0)
         may_have_path(problem)

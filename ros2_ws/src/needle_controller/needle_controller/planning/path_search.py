@@ -12,8 +12,8 @@ via points, with its default constants and without derivatives:
     sigma <- sigma exp(c_s / 2 (|s| / E|N(0, I)| - 1))
 
 It finds narrow passages that random samples miss, because every candidate, even one that touches an
-obstacle, shows the direction of better ones. The draws z depend only on the number of the start, so
-the same problem has the same solution.
+obstacle, indicates the direction of better ones. The draws z depend only on the number of the
+start, so the same problem has the same solution.
 """
 
 # Numba functions take positional arguments: keywords are slow or unsupported.
@@ -35,18 +35,18 @@ _Indices = npt.NDArray[np.int64]
 QUICK_STARTS, THOROUGH_STARTS = 3, 250
 """Starts of the search at every step (about 10 ms), and before insertion if those fail (2 s)."""
 _PATHS = 10
-"""lambda, paths of a generation, of a quick start; the others have twice as many, which find more
-per start (A. Auger, N. Hansen, "A restart CMA evolution strategy with increasing population size",
-2005)."""
+"""lambda, number of paths per generation of a quick start; other starts have twice as many and find
+more per start (A. Auger, N. Hansen, "A restart CMA evolution strategy with increasing population
+size", 2005)."""
 _GENERATIONS = 60
 _SPREAD, _LEAST_SPREAD = 0.004, 1e-5
-"""sigma at the start, and at which the search ends [m]."""
+"""Initial sigma, and sigma at which the search ends [m]."""
 _SHORTEST_LEG = 0.01
 """Least length of a leg to a via point [m]: half a turn of the bevel takes 6 mm."""
 _WIDTH = 0.03
 """Width of the tube around the straight line in which searches start [m]."""
 _PLACES = 1.1127756842787055 ** -np.arange(1.0, 2 * MOST_VIA_POINTS + 1)
-"""Steps of the R sequence in 6 dimensions (M. Roberts 2018), of which g^7 = g + 1."""
+"""Steps of the R sequence in 6 dimensions (M. Roberts 2018), where g^7 = g + 1."""
 
 
 def initial_legs(tip: Array, target: Array, number: int) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Estimators of other packages, tried when they are loaded and checked at every step."""
+"""Estimators of other packages, tested when they are loaded and checked at every step."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ class OwnEstimator:
     part : OwnPart
         The estimator.
     settings : SteeringSettings
-        Of the controller.
+        Settings of the controller.
     initial_rotation : array_like, shape (3, 3)
         Orientation at the entry with the base's rotation at 0, in `target_plane`.
     entry : array_like, shape (3,), optional
         Entry point in `target_plane` [m]; None if it is not known.
     rng : numpy.random.Generator
-        Source of all randomness of the estimator.
+        Source of all randomness in the estimator.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class OwnEstimator:
             self._own.correct(np.array(tip, dtype=float), matrix, float(age))
 
     def correct_heading(self, direction: npt.ArrayLike, variance: float) -> None:
-        """Pass a heading measured with the tip of the next `correct`, if the estimator takes it."""
+        """Pass a heading measured with the tip of the next `correct`, if the estimator uses it."""
         if method := getattr(self._own, "correct_heading", None):
             with self._part.errors_in("correct_heading"):
                 method(np.array(direction, dtype=float), float(variance))
@@ -110,8 +110,8 @@ def tried_estimator(name: str) -> OwnPart:
     Raises
     ------
     OwnPartError
-        As of `own_part`; also if the estimator raises, returns an invalid estimate, loses a needle
-        whose tips are exact, fails at a missing tip, or transforms wrongly with the plane.
+        As for `own_part`; also if the estimator raises, returns an invalid estimate, loses a needle
+        whose tips are exact, fails at a missing tip, or transforms incorrectly to another plane.
     """
     part = own_part("estimator", name)
     settings = SteeringSettings()

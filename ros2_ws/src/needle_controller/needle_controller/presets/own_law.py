@@ -1,4 +1,4 @@
-"""Control laws of other packages, tried when they are loaded and limited to the rig's rotation."""
+"""Control laws of other packages, tested when they are loaded and limited in rotation rate."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class OwnLaw:
     part : OwnPart
         The law.
     settings : SteeringSettings
-        Of the controller.
+        Settings of the controller.
     """
 
     def __init__(self, part: OwnPart, settings: SteeringSettings) -> None:
@@ -69,7 +69,7 @@ def tried_law(name: str) -> OwnPart:
     Raises
     ------
     OwnPartError
-        As of `own_part`; also if the law raises, or does not return a rotation rate.
+        As for `own_part`; also if the law raises, or does not return a rotation rate.
     """
     part = own_part("law", name)
     law = OwnLaw(part, SteeringSettings())

@@ -1,6 +1,6 @@
 """Estimators, laws and planners of other packages, found by their entry points.
 
-A package offers one in its pyproject.toml, and plane_controller, `monte_carlo`, `rerun` and
+A package declares one in its pyproject.toml, and plane_controller, `monte_carlo`, `rerun` and
 `simulate` select it by name:
 
     [project.entry-points."needle_controller.estimators"]
@@ -147,7 +147,7 @@ def check_registered(kind: str, name: str) -> EntryPoint:
     Raises
     ------
     OwnPartError
-        No package offers it, or several do.
+        No package provides it, or several do.
     """
     offered = sorted(entry_points(group=GROUPS[kind]), key=lambda one: one.name)
     # A package may be on the path twice.
@@ -167,12 +167,12 @@ def check_registered(kind: str, name: str) -> EntryPoint:
 def own_part(kind: str, name: str) -> OwnPart:
     """Return a loaded part that has the methods of its kind.
 
-    The parameters are those of `check_registered`, which raises, too.
+    The parameters are those of `check_registered`, whose errors are raised, too.
 
     Raises
     ------
     OwnPartError
-        A module that cannot be imported, an object that is no class, or a missing method.
+        A module that cannot be imported, an object that is not a class, or a missing method.
     """
     entry = check_registered(kind, name)
     origin = f"{_package(entry)}, {entry.value}"

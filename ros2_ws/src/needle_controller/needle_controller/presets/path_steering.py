@@ -1,4 +1,4 @@
-"""Steering to a point along a planned path, by the planner here or that of another package."""
+"""Steering to a point along a planned path, by the built-in planner or that of another package."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Route:
     length : float or None
         Length of the whole path [m]; None if `aim` is the target.
     points : ndarray, shape (N, 3)
-        Corners of a chain along the path in `rig`, from the tip to its end [m].
+        Corners of a polyline along the path in `rig`, from the tip to its end [m].
     """
 
     aim: Array
@@ -52,7 +52,7 @@ class OwnPlanner:
     part : OwnPart
         The planner.
     settings : SteeringSettings
-        Of the controller.
+        Settings of the controller.
     """
 
     def __init__(self, part: OwnPart, settings: SteeringSettings) -> None:
@@ -90,7 +90,7 @@ def tried_planner(name: str) -> OwnPart:
     Raises
     ------
     OwnPartError
-        As of `own_part`; also if the planner raises, or returns an invalid route.
+        As for `own_part`; also if the planner raises, or returns an invalid route.
     """
     part = own_part("planner", name)
     settings = SteeringSettings()
@@ -118,17 +118,17 @@ def configured_obstacles(settings: SteeringSettings) -> Obstacles:
 
 
 class PathSteering:
-    """Steers one needle past obstacles.
+    """Steers one needle around obstacles.
 
     Parameters
     ----------
     settings : SteeringSettings
-        Of the rig.
+        Settings of the rig.
 
     Attributes
     ----------
     path : NeedlePath or None
-        Present path; None with another package's planner, which plans again at every step.
+        Present path; None with another package's planner, which replans at every step.
     last_route : Route or None
         Route of the last command; None if no path was clear.
     """
@@ -144,12 +144,12 @@ class PathSteering:
         self.last_route: Route | None = None
 
     def find_first(self, target: Array, obstacles: Obstacles, rotation: float) -> str:
-        """Find the first path of a needle that is out; return why there is none, empty if found.
+        """Find the first path before insertion; return why there is none, empty if found.
 
         Parameters
         ----------
         target : ndarray, shape (3,)
-            In `rig` [m].
+            Target in `rig` [m].
         obstacles : Obstacles
             Obstacles to avoid.
         rotation : float
@@ -183,11 +183,11 @@ class PathSteering:
         Parameters
         ----------
         estimate : Estimate
-            In `plane`.
+            Estimate in `plane`.
         plane : TargetPlane
             Frame of the estimate.
         target : ndarray, shape (3,)
-            In `rig` [m].
+            Target in `rig` [m].
         obstacles : Obstacles
             Obstacles to avoid.
         insertion : float
@@ -218,7 +218,7 @@ class PathSteering:
 
 
 def tip_state(estimate: Estimate, plane: TargetPlane) -> TipState:
-    """Return the tip of an estimate in a plane's frame, in `rig`."""
+    """Transform the tip of an estimate from a plane's frame to `rig`."""
     turn, shift = plane.T_rig_plane[:3, :3], plane.T_rig_plane[:3, 3]
     variance = np.maximum(np.diagonal(estimate.covariance), 0.0)
     across, heading = max(variance[X], variance[X + 1]), max(variance[PITCH], variance[YAW])

@@ -33,7 +33,7 @@ LawToPoint = Callable[..., SteeringCommand]
 class ArrivalPrediction:
     """Prediction of the target's position at the arrival of the needle.
 
-    A study predicts several needles that advance alike: times, lengths and points then have one
+    A study predicts several needles that advance equally: times, lengths and points then have one
     row per needle.
 
     Parameters
@@ -99,7 +99,7 @@ class PointSteering(ArrivalPrediction):
     Parameters
     ----------
     settings : SteeringSettings
-        Settings of the law; `SteeringSettings.check_steers_to_points` accepts them.
+        Settings of the law, which must pass `SteeringSettings.check_steers_to_points`.
     motion : TargetMotion
         Observed motion of the target, in `rig`; times are seconds of the tips' clock.
     """
@@ -147,7 +147,7 @@ def point_law(settings: SteeringSettings) -> LawToPoint:
 
 
 def prompt_point_law(settings: SteeringSettings) -> LawToPoint:
-    """Return the law for points that turns the bevel at once, as planned paths require."""
+    """Return the law for points that turns the bevel immediately, as planned paths require."""
     if settings.law:
         return point_law(settings)
     return PointLaw(

@@ -44,8 +44,7 @@ class SteeringSettings:
     Raises
     ------
     UserError
-        A value out of its bounds, weights without stable gains, or settings that exclude each
-        other.
+        A value out of its bounds, weights without stable gains, or mutually exclusive settings.
     """
 
     preset: str = parameter(

@@ -1,1 +1,1 @@
-"""The step protocol: when the needle is moved, by what data, and when not."""
+"""The step protocol: when the needle is moved, and based on which data."""

@@ -17,7 +17,7 @@ from needle_controller.observers.estimator import Estimate
 MAX_MISS_PROBABILITY = 0.05
 """Probability of missing the target by `NEAR` above which the final position is doubtful."""
 _95_PERCENT = 1.959964
-"""Half the interval that contains 95 % of a normal distribution [standard deviations]."""
+"""Half-width of the interval with 95 % of a normal distribution [standard deviations]."""
 _NORMAL_POINTS = scipy.special.ndtri(qmc.Sobol(3, scramble=False).random(512)[1:])
 """Evenly spread points of the standard normal distribution, shape (511, 3)."""
 
@@ -56,10 +56,10 @@ def assess_confidence(estimate: Estimate, miss_probability: float | None = None)
     Parameters
     ----------
     estimate : Estimate
-        Of the needle.
+        Estimate of the needle.
     miss_probability : float, optional
         At the end of steering, the probability that the tip is more than `NEAR` from plane or
-        point; None on the way.
+        point; None before the end.
     """
     x, std = float(estimate.coordinates[X]), math.sqrt(max(float(estimate.covariance[X, X]), 0.0))
     low, high = x - _95_PERCENT * std, x + _95_PERCENT * std
@@ -81,9 +81,9 @@ def point_miss_probability(offset: Array, covariance: Array) -> Array:
     Parameters
     ----------
     offset : ndarray, shape (..., 3)
-        From the point to the estimated tip [m].
+        Vector from the point to the estimated tip [m].
     covariance : ndarray, shape (..., 3, 3)
-        Of the tip [m^2].
+        Covariance of the tip [m^2].
     """
     values, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(values, 0.0))[..., np.newaxis, :]

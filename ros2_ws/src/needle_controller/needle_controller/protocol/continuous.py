@@ -1,13 +1,14 @@
 """Continuous insertion: each tip renews a path ahead, which is recomputed every step length.
 
 A path gives the base's rotation over insertion, whatever the speed. Its points do not depend on
-the time at which it is sent: it begins where a tip was used; one step length on, the rotation that
-the law commands is complete; from there on the base does not turn until the next tip is used. So
-the delay from exposure to command loses no rotation; it only bends the way to it.
+the time at which it is sent: it begins where a tip was used; after one step length, the rotation
+that the law commands is complete; beyond that, the base does not turn until the next tip is used.
+So the delay from exposure to command loses no rotation; it only changes the path to it.
 
 A tip is used once the needle has advanced by a step length since the last used one, and at the end
 of the path. Other tips show that the camera works and renew the path's stamp. At rest or at low
-speed they measure one place and their errors may be equal, so nothing depends on their number.
+speed, they measure the same position and their errors may be equal, so nothing depends on their
+number.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from needle_core.status_messages import DeviceStatus
 _STEP_SHARE = 1.0 - 1e-3
 """Share of a step length after which a tip is used."""
 _END_TOLERANCE = 1e-5
-"""Distance from the end of the path at which it counts as reached [m]: an axis rests beside it."""
+"""Distance from the end of the path at which it counts as reached [m]: an axis rests near it."""
 _SAMPLES_PER_STEP = 4
 """Intermediate joint samples per step length, where rotation was not proportional to insertion."""
 
@@ -46,7 +47,7 @@ def make_steering(settings: SteeringSettings) -> Steering:
 
 
 class PathAhead:
-    """Path from one used tip on.
+    """Path ahead of one used tip.
 
     Parameters
     ----------
@@ -85,7 +86,7 @@ class PathAhead:
         """Return the points of `SendPath` for a needle at an insertion [m]."""
         start, knot = self.start, self._knot
         end = max(min(insertion + self._settings.horizon, self.end), knot.insertion)
-        # A path never begins ahead of the needle, even if the needle went back.
+        # A path never begins ahead of the needle, even if the needle moved back.
         begin = min(start.insertion, insertion)
         places = [(begin, start.rotation), (knot.insertion, knot.rotation)]
         if end > knot.insertion:
@@ -94,7 +95,7 @@ class PathAhead:
 
 
 class ContinuousSteering(Steering):
-    """The protocol of one needle that moves as long as a person holds.
+    """Protocol of one needle that moves continuously while the hold lasts.
 
     States and rejections are those of stepwise insertion.
     """

@@ -13,10 +13,10 @@ CONFIRMED_BY = 5
 LARGEST_GAP_NS = 1_000_000_000
 """Longest time between two consistent samples [ns]."""
 _MAX_INSERTION_SPEED, _MAX_ROTATION_SPEED = 0.05, 30.0
-"""Of a needle pushed by hand [m/s], and of a motor [rad/s]."""
+"""Speeds of a needle pushed by hand [m/s], and of a motor [rad/s]."""
 _INSERTION_NOISE, _ROTATION_NOISE = 2e-4, 0.1  # [m], [rad]
 _LONGEST_MOTION = 0.04
-"""Longest motion that may happen between two samples [s]."""
+"""Longest duration of a motion between two samples [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +72,7 @@ class JointHistory:
     Attributes
     ----------
     rejected : int
-        Number of samples that were inconsistent with the one before.
+        Number of samples that were inconsistent with the previous one.
     problem : str
         Why the last sample is held back; empty if it was accepted.
     """

@@ -17,9 +17,9 @@ MAX_ABORTS_AT_REST = 10
 MAX_UNFOLLOWED_STEPS = 3
 """Consecutive steps, reported as succeeded but not executed, after which it gives up."""
 _ARRIVED_INSERTION, _ARRIVED_ROTATION = 1e-5, 1e-2
-"""Distance of both joints from the step's end at which the step has ended [m], [rad]."""
+"""Distance of both joints from the step's end at which it counts as reached [m], [rad]."""
 _STANDSTILL_SAMPLES = 5
-"""Samples at one place, sent after the device's answer, that show a standstill."""
+"""Samples at one position, sent after the device's answer, that show a standstill."""
 _MEDIAN_OF = 5
 """Samples whose median is the needle's insertion, so that two spikes do not count as motion."""
 _FEWEST_SAMPLES = 3
@@ -28,7 +28,7 @@ _SAME_ROTATION = 0.1
 
 
 class StepOutcome(enum.Enum):
-    """Outcome of a step, as the joints show it."""
+    """Outcome of a step according to the joints."""
 
     PENDING = "pending"
     ARRIVED = "arrived"
@@ -36,7 +36,7 @@ class StepOutcome(enum.Enum):
 
 
 class StepMonitor:
-    """Checks by the joints' stamps whether a step that the device reports as done was executed.
+    """Checks from the joints' stamps whether a step that the device reports as done was executed.
 
     Joints that were sent before the answer do not show a standstill, however late they arrive:
     they may have been sampled before the motion.
@@ -75,7 +75,7 @@ class StepMonitor:
         """
         step = self.step
         for known in joints.after(step.stamp_ns):
-            # Farther than the end has arrived, too: a needle pushed by hand overshoots.
+            # A position beyond the end counts as arrived: a needle pushed by hand overshoots.
             short = step.insertion - known.insertion
             turn = abs(step.rotation - known.rotation)
             if short <= _ARRIVED_INSERTION and turn <= _ARRIVED_ROTATION:
@@ -139,7 +139,7 @@ class FailureCounter:
 
 
 class RetractionMonitor:
-    """Detects retraction: after it, the needle must be out before it is steered again.
+    """Detects retraction, after which the needle must be withdrawn before it is steered again.
 
     The model holds for forward insertion only. After a jump of the joints, whose motion was not
     observed, steering may resume once the joints are back where they were.
@@ -154,7 +154,7 @@ class RetractionMonitor:
 
     @property
     def reason(self) -> str:
-        """Reason to draw the needle out before it is steered; empty if there is none."""
+        """Reason to withdraw the needle before it is steered; empty if there is none."""
         if self._retracted:
             return "the needle was retracted: withdraw it first"
         if self._before is not None and self._after is not None:
@@ -178,7 +178,7 @@ class RetractionMonitor:
         Parameters
         ----------
         insertion : float
-            Of the needle [m].
+            Insertion of the needle [m].
         out_below : float
             Largest insertion at which the needle counts as out [m].
         tolerance : float
@@ -206,9 +206,9 @@ class RetractionMonitor:
         Parameters
         ----------
         before, after : JointSample
-            Joint positions before and after it.
+            Joint positions before and after the jump.
         tolerance : float
-            Insertion within which the joints are back [m].
+            Difference of insertion within which the joints are back [m].
 
         Returns
         -------
@@ -256,8 +256,7 @@ class Watchdog:
     def check_silence(self, steady: float, timeout: float) -> list[Action]:
         """Log once that no message of the device has arrived for `timeout` [s].
 
-        There is no further reaction: a simulation that a person pauses is as silent as a driver
-        that has ended.
+        There is no further reaction: a paused simulation is as silent as a driver that has ended.
         """
         if self._received_since is None:
             self._received_since = steady

@@ -32,7 +32,7 @@ from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.tip_checks import TipCovariance
 
 LARGEST_START_ROLL = math.radians(80.0)
-"""For presets whose coordinates are limited to roll +-90 deg [rad]."""
+"""Largest initial roll for presets whose coordinates are limited to roll +-90 deg [rad]."""
 HEADING_CORRELATION = 0.01
 """Inserted length over which measured headings count as one, because errors of the sensor's
 alignment and registration repeat [m]: harmless up to 10 mrad (60 needles each)."""
@@ -46,13 +46,13 @@ class ControlUpdate:
     Attributes
     ----------
     estimate : Estimate
-        In `target_plane`.
+        Estimate in `target_plane`.
     command : SteeringCommand
-        For the next step.
+        Command for the next step.
     turned : float
         Rotation of the base since the first tip [rad].
     reach : Reachability
-        Of the plane, or the point.
+        Reachability of the plane, or the point.
     miss_probability : float, optional
         Probability that the tip is more than 1 mm from the plane, or from the expected position
         of the point; None if the estimator reports none.
@@ -87,7 +87,7 @@ class PlaneControl:
     Attributes
     ----------
     obstacles : Obstacles
-        Obstacles on the way to a point; they may change at any time.
+        Obstacles on the path to a point; they may change at any time.
     """
 
     def __init__(self, settings: SteeringSettings, plane: TargetPlane) -> None:
@@ -128,12 +128,12 @@ class PlaneControl:
             self.observe_target_point(point, 0.0)
 
     def observe_target_point(self, point: Array, time: float) -> None:
-        """Add an observation of the target point, whose motion is predicted from all of them.
+        """Add an observation of the target point, whose motion is predicted from all observations.
 
         Parameters
         ----------
         point : ndarray, shape (3,)
-            In `rig` [m].
+            Point in `rig` [m].
         time : float
             Time of the observation on the clock of the tips [s].
         """
@@ -150,7 +150,7 @@ class PlaneControl:
         if self._joints is None:
             self._estimator, self._law = _new_controller(settings, self._plane)
         else:
-            # The new estimator starts at the present pose, with the base turned as it is.
+            # The new estimator starts at the present pose, with the present rotation of the base.
             now, joints = self._estimator.estimate(), self._joints
             unturned = rotation_from_angles([0.0, 0.0, -joints.rotation])
             self._estimator, self._law = make_controller(settings, now.rotation @ unturned)
@@ -168,7 +168,7 @@ class PlaneControl:
         self._restart_point_steering()
 
     def restart(self) -> None:
-        """Forget the needle: the next tip is the first."""
+        """Discard the state of the needle: the next tip is the first."""
         self._estimator, self._law = _new_controller(self._settings, self._plane)
         self._joints = self._first_joints = None
         self._rotation = 0.0
@@ -212,7 +212,7 @@ class PlaneControl:
         covariance : TipCovariance, optional
             Covariance of the tip in `rig`; the configured one by default. `measurement_std`
             squared is added, for errors that repeat from tip to tip and errors of the model: a
-            filter that trusts micrometres would hold on to a wrong roll.
+            filter that trusts micrometres would keep a wrong roll.
         intermediate : sequence of JointSample
             Joint positions since the last tip, where rotation was not proportional to insertion.
 
@@ -266,7 +266,7 @@ class PlaneControl:
         self._estimator.correct(position, matrix)
 
     def reason_without_path(self, rotation: float) -> str:
-        """Return why no path leads a needle that is out to its point; empty if one does.
+        """Return why a needle before insertion has no path to its point; empty if it has one.
 
         Parameters
         ----------
@@ -295,7 +295,7 @@ class PlaneControl:
 
     @property
     def _is_planned(self) -> bool:
-        """Whether a path is planned: past obstacles, and always with another package's planner."""
+        """Whether a path is planned: with obstacles, and always with another package's planner."""
         return len(self.obstacles) > 0 or self._settings.planner != ""
 
     def _reach(self, estimate: Estimate, joints: JointSample) -> Reachability:
@@ -312,7 +312,7 @@ class PlaneControl:
         return float(point_miss_probability(offset, estimate.covariance[:3, :3]))
 
     def _warm_up(self) -> None:
-        """Compile the code that updates run, which would delay the first steps otherwise."""
+        """Compile the code of updates, which would otherwise delay the first steps."""
         settings, length = self._settings, self._settings.step_length
         estimator, law = make_controller(settings, np.eye(3))
         estimator.reset(np.zeros(3), np.zeros(2))
@@ -329,7 +329,7 @@ class PlaneControl:
 
 
 def _new_controller(settings: SteeringSettings, plane: TargetPlane) -> tuple[Estimator, StepLaw]:
-    """Return estimator and law of a needle that is out, at the origin of `rig` along its z axis."""
+    """Return estimator and law of a needle before insertion, at the origin of `rig` along z."""
     return make_controller(settings, plane.T_plane_rig[:3, :3], plane.from_rig(np.zeros(3)))
 
 

@@ -33,9 +33,9 @@ def reason_not_to_start(
     joints : JointSample or None
         Present joint positions.
     withdrawal : str
-        Why the needle must be drawn out first; empty if it need not be.
+        Why the needle must be withdrawn first; empty if it need not be.
     control : PlaneControl
-        Estimator and law, for the roll at the entry and the path past obstacles.
+        Estimator and law, for the roll at the entry and the path around obstacles.
     settings : SteeringSettings
         Settings of the protocol.
     """

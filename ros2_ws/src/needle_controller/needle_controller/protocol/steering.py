@@ -178,14 +178,14 @@ class Steering:
         return self._on_abort("step", f"step {self.step + 1}", text)
 
     def on_recorded_step(self, stamp_ns: int, end: JointSample) -> None:
-        """Replace a sent step by a recorded one: its command's stamp [ns] and its end."""
+        """Replace a sent step with a recorded one, given its command's stamp [ns] and its end."""
         if self._sent is not None:
             self._sent = SendStep(stamp_ns, end.insertion, end.rotation, self._sent.duration)
 
     def on_device(self, status: DeviceStatus) -> list[Action]:
         """Handle the driver's status."""
         if not status.hold_owner:
-            # A release is not a failure, and an operator who presses again has looked.
+            # A release is not a failure: reset the failure count.
             self._failures.reset()
         self._device = status
         actions = self.watchdog.on_device_message()
@@ -266,7 +266,7 @@ class Steering:
             return []
         latest = self.tips.joints.latest
         if self._step_monitor is None and latest is not None:
-            # Any motion was over by then.
+            # Any motion had ended by the latest sample.
             self.tips.accept_after(latest.stamp_ns)
         self.awaiting = Awaiting.TIP
         self.watchdog.restart()
@@ -370,7 +370,7 @@ class Steering:
         return [step]
 
     def _on_joint_jump(self, before: JointSample, sample: JointSample) -> list[Action]:
-        """Handle joints that are at another place, or time, without an observed motion."""
+        """Handle joints that have jumped in position or time without an observed motion."""
         settings, gap = self.settings, (sample.stamp_ns - before.stamp_ns) * 1e-9
         tolerance = settings.retraction_tolerance
         if gap > 0.0 and sample.is_near(before, settings.step_length + tolerance, math.inf):

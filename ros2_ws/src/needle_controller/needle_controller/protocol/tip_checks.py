@@ -1,4 +1,4 @@
-"""Checks of measured tips: which of them may be used for steering."""
+"""Checks that decide whether a measured tip may be used for steering."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LARGEST_SCALE = 1.15
 STAMP_AHEAD_NS = 1_000_000_000
 """Largest time by which a tip's stamp may be ahead of the joints [ns]."""
 _ASYMMETRY = 1e-9
-"""Largest difference across the diagonal of a covariance, as a share of its largest entry."""
+"""Largest difference across the diagonal of a covariance, relative to its largest entry."""
 
 
 class TipFault(enum.Enum):
@@ -69,9 +69,9 @@ class TipCovariance:
     frame_id : str
         Frame of the covariance; must be `rig`.
     matrix : ndarray, shape (3, 3)
-        Of the position [m^2]; infinite if no tip was found.
+        Covariance of the position [m^2]; infinite if no tip was found.
     heading : Heading, optional
-        None if it is not measured.
+        Measured heading, if any.
     """
 
     stamp_ns: int
@@ -113,7 +113,7 @@ class AcceptedTip:
     Attributes
     ----------
     tip : TipMeasurement
-        As received.
+        Tip as received.
     joints : JointSample
         Joint positions at its exposure.
     covariance : TipCovariance or None
@@ -135,7 +135,7 @@ class RejectedTip:
 
 
 def check_message(tip: TipMeasurement, last: AcceptedTip | None) -> RejectedTip | None:
-    """Check what does not depend on the joints; return the rejection, or None.
+    """Check a tip independently of the joints; return the rejection, or None.
 
     Parameters
     ----------

@@ -24,12 +24,12 @@ from needle_controller.protocol.tip_checks import (
 )
 
 SETTLED_BY = 4
-"""Consecutive tips, near one another but far from the last used tip, that end its authority."""
+"""Consecutive tips, near one another but far from the last used tip, that supersede it."""
 _QUEUE_LENGTH = 64
 _MOVED_SHARE, _MOVED_ROTATION = 0.1, 2e-2
-"""Motion since a tip's exposure from which on the tip is outdated [step lengths], [rad]."""
+"""Motion since a tip's exposure above which the tip is outdated [step lengths], [rad]."""
 _JOINTS_LATE_NS = 100_000_000
-"""Largest time by which a rejected tip's stamp may be ahead of the joints to count [ns]."""
+"""Largest lead of a rejected tip's stamp over the joints that counts as plausible [ns]."""
 
 
 class TipQueue:
@@ -44,7 +44,7 @@ class TipQueue:
     last : AcceptedTip or None
         The last tip that was used.
     after_ns : int
-        Only a tip exposed after this is used [ns].
+        Time after which a tip must have been exposed to be used [ns].
     rejected : Counter
         Number of rejected tips of each `TipFault`.
     """
@@ -144,7 +144,7 @@ class TipQueue:
         )
 
     def is_outdated(self, step_length: float) -> bool:
-        """Return whether the needle has moved so far [m] that a later tip is needed; require it."""
+        """Return whether the needle moved too far for the last tip; if so, require a later one."""
         latest = self.joints.latest
         if latest is None or self.last is None:
             return False
@@ -159,7 +159,7 @@ class TipQueue:
         self._jumped.clear()
 
     def forget_stamps(self) -> None:
-        """Discard everything that has a stamp, after the clock has gone back."""
+        """Discard everything that has a stamp, after the clock was set back."""
         self.clear()
         self.covariances.clear()
         self.last = None
@@ -209,7 +209,7 @@ class TipQueue:
 
     def _enqueue(self, tip: TipMeasurement) -> None:
         queue = self._queue
-        # A topic keeps its order, so earlier tips with a later stamp had a wrong one.
+        # A topic keeps its order, so earlier tips with a later stamp had a wrong stamp.
         while queue and queue[-1].stamp_ns > tip.stamp_ns:
             text = "a tip with an earlier exposure arrived after it"
             self._count(RejectedTip(queue.pop(), TipFault.AHEAD_OF_JOINTS, text))

@@ -1,1 +1,1 @@
-"""plane_controller's ROS side."""
+"""ROS executable of plane_controller."""

@@ -14,7 +14,7 @@ from needle_tracker.filter.measurement import Measurement, NoTip, TrackState
 Image = NDArray[np.uint8]
 
 CLEAR = 0.5
-"""Expected ends, or mean probability of shaft, above which a view shows them."""
+"""Expected number of ends, or mean shaft probability, above which a view shows it."""
 IN_ENTRY_ZONE = "in the entry zone"
 _BY_VIEWS = {
     (False, False): NoTip.NOTHING.value,
@@ -40,7 +40,7 @@ def shows_shaft(end: ImageEnd | None) -> bool:
 
 
 def missing(measured: Measurement) -> str:
-    """Return the reason for no tip, empty with a tip; one in the entry zone does not count."""
+    """Return why a pair has no tip; empty if it has one outside the entry zone."""
     if measured.state is TrackState.ENTRY:
         return IN_ENTRY_ZONE
     if measured.tip is not None:
@@ -65,7 +65,7 @@ def annotate(left: Image, right: Image, measured: Measurement) -> Image:
     -------
     ndarray of uint8, shape (rows, columns, 3)
         RGB, at half size: left and right side by side, each above its description, and a line of
-        text. Green: a clear end; yellow: an unclear end; red: found but not believed.
+        text. Green: a clear end; yellow: an unclear end; red: found but rejected.
     """
     views = [
         _view(image, end, measured.tip is not None)
@@ -97,7 +97,7 @@ def describe(measured: Measurement) -> str:
 
 
 def describe_view(end: ImageEnd | None) -> str:
-    """Return one line of text: expected ends and probability of shaft in a view."""
+    """Return one line of text: expected number of ends and shaft probability in a view."""
     return "nothing found" if end is None else f"end {end.ends:.2f}, shaft {end.shaft:.2f}"
 
 
@@ -119,6 +119,6 @@ def _view(image: Image, end: ImageEnd | None, believed: bool) -> Image:
 
 
 def _fixed(points: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return fixed-point coordinates in the small image of points in the full one."""
+    """Convert points in the full image to fixed-point coordinates in the small one."""
     small = (points + 0.5) * _SCALE - 0.5
     return np.round(np.clip(small, -1e4, 1e4) * (1 << _SHIFT)).astype(np.int32).reshape(-1, 1, 2)

@@ -12,8 +12,8 @@ from needle_tracker.filter.measurement import Measurement, TrackState
 from needle_tracker.sources.pairing import OTHER_SIDE, PairMatcher
 
 TROUBLE_SHOWN = 5.0  # duration of a warning after its cause [s]
-CLOCKS_DIFFER = 1_000_000_000  # time of a pair before the first joint state that is a fault [ns]
-PARTNER_LATE = 0.5  # an image without a partner is reported after [s]
+CLOCKS_DIFFER = 1_000_000_000  # lead of a pair over the first joint state that is a fault [ns]
+PARTNER_LATE = 0.5  # delay before an image without a partner is reported [s]
 _RATE_WINDOW = 5.0  # [s]
 _NOTHING_YET = Measurement(None, TrackState.SEARCHING, "no images yet")
 _EXCHANGE = "exchange stereo_camera's parameters left and right, or the cables"

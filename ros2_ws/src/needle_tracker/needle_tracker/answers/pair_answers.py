@@ -24,7 +24,7 @@ from needle_tracker.tracker_parameters import StereoTrackerParameters
 
 SUSPICION = "left and right images seem to be swapped: exchanged, they show a needle"
 _NEW_RECORDING = 1_000_000_000  # a longer step back in time begins a new recording [ns]
-# Consecutive pairs without a tip before the first check, pairs of a check, period of the checks.
+# Consecutive pairs without a tip before the first check, pairs per check, period of the checks.
 _BEFORE, _CHECKED, _PERIOD = 5, 10, 20
 _AGREEING = 4  # consecutive pairs that must show a needle when swapped
 
@@ -33,8 +33,8 @@ class SwapWatch:
     """Detector of swapped left and right images, such as from exchanged cables.
 
     Both images of a swapped pair show the needle, but the ends do not meet, so that no tip is
-    found. Only then, and for a part of the pairs, a second tracker processes the pair swapped. Its
-    result raises a suspicion and is never published as a tip.
+    found. Only then, and only for some of the pairs, a second tracker processes the swapped images.
+    Its result raises a suspicion and is never published as a tip.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class Frame:
 
 
 class CameraInfoProblem(NamedTuple):
-    """Contradiction of the calibration, empty if none; one of the size rejects all pairs."""
+    """Contradiction between camera_info and calibration, if any; a wrong size rejects all pairs."""
 
     text: str = ""
     of_size: bool = False
@@ -145,11 +145,11 @@ class PairAnswers:
     Attributes
     ----------
     camera_info : dict of str to CameraInfoProblem
-        By side, as received last.
+        Problem with the last camera_info of each side.
     unanswered : int
         Pairs exposed before the first joint state.
     too_early : int
-        Time from the exposure of the last pair to that joint state [ns]; 0 if the pair is answered.
+        Time from the exposure of the last pair to the first joint state [ns]; 0 if it is answered.
     """
 
     def __init__(self, calibration: StereoCalibration, settings: StereoTrackerParameters) -> None:
@@ -167,14 +167,14 @@ class PairAnswers:
         self.camera_info: dict[str, CameraInfoProblem] = {}
 
     def add_image(self, side: str, stamp: int, frame: Frame, now: float) -> Iterator[Answer]:
-        """Add an image of one side, exposed at `stamp` [ns]; then as `ready`."""
+        """Add an image of one side, exposed at `stamp` [ns]; return the answers as `ready`."""
         pair = self.matcher.add(side, stamp, frame)
         if pair is not None:
             self._queue.append((now, pair))
         return self.ready(now)
 
     def add_insertion(self, stamp: int, insertion: float, now: float) -> Iterator[Answer]:
-        """Add an insertion [m] sampled at `stamp` [ns]; then as `ready`."""
+        """Add an insertion [m] sampled at `stamp` [ns]; return the answers as `ready`."""
         self.joints_silent = False
         self.insertions.add(stamp, insertion)
         return self.ready(now)

@@ -25,7 +25,7 @@ _INSIDE_95 = 7.814728
 
 @dataclasses.dataclass
 class SeenCounts:
-    """Counts of ends and shafts that were seen, except in the entry zone."""
+    """Counts of detected ends and shafts, except in the entry zone."""
 
     pairs: int = 0
     ends: Counter[str] = dataclasses.field(default_factory=Counter)
@@ -138,12 +138,12 @@ def read_truth(path: Path) -> dict[str, Array | None]:
     Parameters
     ----------
     path : Path
-        The file, as from `render_images`; other columns are ignored.
+        File as written by `render_images`; other columns are ignored.
 
     Returns
     -------
     dict
-        Name to the tip in `rig` [m]; None if the fields are empty: no needle.
+        Tip in `rig` [m] by name; None if the fields are empty, since there is no needle.
 
     Raises
     ------

@@ -84,7 +84,7 @@ COLUMNS = (
     *("left_end", "left_shaft", "right_end", "right_shaft", "missing"),
 )
 _NODE = "stereo_tracker"
-_NAMED = 5  # names that a warning lists; it counts the others
+_NAMED = 5  # names listed in a warning; the others are only counted
 _NEW_RUN = 10e-3  # change of the insertion between two images that begins a new run [m]
 
 
@@ -184,7 +184,7 @@ def track(
     pairs : PairSequence
         The images.
     tracker : NeedleTracker
-        A fresh one.
+        Tracker without history.
     sizes : dict of str to (int, int)
         Width and height of the images of the calibration [px].
     insertions : mapping
@@ -228,7 +228,7 @@ def to_row(name: str, measured: Measurement) -> list[str]:
 
 
 def _new_folder(name: str, text: str) -> Path:
-    """Create a folder, unless it exists and is empty; return its path."""
+    """Create a folder, or accept an empty one; return its path."""
     folder = Path(text).expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)

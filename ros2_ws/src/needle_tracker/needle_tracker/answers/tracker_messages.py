@@ -151,20 +151,20 @@ def orientation(direction: Array) -> Array:
 def rotation_covariance(direction: Array, direction_covariance: Array) -> Array:
     """Return the covariance of rotations about the fixed x, y, z axes, roll unknown.
 
-    A small rotation w turns d by w x d; the part of w across d is d x (w x d), the part along d is
-    the roll.
+    A small rotation w changes d by w x d; the component of w perpendicular to d is d x (w x d), the
+    component parallel to d is the roll.
 
     Parameters
     ----------
     direction : ndarray, shape (3,)
         Unit vector in `rig`.
     direction_covariance : ndarray, shape (3, 3)
-        Of the direction [-].
+        Covariance of the direction [-].
 
     Returns
     -------
     ndarray, shape (3, 3)
-        [rad^2], with `ROLL_VARIANCE` about the shaft.
+        Covariance [rad^2], with `ROLL_VARIANCE` about the shaft.
     """
     cross = np.cross(direction, np.eye(3), axisb=0, axisc=0)
     across = cross @ direction_covariance @ cross.T

@@ -1,1 +1,1 @@
-"""From images of a board to the calibration of the rig, and whether it still holds."""
+"""Calibration of the rig from images of a board, and check of an existing calibration."""

@@ -69,7 +69,7 @@ _BOARDS = {
     "under": ("board under the surface", "#b03060"),
 }
 _MM = 1e3
-_SCALE_KNOWN = 0.1  # largest standard deviation of a known size of the squares [%]
+_SCALE_KNOWN = 0.1  # largest standard deviation of a determined size of the squares [%]
 _EPILOG = """\
 writes: FILE.yaml, FILE.rig.png (cameras, surface, boards)
 
@@ -129,7 +129,7 @@ def _run(options: Namespace) -> int:
 
 
 def reprojection_by_kind(result: RigCalibration) -> dict[tuple[str, str], float]:
-    """Return the reprojection error by camera and existing kind of view, rms [px]."""
+    """Return the rms reprojection error by camera and kind of view, omitting absent kinds [px]."""
     kinds = np.array([view.kind for view in result.model.views])
     return {
         (side, kind): result.reprojection_rms_px(side, np.flatnonzero(kinds == kind))
@@ -308,7 +308,7 @@ def _outline(result: RigCalibration, view: int) -> Array:
 
 
 def _draw_face(axes: Any, window: Window, axis: int) -> None:
-    """Draw the outer face of a window if it is seen edge on."""
+    """Draw the outer face of a window if the plot shows it edge-on."""
     along, up = window.normal[axis], window.normal[0]
     if np.hypot(along, up) > 0.5:
         place = (_MM * window.point[axis], _MM * window.point[0])

@@ -1,8 +1,8 @@
-"""Check of a calibration by a target of known place.
+"""Check of a calibration against a target at known places.
 
-After a touched camera, with another refractive index or a lower surface, both rays still meet, but
-the tip is wrong. The corners of the target are then measured beside their true positions, and the
-pattern of these errors shows the cause.
+If a camera was touched, or the refractive index or the surface height has changed, both rays still
+meet, but the tip is wrong. The measured corners of the target then deviate from their true
+positions, and the pattern of these errors reveals the cause.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from needle_tracker.optics.calibration import SIDES, StereoCalibration
 Array = NDArray[np.float64]
 
 CAMERAS = tuple(f"{side}_camera_turned" for side in SIDES)
-LEAST_IMPROVEMENT = 30.0  # of chi-squared: far above noise
-EXPLAINED_PX = 1.0  # largest misfit of an explanation by causes
+LEAST_IMPROVEMENT = 30.0  # decrease of chi-squared by one cause: far above noise
+EXPLAINED_PX = 1.0  # largest misfit that still counts as explained by the causes
 TURN_LIMIT = np.deg2rad(0.01)  # a camera with a larger rotation was touched
 _UNEXPLAINED = (
     "corners are off by {:.2f} px, which no turned camera, index or surface explains: {}, or other "
@@ -55,8 +55,8 @@ class Deviation:
     cause : str
         One of `CheckResult.causes`.
     size, sigma : float
-        Truth minus calibration, and its standard deviation [rad, m or -]; of a camera the angle of
-        its rotation, which is not negative.
+        Truth minus calibration, and its standard deviation [rad, m or -]; for a camera, the angle
+        of its rotation (not negative).
     tip_error : float
         Resulting error of tips in the phantom, 95 % [m].
     """
@@ -77,7 +77,7 @@ class CheckResult:
         Possible causes: rotated cameras (`CAMERAS`), and the parameters of the windows
         (`RigModel.names`).
     deviations : list of Deviation
-        Found causes, the most significant first.
+        Causes found, most significant first.
     tip_error : float
         Resulting error of tips in the phantom, 95 % [m]; NaN if no cause explains the views.
     unseen_tip_error : float
@@ -124,7 +124,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     Raises
     ------
     UserError
-        A target that one camera does not see, or without a known place.
+        A target that one camera does not detect, or that has no known place.
     """
     views = [checked_view(view) for view in views]
     model = RigModel(calibration, views, boards_seen(calibration, views))
@@ -185,7 +185,7 @@ def _fit(model: RigModel, causes: list[str], sigma: float | None) -> RigFit:
 
 
 def _columns(model: RigModel, cause: str) -> list[int]:
-    """Return the indices of the parameters of a cause: rotation of a camera, or of a window."""
+    """Return the parameter indices of a cause: rotation of a camera, or a window parameter."""
     if cause in CAMERAS:
         start = camera_slice(SIDES[CAMERAS.index(cause)]).start + len(LENS)
         return [start, start + 1, start + 2]

@@ -1,7 +1,7 @@
 """Detection of contradictions between the boards of a calibration.
 
 A wrong size of the squares or a wrong place hardly increases the reprojection errors, since the fit
-adapts cameras, index and surface, and all tips become wrong. The deviations of the fitted
+compensates with cameras, index and surface, but all tips become wrong. The deviations of the fitted
 parameters reveal the contradiction.
 """
 
@@ -32,7 +32,7 @@ _RINGS = 10
 _RING_SIGMAS = 5.0  # 3.4 at most in 8 x 40 simulated sessions of lenses without a pattern
 _LEAST_PATTERN_PX = 0.02
 _LEAST_SHARE = 1e-9  # least effect of the size on the corners beyond other parameters: rounding
-_SIZE_STEP = 1e-4  # of the derivative with respect to the size of the squares
+_SIZE_STEP = 1e-4  # step of the derivative with respect to the size of the squares
 
 
 def contradictions(result: RigCalibration, size: tuple[float, float]) -> list[str]:
@@ -43,7 +43,7 @@ def contradictions(result: RigCalibration, size: tuple[float, float]) -> list[st
     result : RigCalibration
         The calibration.
     size : (float, float)
-        Its `square_error`.
+        Result of `square_error`.
     """
     found = [text for view, text in misfits(result) if view.place is not None]
     if any(view.place is not None for view in result.apart):
@@ -78,7 +78,7 @@ def contradictions(result: RigCalibration, size: tuple[float, float]) -> list[st
 
 
 def misfits(result: RigCalibration) -> list[tuple[BoardView, str]]:
-    """Return the views whose corners are off by far more than the others', and that in words.
+    """Return the views with far larger corner errors than the others, each with a description.
 
     Parameters
     ----------
@@ -129,8 +129,8 @@ def ring_patterns(result: RigCalibration) -> dict[str, float]:
 def square_error(result: RigCalibration) -> tuple[float, float]:
     """Return the relative error of the size of the squares, and its standard deviation.
 
-    The size is an additional parameter of the fit, in one Gauss-Newton step. Only boards of known
-    place determine it: those held freely would just be nearer or farther.
+    The size is an additional parameter of the fit, in one Gauss-Newton step. Only boards at known
+    places determine it: a larger board held freely would look the same from farther away.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def square_error(result: RigCalibration) -> tuple[float, float]:
     Returns
     -------
     error, sigma : float
-        True size over the given one, minus 1; infinite sigma if undetermined.
+        True size divided by the given size, minus 1; sigma is infinite if undetermined.
     """
     model, fitted = result.model, result.fit
     poses = model.board_poses(fitted.parameters)

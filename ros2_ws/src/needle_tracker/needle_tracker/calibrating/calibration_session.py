@@ -62,7 +62,7 @@ class Place:
 
 @dataclasses.dataclass(frozen=True)
 class Corners:
-    """Corners that one camera saw: in the frame of the board [m] (n, 3), and in pixels (n, 2)."""
+    """Corners detected by one camera: in the board's frame [m] (n, 3), and in pixels (n, 2)."""
 
     points: Array
     pixels: Array
@@ -78,7 +78,7 @@ class BoardView:
     right: Corners
 
     def corners(self, side: str) -> Corners:
-        """Return the corners that the camera of one side saw."""
+        """Return the corners detected by the camera of one side."""
         return self.left if side == "left" else self.right
 
     def without(self, side: str) -> BoardView:
@@ -116,7 +116,7 @@ class Session:
     windows : pair of Window
         Given windows of the left and the right camera.
     places : dict of str to Place
-        By file name without suffix; `*` and `?` as in a shell.
+        Places by file name without suffix; `*` and `?` match as in a shell.
     """
 
     board: CharucoBoard
@@ -198,7 +198,7 @@ def parse_session(content: Any) -> Session:
 def _check_side(
     name: str, place: Place, board: CharucoBoard, windows: tuple[Window, Window]
 ) -> None:
-    """Reject a board that is invisible, or not wholly on the given side of the surface."""
+    """Reject a board that is invisible, or not entirely on the given side of the surface."""
     T = place.T_rig_board  # noqa: N806
     corners = board.corners @ T[:3, :3].T + T[:3, 3]
     for window in windows:
@@ -274,7 +274,7 @@ def views_in_folders(
     Parameters
     ----------
     left, right : Path
-        Folders of images paired by name, or two videos (names: numbers of the frames).
+        Folders of images paired by name, or two videos (named by frame number).
     session : Session
         Board and places.
     all_places : bool
@@ -290,8 +290,8 @@ def views_in_folders(
     Raises
     ------
     UserError
-        Bad folders, names or files, images of different sizes, another board or none, or a place
-        of the session without an image.
+        Bad folders, names or files, images of different sizes, a different board or none, or a
+        place of the session without an image.
     """
     views: list[BoardView] = []
     sizes: Sizes = {}
@@ -321,7 +321,7 @@ def views_in_folders(
 
 
 def nothing_seen(view: BoardView) -> bool:
-    """Return whether neither camera saw the board."""
+    """Return whether neither camera detected the board."""
     return not np.any([len(view.corners(side).points) for side in SIDES])
 
 

@@ -1,8 +1,8 @@
 """Initial calibration from views of the board; unsuitable sets and inconsistent pairs are rejected.
 
-The pose of the right camera relative to the left one is the same in every pair of images. After a
-dropped frame, which shifts the names of one side, or with a moving board before free-running
-cameras, the pose differs in such a pair, although each image fits by itself.
+The pose of the right camera relative to the left one is the same in every pair of images. A dropped
+frame, which shifts the names of one side, or a board that moves in front of free-running cameras
+changes this pose in the affected pairs, although each image fits by itself.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ LEAST_TILT_DEG = 10.0
 _K1_ALONE = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2
 _MANY = 0.25  # share of inconsistent views above which all views are rejected
 _ROUNDS = 10
-# Tolerance of the error of both cameras beyond twice the error of one: in the phantom, the errors
-# of a lens known only from boards in air, and of the surface, are added.
+# Tolerance of the error of both cameras beyond twice the error of one. In the phantom, errors of
+# the surface and of a lens calibrated only in air add to it.
 _SLACK_PX = 0.05
 _SLACK_UNDER_PX = 1.0
 
@@ -45,7 +45,7 @@ def checked_views(
 ) -> list[BoardView]:
     """Return the usable part of a set of views; reject a set that cannot determine the rig.
 
-    Cameras with windows of their own may have little common view in air: a board that is held
+    Cameras with separate windows may have a small common field of view in air: a board that is held
     freely then counts for each camera that sees it.
 
     Parameters
@@ -60,7 +60,7 @@ def checked_views(
     Raises
     ------
     UserError
-        Too few views or corners, a board that only one camera sees, or no board of known place.
+        Too few views or corners, a board that only one camera sees, or no board at a known place.
     """
     checked = [checked_view(v, alone=surface is None and v.place is None) for v in views]
     for side in SIDES:
@@ -82,7 +82,7 @@ def checked_views(
 
 
 def checked_view(view: BoardView, *, alone: bool = False) -> BoardView:
-    """Return a view without a camera that sees too few corners, if `alone` permits that."""
+    """Check a view; with `alone`, remove one camera that sees too few corners."""
     counts = {side: len(view.corners(side).points) for side in SIDES}
     few = [side for side in SIDES if counts[side] < LEAST_CORNERS]
     if few and not (alone and len(few) < len(SIDES)):
@@ -100,7 +100,7 @@ def checked_view(view: BoardView, *, alone: bool = False) -> BoardView:
 
 
 def anchor_view(views: list[BoardView], surface: Window | None) -> BoardView | None:
-    """Return the view that defines `rig`: in air if possible, always so with a common surface."""
+    """Return the view that defines `rig`: preferably in air; with a common surface, only in air."""
     known = [view for view in views if view.place and view.place.is_known]
     in_air = [view for view in known if not view.under_surface]
     return next(iter(in_air if surface else in_air + known), None)
@@ -118,7 +118,7 @@ def cameras_alone(
     sizes : dict of str to (int, int)
         Width and height of the images of each side [px].
     windows : pair of Window
-        Of the left and the right camera.
+        Windows of the left and the right camera.
 
     Returns
     -------
@@ -148,7 +148,7 @@ def first_calibration(
 ) -> tuple[StereoCalibration, Array]:
     """Return a calibration to start the adjustment from.
 
-    A board of known place defines `rig`; windows are ignored.
+    A board at a known place defines `rig`; windows are ignored.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def boards_seen(calibration: StereoCalibration, views: list[BoardView]) -> Array
     calibration : StereoCalibration
         Cameras; the windows are ignored.
     views : list of BoardView
-        Views with at least one camera.
+        Views, each with the corners of at least one camera.
     """
     boards = []
     for view in views:
@@ -217,7 +217,7 @@ def _lens(corners: list[Corners], side: str, size: tuple[int, int]) -> tuple[Arr
     pixels = [c.pixels.astype(np.float32).reshape(-1, 1, 2) for c in corners]
     matrix, distortion, flags = np.eye(3), np.zeros(5), _K1_ALONE
     try:
-        # The last round is without outliers, such as a board in the phantom.
+        # The last round excludes outliers, such as a board in the phantom.
         for _ in range(3):
             _, matrix, distortion, turns, *_, misses = cv2.calibrateCameraExtended(
                 points, pixels, size, matrix, distortion, flags=flags
@@ -254,7 +254,7 @@ def board_pose(camera: Camera, corners: Corners) -> Array:
 
 
 class PairsApartError(UserError):
-    """Left and right images do not belong together in too many views."""
+    """Error raised if left and right images do not belong together in too many views."""
 
 
 def consistent_views(
@@ -276,7 +276,7 @@ def consistent_views(
     kept : list of BoardView
         Consistent views.
     apart : list of BoardView
-        Other views.
+        Inconsistent views.
     T_right_left : ndarray, shape (4, 4), or None
         Relative pose of the cameras in most views in air; None without common views.
 
@@ -324,7 +324,7 @@ def _apart_in_air(cameras: StereoCalibration, views: list[BoardView]) -> tuple[l
     """Return the names of the views that contradict the others, and T_right_left of the others.
 
     The consistent set starts with the view whose relative pose is closest to that of a quarter of
-    all views, or else of one other view, and grows until it does not change.
+    all views, or else of one other view, and grows until it no longer changes.
     """
     left, right = (
         boards_seen(cameras, [view.without(other) for view in views]) for other in SIDES[::-1]
@@ -363,13 +363,13 @@ def _posed(cameras: StereoCalibration, pose: Array) -> StereoCalibration:
 
 
 def _alone(calibration: StereoCalibration, views: list[BoardView]) -> Array:
-    """Return the error of the corners of each view in one camera alone, the larger rms [px]."""
+    """Return the larger rms corner error of each view when fitted to one camera alone [px]."""
     misses = [_misses(calibration, [view.without(side) for view in views]) for side in SIDES]
     return np.asarray(np.max(misses, axis=0))
 
 
 def _misses(calibration: StereoCalibration, views: list[BoardView]) -> Array:
-    """Return the error of the corners of each view at the best place of the board, rms [px]."""
+    """Return the rms corner error of each view at the best-fitting pose of the board [px]."""
     model = RigModel(calibration, views, boards_seen(calibration, views))
     free = board_parameters_free(model)
     if any(view.under_surface for view in views):

@@ -48,7 +48,7 @@ class _Lens(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """Content of one file: lenses; T_right_left; T_stereo_camera of the rectification of ROS."""
+    """Content of one file: lenses, T_right_left, and T_stereo_camera of a ROS rectification."""
 
     lenses: list[_Lens]
     pose: Array | None = None
@@ -68,7 +68,7 @@ def read_lenses(
     sizes : dict of str to (int, int)
         Width and height of the images of each side [px].
     windows : pair of Window
-        Of the left and the right camera.
+        Windows of the left and the right camera.
 
     Returns
     -------
@@ -78,8 +78,8 @@ def read_lenses(
     Raises
     ------
     UserError
-        An unreadable or unknown file, not two cameras, images of another size, or another lens
-        model than plumb_bob.
+        An unreadable file, an unknown format, more or fewer than two cameras, images of another
+        size, or a lens model other than plumb_bob.
     """
     if len(set(paths)) < len(paths):
         raise UserError(f"--lenses {' '.join(map(str, paths))}: a file is given twice")
@@ -150,9 +150,9 @@ def _kalibr(content: Any, path: Path) -> _Found:
 
 
 def _opencv(text: str, path: Path) -> _Found:
-    """Return the content of a file of the OpenCV samples `stereo_calib` (two files), `calibration`.
+    """Return the content of a file by OpenCV's sample `stereo_calib` (two files) or `calibration`.
 
-    Other programs name the matrices like the parameters of `stereoCalibrate`.
+    Other programs name the matrices after the parameters of `stereoCalibrate`.
     """
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)

@@ -51,17 +51,17 @@ LIMITS = {
     "p2": 0.003,
     "k3": 0.05,
 }
-_FIRST_SIGMA_PX = 10.0  # of corners in the first fit of the poses
-_FOCAL_LIMIT = 0.005  # of the focal length, and of the image width for the principal point
-# Of the image width: in a box with a small board, a shifted principal point and a rotated camera
-# are nearly equivalent, and harmless.
+_FIRST_SIGMA_PX = 10.0  # standard deviation of corners in the first fit of the poses
+_FOCAL_LIMIT = 0.005  # largest sigma over focal length, or over image width for the centre
+# Relative to the image width: in a box with a small board, a shifted principal point and a rotated
+# camera are nearly equivalent, so that this uncertainty is harmless.
 _OWN_WINDOWS_CENTRE_LIMIT = 0.01
 _LARGEST_TURN = 0.2  # largest angle between a given relative pose and that of the views [rad]
 
 
 @dataclasses.dataclass(frozen=True)
 class Determined:
-    """Result for one parameter: `sigma` is that of the views, whether or not the value was kept."""
+    """Result for one parameter; `sigma` comes from the views even if the given value was kept."""
 
     value: float
     sigma: float
@@ -111,7 +111,7 @@ class RigCalibration:
         return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else np.nan
 
     def residuals(self, side: str) -> Array:
-        """Return seen minus fitted corners of one camera, shape (n, 2) [px]."""
+        """Return measured minus fitted corners of one camera, shape (n, 2) [px]."""
         count = 2 * len(self.model.pixels["left"])
         part = self.fit.residuals[:count] if side == "left" else self.fit.residuals[count:]
         return part.reshape(-1, 2)
@@ -128,13 +128,13 @@ def calibrate(
     Parameters
     ----------
     views : list of BoardView
-        Held freely in air, on the surface, in the phantom.
+        Views of boards held freely in air, on the surface, and in the phantom.
     sizes : dict of str to (int, int)
         Width and height of each side's images [px].
     windows : pair of Window
         Given windows of the left and the right camera.
     lenses : StereoCalibration, optional
-        Cameras whose lenses are kept, and their relative pose if they are not in one place.
+        Cameras whose lenses are kept, as is their relative pose unless both are at one place.
 
     Returns
     -------
@@ -160,8 +160,8 @@ def calibrate(
     given = model.start[: model.shared].copy()
     given[[name.split(".")[-1] in LENS[4:] for name in names]] = 0.0
     free = board_parameters_free(model)
-    # The initial values ignore refraction: without a board of known place in air, fit the poses of
-    # cameras and boards first.
+    # The initial values ignore refraction: without a board at a known place in air, fit the poses
+    # of cameras and boards first.
     poses = free.copy()
     poses[: model.shared] = [name.split(".")[-1] in POSE for name in names]
     poses[camera_slice("right")] &= not tied

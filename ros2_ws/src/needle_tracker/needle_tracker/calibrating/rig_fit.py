@@ -146,7 +146,7 @@ def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, 
 
 
 def misfit_px(model: RigModel, result: RigFit) -> float:
-    """Return the error of corners beyond their noise, rms of a coordinate [px]: a wrong model.
+    """Return the error of the model: rms of a corner coordinate beyond its noise [px].
 
     The noise is the residual of a polynomial of degree 4 in the coordinates of the board, which
     fits perspective, lens and refraction to a few thousandths of a pixel.
@@ -245,7 +245,7 @@ def _place_priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]
         first = model.shared + 6 * number
         if not free[first]:
             continue
-        # The rotation follows from the coordinates of the edges.
+        # The sigma of the rotation follows from that of the board's edges.
         reach = max(float(np.ptp(view.left.points[:, :2], axis=0).max()), 1e-3)
         rows += range(first, first + 6)
         sigmas += [view.place.sigma * 2.0 / reach] * 3 + [view.place.sigma] * 3

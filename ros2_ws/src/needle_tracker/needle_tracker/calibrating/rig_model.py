@@ -1,14 +1,14 @@
 """Model of the whole rig: pixels of all corners as a function of cameras, surface and boards.
 
-Calibration and its check share this model, and the effect of its errors on tips in the phantom: the
-two rays of a wrong calibration still meet, but elsewhere. The model's parameters are one vector:
+Calibration and check share this model and its estimate of tip errors in the phantom: with a wrong
+calibration, the two rays still meet, but elsewhere. The model's parameters are one vector:
 
     left: fx fy cx cy k1 k2 p1 p2 k3, rotation (3), translation (3); right: likewise;
     windows; for each view of the board: rotation (3), translation (3).
 
-The parameters of the windows are refractive index and height of a common surface, else for each
-window its offset along the normal and its tilts about two axes across that; layers and indices are
-then as given.
+The window parameters are the refractive index and height of a common surface, or else, for each
+window, its offset along the normal and its tilts about two axes perpendicular to it; layers and
+indices then keep their given values.
 
 Rotations and translations are increments on the initial transforms. A camera rotates about its own
 centre, T_optical_rig = [exp(rotation) | translation] T0; a board about its
@@ -164,7 +164,7 @@ class RigModel:
         Parameters
         ----------
         parameters : ndarray, shape (p,)
-            Point of the derivatives.
+            Parameters at which to differentiate.
         free : ndarray of bool, shape (p,)
             Parameters to vary.
         """
@@ -216,7 +216,7 @@ class RigModel:
             return surface_from_above(float(parameters[1]), float(parameters[0]))
         window = self._windows[number]
         offset, *tilt = parameters.reshape(len(SIDES), -1)[number]
-        # Any two axes across the normal.
+        # Any two axes perpendicular to the normal.
         axes = np.linalg.svd(window.normal[None])[2][1:]
         turned = Rotation.from_rotvec(np.array(tilt) @ axes).apply(window.normal)
         return dataclasses.replace(
@@ -234,7 +234,7 @@ def needle_points(calibration: StereoCalibration) -> Array:
     Parameters
     ----------
     calibration : StereoCalibration
-        The points are behind both windows.
+        Calibration whose windows bound the region: the points are behind both.
 
     Raises
     ------
@@ -270,7 +270,7 @@ def tip_shifts(assumed: StereoCalibration, true: StereoCalibration) -> Array:
 
 
 def measured_points(assumed: StereoCalibration, left: Array, right: Array) -> Array:
-    """Return the points of pairs of pixels by a calibration, shape (n, 3), in `rig` [m].
+    """Triangulate pairs of pixels with a calibration; shape (n, 3), in `rig` [m].
 
     Parameters
     ----------

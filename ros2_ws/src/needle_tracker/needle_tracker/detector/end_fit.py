@@ -1,4 +1,4 @@
-"""Fit of the line and the end of the shaft to the maps of the network, about an expected end."""
+"""Fit of the line and the end of the shaft to the maps of the network, near an expected end."""
 
 # Compiled functions take plain numbers, one by one; numba's floor and ceil are floats.
 # ruff: noqa: PLR0917, RUF046
@@ -19,27 +19,27 @@ Map = NDArray[np.float32]
 
 
 class EndFitSettings(NamedTuple):
-    """Numbers of the fit; lengths are in needle widths.
+    """Constants of the fit; lengths are in needle widths.
 
     Attributes
     ----------
     line_widths : float
-        Shaft behind the end that the line is fitted to: short enough to be straight at the largest
-        curvature of a needle.
+        Length of shaft behind the end to which the line is fitted: short enough to be straight at
+        the largest curvature of a needle.
     least_line_widths : float
-        A shorter line has no direction.
+        Least length of a line that has a direction.
     aside_widths : float
         Margin of the map on both sides of the line.
     largest_slope : float
         Tangent of the largest angle between the fitted line and the expected direction.
     systematic_widths : float
-        Standard deviation of line and end beyond that of the maps, caused by light and blur: from
-        the errors in path-traced pairs. An error that both views share is
+        Standard deviation of line and end in addition to that of the maps, caused by light and
+        blur: from the errors in path-traced pairs. An error that both views share is
         `FilterSettings.end_sigma`.
     around_widths : float
-        Half the length within which ends belong to one end that a bevel blurs.
+        Half the length within which ends count as one, since a bevel blurs the end.
     hidden_end : float
-        Probability that the network does not show an end that is there.
+        Probability that the network misses an existing end.
     """
 
     line_widths: float = 8.0
@@ -52,8 +52,8 @@ class EndFitSettings(NamedTuple):
 
 
 FIT = EndFitSettings()
-_PASSES = 2  # of the line's fit; the second centres the window on the result of the first
-_ONE_SIGMA = 0.5 * (1.0 + math.erf(math.sqrt(0.5)))  # share of a normal distribution below it
+_PASSES = 2  # passes of the line fit; the second one is centred on the result of the first
+_ONE_SIGMA = 0.5 * (1.0 + math.erf(math.sqrt(0.5)))  # share of a normal distribution below 1 sigma
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class ImageEnd:
     sigma_angle : float
         Standard deviation of the direction [rad].
     ends : float
-        Expected number of ends about the point, from the network.
+        Expected number of ends near the point, from the network.
     shaft : float
         Mean probability of shaft along the fitted line.
     """
@@ -145,7 +145,7 @@ def fit_end(
 
 
 def _ends_about(ends: Map, point: Array, width: float) -> float:
-    """Return the expected number of ends within the width of a needle of a point."""
+    """Return the expected number of ends within one needle width of a point."""
     half = max(int(math.ceil(width)), 2)
     column, row = np.rint(point).astype(int)
     rows = slice(max(row - half, 0), max(row + half + 1, 0))
@@ -292,7 +292,7 @@ def _end_on_line(
 
 @compiled
 def _keep_about_the_most(density: Array, width: float) -> None:
-    """Set the density to 0 outside the interval that holds the most of it.
+    """Set the density to 0 outside the interval with the largest sum.
 
     A wide window may show two ends, and their median would be at neither.
     """
@@ -314,7 +314,7 @@ def _quantile(density: Array, level: float) -> float:
     """Return the quantile of a density, in samples."""
     below = 0.0
     for i in range(len(density)):
-        # A sample is the density of the pixel about it.
+        # A sample covers the pixel around it.
         if level <= below + density[i]:
             place: float = i - 0.5 + (level - below) / density[i]
             return place

@@ -1,9 +1,9 @@
 """Search of the maps of one camera for ends that a shaft connects to the entry.
 
 The search grid is polar about the entry, in the plane through z of `rig` that faces the window of
-the camera. The needle passes the entry point, and along an arc the chord turns only half as fast as
-the needle, so a reachable needle runs outwards, with one cell in each row. The search excludes
-everything outside the grid (sheath, hole, rim of the phantom).
+the camera. The needle passes through the entry point, and along an arc the chord turns only half as
+fast as the needle, so a reachable needle runs outwards, with one cell in each row. The search
+excludes everything outside the grid (sheath, hole, rim of the phantom).
 
 The score of a path is the log-likelihood ratio of its cells, shaft against floor, plus that of an
 end in its last cell; dynamic programming maximizes it.
@@ -71,7 +71,7 @@ class SearchGrid:
 
 @dataclasses.dataclass(frozen=True)
 class GridSettings:
-    """Numbers of the search grid.
+    """Constants of the search grid.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class GridSettings:
     angle_pitch : float
         Angle between columns [rad]: 0.5 mm at the longest insertion.
     parallax_angle : float
-        Angle by which a needle before or behind the plane appears displaced [rad].
+        Angle by which a needle in front of or behind the plane appears displaced [rad].
     body_offset : float
         Largest distance of the shaft from the path of its tip [m], for a pre-bend of 10 deg over
         9 mm.
@@ -98,7 +98,7 @@ class GridSettings:
 # The trackers of one rig share the grids of its two cameras.
 @functools.lru_cache(maxsize=2)
 def make_search_grid(view: RefractedCamera, needle: StereoTrackerParameters) -> SearchGrid:
-    """Return the grid of one camera, from outside the entry hole on.
+    """Return the grid of one camera, starting outside the entry hole.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def make_search_grid(view: RefractedCamera, needle: StereoTrackerParameters) -> 
 
 @dataclasses.dataclass(frozen=True)
 class SearchSettings:
-    """Numbers of the search for paths; scores are natural logarithms of likelihood ratios.
+    """Constants of the path search; scores are natural logarithms of likelihood ratios.
 
     Attributes
     ----------
@@ -137,12 +137,12 @@ class SearchSettings:
     smooth_rows : int
         Rows over which the steps of the cells average out.
     shaft_prior, ends_prior : float
-        Share of shaft among the pixels of the training, and ends in the window of a cell: the
-        network's probabilities over these are likelihood ratios.
+        Share of shaft pixels in the training images, and number of ends in the window of a cell:
+        the network's probabilities divided by these are likelihood ratios.
     row_weight : float
-        Weight of a row, since neighbouring rows are correlated.
+        Weight of one row, less than 1 since neighbouring rows are correlated.
     row_limit : float
-        Largest size of the score of one row.
+        Largest absolute score of one row.
     late_start : float
         Score of a path that begins away from the entry.
     path_limit : float
@@ -169,7 +169,7 @@ class ShaftPath:
     Attributes
     ----------
     pixels : ndarray, shape (n, 2)
-        From the entry outwards, the end last, to the resolution of the grid [px].
+        Pixels from the entry to the end, at the resolution of the grid [px].
     score : float
         Log-likelihood ratio of shaft and end.
     shaft : float
@@ -209,9 +209,9 @@ def find_paths(
     rows = min(last_end + 1, len(shaft))
     reachable = grid.reachable[:rows]
     pitch = grid.distances[:rows] * grid.angle_pitch
-    # A path leaves the radius by at most 45 deg, the pre-bend included.
+    # A path deviates from the radius by at most 45 deg, including the pre-bend.
     steps = np.maximum(1, np.ceil(grid.row_pitch / pitch)).astype(np.int64)
-    # Ends within two rows are one.
+    # Ends within two rows count as one.
     apart = np.ceil(2.0 * grid.row_pitch / pitch).astype(np.int64)
     shaft_scores, end_scores = _scores(shaft[:rows], ends[:rows], reachable)
     cells, lengths, scores = _best_paths(
@@ -262,7 +262,7 @@ def _best_paths(
     total = _accumulated(shaft_scores, steps, late_start, path_limit)
     score = total + end_scores
     score[:first_end] = -np.inf
-    # A candidate is the best place about it, also along its own shaft.
+    # A candidate has the best score nearby, including along its own shaft.
     peaks = np.full((rows, columns), -np.inf)
     for i in range(first_end, rows):
         for j in range(columns):
@@ -301,7 +301,7 @@ def _accumulated(scores: Array, steps: Cells, late_start: float, path_limit: flo
 
 @compiled
 def _read_back(total: Array, steps: Cells, end: int, column: int, cells: Cells) -> None:
-    """Write the columns of the path to a cell."""
+    """Write the columns of the path that ends in a cell."""
     columns = total.shape[1]
     cells[end] = column
     for i in range(end, 0, -1):
@@ -317,7 +317,7 @@ def _read_back(total: Array, steps: Cells, end: int, column: int, cells: Cells) 
 
 @inlined
 def _is_peak(score: Array, row: int, column: int, apart: int) -> bool:
-    """Return whether a cell has the largest score about it; among equals, the first."""
+    """Return whether a cell has the largest score nearby; of equal cells, the first counts."""
     rows, columns = score.shape
     own = score[row, column]
     for i in range(max(row - 2, 0), min(row + 2 + 1, rows)):

@@ -1,4 +1,4 @@
-"""Detector of the needle in the images of one camera: search, or fit of an expected end."""
+"""Detector of the needle in the images of one camera: search, or fit near an expected end."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ Pixels = TypeVar("Pixels", NDArray[np.float32], NDArray[np.float64])
 
 @dataclasses.dataclass(frozen=True)
 class DetectorSettings:
-    """Numbers of the detector.
+    """Constants of the detector.
 
     Attributes
     ----------
     coarse_width_px : float
-        Width from which on a needle is searched for at half size [px]: there it is 2.2 px wide, the
-        least width of the training.
+        Least width of a needle that is searched for at half size [px]: it is then 2.2 px wide, the
+        least width in the training.
     full_size_reach : float
-        Distance from the entry up to which the search is at full size, which shows more of a short
-        needle [m].
+        Distance from the entry up to which the search uses the full size, which shows more of a
+        short needle [m].
     strips : int
         Boxes that cover the reachable part of an image; with more, the network evaluates fewer
         pixels outside it.
     end_window_px : int
-        Side of the square over which the ends about a cell are summed [px].
+        Side of the square over which the ends around a cell are summed [px].
     near_widths : float
-        Half the size of the region about a path that is examined at full size [needle widths].
+        Half the size of the region around a path that is examined at full size [needle widths].
     """
 
     coarse_width_px: float = 4.4
@@ -96,7 +96,7 @@ class NeedleDetector:
         self._shrunk: dict[int, Image] = {}
 
     def set_background(self, image: Image | None) -> None:
-        """Use an image as the background; None: the background is unknown."""
+        """Use an image as the background; None if the background is unknown."""
         self._backgrounds = {}
         if image is not None:
             for shrink in {self._shrink, self._search_shrink}:
@@ -112,7 +112,7 @@ class NeedleDetector:
         Parameters
         ----------
         least, most : float
-            Distance of the end from the entry [m].
+            Bounds of the distance of the end from the entry [m].
         """
         grid = self._grid
         first, last = grid.row_of(least), grid.row_of(most)
@@ -145,7 +145,7 @@ class NeedleDetector:
         return found[0] if found else path
 
     def _sampled(self, cells: NDArray[np.bool_], shrink: int) -> tuple[Map, Map]:
-        """Return the maps at cells of the first rows of the grid, 0 at all others."""
+        """Return the maps at given cells of the first rows of the grid, 0 at all others."""
         places = _shrunk_px(self._grid.pixels[: len(cells)], np.float32(shrink))
         height, width = self._at(shrink).shape
         shaft, ends = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
@@ -164,14 +164,14 @@ class NeedleDetector:
         return sampled[0], sampled[1]
 
     def ends_near(self, path: ShaftPath, *, hidden: bool) -> list[ImageEnd]:
-        """Return the ends at full size about the end of a path.
+        """Return the ends near the end of a path, at full size.
 
-        Two lines, such as a needle and its shadow, may be one at half size.
+        Two lines, such as a needle and its shadow, may merge at half size.
 
         Parameters
         ----------
         path : ShaftPath
-            From `search`.
+            Path from `search`.
         hidden : bool
             Whether to return the line of the shaft alone if no end is found.
         """
@@ -196,7 +196,7 @@ class NeedleDetector:
             if end is not None:
                 found.append(end)
         if hidden and not found:
-            # The end is hidden, but the shaft determines its position across.
+            # The end is hidden, but the shaft determines its lateral position.
             place = _shrunk_px(path.end, shrink) - corner
             end = self._fitted((shaft, ends, corner), place, path.direction, half, 0.5 * width)
             found = [] if end is None else [end]
@@ -205,7 +205,7 @@ class NeedleDetector:
     def fit(
         self, point: Array, direction: Array, *, along: float, across: float
     ) -> ImageEnd | None:
-        """Fit line and end about an expected end.
+        """Fit line and end near an expected end.
 
         Parameters
         ----------
@@ -236,7 +236,7 @@ class NeedleDetector:
         along: float,
         across: float,
     ) -> ImageEnd | None:
-        """Fit line and end about a pixel of the maps; the result is in pixels of the image."""
+        """Fit line and end near a pixel of the maps; the result is in pixels of the image."""
         shaft, ends, corner = maps
         shrink, width = self._shrink, self.width_px
         point = _full_px(place + corner, shrink)
@@ -294,8 +294,8 @@ class NeedleDetector:
 def _strips(places: Map) -> list[tuple[int, ...]]:
     """Return boxes that cover pixels, shape (n, 2).
 
-    The boxes are strips across the longer side, each as wide as its pixels, since the reach of a
-    needle is a cone.
+    The boxes divide the longer side into strips, each only as wide as its pixels, since the reach
+    of a needle is a cone.
     """
     low, high = places.min(axis=0), places.max(axis=0)
     axis = int((high - low).argmax())
@@ -320,7 +320,7 @@ def _shrunk_px(pixels: Pixels, shrink: float) -> Pixels:
 
 
 def _full_px(pixels: Array, shrink: float) -> Array:
-    """Return the coordinates in the image of pixels of the shrunk image."""
+    """Return the coordinates in the full image of pixels of the shrunk image."""
     return np.asarray((pixels + 0.5) * shrink - 0.5)
 
 

@@ -1,8 +1,8 @@
 """Neural network that maps an image to the probability of shaft and the intensity of ends.
 
 `scripts/train_needle_map` trains the weights (`needle_net.onnx`) on needles of 2 to 9 px. The input
-is brightness relative to the surroundings, so that light and floor matter little, and as a second
-channel the background: the same view with less needle in it.
+channels are the brightness relative to the surroundings, so that lighting and floor matter little,
+and the background: the same view with less needle in it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ Image = NDArray[np.uint8]
 Map = NDArray[np.float32]
 
 MAX_WIDTH_PX = 7.0
-"""A wider needle is halved in size [px]; the network was trained with up to 9 px."""
+"""Width of a needle above which the image is halved [px]; the training has up to 9 px."""
 MARGIN_PX = 20
-"""Context around a window that the network is shown [px]: half the surroundings."""
+"""Context around a window that is passed to the network [px]: half the surroundings."""
 _SURROUNDINGS_PX = 2 * MARGIN_PX + 1  # side of the square of the local mean, as in training
 _DARK_NOISE, _CLIP = 2.0, 4.0  # [grey levels], [standard deviations], as in training
 _MULTIPLE = 4  # the network halves its input twice
@@ -66,7 +66,7 @@ class NeedleNet:
         Parameters
         ----------
         image : ndarray of float32, shape (height, width)
-            From `normalized`.
+            Image from `normalized`.
         background : ndarray of float32, shape (height, width), or None
             The same view with less needle, from `normalized`; None if unknown.
 

@@ -1,1 +1,1 @@
-"""Candidate tips over time in, the believed tip out."""
+"""Filter over time: candidate tips in, the accepted tip out."""

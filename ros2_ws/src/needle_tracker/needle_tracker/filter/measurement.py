@@ -15,13 +15,13 @@ Array = NDArray[np.float64]
 
 
 class TrackState(enum.Enum):
-    """State of the believed track."""
+    """State of the confirmed track."""
 
     SEARCHING = "SEARCHING"  # no track: the whole reachable region is searched
-    CONFIRMING = "CONFIRMING"  # tracks, none of them believed yet
+    CONFIRMING = "CONFIRMING"  # tracks exist, but none is confirmed yet
     TRACKING = "TRACKING"
-    LOST = "LOST"  # believed before, and not seen
-    ENTRY = "ENTRY"  # short and not seen: the tip follows from the insertion
+    LOST = "LOST"  # confirmed before, but no longer detected
+    ENTRY = "ENTRY"  # short and not detected: the tip follows from the insertion
 
 
 class NoTip(str, enum.Enum):
@@ -44,13 +44,13 @@ class Measurement:
     Attributes
     ----------
     tip : SpatialTip or None
-        Believed tip, if any.
+        Accepted tip, if any.
     state : TrackState
         State of the track after this pair.
     reason : str
         Reason for no tip; empty with a tip.
     ends : pair of (ImageEnd or None)
-        End found in the left and the right image, believed or not.
+        End found in the left and the right image, accepted or not.
     probability : float
         Probability that the best track is the needle.
     stage : pair of float

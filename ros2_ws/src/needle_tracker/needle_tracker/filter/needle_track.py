@@ -1,9 +1,10 @@
-"""Track of one thing that may be the needle: its state, and the odds that it is the needle.
+"""Track of an object that may be the needle: its state, and the odds that it is the needle.
 
-The tip of the needle advances along its heading by the way of the stage, or by an unknown way if
-the insertion is unknown; the heading turns by at most the curvature of the needle. The zero and the
-scale of the stage are part of the state, so that a stage that is read 1 mm off does not move the
-tip. Anything else (an old track, a scratch, a screw) stands still, or its end moves by chance.
+The tip of the needle advances along its heading by the travel of the stage, or by an unknown
+distance if the insertion is unknown; the heading turns by at most the curvature of the needle. The
+zero and the scale of the stage are part of the state, so that a stage position that is wrong by 1
+mm does not move the tip. Anything else (an old track, a scratch, a screw) stands still, or its end
+moves at random.
 """
 
 from __future__ import annotations
@@ -58,14 +59,14 @@ class NeedleMotion:
         return NeedleMotion(mean, covariance)
 
     def advanced(self, way: float, curvature: float) -> NeedleMotion:
-        """Return the state after a way of the base of the needle.
+        """Return the state after a displacement of the needle's base.
 
         p_{k+1} = p_k + (1 + scale) way h_k,  h_{k+1} = h_k + turn across h_k
 
         Parameters
         ----------
         way : float
-            Way of the base, negative for a retraction [m].
+            Displacement of the base, negative for a retraction [m].
         curvature : float
             Largest curvature of the path [1/m].
         """
@@ -87,7 +88,7 @@ class NeedleMotion:
         return NeedleMotion(mean, transition @ self.covariance @ transition.T + noise)
 
     def spread(self, way_sigma: float) -> Array:
-        """Return the covariance of the tip after a further, unknown way of zero mean [m^2].
+        """Return the tip's covariance after a further, unknown displacement of zero mean [m^2].
 
         Cov(p + w h) = Cov(p) + sigma_w^2 (h h^T + Cov(h))
         """
@@ -96,19 +97,19 @@ class NeedleMotion:
         return np.asarray(self.covariance[POSITION, POSITION] + way_sigma**2 * ways)
 
     def surprise(self, tip: SpatialTip) -> tuple[float, float]:
-        """Return the squared distance of a sighting over both covariances, and its log-density."""
+        """Return the squared Mahalanobis distance of a sighting, and its log-density."""
         return gaussian(
             tip.position - self.mean[POSITION],
             self.covariance[POSITION, POSITION] + tip.covariance,
         )
 
     def corrected(self, rows: Array, residuals: Array, variances: Array) -> NeedleMotion:
-        """Return the state after independent linear measurements (Kalman's equations).
+        """Return the state after independent linear measurements (Kalman update).
 
         Parameters
         ----------
         rows : ndarray, shape (n, 8)
-            Derivatives of the measurements by the state.
+            Derivatives of the measurements with respect to the state.
         residuals, variances : ndarray, shape (n,)
             Measured minus expected values, and the variances of the measurements.
         """
@@ -140,7 +141,7 @@ class NeedleMotion:
 
 
 def gaussian(off: Array, covariance: Array) -> tuple[float, float]:
-    """Return the squared distance over the covariance, and the log-density."""
+    """Return the squared Mahalanobis distance, and the log-density."""
     square = float(off @ np.linalg.solve(covariance, off))
     _, log_determinant = np.linalg.slogdet(2.0 * math.pi * covariance)
     return square, -0.5 * (square + float(log_determinant))
@@ -152,7 +153,7 @@ def _across(unit: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NeedleTrack:
-    """Track of one thing that may be the needle.
+    """Track of an object that may be the needle.
 
     Attributes
     ----------
@@ -163,15 +164,15 @@ class NeedleTrack:
     end_log_odds : float
         Log-odds that it is an end.
     place_log_odds : float
-        Log-odds that the needle ends here, from the stage and the distance aside.
+        Log-odds that the needle ends here, from the insertion and the length of the shaft.
     motion_log_odds : float
-        Log-odds that it moves as the needle does, and does not stand still.
+        Log-odds that it moves like the needle rather than standing still.
     insertion : float or None
         Insertion of the last pair [m].
     way : float or None
-        Way of the stage since the last sighting [m]; None if the insertion is unknown.
+        Travel of the stage since the last sighting [m]; None if the insertion is unknown.
     way_sigma : float
-        Standard deviation of the way since the previous pair [m]; 0 if the insertion is known.
+        Standard deviation of the travel since the previous pair [m]; 0 if the insertion is known.
     misses : int
         Consecutive pairs without a sighting.
     """
@@ -203,7 +204,7 @@ class NeedleTrack:
         )._bounded()
 
     def predicted(self, insertion: float | None, settings: StereoTrackerParameters) -> NeedleTrack:
-        """Return the track at the next pair, before a sighting in it."""
+        """Return the track at the next pair, before any sighting in it."""
         step, way, way_sigma = 0.0, None, FILTER.free_step * math.sqrt(self.misses + 1.0)
         if insertion is not None and self.insertion is not None:
             step, way_sigma = insertion - self.insertion, 0.0
@@ -218,9 +219,10 @@ class NeedleTrack:
         )
 
     def surprise(self, tip: SpatialTip, settings: StereoTrackerParameters) -> float:
-        """Return the squared distance over the covariance of a sighting that may be this track's.
+        """Return the squared Mahalanobis distance of a sighting from this track.
 
-        The smaller of the distances from the needle, with an unknown way, and from the place.
+        This is the smaller of the distances from the needle, including an unknown travel, and from
+        the place.
         """
         as_needle, _ = self._motion_to(tip, settings).surprise(tip)
         as_needle += self._ways(tip) ** 2
@@ -228,7 +230,7 @@ class NeedleTrack:
         return min(as_needle, as_other)
 
     def fits(self, tip: SpatialTip, settings: StereoTrackerParameters) -> bool:
-        """Return whether a sighting may be this track's."""
+        """Return whether a sighting may belong to this track."""
         return self.surprise(tip, settings) < PAIRING.gate
 
     def seen(self, sighting: Sighting, settings: StereoTrackerParameters) -> NeedleTrack:
@@ -242,7 +244,7 @@ class NeedleTrack:
         place, covariance = _merged(self.place, self.place_covariance, tip)
         way = math.dist(tip.position, self.place) if self.way is None else abs(self.way)
         independent = min(way / FILTER.evidence_length, 1.0)
-        # The end after a gap may be that of another thing, such as the shadow of the needle.
+        # The end after a gap may be that of another object, such as the shadow of the needle.
         before = self.motion_log_odds
         before = max(before - FILTER.miss_cost * self.misses, min(before, 0.0))
         return dataclasses.replace(
@@ -251,7 +253,7 @@ class NeedleTrack:
             place=place,
             place_covariance=covariance,
             end_log_odds=self.end_log_odds + independent * sighting.evidence,
-            # A thing that ended where the needle cannot is not the needle.
+            # An object that ended where the needle cannot end is not the needle.
             place_log_odds=min(
                 self.place_log_odds, place_log_odds(sighting, self.insertion, settings)
             ),
@@ -261,14 +263,14 @@ class NeedleTrack:
         )._bounded()
 
     def _motion_to(self, tip: SpatialTip, settings: StereoTrackerParameters) -> NeedleMotion:
-        """Return the state at a sighting: an unknown way is that to the sighting."""
+        """Return the state at a sighting; an unknown travel is the distance to the sighting."""
         if self.way_sigma == 0.0:
             return self.motion
         way = self._ways(tip) * self.way_sigma
         return self.motion.advanced(way, settings.max_curvature)
 
     def _ways(self, tip: SpatialTip) -> float:
-        """Return the way to a sighting in standard deviations; 0 if the insertion is known."""
+        """Return the travel to a sighting in standard deviations; 0 if the insertion is known."""
         if self.way_sigma == 0.0:
             return 0.0
         ahead = tip.position - self.motion.mean[POSITION]
@@ -279,7 +281,7 @@ class NeedleTrack:
         _, moved = motion.surprise(tip)
         if self.way_sigma == 0.0:
             return moved
-        # The way is that to the sighting: along the heading, use the density of the way.
+        # The travel was fitted to the sighting: along the heading, use the density of the travel.
         heading = motion.mean[HEADING]
         total = motion.covariance[POSITION, POSITION] + tip.covariance
         along = math.sqrt(float(heading @ total @ heading))
@@ -294,10 +296,10 @@ class NeedleTrack:
     def log_odds(self) -> float:
         """Return the log-odds that this is the needle.
 
-        The alternatives are the end of another thing, which does not move as the needle does; no
-        end at all; and the shadow or the mirror image of the needle, which moves so elsewhere. With
-        the insertion, a line without an end is fitted where the stage predicts the end, so that its
-        motion is no evidence.
+        The alternatives are the end of another object, which does not move like the needle; no end
+        at all; and the shadow or the mirror image of the needle, which moves like it elsewhere. If
+        the insertion is known, a line without an end is fitted where the stage predicts the end, so
+        that its motion is no evidence.
 
         P(else) / P(needle) = (e^-motion + e^-end [e^-motion] + e^-shadow) e^-place
         """
@@ -308,7 +310,7 @@ class NeedleTrack:
         return self.place_log_odds - _log_sum(others, -FILTER.shadow_log_odds)
 
     def rank(self) -> float:
-        """Return the log-odds against other tracks, which fall with each miss."""
+        """Return the log-odds for comparison with other tracks, reduced by each miss."""
         return self.log_odds() - FILTER.miss_cost * self.misses
 
     def _bounded(self) -> NeedleTrack:
@@ -334,10 +336,11 @@ class NeedleTrack:
 def place_log_odds(
     sighting: Sighting, insertion: float | None, settings: StereoTrackerParameters
 ) -> float:
-    """Return the log-odds that it is the needle that ends in a place.
+    """Return the log-odds that the end at a place is that of the needle.
 
-    The needle is as long as the insertion, while other things end at any distance. An end that
-    follows the stage is no further evidence: infinite. Without the insertion all places are alike.
+    The needle is as long as the insertion, while other objects end at any distance. An end that was
+    found by following the stage is no further evidence: infinite. Without the insertion, all places
+    are equally likely.
     """
     if insertion is None:
         return 0.0

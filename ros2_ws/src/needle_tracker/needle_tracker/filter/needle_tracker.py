@@ -1,4 +1,4 @@
-"""Tracker of the needle's tip: a stereo pair in, the believed tip out.
+"""Tracker of the needle's tip: a stereo pair in, the accepted tip out.
 
 Tracks are looked for where they are expected; if that fails, both images are searched. The result
 depends only on the images and insertions so far: no time, no randomness, one thread.
@@ -33,7 +33,7 @@ Pair = tuple[Image, Image]
 
 @dataclasses.dataclass(frozen=True)
 class FollowingSettings:
-    """Numbers of the tracker around its filter.
+    """Constants of the tracker outside its filter.
 
     Attributes
     ----------
@@ -42,11 +42,12 @@ class FollowingSettings:
     least_gate_px : float
         Least half size of the window in which an end is expected [px].
     least_new_widths : float
-        Length of needle that must be new since a pair for it to be the background [needle widths].
+        Growth of the needle since a pair at which that pair becomes the background [needle widths].
     glance_shrink : int
-        Factor of size at which a view is compared with the previous one.
+        Factor by which a view is shrunk for comparison with the previous one.
     change : float
-        Relative change of the brightness of most of a view: more than flicker, less than a lamp.
+        Least relative change in the brightness of most of a view: more than flicker, less than a
+        lamp.
     dark : int
         Brightest grey level of a black image.
     """
@@ -63,14 +64,14 @@ FOLLOWING = FollowingSettings()
 
 
 class Background:
-    """The pair with the least needle so far: by the insertion, else the first one.
+    """The pair with the least needle so far: by insertion or, if unknown, the first one.
 
     Parameters
     ----------
     reference : pair of ndarray of uint8, shape (height, width), or None
-        Left and right image of the phantom without needle, to begin with.
+        Initial background: left and right image of the phantom without needle.
     least_new : float
-        Length of needle that must be new since a pair for it to be the background [m].
+        Growth of the needle since a pair at which that pair becomes the background [m].
     """
 
     def __init__(self, reference: Pair | None, least_new: float) -> None:
@@ -81,7 +82,7 @@ class Background:
             self.update(reference, 0.0)
 
     def update(self, pair: Pair, insertion: float | None) -> Pair | None:
-        """Return the background of a pair with an insertion [m] or None; None if there is none."""
+        """Process a pair and its insertion [m], if known; return its background, if any."""
         before = math.inf if self._insertion is None else self._insertion
         less = insertion is not None and insertion <= max(before, 0.0)
         if self._pair is None or less:
@@ -134,9 +135,9 @@ class NeedleTracker:
         return left.width_px, right.width_px
 
     def warm_up(self) -> None:
-        """Compile, or load, all compiled functions: the first pair must not wait for that.
+        """Compile or load all compiled functions, so that the first pair is not delayed.
 
-        The tracker processes a drawn needle, and forgets it.
+        The tracker processes a synthetic needle, then forgets it.
         """
         background, self._background = self._background, self._new_background(None)
         length = 2.0 * DETECTOR.full_size_reach
@@ -177,7 +178,7 @@ class NeedleTracker:
         Returns
         -------
         Measurement
-            With or without a tip.
+            Result, with or without a tip.
 
         Raises
         ------
@@ -323,10 +324,10 @@ class NeedleTracker:
         return Measurement(tip, state, reason, ends, probability, best.stage)
 
     def _published(self, tip: SpatialTip) -> SpatialTip | None:
-        """Return the tip of a believed needle to be published; None if it is too uncertain.
+        """Return the tip to be published of an accepted needle; None if it is too uncertain.
 
-        Errors by a bevel, its light or a shadow beside the shaft persist from pair to pair: they
-        cancel in motion, and pairs are not averaged.
+        Errors from the bevel, its lighting or a shadow beside the shaft persist from pair to pair:
+        they cancel in displacements, and averaging pairs would not reduce them.
         """
         if float(np.linalg.eigvalsh(tip.covariance)[-1]) > FILTER.max_sigma**2:
             return None

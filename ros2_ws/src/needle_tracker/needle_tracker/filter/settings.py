@@ -1,4 +1,4 @@
-"""Numbers of the filter over time."""
+"""Constants of the filter over time."""
 
 from __future__ import annotations
 
@@ -7,38 +7,38 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True)
 class FilterSettings:
-    """Numbers of the filter over time; odds are natural logarithms.
+    """Constants of the filter over time; odds are natural logarithms.
 
     Attributes
     ----------
     slip_sigma : float
-        Standard deviation of the way of the tip over the way of the base [-]: needle and gel give.
+        Standard deviation of the ratio of tip travel to base travel [-]: needle and gel yield.
     drift_sigma : float
         Standard deviation of the motion of the tip between two pairs at rest [m].
     free_step : float
-        Standard deviation of the way between two pairs if the insertion is unknown [m].
+        Standard deviation of the travel between two pairs if the insertion is unknown [m].
     chance_density : float
-        Density of the next end of something that is not the needle, if it ends elsewhere in the
-        next pair [1/m^3]: once per metre along the needle, within 0.3 mm across.
+        Density of the next end of an object other than the needle, if it ends elsewhere in the next
+        pair [1/m^3]: once per metre along the needle, within 0.3 mm across.
     shadow_log_odds : float
-        A needle against its own shadow or mirror image.
+        Log-odds of a needle against its own shadow or mirror image.
     length_sigma : float
         Standard deviation of the length of the shaft [m], from path-traced pairs.
     prior_log_odds : float
-        Two ends that meet are an end, before the network is evaluated: from 231 sightings in
-        path-traced pairs (logistic regression, with a weight of 1 for the evidence).
+        Log-odds that two ends that meet are real, before the network is evaluated: from 231
+        sightings in path-traced pairs (logistic regression, with a weight of 1 for the evidence).
     evidence_length : float
-        Way of the tip over which the images become independent [m]: the same picture again is no
+        Travel of the tip over which the images become independent [m]: a repeated image is no
         further evidence.
     miss_cost : float
         Log-odds that a track loses in a pair that does not show it.
     max_log_odds : float
-        Largest size of the log-odds of a track.
+        Largest absolute log-odds of a track.
     accepted : float
-        Probability from which on a track is the needle.
+        Probability above which a track is accepted as the needle.
     end_sigma : float
         Standard deviation of the end along the needle that both views and all pairs share, since a
-        bevel and its light hide a part [needle widths]: from errors in path-traced pairs.
+        bevel and its lighting hide part of it [needle widths]: from errors in path-traced pairs.
     max_sigma : float
         Largest standard deviation of a published tip, in any direction [m].
     lost_after : int
@@ -62,7 +62,7 @@ class FilterSettings:
 
     @property
     def forgotten_after(self) -> float:
-        """Consecutive misses that outweigh any evidence: then the track is dropped."""
+        """Consecutive misses that outweigh any evidence, after which a track is dropped."""
         return 2.0 * self.max_log_odds / self.miss_cost
 
 

@@ -21,7 +21,7 @@ LEAST_BASELINE = 1e-3  # distance between the cameras [m]
 _DISTORTION_MODEL = "plumb_bob"
 _INDICES = (1.0, 3.0)
 _THICKEST = 0.5  # largest thickness of a layer [m]
-_LEAST_ASIDE = 0.3  # component of the normal of a window across the needle [-]
+_LEAST_ASIDE = 0.3  # component of the normal of a window perpendicular to the needle [-]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Layer:
     Attributes
     ----------
     thickness : float
-        Along the normal of the window [m].
+        Thickness along the normal of the window [m].
     refractive_index : float
-        Relative to air [-], at least 1.
+        Refractive index relative to air [-], at least 1.
     """
 
     thickness: float
@@ -49,9 +49,9 @@ class Window:
     point : ndarray, shape (3,)
         Any point of the outer face in `rig` [m].
     normal : ndarray, shape (3,)
-        Unit vector in `rig`, across the faces and towards the camera.
+        Unit vector in `rig`, perpendicular to the faces and towards the camera.
     layers : tuple of Layer
-        From the outer face inwards; none for a body with a free surface.
+        Layers from the outer face inwards; none for a body with a free surface.
     inside : float
         Refractive index of the body relative to air [-], at least 1.
     """
@@ -72,12 +72,12 @@ class Window:
         Parameters
         ----------
         points : ndarray, shape (..., 3)
-            In `rig` [m].
+            Points in `rig` [m].
 
         Returns
         -------
         ndarray, shape (...)
-            Negative behind the face [m].
+            Heights [m], negative behind the face.
         """
         return np.asarray((points - self.point) @ self.normal)
 
@@ -87,12 +87,12 @@ class Window:
         Parameters
         ----------
         points : ndarray, shape (..., 3)
-            In `rig` [m].
+            Points in `rig` [m].
 
         Returns
         -------
         ndarray, shape (...)
-            Negative in a layer and before the window [m].
+            Depths [m], negative in a layer and in front of the window.
         """
         return -self.height(points) - self.thickness
 
@@ -172,7 +172,7 @@ class StereoCalibration:
 
     @property
     def surface(self) -> Window | None:
-        """Level surface that both cameras share; None for windows of their own."""
+        """Level surface that both cameras share; None if each has its own window."""
         return common_surface(self.left.window, self.right.window)
 
 
@@ -188,7 +188,7 @@ def load_calibration(path: Path) -> StereoCalibration:
     Returns
     -------
     StereoCalibration
-        With rotations normalised.
+        Calibration with normalised rotations.
 
     Raises
     ------
@@ -241,7 +241,7 @@ def parse_windows(content: Any) -> tuple[Window, Window]:
     Raises
     ------
     UserError
-        Both or neither, or a value missing, not finite or out of bounds.
+        Both kinds or neither, or a value missing, not finite or out of bounds.
     """
     top = content if isinstance(content, dict) else {}
     own = [f"{s}.window" for s in SIDES if isinstance(top.get(s), dict) and "window" in top[s]]

@@ -1,10 +1,10 @@
 """Camera behind its refracting window: projection of points by Snell's law.
 
 The window is a stack of plane-parallel media: air with the camera, layers such as a wall of
-acrylic, then the body with the needle. A ray from the camera and its continuations are in one plane
-with the normal of the window, so that refraction is a problem in that plane.
+acrylic, then the body with the needle. A ray from the camera and its refracted continuations lie in
+one plane with the normal of the window, so that refraction is a problem in that plane.
 
-The compiled functions are for loops; `RefractedCamera` takes arrays of any shape.
+The compiled functions are for loops; `RefractedCamera` accepts arrays of any shape.
 """
 
 # Compiled functions take plain numbers, one by one.
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 _ITERATIONS = 40
 _UNDISTORT_ITERATIONS = 12
 _UNDISTORTED = 1e-9  # error of a converged inversion of the distortion, at unit focal length
-_JACOBIAN_STEP = 1e-5  # of the central differences [m]: their relative error is about 1e-8
+_JACOBIAN_STEP = 1e-5  # step of the central differences [m], for a relative error of about 1e-8
 _LAYERS = 29  # index of the first layer in a packed camera: thickness and refractive index
 
 
@@ -49,7 +49,7 @@ def pack_camera(camera: Camera) -> Array:
     """Return the parameters of the projection as one array, for `project_point`."""
     window = camera.window
     height = float(window.height(camera.centre))
-    # Point of the outer face next to the camera.
+    # Point of the outer face closest to the camera.
     foot = window.point + (camera.centre - window.point - height * window.normal)
     return np.concatenate(
         [
@@ -69,15 +69,15 @@ def pack_camera(camera: Camera) -> Array:
 def _crossing(camera: Array, distance: float, depth: float) -> float:
     """Return the distance from the foot of the camera at which light crosses the outer face [m].
 
-    Snell's law in the plane of incidence, rho the wanted distance, s = rho / sqrt(rho^2 + h^2)
-    the sine in air: a layer takes the light t s / sqrt(n_i^2 - s^2) farther, and in the last
-    medium, of index n, the rest r = D - rho - ... over the depth d wants s = n r / sqrt(r^2 +
-    d^2). The difference of the sides increases with rho and has one root in [0, D].
+    Snell's law in the plane of incidence, with rho the desired distance and s = rho / sqrt(rho^2 +
+    h^2) the sine in air: a layer displaces the light by t s / sqrt(n_i^2 - s^2), and in the last
+    medium, of index n, the remaining distance r = D - rho - ... over the depth d requires s = n r /
+    sqrt(r^2 + d^2). The difference of the two sides increases with rho and has one root in [0, D].
 
     Parameters
     ----------
     camera : ndarray
-        From `pack_camera`.
+        Packed camera, from `pack_camera`.
     distance : float
         D: distance of the point from the foot of the camera, along the window [m].
     depth : float
@@ -155,11 +155,11 @@ def see_through(camera: Array, points: Array, seen: Array) -> None:
     Parameters
     ----------
     camera : ndarray
-        From `pack_camera`.
+        Packed camera, from `pack_camera`.
     points : ndarray, shape (n, 3)
-        In `rig` [m]; those before the window are not refracted.
+        Points in `rig` [m]; those in front of the window are not refracted.
     seen : ndarray, shape (n, 3)
-        Output, in the optical frame [m].
+        Output: points in the optical frame [m].
     """
     for i in range(len(points)):
         seen[i, 0], seen[i, 1], seen[i, 2] = _seen(camera, points[i, 0], points[i, 1], points[i, 2])
@@ -172,11 +172,11 @@ def project_point(camera: Array, point: Array, pixel: Array) -> None:
     Parameters
     ----------
     camera : ndarray
-        From `pack_camera`.
+        Packed camera, from `pack_camera`.
     point : ndarray, shape (3,)
-        In `rig` [m].
+        Point in `rig` [m].
     pixel : ndarray, shape (2,)
-        Output; NaN behind the camera.
+        Output: pixel coordinates; NaN behind the camera.
     """
     x, y, z = _seen(camera, point[0], point[1], point[2])
     if z <= 0.0:
@@ -195,7 +195,7 @@ def project_point(camera: Array, point: Array, pixel: Array) -> None:
 def _refracted(
     camera: Array, along_x: float, along_y: float, along_z: float, index: float, direction: Array
 ) -> float:
-    """Write the unit vector in a medium of an index; return its component along the normal."""
+    """Write the unit vector of a ray in a medium; return its component along the normal."""
     x, y, z = along_x / index, along_y / index, along_z / index
     steep = math.sqrt(1.0 - x * x - y * y - z * z)
     direction[0] = x - steep * camera[26]
@@ -211,7 +211,7 @@ def pixel_ray(camera: Array, pixel: Array, origin: Array, direction: Array) -> N
     Parameters
     ----------
     camera : ndarray
-        From `pack_camera`.
+        Packed camera, from `pack_camera`.
     pixel : ndarray, shape (2,)
         Pixel coordinates.
     origin, direction : ndarray, shape (3,)
@@ -284,7 +284,7 @@ def project_optical(camera: Camera, points: Array) -> Array:
     camera : Camera
         The camera.
     points : ndarray, shape (..., 3)
-        In the camera's optical frame [m].
+        Points in the camera's optical frame [m].
 
     Returns
     -------
@@ -313,7 +313,7 @@ class RefractedCamera:
     Parameters
     ----------
     camera : Camera
-        Calibrated camera, before its window.
+        Calibrated camera in front of its window.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -321,7 +321,7 @@ class RefractedCamera:
         self.packed = pack_camera(camera)
 
     def __eq__(self, other: object) -> bool:
-        """Return whether both cameras project all points alike."""
+        """Return whether both cameras project all points identically."""
         return isinstance(other, RefractedCamera) and self._identity == other._identity
 
     def __hash__(self) -> int:
@@ -334,7 +334,7 @@ class RefractedCamera:
 
     @property
     def sideways(self) -> Array:
-        """Unit vector in `rig`, shape (3,), across the needle's axis and the window's normal.
+        """Unit vector in `rig`, shape (3,), perpendicular to needle axis and window normal.
 
         With z it spans the plane through the needle that faces this camera.
         """
@@ -347,7 +347,7 @@ class RefractedCamera:
         Parameters
         ----------
         points : ndarray, shape (..., 3)
-            Points in `rig` [m]; those before the window are not refracted.
+            Points in `rig` [m]; those in front of the window are not refracted.
 
         Returns
         -------
@@ -362,12 +362,12 @@ class RefractedCamera:
         Parameters
         ----------
         points : ndarray, shape (..., 3)
-            Points in `rig` [m]; those before the window are not refracted.
+            Points in `rig` [m]; those in front of the window are not refracted.
 
         Returns
         -------
         ndarray, shape (..., 3)
-            Points of the optical frame [m].
+            Points in the optical frame [m].
         """
         points = np.ascontiguousarray(points, dtype=np.float64)
         seen = np.empty(points.shape)

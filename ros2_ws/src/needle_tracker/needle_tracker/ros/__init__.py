@@ -1,1 +1,1 @@
-"""The tracker's and the cameras' ROS side."""
+"""ROS executables of the tracker and the cameras."""

@@ -1,1 +1,1 @@
-"""Sources of images and joint states, and which belong together."""
+"""Sources of images and joint states, and their matching by stamp."""

@@ -55,7 +55,7 @@ def grey_image(rows: NDArray[np.uint8], width: int, encoding: str) -> Image:
     Returns
     -------
     ndarray of uint8, shape (height, width)
-        Shares the memory of a grey image.
+        Grey image, which shares memory with a grey input.
     """
     pixels = rows[:, : width * bytes_per_pixel(encoding)]
     if encoding in _COLOUR:

@@ -54,7 +54,7 @@ class NamedPair:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names that a session or a CSV may use for the pair, with and without ending."""
+        """Names that a session or a CSV may use for the pair, with and without suffix."""
         paths = (Path(self.name), *self.files)
         return tuple(dict.fromkeys(name for path in paths for name in (path.name, path.stem)))
 
@@ -91,9 +91,9 @@ class PairSequence:
     names : list of str
         Names of the pairs, in natural order; for videos as many as the containers declare.
     unpaired : list of str
-        Names without a partner, with their side; for videos known at the end.
+        Names without a partner, with their side; for videos, complete only at the end.
     cut_off : int
-        Number of pairs that the containers declare and the data lack; known at the end.
+        Number of pairs that the containers declare but the data lack; valid only at the end.
     """
 
     names: list[str]
@@ -111,7 +111,7 @@ class PairSequence:
 
     @property
     def missing(self) -> str:
-        """Missing frames of the videos, as text, known at the end; empty if complete."""
+        """Missing frames of the videos, as text, valid only at the end; empty if complete."""
         parts = []
         if self.unpaired:
             parts.append(f"{len(self.unpaired)} frames without a partner")
@@ -120,7 +120,7 @@ class PairSequence:
         return ", ".join(parts)
 
     def __iter__(self) -> Iterator[NamedPair]:
-        """Read pair after pair."""
+        """Yield the pairs in order."""
         return self._frames() if self._files is None else self._images(self._files)
 
     def _images(self, files: list[tuple[str, str]]) -> Iterator[NamedPair]:
@@ -156,12 +156,12 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
     Returns
     -------
     PairSequence
-        Not empty.
+        Sequence of at least one pair.
 
     Raises
     ------
     UserError
-        One is missing or cannot be opened, only one is a folder, or nothing pairs.
+        A path is missing or cannot be opened, only one is a folder, or no images form a pair.
     """
     paths = dict(zip(_SIDES, (left, right), strict=True))
     for side, path in paths.items():
@@ -233,7 +233,7 @@ def mean_pair(left: Path, right: Path, sizes: Sizes) -> tuple[Image, Image]:
 
 
 def _pair(left: set[str], right: set[str], *, one_folder: bool) -> list[tuple[str, str, str]]:
-    """Return name, left and right file of each pair: of equal names, else by `_WORDS`."""
+    """Return name, left and right file of each pair, matched by equal names, else by `_WORDS`."""
     equal = set() if one_folder else left & right
     pairs = [(name, name, name) for name in equal]
     unused = right - equal
@@ -270,7 +270,7 @@ def read_insertions(path: Path) -> Mapping[str, float]:
     Returns
     -------
     mapping
-        Name to insertion [m], without names that have no value.
+        Insertion [m] by name, without names that have no value.
 
     Raises
     ------
@@ -298,7 +298,7 @@ def read_numbers(
     Returns
     -------
     dict
-        Name to the numbers of the columns; None if all of these fields are empty.
+        Numbers of the columns by name; None if all of these fields are empty.
 
     Raises
     ------

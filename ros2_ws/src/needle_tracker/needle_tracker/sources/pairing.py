@@ -19,7 +19,7 @@ OTHER_SIDE = {"left": "right", "right": "left"}
 
 @dataclasses.dataclass(frozen=True)
 class Pair(Generic[T]):
-    """Two images of one exposure; `stamp` [ns] is the left one's."""
+    """Two images of one exposure; `stamp` [ns] is that of the left one."""
 
     stamp: int
     left: T

@@ -90,9 +90,9 @@ class CameraPair:
     Parameters
     ----------
     names, sizes, rate, clock
-        As of `open_source`.
+        As for `open_source`.
     open_capture : callable
-        Opens a device by its name; by default that of OpenCV.
+        Opens a device by its name; by default with OpenCV.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class RecordedPairs:
     Parameters
     ----------
     names, sizes, clock, loop
-        As of `open_source`.
+        As for `open_source`.
     """
 
     def __init__(
@@ -241,7 +241,7 @@ class PairPort:
         self._reader = ThreadPoolExecutor(1, "pairs")
 
     def open(self, arrive: Callable[[Batch | PortChange], None]) -> None:
-        """Set the callback for results, which the thread calls."""
+        """Set the callback that the thread calls with results."""
         self._arrive = arrive
 
     def send(self, batch: tuple[Any, ...]) -> None:

@@ -1,8 +1,8 @@
 """Pairing of the ends in both views: which pairs can be the needle, and the evidence for each.
 
-A shadow on the floor, a cable above the surface or two different lines in the two images end where
-a needle could; but on their way from the entry they are too deep, too high, or do not meet. So the
-whole shaft is reconstructed from its paths in both images.
+A shadow on the floor, a cable above the surface or two different lines in the two images may end
+where a needle could, but between the entry and that end they are too deep, too high, or do not
+meet. Therefore, the whole shaft is reconstructed from its paths in both images.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ Ends = tuple[ImageEnd | None, ImageEnd | None]
 
 @dataclasses.dataclass(frozen=True)
 class PairingSettings:
-    """Numbers of the pairing; those without an origin are bounds that hardly matter.
+    """Constants of the pairing; those without an origin are bounds that hardly matter.
 
     Attributes
     ----------
     gate : float
-        Squared distance over its covariance above which two observations differ: 5 sigma.
+        Squared Mahalanobis distance above which two observations differ: 5 sigma.
     sigmas : float
         Half width of a search region, in standard deviations.
     path_across_px, path_along_px : float
-        Standard deviations of the end of a path [px]: two lines may be one at half size.
+        Standard deviations of the end of a path [px]: two lines may merge at half size.
     same_px : float
-        Ends of one view that are closer are one [px].
+        Distance below which two ends in one view count as one [px].
     least_chance : float
-        The probabilities of the network are limited to this and 1 less it.
+        Lower limit of the network's probabilities; the upper limit is 1 minus this.
     pre_bend : float
-        Longest part of the needle that is bent beforehand [m].
+        Largest length of the pre-bend [m].
     tolerance : float
         Margin of the reach for a point along the shaft [m].
     point_sigma : float
@@ -117,12 +117,12 @@ class StereoSearch:
         Parameters
         ----------
         least, most : float
-            Distance of the tip from the entry [m].
+            Bounds of the distance of the tip from the entry [m].
 
         Returns
         -------
         list of Sighting
-            The most likely first.
+            Sightings, most likely first.
         pair of (ImageEnd or None)
             The clearest end in the left and the right image, whether or not they meet.
         """
@@ -158,7 +158,7 @@ class StereoSearch:
             if tip is not None and tip.misfit < PAIRING.gate:
                 pairs.append((pair[0].score + pair[1].score - 0.5 * tip.misfit, pair))
         pairs.sort(key=lambda scored: -scored[0])
-        # The ends of as many pairs as half of the candidates are fitted at full size.
+        # Fit the ends of only half as many pairs as there are candidates at full size.
         best = [pair for _, pair in pairs[: SEARCH.candidates // 2]]
         left, right = (list({id(pair[i]): pair[i] for pair in best}.values()) for i in range(2))
         return left, right
@@ -174,7 +174,7 @@ class StereoSearch:
         tip = triangulate(self.views, ends)
         if tip is None or tip.misfit > PAIRING.gate or not self.is_possible(tip, least, most):
             return None
-        # At half size a needle and its shadow may be one line.
+        # At half size, a needle and its shadow may merge into one line.
         left, right = (
             detector.trace(path, end)
             for detector, path, end in zip(self.detectors, paths, ends, strict=True)
@@ -198,9 +198,9 @@ class StereoSearch:
     def _comes_from_entry(self, tip: SpatialTip, distance: float) -> bool:
         """Return whether the tangent at the tip passes the entry as closely as that of a needle.
 
-        Over a length L, an arc of the largest curvature leaves its tangent by kappa L^2 / 2; the
-        visible end may lean over the length of its pre-bend. A shadow on the floor runs beside the
-        needle all the way: its tangent misses the entry by more.
+        Over a length L, an arc of the largest curvature deviates from its tangent by kappa L^2 / 2;
+        the visible end may lean over the length of its pre-bend. A shadow on the floor runs beside
+        the needle over its whole length: its tangent misses the entry by more.
         """
         ahead = float(tip.position @ tip.direction)
         miss = float(np.linalg.norm(tip.position - ahead * tip.direction))
@@ -212,7 +212,7 @@ class StereoSearch:
 
 
 def evidence(ends: tuple[ImageEnd, ImageEnd], tip: SpatialTip) -> float:
-    """Return the log-odds that two ends are one, from the network and the misfit."""
+    """Return the log-odds that two ends are the same one, from the network and the misfit."""
     return sum(_log_odds(end.ends) for end in ends) - 0.5 * tip.misfit
 
 
@@ -222,7 +222,7 @@ def _log_odds(chance: float) -> float:
 
 
 def _coarse_end(path: ShaftPath) -> ImageEnd:
-    """Return the end of a path, to be paired by position."""
+    """Return the end of a path with a coarse uncertainty, for pairing by position."""
     across, along = PAIRING.path_across_px, PAIRING.path_along_px
     return ImageEnd(path.end, path.direction, across, along, 0.0, 0.0, path.shaft)
 
@@ -253,7 +253,7 @@ def shaft_points(
     Returns
     -------
     ndarray, shape (n, 3)
-        In `rig` [m]; few or none if the shaft runs along the baseline of the cameras.
+        Points in `rig` [m]; few or none if the shaft runs along the baseline of the cameras.
     """
     stations, others = (_smooth(path.pixels) for path in paths)
     points = np.empty((len(stations), 3))
@@ -268,14 +268,14 @@ def shaft_points(
 def _meeting_points(
     cameras: tuple[Array, Array], stations: Array, others: Array, least_step: float, points: Array
 ) -> int:
-    """Write where the rays of the stations meet the surface of the rays of the other image.
+    """Write the points where the rays of the stations meet the surface of the other rays.
 
     Parameters
     ----------
     cameras : pair of ndarray
-        From `pack_camera`.
+        Packed cameras, from `pack_camera`.
     stations, others : ndarray, shape (m, 2) and (n, 2)
-        Pixels of the one image, and of the other in the order of its path.
+        Pixels of one image, and of the other in the order of its path.
     least_step : float
         As in `PairingSettings` [m].
     points : ndarray, shape (m + 1, 3)
@@ -323,7 +323,7 @@ def is_reachable(points: Array, needle: StereoTrackerParameters) -> bool:
     Parameters
     ----------
     points : ndarray, shape (n, 3)
-        From `shaft_points`.
+        Points from `shaft_points`.
     needle : StereoTrackerParameters
         Reach of the needle.
     """
@@ -340,13 +340,13 @@ def shaft_length(points: Array) -> float:
     Parameters
     ----------
     points : ndarray, shape (n, 3)
-        Outwards along the shaft, in `rig` [m].
+        Points outwards along the shaft, in `rig` [m].
     """
     tip = points[-1]
     s = np.linalg.norm(points, axis=1) / float(np.linalg.norm(tip))
     bent = points - s[:, None] * tip
     terms, solution, weight = _bends(s), np.zeros((2, 3)), np.ones((len(s), 1))
-    # Reweighted least squares: points of a path that clutter deflects have a low weight.
+    # Reweighted least squares: points where clutter deflects the path have a low weight.
     for _ in range(PAIRING.passes):
         solution, *_ = np.linalg.lstsq(terms * weight, bent * weight, rcond=None)
         off = np.linalg.norm(bent - terms @ solution, axis=1)
@@ -362,7 +362,7 @@ def _bends(s: Array) -> Array:
 
 
 def _smooth(pixels: Array) -> Array:
-    """Return the path without the steps of the cells: a moving average, shorter at the ends."""
+    """Smooth the steps of the cells out of a path: a moving average, shorter at the ends."""
     place = np.arange(len(pixels))
     half = np.minimum(SEARCH.smooth_rows // 2, np.minimum(place, place[::-1]))
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(pixels, axis=0)])

@@ -1,8 +1,8 @@
 """Triangulation of the ends in both views: tight across the needle, loose along it.
 
 A view determines the end to a few hundredths of a pixel across the shaft, from its line, and to
-about a pixel along it. Least squares weights both accordingly, so that an end that is poorly seen
-hardly affects the depth.
+about a pixel along it. Least squares weights both accordingly, so that a poorly visible end hardly
+affects the depth.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 _ITERATIONS = 12
 _ROUNDING = 1e-10  # step of a converged position [m]; scaled determinant of a singular matrix
-_LEAST_SINE = 1e-3  # of the angle between the two planes through a camera and the shaft
+_LEAST_SINE = 1e-3  # least sine of the angle between the planes through a camera and the shaft
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,11 +40,11 @@ class SpatialTip:
     position : ndarray, shape (3,)
         Visible end [m].
     covariance : ndarray, shape (3, 3)
-        Of the position [m^2].
+        Covariance of the position [m^2].
     direction : ndarray, shape (3,)
         Unit vector along the visible shaft near the tip, towards the tip.
     direction_covariance : ndarray, shape (3, 3)
-        Of the direction [-]; zero along it.
+        Covariance of the direction [-]; zero along it.
     misfit : float
         Squared residuals of both views over their variances: chi-squared, one degree of freedom.
     """
@@ -69,7 +69,7 @@ def midpoint(views: tuple[RefractedCamera, RefractedCamera], tips: tuple[Array, 
     Returns
     -------
     ndarray, shape (3,)
-        NaN for parallel rays.
+        Midpoint; NaN for parallel rays.
     """
     p, a, q, b = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     pixel_ray(views[0].packed, np.asarray(tips[0], dtype=np.float64), p, a)
@@ -140,7 +140,7 @@ def _solve_position(
     Parameters
     ----------
     cameras : pair of ndarray
-        From `pack_camera`.
+        Packed cameras, from `pack_camera`.
     points : ndarray, shape (2, 2)
         Image points [px].
     axes : ndarray, shape (2, 2, 2)
@@ -148,7 +148,7 @@ def _solve_position(
     sigmas : ndarray, shape (4,)
         Standard deviations: left across, left along, right across, right along [px].
     position : ndarray, shape (3,)
-        Initial value, and output [m].
+        Initial value, replaced by the result [m].
 
     Returns
     -------
@@ -159,7 +159,7 @@ def _solve_position(
     residual : ndarray, shape (4,)
         Residuals over `sigmas`.
     jacobians : ndarray, shape (2, 2, 3)
-        Of both cameras at the position [px/m].
+        Jacobians of both cameras at the position [px/m].
     """
     jacobians, rows, residual = np.empty((2, 2, 3)), np.empty((4, 3)), np.empty(4)
     normal, pixel = np.zeros((3, 3)), np.empty(2)
@@ -175,7 +175,7 @@ def _solve_position(
         normal = rows.T @ rows
         # Scaled by its diagonal, the determinant shows how well the position is determined.
         product = normal[0, 0] * normal[1, 1] * normal[2, 2]
-        # A NaN, of a point behind a camera, must not reach det().
+        # A NaN from a point behind a camera must not reach det().
         if not (0.0 < product < math.inf and np.linalg.det(normal) > _ROUNDING * product):
             break
         step = np.linalg.solve(normal, rows.T @ residual)
@@ -192,7 +192,8 @@ def _shaft_direction(
     """Write the direction of the shaft in `rig`, and add its covariance; False if undetermined.
 
     Seen through the Jacobian J of a camera, the direction d runs along the image line: n . J d = 0
-    with n across the line. So d is across both J^T n: the intersection of two planes.
+    with n perpendicular to the line. So d is perpendicular to both J^T n: the intersection of two
+    planes.
     """
     normals, alongs, turned = np.empty((2, 3)), np.empty((2, 3)), np.empty(3)
     for i in range(2):

@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 
 LARGEST_ERROR, LARGEST_TARGET_ERROR = 1e-3, 3e-3
 """Limits of the root mean square fiducial error, and of the error at a point left out [m]."""
-_LEAST_DISTANCE, _LEAST_WIDTH = 5e-3, 3e-3  # of two points, and of all from a line [m]
-_LEAST_STD = 1e-5  # of a measured coordinate [m]
+_LEAST_DISTANCE, _LEAST_WIDTH = 5e-3, 3e-3  # between two points, and of all points from a line [m]
+_LEAST_STD = 1e-5  # least standard deviation of a measured coordinate [m]
 _POINT_COLUMNS = tuple(f"{frame}_{axis}_mm" for frame in ("rig", "tracker") for axis in "xyz")
 _PIVOT_COLUMNS = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 _DESCRIPTION = f"""\
@@ -52,10 +52,10 @@ class Fit(NamedTuple):
 
 
 def fit(rig: Array, tracker: Array) -> Fit:
-    """Return the transform with the least squared distances of points, (N, 3): Kabsch [m]."""
+    """Return the least-squares transform between points, (N, 3) [m], by Kabsch's method."""
     to, origin = rig.mean(axis=0), tracker.mean(axis=0)
     with warnings.catch_warnings():
-        # A trial exchange of points may leave the rotation undetermined; its error tells.
+        # A trial exchange of points may leave the rotation undetermined, which its error reveals.
         warnings.simplefilter("ignore", UserWarning)
         rotation = Rotation.align_vectors(rig - to, tracker - origin)[0].as_matrix()
     translation = to - rotation @ origin

@@ -1,4 +1,4 @@
-"""Registration of a tracker to the rig: the file of `register_tracker`, and its error by place."""
+"""Registration of a tracker to the rig: the file of `register_tracker`, and its local error."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ class Registration:
     centroid : ndarray, shape (3,)
         Centroid of the registration's points in `rig` [m].
     covariance : ndarray, shape (6, 6)
-        Of the translation at the centroid [m] and the rotation about the axes of `rig` [rad].
+        Covariance of the translation at the centroid [m] and the rotation about the axes of `rig`
+        [rad].
     tip_offset : ndarray, shape (3,)
         The needle's tip in the sensor's frame [m].
     sensor_std : float
@@ -112,7 +113,7 @@ def _checked(found: Registration) -> Registration:
 
 
 def write_registration(path: Path, found: Registration, comments: list[str]) -> None:
-    """Write a file of a registration; raises a `UserError` if that fails or it is unusable."""
+    """Write a registration file; raises a `UserError` if the file or registration is unusable."""
     found = _checked(found)
     content = {
         "T_rig_tracker": {

@@ -1,4 +1,4 @@
-"""Checks of transforms of a tracker: which of them are tips.
+"""Validity checks of the transforms of a tracker.
 
 A rejection is a pair: the name of the fault, which is counted, and a text with value and bound.
 """
@@ -20,8 +20,8 @@ _LARGEST_CURVATURE = 9.0  # of the needle's path, as for stereo_tracker [1/m]
 _LARGEST_ANGLE = 1.4  # between heading and insertion [rad]
 _MARGIN = 4e-3  # for the errors of registration and entry point, as for plane_controller [m]
 _GATE = 6.0  # for the noise of a change of place [standard deviations]
-_OLDER_GATES = 3.0  # insertion after which an older tip is replaced
-_OUT = 1e-3  # insertion up to which the needle is out [m]
+_OLDER_GATES = 3.0  # insertion after which an older tip is replaced [gates]
+_OUT = 1e-3  # insertion up to which the needle counts as withdrawn [m]
 _ROTATION_TOLERANCE = 1e-3  # of R R^T = 1; single precision has 1e-6
 _AHEAD = 0.05  # tolerated difference of two clocks [s]
 
@@ -47,7 +47,7 @@ class TrackerTransform(NamedTuple):
 def check_transform(
     transform: TrackerTransform, last: TrackerTransform | None, now: float, max_age: float
 ) -> Rejection | None:
-    """Check what does not depend on the needle; return the rejection, or None.
+    """Check a transform independently of the needle; return the rejection, or None.
 
     Parameters
     ----------
