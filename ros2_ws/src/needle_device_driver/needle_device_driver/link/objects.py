@@ -20,7 +20,7 @@ class Entry:
     format : str
         `struct` format, little-endian.
     name : str
-        As in CiA 301 or CiA 402.
+        Name in CiA 301 or CiA 402.
     rule : Rule or None
         The safety rule that needs it.
     """
