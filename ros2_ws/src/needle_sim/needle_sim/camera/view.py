@@ -183,7 +183,7 @@ class View:
         return np.asarray(cv2.convertScaleAbs(cv2.max(image, 0.0)), dtype=np.uint8)
 
     def visible_share(self, points: FloatArray, moment: SceneState) -> float:
-        """Return the share of points (M, 3) in `rig` that are in the image and not under a hand."""
+        """Return the share of points (M, 3) in `rig` that are in the image, not behind a hand."""
         pixels = self._optics.project(points)
         visible = self._optics.in_image(pixels)
         if moment.hand and len(points):
