@@ -82,7 +82,7 @@ class DeviceDriver(Component):
     drives : tuple of Drives
         Each kind of drive in use.
     waiting : str
-        Why services are not ready; empty: they are.
+        Reason why services are not ready; empty: they are ready.
     searches : bool
         Whether the driver searches for the drives.
     is_set_up : bool
@@ -164,7 +164,7 @@ class DeviceDriver(Component):
         Parameters
         ----------
         handler : callable
-            Its last argument is the moment.
+            Handler whose last argument is the moment.
         ends : bool
             Whether an error also ends the component; without its heartbeat, the drives then stop.
         """

@@ -55,7 +55,7 @@ class AxisSnapshot:
     at_inner_switch : bool
         Whether the limit switch at the far end is active.
     fault : str
-        Why the axis refuses to move; empty: no fault.
+        Reason why the axis refuses to move; empty: no fault.
     fault_rule : Rule
         The rule behind the fault.
     ready : bool
@@ -210,7 +210,7 @@ class PairSnapshot:
 
 
 class AxisPair:
-    """Sends orders to both axes; an error on one does not withhold the order from the other.
+    """Sends orders to both axes; an error on one axis does not affect the order to the other.
 
     Parameters
     ----------

@@ -233,7 +233,7 @@ class ObjectRow:
     rule, name : str
         The rule that needs it; its address and name.
     problem : str
-        Why the drive refuses it; empty: it does not.
+        Reason why the drive refuses it; empty: accepted.
     is_fatal : bool
         Whether this makes the drive unusable.
     """

@@ -91,12 +91,12 @@ def read_units(
     access : ObjectAccess
         The drive.
     settings : DriveSettings
-        Its settings; a `counts_per_turn` above 0 replaces 0x608F and 0x6091.
+        Settings of the drive; a `counts_per_turn` above 0 replaces 0x608F and 0x6091.
 
     Returns
     -------
     DriveSettings
-        With units of counts/s or rpm, with any prefix; by default counts/s.
+        Settings with units of counts/s or rpm, with any prefix; by default counts/s.
     str
         Units that the drive does not report, and the assumed ones; empty: none.
 

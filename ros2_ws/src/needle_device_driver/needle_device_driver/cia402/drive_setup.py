@@ -27,7 +27,7 @@ PRODUCER_HEARTBEAT_MS = 30
 # Longest accepted heartbeat period of a drive that refuses the one above: the driver waits for
 # heartbeats when a drive starts, and while it stands still.
 _MAX_HEARTBEAT_MS = 200
-# In seconds.
+# Time-outs [s].
 _SWITCH_OFF_TIMEOUT = 1.0
 _MODE_TIMEOUT = 0.5
 # Two of the four transmit PDOs that CiA 402 drives have by default; they may be on.
@@ -64,7 +64,7 @@ def set_up(
     Returns
     -------
     DriveSettings
-        As given, with the units of the drive.
+        The given settings, with the units of the drive.
     tuple of str
         Notes on optional objects that the drive lacks, and on assumptions.
 

@@ -15,7 +15,7 @@ from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.link.sdo_client import SdoAbortedError, SdoTimeoutError
 from needle_device_driver.procedure import Procedure
 
-# In seconds.
+# Time-outs [s].
 _HEARTBEAT_TIMEOUT = 0.3
 _START_TIMEOUT = 1.0
 _FAULT_RESET_TIMEOUT = 1.0

@@ -124,7 +124,7 @@ class ObjectAccess:
         entry : Entry
             The entry.
         value : int
-            Its new value.
+            New value of the entry.
         accepted : tuple of int, optional
             Least and greatest accepted value after rounding by the drive; by default `value`.
         variable : bool

@@ -34,7 +34,7 @@ class SdoAbortedError(Exception):
     Parameters
     ----------
     code : int
-        Its abort code.
+        SDO abort code.
     """
 
     def __init__(self, code: int) -> None:

@@ -40,7 +40,7 @@ class CommandContext:
     homed : bool
         Whether both axes are homed.
     not_new : str
-        Why the command's stamp is not new; empty: it is new.
+        Reason why the command's stamp is not new; empty: it is new.
     tip_age : float
         Steady age of the command's stamp [s]; negative: it is in the future.
     publishers : int
@@ -294,7 +294,7 @@ class CommandHandler:
         if not self._on_path or stamp_ns is None:
             return
         age, limit = self.stamps.age(stamp_ns, now), self._limits.tip_age_limit
-        # The age is negative if ROS time was set back; the tip would never get too old.
+        # The age is negative if ROS time was set back; the tip would then never expire.
         if not 0.0 <= age <= limit:
             self._core.watchdog_trips += 1
             old = f"{age:.3f} s old, limit {limit:g} s"

@@ -44,7 +44,7 @@ class DeviceCore:
     configured : bool
         Whether the axes are set up.
     reason : str
-        Why the device last stopped, refused something or waits.
+        Reason why the device stopped, refused a request or waits.
     watchdog_trips : int
         Number of times that a hold, tip or feedback was too old.
     snapshot : PairSnapshot or None

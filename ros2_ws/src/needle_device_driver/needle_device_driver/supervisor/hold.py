@@ -33,7 +33,7 @@ class _Source:
     )
 
     def begin(self, session: str) -> None:
-        """Begin a new session; the present one has ended for good."""
+        """Begin a new session; the present one has ended and cannot resume."""
         self.ended.append(self.session)
         self.session, self.count = session, _NO_COUNT
         self.released, self.until = False, -math.inf

@@ -197,7 +197,7 @@ class RetractionBound:
     Parameters
     ----------
     max_depth : float
-        Bound if the depth was never known [m].
+        Bound if the depth has never been known [m].
     """
 
     def __init__(self, max_depth: float) -> None:

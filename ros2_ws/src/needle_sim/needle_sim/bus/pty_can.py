@@ -24,7 +24,7 @@ _WAKE_UP_PERIOD = 0.05  # [s]
 
 
 class PtyCan:
-    """Port of a component: a pseudo-terminal, which a computer opens as a serial CAN adapter.
+    """Port of a component: a pseudo-terminal that a computer opens as a serial CAN adapter.
 
     `open` starts a thread that reads it; without one, call `receive`.
 

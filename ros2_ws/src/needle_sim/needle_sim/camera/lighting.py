@@ -33,7 +33,7 @@ def lamp_light(camera: SimulatedCamera) -> FloatImage:
 def uneven_light(
     lighting: Lighting, camera: SimulatedCamera, rng: np.random.Generator
 ) -> FloatImage:
-    """Return the factor of the lamp's light: wide blotches, and one side in a soft shade."""
+    """Return the factor of the lamp's light: wide blotches, and a soft shade on one side."""
     size = (camera.image_width, camera.image_height)
     small = (-(-size[0] // _COARSE), -(-size[1] // _COARSE))
     field = cv2.GaussianBlur(
@@ -54,7 +54,7 @@ def uneven_light(
 
 
 def drift(lighting: Lighting, exposure_number: int, phase: float) -> float:
-    """Return the factor of all light in an exposure; `phase` is the initial phase [rad]."""
+    """Return the factor by which an exposure's light drifts; `phase` is the initial one [rad]."""
     angle = 2.0 * np.pi * exposure_number / lighting.drift_period + phase
     return float(1.0 + lighting.drift * np.sin(angle))
 

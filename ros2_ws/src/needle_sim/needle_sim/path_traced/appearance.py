@@ -143,7 +143,7 @@ class NamedAppearance:
     Attributes
     ----------
     summary : str
-        One line for the user.
+        One-line description for the user.
     metal, lamps, floor : str or None
         Fixed value; None: drawn at random.
     needle : bool

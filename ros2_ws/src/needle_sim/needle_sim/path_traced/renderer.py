@@ -97,7 +97,7 @@ class PathTracedRenderer:
 
     Shape and position of all traced objects are exact: lines of sight obey Snell's law at each
     layer of a camera's window; the phantom begins at z = 0, a box ends at its walls.
-    Approximations: lamps are at their apparent position from the phantom's centre through a level
+    Approximations: lamps are where they appear from the phantom's centre through a level
     top, also for a box; the surface mirrors a ring of constant brightness into the phantom, but not
     into a box; walls and needle do not light the floor; bubbles cast shadows without caustics; haze
     is one exponential with a glow of one width; windows do not reflect; all floors are Lambertian;

@@ -262,7 +262,7 @@ class BiasWalk:
 
 
 class DelayLine:
-    """Delays measurements by some steps.
+    """Delays measurements by a number of steps.
 
     The first measurement is not delayed; then nothing arrives until the second one is due.
 
