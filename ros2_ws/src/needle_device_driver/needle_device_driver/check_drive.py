@@ -38,7 +38,7 @@ interrupted
 """
 # An arbitrary value, so that a drive in rpm needs no 0x608F.
 _COUNTS_PER_TURN = 20_000.0
-# Time that device_driver may take to shut down [s].
+# Time for device_driver to shut down [s].
 _END = 2.0
 
 

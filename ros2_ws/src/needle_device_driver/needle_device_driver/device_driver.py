@@ -37,7 +37,7 @@ _REPLY_TIMEOUT = 0.75 * PERIOD
 _SEARCH_PERIOD = 0.25
 EXIT_BROKEN = 3
 """The cycle raised an error: the axes are no longer controlled."""
-# A cycle is late if it begins more than this share of a period after its time.
+# A cycle is late if its delay exceeds this share of a period.
 _LATE = 0.5
 
 
@@ -82,7 +82,7 @@ class DeviceDriver(Component):
     drives : tuple of Drives
         Each kind of drive in use.
     waiting : str
-        Reason why services are not ready; empty: they are ready.
+        Reason why services are not ready; empty: ready.
     searches : bool
         Whether the driver searches for the drives.
     is_set_up : bool

@@ -11,7 +11,7 @@ from needle_sim.needle.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
 
 RIG = "rig"
-# Variance of the orientation, which a tip position does not determine [rad^2].
+# Variance of the undetermined orientation [rad^2].
 _UNKNOWN_ORIENTATION = 1e6
 # A variance of 0 would mean "unknown" [m^2].
 _MIN_POSITION_VARIANCE = 1e-12

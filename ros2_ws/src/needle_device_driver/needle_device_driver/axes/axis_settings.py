@@ -33,7 +33,7 @@ class AxisSettings:
     lower, upper : float
         Software limits, from home.
     tolerance : float
-        Largest motion in one cycle of an axis that counts as standing still.
+        Largest motion per cycle of an axis at rest.
     unit : str
         Unit of the axis: m or rad.
     travel : float
@@ -94,7 +94,7 @@ class AxisSettings:
 
     @property
     def longest_search(self) -> float:
-        """Longest distance over which homing searches for the switch: 20 % more than the travel."""
+        """Longest search for the home switch: 20 % more than the travel."""
         return 1.2 * self.travel
 
     @property

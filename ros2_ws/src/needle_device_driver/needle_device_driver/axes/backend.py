@@ -15,7 +15,7 @@ from needle_device_driver.axes.drives import Drives
 GROUP = "needle_device_driver.axes"
 """Group of the entry points; their names are the values of `insertion_drive`, `rotation_drive`."""
 HAND = "hand"
-"""Name of the drive of an axis that is moved by hand and only measured."""
+"""Drive of an axis that is moved by hand and only measured."""
 _OWN = {
     "cia402": "needle_device_driver.cia402.backend:BACKEND",
     "stepdir": "needle_device_driver.backends.stepdir:BACKEND",

@@ -13,8 +13,8 @@ class Capabilities:
     Attributes
     ----------
     watchdog : float
-        Time without contact to the computer after which it stops by itself, at the default of
-        parameter `watchdog` [s]; infinite: it has no watchdog.
+        Silence of the computer after which it stops by itself, with the default parameter
+        `watchdog` [s]; infinite: it has no watchdog.
     longest_order : float
         Longest time for which the last set-point keeps it moving [s]; for a drive
         with trapezoidal profiles 0.02 s + speed / deceleration.
@@ -44,5 +44,5 @@ class Capabilities:
 
     @property
     def has_watchdog(self) -> bool:
-        """Whether the drive stops by itself when it loses contact to the computer."""
+        """Whether it stops by itself when the computer is silent."""
         return math.isfinite(self.watchdog)

@@ -184,7 +184,7 @@ class Drives(abc.ABC):
         """Receive a batch from the port."""
 
     def probe(self) -> Procedure[str]:
-        """Open the link and check that every drive answers; return the error or an empty text."""
+        """Open the link and check that every drive answers; return the error, if any."""
         try:
             self.link.open()
             yield from self._identify()

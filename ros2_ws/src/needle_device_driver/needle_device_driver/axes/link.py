@@ -60,7 +60,7 @@ class Link:
 
     @property
     def is_open(self) -> bool:
-        """Whether the link is open and not lost."""
+        """Whether it is open and not lost."""
         return self._is_open and not self.lost
 
     @property

@@ -91,7 +91,7 @@ class CoordinatedMotion:
         while True:
             leg = self._legs[self._leg]
             length, whole = leg.insertion - self._start[0], abs(leg.rotation - self._start[1])
-            # The needle may have been pushed past the leg before its rotation began.
+            # The needle may have passed the leg before its rotation began.
             part = (insertion - self._start[0]) / length if length > 0.0 else 1.0
             reached = min(max(part, self._progress), 1.0)
             step = min(reached - self._progress, turn / whole if whole > 0.0 else 1.0)

@@ -30,7 +30,7 @@ _ASSUMED = {(0x1000, 0): 402, (0x6502, 0): 1 << 5}
 _SECTION = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?", re.IGNORECASE)
 # Size in bytes of the data types, negative if signed; 0: not a number.
 _SIZES = {1: 1, 2: -1, 3: -2, 4: -4, 5: 1, 6: 2, 7: 4, 0x15: -8, 0x1B: 8}
-# First index of the PDO mappings, of which there are up to 512 each.
+# First index of the mappings of up to 512 PDOs.
 _PDO_MAPPINGS = (0x1600, 0x1A00)
 _MISSING, _READ_ONLY, _NOT_MAPPABLE = 0x0602_0000, 0x0601_0002, 0x0604_0041
 _WRONG_LENGTH, _RANGE = 0x0607_0010, 0x0609_0030
@@ -98,7 +98,7 @@ def _file_object(section: Mapping[str, str | None], node_id: int) -> FileObject:
     def value(key: str) -> int | None:
         number = _number(section.get(key), node_id)
         if number is not None and size < 0 and number >> (8 * -size - 1) == 1:
-            # Negative numbers are written as hexadecimal two's complement.
+            # Hexadecimal two's complement.
             number -= 1 << 8 * -size
         return number
 
@@ -270,7 +270,7 @@ def check_device_file(
     Raises
     ------
     UserError
-        If the file has neither format, or does not describe a CiA 402 drive.
+        If the file has neither format, or its drive is not CiA 402.
     """
     product, objects = read_device_file(path, settings.node_id)
     device = FileDevice(objects)

@@ -19,7 +19,7 @@ from needle_device_driver.cia402.cia402 import (
 )
 from needle_device_driver.cia402.drive_monitor import Feedback
 
-# All in cycles. An axis is at rest after it has stood still for this time.
+# All in cycles. An axis is at rest after standing still for this time.
 _REST = 3
 # A stopped axis is switched off after this time even if it is not at rest.
 MAX_REST = 50
@@ -40,7 +40,7 @@ class DriveMachine:
     Parameters
     ----------
     rest_counts : int
-        Largest motion in one cycle of an axis that counts as standing still.
+        Largest motion per cycle of an axis at rest [counts].
     period : float
         Period of a cycle [s].
     stop_time : float

@@ -37,7 +37,7 @@ class Feedback:
     number : int
         Number of complete answers to a SYNC.
     statusword, mode, inputs : int
-        Values as sent by the drive.
+        Values as sent.
     position : int
         Position actual value [counts].
     following_error : int

@@ -13,7 +13,7 @@ from needle_device_driver.link import objects as od
 from needle_device_driver.link.object_access import ObjectAccess, ObjectError
 from needle_device_driver.procedure import Procedure
 
-# Homing methods that use an index pulse, and those that use a switch.
+# Homing methods that use an index pulse, and a switch.
 INDEX_PULSE = (*range(1, 15), 33, 34)
 SWITCHES = tuple(range(1, 15)) + tuple(range(17, 31))
 HOMING_METHODS = (*SWITCHES, 33, 34, *HERE)
@@ -30,7 +30,7 @@ class DriveSettings(AxisSettings):
     following_error_time : float
         Time for which the drive tolerates a greater following error [s].
     max_torque : float
-        Largest torque, as a share of the rated torque; 0: the drive's own setting.
+        Largest share of the rated torque; 0: the drive's own setting.
     counts_per_turn : float
         Position counts per turn of the drive's shaft; 0: as the drive reports, or unknown.
     speed_unit, ramp_unit : float

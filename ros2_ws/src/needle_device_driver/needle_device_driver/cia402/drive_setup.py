@@ -24,7 +24,7 @@ from needle_device_driver.procedure import Procedure
 
 # Milliseconds between a drive's heartbeats: much shorter than the reply age limit.
 PRODUCER_HEARTBEAT_MS = 30
-# Longest accepted heartbeat period of a drive that refuses the one above: the driver waits for
+# Longest accepted heartbeat period if a drive refuses the one above: the driver waits for
 # heartbeats when a drive starts, and while it stands still.
 _MAX_HEARTBEAT_MS = 200
 # Time-outs [s].
@@ -66,7 +66,7 @@ def set_up(
     DriveSettings
         The given settings, with the units of the drive.
     tuple of str
-        Notes on optional objects that the drive lacks, and on assumptions.
+        Optional objects that the drive lacks, and assumptions.
 
     Raises
     ------

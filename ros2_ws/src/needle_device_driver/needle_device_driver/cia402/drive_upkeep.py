@@ -61,7 +61,7 @@ def await_operational(
     """Return whether the drive reports operational; meanwhile send the computer's heartbeat."""
     until = link.now + timeout
     while link.now < until:
-        # Read the count before beating: the drive may answer at once.
+        # Count first: the drive may answer at once.
         before = monitor.heartbeats
         link.beat()
         if (yield from monitor.await_operational(before, period)):

@@ -51,7 +51,7 @@ class HomingRun:
     step : HomingStep
         Stage of the homing.
     problem : str
-        Reason why the homing must not continue; empty: none.
+        Reason to abort the homing; empty: none.
     """
 
     def __init__(self, settings: DriveSettings, speed: float, *, has_inputs: bool) -> None:

@@ -10,7 +10,7 @@ from needle_device_driver.procedure import Procedure
 STEP_TIME = 0.41
 """Duration of a step of 2 mm at nearly the largest speed [s]."""
 TIGHT = 50e-6
-"""Distance of tight software limits from home, for an order beyond them [m]."""
+"""Software limits on either side of home, for an order beyond them [m]."""
 _OFF = ("OFF", "SWITCH_ON_DISABLED", "READY_TO_SWITCH_ON", "SWITCHED_ON")
 
 

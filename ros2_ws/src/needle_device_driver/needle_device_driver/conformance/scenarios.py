@@ -25,7 +25,7 @@ IMPOSSIBLE = "not possible"
 _STOPPED = 1.5
 _DEEP, _SHALLOW = 0.1, 0.02
 _RETRACT_AT = 0.003
-# Largest motion ordered by another computer until it is detected [m].
+# Motion ordered by another computer until detection [m].
 _INTRUSION = 0.001
 # Constant delay of replies that only slows a motion down [s].
 _LATE = 0.03
@@ -43,7 +43,7 @@ def random_moment(fault: Fault, make: MakeRig, seed: int) -> None:
 
 
 def _proceed(rig: ConformanceRig) -> None:
-    """Take the next action on the way to a step or retraction."""
+    """Take the next action towards a step or retraction."""
     status = rig.hand.status
     match status.state, status.homed, status.activity:
         case "DISABLED", False, _:
@@ -96,7 +96,7 @@ def _later_motion(rig: ConformanceRig) -> Travel:
 def no_motion_by_itself(make: MakeRig) -> None:
     """Set up, reconnect, reset, switch on and off, also after a step: nothing moves.
 
-    The drives are off after the set-up and after the end of the driver.
+    The drives are off after set-up and after the driver ends.
     """
     rig = make(drives={"insertion_start": 0.01})
     begin = rig.place
@@ -127,7 +127,7 @@ def no_motion_by_itself(make: MakeRig) -> None:
     rig = make()
     rig.ready()
     rig.runner.stop(DRIVER)
-    # The first run returns as soon as the driver ends.
+    # The first run returns when the driver ends.
     rig.until(lambda: not rig.runner.runs(DRIVER), "the end of the driver")
     rig.runner.run(1.0)
     assert checks.are_off(rig)
@@ -274,7 +274,7 @@ def software_limits(make: MakeRig) -> None:
 
 
 def one_master(make: MakeRig) -> None:
-    """Simulate interference by another computer at rest: the driver detects it."""
+    """Interfere as another computer at rest: the driver detects it."""
     rig = make()
     rig.ready()
     begin = rig.place

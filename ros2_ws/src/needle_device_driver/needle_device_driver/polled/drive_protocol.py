@@ -97,8 +97,8 @@ class DriveProtocol(abc.ABC):
     def identify(self) -> Procedure[str]:
         """Return name and version, and resynchronise a reopened connection.
 
-        The drive may have received a partial line: end it so that the drive rejects it. The name of
-        an emulator begins with "Emulated".
+        The drive may hold a partial line: end it so that the drive rejects it. The name of an
+        emulator begins with "Emulated".
         """
 
     @abc.abstractmethod

@@ -79,7 +79,7 @@ class TextLink(Link):
     def __init__(self, name: str, terminators: bytes) -> None:
         super().__init__(name)
         self.bytes_sent = self.lines_received = self.garbled = 0
-        # Matches the position after a terminator.
+        # Position after a terminator.
         self._line_end = re.compile(b"(?<=[" + re.escape(terminators) + b"])")
         self._rest = b""
         self._outgoing = b""

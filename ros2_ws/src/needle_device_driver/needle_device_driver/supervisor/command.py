@@ -1,8 +1,8 @@
 """Checks of commands, which are refused as a whole if they break a rule; start, replacement.
 
-A step has one point: the target of both joints. A path has several points, which give the rotation
-as a function of insertion for the next part of a continuous insertion. A path may begin at an
-earlier position, with a point at `time_from_start` 0, and replaces the path under way.
+A step has one point: the target of both joints. A path has several: the rotation as a function of
+depth for the next part of a continuous insertion. A path may begin at an earlier position, with a
+point at `time_from_start` 0, and replaces the path under way.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class CommandContext:
     homed : bool
         Whether both axes are homed.
     not_new : str
-        Reason why the command's stamp is not new; empty: it is new.
+        Reason why the command's stamp is not new; else empty.
     tip_age : float
         Steady age of the command's stamp [s]; negative: it is in the future.
     publishers : int

@@ -46,7 +46,7 @@ class DeviceCore:
     reason : str
         Reason why the device stopped, refused a request or waits.
     watchdog_trips : int
-        Number of times that a hold, tip or feedback was too old.
+        Number of hold, tip and feedback time-outs.
     snapshot : PairSnapshot or None
         Newest feedback of the axes.
     step_stamp_ns : int or None

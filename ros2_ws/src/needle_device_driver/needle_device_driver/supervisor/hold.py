@@ -187,7 +187,7 @@ class Hold:
 
 
 class HoldNotices:
-    """Notices about holds that do not count, each given once until the reason changes."""
+    """Notices about holds that do not count, once until the reason changes."""
 
     def __init__(self) -> None:
         # Unknown sources share one entry. Ignored messages have entries of their own, because they

@@ -53,7 +53,7 @@ class SafetyLimits:
     insertion_following_error, rotation_following_error : float
         Largest distance of an axis from its set-point [m], [rad].
     insertion_tolerance, rotation_tolerance : float
-        Largest distance of each axis from its target at the end of a motion [m], [rad].
+        Largest distance from the target at the end of a motion [m], [rad].
     settling_time : float
         Longest time to reach the target after the last set-point [s].
     """

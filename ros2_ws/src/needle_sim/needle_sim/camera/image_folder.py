@@ -117,7 +117,7 @@ class ImageFolder:
         insertion : float
             Insertion of the stage [m].
         truth : Truth or None
-            Ground truth; None without a needle, which leaves the fields empty.
+            Ground truth; None without a needle: empty fields.
         visible_share : pair of float
             Visible share of the needle's last 10 mm, in the left and the right image.
         more : sequence of float or str

@@ -148,7 +148,7 @@ class Scenario:
     name : str
         Name in `SCENARIOS`.
     summary : str
-        One-line description for the user.
+        Description for the user.
     noise : float
         Standard deviation of the sensor noise [grey levels].
     needle : bool

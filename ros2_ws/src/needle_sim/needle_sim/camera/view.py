@@ -43,7 +43,7 @@ _CABLE = 40.0
 _HAND = 118.0
 _HAND_EDGE = 62.0
 _COVER = 24.0
-# Sensor noise at 65536 equally likely levels: drawing a 16-bit number takes a third of the time of
+# Sensor noise at 65536 equally likely levels: drawing a 16-bit number is three times as fast as
 # drawing a normal one.
 _NORMAL_TABLE = ndtri((np.arange(65536) + 0.5) / 65536.0)
 _NOISE_BAND_ROWS = 32

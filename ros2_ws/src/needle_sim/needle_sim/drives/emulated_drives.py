@@ -130,7 +130,7 @@ class EmulatedDrives(abc.ABC):
         self._drives[axis].hung = True
 
     def intrude(self) -> bool:
-        """Simulate interference by another computer; return False if none can be connected."""
+        """Interfere as another computer; return False if none can be connected."""
         return False
 
     def restore(self, now: float) -> None:

@@ -168,7 +168,7 @@ class GalilDrives(TextDrives[GalilAxis]):
 
     def watch(self, now: float) -> None:
         """Execute the next commands of the program's thread."""
-        # The controller executes about five commands per millisecond.
+        # It executes about five commands per millisecond.
         for _ in range(5):
             if not 0 <= self._next < len(self._program) or now < self._wake:
                 return

@@ -20,7 +20,7 @@ class MotorSettings:
     max_speed : float
         Maximum speed [counts/s].
     lag : float
-        Time constant with which the motor follows the demand [s]; 0: no lag.
+        Time constant of the lag behind the demand [s]; 0: no lag.
     start : float
         Position at power-up, from the home switch's edge [counts].
     travel : float

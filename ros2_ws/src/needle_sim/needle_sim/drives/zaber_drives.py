@@ -61,7 +61,7 @@ class ZaberDrive(TextDrive):
         self.zero = self.motor.position - self.settings["limit.max"]
 
     def set_position(self, position: float) -> None:
-        """Set the present position; it is then a reference, although the axis is not homed."""
+        """Set the present position: a reference, although the axis is not homed."""
         self.zero = self.demand.position - position
         self.flags = self.flags - {"WR"} | {"WH"}
 

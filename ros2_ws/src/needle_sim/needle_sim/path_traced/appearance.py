@@ -138,12 +138,12 @@ class Appearance:
 
 @dataclasses.dataclass(frozen=True)
 class NamedAppearance:
-    """Named appearance: some properties are fixed, the others are drawn at random.
+    """Named appearance with some fixed properties; the others are drawn.
 
     Attributes
     ----------
     summary : str
-        One-line description for the user.
+        Description for the user.
     metal, lamps, floor : str or None
         Fixed value; None: drawn at random.
     needle : bool

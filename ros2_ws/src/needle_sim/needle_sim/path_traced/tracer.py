@@ -24,7 +24,7 @@ _HINT = "docs/dependencies.md says how to install it"
 
 
 class Mitsuba(NamedTuple):
-    """Modules of the tracer, which have no type annotations.
+    """Modules of the tracer, without type annotations.
 
     Attributes
     ----------

@@ -77,7 +77,7 @@ def random_directions(numbers: NDArray[np.float32]) -> FloatArray:
 
 
 Insertion = TypeVar("Insertion", float, FloatArray)
-"""Type of an insertion, common to all needles or one for each."""
+"""Insertion common to all needles, or one for each."""
 PATCH_LENGTH = 0.020
 """Insertion over which the curvature is constant [m]."""
 _NEGLIGIBLE = 1e-6
